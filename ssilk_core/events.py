@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What long work says while it runs: a closed set of events, as JSON lines or as text for people."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from dataclasses import asdict, dataclass, field
+from typing import Protocol, TextIO
+
+
+@dataclass(frozen=True)
+class Started:
+    task: str
+    total: int
+    detail: dict[str, object] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Progress:
+    """`done` of `total` steps; `seconds_left` is None until it can be estimated; `terms` are energies [J]."""
+
+    done: int
+    total: int
+    seconds_left: float | None = None
+    terms: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Message:
+    """`level` is "info" or "warning"."""
+
+    text: str
+    level: str = "info"
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    path: str
+    done: int
+    best: bool
+
+
+@dataclass(frozen=True)
+class Result:
+    task: str
+    detail: dict[str, object] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Failed:
+    error: str
+
+
+Event = Started | Progress | Message | Checkpoint | Result | Failed
+
+
+class Reporter(Protocol):
+    """Anything that takes events."""
+
+    def __call__(self, event: Event) -> None: ...
+
+
+def silent(event: Event) -> None:
+    """Take an event and say nothing."""
+
+
+class JsonReporter:
+    """One JSON object per line on standard output: {"event": "progress", "done": ...}."""
+
+    def __init__(self, stream: TextIO | None = None) -> None:
+        self.stream = stream or sys.stdout
+
+    def __call__(self, event: Event) -> None:
+        line = {"event": type(event).__name__.lower(), **asdict(event)}
+        print(json.dumps(line, allow_nan=False, default=str), file=self.stream, flush=True)
+
+
+class TextReporter:
+    """A line that renews itself on a terminal; one line every ten seconds elsewhere."""
+
+    def __init__(self, stream: TextIO | None = None) -> None:
+        self.stream = stream or sys.stderr
+        self.live = self.stream.isatty()
+        self.last = 0.0
+        self.open_line = False
+
+    def __call__(self, event: Event) -> None:
+        if isinstance(event, Progress):
+            self._progress(event)
+            return
+        self._end_line()
+        text = describe(event)
+        if text:
+            print(text, file=self.stream, flush=True)
+
+    def _progress(self, event: Progress) -> None:
+        now = time.monotonic()
+        if now - self.last < (0.1 if self.live else 10.0) and event.done < event.total:
+            return
+        self.last = now
+        left = "" if event.seconds_left is None else f"  {format_seconds(event.seconds_left)} left"
+        terms = "  ".join(f"{name} {value:.4g}" for name, value in event.terms.items())
+        line = f"  {event.done}/{event.total}{left}  {terms}"
+        print(f"\r\x1b[K{line}" if self.live else line, end="" if self.live else "\n", file=self.stream, flush=True)
+        self.open_line = self.live
+
+    def _end_line(self) -> None:
+        if self.open_line:
+            print(file=self.stream)
+            self.open_line = False
+
+
+def describe(event: Event) -> str:
+    """Return an event as one line for people; empty for events they need not see."""
+    match event:
+        case Started():
+            return f"{event.task} ..."
+        case Message():
+            return event.text if event.level == "info" else f"warning: {event.text}"
+        case Failed():
+            return f"error: {event.error}"
+        case Result():
+            return "\n".join(f"  {name}: {value}" for name, value in event.detail.items())
+    return ""
+
+
+def format_seconds(seconds: float) -> str:
+    """Return a duration as people say it: "42 s", "3 min 05 s", "2 h 10 min"."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"

@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rotations, forward kinematics and skinning in float64 numpy: the slow twin of every fast path."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .assets import Deformer, Floats, GarmentPose, Ints, Motion, SkinWeights
+
+
+def matrix_from_quaternion(quaternions: Floats) -> Floats:
+    """Return rotation matrices, shape (..., 3, 3), of unit quaternions (w, x, y, z), shape (..., 4)."""
+    w, x, y, z = np.moveaxis(np.asarray(quaternions, dtype=np.float64), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def quaternion_from_matrix(matrices: Floats) -> Floats:
+    """Return unit quaternions (w, x, y, z), w >= 0, shape (..., 4), of rotation matrices (..., 3, 3)."""
+    m = np.asarray(matrices, dtype=np.float64)
+    diagonal = np.moveaxis(np.diagonal(m, axis1=-2, axis2=-1), -1, 0)
+    trace = diagonal.sum(axis=0)
+    # Four candidates, each exact where its own component is large; the largest is the well-conditioned one.
+    squares = np.stack([trace, *(2 * diagonal - trace)], axis=-1)
+    a = m[..., 2, 1] - m[..., 1, 2]
+    b = m[..., 0, 2] - m[..., 2, 0]
+    c = m[..., 1, 0] - m[..., 0, 1]
+    d = m[..., 1, 0] + m[..., 0, 1]
+    e = m[..., 0, 2] + m[..., 2, 0]
+    f = m[..., 2, 1] + m[..., 1, 2]
+    s = squares + 1
+    candidates = np.stack(
+        [
+            np.stack([s[..., 0], a, b, c], axis=-1),
+            np.stack([a, s[..., 1], d, e], axis=-1),
+            np.stack([b, d, s[..., 2], f], axis=-1),
+            np.stack([c, e, f, s[..., 3]], axis=-1),
+        ],
+        axis=-2,
+    )
+    best = np.argmax(squares, axis=-1)[..., None, None]
+    q = np.take_along_axis(candidates, best, axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., :1] < 0, -q, q)
+
+
+def multiply_quaternions(p: Floats, q: Floats) -> Floats:
+    """Return the products p * q (first q, then p), shape (..., 4)."""
+    pw, px, py, pz = np.moveaxis(np.asarray(p), -1, 0)
+    qw, qx, qy, qz = np.moveaxis(np.asarray(q), -1, 0)
+    return np.stack(
+        [
+            pw * qw - px * qx - py * qy - pz * qz,
+            pw * qx + px * qw + py * qz - pz * qy,
+            pw * qy - px * qz + py * qw + pz * qx,
+            pw * qz + px * qy - py * qx + pz * qw,
+        ],
+        axis=-1,
+    )
+
+
+def slerp(p: Floats, q: Floats, t: Floats) -> Floats:
+    """Interpolate unit quaternions (..., 4) along the shorter great arc; `t` in [0, 1] broadcasts over (...)."""
+    cosine = np.sum(p * q, axis=-1)
+    q = np.where(cosine[..., None] < 0, -q, q)
+    angle = np.arccos(np.clip(np.abs(cosine), 0.0, 1.0))
+    sine = np.sin(angle)
+    near = sine < 1e-6  # here the arc is a line to machine precision
+    safe = np.where(near, 1.0, sine)
+    a = np.where(near, 1 - t, np.sin((1 - t) * angle) / safe)
+    b = np.where(near, t, np.sin(t * angle) / safe)
+    mixed = a[..., None] * p + b[..., None] * q
+    return mixed / np.linalg.norm(mixed, axis=-1, keepdims=True)
+
+
+def rigid(rotations: Floats, translations: Floats) -> Floats:
+    """Return (..., 4, 4) transforms from rotation matrices (..., 3, 3) and translations (..., 3)."""
+    result = np.zeros((*rotations.shape[:-2], 4, 4))
+    result[..., :3, :3] = rotations
+    result[..., :3, 3] = translations
+    result[..., 3, 3] = 1
+    return result
+
+
+def invert_rigid(transforms: Floats) -> Floats:
+    """Return the inverses of rigid transforms, shape (..., 4, 4)."""
+    rotation = np.swapaxes(transforms[..., :3, :3], -1, -2)
+    return rigid(rotation, -(rotation @ transforms[..., :3, 3:])[..., 0])
+
+
+def world_transforms(local: Floats, parents: Ints) -> Floats:
+    """Forward kinematics: joint to world, from joint to parent, both (..., J, 4, 4); parents come first."""
+    world = np.array(local, dtype=np.float64)
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            world[..., joint, :, :] = world[..., parent, :, :] @ local[..., joint, :, :]
+    return world
+
+
+def local_transforms(world: Floats, parents: Ints) -> Floats:
+    """Return joint to parent, from joint to world, both (..., J, 4, 4)."""
+    local = np.array(world, dtype=np.float64)
+    children = np.flatnonzero(np.asarray(parents) >= 0)
+    above = np.asarray(parents)[children]
+    local[..., children, :, :] = invert_rigid(world[..., above, :, :]) @ world[..., children, :, :]
+    return local
+
+
+def motion_transforms(motion: Motion, parents: Ints) -> Floats:
+    """Return joint to world for every frame of a motion [m], shape (F, J, 4, 4)."""
+    return world_transforms(rigid(matrix_from_quaternion(motion.rotations), motion.translations), parents)
+
+
+def resample(motion: Motion, fps: float) -> Motion:
+    """Return the motion at `fps`: slerp for rotations, lines for translations; its duration is kept."""
+    if abs(motion.fps - fps) < 1e-9 * fps or motion.frame_count == 1:
+        return motion if motion.fps == fps else Motion(motion.path, fps, motion.rotations, motion.translations)
+    last = motion.frame_count - 1
+    count = int(np.floor(last * fps / motion.fps + 1e-6)) + 1
+    position = np.minimum(np.arange(count) * motion.fps / fps, last)
+    rotations, translations = sample_motion(motion, position)
+    return Motion(motion.path, fps, rotations, translations)
+
+
+def sample_motion(motion: Motion, position: Floats) -> tuple[Floats, Floats]:
+    """Return rotations (N, J, 4) and translations (N, J, 3) at fractional frames `position`, shape (N,)."""
+    low = np.minimum(position.astype(int), motion.frame_count - 1)
+    high = np.minimum(low + 1, motion.frame_count - 1)
+    t = (position - low)[:, None]
+    rotations = slerp(motion.rotations[low], motion.rotations[high], t)
+    translations = motion.translations[low] * (1 - t[..., None]) + motion.translations[high] * t[..., None]
+    return rotations, translations
+
+
+def skin_points(points: Floats, skin: SkinWeights, matrices: Floats) -> Floats:
+    """Linear blend skinning.
+
+    Args:
+        points: rest positions [m], shape (V, 3) or (F, V, 3).
+        skin: weights of the V points.
+        matrices: bind pose to posed world for each joint, shape (F, J, 4, 4).
+
+    Returns:
+        Posed positions [m], shape (F, V, 3).
+    """
+    points = np.broadcast_to(points, (len(matrices), *points.shape[-2:]))
+    posed = np.zeros(points.shape)
+    for index, weight in zip(skin.indices.T, skin.weights.T):
+        joint = matrices[:, index]
+        posed += weight[:, None] * ((joint[..., :3, :3] @ points[..., None])[..., 0] + joint[..., :3, 3])
+    return posed
+
+
+def skinning_matrices(world: Floats, bind_transforms: Floats) -> Floats:
+    """Return bind pose to posed world for each joint, shape (F, J, 4, 4)."""
+    return world @ invert_rigid(bind_transforms)
+
+
+def combined_transforms(deformer: Deformer, motion: Motion, pose: GarmentPose) -> Floats:
+    """Joint to world of character joints, then proxies, for the frames of `pose`, shape (F, J + P, 4, 4)."""
+    scene = deformer.scene
+    skeleton, rig = scene.character.skeleton, scene.rig
+    frames = slice(pose.start, pose.start + pose.frame_count)
+    character = rigid(matrix_from_quaternion(motion.rotations[frames]), motion.translations[frames])
+    rest = local_transforms(scene.bind_transforms, scene.parents)[skeleton.joint_count :]
+    translations = np.broadcast_to(rest[:, :3, 3], (pose.frame_count, rig.proxy_count, 3))
+    proxies = rigid(matrix_from_quaternion(pose.rotations), translations)
+    return world_transforms(np.concatenate([character, proxies], axis=1), scene.parents)
+
+
+def deform(deformer: Deformer, motion: Motion, pose: GarmentPose) -> Floats:
+    """Decode a pose to garment vertices in world space [m], shape (F, V, 3) (Eqs. 5 and 8).
+
+    `motion` is the character's motion over the whole shot; `pose.start` says where the pose stands in it.
+    """
+    scene = deformer.scene
+    matrices = skinning_matrices(combined_transforms(deformer, motion, pose), scene.bind_transforms)
+    canonical = scene.garment.mesh.points + np.einsum("fk,kvc->fvc", pose.weights.astype(np.float64), deformer.shapes)
+    return skin_points(canonical, deformer.skin, matrices)
