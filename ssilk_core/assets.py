@@ -24,7 +24,7 @@ Ints = NDArray[np.integer]
 
 
 def _frozen(array: object, dtype: type) -> NDArray:
-    copy = np.array(array, dtype=dtype, order="C")
+    copy: NDArray = np.array(array, dtype=dtype, order="C")
     copy.flags.writeable = False
     return copy
 
