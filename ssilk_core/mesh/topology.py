@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which vertices, edges and faces of a triangle mesh meet, and their areas and normals (numpy only)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ssilk_core.assets import Floats, Ints
+
+
+def edges(faces: Ints) -> NDArray[np.int64]:
+    """Return each undirected edge once, as (low, high) in ascending order, shape (E, 2)."""
+    return np.unique(np.sort(_half_edges(faces), axis=1), axis=0)
+
+
+def edge_use(faces: Ints) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the edges, shape (E, 2), and how many faces use each, shape (E,): 1 is a border, over 2 non-manifold."""
+    return np.unique(np.sort(_half_edges(faces), axis=1), axis=0, return_counts=True)
+
+
+def border_vertices(faces: Ints, vertex_count: int) -> NDArray[np.bool_]:
+    """Return which vertices lie on an edge that only one face uses, shape (V,)."""
+    pairs, uses = edge_use(faces)
+    return vertex_mask(pairs[uses == 1], vertex_count)
+
+
+def vertex_mask(indices: Ints, vertex_count: int) -> NDArray[np.bool_]:
+    """Return a boolean mask over the vertices that is true at `indices` (any shape)."""
+    mask = np.zeros(vertex_count, dtype=bool)
+    mask[indices] = True
+    return mask
+
+
+def hinges(faces: Ints) -> NDArray[np.int64]:
+    """Return the interior edges with the two vertices across from them, shape (H, 4).
+
+    Each row is (v0, v1, o0, o1): the edge runs v0 -> v1 in the face that holds o0, and o1 lies in the other
+    face. Edges used by one face, or by more than two, have no hinge.
+    """
+    half, opposite = _half_edges(faces), np.roll(faces, 1, axis=1).reshape(-1)
+    _, group, uses = np.unique(np.sort(half, axis=1), axis=0, return_inverse=True, return_counts=True)
+    order = np.argsort(group.reshape(-1), kind="stable")
+    starts = np.concatenate([[0], np.cumsum(uses)[:-1]])[uses == 2]
+    first, second = order[starts], order[starts + 1]
+    return np.column_stack([half[first], opposite[first], opposite[second]])
+
+
+def face_areas(points: Floats, faces: Ints) -> Floats:
+    """Return triangle areas [m2], shape (F,)."""
+    return 0.5 * np.linalg.norm(_face_crosses(points, faces), axis=-1)
+
+
+def face_normals(points: Floats, faces: Ints) -> Floats:
+    """Return unit triangle normals, shape (F, 3); zero for triangles without area."""
+    return _unit(_face_crosses(points, faces))
+
+
+def vertex_areas(points: Floats, faces: Ints) -> Floats:
+    """Return a third of the area of the faces around each vertex [m2], shape (V,)."""
+    thirds = np.repeat(face_areas(points, faces) / 3, 3)
+    return np.bincount(faces.reshape(-1), thirds, minlength=len(points)).astype(np.float64)
+
+
+def vertex_normals(points: Floats, faces: Ints) -> Floats:
+    """Return unit vertex normals, the area-weighted mean of the face normals around, shape (V, 3)."""
+    crosses = np.repeat(_face_crosses(points, faces), 3, axis=0)
+    corners = faces.reshape(-1)
+    return _unit(np.stack([np.bincount(corners, axis, minlength=len(points)) for axis in crosses.T], axis=-1))
+
+
+def islands(faces: Ints, vertex_count: int) -> NDArray[np.int64]:
+    """Return the connected component of each vertex, shape (V,), numbered by first vertex; lone vertices count."""
+    return components(edges(faces), vertex_count)
+
+
+def components(pairs: Ints, vertex_count: int) -> NDArray[np.int64]:
+    """Return the connected component of each vertex under the edges `pairs` (E, 2), numbered by first vertex."""
+    label = np.arange(vertex_count)
+    while True:
+        lowest = np.minimum(label[pairs[:, 0]], label[pairs[:, 1]])
+        merged = label.copy()
+        # Roots as well as vertices take the lower label, so that whole trees join at once.
+        for column in pairs.T:
+            np.minimum.at(merged, label[column], lowest)
+            np.minimum.at(merged, column, lowest)
+        merged = merged[merged]
+        if np.array_equal(merged, label):
+            return np.unique(label, return_inverse=True)[1].reshape(-1)
+        label = merged
+
+
+def smooth(values: Floats, pairs: Ints, rounds: int) -> Floats:
+    """Average each row of `values` (V, N) with those of its neighbours, `rounds` times.
+
+    `pairs` (E, 2) are undirected edges; the vertex itself counts as one neighbour. A constant stays constant.
+    """
+    count = len(values)
+    heads, tails = np.concatenate([pairs, pairs[:, ::-1]]).T
+    share = 1.0 / (1 + np.bincount(heads, minlength=count))
+    order = np.argsort(heads, kind="stable")
+    heads, tails = heads[order], tails[order]
+    owners, starts = np.unique(heads, return_index=True)
+    result = np.array(values, dtype=np.float64)
+    for _ in range(rounds):
+        total = result.copy()
+        if len(owners):
+            total[owners] += np.add.reduceat(result[tails], starts, axis=0)
+        result = total * share[:, None]
+    return result
+
+
+def _half_edges(faces: Ints) -> NDArray[np.int64]:
+    """Return the directed edges of every face in corner order, shape (3 F, 2)."""
+    faces = np.asarray(faces, dtype=np.int64)
+    return np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
+
+
+def _face_crosses(points: Floats, faces: Ints) -> Floats:
+    a, b, c = np.moveaxis(np.asarray(points, dtype=np.float64)[faces], 1, 0)
+    return np.cross(b - a, c - a)
+
+
+def _unit(vectors: Floats) -> Floats:
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
