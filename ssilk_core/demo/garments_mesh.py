@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the demo garments are cut with: a fit to the body, lofted rows, even triangles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..assets import Character, Floats, Ints
+
+# Where joints stand in a standing adult, as (left, up) fractions of the height: used when a rig names them otherwise.
+PROPORTIONS = {
+    "Hips": (0.0, 0.535),
+    "Spine": (0.0, 0.665),
+    "Neck": (0.0, 0.85),
+    "Head": (0.0, 0.91),
+    "LeftArm": (0.1, 0.79),
+    "LeftUpLeg": (0.063, 0.53),
+    "LeftLeg": (0.083, 0.29),
+    "LeftFoot": (0.109, 0.043),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A body in its bind pose to cut garments on: points [m] (V, 3), faces (F, 3), joint positions by plain name."""
+
+    points: Floats
+    faces: Ints
+    joints: dict[str, Floats]
+
+    def joint(self, name: str) -> Floats:
+        """Return a joint's position [m], or where a body of this height usually has it."""
+        if name in self.joints:
+            return self.joints[name]
+        low, high = self.points.min(axis=0), self.points.max(axis=0)
+        side, up = np.array(PROPORTIONS[name]) * (high[1] - low[1])
+        return np.array([(low[0] + high[0]) / 2 + side, low[1] + up, float(np.median(self.points[:, 2]))])
+
+    def nearest(self, points: Floats) -> tuple[Floats, Floats]:
+        """Return signed distances [m], shape (N,), and directions of their growth, shape (N, 3)."""
+        import igl
+
+        distance, _, closest, _ = igl.signed_distance(
+            np.ascontiguousarray(points),
+            self.points,
+            self.faces,
+            sign_type=igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER,
+        )
+        away = (points - closest) * np.where(distance < 0, -1.0, 1.0)[:, None]
+        return distance, away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
+
+
+def fit(character: Character) -> Fit:
+    """Return the merged body of a character with its joint positions at the bind pose."""
+    body, skeleton = character.merged_body(), character.skeleton
+    names = [name.rsplit("/", 1)[-1].rsplit(":", 1)[-1] for name in skeleton.joint_names]
+    joints = dict(zip(names, skeleton.bind_transforms[:, :3, 3]))
+    return Fit(np.asarray(body.mesh.points), np.asarray(body.mesh.faces), joints)
+
+
+def relax(fit: Fit, grid: Floats, clearance: float, *, cling: Floats, rounds: int) -> Floats:
+    """Smooth a grid of points, shape (rows, columns, 3), while it stays off the body.
+
+    `cling` in [0, 1], shape (rows, 1) or (rows, columns), is how much each point is drawn to lie at
+    `clearance` [m] from the body. Border columns and the last row slide only along themselves.
+    """
+    for _ in range(rounds):
+        padded = np.concatenate([2 * grid[:1] - grid[1:2], grid, 2 * grid[-1:] - grid[-2:-1]])
+        padded = np.concatenate(
+            [2 * padded[:, :1] - padded[:, 1:2], padded, 2 * padded[:, -1:] - padded[:, -2:-1]], axis=1
+        )
+        around = (padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:]) / 4
+        grid = grid + 0.5 * (around - grid)
+        distance, away = fit.nearest(grid.reshape(-1, 3))
+        gap = (clearance - distance).reshape(grid.shape[:2])
+        grid = grid + (np.where(gap > 0, 1.0, cling) * gap)[..., None] * away.reshape(grid.shape)
+    return grid
+
+
+def along(line: Floats, count: int) -> Floats:
+    """Return `count` points spaced evenly along a polyline (N, 3), ends included."""
+    steps = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    at = np.linspace(0, steps[-1], count)
+    return np.stack([np.interp(at, steps, axis) for axis in line.T], axis=1)
+
+
+def length(line: Floats) -> float:
+    """Return the length of a polyline [m]."""
+    return float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
+
+
+def loft(grid: Floats, edge: float, *, closed: bool = False) -> tuple[Floats, Ints]:
+    """Mesh a surface given as a grid of points with triangles of about `edge` [m].
+
+    Args:
+        grid: rows from top to bottom, each running so that (row, down) spans the outside, shape (R, C, 3);
+            with `closed`, the last column repeats the first.
+
+    Returns:
+        Points (V, 3) and faces (F, 3). Rows get as many vertices as their length asks for.
+    """
+    down = np.mean([length(grid[:, column]) for column in range(grid.shape[1])])
+    count = max(2, round(down / (edge * np.sqrt(3) / 2))) + 1
+    columns = np.stack([along(grid[:, column], count) for column in range(grid.shape[1])], axis=1)
+    rows = [along(row, max(3, round(length(row) / edge)) + 1) for row in columns]
+    if closed:
+        rows = [row[:-1] for row in rows]
+    starts = np.cumsum([0] + [len(row) for row in rows])
+    strips = [
+        stitch(above, below, start, stop, closed=closed)
+        for above, below, start, stop in zip(rows, rows[1:], starts, starts[1:])
+    ]
+    return np.concatenate(rows), np.concatenate(strips)
+
+
+def stitch(above: Floats, below: Floats, start: int, stop: int, *, closed: bool) -> Ints:
+    """Return triangles between two rows of points numbered from `start` and `stop`, taking the shorter diagonal."""
+    n, m = len(above), len(below)
+    last_n, last_m = (n, m) if closed else (n - 1, m - 1)
+    faces, i, j = [], 0, 0
+    while i < last_n or j < last_m:
+        right = np.linalg.norm(above[(i + 1) % n] - below[j % m]) if i < last_n else np.inf
+        left = np.linalg.norm(above[i % n] - below[(j + 1) % m]) if j < last_m else np.inf
+        if right <= left:
+            faces.append((start + i % n, stop + j % m, start + (i + 1) % n))
+            i += 1
+        else:
+            faces.append((start + i % n, stop + j % m, stop + (j + 1) % m))
+            j += 1
+    return np.array(faces)
