@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Exact geodesic distances along a triangle mesh [m], and samples spread evenly by them (float64).
+
+Two strips of cloth that hang side by side are a finger apart in space and far apart along the cloth. Distances
+here run along the cloth, and are infinite between islands.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ssilk_core.assets import Floats, Ints
+from ssilk_core.mesh.topology import components, edge_use, edges
+
+
+def distances(points: Floats, faces: Ints, sources: Ints) -> Floats:
+    """Return the geodesic distance of each vertex to the nearest of `sources` [m], shape (V,).
+
+    Exact (Mitchell, Mount and Papadimitriou 1987, by libigl) over faces that share edges. Paths may not cross
+    degenerate faces or the third and later faces of a non-manifold edge; vertices that only an edge, a single
+    point or such a face connects are reached along edges. Vertices of islands without a source are infinite.
+    """
+    result = np.full(len(points), np.inf)
+    result[sources] = 0
+    sound = _manifold_faces(faces)
+    for sheet in _sheets(sound):
+        inside, corners = np.unique(sound[sheet], return_inverse=True)
+        starts = np.flatnonzero(np.isin(inside, sources))
+        if len(starts):
+            found = _exact(points[inside], corners.reshape(-1, 3), starts)
+            result[inside] = np.minimum(result[inside], found)
+    return _along_edges(result, points, edges(faces))
+
+
+def nearest_sources(points: Floats, faces: Ints, sources: Ints) -> tuple[Floats, NDArray[np.int64]]:
+    """Return the distance to the nearest of `sources` [m], and that source (-1 where unreached), both (V,).
+
+    The distance is exact; the source is found by walking down the distance field along edges, so between two
+    sources that are equally far to within an edge either may be named.
+    """
+    distance = distances(points, faces, sources)
+    pairs = edges(faces)
+    heads, tails = np.concatenate([pairs, pairs[:, ::-1]]).T
+    downhill = distance[tails] < distance[heads]
+    heads, tails = heads[downhill], tails[downhill]
+    through = distance[tails] + np.linalg.norm(points[heads] - points[tails], axis=1)
+    order = np.lexsort((through, heads))
+    above, first = np.unique(heads[order], return_index=True)
+    nearest = np.arange(len(points))
+    nearest[above] = tails[order][first]
+    nearest[sources] = sources
+    while not np.array_equal(nearest, nearest[nearest]):
+        nearest = nearest[nearest]
+    return distance, np.where(np.isfinite(distance), nearest, -1)
+
+
+def farthest_points(points: Floats, faces: Ints, start: int, count: int) -> tuple[NDArray[np.int64], Floats]:
+    """Sample vertices so that each lies as far as possible from those before it, beginning with `start`.
+
+    Returns:
+        Up to `count` vertices of the island of `start`, shape (S,), fewer when all of its points are taken, and
+        the distance of every vertex to each sample [m], shape (S, V).
+    """
+    samples, rows = [start], [distances(points, faces, np.array([start]))]
+    nearest = rows[0].copy()
+    while len(samples) < count:
+        reached = np.where(np.isfinite(nearest), nearest, 0)
+        farthest = int(reached.argmax())
+        if reached[farthest] <= 0:
+            break
+        samples.append(farthest)
+        rows.append(distances(points, faces, np.array([farthest])))
+        nearest = np.minimum(nearest, rows[-1])
+    return np.array(samples), np.array(rows)
+
+
+def submesh(faces: Ints, mask: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the part of a mesh that lies within `mask` (V,): renumbered faces and the vertices they index, (M,).
+
+    Edges are kept too, as faces without area, so that what only an edge connects stays connected.
+    """
+    kept = np.flatnonzero(mask)
+    number = np.full(len(mask), -1)
+    number[kept] = np.arange(len(kept))
+    faces = np.concatenate([faces, edges(faces)[:, [0, 1, 1]]])
+    return number[faces[mask[faces].all(axis=1)]], kept
+
+
+def _exact(points: Floats, faces: Ints, sources: Ints) -> Floats:
+    import igl
+
+    none = np.empty(0, dtype=np.int64)
+    vertices = np.arange(len(points))
+    return igl.exact_geodesic(
+        np.ascontiguousarray(points), np.ascontiguousarray(faces), sources, none, vertices, none
+    )
+
+
+def _manifold_faces(faces: Ints) -> NDArray[np.int64]:
+    """Return the faces, less the degenerate ones and those that would give an edge a third face."""
+    faces = np.asarray(faces, dtype=np.int64)
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    pairs, uses = edge_use(faces)
+    keep = np.ones(len(faces), dtype=bool)
+    for low, high in pairs[uses > 2]:
+        around = np.flatnonzero(((faces == low) | (faces == high)).sum(axis=1) == 2)
+        keep[around[2:]] = False
+    return faces[keep]
+
+
+def _sheets(faces: Ints) -> list[NDArray[np.int64]]:
+    """Return the faces in groups that hang together by edges; touching at a point alone does not join them."""
+    half = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
+    _, edge = np.unique(half, axis=0, return_inverse=True)
+    owner = np.repeat(np.arange(len(faces)), 3)
+    by_edge = np.argsort(edge.reshape(-1), kind="stable")
+    same = np.diff(edge.reshape(-1)[by_edge]) == 0
+    pairs = np.column_stack([owner[by_edge][:-1][same], owner[by_edge][1:][same]])
+    label = components(pairs, len(faces))
+    return [np.flatnonzero(label == sheet) for sheet in range(label.max(initial=-1) + 1)]
+
+
+def _along_edges(distance: Floats, points: Floats, pairs: Ints) -> Floats:
+    """Carry finite distances along edges to the vertices that are still at infinity."""
+    missing = ~np.isfinite(distance)
+    heads, tails = np.concatenate([pairs, pairs[:, ::-1]]).T
+    heads, tails = heads[missing[heads]], tails[missing[heads]]
+    lengths = np.linalg.norm(points[heads] - points[tails], axis=1)
+    while True:
+        longer = distance.copy()
+        np.minimum.at(longer, heads, distance[tails] + lengths)
+        if np.array_equal(longer, distance):
+            return distance
+        distance = longer
