@@ -1,0 +1,11 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stages that ship with the package: the body of the demo."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+def demo_body_path() -> Path:
+    """Return the path of the stage of the demo's body; licence and making are told in LICENSE.md beside it."""
+    return Path(__file__).with_name("demo_body.usdc")
