@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Units and axes of a stage, and the way to metres, y up, and back.
+
+A change of units and axes turns and scales the world, not the joints: of a hierarchy of joints it changes the
+roots' transforms, and of all other joints the length of their translations alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pxr import Usd, UsdGeom
+
+from ssilk_core.assets import Floats
+from ssilk_core.errors import need
+
+_TO_Y_UP = {
+    "Y": np.eye(3),
+    "Z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+}
+
+
+@dataclass(frozen=True)
+class StageUnits:
+    """Length of a stage's unit [m] and its up axis, "Y" or "Z"."""
+
+    meters_per_unit: float = 1.0
+    up_axis: str = "Y"
+
+    def __post_init__(self) -> None:
+        need(
+            0 < self.meters_per_unit < np.inf,
+            "stage units",
+            f"metersPerUnit is {self.meters_per_unit}",
+            "it must be positive",
+            "set it in the file",
+        )
+        need(self.up_axis in _TO_Y_UP, "stage units", f"the up axis is '{self.up_axis}'", "it is Y or Z")
+
+    @classmethod
+    def of(cls, stage: Usd.Stage) -> StageUnits:
+        """Read the units of `stage`; unauthored ones are USD's own (centimetres, y up).
+
+        Raises:
+            SsilkError: metersPerUnit is not positive.
+        """
+        return cls(UsdGeom.GetStageMetersPerUnit(stage), str(UsdGeom.GetStageUpAxis(stage)))
+
+    @property
+    def rotation(self) -> Floats:
+        """Rotation from the stage's axes to y up, shape (3, 3)."""
+        return _TO_Y_UP[self.up_axis]
+
+    @property
+    def matrix(self) -> Floats:
+        """Stage world to core world [m], shape (4, 4), column vectors."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.rotation * self.meters_per_unit
+        return matrix
+
+    def points_from_core(self, points: Floats) -> Floats:
+        """Return points [m], y up, shape (..., 3), in the stage's units and axes."""
+        return np.asarray(points) @ self.rotation / self.meters_per_unit
+
+    def vectors_from_core(self, vectors: Floats) -> Floats:
+        """Return offsets [m], y up, shape (..., 3), in the stage's units and axes."""
+        return self.points_from_core(vectors)
+
+    def transforms_to_core(self, transforms: Floats) -> Floats:
+        """Return rigid joint-to-world transforms of the stage, shape (..., 4, 4), in metres, y up."""
+        return self.matrix @ transforms @ _scale(1 / self.meters_per_unit)
+
+    def transforms_from_core(self, transforms: Floats) -> Floats:
+        """Return rigid joint-to-world transforms [m], y up, shape (..., 4, 4), in the stage's units and axes."""
+        return np.linalg.inv(self.matrix) @ transforms @ _scale(self.meters_per_unit)
+
+
+def _scale(factor: float) -> Floats:
+    return np.diag([factor, factor, factor, 1.0])
