@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Play any shot back: meshes deformed by UsdSkel's own functions, or by samples of their points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pxr import Usd, UsdGeom, UsdSkel
+
+from ssilk_core.assets import Floats, Ints
+from ssilk_core.errors import need
+
+from .read_mesh import is_garment, read_mesh
+from .read_stage import PRIMS, StageLike, apply, column_matrix, open_stage, stage_name
+from .units import StageUnits
+
+
+@dataclass(frozen=True, eq=False)
+class ShotMesh:
+    """A mesh of a shot.
+
+    Attributes:
+        name: its prim's name.
+        path: its prim's path.
+        faces: triangles, shape (F, 3).
+        is_garment: it is marked as a garment (see `read_mesh.is_garment`); what is not counts as body.
+    """
+
+    name: str
+    path: str
+    faces: Ints
+    is_garment: bool
+
+
+class Shot:
+    """Meshes over time, in metres and y up.
+
+    Attributes:
+        stage, units: the opened stage and its units.
+        start, end: first and last time code; fps: frames per second, and time codes too.
+        meshes: every mesh of the stage, in its order.
+    """
+
+    def __init__(self, source: StageLike) -> None:
+        """Open a shot.
+
+        Raises:
+            SsilkError: not a readable stage, or one without meshes.
+        """
+        self.stage = open_stage(source)
+        self.name = stage_name(self.stage)
+        self.units = StageUnits.of(self.stage)
+        self.fps = float(self.stage.GetTimeCodesPerSecond())
+        skinned = _skinning_of(self.stage)
+        prims = [prim for prim in Usd.PrimRange(self.stage.GetPseudoRoot(), PRIMS) if prim.IsA(UsdGeom.Mesh)]
+        need(prims, self.name, "there is no mesh", "a shot holds at least one", "check that this is the right file")
+        self._players = [
+            _SkinnedMesh(prim, *skinned[prim]) if prim in skinned else _PlainMesh(prim) for prim in prims
+        ]
+        self.meshes = tuple(_describe(prim) for prim in prims)
+        self.start, self.end = _time_range(self.stage)
+
+    @property
+    def frame_times(self) -> Floats:
+        """Time code of each frame, shape (F,)."""
+        return self.start + np.arange(int(np.floor(self.end - self.start + 1e-6)) + 1)
+
+    def points(self, time: float) -> list[Floats]:
+        """Return the points of each mesh in world space [m], y up, float64, shape (V, 3), at a time code."""
+        code = Usd.TimeCode(float(time))
+        xforms = UsdGeom.XformCache(code)
+        return [apply(self.units.matrix, player.points(code, xforms)) for player in self._players]
+
+    def garment_points(self, time: float) -> Floats:
+        """Return the points of the one garment [m], shape (V, 3).
+
+        Raises:
+            SsilkError: the shot has no garment, or several.
+        """
+        garments = [player for player, mesh in zip(self._players, self.meshes) if mesh.is_garment]
+        need(len(garments) == 1, self.name, f"{len(garments)} meshes are marked as garments", "one is needed")
+        code = Usd.TimeCode(float(time))
+        return apply(self.units.matrix, garments[0].points(code, UsdGeom.XformCache(code)))
+
+
+def _skinning_of(stage: Usd.Stage) -> dict[Usd.Prim, tuple[UsdSkel.SkeletonQuery, UsdSkel.SkinningQuery]]:
+    """Return skeleton and skinning query of each skinned prim."""
+    cache, found = UsdSkel.Cache(), {}
+    for prim in Usd.PrimRange(stage.GetPseudoRoot(), PRIMS):
+        root = UsdSkel.Root(prim)
+        if not root:
+            continue
+        cache.Populate(root, PRIMS)
+        for binding in cache.ComputeSkelBindings(root, PRIMS):
+            skeleton = cache.GetSkelQuery(binding.GetSkeleton())
+            for query in binding.GetSkinningTargets():
+                found[query.GetPrim()] = (skeleton, query)
+    return found
+
+
+class _SkinnedMesh:
+    """A mesh that UsdSkel deforms: blendshapes in rest space, then linear blend skinning."""
+
+    def __init__(self, prim: Usd.Prim, skeleton: UsdSkel.SkeletonQuery, skinning: UsdSkel.SkinningQuery) -> None:
+        self.prim, self.skeleton, self.skinning = prim, skeleton, skinning
+        self.rest = UsdGeom.Mesh(prim).GetPointsAttr()
+        self.shapes = UsdSkel.BlendShapeQuery(UsdSkel.BindingAPI(prim)) if self._has_shapes() else None
+        if self.shapes:
+            self.rows = self.shapes.ComputeBlendShapePointIndices()
+            self.offsets = self.shapes.ComputeSubShapePointOffsets()
+
+    def _has_shapes(self) -> bool:
+        return bool(self.skinning.HasBlendShapes() and self.skeleton.GetAnimQuery())
+
+    def points(self, time: Usd.TimeCode, xforms: UsdGeom.XformCache) -> Floats:
+        """Return the posed points in stage units, shape (V, 3)."""
+        points = self.rest.Get(time)
+        if self.shapes:
+            weights = self.skeleton.GetAnimQuery().ComputeBlendShapeWeights(time)
+            own = self.skinning.GetBlendShapeMapper().Remap(weights)
+            self.shapes.ComputeDeformedPoints(
+                *self.shapes.ComputeSubShapeWeights(own), self.rows, self.offsets, points
+            )
+        space = self.prim
+        if self.skinning.HasJointInfluences():
+            self.skinning.ComputeSkinnedPoints(self.skeleton.ComputeSkinningTransforms(time), points, time)
+            space = self.skeleton.GetPrim()
+        return apply(column_matrix(xforms.GetLocalToWorldTransform(space)), np.array(points, dtype=np.float64))
+
+
+class _PlainMesh:
+    """A mesh whose points are stored, one set or one for each time sample."""
+
+    def __init__(self, prim: Usd.Prim) -> None:
+        self.prim, self.samples = prim, UsdGeom.Mesh(prim).GetPointsAttr()
+
+    def points(self, time: Usd.TimeCode, xforms: UsdGeom.XformCache) -> Floats:
+        """Return the points in stage units, shape (V, 3)."""
+        points = np.array(self.samples.Get(time), dtype=np.float64)
+        return apply(column_matrix(xforms.GetLocalToWorldTransform(self.prim)), points)
+
+
+def _describe(prim: Usd.Prim) -> ShotMesh:
+    return ShotMesh(prim.GetName(), str(prim.GetPath()), read_mesh(prim, np.eye(4)).faces, is_garment(prim))
+
+
+def _time_range(stage: Usd.Stage) -> tuple[float, float]:
+    """First and last time code: as authored, else of the samples of whatever is animated."""
+    if stage.HasAuthoredTimeCodeRange():
+        return stage.GetStartTimeCode(), stage.GetEndTimeCode()
+    prims = Usd.PrimRange(stage.GetPseudoRoot(), PRIMS)
+    times = [attribute.GetTimeSamples() for prim in prims for attribute in prim.GetAuthoredAttributes()]
+    spans = [(samples[0], samples[-1]) for samples in times if samples]
+    return (min(low for low, _ in spans), max(high for _, high in spans)) if spans else (0.0, 0.0)
