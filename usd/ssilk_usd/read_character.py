@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A character from a stage: its skeleton and the body meshes bound to it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from pxr import Usd, UsdGeom
+
+from ssilk_core.assets import Body, Character, Floats
+from ssilk_core.errors import need
+
+from .read_mesh import is_drawn, is_garment, read_mesh
+from .read_skeleton import SkelSource, bound_skeleton, character_skeleton, find_skeleton
+from .read_skin import SKEL, read_skin
+from .read_stage import PRIMS, StageLike, column_matrix, inherited, listed, location, named, open_stage
+
+GEOM_BIND = "primvars:skel:geomBindTransform"
+
+
+def read_character(
+    source: StageLike, *, root: str | None = None, bodies: Sequence[str] = (), garment: str | None = None
+) -> Character:
+    """Read a character; all drawn meshes bound to its skeleton that are no garments are its bodies.
+
+    Points and bind transforms are in the core's bind space: UsdSkel's bind space (points after
+    geomBindTransform) in metres, y up, with the uniform scale of the character's xforms taken in, but not
+    their position; see `SkelSource.bind_to_core`. Rest transforms of root joints are in world.
+
+    Args:
+        source: a file or an open stage.
+        root: SkelRoot or Skeleton, by path or name, where there are several.
+        bodies: meshes to take, by path or name; all when empty.
+        garment: a mesh that is a garment though nothing marks it as one, by path or name.
+
+    Raises:
+        SsilkError: no or several characters, an unknown mesh, or malformed data.
+    """
+    skel = find_skeleton(open_stage(source), root=root)
+    skeleton = character_skeleton(skel)
+    order = skeleton.joint_names
+    return Character(
+        location(skel.root),
+        skeleton,
+        tuple(_read_body(prim, skel, order) for prim in _body_prims(skel, bodies, garment)),
+    )
+
+
+def geom_to_core(prim: Usd.Prim, skel: SkelSource) -> Floats:
+    """Return a bound mesh's own space to the core's bind space [m], column vectors, shape (4, 4)."""
+    bind = inherited(prim, GEOM_BIND)
+    matrix = None if bind is None else bind.Get()
+    return skel.bind_to_core if matrix is None else skel.bind_to_core @ column_matrix(matrix)
+
+
+def is_skinned(prim: Usd.Prim, skel: SkelSource) -> bool:
+    """Return whether a prim is bound to this skeleton and has influences."""
+    return bound_skeleton(prim) == skel.prim and inherited(prim, SKEL[0]) is not None
+
+
+def _body_prims(skel: SkelSource, bodies: Sequence[str], garment: str | None) -> list[Usd.Prim]:
+    meshes = [prim for prim in Usd.PrimRange(skel.root, PRIMS) if prim.IsA(UsdGeom.Mesh) and is_skinned(prim, skel)]
+    garments = named(meshes, garment) if garment else []
+    if not bodies:
+        return [prim for prim in meshes if is_drawn(prim) and not is_garment(prim) and prim not in garments]
+    unknown = next((name for name in bodies if not named(meshes, name)), None)
+    need(
+        unknown is None,
+        location(skel.root),
+        f"no mesh '{unknown}' is bound to the skeleton",
+        f"there are {listed(meshes)}",
+        "name one of these with --body",
+    )
+    return [prim for name in bodies for prim in named(meshes, name)]
+
+
+def _read_body(prim: Usd.Prim, skel: SkelSource, order: tuple[str, ...]) -> Body:
+    mesh = read_mesh(prim, geom_to_core(prim, skel))
+    skin = read_skin(prim, skel.joints, order)
+    assert skin is not None  # is_skinned
+    return Body(mesh, skin)

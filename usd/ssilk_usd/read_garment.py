@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A garment from the character's stage or from a file of its own."""
+
+from __future__ import annotations
+
+import numpy as np
+from pxr import Usd, UsdGeom
+
+from ssilk_core.assets import Floats, Garment, Ints, Skeleton, SkinWeights
+from ssilk_core.errors import need
+
+from .read_character import geom_to_core, is_skinned
+from .read_mesh import CLASS, PROXIES, is_drawn, is_garment, read_mesh
+from .read_skeleton import SkelSource, bound_skeleton, find_skeleton, skeletons
+from .read_skin import PLAIN, read_influences, read_skin
+from .read_stage import (
+    EARLIEST,
+    PRIMS,
+    StageLike,
+    listed,
+    location,
+    named,
+    open_stage,
+    stage_name,
+    world_matrix,
+)
+from .units import StageUnits
+
+
+def read_garment(
+    source: StageLike, skeleton: Skeleton, *, garment: str | None = None, root: str | None = None
+) -> Garment:
+    """Read a garment at rest, in the core's bind space [m], y up.
+
+    A mesh with influences is placed as UsdSkel binds it (geomBindTransform); one without, by where it stands in
+    world: in a stage with a character relative to where the character stands, in a file of its own as it is.
+
+    Args:
+        source: the character's stage or a file with garments, each with its own units and axes.
+        skeleton: the character's; weights are remapped onto its joints by name.
+        garment: the mesh, by path or name, where there are several.
+        root: the character that it is fitted to, where its stage holds several.
+
+    Raises:
+        SsilkError: no or several garments, or malformed data.
+    """
+    stage = open_stage(source)
+    prim = find_garment(stage, garment)
+    skel = fitted_skeleton(prim, root)
+    mesh = read_mesh(prim, garment_to_core(prim, skel))
+    joints = skel.joints if skel else ()
+    return Garment(mesh, plain_skin(prim, joints, skeleton), _classes(prim))
+
+
+def find_garment(stage: Usd.Stage, garment: str | None = None) -> Usd.Prim:
+    """Find the garment mesh of a stage: the named one, or the only one (marked, or in a stage without character).
+
+    Raises:
+        SsilkError: there is none, several and no name, or no such mesh; the sentence lists them.
+    """
+    where = stage_name(stage)
+    meshes = [prim for prim in Usd.PrimRange.Stage(stage, PRIMS) if prim.IsA(UsdGeom.Mesh)]
+    marked = [prim for prim in meshes if is_garment(prim)]
+    if garment is not None:
+        found = named(meshes, garment)
+        need(
+            found, where, f"no mesh is named '{garment}'", f"there are {listed(meshes)}", "choose one with --garment"
+        )
+    else:
+        found = marked if marked or skeletons(stage) else [prim for prim in meshes if is_drawn(prim)]
+        need(
+            found,
+            where,
+            f"no mesh is marked as a garment; the meshes are {listed(meshes)}",
+            "a garment has primvars:ssilk:class or ssilk:garment = true",
+            "name it with --garment",
+        )
+    need(
+        len(found) == 1, where, f"there are several garments: {listed(found)}", "one is used", "choose with --garment"
+    )
+    return found[0]
+
+
+def fitted_skeleton(prim: Usd.Prim, root: str | None = None) -> SkelSource | None:
+    """Return the skeleton of its stage that a garment is fitted to; None in a stage without a character."""
+    stage = prim.GetStage()
+    found, bound = skeletons(stage), bound_skeleton(prim)
+    if not found:
+        return None
+    above = [skeleton for top, skeleton in found if prim.GetPath().HasPrefix(top.GetPath())]
+    own = bound or (above[0] if len(above) == 1 else None)
+    return find_skeleton(stage, root=str(own.GetPath()) if own else root)
+
+
+def garment_to_core(prim: Usd.Prim, skel: SkelSource | None) -> Floats:
+    """Return a garment mesh's own space to the core's bind space [m], column vectors, shape (4, 4)."""
+    if skel is None:
+        return StageUnits.of(prim.GetStage()).matrix @ world_matrix(prim)
+    if is_skinned(prim, skel):
+        return geom_to_core(prim, skel)
+    return skel.bind_to_core @ skel.world_to_bind @ world_matrix(prim)
+
+
+def plain_skin(prim: Usd.Prim, joints: tuple[str, ...], skeleton: Skeleton) -> SkinWeights | None:
+    """Return a garment's weights onto the character's joints alone, or None; those kept beside a rig go first."""
+    if prim.HasAttribute(PLAIN[0]):
+        influences = read_influences(prim, joints, PLAIN)
+        assert influences is not None
+        return SkinWeights(influences.path, *influences.onto(skeleton.joint_names))
+    return None if prim.HasAttribute(PROXIES) else read_skin(prim, joints, skeleton.joint_names)
+
+
+def _classes(prim: Usd.Prim) -> Ints | None:
+    """Return whole-numbered vertex classes, or None; `Garment` checks their count and range."""
+    primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar(CLASS.removeprefix("primvars:"))
+    if not primvar or not primvar.HasAuthoredValue():
+        return None
+    where, interpolation = location(prim), primvar.GetInterpolation()
+    need(
+        interpolation in (UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying),
+        where,
+        f"{CLASS} has {interpolation} interpolation",
+        "classes are one value for each point (vertex interpolation)",
+        "paint them on points",
+    )
+    classes = np.array(primvar.ComputeFlattened(EARLIEST), dtype=np.float64).reshape(-1)
+    broken = int(np.count_nonzero(classes != np.round(classes)))
+    need(
+        broken == 0, where, f"{broken} vertex classes are no whole numbers", "they are 0, 1 or 2", "paint them again"
+    )
+    return classes.astype(np.int64)

@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Motions from SkelAnimations, in files of their own or on characters in stages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from pxr import Usd, UsdGeom, UsdSkel
+
+from ssilk_core.assets import Floats, Ints, Motion, Skeleton
+from ssilk_core.errors import fail, need
+from ssilk_core.kinematics import matrix_from_quaternion, quaternion_from_matrix, rigid
+
+from .read_skeleton import joints_to_core, need_similarity, skeletons
+from .read_skin import match_joints
+from .read_stage import PRIMS, StageLike, inherited_target, listed, location, named, open_stage, world_matrix
+from .units import StageUnits
+
+USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
+_SCALE_TOLERANCE = 1e-3
+
+
+def read_motions(paths: Iterable[str | Path], skeleton: Skeleton) -> list[Motion]:
+    """Read several motions; a folder stands for all USD files in it, by name.
+
+    Raises:
+        SsilkError: a folder without USD files, or any of `read_motion`.
+    """
+    return [read_motion(path, skeleton) for path in motion_files(paths)]
+
+
+def motion_files(paths: Iterable[str | Path]) -> list[Path]:
+    """Return the files that files and folders stand for, folders sorted by name."""
+    files: list[Path] = []
+    for path in map(Path, paths):
+        within = sorted(file for file in path.iterdir() if file.suffix in USD_SUFFIXES) if path.is_dir() else [path]
+        need(within, str(path), "the folder holds no USD files", f"motions are {', '.join(USD_SUFFIXES)} files")
+        files += within
+    return files
+
+
+def read_motion(source: StageLike, skeleton: Skeleton, *, prim: str | None = None, root: str | None = None) -> Motion:
+    """Read a motion at its own rate: framesPerSecond where authored, else timeCodesPerSecond.
+
+    Frames run from the first to the last authored sample, USD interpolating between samples. On a character,
+    the xforms above its skeleton, also animated, are part of the root joints. Joints are matched by their paths,
+    then by unique leaf names; joints that the animation lacks stay at rest.
+
+    Args:
+        source: a file with a SkelAnimation, or a stage with an animated character.
+        skeleton: whose joints the motion is for.
+        prim: the SkelAnimation, by path or name, where there are several.
+        root: the character, where several are animated.
+
+    Raises:
+        SsilkError: no or several animations, an animation of another skeleton, scales, or malformed data.
+    """
+    stage = open_stage(source)
+    animation, placed = _find_animation(stage, prim, root)
+    where = location(animation)
+    joints = tuple(str(name) for name in UsdSkel.Animation(animation).GetJointsAttr().Get() or ())
+    match = _matched(joints, skeleton, where)
+    codes, fps = _time_codes(stage, animation, placed)
+    rotations, translations = _samples(animation, codes, len(joints), where)
+    placements = np.stack([world_matrix(placed, code) for code in codes]) if placed else np.eye(4)[None]
+    if placed:
+        need_similarity(placed, placements)
+    local = joints_to_core(
+        rigid(matrix_from_quaternion(rotations), translations)[:, match],
+        skeleton.parents,
+        placements,
+        StageUnits.of(stage),
+    )
+    local[:, match < 0] = skeleton.rest_transforms[match < 0]
+    _check_lengths(local[:, match >= 0], skeleton.rest_transforms[match >= 0], skeleton.parents[match >= 0], where)
+    return Motion(where, fps, quaternion_from_matrix(local[..., :3, :3]), local[..., :3, 3], float(codes[0]))
+
+
+def _find_animation(stage: Usd.Stage, prim: str | None, root: str | None) -> tuple[Usd.Prim, Usd.Prim | None]:
+    """Return the SkelAnimation and the Skeleton that it animates, None for an animation by itself."""
+    where = stage.GetRootLayer().identifier
+    bound = {}
+    for top, skeleton in skeletons(stage):
+        animation = inherited_target(skeleton, "skel:animationSource")
+        if animation and (root is None or named([top, skeleton], root)):
+            bound[animation] = skeleton
+    every = [other for other in Usd.PrimRange.Stage(stage, PRIMS) if other.IsA(UsdSkel.Animation)]
+    found = named(every, prim) if prim else list(bound) or every
+    need(
+        found,
+        where,
+        f"no SkelAnimation{f' is named {prim!r}' if prim else ''}",
+        f"a motion is a SkelAnimation; there are {listed(every)}",
+        "export the animation, or name another prim",
+    )
+    need(len(found) == 1, where, f"there are several animations: {listed(found)}", "one is read", "name one")
+    return found[0], bound.get(found[0])
+
+
+def _matched(joints: tuple[str, ...], skeleton: Skeleton, where: str) -> Ints:
+    """Return for each joint of the skeleton its index in the animation, or -1."""
+    match = np.array(match_joints(skeleton.joint_names, joints))
+    found, smaller = int(np.count_nonzero(match >= 0)), min(len(joints), skeleton.joint_count)
+    missing = [name for name, index in zip(skeleton.joint_names, match) if index < 0]
+    need(
+        found > 0 and 2 * found >= smaller,
+        where,
+        f"this is a motion of another skeleton: {found} of {skeleton.joint_count} joints match its {len(joints)} "
+        f"(it lacks {', '.join(missing[:3])})",
+        f"at least half of the joints of {skeleton.path} must be in it, by path or by leaf name",
+        "retarget the motion or rename its joints",
+    )
+    return match
+
+
+def _time_codes(stage: Usd.Stage, animation: Usd.Prim, placed: Usd.Prim | None) -> tuple[Floats, float]:
+    """Return the time codes of the frames and their rate [1/s]."""
+    second = stage.GetTimeCodesPerSecond()
+    fps = stage.GetFramesPerSecond() if stage.HasAuthoredMetadata("framesPerSecond") else second
+    need(fps > 0 and second > 0, stage.GetRootLayer().identifier, f"a rate of {fps} frames", "it must be positive")
+    samples = [
+        time for name in ("rotations", "translations") for time in animation.GetAttribute(name).GetTimeSamples()
+    ]
+    above = placed
+    while above and not above.IsPseudoRoot():
+        samples += UsdGeom.Xformable(above).GetTimeSamples() if above.IsA(UsdGeom.Xformable) else []
+        above = above.GetParent()
+    if not samples:
+        return np.zeros(1), fps
+    step = second / fps
+    count = int(np.floor((max(samples) - min(samples)) / step + 1e-6)) + 1
+    return min(samples) + step * np.arange(count), fps
+
+
+def _samples(animation: Usd.Prim, codes: Floats, count: int, where: str) -> tuple[Floats, Floats]:
+    """Return rotations (F, N, 4) as (w, x, y, z) and translations (F, N, 3) in stage units."""
+    rotations = _sampled(animation, "rotations", codes, (count, 4), where)
+    translations = _sampled(animation, "translations", codes, (count, 3), where)
+    if animation.GetAttribute("scales").HasAuthoredValue():
+        scales = _sampled(animation, "scales", codes, (count, 3), where)
+        scaled = int(np.count_nonzero((np.abs(scales - 1) > _SCALE_TOLERANCE).any(axis=(0, 2))))
+        need(
+            scaled == 0, where, f"{scaled} joints are scaled", "joints may turn and move only", "bake the scale away"
+        )
+    norms = np.linalg.norm(rotations, axis=-1, keepdims=True)
+    need(
+        norms.min() > 1e-6, where, "a rotation is the zero quaternion", "rotations are unit quaternions", "repair it"
+    )
+    return np.roll(rotations / norms, 1, axis=-1), translations
+
+
+def _sampled(animation: Usd.Prim, name: str, codes: Floats, shape: tuple[int, int], where: str) -> Floats:
+    """Return an attribute at each time code, shape (F, *shape)."""
+    values = [np.array(animation.GetAttribute(name).Get(code)) for code in codes]
+    odd = next((item for item in values if item.shape != shape), None)
+    if odd is not None:
+        found = f"{name} for {len(odd)} joints" if odd.ndim else f"no {name}"
+        fail(where, f"the animation has {found}", f"{shape[0]} are needed, one for each joint", "export it again")
+    result = np.array(values, dtype=np.float64)
+    need(
+        np.isfinite(result).all(), where, f"{name} hold NaN or infinity", "all must be finite", "repair the animation"
+    )
+    return result
+
+
+def _check_lengths(local: Floats, rest: Floats, parents: Ints, where: str) -> None:
+    """Refuse a motion whose bones are far longer or shorter than the skeleton's: its units are wrong."""
+    bones = np.linalg.norm(rest[:, :3, 3], axis=-1)
+    kept = (parents >= 0) & (bones > 1e-3)
+    if not kept.any():
+        return
+    ratio = float(np.median(np.linalg.norm(local[0, kept, :3, 3], axis=-1) / bones[kept]))
+    need(
+        0.5 < ratio < 2,
+        where,
+        f"bones are {ratio:.3g} times as long as the skeleton's",
+        "both must agree in metres",
+        "set metersPerUnit of the motion's file to its units",
+    )

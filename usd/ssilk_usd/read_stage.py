@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Opening stages, naming what is in them, and asking prims for values: what every reader shares."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from pxr import Pcp, Tf, Usd, UsdGeom, UsdUtils
+
+from ssilk_core.assets import Floats
+from ssilk_core.errors import fail, need
+
+StageLike: TypeAlias = str | Path | Usd.Stage
+EARLIEST = Usd.TimeCode.EarliestTime()
+# Instance proxies are read too: a referenced character may be instanceable.
+PRIMS = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
+_MISSING = (Pcp.ErrorInvalidAssetPath, Pcp.ErrorInvalidSublayerPath, Pcp.ErrorUnresolvedPrimPath)
+
+
+def open_stage(source: StageLike) -> Usd.Stage:
+    """Open a stage with all its payloads, as the file is on disk now; a stage is returned as it is.
+
+    Raises:
+        SsilkError: no such file, not USD, damaged, or a layer that it needs cannot be found.
+    """
+    if isinstance(source, Usd.Stage):
+        return source
+    need(Path(source).is_file(), str(source), "there is no such file", "a USD file is needed", "check the path")
+    quiet = UsdUtils.CoalescingDiagnosticDelegate()  # what USD would print, the error below says
+    try:
+        stage = Usd.Stage.Open(str(source), Usd.Stage.LoadAll)
+        stage.Reload()
+    except Tf.ErrorException as error:
+        reason = error.args[0].commentary if error.args else "unknown reason"
+        fail(
+            str(source), f"it cannot be read as USD ({reason})", "a whole .usd, .usda, .usdc or .usdz file is needed"
+        )
+    finally:
+        del quiet
+    missing = [str(error).rstrip(".") for error in stage.GetCompositionErrors() if isinstance(error, _MISSING)]
+    need(not missing, str(source), " and ".join(missing[:2]), "every layer must be found", "restore it or its path")
+    return stage
+
+
+def location(prim: Usd.Prim) -> str:
+    """Return "file:/Prim/Path", for messages and for `split_location`."""
+    return f"{stage_name(prim.GetStage())}:{prim.GetPath()}"
+
+
+def stage_name(stage: Usd.Stage) -> str:
+    """Return the path of a stage's root layer as its user gave it."""
+    return stage.GetRootLayer().identifier
+
+
+def split_location(text: str) -> tuple[str, str | None]:
+    """Split "file[:/Prim/Path]" into file and prim path; None when there is no prim path."""
+    file, colon, prim = text.rpartition(":/")
+    # "C:/file.usd" is a file: what stands before a prim path has a suffix.
+    return (file, f"/{prim}") if colon and Path(file).suffix else (text, None)
+
+
+def named(prims: list[Usd.Prim], name: str) -> list[Usd.Prim]:
+    """Return the prims whose path, or else whose name, is `name`."""
+    by_path = [prim for prim in prims if str(prim.GetPath()) == name]
+    return by_path or [prim for prim in prims if prim.GetName() == name]
+
+
+def listed(prims: list[Usd.Prim]) -> str:
+    """Return prim paths for a message."""
+    return ", ".join(str(prim.GetPath()) for prim in prims) or "none"
+
+
+def inherited(prim: Usd.Prim, name: str) -> Usd.Property | None:
+    """Return the nearest authored property `name` of a prim or its ancestors, as UsdSkel bindings inherit."""
+    while prim and not prim.IsPseudoRoot():
+        if prim.HasProperty(name) and prim.GetProperty(name).IsAuthored():
+            return prim.GetProperty(name)
+        prim = prim.GetParent()
+    return None
+
+
+def inherited_target(prim: Usd.Prim, name: str) -> Usd.Prim | None:
+    """Return the prim that the nearest authored relationship `name` points at, or None."""
+    relationship = inherited(prim, name)
+    targets = relationship.GetForwardedTargets() if isinstance(relationship, Usd.Relationship) else []
+    target = prim.GetStage().GetPrimAtPath(targets[0]) if targets else None
+    return target or None
+
+
+def value(prim: Usd.Prim, name: str) -> Any:
+    """Return an attribute's value at its earliest time, or None."""
+    attribute = prim.GetAttribute(name)
+    return attribute.Get(EARLIEST) if attribute else None
+
+
+def column_matrix(matrix: object) -> Floats:
+    """Return USD matrices (row vectors) as float64 column-vector matrices, shape (..., 4, 4)."""
+    return np.swapaxes(np.array(matrix, dtype=np.float64), -1, -2)
+
+
+def world_matrix(prim: Usd.Prim, time: Usd.TimeCode = EARLIEST) -> Floats:
+    """Return a prim's local-to-world matrix in stage units, column vectors, shape (4, 4)."""
+    return column_matrix(UsdGeom.XformCache(time).GetLocalToWorldTransform(prim))
+
+
+def apply(matrix: Floats, points: Floats) -> Floats:
+    """Return points (..., 3) moved by an affine column-vector matrix (4, 4)."""
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
