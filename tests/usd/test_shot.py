@@ -1,11 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """A written shot, re-skinned by UsdSkel alone, is what the decoder computes."""
 
+import re
+import resource
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import ssilk_usd.shot as shot_module
+from pxr import Sdf, Usd, UsdGeom, UsdSkel
+from ssilk_usd.author import sorted_influences
+from ssilk_usd.check import check_shot, compare_points
 from ssilk_usd.play import Shot
+from ssilk_usd.read_character import read_character
+from ssilk_usd.read_garment import read_garment
+from ssilk_usd.read_motion import read_motion
 from ssilk_usd.read_polygons import triangulate
 from ssilk_usd.shot import write_shot
 from ssilk_usd.units import StageUnits
@@ -23,7 +33,16 @@ from ssilk_core.assets import (
     Skeleton,
     SkinWeights,
 )
-from ssilk_core.kinematics import deform, local_transforms, matrix_from_quaternion, rigid
+from ssilk_core.errors import SsilkError, VerificationError
+from ssilk_core.kinematics import (
+    deform,
+    local_transforms,
+    matrix_from_quaternion,
+    motion_transforms,
+    rigid,
+    skin_points,
+    skinning_matrices,
+)
 
 SHARED = Path(__file__).parents[2] / ".." / "shared"
 METRES_Y, CENTIMETRES_Z = StageUnits(1.0, "Y"), StageUnits(0.01, "Z")
@@ -66,7 +85,7 @@ def make_scene(rng: np.random.Generator, proxies: int) -> Scene:
     skeleton = Skeleton("hero.usda:/Hero/Rig", ("Hips", "Hips/Spine", "Hips/Spine/Head"), parents, bind, rest)
     body = strip("hero.usda:/Hero/Body")
     character = Character("hero.usda:/Hero", skeleton, (Body(body, random_skin(rng, body.vertex_count, 3)),))
-    mesh = strip("cape.usda:/Cape/cape mesh")
+    mesh = strip("cape.usda:/Cape/cape")
     garment = Garment(mesh, random_skin(rng, mesh.vertex_count, 3), rng.integers(0, 3, mesh.vertex_count))
     names = ("Hips/Spine/proxy_0", "Hips/Spine/proxy_0/proxy_1")[:proxies]
     proxy_bind = rigid(matrix_from_quaternion(quaternions(rng, proxies)), rng.normal(size=(proxies, 3)))
@@ -100,12 +119,15 @@ def make_poses(
     ]
 
 
-def worst_error(path: Path, deformer: Deformer, motion: Motion, poses: list[GarmentPose]) -> float:
-    """Largest distance [m] between UsdSkel's points and the decoder's, over garment and body."""
-    shot = Shot(path)
-    expected = np.concatenate([deform(deformer, motion, pose) for pose in poses])
-    played = np.stack([shot.garment_points(time) for time in shot.frame_times])
-    return float(np.linalg.norm(played - expected, axis=-1).max())
+def write(
+    path: Path, *, seed: int = 3, units: StageUnits = METRES_Y, away: float = 0.0, start: float = 1.0, **counts
+):
+    """Write a random shot; return what the decoder makes of it, shape (F, V, 3)."""
+    rng = np.random.default_rng(3)
+    deformer, motion = make_deformer(rng, **counts), make_motion(rng, away=away)
+    poses = make_poses(rng, deformer)
+    write_shot(path, deformer, motion, poses, units=units, start=start)
+    return np.concatenate([deform(deformer, motion, pose) for pose in poses])
 
 
 @pytest.mark.parametrize("units", [METRES_Y, CENTIMETRES_Z], ids=["metres_y", "centimetres_z"])
@@ -114,7 +136,427 @@ def worst_error(path: Path, deformer: Deformer, motion: Motion, poses: list[Garm
 def test_usdskel_reproduces_the_decoder(tmp_path, units, proxies, shapes, fps, start):
     rng = np.random.default_rng(3)
     deformer, motion = make_deformer(rng, proxies=proxies, shapes=shapes), make_motion(rng, fps=fps)
-    poses = make_poses(rng, deformer)
-    summary = write_shot(tmp_path / "shot.usdc", deformer, motion, poses, units=units, start=start)
+    poses, path = make_poses(rng, deformer), tmp_path / "shot.usdc"
+    summary = write_shot(path, deformer, motion, poses, units=units, start=start)
     assert (summary.frame_count, summary.start, summary.end, summary.fps) == (FRAMES, start, start + FRAMES - 1, fps)
-    assert worst_error(tmp_path / "shot.usdc", deformer, motion, poses) < 2e-6
+    shot = Shot(path)
+    assert shot.fps == fps
+    comparison = compare_points(shot, (frame for pose in poses for frame in deform(deformer, motion, pose)))
+    assert comparison.worst < 2e-6
+    assert check_shot(path) == []
+
+
+def test_body_meshes_follow_the_character(tmp_path):
+    rng = np.random.default_rng(4)
+    deformer, motion = make_deformer(rng), make_motion(rng)
+    path = tmp_path / "shot.usdc"
+    write_shot(path, deformer, motion, make_poses(rng, deformer), units=CENTIMETRES_Z)
+    skeleton, body = deformer.scene.character.skeleton, deformer.scene.character.bodies[0]
+    matrices = skinning_matrices(motion_transforms(motion, skeleton.parents), skeleton.bind_transforms)
+    shot = Shot(path)
+    assert [(mesh.name, mesh.is_garment) for mesh in shot.meshes] == [("cape", True), ("Body", False)]
+    played = np.stack([shot.points(time)[1] for time in shot.frame_times])
+    np.testing.assert_allclose(played, skin_points(body.mesh.points, body.skin, matrices), atol=2e-6)
+
+
+@pytest.mark.parametrize("units", [METRES_Y, CENTIMETRES_Z], ids=["metres_y", "centimetres_z"])
+def test_a_character_far_away_loses_only_float32_precision(tmp_path, units):
+    expected = write(tmp_path / "shot.usdc", units=units, away=100.0)
+    comparison = compare_points(Shot(tmp_path / "shot.usdc"), expected)
+    assert np.abs(expected).max() > 80
+    assert comparison.bound == pytest.approx(1e-5 + 4 * 2**-23 * np.abs(expected).max(), rel=0.1)
+    assert comparison.passed
+
+
+def test_usd_bakes_the_same_points(tmp_path):
+    expected = write(tmp_path / "shot.usdc", units=METRES_Y)
+    stage = Usd.Stage.Open(str(tmp_path / "shot.usdc"))
+    assert UsdSkel.BakeSkinning(Usd.PrimRange(stage.GetPseudoRoot()))
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/Hero/cape"))
+    space = np.array(mesh.ComputeLocalToWorldTransform(Usd.TimeCode.Default()))
+    for frame, points in enumerate(expected):
+        baked = np.array(mesh.GetPointsAttr().Get(1.0 + frame)) @ space[:3, :3] + space[3, :3]
+        np.testing.assert_allclose(baked, points, atol=2e-6)
+
+
+def test_polygons_and_texture_coordinates_are_the_authored_ones(tmp_path):
+    write(tmp_path / "shot.usdc")
+    stage = Usd.Stage.Open(str(tmp_path / "shot.usdc"))
+    prim = stage.GetPrimAtPath("/Hero/cape")
+    mesh, source = UsdGeom.Mesh(prim), strip("strip")
+    np.testing.assert_array_equal(mesh.GetFaceVertexCountsAttr().Get(), source.polygon_counts)
+    np.testing.assert_array_equal(mesh.GetFaceVertexIndicesAttr().Get(), source.polygon_indices)
+    np.testing.assert_array_equal(UsdGeom.PrimvarsAPI(prim).GetPrimvar("st").Get(), source.uvs)
+
+
+def test_nothing_is_written_that_a_plain_skinned_garment_does_not_need(tmp_path):
+    write(tmp_path / "shot.usdc", proxies=0, shapes=0)
+    stage = Usd.Stage.Open(str(tmp_path / "shot.usdc"))
+    assert [str(prim.GetPath()) for prim in stage.Traverse()] == [
+        "/Hero",
+        "/Hero/Skeleton",
+        "/Hero/Animation",
+        "/Hero/cape",
+        "/Hero/Body",
+    ]
+    names = [attribute.GetName() for prim in stage.Traverse() for attribute in prim.GetAuthoredProperties()]
+    assert not [name for name in names if "lendShape" in name or "proxy" in name]
+
+
+def test_blendshapes_keep_moving_rows_only_and_still_shapes_are_left_out(tmp_path):
+    rng = np.random.default_rng(5)
+    deformer, motion = make_deformer(rng), make_motion(rng)
+    shapes = np.array(deformer.shapes)
+    shapes[1] = 0
+    deformer = replace(deformer, shapes=shapes)
+    poses, path = make_poses(rng, deformer), tmp_path / "shot.usdc"
+    assert write_shot(path, deformer, motion, poses, units=METRES_Y).shape_count == 2
+    stage = Usd.Stage.Open(str(path))
+    rows = UsdSkel.BlendShape(stage.GetPrimAtPath("/Hero/cape/shape_002")).GetPointIndicesAttr().Get()
+    np.testing.assert_array_equal(rows, np.flatnonzero(deformer.scene.classes != 0))
+    assert not stage.GetPrimAtPath("/Hero/cape/shape_001")
+    assert compare_points(Shot(path), np.concatenate([deform(deformer, motion, pose) for pose in poses])).worst < 2e-6
+
+
+def test_a_joint_named_twice_is_stored_once_heaviest_first():
+    skin = SkinWeights("strip", np.array([[2, 1, 2], [0, 0, 0]]), np.array([[0.3, 0.4, 0.3], [0.2, 0.3, 0.5]]))
+    indices, weights = sorted_influences(skin)
+    np.testing.assert_array_equal(indices, [[2, 1], [0, 0]])
+    np.testing.assert_allclose(weights, [[0.6, 0.4], [1, 0]], atol=1e-7)
+
+
+def test_joints_that_stay_put_cost_one_sample(tmp_path):
+    rng = np.random.default_rng(6)
+    deformer, motion = make_deformer(rng), make_motion(rng)
+    still = replace(motion, translations=np.repeat(motion.translations[:1], FRAMES, axis=0))
+    poses, path = make_poses(rng, deformer), tmp_path / "shot.usdc"
+    write_shot(path, deformer, still, poses, units=CENTIMETRES_Z)
+    stage = Usd.Stage.Open(str(path))
+    animation = UsdSkel.Animation(stage.GetPrimAtPath("/Hero/Animation"))
+    assert animation.GetTranslationsAttr().GetNumTimeSamples() == 0
+    assert animation.GetRotationsAttr().GetNumTimeSamples() == FRAMES
+    assert check_shot(path) == []
+    assert compare_points(Shot(path), np.concatenate([deform(deformer, still, pose) for pose in poses])).worst < 2e-6
+
+
+def test_quaternions_never_flip_sign_between_frames(tmp_path):
+    rng = np.random.default_rng(7)
+    deformer, motion = make_deformer(rng), make_motion(rng)
+    turn = np.linspace(0, 4 * np.pi, FRAMES)
+    spin = np.stack([np.cos(turn / 2), 0 * turn, np.sin(turn / 2), 0 * turn], axis=-1)
+    rotations = np.array(motion.rotations)
+    rotations[:, 0] = spin
+    path = tmp_path / "shot.usdc"
+    write_shot(path, deformer, replace(motion, rotations=rotations), make_poses(rng, deformer), units=METRES_Y)
+    stage = Usd.Stage.Open(str(path))
+    rotations = stage.GetAttributeAtPath("/Hero/Animation.rotations")
+    stored = np.stack([rotations.Get(time) for time in rotations.GetTimeSamples()])
+    assert (np.sum(stored[1:] * stored[:-1], axis=-1) >= 0).all()
+    np.testing.assert_allclose(np.abs(np.sum(stored[:, 0] * spin[:, [1, 2, 3, 0]], axis=-1)), 1, atol=1e-6)
+
+
+def test_saving_often_changes_nothing_but_the_bytes(tmp_path, monkeypatch):
+    monkeypatch.setattr(shot_module, "FRAMES_PER_SAVE", 5)
+    expected = write(tmp_path / "shot.usdc")
+    assert check_shot(tmp_path / "shot.usdc") == []
+    assert compare_points(Shot(tmp_path / "shot.usdc"), expected).worst < 2e-6
+
+
+def test_the_same_shot_has_the_same_bytes(tmp_path):
+    write(tmp_path / "a.usdc")
+    write(tmp_path / "b.usdc")
+    assert (tmp_path / "a.usdc").read_bytes() == (tmp_path / "b.usdc").read_bytes()
+
+
+def test_provenance_is_kept_in_the_layer(tmp_path):
+    rng = np.random.default_rng(8)
+    deformer = make_deformer(rng)
+    provenance = {
+        "model": "cape.safetensors",
+        "inputs": {"stage": "0f3a"},
+        "motions": ["a", "b"],
+        "seed": 3,
+        "no": None,
+    }
+    path = tmp_path / "shot.usda"
+    poses = make_poses(rng, deformer)
+    write_shot(path, deformer, make_motion(rng), poses, units=METRES_Y, provenance=provenance)
+    kept = Sdf.Layer.FindOrOpen(str(path)).customLayerData["ssilk"]
+    assert kept["model"] == "cape.safetensors" and kept["inputs"] == {"stage": "0f3a"} and kept["seed"] == 3
+    assert list(kept["motions"]) == ["a", "b"] and "no" not in kept
+
+
+def test_readers_take_a_shot_as_a_stage(tmp_path):
+    rng = np.random.default_rng(9)
+    deformer, motion = make_deformer(rng), make_motion(rng)
+    path = tmp_path / "shot.usdc"
+    write_shot(path, deformer, motion, make_poses(rng, deformer), units=CENTIMETRES_Z)
+    character = read_character(path)
+    assert character.skeleton.joint_names == deformer.scene.character.skeleton.joint_names
+    back = read_motion(path, character.skeleton)
+    ours, theirs = (motion_transforms(each, character.skeleton.parents) for each in (motion, back))
+    np.testing.assert_allclose(theirs, ours, atol=2e-6)
+
+
+def with_weights(poses, value):
+    weights = np.array(poses[1].weights)
+    weights[2, 1] = value
+    return [poses[0], replace(poses[1], weights=weights), *poses[2:]]
+
+
+REFUSED = {
+    "weight above one": (lambda poses: with_weights(poses, 1.01), "blendshape 1 weighs 1.01 at frame 9"),
+    "negative weight": (lambda poses: with_weights(poses, -0.1), "blendshape 1 weighs -0.1 at frame 9"),
+    "weight not a number": (lambda poses: with_weights(poses, np.nan), "blendshape 1 weighs nan at frame 9"),
+    "chunk left out": (lambda poses: poses[::2], "a chunk that starts at frame 15; frame 7 comes next"),
+    "last chunk left out": (lambda poses: poses[:-1], "15 garment frames for the 20 of walk.usda"),
+    "frames past the motion": (lambda poses: [*poses, replace(poses[0], start=20)], "27 garment frames for the 20"),
+    "another proxy count": (lambda poses: [replace(poses[0], rotations=poses[0].rotations[:, :1])], "(7, 2, 4) and"),
+    "rotations not finite": (lambda poses: [replace(poses[0], rotations=poses[0].rotations * np.nan)], "NaN"),
+}
+
+
+@pytest.mark.parametrize("damage, message", REFUSED.values(), ids=REFUSED)
+def test_bad_frames_are_refused_and_leave_no_file(tmp_path, damage, message):
+    rng = np.random.default_rng(10)
+    deformer = make_deformer(rng)
+    poses = damage(make_poses(rng, deformer))
+    with pytest.raises(SsilkError, match=re.escape(message)):
+        write_shot(tmp_path / "shot.usdc", deformer, make_motion(rng), poses, units=METRES_Y)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_names_that_do_not_spell_the_hierarchy_are_refused(tmp_path):
+    rng = np.random.default_rng(11)
+    deformer = make_deformer(rng)
+    rig = replace(deformer.scene.rig, joint_names=("proxy_0", "proxy_1"))
+    deformer = replace(deformer, scene=replace(deformer.scene, rig=rig))
+    with pytest.raises(SsilkError, match="path of joint 'proxy_0' does not spell its parent"):
+        write_shot(tmp_path / "shot.usdc", deformer, make_motion(rng), make_poses(rng, deformer), units=METRES_Y)
+
+
+@pytest.mark.parametrize("name", ["shot.abc", "shot"])
+def test_other_file_formats_are_refused(tmp_path, name):
+    with pytest.raises(SsilkError, match=r"ends in \.usdc, \.usd, \.usda"):
+        write(tmp_path / name)
+
+
+def test_a_full_disk_is_one_sentence(tmp_path, monkeypatch):
+    """A limit on the size of files stands in for the disk."""
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limit[1]))
+    try:
+        with pytest.raises(SsilkError, match=r"shot\.usdc: .*free some space"):
+            write(tmp_path / "shot.usdc")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_point_caches_play_too(tmp_path):
+    stage = Usd.Stage.CreateNew(str(tmp_path / "cache.usda"))
+    UsdGeom.SetStageUpAxis(stage, "Z")
+    UsdGeom.SetStageMetersPerUnit(stage, 0.01)
+    UsdGeom.Xform.Define(stage, "/Set").AddTranslateOp().Set((100, 0, 0))
+    mesh = UsdGeom.Mesh.Define(stage, "/Set/Cloth")
+    mesh.CreateFaceVertexCountsAttr([3])
+    mesh.CreateFaceVertexIndicesAttr([0, 1, 2])
+    for time, height in ((10.0, 0.0), (12.0, 200.0)):
+        mesh.CreatePointsAttr().Set([(0, 0, height), (100, 0, height), (0, 100, height)], time)
+    stage.Save()
+    shot = Shot(tmp_path / "cache.usda")
+    assert shot.frame_times == (10.0, 11.0, 12.0)
+    np.testing.assert_allclose(shot.points(11.0)[0], [[1, 1, 0], [2, 1, 0], [1, 1, -1]], atol=1e-6)
+
+
+def attribute(stage: Usd.Stage, path: str) -> Usd.Attribute:
+    return stage.GetAttributeAtPath(path)
+
+
+def set_sample(path: str, index: object, value: object, time: float | None = 8.0):
+    """Return a function that overwrites one element of an array at a time, or for all time."""
+
+    def damage(stage: Usd.Stage) -> None:
+        code = Usd.TimeCode.Default() if time is None else time
+        array = np.array(attribute(stage, path).Get(code))
+        array[index] = value
+        attribute(stage, path).Set(type(attribute(stage, path).Get(code)).FromNumpy(array), code)
+
+    return damage
+
+
+def shorten(path: str, time: float | None = 8.0):
+    def damage(stage: Usd.Stage) -> None:
+        code = Usd.TimeCode.Default() if time is None else time
+        value = attribute(stage, path).Get(code)
+        attribute(stage, path).Set(type(value)(list(value)[:-1]), code)
+
+    return damage
+
+
+def set_layer(**fields: object):
+    def damage(stage: Usd.Stage) -> None:
+        for name, value in fields.items():
+            setattr(stage.GetRootLayer(), name, value)
+
+    return damage
+
+
+def clear_layer(name: str):
+    return lambda stage: stage.GetRootLayer().pseudoRoot.ClearInfo(name)
+
+
+def move_joints(stage: Usd.Stage) -> None:
+    joints = attribute(stage, "/Hero/Animation.joints")
+    names = list(joints.Get())
+    joints.Set([names[1], names[0], *names[2:]])
+
+
+def child_before_parent(stage: Usd.Stage) -> None:
+    for path in ("/Hero/Skeleton.joints", "/Hero/Animation.joints"):
+        names = list(attribute(stage, path).Get())
+        attribute(stage, path).Set([names[1], names[0], *names[2:]])
+
+
+def wrap_in_typeless_prim(stage: Usd.Stage) -> None:
+    layer = stage.GetRootLayer()
+    Sdf.CreatePrimInLayer(layer, "/Shot").specifier = Sdf.SpecifierDef
+    Sdf.CopySpec(layer, "/Hero", layer, "/Shot/Hero")
+    stage.RemovePrim("/Hero")
+    stage.SetDefaultPrim(stage.GetPrimAtPath("/Shot"))
+    Usd.ModelAPI(stage.GetPrimAtPath("/Shot")).SetKind("component")
+
+
+CAPE, MOVES = "/Hero/cape", "/Hero/Animation"
+WEIGHTS, INDICES = f"{CAPE}.primvars:skel:jointWeights", f"{CAPE}.primvars:skel:jointIndices"
+TAMPERED = {
+    "no default prim": (lambda stage: stage.ClearDefaultPrim(), "no default prim"),
+    "no kind": (lambda stage: stage.GetPrimAtPath("/Hero").ClearMetadata("kind"), "no kind"),
+    "no frames per second": (clear_layer("framesPerSecond"), "framesPerSecond is not authored"),
+    "no time codes per second": (clear_layer("timeCodesPerSecond"), "timeCodesPerSecond is not authored"),
+    "no frame range": (clear_layer("startTimeCode"), "startTimeCode is not authored"),
+    "rates differ": (set_layer(framesPerSecond=24.0), "timeCodesPerSecond and framesPerSecond differ"),
+    "no up axis": (clear_layer("upAxis"), "upAxis"),
+    "longer range": (set_layer(endTimeCode=25.0), "rotations has no sample at 5 of 25 frames"),
+    "second root": (lambda stage: UsdSkel.Root.Define(stage, "/Other"), "2 SkelRoots"),
+    "typeless ancestor": (wrap_in_typeless_prim, "it has no type"),
+    "instanceable": (lambda stage: stage.GetPrimAtPath("/Hero").SetInstanceable(True), "instanceable"),
+    "joint order": (move_joints, "joints differ from the Skeleton's"),
+    "parents last": (child_before_parent, "parents must come before"),
+    "bind transforms": (shorten("/Hero/Skeleton.bindTransforms", None), "4 bindTransforms for 5 joints"),
+    "rest transforms": (shorten("/Hero/Skeleton.restTransforms", None), "4 restTransforms for 5 joints"),
+    "singular bind": (set_sample("/Hero/Skeleton.bindTransforms", 0, 0.0, None), "cannot be inverted"),
+    "no animation": (
+        lambda stage: stage.GetPrimAtPath("/Hero").RemoveProperty("skel:animationSource"),
+        "no animation is bound",
+    ),
+    "rotation count": (shorten(f"{MOVES}.rotations"), "rotations has another length than 5 at 1 samples"),
+    "scale count": (shorten(f"{MOVES}.scales", None), "scales has another length than 5"),
+    "no translations": (lambda stage: attribute(stage, f"{MOVES}.translations").Clear(), "translations has no value"),
+    "frame missing": (
+        lambda stage: attribute(stage, f"{MOVES}.translations").ClearAtTime(8.0),
+        "translations has no sample at 1 of 20 frames",
+    ),
+    "quaternion length": (set_sample(f"{MOVES}.rotations", 1, 0.9), "no unit quaternions at time 8"),
+    "weight over one": (set_sample(f"{MOVES}.blendShapeWeights", 0, 1.5), "leave [0, 1] at time 8"),
+    "weight below zero": (set_sample(f"{MOVES}.blendShapeWeights", 2, -0.5), "leave [0, 1] at time 8"),
+    "weight count": (shorten(f"{MOVES}.blendShapeWeights"), "blendShapeWeights has another length than 3"),
+    "shape names repeat": (
+        lambda stage: attribute(stage, f"{MOVES}.blendShapes").Set(["shape_000"] * 3),
+        "blendshape names repeat",
+    ),
+    "shape unknown": (
+        lambda stage: attribute(stage, f"{CAPE}.skel:blendShapes").Set(["shape_000", "shape_001", "other"]),
+        "no animation knows 1",
+    ),
+    "target count": (shorten(f"{CAPE}.skel:blendShapes", None), "2 blendShapes and 3 blendShapeTargets"),
+    "target missing": (lambda stage: stage.RemovePrim(f"{CAPE}/shape_001"), "shape_001 is no BlendShape"),
+    "offset count": (shorten(f"{CAPE}/shape_001.offsets", None), "offsets for"),
+    "offsets not finite": (set_sample(f"{CAPE}/shape_001.offsets", 0, np.nan, None), "offsets are not finite"),
+    "rows out of range": (set_sample(f"{CAPE}/shape_001.pointIndices", 0, 99, None), "lie outside 0 to 35"),
+    "in-between": (
+        lambda stage: UsdSkel.BlendShape(stage.GetPrimAtPath(f"{CAPE}/shape_001")).CreateInbetween("half"),
+        "in-between",
+    ),
+    "joint index out of range": (set_sample(INDICES, 0, 5, None), "1 jointIndices lie outside 0 to 4"),
+    "weights not normalised": (set_sample(WEIGHTS, 0, 0.9, None), "Weights of 1 vertices do not add up"),
+    "negative joint weight": (set_sample(WEIGHTS, 3, -0.1, None), "1 jointWeights are negative"),
+    "influence count": (shorten(INDICES, None), "jointIndices and"),
+    "unsorted": (set_sample(WEIGHTS, slice(0, 4), [0.1, 0.2, 0.3, 0.4], None), "1 vertices are not sorted"),
+    "joint twice": (set_sample(INDICES, slice(0, 2), [1, 1], None), "1 vertices name a joint twice"),
+    "no geomBindTransform": (
+        lambda stage: stage.GetPrimAtPath(CAPE).RemoveProperty("primvars:skel:geomBindTransform"),
+        "geomBindTransform is not authored",
+    ),
+    "deforms twice": (
+        lambda stage: [attribute(stage, f"{CAPE}.points").Set(strip("x").points, time) for time in (1.0, 2.0)],
+        "deforms twice",
+    ),
+    "unbound": (
+        lambda stage: [stage.GetPrimAtPath(path).RemoveProperty("skel:skeleton") for path in ("/Hero", CAPE)],
+        "bound to no skeleton",
+    ),
+    "class count": (shorten(f"{CAPE}.primvars:ssilk:class", None), "holds 35 values, where 36"),
+    "face index": (set_sample(f"{CAPE}.faceVertexIndices", 0, 36, None), "1 faceVertexIndices name no point"),
+    "face count": (shorten(f"{CAPE}.faceVertexCounts", None), "do not add up to faceVertexIndices"),
+    "point not finite": (set_sample(f"{CAPE}.points", 0, np.inf, None), "not finite ones"),
+    "extent missing": (lambda stage: attribute(stage, "/Hero.extent").Clear(), "extent has no sample at 20"),
+    "extent too small": (set_sample("/Hero.extent", 1, 0.0), "does not hold the skinned points at time 8"),
+}
+
+
+@pytest.mark.parametrize("damage, message", TAMPERED.values(), ids=TAMPERED)
+def test_each_check_fires(tmp_path, damage, message):
+    path = tmp_path / "shot.usdc"
+    write(path)
+    stage = Usd.Stage.Open(str(path))
+    damage(stage)
+    stage.Save()
+    findings = check_shot(path)
+    assert any(message in finding.text and finding.severity == "error" for finding in findings), findings
+
+
+def test_a_moved_vertex_is_named(tmp_path):
+    expected = write(tmp_path / "shot.usdc", start=101.0)
+    expected[12, 5] += [0, 2e-5, 0]
+    comparison = compare_points(Shot(tmp_path / "shot.usdc"), expected)
+    assert not comparison.passed
+    assert (comparison.time, comparison.vertex) == (113.0, 5)
+    assert comparison.worst == pytest.approx(2e-5, abs=2e-6)
+
+
+def test_points_that_are_not_numbers_never_pass(tmp_path):
+    expected = write(tmp_path / "shot.usdc")
+    expected[3, 4] = np.nan
+    assert not compare_points(Shot(tmp_path / "shot.usdc"), expected).passed
+
+
+@pytest.mark.parametrize("frames", [slice(0, 19), np.r_[0:20, 0]], ids=["one short", "one more"])
+def test_other_frame_counts_fail_verification(tmp_path, frames):
+    expected = write(tmp_path / "shot.usdc")[frames]
+    with pytest.raises(VerificationError, match="another number of frames"):
+        compare_points(Shot(tmp_path / "shot.usdc"), expected)
+
+
+def test_other_vertex_counts_fail_verification(tmp_path):
+    expected = write(tmp_path / "shot.usdc")[:, :-1]
+    with pytest.raises(VerificationError, match="36 vertices, but 35"):
+        compare_points(Shot(tmp_path / "shot.usdc"), expected)
+
+
+@pytest.mark.skipif(not (SHARED / "data").is_dir(), reason="the shared data are not here")
+@pytest.mark.parametrize("units", [METRES_Y, CENTIMETRES_Z], ids=["metres_y", "centimetres_z"])
+def test_a_captured_motion_on_a_real_character(tmp_path, units):
+    rng, path = np.random.default_rng(12), tmp_path / "shot.usdc"
+    character = read_character(SHARED / "data/character.usdc")
+    motion = read_motion(SHARED / "data/motions/01_01.usdc", character.skeleton).clip(600, 630)
+    garment = read_garment(SHARED / "data/garments/tshirt.usdc", character.skeleton)
+    count = garment.mesh.vertex_count
+    skin = random_skin(rng, count, character.skeleton.joint_count)
+    garment = Garment(garment.mesh, skin, np.full(count, 2))
+    rig = ProxyRig("none", (), np.zeros(0, int), np.zeros((0, 4, 4)), skin)
+    deformer = Deformer(Scene(character, garment, rig), skin, 0.01 * rng.normal(size=(16, count, 3)))
+    pose = GarmentPose(0, np.zeros((30, 0, 4)), rng.random((30, 16)))
+    write_shot(path, deformer, motion, [pose], units=units, start=1.0)
+    assert check_shot(path) == []
+    assert compare_points(Shot(path), deform(deformer, motion, pose)).worst < 3e-6

@@ -51,12 +51,12 @@ def define_asset(stage: Usd.Stage, deformer: Deformer, bodies: tuple[Body, ...],
     shape_names = [f"shape_{index:03d}" for index in shapes]
     _define_animation(stage, paths[1], scene.joint_names, shape_names)
     _bind_root(root, skeleton, paths[1])
-    garment = _define_mesh(stage, paths[2], scene.garment.mesh, units)
+    garment = define_mesh(stage, paths[2], scene.garment.mesh, units)
     _mark_garment(garment, scene)
-    _bind_skin(garment, deformer.skin, skeleton)
+    bind_skin(garment, deformer.skin, skeleton)
     _define_blendshapes(garment, shape_names, deformer.shapes[shapes], units)
     for path, body in zip(paths[3:], bodies):
-        _bind_skin(_define_mesh(stage, path, body.mesh, units), body.skin, skeleton)
+        bind_skin(define_mesh(stage, path, body.mesh, units), body.skin, skeleton)
     return Asset(root.GetPath(), paths[1], bodies, shapes)
 
 
@@ -129,7 +129,7 @@ def matrix_array(transforms: Floats) -> Vt.Matrix4dArray:
     return Vt.Matrix4dArray.FromNumpy(np.ascontiguousarray(np.swapaxes(transforms, -1, -2), dtype=np.float64))
 
 
-def _define_mesh(stage: Usd.Stage, path: Sdf.Path, mesh: Mesh, units: StageUnits) -> UsdGeom.Mesh:
+def define_mesh(stage: Usd.Stage, path: Sdf.Path, mesh: Mesh, units: StageUnits) -> UsdGeom.Mesh:
     """Define a polygon mesh at its bind pose, with its own polygons and texture coordinates."""
     points = np.asarray(units.points_from_core(mesh.points), dtype=np.float32)
     prim = UsdGeom.Mesh.Define(stage, path)
@@ -160,7 +160,7 @@ def _mark_garment(mesh: UsdGeom.Mesh, scene: Scene) -> None:
         prim.CreateAttribute(PROXIES, types.TokenArray).Set(Vt.TokenArray(scene.rig.joint_names))
 
 
-def _bind_skin(mesh: UsdGeom.Mesh, skin: SkinWeights, skeleton: UsdSkel.Skeleton) -> None:
+def bind_skin(mesh: UsdGeom.Mesh, skin: SkinWeights, skeleton: UsdSkel.Skeleton) -> None:
     """Bind a mesh to a skeleton; influences sorted by weight, padded with zeros, of sum one in float32."""
     indices, weights = sorted_influences(skin)
     binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
@@ -172,13 +172,13 @@ def _bind_skin(mesh: UsdGeom.Mesh, skin: SkinWeights, skeleton: UsdSkel.Skeleton
 
 
 def sorted_influences(skin: SkinWeights) -> tuple[np.ndarray, np.ndarray]:
-    """Return joint indices (int32) and weights (float32), heaviest first, shape (V, I), I as small as it can be."""
-    order = np.argsort(-skin.weights, axis=1, kind="stable")[:, : max(1, int((skin.weights > 0).sum(axis=1).max()))]
-    weights = np.take_along_axis(skin.weights, order, axis=1).astype(np.float32)
+    """Return joint indices (int32) and weights (float32), heaviest first, each joint once, shape (V, I)."""
+    # By way of the dense matrix a joint that a row names twice is added up, where Blender keeps the last one only.
+    merged = SkinWeights.from_dense(skin.path, skin.dense(int(skin.indices.max()) + 1))
+    weights = merged.weights.astype(np.float32)
     # Far from the origin an error in the sum moves the vertex: let the heaviest weight take up the rounding.
     weights[:, 0] = 1 - weights[:, 1:].sum(axis=1, dtype=np.float64)
-    indices = np.where(weights > 0, np.take_along_axis(skin.indices, order, axis=1), 0)
-    return np.ascontiguousarray(indices, dtype=np.int32), weights
+    return np.ascontiguousarray(merged.indices), weights
 
 
 def _define_blendshapes(mesh: UsdGeom.Mesh, names: Sequence[str], offsets: Floats, units: StageUnits) -> None:

@@ -38,7 +38,8 @@ class Shot:
 
     Attributes:
         stage, units: the opened stage and its units.
-        start, end: first and last time code; fps: frames per second, and time codes too.
+        fps: frames per second, and time codes too.
+        frame_times: time code of each frame.
         meshes: every mesh of the stage, in its order.
     """
 
@@ -59,12 +60,7 @@ class Shot:
             _SkinnedMesh(prim, *skinned[prim]) if prim in skinned else _PlainMesh(prim) for prim in prims
         ]
         self.meshes = tuple(_describe(prim) for prim in prims)
-        self.start, self.end = _time_range(self.stage)
-
-    @property
-    def frame_times(self) -> Floats:
-        """Time code of each frame, shape (F,)."""
-        return self.start + np.arange(int(np.floor(self.end - self.start + 1e-6)) + 1)
+        self.frame_times = frame_times(self.stage)
 
     def points(self, time: float) -> list[Floats]:
         """Return the points of each mesh in world space [m], y up, float64, shape (V, 3), at a time code."""
@@ -143,6 +139,12 @@ class _PlainMesh:
 
 def _describe(prim: Usd.Prim) -> ShotMesh:
     return ShotMesh(prim.GetName(), str(prim.GetPath()), read_mesh(prim, np.eye(4)).faces, is_garment(prim))
+
+
+def frame_times(stage: Usd.Stage) -> tuple[float, ...]:
+    """Return the time code of each frame of a stage, one apart."""
+    start, end = _time_range(stage)
+    return tuple(start + frame for frame in range(int(np.floor(end - start + 1e-6)) + 1))
 
 
 def _time_range(stage: Usd.Stage) -> tuple[float, float]:

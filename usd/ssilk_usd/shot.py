@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write a baked garment as one self-contained UsdSkel shot, in memory that does not grow with its length."""
+"""Write a baked garment as one self-contained UsdSkel shot, whatever its length in little memory."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ from .author import Asset, define_asset, extent_array, matrix_array, sorted_infl
 from .units import StageUnits
 
 SUFFIXES = (".usdc", ".usd", ".usda")
-# A save lets go of the samples in memory, but leaves each attribute's older table of samples behind in the file.
-# At this many frames both stay small: 10 MB pending, and a fifth of the file at 100,000 frames.
+# A save lets go of the samples (less than 1 kB a frame remains, for the tables of their times), but leaves each
+# attribute's older table behind in the file. At this many frames both stay small: about 10 MB in memory, and a
+# fifth of the file at 100,000 frames.
 FRAMES_PER_SAVE = 4096
 
 
@@ -126,10 +127,15 @@ def _checked(poses: Iterable[GarmentPose], deformer: Deformer, motion: Motion) -
         need(pose.start == count, where, f"a chunk that starts at frame {pose.start}", f"frame {count} comes next")
         _check_pose(pose, deformer)
         count += pose.frame_count
+        _need_frames(count <= motion.frame_count, count, deformer, motion)
         yield pose
+    _need_frames(count == motion.frame_count, count, deformer, motion)
+
+
+def _need_frames(enough: bool, count: int, deformer: Deformer, motion: Motion) -> None:
     need(
-        count == motion.frame_count,
-        where,
+        enough,
+        deformer.scene.garment.mesh.path,
         f"{count} garment frames for the {motion.frame_count} of {motion.path}",
         "each frame of the motion needs one",
     )
@@ -171,6 +177,7 @@ class _Samples:
         self.layer, self.asset, self.deformer, self.motion = layer, asset, deformer, motion
         self.units, self.start, self.unsaved_count = units, start, 0
         self.surfaces = [_Surface(deformer.skin), *(_Surface(body.skin) for body in asset.bodies)]
+        self.moves = bool(np.ptp(motion.translations, axis=0).any())
         self.last_rotations: Floats | None = None
 
     def append(self, pose: GarmentPose) -> None:
@@ -195,7 +202,7 @@ class _Samples:
         rotations = self._continuous(quaternion_from_matrix(local[..., :3, :3]))[..., [1, 2, 3, 0]]
         self._write(animation, "rotations", times, map(Vt.QuatfArray.FromNumpy, rotations.astype(np.float32)))
         translations = local[..., :3, 3].astype(np.float32)
-        if np.ptp(self.motion.translations, axis=0).any():
+        if self.moves:
             self._write(animation, "translations", times, map(Vt.Vec3fArray.FromNumpy, translations))
         else:
             attribute = self.layer.GetAttributeAtPath(animation.AppendProperty("translations"))

@@ -1,0 +1,27 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a check of a shot has to say."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from pxr import Usd
+
+
+@dataclass(frozen=True)
+class Finding:
+    """`severity` is "error" (some reader will show something else) or "warning"; `prim` is a path, or empty."""
+
+    severity: str
+    prim: str
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.severity}: {self.prim or 'stage'}: {self.text}"
+
+
+def error_unless(condition: object, prim: Usd.Prim, text: str) -> Iterator[Finding]:
+    """Yield an error about `prim` unless `condition` holds."""
+    if not condition:
+        yield Finding("error", str(prim.GetPath()), text)
