@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures side by side, with words on them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..errors import SsilkError
+from .render import Image
+
+GAP = 4  # between panels [pixels]
+PAPER = 255
+INK = (38, 42, 48)
+
+
+def pillow() -> Any:
+    """Return the package PIL with its modules loaded; raise `SsilkError` when it is missing."""
+    try:
+        from PIL import Image, ImageDraw, ImageFont  # noqa: F401
+    except ImportError as error:
+        raise SsilkError(
+            "pictures: the package 'pillow' is missing; text and PNG files need it; run: pip install 'ssilk[view]'."
+        ) from error
+    import PIL
+
+    return PIL
+
+
+def captioned(image: Image, *, top: str = "", bottom: str = "") -> Image:
+    """Return the image with words in its upper and lower left corner."""
+    if not (top or bottom):
+        return image
+    pil = pillow()
+    picture = pil.Image.fromarray(image)
+    height = image.shape[0]
+    font = pil.ImageFont.load_default(size=max(11, height // 24))
+    edge = max(6, height // 40)
+    draw = pil.ImageDraw.Draw(picture)
+    draw.text((edge, edge), top, fill=INK, font=font, anchor="la")
+    draw.text((edge, height - edge), bottom, fill=INK, font=font, anchor="ld")
+    return np.asarray(picture)
+
+
+def contact_sheet(images: Sequence[Image], *, columns: int) -> Image:
+    """Return images of one size (h, w, 3) in rows of `columns`, with white gaps; a short row ends in white."""
+    height, width, _ = images[0].shape
+    rows = -(-len(images) // columns)
+    shape = rows * (height + GAP) - GAP, columns * (width + GAP) - GAP, 3
+    sheet = np.full(shape, PAPER, dtype=np.uint8)
+    for number, image in enumerate(images):
+        row, column = divmod(number, columns)
+        y, x = row * (height + GAP), column * (width + GAP)
+        sheet[y : y + height, x : x + width] = image
+    return sheet
+
+
+def compare(images: Sequence[Image]) -> Image:
+    """Return images of one size side by side."""
+    return contact_sheet(images, columns=len(images))

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the viewer asks of a shot, whatever file it came from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from ..assets import Floats, Ints
+
+
+class PlayerMesh(Protocol):
+    """A mesh of a shot: its triangles (F, 3), and whether it is cloth or skin."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def faces(self) -> Ints: ...
+
+    @property
+    def is_garment(self) -> bool: ...
+
+
+class Player(Protocol):
+    """A shot that can be posed at each of its frames."""
+
+    @property
+    def fps(self) -> float:
+        """Frames per second."""
+
+    @property
+    def frame_times(self) -> Sequence[float]:
+        """What to hand to `points` for each frame, in order."""
+
+    @property
+    def meshes(self) -> Sequence[PlayerMesh]: ...
+
+    def points(self, time: float) -> Sequence[Floats]:
+        """Return the vertices of every mesh at one frame time [m], y up, each (V, 3)."""

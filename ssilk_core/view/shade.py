@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The colour of points on surfaces."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..assets import Floats, Ints
+from .light import KEY, OFFSET, RIM, Lit, Rig
+from .trace import Hits
+
+SHEEN = 0.16  # light that fibres of cloth catch at grazing angles
+GLOSS = 0.10  # highlight of skin
+
+
+def shade(lit: Lit, hits: Hits, view: Floats, rig: Rig, lamps: Ints) -> Floats:
+    """Return the linear colours of hits, shape (N, 3).
+
+    Args:
+        lit: the geometry and the sky's light on it.
+        hits: where rays met it (N).
+        view: unit directions of those rays, shape (N, 3).
+        rig: the lamps.
+        lamps: which sample of the key lamp each hit looks at, shape (N,).
+    """
+    geometry, corners = lit.geometry, lit.geometry.faces[hits.faces]
+    normals = _mixed(geometry.normals, corners, hits)
+    normals /= np.sqrt(_dot(normals, normals))[:, None]
+    smooth = _smooth_points(lit, corners, hits, normals)
+    seen_inside = _faces_away(lit, corners, view)
+    thin = geometry.thin[corners[:, 0]]
+    normals = np.where((seen_inside & thin)[:, None], -normals, normals)
+    albedo = _of_side(geometry.outside, geometry.inside, seen_inside, corners, hits)
+    light = _of_side(lit.sky_outside, lit.sky_inside, seen_inside & thin, corners, hits)
+    light += _key_light(lit, smooth, normals, rig, lamps)[:, None] * KEY
+    light += np.maximum(_dot(normals, rig.rim), 0)[:, None] * RIM
+    grazing = (1 - np.abs(_dot(normals, view))) ** 3
+    return albedo * light + np.where(thin, SHEEN * grazing, GLOSS * grazing)[:, None] * light
+
+
+def _dot(a: Floats, b: Floats) -> Floats:
+    return np.einsum("...k,...k->...", a, b)
+
+
+def _mixed(values: Floats, corners: Ints, hits: Hits) -> Floats:
+    """Interpolate vertex values (V, 3) over the faces that were hit, shape (N, 3)."""
+    weights = hits.barycentric
+    return sum(values[corners[:, k]] * weights[:, k, None] for k in range(3))
+
+
+def _of_side(outside: Floats, inside: Floats, seen_inside: np.ndarray, corners: Ints, hits: Hits) -> Floats:
+    mixed = _mixed(outside, corners, hits)
+    rows = np.flatnonzero(seen_inside)
+    mixed[rows] = _mixed(inside, corners[rows], hits.where(rows))
+    return mixed
+
+
+def _faces_away(lit: Lit, corners: Ints, view: Floats) -> np.ndarray:
+    a, b, c = (lit.geometry.points[corners[:, k]] for k in range(3))
+    return _dot(np.cross(b - a, c - a), view) > 0
+
+
+def _smooth_points(lit: Lit, corners: Ints, hits: Hits, normals: Floats) -> Floats:
+    """Lift hits from flat faces to the round surface that their normals suggest, shape (N, 3).
+
+    Without it shadow rays from coarse faces meet their own neighbours and the edge of the shade shows the triangles
+    (Hanika, "Hacking the Shadow Terminator", Ray Tracing Gems II, 2021).
+    """
+    points = _mixed(lit.geometry.points, corners, hits)
+    lifted = np.zeros_like(points)
+    for k in range(3):
+        normal = lit.geometry.normals[corners[:, k]]
+        depth = np.minimum(_dot(points - lit.geometry.points[corners[:, k]], normal), 0)
+        lifted += hits.barycentric[:, k, None] * (points - depth[:, None] * normal)
+    return lifted
+
+
+def _key_light(lit: Lit, points: Floats, normals: Floats, rig: Rig, lamps: Ints) -> Floats:
+    """Return how much of the key lamp reaches points with these normals, shape (N,)."""
+    towards = rig.lamp[lamps]
+    cosine = _dot(normals, towards)
+    facing = np.flatnonzero(cosine > 0)
+    blocked = lit.tracer.blocked(points[facing] + OFFSET * normals[facing], towards[facing])
+    light = np.zeros(len(points), dtype=np.float32)
+    light[facing] = np.where(blocked, 0, cosine[facing])
+    return light
