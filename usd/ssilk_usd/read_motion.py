@@ -15,10 +15,19 @@ from ssilk_core.kinematics import matrix_from_quaternion, quaternion_from_matrix
 
 from .read_skeleton import joints_to_core, need_similarity, skeletons
 from .read_skin import match_joints
-from .read_stage import PRIMS, StageLike, inherited_target, listed, location, named, open_stage, world_matrix
+from .read_stage import (
+    PRIMS,
+    USD_SUFFIXES,
+    StageLike,
+    inherited_target,
+    listed,
+    location,
+    named,
+    open_stage,
+    world_matrix,
+)
 from .units import StageUnits
 
-USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 _SCALE_TOLERANCE = 1e-3
 
 

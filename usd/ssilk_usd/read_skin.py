@@ -14,8 +14,10 @@ from ssilk_core.errors import need
 
 from .read_stage import EARLIEST, inherited, location
 
-SKEL = ("primvars:skel:jointIndices", "primvars:skel:jointWeights")
-PLAIN = ("primvars:ssilk:plainJointIndices", "primvars:ssilk:plainJointWeights")
+JOINTS = "skel:joints"
+# Indices, weights and, where the mesh names its joints, their order.
+SKEL = ("primvars:skel:jointIndices", "primvars:skel:jointWeights", JOINTS)
+PLAIN = ("primvars:ssilk:plainJointIndices", "primvars:ssilk:plainJointWeights", "ssilk:plainJoints")
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,10 +86,12 @@ def read_skin(prim: Usd.Prim, joints: tuple[str, ...], names: tuple[str, ...]) -
     return SkinWeights(influences.path, *influences.onto(names))
 
 
-def read_influences(prim: Usd.Prim, joints: tuple[str, ...], properties: tuple[str, str] = SKEL) -> Influences | None:
-    """Read the authored influences of a mesh (`properties` names indices and weights); None without them."""
+def read_influences(
+    prim: Usd.Prim, joints: tuple[str, ...], properties: tuple[str, str, str] = SKEL
+) -> Influences | None:
+    """Read the influences of a mesh under the names `properties`, over its own joint order or else `joints`."""
     where = location(prim)
-    indices, weights = (inherited(prim, name) for name in properties)
+    indices, weights = (inherited(prim, name) for name in properties[:2])
     if indices is None and weights is None:
         return None
     need(
@@ -107,7 +111,7 @@ def read_influences(prim: Usd.Prim, joints: tuple[str, ...], properties: tuple[s
         "both need the same elementSize",
         "bind the mesh again",
     )
-    own = inherited(prim, "skel:joints")
+    own = inherited(prim, properties[2]) or inherited(prim, JOINTS)
     names = joints if own is None else tuple(own.Get(EARLIEST) or ())
     return Influences(where, names, _checked(rows_of_indices, rows_of_weights, names, where), rows_of_weights)
 

@@ -13,6 +13,8 @@ from ssilk_core.assets import Floats
 from ssilk_core.errors import fail, need
 
 StageLike: TypeAlias = str | Path | Usd.Stage
+LAYER_SUFFIXES = (".usdc", ".usd", ".usda")
+USD_SUFFIXES = (*LAYER_SUFFIXES, ".usdz")
 EARLIEST = Usd.TimeCode.EarliestTime()
 # Instance proxies are read too: a referenced character may be instanceable.
 PRIMS = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
@@ -33,13 +35,17 @@ def open_stage(source: StageLike) -> Usd.Stage:
         stage = Usd.Stage.Open(str(source), Usd.Stage.LoadAll)
         stage.Reload()
     except Tf.ErrorException as error:
-        reason = error.args[0].commentary if error.args else "unknown reason"
+        reason = " ".join(error.args[0].commentary.split()) if error.args else "unknown reason"
         fail(
             str(source), f"it cannot be read as USD ({reason})", "a whole .usd, .usda, .usdc or .usdz file is needed"
         )
     finally:
         del quiet
-    missing = [str(error).rstrip(".") for error in stage.GetCompositionErrors() if isinstance(error, _MISSING)]
+    missing = [
+        " ".join(str(error).split()).rstrip(".")
+        for error in stage.GetCompositionErrors()
+        if isinstance(error, _MISSING)
+    ]
     need(not missing, str(source), " and ".join(missing[:2]), "every layer must be found", "restore it or its path")
     return stage
 

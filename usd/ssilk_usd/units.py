@@ -28,24 +28,18 @@ class StageUnits:
     meters_per_unit: float = 1.0
     up_axis: str = "Y"
 
-    def __post_init__(self) -> None:
-        need(
-            0 < self.meters_per_unit < np.inf,
-            "stage units",
-            f"metersPerUnit is {self.meters_per_unit}",
-            "it must be positive",
-            "set it in the file",
-        )
-        need(self.up_axis in _TO_Y_UP, "stage units", f"the up axis is '{self.up_axis}'", "it is Y or Z")
-
     @classmethod
     def of(cls, stage: Usd.Stage) -> StageUnits:
         """Read the units of `stage`; unauthored ones are USD's own (centimetres, y up).
 
         Raises:
-            SsilkError: metersPerUnit is not positive.
+            SsilkError: metersPerUnit is not positive, or the up axis is neither Y nor Z.
         """
-        return cls(UsdGeom.GetStageMetersPerUnit(stage), str(UsdGeom.GetStageUpAxis(stage)))
+        where, meters = stage.GetRootLayer().identifier, UsdGeom.GetStageMetersPerUnit(stage)
+        need(0 < meters < np.inf, where, f"metersPerUnit is {meters}", "it must be positive", "set it in the file")
+        axis = str(UsdGeom.GetStageUpAxis(stage))
+        need(axis in _TO_Y_UP, where, f"upAxis is '{axis}'", "it is Y or Z", "set it in the file")
+        return cls(meters, axis)
 
     @property
     def rotation(self) -> Floats:

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""All that a stage says of one dressed character, in one call."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from ssilk_core.assets import Character, Garment, ProxyRig
+from ssilk_core.events import Reporter, silent
+
+from .read_character import read_character
+from .read_garment import read_garment
+from .read_stage import USD_SUFFIXES, StageLike, open_stage, split_location
+from .rig_io import read_proxy_rig
+
+
+def read_scene(
+    source: StageLike,
+    *,
+    root: str | None = None,
+    bodies: Sequence[str] = (),
+    garment: str | None = None,
+    report: Reporter = silent,
+) -> tuple[Character, Garment, ProxyRig | None]:
+    """Read a character, one garment, and the garment's proxy rig where it has one.
+
+    Args:
+        source: the character's file or open stage.
+        root: SkelRoot or Skeleton, by path or name, where there are several.
+        bodies: body meshes, by path or name; all when empty.
+        garment: a mesh of the stage, by path or name, or "FILE[:/Prim/Path]" for a garment in its own file.
+        report: hears what was assumed.
+
+    Raises:
+        SsilkError: as `read_character`, `read_garment` and `read_proxy_rig` do.
+    """
+    stage = open_stage(source)
+    file, prim = split_location(garment) if garment else (None, None)
+    if file and Path(file).suffix in USD_SUFFIXES:
+        character = read_character(stage, root=root, bodies=bodies)
+        wardrobe, where = open_stage(file), {"garment": prim}
+    else:
+        character = read_character(stage, root=root, bodies=bodies, garment=garment)
+        wardrobe, where = stage, {"garment": garment, "root": root}
+    skeleton = character.skeleton
+    rig = read_proxy_rig(wardrobe, skeleton, **where, report=report)
+    return character, read_garment(wardrobe, skeleton, **where), rig

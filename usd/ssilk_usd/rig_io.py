@@ -1,0 +1,322 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Proxy rigs in stages: joints appended to the skeleton, listed in the garment's `ssilk:proxyJoints`.
+
+A rig may be edited by hand. What the skeleton holds is what counts: a joint listed is a proxy wherever it moved
+in the hierarchy (it is found by a leaf name that is unique), a joint removed is gone with its weights, and a joint
+that descends from a proxy is a proxy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdSkel, Vt
+
+from ssilk_core.assets import Floats, Garment, Ints, ProxyRig, Scene, Skeleton, SkinWeights
+from ssilk_core.errors import fail, need
+from ssilk_core.events import Message, Reporter, silent
+from ssilk_core.files import replacing
+
+from .author import bind_skin, define_mesh, matrix_array, prim_names, sorted_influences
+from .read_garment import find_garment, fitted_skeleton, garment_to_core, plain_skin
+from .read_mesh import CLASS, PROXIES, is_garment
+from .read_skeleton import SkelSource, find_skeleton
+from .read_skin import PLAIN, SKEL, leaf, match_joints, read_influences
+from .read_stage import (
+    LAYER_SUFFIXES,
+    PRIMS,
+    StageLike,
+    apply,
+    inherited,
+    location,
+    open_stage,
+    split_location,
+    value,
+)
+from .units import StageUnits
+
+
+def read_proxy_rig(
+    source: StageLike,
+    skeleton: Skeleton,
+    *,
+    garment: str | None = None,
+    root: str | None = None,
+    report: Reporter = silent,
+) -> ProxyRig | None:
+    """Read a garment's proxy rig, as it was written or as it was edited by hand; None where it has none.
+
+    Args:
+        source: the stage with the garment and the skeleton that its proxies hang from.
+        skeleton: the character's; combined joint indices run over its joints, then over the proxies.
+        garment, root: as in `read_garment`.
+        report: hears of proxies that are gone, and of vertices that fall back to plain skinning for that.
+
+    Raises:
+        SsilkError: a proxy hangs from another garment's, or vertices have no weights left and no plain ones.
+    """
+    stage = open_stage(source)
+    prim = find_garment(stage, garment)
+    if not prim.HasAttribute(PROXIES):
+        return None
+    where, skel = location(prim), fitted_skeleton(prim, root)
+    if skel is None:
+        fail(where, "it lists proxy joints but its stage has no skeleton", "proxies are joints", "rig it again")
+    mine = np.flatnonzero([owner == str(prim.GetPath()) for owner in skel.owners])
+    names = tuple(skel.joints[index] for index in mine)
+    gone = [name for name, index in zip(value(prim, PROXIES), _find(prim, skel)) if index < 0]
+    if gone:
+        report(Message(f"{where}: {len(gone)} of its proxy joints are gone ({gone[0]}, ...)", "warning"))
+    return ProxyRig(
+        where,
+        names,
+        _proxy_parents(skel, mine, skeleton, where),
+        skel.binds_to_core(skel.bind[mine]),
+        _rig_skin(prim, skel, skeleton, names, report),
+    )
+
+
+def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path) -> None:
+    """Write a flattened copy of the character's stage with the garment bound to its proxy rig.
+
+    The copy keeps the stage's units and axes. Proxies are appended to the skeleton's joints, in place of older ones
+    of the same garment. The garment's mesh stands under the SkelRoot with its classes, the rig's weights, and the
+    plain-skinning weights beside them (`primvars:ssilk:plainJointIndices` and `...Weights`).
+
+    Args:
+        source: the stage that `scene.character` was read from.
+        scene: the character, its garment (from the same stage or from another file) and the rig.
+        out: the file to write: .usdc, .usd or .usda.
+
+    Raises:
+        SsilkError: the output cannot be written.
+    """
+    need(
+        Path(out).suffix in LAYER_SUFFIXES,
+        str(out),
+        f"the suffix is '{Path(out).suffix}'",
+        f"it is one of {', '.join(LAYER_SUFFIXES)}",
+        "choose another name",
+    )
+    layer = _flattened(source, scene)
+    stage = Usd.Stage.Open(layer)
+    skel = find_skeleton(stage, root=_prim_path(scene.character.skeleton.path))
+    mesh, to_bind = _place_garment(stage, skel, source, scene.garment)
+    proxies = _append_proxies(skel, str(mesh.GetPath()), scene)
+    _bind_garment(mesh, to_bind, skel, scene, proxies)
+    with replacing(out) as temporary:
+        try:
+            layer.Export(str(temporary))
+        except Tf.ErrorException as error:
+            fail(str(out), f"USD cannot write it ({error})", "the disk may be full", "free some space")
+
+
+def _find(prim: Usd.Prim, skel: SkelSource) -> list[int]:
+    return match_joints(tuple(value(prim, PROXIES) or ()), skel.joints)
+
+
+def _proxy_parents(skel: SkelSource, mine: Ints, skeleton: Skeleton, where: str) -> Ints:
+    """Return the combined index of each proxy's parent."""
+    own = {int(index): skeleton.joint_count + proxy for proxy, index in enumerate(mine)}
+    parents = []
+    for index in mine:
+        above = int(skel.parents[index])
+        need(
+            above >= 0,
+            where,
+            f"proxy '{skel.joints[index]}' has no parent",
+            "proxies hang from joints",
+            "reparent it",
+        )
+        combined = own.get(above, -1)
+        if combined < 0 and not skel.owners[above]:
+            combined = match_joints((skel.joints[above],), skeleton.joint_names)[0]
+        need(
+            combined >= 0,
+            where,
+            f"proxy '{skel.joints[index]}' hangs from '{skel.joints[above]}'",
+            "a proxy hangs from a joint of the character or from a proxy of the same garment",
+            "reparent it",
+        )
+        parents.append(combined)
+    return np.array(parents, dtype=np.int64)
+
+
+def _rig_skin(
+    prim: Usd.Prim, skel: SkelSource, skeleton: Skeleton, names: tuple[str, ...], report: Reporter
+) -> SkinWeights:
+    """Return the garment's weights over the combined joints; rows whose joints are all gone take plain ones."""
+    influences = read_influences(prim, skel.joints)
+    if influences is None:
+        fail(
+            location(prim), "the garment has proxies but no weights", "weights are needed", "bind it, or rig it again"
+        )
+    indices, weights = influences.onto((*skeleton.joint_names, *names))
+    lost = (weights.sum(axis=1) <= 0) & (influences.weights.sum(axis=1) > 0)
+    if not lost.any():
+        return SkinWeights(influences.path, indices, weights)
+    plain = plain_skin(prim, skel.joints, skeleton)
+    need(
+        plain,
+        influences.path,
+        f"{np.count_nonzero(lost)} vertices are weighted to joints that are gone, and to no others",
+        "each vertex needs a weight",
+        "paint them, or rig the garment again",
+    )
+    assert plain is not None
+    report(Message(f"{influences.path}: {np.count_nonzero(lost)} vertices lost all proxies and follow the body"))
+    width = max(indices.shape[1], plain.indices.shape[1])
+    mixed = [
+        np.where(lost[:, None], _padded(body, width), _padded(own, width))
+        for body, own in ((plain.indices, indices), (plain.weights, weights))
+    ]
+    return SkinWeights(influences.path, *mixed)
+
+
+def _padded(array: Floats | Ints, width: int) -> Floats | Ints:
+    return np.pad(array, ((0, 0), (0, width - array.shape[1])))
+
+
+def _flattened(source: str | Path, scene: Scene) -> Sdf.Layer:
+    """Return the source as one layer, with no instance where the rig will be written."""
+    stage = open_stage(source)
+    stage.SetEditTarget(stage.GetSessionLayer())
+    for path in (_prim_path(scene.character.path), _prim_path(scene.garment.mesh.path)):
+        for prefix in Sdf.Path(path).GetPrefixes():
+            _expand(stage.GetPrimAtPath(prefix))
+    top = stage.GetPrimAtPath(_prim_path(scene.character.path))
+    while instances := [prim for prim in Usd.PrimRange(top) if prim.IsInstance()]:
+        for prim in instances:
+            _expand(prim)
+    return stage.Flatten()
+
+
+def _expand(prim: Usd.Prim) -> None:
+    if prim and prim.IsInstance():
+        prim.SetInstanceable(False)
+
+
+def _prim_path(where: str) -> str:
+    return split_location(where)[1] or where
+
+
+def _place_garment(
+    stage: Usd.Stage, skel: SkelSource, source: str | Path, garment: Garment
+) -> tuple[UsdGeom.Mesh, Floats]:
+    """Return the garment's mesh beneath the SkelRoot, and its own space to bind space, shape (4, 4).
+
+    A mesh of the stage keeps its points, and moves if it stands elsewhere; one from its own file is copied.
+    """
+    file, path = split_location(garment.mesh.path)
+    old = stage.GetPrimAtPath(path or "/")
+    same = Path(file).exists() and Path(file).samefile(source)
+    if not (same and old and old.IsA(UsdGeom.Mesh)):
+        return _copy_garment(stage, skel, garment), np.eye(4)
+    to_bind = np.linalg.inv(skel.bind_to_core) @ garment_to_core(old, skel)
+    if not old.GetPath().HasPrefix(skel.root.GetPath()):
+        old = _move(stage, old, _free_path(skel, old.GetName()))
+    return UsdGeom.Mesh(old), to_bind
+
+
+def _copy_garment(stage: Usd.Stage, skel: SkelSource, garment: Garment) -> UsdGeom.Mesh:
+    """Define the garment beneath the SkelRoot in the stage's bind space, in place of an older copy."""
+    name = prim_names([garment.mesh.path], fallback="Garment")[0]
+    older = stage.GetPrimAtPath(skel.root.GetPath().AppendChild(name))
+    if older and is_garment(older):
+        stage.RemovePrim(older.GetPath())
+    points = apply(np.linalg.inv(skel.bind_to_core), garment.mesh.points)
+    return define_mesh(stage, _free_path(skel, name), replace(garment.mesh, points=points), StageUnits())
+
+
+def _free_path(skel: SkelSource, name: str) -> Sdf.Path:
+    taken = [str(child.GetPath()) for child in skel.root.GetAllChildren()]
+    return skel.root.GetPath().AppendChild(prim_names([*taken, name], fallback="Garment")[-1])
+
+
+def _move(stage: Usd.Stage, prim: Usd.Prim, to: Sdf.Path) -> Usd.Prim:
+    edit = Sdf.BatchNamespaceEdit()
+    edit.Add(Sdf.NamespaceEdit(prim.GetPath(), to, Sdf.NamespaceEdit.atEnd))
+    stage.GetRootLayer().Apply(edit)
+    return stage.GetPrimAtPath(to)
+
+
+def _append_proxies(skel: SkelSource, garment: str, scene: Scene) -> tuple[str, ...]:
+    """Append the rig's joints to the skeleton, drop older ones of the garment; return the proxies' joint paths."""
+    kept = [index for index, owner in enumerate(skel.owners) if owner != garment]
+    if len(kept) < len(skel.joints):
+        _keep_joint_names(skel)
+    joints = tuple(skel.joints[index] for index in kept)
+    proxies = _proxy_paths(scene, joints)
+    binds = skel.binds_from_core(scene.rig.bind_transforms)
+    bind = np.concatenate([skel.bind[kept], binds])
+    combined = np.concatenate([skel.binds_from_core(scene.character.skeleton.bind_transforms), binds])
+    rest = np.linalg.inv(combined[scene.rig.parents]) @ binds
+    skeleton = UsdSkel.Skeleton(skel.prim)
+    skeleton.CreateJointsAttr(Vt.TokenArray((*joints, *proxies)))
+    skeleton.CreateBindTransformsAttr(matrix_array(bind))
+    skeleton.CreateRestTransformsAttr(matrix_array(np.concatenate([skel.rest[kept], rest])))
+    names = value(skel.prim, "jointNames")
+    if names:
+        short = [*(names[index] for index in kept), *map(leaf, proxies)]
+        skeleton.CreateJointNamesAttr(Vt.TokenArray(short))
+    return proxies
+
+
+def _keep_joint_names(skel: SkelSource) -> None:
+    """Author the joint order on meshes that rely on the skeleton's, before its indices change."""
+    for prim in Usd.PrimRange(skel.root, PRIMS):
+        if prim.HasAttribute(SKEL[0]) and inherited(prim, "skel:joints") is None:
+            UsdSkel.BindingAPI.Apply(prim).CreateJointsAttr(Vt.TokenArray(skel.joints))
+
+
+def _proxy_paths(scene: Scene, taken: tuple[str, ...]) -> tuple[str, ...]:
+    """Return joint paths that spell the proxies' parents, with leaf names that no other joint has."""
+    leaves = {leaf(name) for name in taken}
+    paths = list(scene.character.skeleton.joint_names)
+    for name, parent in zip(scene.rig.joint_names, scene.rig.parents):
+        unique, copy = leaf(name), 1
+        while unique in leaves:
+            copy += 1
+            unique = f"{leaf(name)}_{copy}"
+        leaves.add(unique)
+        paths.append(f"{paths[parent]}/{unique}")
+    return tuple(paths[scene.character.skeleton.joint_count :])
+
+
+def _bind_garment(
+    mesh: UsdGeom.Mesh, to_bind: Floats, skel: SkelSource, scene: Scene, proxies: tuple[str, ...]
+) -> None:
+    """Author classes, weights and the list of proxies on the garment's mesh.
+
+    Its own joint order holds the names, so that its weights survive joints that are removed or reordered by hand.
+    """
+    prim, plain_joints = mesh.GetPrim(), scene.character.skeleton.joint_names
+    for name in (CLASS, *SKEL, *PLAIN):
+        prim.RemoveProperty(name)
+        prim.RemoveProperty(f"{name}:indices")  # of an indexed primvar
+    bind_skin(mesh, scene.rig.skin, UsdSkel.Skeleton(skel.prim))
+    binding = UsdSkel.BindingAPI(prim)
+    binding.CreateGeomBindTransformAttr(Gf.Matrix4d(to_bind.T.tolist()))
+    binding.CreateJointsAttr(Vt.TokenArray((*plain_joints, *proxies)))
+    _author_names(prim, PROXIES, proxies)
+    _author_names(prim, PLAIN[2], plain_joints)
+    _author_rows(prim, CLASS, scene.classes[:, None].astype(np.int32))
+    for name, rows in zip(PLAIN[:2], sorted_influences(scene.plain_skin)):
+        _author_rows(prim, name, rows)
+
+
+def _author_names(prim: Usd.Prim, name: str, names: tuple[str, ...]) -> None:
+    attribute = prim.CreateAttribute(name, Sdf.ValueTypeNames.TokenArray, False, Sdf.VariabilityUniform)
+    attribute.Set(Vt.TokenArray(names))
+
+
+def _author_rows(prim: Usd.Prim, name: str, rows: np.ndarray) -> None:
+    """Author a vertex primvar of whole numbers or floats, shape (V, elementSize)."""
+    whole = np.issubdtype(rows.dtype, np.integer)
+    kind = Sdf.ValueTypeNames.IntArray if whole else Sdf.ValueTypeNames.FloatArray
+    array = (Vt.IntArray if whole else Vt.FloatArray).FromNumpy(np.ascontiguousarray(rows).reshape(-1))
+    primvar = UsdGeom.PrimvarsAPI(prim).CreatePrimvar(name.removeprefix("primvars:"), kind, UsdGeom.Tokens.vertex)
+    primvar.SetElementSize(rows.shape[1])
+    primvar.Set(array)
