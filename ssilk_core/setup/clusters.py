@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The loose part of a garment in connected clusters, each with its proxies in a hierarchy (paper, Appendix A)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ssilk_core.assets import Floats, Ints, Mesh
+from ssilk_core.errors import need
+from ssilk_core.mesh.geodesic import farthest_points, nearest_sources, submesh
+from ssilk_core.mesh.topology import components, edges, vertex_areas
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Seam:
+    """Where loose cloth meets the rest: how far each vertex is from it [m], and its nearest vertex there, (V,)."""
+
+    distance: Floats
+    nearest: Ints
+
+
+@dataclass(frozen=True, eq=False)
+class Cluster:
+    """A connected piece of the loose part, with its proxies in breadth-first order.
+
+    Attributes:
+        vertices: garment vertices of the piece, ascending, shape (M,).
+        beside: those that an edge joins to the rest of the garment, the seam, shape (M,).
+        samples: the garment vertices at which its proxies stand, shape (S,).
+        distances: geodesic distance of each piece vertex to each sample [m], shape (S, M).
+        parents: index of each proxy's parent among `samples`, -1 for roots, shape (S,).
+        joint: the character joint that carries the roots.
+    """
+
+    vertices: Ints
+    beside: Mask
+    samples: Ints
+    distances: Floats
+    parents: Ints
+    joint: int
+
+
+def find_seam(mesh: Mesh, loose: Mask) -> Seam:
+    """Measure how far every vertex is from those that are not `loose` (V,).
+
+    Raises:
+        SsilkError: an island has none that are not loose.
+    """
+    seam = Seam(*nearest_sources(mesh.points, mesh.faces, np.flatnonzero(~loose)))
+    adrift = int(np.count_nonzero(seam.nearest < 0))
+    need(
+        adrift == 0,
+        mesh.path,
+        f"{adrift} loose vertices lie on islands without a pinned or tight vertex",
+        "every island needs some, or it falls off",
+        "paint primvars:ssilk:class",
+    )
+    return seam
+
+
+def find_pieces(mesh: Mesh, loose: Mask) -> list[Ints]:
+    """Return the vertices of each connected piece of `loose` (V,), the largest area first."""
+    faces, kept = submesh(mesh.faces, loose)
+    label = components(edges(faces), len(kept))
+    areas = np.bincount(label, vertex_areas(mesh.points, mesh.faces)[kept])
+    return [kept[label == number] for number in np.argsort(-areas, kind="stable")]
+
+
+def share_out(areas: Floats, sizes: Ints, count: int) -> Ints:
+    """Share `count` proxies out among pieces, by area.
+
+    The first pieces get one each as far as they go, and none gets more than its `sizes` in vertices, shape (N,).
+    """
+    shares = (np.arange(len(areas)) < count).astype(int)
+    while shares.sum() < min(count, sizes.sum()):
+        unfilled = np.where((shares > 0) & (shares < sizes), areas, -1.0)
+        shares[np.argmax(unfilled / np.maximum(shares, 1))] += 1
+    return shares
+
+
+def build_cluster(
+    mesh: Mesh, vertices: Ints, seam: Seam, body_weights: Floats, parents: Ints, *, proxies: int, roots: int
+) -> Cluster:
+    """Sample `proxies` vertices of a loose piece and hang them on the body.
+
+    The first sample is the vertex beside the seam nearest to the middle of that row, where the cloth hinges; the
+    others are farthest points by geodesic distance within the piece.
+
+    Args:
+        vertices: the piece, ascending, shape (M,).
+        body_weights: plain weights of all garment vertices, shape (V, J).
+        parents: parents of the character's joints, shape (J,).
+    """
+    inside = np.zeros(mesh.vertex_count, dtype=bool)
+    inside[vertices] = True
+    faces, _ = submesh(mesh.faces, inside)
+    beside = _beside(mesh, inside)[vertices]
+    points = mesh.points[vertices]
+    off_middle = np.linalg.norm(points - points[beside].mean(axis=0), axis=1)
+    start = int(np.where(beside, off_middle, np.inf).argmin())
+    samples, spread = farthest_points(points, faces, start, proxies)
+    order, above = hierarchy(spread, samples, seam.distance[vertices], beside, edges(faces), roots)
+    joint = carrying_joint(body_weights[seam.nearest[vertices[beside]]].sum(axis=0), parents)
+    return Cluster(vertices, beside, vertices[samples[order]], spread[order], above, joint)
+
+
+def _beside(mesh: Mesh, inside: Mask) -> Mask:
+    """Return the vertices of `inside` (V,) that an edge joins to a vertex outside it, shape (V,)."""
+    pairs = edges(mesh.faces)
+    result = np.zeros(mesh.vertex_count, dtype=bool)
+    result[pairs[inside[pairs[:, 0]] != inside[pairs[:, 1]]]] = True
+    return result & inside
+
+
+def carrying_joint(weights: Floats, parents: Ints) -> int:
+    """Return the deepest joint that carries, with the joints below it, over half of `weights` (J,).
+
+    The paper takes the heaviest joint of the nearest vertex, but every vertex of a seam is equally near, and a
+    skirt whose seam lies half on each thigh must hang from the hips. Where one joint dominates, this is that joint.
+    """
+    carried = np.array(weights, dtype=np.float64)
+    for joint in range(len(parents) - 1, 0, -1):
+        if parents[joint] >= 0:
+            carried[parents[joint]] += carried[joint]
+    return int(np.flatnonzero(carried > 0.5 * carried.max())[-1])
+
+
+def hierarchy(
+    spread: Floats, samples: Ints, to_seam: Floats, beside: Mask, pairs: Ints, roots: int
+) -> tuple[Ints, Ints]:
+    """Order proxies breadth first, over proxies whose regions touch.
+
+    The roots are the `roots` nearest to the seam among the proxies whose regions (their share of the piece, by
+    distance) reach it. The rest follow level by level, each under its nearest neighbour of the level above.
+
+    Args:
+        spread: distance of every piece vertex to each sample [m], shape (S, M).
+        samples: piece vertices of the samples, shape (S,).
+        to_seam: distance of every piece vertex to the seam [m], shape (M,).
+        beside: piece vertices beside the seam, shape (M,).
+        pairs: edges of the piece, shape (E, 2).
+
+    Returns:
+        The samples in order, shape (S,), and the position in that order of each one's parent, -1 for roots, (S,).
+    """
+    count, region = len(samples), spread.argmin(axis=0)
+    touching = np.zeros((count, count), dtype=bool)
+    touching[tuple(region[pairs].T)] = touching[tuple(region[pairs[:, ::-1]].T)] = True
+    between = np.where(touching, spread[:, samples], np.inf)
+    hinged = np.unique(region[beside])
+    order = hinged[np.argsort(to_seam[samples[hinged]], kind="stable")][:roots].tolist()
+    above = [-1] * len(order)
+    while len(order) < count:
+        rest = np.setdiff1d(np.arange(count), order)
+        reach = between[np.ix_(order, rest)]
+        level = np.flatnonzero(np.isfinite(reach.min(axis=0)))
+        level = level[np.argsort(reach.min(axis=0)[level], kind="stable")]
+        above += reach.argmin(axis=0)[level].tolist()
+        order += rest[level].tolist()
+    return np.array(order), np.array(above)

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a character and a garment as they were authored to a scene that can be trained."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ssilk_core import events
+from ssilk_core.assets import CLASS_NAMES, LOOSE, Character, Garment, ProxyRig, Scene
+from ssilk_core.setup.classes import ClassOptions, classify
+from ssilk_core.setup.rig import RigOptions, build_rig
+from ssilk_core.setup.weights import WeightOptions, transfer_weights
+
+
+def prepare_scene(
+    character: Character,
+    garment: Garment,
+    rig: ProxyRig | None = None,
+    *,
+    weight_options: WeightOptions | None = None,
+    class_options: ClassOptions | None = None,
+    rig_options: RigOptions | None = None,
+    report: events.Reporter = events.silent,
+) -> Scene:
+    """Fill in the weights, classes and proxies that a garment lacks; what is authored stays as it is.
+
+    Args:
+        garment: fitted to the character's bind pose, with or without weights and classes.
+        rig: proxies that were authored for it, or None.
+        report: told about everything that had to be assumed.
+
+    Raises:
+        SsilkError: an island of the garment is held nowhere, or what was authored does not fit together.
+    """
+    classes = garment.classes
+    if classes is None:
+        classes = _find_classes(character, garment, class_options, report)
+    skin = garment.skin
+    if skin is None:
+        report(events.Message(f"{garment.mesh.path}: no skinning weights, taken from the body"))
+        skin = transfer_weights(character, garment.mesh, classes=classes, options=weight_options)
+    garment = replace(garment, skin=skin, classes=classes)
+    if rig is None:
+        rig = build_rig(character, garment, rig_options, report=report)
+        report(events.Message(_describe_rig(garment, rig)))
+    return Scene(character, garment, rig)
+
+
+def _find_classes(
+    character: Character, garment: Garment, options: ClassOptions | None, report: events.Reporter
+) -> np.ndarray:
+    """Classify by authored weights, or by unsmoothed ones from the body: they jump where limbs part."""
+    unsmoothed = WeightOptions(tight_rounds=0, loose_rounds=0)
+    skin = garment.skin or transfer_weights(character, garment.mesh, options=unsmoothed)
+    classes = classify(character, garment.mesh, skin, options)
+    shares = ", ".join(f"{np.mean(classes == value):.0%} {name}" for value, name in enumerate(CLASS_NAMES))
+    report(events.Message(f"{garment.mesh.path}: no vertex classes, found {shares}"))
+    return classes
+
+
+def _describe_rig(garment: Garment, rig: ProxyRig) -> str:
+    if rig.proxy_count:
+        return f"{garment.mesh.path}: no proxy joints, {rig.proxy_count} placed on the loose part"
+    if np.equal(garment.classes, LOOSE).any():
+        return f"{garment.mesh.path}: no proxy joints, loose vertices follow the body"
+    return f"{garment.mesh.path}: nothing loose, no proxy joints needed"

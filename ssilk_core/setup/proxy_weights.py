@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Initial skinning weights of a garment over character joints and proxies (paper, Appendix A)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ssilk_core.assets import Floats, Mesh
+from ssilk_core.mesh.geodesic import nearest_sources
+from ssilk_core.setup.clusters import Cluster, Mask, Seam
+
+LEAST_SHARE = 1e-3  # of the body's weights on a loose vertex; less is left out, so that its rows stay short
+
+
+def proxy_weights(
+    mesh: Mesh,
+    loose: Mask,
+    body_weights: Floats,
+    seam: Seam,
+    clusters: list[Cluster],
+    *,
+    influences: int,
+    seam_blend: bool,
+) -> Floats:
+    """Return dense weights over the character's joints, then the proxies of all clusters, shape (V, J + P).
+
+    Vertices that are not loose keep `body_weights` (V, J). Loose vertices follow up to `influences` proxies of
+    their cluster, and with `seam_blend` near the seam the body too, by up to `influences` joints.
+    """
+    joint_count = body_weights.shape[1]
+    proxy_count = sum(len(cluster.samples) for cluster in clusters)
+    matrix = np.concatenate([body_weights, np.zeros((len(body_weights), proxy_count))], axis=1)
+    first = joint_count
+    for cluster in clusters:
+        rows, last = cluster.vertices, first + len(cluster.samples)
+        kept = seam_share(cluster, seam)[:, None] if seam_blend else np.zeros((len(rows), 1))
+        matrix[rows, :joint_count] = kept * _largest(body_weights[seam.nearest[rows]], influences)
+        matrix[rows, first:last] = (1 - kept) * falloff(cluster.distances.T, spacing(cluster), influences)
+        first = last
+    _follow_neighbours(mesh, loose, clusters, matrix)
+    return matrix
+
+
+def spacing(cluster: Cluster) -> float:
+    """Return the mean distance of a cluster's proxies to their nearest neighbour [m]; of one alone, its reach."""
+    columns = np.searchsorted(cluster.vertices, cluster.samples)
+    between = cluster.distances[:, columns] + np.diag(np.full(len(columns), np.inf))
+    mean = between.min(axis=1).mean() if len(columns) > 1 else cluster.distances.max()
+    return max(float(mean), 1e-6)
+
+
+def falloff(distance: Floats, radius: float, influences: int) -> Floats:
+    """Return weights exp(-(distance/radius)^2) of at most `influences` proxies, rows normalised, shape (M, S).
+
+    The first weight that is left out is taken off those that stay, so that none jumps where the choice changes.
+    """
+    nearest = distance.min(axis=1, keepdims=True)
+    # The common factor exp(-(nearest/radius)^2) leaves the ratios and keeps far rows from vanishing.
+    weights = _largest(np.exp((nearest**2 - distance**2) / radius**2), influences)
+    return weights / weights.sum(axis=1, keepdims=True)
+
+
+def seam_share(cluster: Cluster, seam: Seam) -> Floats:
+    """Return the share of the body's weights that each vertex of a cluster keeps, exp(-(d/r)^2), shape (M,).
+
+    d is the distance to the seam. The cloth is torn there by turning proxies as far as it lies from their pivots,
+    so r is twice the mean distance of the seam to the nearest proxy: wide for a cape, a finger for a fringe.
+    """
+    radius = 2 * cluster.distances[:, cluster.beside].min(axis=0).mean()
+    share = np.exp(-((seam.distance[cluster.vertices] / max(radius, 1e-6)) ** 2))
+    return np.where(share < LEAST_SHARE, 0, share)
+
+
+def _largest(weights: Floats, count: int) -> Floats:
+    """Keep at most `count` entries of each row (M, N), less the largest of those left out, with the row's old sum."""
+    if weights.shape[1] <= count:
+        return weights
+    cut = np.partition(weights, -count - 1, axis=1)[:, -count - 1, None]
+    kept = np.maximum(weights - cut, 0)
+    total = kept.sum(axis=1, keepdims=True)
+    # Where more than `count` are equally large nothing would remain: the first of them does.
+    kept = np.where(total > 0, kept, np.eye(weights.shape[1])[weights.argmax(axis=1)])
+    return kept * (weights.sum(axis=1, keepdims=True) / kept.sum(axis=1, keepdims=True))
+
+
+def _follow_neighbours(mesh: Mesh, loose: Mask, clusters: list[Cluster], matrix: Floats) -> None:
+    """Give loose vertices of pieces without proxies the row of their geodesically nearest vertex with some."""
+    covered = np.concatenate([cluster.vertices for cluster in clusters])
+    left = np.setdiff1d(np.flatnonzero(loose), covered)
+    if len(left):
+        nearest = nearest_sources(mesh.points, mesh.faces, covered)[1][left]
+        matrix[left[nearest >= 0]] = matrix[nearest[nearest >= 0]]

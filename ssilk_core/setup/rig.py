@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Proxy joints for the loose part of a garment (paper, Section 3.4 and Appendix A)."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from ssilk_core import events
+from ssilk_core.assets import LOOSE, Character, Floats, Garment, Ints, Mesh, ProxyRig, SkinWeights
+from ssilk_core.errors import need
+from ssilk_core.kinematics import rigid
+from ssilk_core.mesh.topology import vertex_areas, vertex_normals
+from ssilk_core.setup.clusters import Cluster, Mask, Seam, build_cluster, find_pieces, find_seam, share_out
+from ssilk_core.setup.proxy_weights import proxy_weights
+
+
+@dataclass(frozen=True)
+class RigOptions:
+    """How proxies are placed.
+
+    Attributes:
+        proxies: how many to spread over the loose part; 0 leaves the garment on the character's joints.
+        most_proxies: how far `proxies` may be raised to give each loose cluster (each strip of a fringe) one of
+            its own. Beyond that the smallest clusters follow the nearest proxies of their neighbours.
+        roots_per_cluster: how many proxies of a cluster hang directly from a character joint (the paper's j).
+        influences: how many proxies move a vertex.
+        seam_blend: whether loose vertices near the seam keep a share of the body's weights.
+    """
+
+    proxies: int = 20
+    most_proxies: int = 64
+    roots_per_cluster: int = 4
+    influences: int = 4
+    seam_blend: bool = True
+
+    def __post_init__(self) -> None:
+        for name, least in (("proxies", 0), ("most_proxies", 1), ("roots_per_cluster", 1), ("influences", 1)):
+            value = getattr(self, name)
+            need(value >= least, "proxy rig", f"{name} = {value}", f"it must be at least {least}")
+
+
+def build_rig(
+    character: Character,
+    garment: Garment,
+    options: RigOptions | None = None,
+    *,
+    report: events.Reporter = events.silent,
+) -> ProxyRig:
+    """Spread proxy joints over the loose part of a garment and skin it to them.
+
+    Each connected cluster of loose vertices gets a share of the proxies by its area, at least one. They are
+    farthest-point samples by geodesic distance, which start at the seam where the cloth hinges. Up to
+    `roots_per_cluster` of them, the nearest to the seam, hang from the character joint that carries the seam; a
+    breadth-first search over proxies whose regions touch attaches the rest, each to its nearest neighbour.
+
+    Weights fall off as exp(-(d/r)^2), r the mean spacing of the cluster's proxies. Beyond the paper, loose
+    vertices near the seam keep a share of the weights of their nearest vertex on it: without that the cloth tears
+    open there as soon as a root turns, because tight vertices follow the body alone.
+
+    Args:
+        garment: with weights and classes.
+        report: told when the number of proxies is not what was asked for.
+
+    Raises:
+        SsilkError: the garment has no weights or classes, or an island has only loose vertices.
+    """
+    options = options or RigOptions()
+    need(garment.skin is not None, garment.mesh.path, "no skinning weights", "weights are needed", "transfer them")
+    need(garment.classes is not None, garment.mesh.path, "no vertex classes", "classes are needed", "classify it")
+    assert garment.skin is not None and garment.classes is not None
+    loose: Mask = np.equal(garment.classes, LOOSE)
+    if options.proxies == 0 or not loose.any():
+        return ProxyRig(garment.mesh.path, (), np.zeros(0, dtype=int), np.zeros((0, 4, 4)), garment.skin)
+    body_weights = garment.skin.dense(character.skeleton.joint_count)
+    seam = find_seam(garment.mesh, loose)
+    clusters = _clusters(character, garment.mesh, loose, body_weights, seam, options, report)
+    weights = proxy_weights(
+        garment.mesh,
+        loose,
+        body_weights,
+        seam,
+        clusters,
+        influences=options.influences,
+        seam_blend=options.seam_blend,
+    )
+    return _assemble(character, garment.mesh, clusters, weights, seam)
+
+
+def _clusters(
+    character: Character,
+    mesh: Mesh,
+    loose: Mask,
+    body_weights: Floats,
+    seam: Seam,
+    options: RigOptions,
+    report: events.Reporter,
+) -> list[Cluster]:
+    """Return the clusters that get proxies of their own, the largest first."""
+    pieces, areas = find_pieces(mesh, loose), vertex_areas(mesh.points, mesh.faces)
+    count = _affordable(len(pieces), options, mesh.path, report)
+    shares = share_out(
+        np.array([areas[piece].sum() for piece in pieces]), np.array([len(piece) for piece in pieces]), count
+    )
+    parents, roots = character.skeleton.parents, options.roots_per_cluster
+    return [
+        build_cluster(mesh, piece, seam, body_weights, parents, proxies=int(share), roots=roots)
+        for piece, share in zip(pieces, shares)
+        if share
+    ]
+
+
+def _affordable(piece_count: int, options: RigOptions, path: str, report: events.Reporter) -> int:
+    """Return how many proxies to place, raised so that each piece has one as far as that goes, and say so."""
+    count = max(options.proxies, min(piece_count, options.most_proxies))
+    if count > options.proxies:
+        text = f"{path}: {piece_count} loose pieces need a proxy each: {count} proxies, not {options.proxies}"
+        report(events.Message(text))
+    if count < piece_count:
+        text = (
+            f"{path}: of {piece_count} loose pieces the {piece_count - count} smallest follow the proxies of others"
+        )
+        report(events.Message(text, "warning"))
+    return count
+
+
+def _assemble(character: Character, mesh: Mesh, clusters: list[Cluster], weights: Floats, seam: Seam) -> ProxyRig:
+    """Return the rig of all clusters; proxies run cluster by cluster, breadth first within each."""
+    skeleton = character.skeleton
+    parents: list[int] = []
+    for cluster in clusters:
+        first = skeleton.joint_count + len(parents)
+        parents += [cluster.joint if above < 0 else first + above for above in cluster.parents]
+    samples = np.concatenate([cluster.samples for cluster in clusters])
+    return ProxyRig(
+        mesh.path,
+        _names(mesh.path, skeleton.joint_names, parents),
+        np.array(parents),
+        _bind_transforms(mesh, samples, np.array(parents) - skeleton.joint_count, seam),
+        SkinWeights.from_dense(mesh.path, weights),
+    )
+
+
+def _names(path: str, joint_names: tuple[str, ...], parents: list[int]) -> tuple[str, ...]:
+    """Return a USD joint path for each proxy: its parent's, then "<garment>_proxy_<number>"."""
+    garment = re.sub(r"\W", "_", path.rstrip("/").rsplit("/", 1)[-1], flags=re.ASCII)
+    stem = garment if re.match("[A-Za-z_]", garment) else f"_{garment}"
+    digits = max(2, len(str(len(parents) - 1)))
+    names = list(joint_names)
+    for number, parent in enumerate(parents):
+        names.append(f"{names[parent]}/{stem}_proxy_{number:0{digits}d}")
+    return tuple(names[len(joint_names) :])
+
+
+def _bind_transforms(mesh: Mesh, samples: Ints, parents: Ints, seam: Seam) -> Floats:
+    """Return proxies at `samples` (P,) with y along the cloth away from the body and z along its normal, (P, 4, 4).
+
+    y points to the middle of the children, or on from the parent where there are none; `parents` (P,) is
+    negative for roots, which then point on from the seam.
+    """
+    points = mesh.points[samples]
+    came_from = np.where(parents[:, None] >= 0, points[np.maximum(parents, 0)], mesh.points[seam.nearest[samples]])
+    along = points - came_from
+    for proxy in np.unique(parents[parents >= 0]):
+        along[proxy] = points[parents == proxy].mean(axis=0) - points[proxy]
+    normals = vertex_normals(mesh.points, mesh.faces)[samples]
+    return rigid(np.array([_frame(y, z) for y, z in zip(along, normals)]), points)
+
+
+def _frame(along: Floats, normal: Floats) -> Floats:
+    """Return the rotation with y along `along` and z as near to `normal` as can be; any frame where they vanish."""
+    axes: list[Floats] = []
+    for wanted in (along, normal, *np.eye(3)):
+        rest = wanted - sum((axis * (axis @ wanted) for axis in axes), np.zeros(3))
+        length = np.linalg.norm(rest)
+        if len(axes) < 2 and length > 1e-6 * max(1.0, float(np.linalg.norm(wanted))):
+            axes.append(rest / length)
+    y, z = axes
+    return np.column_stack([np.cross(y, z), y, z])

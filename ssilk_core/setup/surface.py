@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the body's surface is, seen from points near it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ssilk_core.assets import Floats, Ints, Mesh
+from ssilk_core.mesh.topology import vertex_normals
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePoints:
+    """The closest point of a triangle mesh for each of V queries.
+
+    Attributes:
+        distance: how far it is [m], shape (V,).
+        corners: the vertices of its triangle, shape (V, 3).
+        barycentric: its barycentric coordinates there, rows sum to one, shape (V, 3).
+        normals: unit normals, interpolated from the vertices and so continuous, shape (V, 3).
+    """
+
+    distance: Floats
+    corners: Ints
+    barycentric: Floats
+    normals: Floats
+
+
+def closest_on_surface(points: Floats, mesh: Mesh) -> SurfacePoints:
+    """Return the closest point of `mesh` for each of `points` [m], shape (V, 3)."""
+    import igl
+
+    squared, face, found = igl.point_mesh_squared_distance(np.ascontiguousarray(points), mesh.points, mesh.faces)
+    corners = mesh.faces[face]
+    barycentric = _barycentric(found, mesh.points[corners])
+    normals = np.einsum("vk,vkc->vc", barycentric, vertex_normals(mesh.points, mesh.faces)[corners])
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return SurfacePoints(np.sqrt(squared), corners, barycentric, normals / np.maximum(length, 1e-12))
+
+
+def _barycentric(points: Floats, triangles: Floats) -> Floats:
+    """Return barycentric coordinates of points (V, 3) on triangles (V, 3, 3); slivers give their nearest corner."""
+    import igl
+
+    corners = [np.ascontiguousarray(triangles[:, corner]) for corner in range(3)]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        found = np.clip(np.asarray(igl.barycentric_coordinates(points, *corners)), 0, 1)
+        found /= found.sum(axis=1, keepdims=True)
+    nearest = np.linalg.norm(triangles - points[:, None], axis=2).argmin(axis=1)
+    return np.where(np.isfinite(found).all(axis=1, keepdims=True), found, np.eye(3)[nearest])
