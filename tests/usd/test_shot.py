@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import ssilk_usd.shot as shot_module
 from pxr import Sdf, Usd, UsdGeom, UsdSkel
-from ssilk_usd.author import sorted_influences
+from ssilk_usd.author import prim_names, sorted_influences
 from ssilk_usd.check import check_shot, compare_points
 from ssilk_usd.play import Shot
 from ssilk_usd.read_character import read_character
@@ -326,6 +326,35 @@ def test_bad_frames_are_refused_and_leave_no_file(tmp_path, damage, message):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_an_interrupted_bake_leaves_the_old_file(tmp_path):
+    rng, path = np.random.default_rng(10), tmp_path / "shot.usdc"
+    write(path)
+    before, deformer = path.read_bytes(), make_deformer(rng)
+
+    def poses():
+        yield make_poses(rng, deformer)[0]
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_shot(path, deformer, make_motion(rng), poses(), units=METRES_Y)
+    assert list(tmp_path.iterdir()) == [path] and path.read_bytes() == before
+
+
+def test_a_motion_of_another_skeleton_is_refused(tmp_path):
+    rng = np.random.default_rng(10)
+    deformer, motion = make_deformer(rng), make_motion(rng)
+    other = replace(motion, rotations=motion.rotations[:, :2], translations=motion.translations[:, :2])
+    with pytest.raises(SsilkError, match=r"walk\.usda:/Walk: 2 animated joints, where hero\.usda:/Hero/Rig has 3"):
+        write_shot(tmp_path / "shot.usdc", deformer, other, make_poses(rng, deformer), units=METRES_Y)
+
+
+def test_prim_names_are_valid_and_unique():
+    paths = ["a.usda:/Set/Hero", "b.usdc", "b.usda:/Hero", "c.usda:/Hero", "/01_shot", ""]
+    names = prim_names(paths)
+    assert names == ["Hero", "b", "Hero_2", "Hero_3", "_01_shot", "_"]
+    assert all(Sdf.Path.IsValidIdentifier(name) for name in names)
+
+
 def test_names_that_do_not_spell_the_hierarchy_are_refused(tmp_path):
     rng = np.random.default_rng(11)
     deformer = make_deformer(rng)
@@ -346,7 +375,7 @@ def test_a_full_disk_is_one_sentence(tmp_path, monkeypatch):
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limit[1]))
     try:
-        with pytest.raises(SsilkError, match=r"shot\.usdc: .*free some space"):
+        with pytest.raises(SsilkError, match=r"shot\.usdc: writing failed \(.*File too large\)"):
             write(tmp_path / "shot.usdc")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
@@ -361,11 +390,13 @@ def test_point_caches_play_too(tmp_path):
     mesh = UsdGeom.Mesh.Define(stage, "/Set/Cloth")
     mesh.CreateFaceVertexCountsAttr([3])
     mesh.CreateFaceVertexIndicesAttr([0, 1, 2])
+    UsdGeom.Mesh.Define(stage, "/Set/Hidden").CreateVisibilityAttr("invisible")
     for time, height in ((10.0, 0.0), (12.0, 200.0)):
         mesh.CreatePointsAttr().Set([(0, 0, height), (100, 0, height), (0, 100, height)], time)
     stage.Save()
     shot = Shot(tmp_path / "cache.usda")
     assert shot.frame_times == (10.0, 11.0, 12.0)
+    assert [mesh.name for mesh in shot.meshes] == ["Cloth"]
     np.testing.assert_allclose(shot.points(11.0)[0], [[1, 1, 0], [2, 1, 0], [1, 1, -1]], atol=1e-6)
 
 

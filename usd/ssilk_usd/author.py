@@ -6,6 +6,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import count
 
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
@@ -43,8 +44,8 @@ def define_asset(stage: Usd.Stage, deformer: Deformer, bodies: tuple[Body, ...],
     """
     scene = deformer.scene
     meshes = [scene.garment.mesh.path, *(body.mesh.path for body in bodies)]
-    names = prim_names(["Skeleton", "Animation", *meshes], fallback="Mesh")
-    root = UsdSkel.Root.Define(stage, "/" + prim_names([scene.character.path], fallback="Character")[0])
+    names = prim_names(["Skeleton", "Animation", *meshes])
+    root = UsdSkel.Root.Define(stage, "/" + prim_names([scene.character.path])[0])
     paths = [root.GetPath().AppendChild(name) for name in names]
     skeleton = _define_skeleton(stage, paths[0], scene, units)
     shapes = np.flatnonzero(deformer.shapes.any(axis=(1, 2)))
@@ -60,17 +61,14 @@ def define_asset(stage: Usd.Stage, deformer: Deformer, bodies: tuple[Body, ...],
     return Asset(root.GetPath(), paths[1], bodies, shapes)
 
 
-def prim_names(paths: Sequence[str], fallback: str) -> list[str]:
+def prim_names(paths: Sequence[str]) -> list[str]:
     """Return a valid and unique prim name for each path, made from the path's last part."""
     names: list[str] = []
     for path in paths:
-        words = re.findall(r"\w+", path.rsplit("/", 1)[-1])
-        stem = re.sub(r"^\d", "_\\g<0>", words[0]) if words else fallback
-        name, copy = stem, 1
-        while name in names:
-            copy += 1
-            name = f"{stem}_{copy}"
-        names.append(name)
+        word = re.search(r"\w+", path.rsplit("/", 1)[-1])
+        stem = re.sub(r"^(\d|$)", r"_\1", word.group() if word else "")
+        copies = (f"{stem}_{copy}" for copy in count(2))
+        names.append(stem if stem not in names else next(name for name in copies if name not in names))
     return names
 
 

@@ -11,7 +11,7 @@ from pxr import Usd, UsdGeom, UsdSkel
 from ssilk_core.assets import Floats, Ints
 from ssilk_core.errors import need
 
-from .read_mesh import is_garment, read_mesh
+from .read_mesh import is_drawn, is_garment, read_mesh
 from .read_stage import PRIMS, StageLike, apply, column_matrix, open_stage, stage_name
 from .units import StageUnits
 
@@ -40,22 +40,23 @@ class Shot:
         stage, units: the opened stage and its units.
         fps: frames per second, and time codes too.
         frame_times: time code of each frame.
-        meshes: every mesh of the stage, in its order.
+        meshes: every visible mesh of the stage, in its order.
     """
 
     def __init__(self, source: StageLike) -> None:
         """Open a shot.
 
         Raises:
-            SsilkError: not a readable stage, or one without meshes.
+            SsilkError: not a readable stage, or one without visible meshes.
         """
         self.stage = open_stage(source)
         self.name = stage_name(self.stage)
         self.units = StageUnits.of(self.stage)
         self.fps = float(self.stage.GetTimeCodesPerSecond())
         skinned = _skinning_of(self.stage)
-        prims = [prim for prim in Usd.PrimRange(self.stage.GetPseudoRoot(), PRIMS) if prim.IsA(UsdGeom.Mesh)]
-        need(prims, self.name, "there is no mesh", "a shot holds at least one", "check that this is the right file")
+        everything = Usd.PrimRange(self.stage.GetPseudoRoot(), PRIMS)
+        prims = [prim for prim in everything if prim.IsA(UsdGeom.Mesh) and is_drawn(prim)]
+        need(prims, self.name, "no visible mesh", "a shot holds at least one", "check that this is the right file")
         self._players = [
             _SkinnedMesh(prim, *skinned[prim]) if prim in skinned else _PlainMesh(prim) for prim in prims
         ]

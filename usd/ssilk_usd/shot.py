@@ -72,7 +72,7 @@ def write_shot(
         stage = Usd.Stage.Open(layer)
         asset = define_asset(stage, deformer, bodies, units)
         _set_metadata(stage, motion, units, start, provenance or {})
-        del stage  # without a listening stage a sample costs a tenth
+        del stage  # nobody has to hear of each sample
         samples = _Samples(layer, asset, deformer, motion, units, start)
         for pose in _checked(poses, deformer, motion):
             samples.append(pose)
@@ -234,7 +234,13 @@ class _Samples:
         try:
             self.layer.Save()
         except Tf.ErrorException as error:
-            fail(str(name), "USD cannot write it", "the disk may be full", f"free some space ({_first_line(error)})")
+            reason = error.args[0].commentary if error.args else "unknown reason"
+            fail(
+                str(name),
+                f"writing failed ({reason})",
+                "the whole shot must fit",
+                "free space or choose another output",
+            )
         self.unsaved_count = 0
 
 
@@ -252,7 +258,3 @@ class _Surface:
         posed = Vt.Vec3fArray.FromNumpy(np.asarray(points, dtype=np.float32))
         UsdSkel.SkinPointsLBS(Gf.Matrix4d(1), matrix_array(matrices), self.indices, self.weights, self.width, posed)
         return np.array(posed)
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().splitlines()[-1]
