@@ -33,10 +33,10 @@ class Camera:
     def directions(self, x: Floats, y: Floats, width: int, height: int) -> Floats:
         """Return unit rays through pixel coordinates (...), float32, shape (..., 3); (0, 0) is top left."""
         half = np.tan(np.radians(self.fov) / 2)
-        right, up, forward = self.axes()
-        across = ((2 * x - width) / height * half).astype(np.float32)[..., None]
-        upward = ((1 - 2 * y / height) * half).astype(np.float32)[..., None]
-        rays = upward * up.astype(np.float32) + across * right.astype(np.float32) + forward.astype(np.float32)
+        across, upward = (2 * x - width) / height * half, (1 - 2 * y / height) * half
+        # float32 throughout, and a product of matrices, because a picture has a million of these.
+        rays = np.stack([across, upward, np.ones_like(across)], axis=-1, dtype=np.float32, casting="same_kind")
+        rays = rays @ self.axes().astype(np.float32)
         return rays / np.sqrt(np.einsum("...k,...k", rays, rays))[..., None]
 
     def project(self, points: Floats, width: int, height: int) -> tuple[Floats, Floats]:

@@ -13,7 +13,7 @@ from .surface import linear
 BACKDROP, HAZE, FLOOR = linear([0.70, 0.735, 0.775]), linear([0.90, 0.91, 0.92]), linear([0.855, 0.86, 0.868])
 LINE = 0.86  # brightness of grid lines against the floor
 SPACING, LINE_WIDTH = 0.5, 0.008  # of the grid [m]
-NEAR, FAR = 1.6, 4.5  # the floor fades into the backdrop between these distances from the target, in view distances
+NEAR, FAR = 0.4, 3.3  # the floor fades into the backdrop between these distances from the target, in view distances
 KEY_SHADE = 0.42  # darkness of the key lamp's shadow
 SKY_SHADE = 0.75  # darkness where the floor sees no sky
 PENUMBRA = 0.15  # how far the key lamp's shadow may spread past its centre [m]
@@ -33,17 +33,17 @@ def stage(lit: Lit, rig: Rig, camera: Camera, directions: Floats, height: float)
         height: of the floor [m].
     """
     distance = floor_distance(camera, directions, height)
-    upward = np.clip(directions[..., 1:2] * 3.0 + 0.05, 0, 1)
-    colours = HAZE + (BACKDROP - HAZE) * upward**2 * (3 - 2 * upward)
     run = np.where(np.isfinite(distance), distance, 0)
     x, z = (np.float32(camera.position[k]) + run * directions[..., k] for k in (0, 2))
     away = np.hypot(x - np.float32(camera.target[0]), z - np.float32(camera.target[2]))
     reach = np.float32(np.linalg.norm(camera.target - camera.position))
-    haze = np.where(np.isfinite(distance), np.clip((away / reach - NEAR * 0.25) / (FAR - NEAR), 0, 1), 1)
+    haze = np.where(np.isfinite(distance), np.clip((away / reach - NEAR) / (FAR - NEAR), 0, 1), 1)
+    haze = haze * (1.5 - 0.5 * haze)
     lines = 1 - (1 - LINE) * np.maximum(_line_cover(x), _line_cover(z))
     shade = lines * _sky_shade(lit, x, z, height) * _key_shade(lit, rig, x, z, height)
-    floor = FLOOR * shade[..., None]
-    return floor + (colours - floor) * haze[..., None] ** 0.75
+    upward = np.clip(directions[..., 1] * 3.0 + 0.05, 0, 1)
+    sky = upward * upward * (3 - 2 * upward)
+    return np.stack([shade * (1 - haze), haze * (1 - sky), haze * sky], axis=-1) @ np.stack([FLOOR, HAZE, BACKDROP])
 
 
 def floor_distance(camera: Camera, directions: Floats, height: float) -> Floats:

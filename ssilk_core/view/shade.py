@@ -10,6 +10,7 @@ from .light import KEY, OFFSET, RIM, Lit, Rig
 from .trace import Hits
 
 SHEEN = 0.16  # light that fibres of cloth catch at grazing angles
+FILL = 0.10  # light from the camera, so that nothing is quite black
 GLOSS = 0.10  # highlight of skin
 
 
@@ -26,7 +27,7 @@ def shade(lit: Lit, hits: Hits, view: Floats, rig: Rig, lamps: Ints) -> Floats:
     geometry, corners = lit.geometry, lit.geometry.faces[hits.faces]
     normals = _mixed(geometry.normals, corners, hits)
     normals /= np.sqrt(_dot(normals, normals))[:, None]
-    smooth = _smooth_points(lit, corners, hits, normals)
+    smooth = _smooth_points(lit, corners, hits)
     seen_inside = _faces_away(lit, corners, view)
     thin = geometry.thin[corners[:, 0]]
     normals = np.where((seen_inside & thin)[:, None], -normals, normals)
@@ -34,8 +35,10 @@ def shade(lit: Lit, hits: Hits, view: Floats, rig: Rig, lamps: Ints) -> Floats:
     light = _of_side(lit.sky_outside, lit.sky_inside, seen_inside & thin, corners, hits)
     light += _key_light(lit, smooth, normals, rig, lamps)[:, None] * KEY
     light += np.maximum(_dot(normals, rig.rim), 0)[:, None] * RIM
-    grazing = (1 - np.abs(_dot(normals, view))) ** 3
-    return albedo * light + np.where(thin, SHEEN * grazing, GLOSS * grazing)[:, None] * light
+    facing = np.abs(_dot(normals, view))
+    light += FILL * facing[:, None]
+    grazing = (1 - facing) ** 3
+    return (albedo + np.where(thin, SHEEN * grazing, GLOSS * grazing)[:, None]) * light
 
 
 def _dot(a: Floats, b: Floats) -> Floats:
@@ -44,8 +47,7 @@ def _dot(a: Floats, b: Floats) -> Floats:
 
 def _mixed(values: Floats, corners: Ints, hits: Hits) -> Floats:
     """Interpolate vertex values (V, 3) over the faces that were hit, shape (N, 3)."""
-    weights = hits.barycentric
-    return sum(values[corners[:, k]] * weights[:, k, None] for k in range(3))
+    return np.einsum("nk,nkc->nc", hits.barycentric, values[corners])
 
 
 def _of_side(outside: Floats, inside: Floats, seen_inside: np.ndarray, corners: Ints, hits: Hits) -> Floats:
@@ -56,23 +58,20 @@ def _of_side(outside: Floats, inside: Floats, seen_inside: np.ndarray, corners: 
 
 
 def _faces_away(lit: Lit, corners: Ints, view: Floats) -> np.ndarray:
-    a, b, c = (lit.geometry.points[corners[:, k]] for k in range(3))
+    a, b, c = np.moveaxis(lit.geometry.points[corners], 1, 0)
     return _dot(np.cross(b - a, c - a), view) > 0
 
 
-def _smooth_points(lit: Lit, corners: Ints, hits: Hits, normals: Floats) -> Floats:
+def _smooth_points(lit: Lit, corners: Ints, hits: Hits) -> Floats:
     """Lift hits from flat faces to the round surface that their normals suggest, shape (N, 3).
 
     Without it shadow rays from coarse faces meet their own neighbours and the edge of the shade shows the triangles
     (Hanika, "Hacking the Shadow Terminator", Ray Tracing Gems II, 2021).
     """
     points = _mixed(lit.geometry.points, corners, hits)
-    lifted = np.zeros_like(points)
-    for k in range(3):
-        normal = lit.geometry.normals[corners[:, k]]
-        depth = np.minimum(_dot(points - lit.geometry.points[corners[:, k]], normal), 0)
-        lifted += hits.barycentric[:, k, None] * (points - depth[:, None] * normal)
-    return lifted
+    corner_normals = lit.geometry.normals[corners]
+    depth = np.minimum(_dot(points[:, None] - lit.geometry.points[corners], corner_normals), 0)
+    return points - np.einsum("nk,nkc->nc", hits.barycentric * depth, corner_normals)
 
 
 def _key_light(lit: Lit, points: Floats, normals: Floats, rig: Rig, lamps: Ints) -> Floats:

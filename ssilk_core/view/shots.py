@@ -22,8 +22,6 @@ from .player import Player
 from .render import Image, render
 from .surface import Surface
 
-FOOTFALL = 0.1  # share of a shot's frames whose lowest point may lie below the floor
-
 
 @dataclass(frozen=True)
 class Look:
@@ -32,7 +30,7 @@ class Look:
     Attributes:
         width, height: of one panel [pixels].
         azimuth: where the camera stands, turned from +z towards +x [degrees].
-        ground: height of the floor [m]; None puts it under the feet.
+        ground: height of the floor [m]; None puts it where the skin is lowest in the median frame.
         samples: rays for each pixel on an edge, 1 or 4.
         workers: threads that draw; the pictures do not depend on it.
     """
@@ -157,7 +155,7 @@ def _survey(players: Sequence[Player], look: Look) -> tuple[list[Camera], float]
             yield np.concatenate([surface.points for surface in surfaces])
 
     cameras = follow_cameras(frames(), players[0].fps, look.width / look.height, azimuth=look.azimuth)
-    return cameras, float(np.quantile(lows, FOOTFALL)) if look.ground is None else look.ground
+    return cameras, float(np.median(lows)) if look.ground is None else look.ground
 
 
 def shot_surfaces(player: Player, frame: int) -> tuple[Surface, ...]:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from ..assets import Floats, Ints
 from ..errors import need
 
-INSIDE_SHADE = 0.62  # the inside of cloth is this much darker than its outside
+INSIDE_SHADE = 0.75  # brightness of the inside of cloth, against its outside
 
 
 @dataclass(frozen=True, eq=False)

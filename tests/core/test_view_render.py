@@ -13,7 +13,7 @@ from ssilk_core.errors import SsilkError
 from ssilk_core.view.camera import Camera
 from ssilk_core.view.light import LAMP_RADIUS, Rig, sky_directions
 from ssilk_core.view.render import render
-from ssilk_core.view.surface import Surface
+from ssilk_core.view.surface import INSIDE_SHADE, Surface
 
 RED, GREEN, BLUE, GREY = np.eye(3)[0], np.eye(3)[1], np.eye(3)[2], np.full(3, 0.6)
 WIDTH, HEIGHT = 240, 200
@@ -105,8 +105,8 @@ def test_cloth_is_darker_inside():
     middle = HEIGHT // 2, WIDTH // 2, 2
     outside = render([sheet(BLUE)], AHEAD, WIDTH, HEIGHT, ground=FAR_BELOW)[middle]
     inside = render([sheet(BLUE)], behind, WIDTH, HEIGHT, ground=FAR_BELOW)[middle]
-    # The lamps go with the camera, so that only the darker inside tells the sides apart: 0.62 in linear light.
-    assert inside / outside == pytest.approx(0.62 ** (1 / 2.2), abs=0.04)
+    # The lamps go with the camera, so that only the darker inside tells the sides apart.
+    assert inside / outside == pytest.approx(INSIDE_SHADE ** (1 / 2.2), abs=0.04)
 
 
 def test_smooth_normals_hide_the_facets():
