@@ -325,6 +325,7 @@ def triangle_normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 POLYGONS = {
     "convex quad": [[0, 0], [2, 0], [2, 1], [0, 1]],
     "arrow": [[0, 0], [2, -1], [0.5, 0], [2, 1]],
+    "narrow arrow": [[0, 0], [3, -0.3], [2.5, 0], [3, 0.3]],
     "arrow, started elsewhere": [[2, -1], [0.5, 0], [2, 1], [0, 0]],
     "L": [[0, 0], [2, 0], [2, 1], [1, 1], [1, 2], [0, 2]],
     "comb": [[0, 0], [5, 0], [5, 3], [4, 1], [3, 3], [2, 1], [1, 3], [0, 1]],
@@ -509,6 +510,12 @@ def test_a_single_sample_is_a_motion_of_one_frame():
     assert (motion.frame_count, motion.start) == (1, 7)
 
 
+def test_frames_last_as_long_as_the_xforms_above_move():
+    stage = author(Usd.Stage.CreateInMemory(), Recipe(placements=[turned("y", 9 * i) for i in range(FRAMES + 4)]))
+    motion = read_motion(stage, SKELETON)
+    assert (motion.start, motion.frame_count) == (1, FRAMES + 4)
+
+
 def test_joints_are_matched_by_leaf_name_and_lacking_ones_rest():
     motion = read_motion(clip(("Armature/Hips", "Armature/Hips/Chest/Spine", "Leg"), {0: 0, 1: 60}), SKELETON)
     world = kinematics.rigid(kinematics.matrix_from_quaternion(motion.rotations), motion.translations)
@@ -643,6 +650,7 @@ BAD_MOTIONS = {
     "count": (broken(set_on(WALK, "joints", JOINTS[:4])), "rotations for 5 joints; 4 are needed"),
     "no rotations": (broken(lambda s: s.GetPrimAtPath(WALK).RemoveProperty("rotations")), "has no rotations"),
     "units": (broken(lambda s: UsdGeom.SetStageMetersPerUnit(s, 0.01)), "0.01 times as long"),
+    "stray sample": (clip(JOINTS, {0: 0, 1e9: 0}), "time code 0 to 1e\\+09"),
     "growing": (
         author(Usd.Stage.CreateInMemory(), Recipe(placements=[turned("y", 0, 1 + i) for i in range(FRAMES)])),
         "animate scale",
@@ -704,6 +712,30 @@ def test_files_that_are_no_stages_give_one_sentence(damage, tmp_path, capfd):
         read_character(path)
     assert "\n" not in str(caught.value)
     assert capfd.readouterr().err == ""
+
+
+def test_values_that_cannot_be_unpacked_give_one_sentence(tmp_path):
+    path = tmp_path / "hero.usdc"
+    author(Usd.Stage.CreateNew(str(path))).Save()
+    data = path.read_bytes()
+    sentences = 0
+    for start in range(88, len(data) - 64, len(data) // 40):
+        path.write_bytes(data[:start] + bytes(range(1, 65)) + data[start + 64 :])
+        try:
+            read_motion(path, read_character(path).skeleton)
+        except SsilkError as error:
+            sentences += "\n" not in str(error)
+    assert sentences > 20
+
+
+def test_what_is_assumed_is_said():
+    stage, said = author(Usd.Stage.CreateInMemory()), []
+    plain_mesh(stage)
+    stage.ClearMetadata("metersPerUnit")
+    UsdSkel.BindingAPI(stage.GetPrimAtPath(BODY)).CreateSkinningMethodAttr("dualQuaternion")
+    read_scene(stage, garment="Cape", report=said.append)
+    assert "dualQuaternion skinning is played as linear" in said[0].text
+    assert "metersPerUnit is not authored" in said[1].text
 
 
 @pytest.mark.parametrize("arc", ["references", "payload", "subLayers"])

@@ -5,21 +5,39 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from pxr import Usd, UsdGeom
+from pxr import Usd, UsdGeom, UsdSkel
 
 from ssilk_core.assets import Body, Character, Floats
 from ssilk_core.errors import need
+from ssilk_core.events import Message, Reporter, silent
 
 from .read_mesh import is_drawn, is_garment, read_mesh
 from .read_skeleton import SkelSource, bound_skeleton, character_skeleton, find_skeleton
 from .read_skin import SKEL, read_skin
-from .read_stage import PRIMS, StageLike, column_matrix, inherited, listed, location, named, open_stage
+from .read_stage import (
+    PRIMS,
+    StageLike,
+    column_matrix,
+    inherited,
+    listed,
+    location,
+    named,
+    needs_whole_files,
+    open_stage,
+)
 
 GEOM_BIND = "primvars:skel:geomBindTransform"
+SKINNING_METHOD = "primvars:skel:skinningMethod"
 
 
+@needs_whole_files
 def read_character(
-    source: StageLike, *, root: str | None = None, bodies: Sequence[str] = (), garment: str | None = None
+    source: StageLike,
+    *,
+    root: str | None = None,
+    bodies: Sequence[str] = (),
+    garment: str | None = None,
+    report: Reporter = silent,
 ) -> Character:
     """Read a character; all drawn meshes bound to its skeleton that are no garments are its bodies.
 
@@ -32,6 +50,7 @@ def read_character(
         root: SkelRoot or Skeleton, by path or name, where there are several.
         bodies: meshes to take, by path or name; all when empty.
         garment: a mesh that is a garment though nothing marks it as one, by path or name.
+        report: hears of bodies whose skinning differs from the core's.
 
     Raises:
         SsilkError: no or several characters, an unknown mesh, or malformed data.
@@ -42,7 +61,7 @@ def read_character(
     return Character(
         location(skel.root),
         skeleton,
-        tuple(_read_body(prim, skel, order) for prim in _body_prims(skel, bodies, garment)),
+        tuple(_read_body(prim, skel, order, report) for prim in _body_prims(skel, bodies, garment)),
     )
 
 
@@ -74,7 +93,12 @@ def _body_prims(skel: SkelSource, bodies: Sequence[str], garment: str | None) ->
     return [prim for name in bodies for prim in named(meshes, name)]
 
 
-def _read_body(prim: Usd.Prim, skel: SkelSource, order: tuple[str, ...]) -> Body:
+def _read_body(prim: Usd.Prim, skel: SkelSource, order: tuple[str, ...], report: Reporter) -> Body:
+    method = inherited(prim, SKINNING_METHOD)
+    if method is not None and method.Get() != UsdSkel.Tokens.classicLinear:
+        report(
+            Message(f"{location(prim)}: its {method.Get()} skinning is played as linear blend skinning", "warning")
+        )
     mesh = read_mesh(prim, geom_to_core(prim, skel))
     skin = read_skin(prim, skel.joints, order)
     assert skin is not None  # is_skinned

@@ -20,6 +20,7 @@ from .read_stage import (
     listed,
     location,
     named,
+    needs_whole_files,
     open_stage,
     stage_name,
     world_matrix,
@@ -27,6 +28,7 @@ from .read_stage import (
 from .units import StageUnits
 
 
+@needs_whole_files
 def read_garment(
     source: StageLike, skeleton: Skeleton, *, garment: str | None = None, root: str | None = None
 ) -> Garment:

@@ -23,12 +23,14 @@ from .read_stage import (
     listed,
     location,
     named,
+    needs_whole_files,
     open_stage,
     world_matrix,
 )
 from .units import StageUnits
 
 _SCALE_TOLERANCE = 1e-3
+_MOST_FRAMES = 1_000_000
 
 
 def read_motions(paths: Iterable[str | Path], skeleton: Skeleton) -> list[Motion]:
@@ -50,6 +52,7 @@ def motion_files(paths: Iterable[str | Path]) -> list[Path]:
     return files
 
 
+@needs_whole_files
 def read_motion(source: StageLike, skeleton: Skeleton, *, prim: str | None = None, root: str | None = None) -> Motion:
     """Read a motion at its own rate: framesPerSecond where authored, else timeCodesPerSecond.
 
@@ -139,8 +142,15 @@ def _time_codes(stage: Usd.Stage, animation: Usd.Prim, placed: Usd.Prim | None) 
     if not samples:
         return np.zeros(1), fps
     step = second / fps
-    count = int(np.floor((max(samples) - min(samples)) / step + 1e-6)) + 1
-    return min(samples) + step * np.arange(count), fps
+    first, last = min(samples), max(samples)
+    need(
+        last - first < step * _MOST_FRAMES,
+        location(animation),
+        f"samples run from time code {first:g} to {last:g}",
+        f"a motion has at most {_MOST_FRAMES} frames",
+        "remove stray samples",
+    )
+    return first + step * np.arange(int((last - first) / step + 1e-6) + 1), fps
 
 
 def _samples(animation: Usd.Prim, codes: Floats, count: int, where: str) -> tuple[Floats, Floats]:

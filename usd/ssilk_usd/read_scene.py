@@ -6,15 +6,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from pxr import Usd, UsdGeom
+
 from ssilk_core.assets import Character, Garment, ProxyRig
-from ssilk_core.events import Reporter, silent
+from ssilk_core.events import Message, Reporter, silent
 
 from .read_character import read_character
 from .read_garment import read_garment
-from .read_stage import USD_SUFFIXES, StageLike, open_stage, split_location
+from .read_stage import USD_SUFFIXES, StageLike, needs_whole_files, open_stage, split_location, stage_name
 from .rig_io import read_proxy_rig
 
 
+@needs_whole_files
 def read_scene(
     source: StageLike,
     *,
@@ -38,11 +41,21 @@ def read_scene(
     stage = open_stage(source)
     file, prim = split_location(garment) if garment else (None, None)
     if file and Path(file).suffix in USD_SUFFIXES:
-        character = read_character(stage, root=root, bodies=bodies)
+        character = read_character(stage, root=root, bodies=bodies, report=report)
         wardrobe, where = open_stage(file), {"garment": prim}
     else:
-        character = read_character(stage, root=root, bodies=bodies, garment=garment)
+        character = read_character(stage, root=root, bodies=bodies, garment=garment, report=report)
         wardrobe, where = stage, {"garment": garment, "root": root}
+    for opened in dict.fromkeys((stage, wardrobe)):
+        _announce_units(opened, report)
     skeleton = character.skeleton
     rig = read_proxy_rig(wardrobe, skeleton, **where, report=report)
     return character, read_garment(wardrobe, skeleton, **where), rig
+
+
+def _announce_units(stage: Usd.Stage, report: Reporter) -> None:
+    if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
+        text = (
+            f"{stage_name(stage)}: metersPerUnit is not authored; its lengths are taken as centimetres, as USD does"
+        )
+        report(Message(text, "warning"))

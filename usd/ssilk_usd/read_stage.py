@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar, cast
 
 import numpy as np
 from pxr import Pcp, Tf, Usd, UsdGeom, UsdUtils
@@ -12,6 +14,7 @@ from pxr import Pcp, Tf, Usd, UsdGeom, UsdUtils
 from ssilk_core.assets import Floats
 from ssilk_core.errors import fail, need
 
+Reader = TypeVar("Reader", bound=Callable[..., Any])
 StageLike: TypeAlias = str | Path | Usd.Stage
 LAYER_SUFFIXES = (".usdc", ".usd", ".usda")
 USD_SUFFIXES = (*LAYER_SUFFIXES, ".usdz")
@@ -21,6 +24,22 @@ PRIMS = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
 _MISSING = (Pcp.ErrorInvalidAssetPath, Pcp.ErrorInvalidSublayerPath, Pcp.ErrorUnresolvedPrimPath)
 
 
+def needs_whole_files(read: Reader) -> Reader:
+    """Make a reader, whose first argument is its source, say in one sentence that USD finds a file damaged."""
+
+    @wraps(read)
+    def reader(source: StageLike, *args: Any, **options: Any) -> Any:
+        try:
+            return read(source, *args, **options)
+        except Tf.ErrorException as error:
+            where = stage_name(source) if isinstance(source, Usd.Stage) else str(source)
+            reason = " ".join(error.args[0].commentary.split()) if error.args else "unknown reason"
+            fail(where, f"it cannot be read as USD ({reason})", "a whole .usd, .usda, .usdc or .usdz file is needed")
+
+    return cast(Reader, reader)
+
+
+@needs_whole_files
 def open_stage(source: StageLike) -> Usd.Stage:
     """Open a stage with all its payloads, as the file is on disk now; a stage is returned as it is.
 
@@ -30,17 +49,10 @@ def open_stage(source: StageLike) -> Usd.Stage:
     if isinstance(source, Usd.Stage):
         return source
     need(Path(source).is_file(), str(source), "there is no such file", "a USD file is needed", "check the path")
-    quiet = UsdUtils.CoalescingDiagnosticDelegate()  # what USD would print, the error below says
-    try:
-        stage = Usd.Stage.Open(str(source), Usd.Stage.LoadAll)
-        stage.Reload()
-    except Tf.ErrorException as error:
-        reason = " ".join(error.args[0].commentary.split()) if error.args else "unknown reason"
-        fail(
-            str(source), f"it cannot be read as USD ({reason})", "a whole .usd, .usda, .usdc or .usdz file is needed"
-        )
-    finally:
-        del quiet
+    quiet = UsdUtils.CoalescingDiagnosticDelegate()  # what USD would print, the errors below say
+    stage = Usd.Stage.Open(str(source), Usd.Stage.LoadAll)
+    stage.Reload()
+    del quiet
     missing = [
         " ".join(str(error).split()).rstrip(".")
         for error in stage.GetCompositionErrors()

@@ -31,6 +31,7 @@ from .read_stage import (
     apply,
     inherited,
     location,
+    needs_whole_files,
     open_stage,
     split_location,
     value,
@@ -38,6 +39,7 @@ from .read_stage import (
 from .units import StageUnits
 
 
+@needs_whole_files
 def read_proxy_rig(
     source: StageLike,
     skeleton: Skeleton,
@@ -222,7 +224,7 @@ def _place_garment(
 
 def _copy_garment(stage: Usd.Stage, skel: SkelSource, garment: Garment) -> UsdGeom.Mesh:
     """Define the garment beneath the SkelRoot in the stage's bind space, in place of an older copy."""
-    name = prim_names([garment.mesh.path], fallback="Garment")[0]
+    name = prim_names([garment.mesh.path])[0]
     older = stage.GetPrimAtPath(skel.root.GetPath().AppendChild(name))
     if older and is_garment(older):
         stage.RemovePrim(older.GetPath())
@@ -232,7 +234,7 @@ def _copy_garment(stage: Usd.Stage, skel: SkelSource, garment: Garment) -> UsdGe
 
 def _free_path(skel: SkelSource, name: str) -> Sdf.Path:
     taken = [str(child.GetPath()) for child in skel.root.GetAllChildren()]
-    return skel.root.GetPath().AppendChild(prim_names([*taken, name], fallback="Garment")[-1])
+    return skel.root.GetPath().AppendChild(prim_names([*taken, name])[-1])
 
 
 def _move(stage: Usd.Stage, prim: Usd.Prim, to: Sdf.Path) -> Usd.Prim:
