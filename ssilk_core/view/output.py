@@ -14,9 +14,8 @@ from typing import IO
 
 import numpy as np
 
-from ..errors import SsilkError, fail, need
+from ..errors import fail, need
 from ..files import replacing
-from .panels import pillow
 from .render import Image
 
 FILM, PICTURE = ".mp4", ".png"
@@ -35,9 +34,10 @@ def check_suffix(path: str | Path, allowed: tuple[str, ...] = (FILM, PICTURE)) -
 def write_image(path: str | Path, image: Image) -> None:
     """Write a picture (H, W, 3) as PNG; raise `SsilkError` for another suffix or an unwritable file."""
     check_suffix(path, (PICTURE,))
-    pil = pillow()
+    from PIL import Image as Pictures
+
     with replacing(path) as temporary:
-        pil.Image.fromarray(image).save(temporary, optimize=True)
+        Pictures.fromarray(image).save(temporary, optimize=True)
 
 
 def write_film(path: str | Path, images: Iterable[Image], fps: float) -> int:
@@ -104,12 +104,8 @@ def _last_line(words: IO[bytes]) -> str:
 
 
 def _program() -> list[str]:
-    try:
-        import imageio_ffmpeg
-    except ImportError as error:
-        raise SsilkError(
-            "films: the package 'imageio-ffmpeg' is missing; it brings ffmpeg; run: pip install 'ssilk[view]'."
-        ) from error
+    import imageio_ffmpeg
+
     return [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error"]
 
 

@@ -4,11 +4,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
-from ..errors import SsilkError
 from .render import Image
 
 GAP = 4  # between panels [pixels]
@@ -16,29 +14,18 @@ PAPER = 255
 INK = (38, 42, 48)
 
 
-def pillow() -> Any:
-    """Return the package PIL with its modules loaded; raise `SsilkError` when it is missing."""
-    try:
-        from PIL import Image, ImageDraw, ImageFont  # noqa: F401
-    except ImportError as error:
-        raise SsilkError(
-            "pictures: the package 'pillow' is missing; text and PNG files need it; run: pip install 'ssilk[view]'."
-        ) from error
-    import PIL
-
-    return PIL
-
-
 def captioned(image: Image, *, top: str = "", bottom: str = "") -> Image:
     """Return the image with words in its upper and lower left corner."""
     if not (top or bottom):
         return image
-    pil = pillow()
-    picture = pil.Image.fromarray(image)
+    from PIL import Image as Pictures
+    from PIL import ImageDraw, ImageFont
+
+    picture = Pictures.fromarray(image)
     height = image.shape[0]
-    font = pil.ImageFont.load_default(size=max(11, height // 24))
+    font = ImageFont.load_default(size=max(11, height // 24))
     edge = max(6, height // 40)
-    draw = pil.ImageDraw.Draw(picture)
+    draw = ImageDraw.Draw(picture)
     draw.text((edge, edge), top, fill=INK, font=font, anchor="la")
     draw.text((edge, height - edge), bottom, fill=INK, font=font, anchor="ld")
     return np.asarray(picture)

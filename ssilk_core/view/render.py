@@ -35,7 +35,7 @@ def render(
         ground: height of the floor [m].
 
     Raises:
-        SsilkError: there is nothing to draw, `samples` is neither 1 nor 4, or the package `embreex` is missing.
+        SsilkError: there is nothing to draw, or `samples` is neither 1 nor 4.
     """
     need(samples in (1, 4), "rendering", f"{samples} samples", "1 and 4 are allowed")
     geometry = Geometry.of(surfaces)

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..assets import Floats, Ints
-from ..errors import SsilkError
 from .surface import Geometry
 
 
@@ -30,13 +29,9 @@ class Tracer:
     """The triangles of a geometry, ready for rays; runs outside Python's lock, so that threads share the work."""
 
     def __init__(self, geometry: Geometry) -> None:
-        try:
-            from embreex.mesh_construction import TriangleMesh
-            from embreex.rtcore_scene import EmbreeScene
-        except ImportError as error:
-            raise SsilkError(
-                "rendering: the package 'embreex' is missing; pictures need it; run: pip install 'ssilk[view]'."
-            ) from error
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
         self.scene = EmbreeScene()
         self.mesh = TriangleMesh(self.scene, geometry.points, geometry.faces)
 
