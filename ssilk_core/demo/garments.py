@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from ..assets import Character, Floats, Garment, Ints, Mesh
-from ..errors import need
-from .garments_mesh import Fit, fit, loft, relax
+from ssilk_core.assets import Character, Floats, Garment, Ints, Mesh
+from ssilk_core.demo.garments_mesh import Fit, fit, loft, outline, relax
+from ssilk_core.errors import need
 
-CLEARANCE = 0.010  # [m]; more than the 6 mm that must remain, because triangles cut corners
+CLEARANCE = 0.012  # [m]; more than the 6 mm that must remain, because triangles cut corners
 
 
 def build_garment(name: str, character: Character) -> Garment:
@@ -59,7 +60,7 @@ def cape_keys(fit: Fit) -> Floats:
     )
 
 
-def arc(degrees: float, half_width: float, middle: Floats, end: Floats) -> Floats:
+def arc(degrees: float, half_width: float, middle: ArrayLike, end: ArrayLike) -> Floats:
     """Return 61 points of a line round the back, right to left, turning by `degrees` to each side.
 
     Height and depth go from those of `middle` to those of `end`; the widest point lies at `half_width`.
@@ -80,5 +81,44 @@ def through(keys: Floats, count: int) -> tuple[Floats, Floats]:
     return PchipInterpolator(at, keys)(depth), depth
 
 
-CUTS = {"cape": cape}
+def fringe_skirt(fit: Fit) -> tuple[Floats, Ints]:
+    """Cut a skirt: a waistband on the hips, and 32 strips that hang from it to the knees, free of each other."""
+    strips, band = 32, 8
+    grid = skirt_surface(fit, strips * 3 + 1, band)[:, :-1]
+    rows, columns = grid.shape[:2]
+    row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns), indexing="ij")
+    kept = (row < band) | (column % 3 < 2)
+    row, column = row[kept], column[kept]
+    after = (column + 1) % columns
+    above, below = row * columns, (row + 1) * columns
+    corners = [above + column, above + after, below + after, below + column]
+    return grid.reshape(-1, 3), halve(np.stack(corners, axis=1), (row + column) % 2 == 0)
+
+
+def halve(quads: Ints, forward: Ints) -> Ints:
+    """Return two triangles for each quad (N, 4), cut along its first diagonal where `forward`."""
+    a, b, c, d = quads.T
+    first = np.where(forward, np.stack([a, b, c]), np.stack([a, b, d])).T
+    second = np.where(forward, np.stack([a, c, d]), np.stack([b, c, d])).T
+    return np.concatenate([first, second])
+
+
+def skirt_surface(fit: Fit, columns: int, band: int) -> Floats:
+    """Return a closed grid from the waist to the knees whose first `band` rows cling to the hips."""
+    hips, shoulder, knee = fit.joint("Hips"), fit.joint("LeftArm"), fit.joint("LeftLeg")
+    s = shoulder[0] / 0.162
+    top, hem, edge = hips[1] + 0.125 * s, knee[1] - 0.01 * s, 0.0125 * s
+    heights = np.arange(top, hem, -edge)
+    rows = [outline(fit, height, CLEARANCE, half_width=0.27 * s, count=columns) for height in heights]
+    grid = np.stack(rows)
+    centre = grid[:, :-1].mean(axis=1, keepdims=True)
+    spoke = grid[band:] - centre[band:]
+    reach = np.linalg.norm(spoke[..., [0, 2]], axis=-1, keepdims=True)
+    wide = np.maximum.accumulate(reach, axis=0) + 0.16 * (heights[band] - heights[band:])[:, None, None]
+    grid[band:] = centre[band:] + spoke * [1, 0, 1] * wide / reach
+    cling = np.where(np.arange(len(grid)) < band, 0.5, 0.0)[:, None]
+    return relax(fit, grid, CLEARANCE, cling=cling, rounds=25, closed=True)
+
+
+CUTS = {"cape": cape, "fringe_skirt": fringe_skirt}
 GARMENTS = tuple(CUTS)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..assets import Character, Floats, Ints
+from ssilk_core.assets import Character, Floats, Ints
 
 # Where joints stand in a standing adult, as (left, up) fractions of the height: used when a rig names them otherwise.
 PROPORTIONS = {
@@ -60,23 +60,41 @@ def fit(character: Character) -> Fit:
     return Fit(np.asarray(body.mesh.points), np.asarray(body.mesh.faces), joints)
 
 
-def relax(fit: Fit, grid: Floats, clearance: float, *, cling: Floats, rounds: int) -> Floats:
+def relax(fit: Fit, grid: Floats, clearance: float, *, cling: Floats, rounds: int, closed: bool = False) -> Floats:
     """Smooth a grid of points, shape (rows, columns, 3), while it stays off the body.
 
-    `cling` in [0, 1], shape (rows, 1) or (rows, columns), is how much each point is drawn to lie at
-    `clearance` [m] from the body. Border columns and the last row slide only along themselves.
+    `cling` in [0, 1], shape (rows, 1), is how much each row is drawn to lie at `clearance` [m] from the body. The
+    first and the last row slide only along themselves, and so do the side columns unless the rows are `closed`.
     """
+    if closed:
+        grid = grid[:, :-1]
     for _ in range(rounds):
-        padded = np.concatenate([2 * grid[:1] - grid[1:2], grid, 2 * grid[-1:] - grid[-2:-1]])
-        padded = np.concatenate(
-            [2 * padded[:, :1] - padded[:, 1:2], padded, 2 * padded[:, -1:] - padded[:, -2:-1]], axis=1
-        )
-        around = (padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:]) / 4
-        grid = grid + 0.5 * (around - grid)
+        tall = np.concatenate([2 * grid[:1] - grid[1:2], grid, 2 * grid[-1:] - grid[-2:-1]])
+        left = tall[:, -1:] if closed else 2 * tall[:, :1] - tall[:, 1:2]
+        right = tall[:, :1] if closed else 2 * tall[:, -1:] - tall[:, -2:-1]
+        wide = np.concatenate([left, tall, right], axis=1)
+        grid = grid + 0.5 * ((wide[:-2, 1:-1] + wide[2:, 1:-1] + wide[1:-1, :-2] + wide[1:-1, 2:]) / 4 - grid)
         distance, away = fit.nearest(grid.reshape(-1, 3))
         gap = (clearance - distance).reshape(grid.shape[:2])
         grid = grid + (np.where(gap > 0, 1.0, cling) * gap)[..., None] * away.reshape(grid.shape)
-    return grid
+    return np.concatenate([grid, grid[:, :1]], axis=1) if closed else grid
+
+
+def outline(fit: Fit, height: float, clearance: float, *, half_width: float, count: int = 97) -> Floats:
+    """Return a closed convex line round the body at a height [m], from the back by its left side, shape (count, 3).
+
+    Only what lies within `half_width` [m] of the middle is seen, so that hanging arms are left out.
+    """
+    near = np.abs(fit.points[:, 1] - height) < 0.035
+    flat = fit.points[near & (np.abs(fit.points[:, 0]) < half_width)][:, [0, 2]]
+    centre = (flat.min(axis=0) + flat.max(axis=0)) / 2
+    angle = np.linspace(0, 2 * np.pi, count)
+    ray = np.stack([np.sin(angle), -np.cos(angle)], axis=1)
+    support = ((flat - centre) @ ray.T).max(axis=0) + clearance
+    facing = ray @ ray.T
+    radius = np.where(facing > 0.05, support[:, None] / np.maximum(facing, 0.05), np.inf).min(axis=0)
+    line = centre + radius[:, None] * ray
+    return np.stack([line[:, 0], np.full(count, height), line[:, 1]], axis=1)
 
 
 def along(line: Floats, count: int) -> Floats:
@@ -124,9 +142,9 @@ def stitch(above: Floats, below: Floats, start: int, stop: int, *, closed: bool)
         right = np.linalg.norm(above[(i + 1) % n] - below[j % m]) if i < last_n else np.inf
         left = np.linalg.norm(above[i % n] - below[(j + 1) % m]) if j < last_m else np.inf
         if right <= left:
-            faces.append((start + i % n, stop + j % m, start + (i + 1) % n))
+            faces.append((start + i % n, start + (i + 1) % n, stop + j % m))
             i += 1
         else:
-            faces.append((start + i % n, stop + j % m, stop + (j + 1) % m))
+            faces.append((start + i % n, stop + (j + 1) % m, stop + j % m))
             j += 1
     return np.array(faces)
