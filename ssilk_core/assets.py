@@ -282,18 +282,22 @@ class Character:
 
     def __post_init__(self) -> None:
         _set(self, bodies=tuple(self.bodies))
-        need(
-            self.bodies,
-            self.path,
-            "the character has no skinned body mesh",
-            "at least one is needed",
-            "bind a mesh to the skeleton, or name it with --body",
-        )
         for body in self.bodies:
             body.skin.check_joints(self.skeleton.joint_count)
 
     def merged_body(self) -> Body:
-        """Return all body meshes as one, with point and face indices in their order."""
+        """Return all body meshes as one, with point and face indices in their order.
+
+        Raises:
+            SsilkError: the character has no body mesh.
+        """
+        need(
+            self.bodies,
+            self.path,
+            "the character has no skinned body mesh",
+            "a garment collides with at least one",
+            "bind a mesh to the skeleton, or name it with --body",
+        )
         if len(self.bodies) == 1:
             return self.bodies[0]
         offsets = np.cumsum([0] + [body.mesh.vertex_count for body in self.bodies])

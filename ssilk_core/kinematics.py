@@ -126,6 +126,16 @@ def resample(motion: Motion, fps: float) -> Motion:
     return Motion(motion.path, fps, rotations, translations)
 
 
+CUT_SPEED = 25.0  # [m/s]; a root faster than this has been moved, not animated
+
+
+def split_at_cuts(motion: Motion) -> list[Motion]:
+    """Return the spans of a motion between jumps of its root (a teleport, an edit), in order; mostly just one."""
+    step = np.linalg.norm(np.diff(motion.translations[:, 0], axis=0), axis=1) * motion.fps
+    ends = [*(np.flatnonzero(step > CUT_SPEED) + 1), motion.frame_count]
+    return [motion.clip(start, stop) for start, stop in zip([0, *ends[:-1]], ends)]
+
+
 def sample_motion(motion: Motion, position: Floats) -> tuple[Floats, Floats]:
     """Return rotations (N, J, 4) and translations (N, J, 3) at fractional frames `position`, shape (N,)."""
     low = np.minimum(position.astype(int), motion.frame_count - 1)

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line: one module per verb, loaded cheaply; the only place that joins the core and USD."""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import sys
+from collections.abc import Sequence
+
+from ssilk_core import __version__
+from ssilk_core.errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK, SsilkError
+from ssilk_core.events import Failed, JsonReporter, Reporter, TextReporter
+
+from . import bake, demo, inspect, rig, train, verify, view
+
+VERBS = (inspect, rig, train, bake, verify, view, demo)
+
+# Distribution extra that brings each optional library.
+EXTRAS = {
+    "torch": "train", "pxr": "usd", "igl": "setup", "scipy": "setup", "trimesh": "setup", "embreex": "view",
+    "imageio_ffmpeg": "view", "PIL": "view",
+}  # fmt: skip
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of all verbs."""
+    top = argparse.ArgumentParser(prog="ssilk", description="Neural loose garments, trained by physics alone, baked as UsdSkel.")
+    top.add_argument("--version", action="version", version=f"ssilk {__version__}")
+    verbs = top.add_subparsers(dest="verb", metavar="VERB", required=True)
+    for module in VERBS:
+        verb = verbs.add_parser(
+            module.__name__.rpartition(".")[2],
+            help=(module.__doc__ or "").splitlines()[0],
+            description=module.__doc__,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        verb.add_argument("--json", action="store_true", help="events as JSON, one object per line, on standard output")
+        verb.set_defaults(run=module.run)
+        module.add_arguments(verb)
+    return top
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; return its exit code (0 well, 2 bad input, 3 not verified, 130 interrupted)."""
+    options = parser().parse_args(arguments)
+    report: Reporter = JsonReporter() if options.json else TextReporter()
+    try:
+        return int(options.run(options, report))
+    except SsilkError as error:
+        report(Failed(str(error)))
+        return error.exit_code
+    except KeyboardInterrupt:
+        report(Failed("interrupted; nothing half written was left behind."))
+        return EXIT_INTERRUPTED
+    except ModuleNotFoundError as error:
+        extra = EXTRAS.get((error.name or "").partition(".")[0])
+        if extra is None:
+            raise
+        report(Failed(f"'{options.verb}' needs {error.name}, which is not installed; pip install 'ssilk[{extra}]'."))
+        return EXIT_BAD_INPUT
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EACCES, errno.EROFS, errno.ENOENT, errno.EISDIR, errno.ENOTDIR):
+            raise
+        report(Failed(f"{error.filename or 'output'}: {error.strerror}; free some space or choose another path."))
+        return EXIT_BAD_INPUT
+
+
+if __name__ == "__main__":
+    sys.exit(main() or EXIT_OK)

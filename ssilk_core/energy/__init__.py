@@ -1,0 +1,9 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Physics energies of a garment (paper, Section 3.5), each unreduced over frames.
+
+Positions have the shape (V, 3, N): vertices, coordinates, frames. Every term returns [J] per frame, shape (N,).
+"""
+
+from .garment import TERMS, GarmentEnergy
+
+__all__ = ["TERMS", "GarmentEnergy"]

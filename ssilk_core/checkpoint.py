@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Model files: safetensors that hold everything needed to run, with provenance in the header.
+
+Nothing is ever unpickled. Tensors are named "scene.*" (the garment, its rig and the skeleton) and "model.*"
+(parameters); the header holds one JSON document under "ssilk".
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from . import __version__
+from .assets import Character, Garment, Mesh, ProxyRig, Scene, Skeleton, SkinWeights
+from .config import ModelConfig
+from .errors import SsilkError, need
+from .fabrics import Fabric
+from .files import replacing
+
+if TYPE_CHECKING:
+    from .model.network import GarmentModel
+
+FORMAT = 1
+HEADER_LIMIT = 64 << 20  # bytes; a header this large is damage or mischief, not a model
+
+
+@dataclass(frozen=True, eq=False)
+class ModelFile:
+    """A model as it lies on disk.
+
+    Attributes:
+        scene: garment, rig and skeleton (no body meshes).
+        config: sizes of the network.
+        fabric: material it was trained with.
+        joints: character joints in the descriptors.
+        parameters: the network's tensors by name.
+        provenance: how it came to be (seed, schedule, versions, hashes of the inputs, validation).
+    """
+
+    scene: Scene
+    config: ModelConfig
+    fabric: Fabric
+    joints: np.ndarray
+    parameters: dict[str, np.ndarray]
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+
+def save_model(path: str | Path, model: ModelFile) -> None:
+    """Write a model file whole or not at all."""
+    from safetensors.numpy import save_file
+
+    scene, skeleton, mesh, rig = (
+        model.scene,
+        model.scene.character.skeleton,
+        model.scene.garment.mesh,
+        model.scene.rig,
+    )
+    tensors = {
+        "scene.skeleton.parents": skeleton.parents,
+        "scene.skeleton.bind_transforms": skeleton.bind_transforms,
+        "scene.skeleton.rest_transforms": skeleton.rest_transforms,
+        "scene.mesh.points": mesh.points,
+        "scene.mesh.faces": mesh.faces,
+        "scene.mesh.polygon_counts": mesh.polygon_counts,
+        "scene.mesh.polygon_indices": mesh.polygon_indices,
+        "scene.classes": scene.classes,
+        "scene.plain.indices": scene.plain_skin.indices,
+        "scene.plain.weights": scene.plain_skin.weights,
+        "scene.rig.parents": rig.parents,
+        "scene.rig.bind_transforms": rig.bind_transforms,
+        "scene.rig.indices": rig.skin.indices,
+        "scene.rig.weights": rig.skin.weights,
+        "joints": model.joints,
+        **({} if mesh.uvs is None else {"scene.mesh.uvs": mesh.uvs}),
+        **{f"model.{name}": value for name, value in model.parameters.items()},
+    }
+    document = {
+        "format": FORMAT,
+        "ssilk": __version__,
+        "joint_names": skeleton.joint_names,
+        "proxy_names": rig.joint_names,
+        "paths": {"skeleton": skeleton.path, "garment": mesh.path, "rig": rig.path},
+        "config": asdict(model.config),
+        "fabric": asdict(model.fabric),
+        "provenance": model.provenance,
+    }
+    with replacing(path) as temporary:
+        save_file(
+            {k: np.ascontiguousarray(v) for k, v in tensors.items()}, temporary, {"ssilk": json.dumps(document)}
+        )
+
+
+def load_model(path: str | Path) -> ModelFile:
+    """Read a model file.
+
+    Raises:
+        SsilkError: there is no such file, it is truncated, foreign, or of another format version.
+    """
+    tensors, document = _read(Path(path))
+    try:
+        return _model_of(tensors, document)
+    except (KeyError, TypeError, ValueError) as error:
+        raise SsilkError(
+            f"{path}: the model file is incomplete or inconsistent ({type(error).__name__}: {error}); "
+            "train again or fetch the file again."
+        ) from error
+
+
+def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    from safetensors import SafetensorError, safe_open
+
+    need(path.is_file(), str(path), "there is no such model file", "a file written by 'ssilk train' is needed")
+    with path.open("rb") as stream:
+        size = int.from_bytes(stream.read(8).ljust(8, b"\0"), "little")
+    need(
+        0 < size <= HEADER_LIMIT,
+        str(path),
+        "this is no safetensors file",
+        "a file written by 'ssilk train' is needed",
+    )
+    try:
+        with safe_open(path, "numpy") as stream:
+            header = (stream.metadata() or {}).get("ssilk", "")
+            tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
+    except SafetensorError as error:
+        raise SsilkError(
+            f"{path}: the model file is truncated or damaged ({error}); train again or fetch the file again."
+        ) from error
+    need(header, str(path), "a safetensors file without SSILK's header", "a file written by 'ssilk train' is needed")
+    try:
+        document = json.loads(header)
+    except ValueError as error:
+        raise SsilkError(f"{path}: the model's header is damaged ({error}); train again.") from error
+    found = document.get("format") if isinstance(document, dict) else None
+    need(found == FORMAT, str(path), f"model format {found}", f"this version reads format {FORMAT}", "train it again")
+    return tensors, document
+
+
+def _model_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> ModelFile:
+    paths = document["paths"]
+
+    def skin(name: str, path: str) -> SkinWeights:
+        return SkinWeights(path, tensors[f"scene.{name}.indices"], tensors[f"scene.{name}.weights"])
+
+    skeleton = Skeleton(
+        paths["skeleton"],
+        tuple(document["joint_names"]),
+        tensors["scene.skeleton.parents"],
+        tensors["scene.skeleton.bind_transforms"],
+        tensors["scene.skeleton.rest_transforms"],
+    )
+    mesh = Mesh(
+        paths["garment"],
+        tensors["scene.mesh.points"],
+        tensors["scene.mesh.faces"],
+        tensors["scene.mesh.polygon_counts"],
+        tensors["scene.mesh.polygon_indices"],
+        tensors.get("scene.mesh.uvs"),
+    )
+    rig = ProxyRig(
+        paths["rig"],
+        tuple(document["proxy_names"]),
+        tensors["scene.rig.parents"],
+        tensors["scene.rig.bind_transforms"],
+        skin("rig", paths["rig"]),
+    )
+    garment = Garment(mesh, skin("plain", paths["garment"]), tensors["scene.classes"])
+    parameters = {name[6:]: value for name, value in tensors.items() if name.startswith("model.")}
+    for name, value in parameters.items():
+        need(np.isfinite(value).all(), paths["garment"], f"parameter '{name}' holds NaN or infinity", "all are finite",
+             "train again")  # fmt: skip
+    return ModelFile(
+        Scene(Character(paths["skeleton"], skeleton, ()), garment, rig),
+        ModelConfig(**document["config"]),
+        Fabric(**document["fabric"]),
+        tensors["joints"],
+        parameters,
+        document["provenance"],
+    )
+
+
+def model_file(model: GarmentModel, fabric: Fabric, provenance: dict[str, Any]) -> ModelFile:
+    """Return a network as it would be written."""
+    parameters = {name: value.detach().cpu().numpy() for name, value in model.state_dict().items()}
+    return ModelFile(model.scene, model.config, fabric, model.joints, parameters, provenance)
+
+
+def network(file: ModelFile, scene: Scene | None = None) -> GarmentModel:
+    """Return the network of a model file, on its own scene or on one that adds the character's body.
+
+    Raises:
+        SsilkError: the parameters do not fit the sizes in the header.
+    """
+    import torch
+
+    from .model.network import GarmentModel
+
+    model = GarmentModel(scene or file.scene, file.config, file.joints)
+    try:
+        model.load_state_dict({name: torch.from_numpy(value.copy()) for name, value in file.parameters.items()})
+    except RuntimeError as error:
+        problem = str(error).splitlines()[-1].strip()
+        raise SsilkError(
+            f"{file.scene.garment.mesh.path}: the model's parameters do not fit its header ({problem}); train again."
+        ) from error
+    return model.eval()

@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What 'bake' and 'verify' share: a model, a character and a motion, ready to roll."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ssilk_core.assets import Deformer, Floats, GarmentPose, Motion, ProxyRig, Scene
+from ssilk_core.errors import VerificationError, need
+from ssilk_core.events import Message, Progress, Reporter
+
+if TYPE_CHECKING:
+    from ssilk_core.model.network import GarmentModel
+    from ssilk_usd.units import StageUnits
+
+CHUNK = 256  # frames in memory at once
+
+
+@dataclass(frozen=True, kw_only=True)
+class BakeRequest:
+    """What is to be baked, as paths and plain values, so that a shot can carry it and be verified against it."""
+
+    model: str
+    stage: str
+    motion: str
+    fps: float | None = None
+    root: str | None = None
+    plain: bool = False
+    device: str = "cpu"
+
+
+@dataclass(frozen=True, eq=False)
+class Bake:
+    """A garment over a motion at the shot's rate; `model` is None under plain skinning."""
+
+    request: BakeRequest
+    model: GarmentModel | None
+    deformer: Deformer
+    motion: Motion
+    source: Motion
+    units: StageUnits
+    provenance: dict[str, Any]
+
+    def poses(self) -> Iterator[GarmentPose]:
+        """Yield the shot's poses, some frames at a time."""
+        count = self.motion.frame_count
+        if self.model is None:
+            for start in range(0, count, CHUNK):
+                frames = min(CHUNK, count - start)
+                yield GarmentPose(start, np.zeros((frames, 0, 4)), np.zeros((frames, 0)))
+            return
+        from ssilk_core.rollout import garment_poses
+
+        done = 0
+        for pose in garment_poses(self.model, self.source, self.motion.fps, CHUNK):
+            frames = min(pose.frame_count, count - done)
+            yield replace(pose, rotations=pose.rotations[:frames], weights=pose.weights[:frames])
+            done += frames
+
+    def vertices(self, report: Reporter) -> Iterator[Floats]:
+        """Yield the decoder's own garment points (V, 3) [m] of each frame."""
+        for pose in self.poses():
+            yield from self._decoded(pose)
+            report(Progress(pose.start + pose.frame_count, self.motion.frame_count))
+
+    def _decoded(self, pose: GarmentPose) -> Floats:
+        if self.model is None:
+            from ssilk_core.kinematics import deform
+
+            return deform(self.deformer, self.motion, pose)
+        from ssilk_core.rollout import decode
+
+        return decode(self.model, self.motion, pose)
+
+    def verify(self, path: Path, report: Reporter) -> dict[str, object]:
+        """Check a written shot and compare it, re-skinned by UsdSkel, with the decoder; return figures.
+
+        Raises:
+            VerificationError: a check fails, or a vertex is further off than allowed.
+        """
+        from ssilk_usd.check import check_shot, compare_points
+        from ssilk_usd.play import Shot
+
+        findings = check_shot(path)
+        for finding in findings:
+            report(Message(str(finding), "warning"))
+        errors = [finding for finding in findings if finding.severity == "error"]
+        if errors:
+            raise VerificationError(f"{path}: {len(errors)} checks fail, the first: {errors[0]}.")
+        found = compare_points(Shot(path), self.vertices(report))
+        if not found.passed:
+            raise VerificationError(
+                f"{path}: vertex {found.vertex} at time code {found.time:g} is {found.worst:.3g} m from the decoder's; "
+                f"at most {found.bound:.3g} m is allowed."
+            )
+        return {"largest error [m]": f"{found.worst:.3g}", "allowed [m]": f"{found.bound:.3g}"}
+
+
+def open_bake(request: BakeRequest) -> Bake:
+    """Load everything that a request names.
+
+    Raises:
+        SsilkError: a file is missing or does not fit the others.
+    """
+    from ssilk_core.checkpoint import load_model, network
+    from ssilk_core.files import sha256
+    from ssilk_usd.read_character import read_character
+    from ssilk_usd.read_motion import read_motion
+    from ssilk_usd.read_stage import open_stage
+    from ssilk_usd.units import StageUnits
+
+    file = load_model(request.model)
+    stage = open_stage(request.stage)
+    character = read_character(stage, root=request.root, garment=None)
+    skeleton = file.scene.character.skeleton
+    missing = sorted(set(skeleton.joint_names) - set(character.skeleton.joint_names))
+    need(not missing, request.stage, f"the skeleton lacks {len(missing)} of the model's joints ({', '.join(missing[:3])})",
+         "a model bakes on the character it was trained with", "train on this character")  # fmt: skip
+    scene = replace(file.scene, character=replace(character, skeleton=skeleton))
+    source = read_motion(request.motion, skeleton)
+    motion = source if request.fps is None else _at_rate(source, request.fps)
+    model = None if request.plain else network(file, scene).to(request.device)
+    deformer = _plain(scene) if model is None else model.deformer()
+    provenance = {
+        "request": {key: value for key, value in vars(request).items() if value is not None},
+        "model_sha256": sha256(request.model),
+        "motion_sha256": sha256(request.motion),
+        "training": file.provenance.get("ssilk", ""),
+    }
+    return Bake(request, model, deformer, motion, source, StageUnits.of(stage), provenance)
+
+
+def _at_rate(motion: Motion, fps: float) -> Motion:
+    from ssilk_core.kinematics import resample
+
+    need(0 < fps <= 10_000, "--fps", f"{fps:g} frames per second", "a positive rate is needed")
+    return replace(resample(motion, fps), start=motion.start * fps / motion.fps)
+
+
+def _plain(scene: Scene) -> Deformer:
+    """Return the garment under plain skinning: no proxies, no shapes."""
+    none = ProxyRig(scene.rig.path, (), np.zeros(0), np.zeros((0, 4, 4)), scene.plain_skin)
+    bare = replace(scene, rig=none)
+    return Deformer(bare, scene.plain_skin, np.zeros((0, scene.garment.mesh.vertex_count, 3)))

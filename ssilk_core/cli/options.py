@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Options that several verbs share, and how a scene is loaded from them."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ssilk_core.config import overridden
+from ssilk_core.errors import need
+from ssilk_core.events import Reporter
+from ssilk_core.setup.classes import ClassOptions
+from ssilk_core.setup.rig import RigOptions
+
+if TYPE_CHECKING:
+    from ssilk_core.assets import Character, Garment, ProxyRig, Scene
+
+
+def add_scene(verb: argparse.ArgumentParser) -> None:
+    """Add the options that say which character and garment are meant."""
+    verb.add_argument("stage", type=Path, help="USD file with the character (SkelRoot, Skeleton, body meshes)")
+    verb.add_argument("--garment", metavar="FILE[:/PRIM]|PRIM", help="garment: a file of its own, or a mesh of the stage")
+    verb.add_argument("--root", metavar="PRIM", help="SkelRoot of the character, where the stage has several")
+    verb.add_argument(
+        "--body", metavar="PRIM", action="append", default=[], help="body mesh (repeatable; default: all under the SkelRoot)"
+    )
+
+
+def add_setup(verb: argparse.ArgumentParser) -> None:
+    """Add the options of automatic classes and proxies."""
+    group = verb.add_argument_group("automatic classes and rig")
+    group.add_argument("--proxies", type=int, default=RigOptions.proxies, help="proxy joints on the loose part (default %(default)s)")
+    for name, kind in (("classes", ClassOptions), ("rig", RigOptions)):
+        names = ", ".join(f"{key}={value:g}" for key, value in vars(kind()).items())
+        group.add_argument(
+            f"--{name}", action="append", default=[], metavar="NAME=VALUE", help=f"change a threshold (repeatable): {names}"
+        )
+
+
+def read(options: argparse.Namespace, report: Reporter) -> tuple[Character, Garment, ProxyRig | None]:
+    """Read the character, the garment and its authored rig, as the options of `add_scene` say."""
+    from ssilk_usd.read_scene import read_scene
+
+    need(options.stage.exists(), str(options.stage), "there is no such file", "a USD stage with a character is needed")
+    return read_scene(options.stage, root=options.root, bodies=options.body, garment=options.garment, report=report)
+
+
+def load_scene(options: argparse.Namespace, report: Reporter, *, anew: bool = False) -> Scene:
+    """Read and prepare a scene; what is missing (weights, classes, rig) is made and announced."""
+    from ssilk_core.setup.prepare import prepare_scene
+
+    character, garment, rig = read(options, report)
+    if anew:
+        garment, rig = replace(garment, classes=None), None
+    return prepare_scene(
+        character,
+        garment,
+        rig,
+        class_options=overridden(ClassOptions(), options.classes),
+        rig_options=overridden(RigOptions(proxies=options.proxies), options.rig),
+        report=report,
+    )

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Train a garment on motions and write a model.
+
+The stage may be plain (character and garment); weights, classes and a proxy rig are then made as 'ssilk rig'
+does. Interrupt with Ctrl-C: the best model and the state are kept, and --resume goes on from there.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from ssilk_core.config import PRESETS, ModelConfig, TrainConfig, overridden, preset_named
+from ssilk_core.errors import EXIT_INTERRUPTED, EXIT_OK, need
+from ssilk_core.events import Message, Reporter, Result
+from ssilk_core.fabrics import FABRICS, fabric_named
+
+from . import options as shared
+
+
+def add_arguments(verb: argparse.ArgumentParser) -> None:
+    """Add the options of this verb."""
+    shared.add_scene(verb)
+    shared.add_setup(verb)
+    verb.add_argument("--motions", type=Path, nargs="+", required=True, metavar="PATH", help="motion files or folders to train on")
+    verb.add_argument("--valid", type=Path, nargs="+", default=[], metavar="PATH", help="motions to validate on (default: every fifth of --motions)")
+    verb.add_argument("-o", "--output", type=Path, required=True, metavar="MODEL", help="model to write (.safetensors)")
+    verb.add_argument("--preset", choices=PRESETS, default="preview", help="schedule and size of the network (default preview)")
+    verb.add_argument("--fabric", choices=FABRICS, default="default", help="material (default: that of the paper)")
+    verb.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1, ... (default auto)")
+    verb.add_argument("--resume", action="store_true", help="go on from the state beside the model")
+    verb.add_argument("--seed", type=int, default=0, help="of everything random (default 0)")
+    verb.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="settings", help="change one setting of the preset (repeatable)")
+
+
+def run(options: argparse.Namespace, report: Reporter) -> int:
+    """Train; return 0 when finished, 130 when interrupted."""
+    from ssilk_core.training.run import interruptible, train
+
+    need(options.output.suffix == ".safetensors", str(options.output), "not a name for a model", "it ends in .safetensors")
+    job = _job(options, report)
+    with interruptible() as stop:
+        trained = train(job, report, stop)
+    share = 1 - trained.score.total / trained.plain.total
+    report(Result("train", {
+        "model": str(options.output), "iterations": trained.iterations, "total [J]": round(trained.score.total, 5),
+        "plain skinning [J]": round(trained.plain.total, 5), "lower by": f"{share:.1%}",
+        "collisions": f"{trained.score.collisions:.2%}", **{f"{k} [J]": round(v, 5) for k, v in trained.score.terms.items()},
+    }))  # fmt: skip
+    if not trained.finished:
+        report(Message(f"stopped at iteration {trained.iterations}; --resume goes on from there."))
+        return EXIT_INTERRUPTED
+    return EXIT_OK
+
+
+def _job(options: argparse.Namespace, report: Reporter):  # type: ignore[no-untyped-def]  # TrainJob is heavy to import
+    from ssilk_core.files import sha256
+    from ssilk_core.training.run import TrainJob, split_motions
+    from ssilk_usd.read_motion import motion_files, read_motions
+
+    preset = preset_named(options.preset)
+    scene = shared.load_scene(options, report)
+    motions = read_motions(options.motions, scene.character.skeleton)
+    held = read_motions(options.valid, scene.character.skeleton)
+    if not held:
+        motions, held = split_motions(motions)
+        report(Message(f"validating on {len(held)} of {len(motions) + len(held)} motions, training on the rest"))
+    model, train = _settings(options.settings, preset.model, preset.train, options.seed)
+    files = [options.stage, *motion_files([*options.motions, *options.valid])]
+    return TrainJob(
+        scene=scene, motions=motions, held_out=held, model=model, train=train, fabric=fabric_named(options.fabric),
+        output=options.output, device=options.device, resume=options.resume,
+        inputs={str(path): sha256(path) for path in files},
+    )  # fmt: skip
+
+
+def _settings(settings: list[str], model: ModelConfig, train: TrainConfig, seed: int) -> tuple[ModelConfig, TrainConfig]:
+    """Apply "name=value" settings to whichever of the two has the name."""
+    own = [setting for setting in settings if setting.partition("=")[0] in ModelConfig.__dataclass_fields__]
+    others = [setting for setting in settings if setting not in own]
+    return overridden(model, own), overridden(train, [f"seed={seed}", *others])

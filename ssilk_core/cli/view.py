@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Film a shot (.mp4) or lay out its moments as a contact sheet (.png); several shots stand side by side.
+
+Works without a display and without a GPU.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from ssilk_core.errors import EXIT_OK, need
+from ssilk_core.events import Reporter, Result
+
+
+def add_arguments(verb: argparse.ArgumentParser) -> None:
+    """Add the options of this verb."""
+    verb.add_argument("shots", type=Path, nargs="+", metavar="SHOT", help="shots of one length and rate")
+    verb.add_argument("-o", "--output", type=Path, required=True, help="film (.mp4) or contact sheet (.png)")
+    verb.add_argument("--label", action="append", default=[], help="a word for each shot (repeatable)")
+    verb.add_argument("--fps", type=float, default=30.0, help="at most so many frames per second of film (default 30)")
+    verb.add_argument("--columns", type=int, default=6, help="moments in a row of the sheet (default 6)")
+    verb.add_argument("--rows", type=int, default=1, help="rows of the sheet (default 1)")
+    verb.add_argument("--azimuth", type=float, default=None, help="side from which the camera looks [degrees]")
+    verb.add_argument("--size", metavar="WxH", help="pixels of one panel")
+    verb.add_argument("--workers", type=int, default=2, help="threads that draw (default 2)")
+
+
+def run(options: argparse.Namespace, report: Reporter) -> int:
+    """Draw."""
+    from ssilk_core.view.output import FILM, check_suffix
+    from ssilk_core.view.shots import film_of_shots, sheet_of_shots
+    from ssilk_usd.play import Shot
+
+    film = check_suffix(options.output) == FILM
+    players = [Shot(path) for path in options.shots]
+    labels = options.label or ([path.stem for path in options.shots] if len(players) > 1 else [])
+    look = _look(options, film)
+    if film:
+        count = film_of_shots(options.output, players, labels=labels, fps=options.fps, look=look, report=report)
+    else:
+        count = sheet_of_shots(
+            options.output, players, labels=labels, columns=options.columns, rows=options.rows, look=look, report=report
+        )
+    report(Result("view", {"picture": str(options.output), "frames": count}))
+    return EXIT_OK
+
+
+def _look(options: argparse.Namespace, film: bool):  # type: ignore[no-untyped-def]  # Look is heavy to import
+    from ssilk_core.view.shots import Look
+
+    width, height = (480, 640) if film else (320, 440)
+    if options.size:
+        parts = options.size.lower().split("x")
+        need(len(parts) == 2 and all(part.isdigit() and int(part) >= 16 for part in parts), f"--size {options.size}",
+             "not a size", "WIDTHxHEIGHT in pixels is needed, 16 at least")  # fmt: skip
+        width, height = int(parts[0]), int(parts[1])
+    azimuth = Look.azimuth if options.azimuth is None else options.azimuth
+    return Look(width=width, height=height, azimuth=azimuth, workers=options.workers)

@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What can be chosen about a model and its training, with the presets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any, TypeVar
+
+from .errors import need
+
+SCHEMES = ("spring_verlet", "verlet", "direct", "direct_residual")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelConfig:
+    """Shape of the network.
+
+    Attributes:
+        latent: dimensions of the latent state z.
+        widths: hidden layers of the initialiser P, the stepper S and the decoder D.
+        shapes: blendshapes K; zero leaves proxies alone to deform the garment.
+        scheme: how z is integrated: "verlet" (Eq. 3), "direct" (Eq. 11), "direct_residual" (Eq. 12), or
+            "spring_verlet", Eq. 3 with a spring to the quasi-static state.
+        bound: soft bound on each latent dimension; zero leaves the latents free, as the paper does.
+        smoothing: strength of the Laplacian preconditioner of the blendshapes; zero trains each vertex by itself.
+        fps: rate at which the model steps [1/s].
+    """
+
+    latent: int = 128
+    widths: tuple[int, ...] = (256, 512, 512)
+    shapes: int = 64
+    scheme: str = "spring_verlet"
+    bound: float = 4.0
+    smoothing: float = 0.0
+    fps: float = 30.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "widths", tuple(self.widths))
+        need(
+            self.scheme in SCHEMES,
+            "model",
+            f"integration scheme '{self.scheme}'",
+            f"it is one of {', '.join(SCHEMES)}",
+        )
+        need(
+            self.latent > 0 and self.shapes >= 0 and self.bound >= 0 and self.fps > 0 and min(self.widths) > 0,
+            "model",
+            "a negative or zero size",
+            "latent size, widths and rate are positive, shapes and bound not negative",
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """How a model is trained (paper, Section 3.7; defaults that differ are explained in docs/training.md).
+
+    Attributes:
+        iterations: optimiser steps, warm start included.
+        warm: share of the iterations that train P and D alone on single poses (quasi-static warm start).
+        warm_batch: poses for each step of the warm start.
+        batch, window: windows for each step, and poses in each window.
+        carry: share of windows that continue from the state where the last window of their slot ended.
+        rotated: share of windows that get a random rotation, uniform on SO(3); the others stay upright.
+        noise: standard deviation added to the first two latents of a window.
+        warm_rate: Adam's step size in the warm start, decaying to a tenth.
+        rate, final_rate: Adam's step size in training proper, after its warm-up and at the end (cosine in between).
+        skin_rate: factor on the step size of skinning weights, alpha and beta.
+        clip: bound on the global gradient norm.
+        validate_every: iterations between validations; valid_frames: frames of each clip used for them.
+        seed: of everything random.
+    """
+
+    iterations: int = 250_000
+    warm: float = 0.1
+    warm_batch: int = 1024
+    batch: int = 32
+    window: int = 32
+    carry: float = 0.7
+    rotated: float = 1.0
+    noise: float = 0.1
+    warm_rate: float = 1e-3
+    rate: float = 5e-4
+    final_rate: float = 2e-5
+    rate_warmup: int = 500
+    skin_rate: float = 0.1
+    clip: float = 1.0
+    validate_every: int = 1000
+    valid_frames: int = 300
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        need(self.window >= 3, "training", f"a window of {self.window} poses", "inertia needs at least 3")
+        need(
+            self.iterations >= 1 and self.batch >= 1 and self.warm_batch >= 1 and self.validate_every >= 1,
+            "training",
+            "fewer than one iteration or window",
+            "counts are positive",
+        )
+        need(
+            0 <= self.warm < 1 and 0 <= self.carry <= 1,
+            "training",
+            "a share outside 0 to 1",
+            "warm and carry are shares",
+        )
+
+    @property
+    def warm_iterations(self) -> int:
+        return int(self.iterations * self.warm)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Preset:
+    """A model and a schedule under one name, with the proxies that the automatic rig gets."""
+
+    name: str
+    model: ModelConfig
+    train: TrainConfig
+    proxies: int = 20
+
+
+PRESETS = {
+    preset.name: preset
+    for preset in (
+        Preset(
+            name="draft",
+            model=ModelConfig(latent=32, widths=(128, 128), shapes=24),
+            train=TrainConfig(
+                iterations=700, warm=0.55, warm_batch=48, warm_rate=2e-3, batch=4, window=16, rotated=0.3, rate=6e-4,
+                final_rate=1e-4, rate_warmup=20, validate_every=100, valid_frames=90,
+            ),
+        ),
+        Preset(
+            name="preview",
+            model=ModelConfig(),
+            train=TrainConfig(iterations=12_000, warm=0.3, warm_batch=1024, batch=32, window=32, validate_every=1500),
+        ),
+        Preset(name="final", model=ModelConfig(), train=TrainConfig()),
+    )
+}  # fmt: skip
+
+
+def preset_named(name: str) -> Preset:
+    """Return a preset; raise `SsilkError` for an unknown name."""
+    need(name in PRESETS, f"preset '{name}'", "no such preset", f"it is one of {', '.join(PRESETS)}")
+    return PRESETS[name]
+
+
+def _converted(kind: type, text: str) -> Any:
+    if kind is bool:
+        return {"true": True, "false": False}[text.lower()]
+    return kind(text)
+
+
+Config = TypeVar("Config")
+
+
+def overridden(config: Config, assignments: list[str]) -> Config:
+    """Return `config` with "name=value" assignments applied, each converted to the field's own type.
+
+    Raises:
+        SsilkError: a name that is no field, or a value that does not convert.
+    """
+    types = {item.name: type(getattr(config, item.name)) for item in fields(config)}  # type: ignore[arg-type]
+    changes: dict[str, Any] = {}
+    for assignment in assignments:
+        name, _, text = assignment.partition("=")
+        need(name in types, f"option '{assignment}'", "no such setting", f"settings are {', '.join(types)}")
+        try:
+            changes[name] = tuple(int(n) for n in text.split(",")) if types[name] is tuple else _converted(types[name], text)
+        except (ValueError, KeyError):
+            need(
+                False,
+                f"option '{assignment}'",
+                f"'{text}' is not a value for '{name}'",
+                f"a value of type {types[name].__name__} is needed",
+            )
+    return replace(config, **changes)  # type: ignore[type-var]

@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bending energy of interior edges from the signed dihedral angle."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def cross(a: Tensor, b: Tensor) -> Tensor:
+    """Cross product over dimension 1; on (H, 3, N) several times faster than the library's on the CPU."""
+    (ax, ay, az), (bx, by, bz) = a.unbind(1), b.unbind(1)
+    return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], dim=1)
+
+
+def dihedral_angles(edge: Tensor, left: Tensor, right: Tensor) -> Tensor:
+    """Signed dihedral angle of each hinge [rad], zero when flat, in (-pi, pi].
+
+    Positive when the two faces fold away from their normals' side (a ridge seen from outside).
+
+    Args:
+        edge: shared edge x1 - x0, shape (H, 3, N).
+        left: opposite vertex of the face where the edge runs x0 to x1, minus x0, same shape.
+        right: opposite vertex of the other face, minus x0, same shape.
+
+    Returns:
+        Shape (H, N).
+    """
+    normal_left, normal_right = cross(edge, left), cross(right, edge)
+    # With lengths left in, atan2(|e| n_r . left', n_l . n_r) needs no normalisation but that of the edge.
+    length = (edge * edge).sum(1).clamp_min(1e-18).sqrt()
+    sine = -(normal_right * left).sum(1) * length
+    cosine = (normal_left * normal_right).sum(1)
+    # Where a face collapses both vanish and atan2 has no gradient: such a hinge counts as flat.
+    collapsed = sine.abs() + cosine.abs() < 1e-24
+    return torch.atan2(sine, torch.where(collapsed, 1.0, cosine))
+
+
+def bending_energy(angle: Tensor, rest_angle: Tensor, stiffness: Tensor) -> Tensor:
+    """Energy of each hinge [J], stiffness * (angle - rest)^2, shape (H, N).
+
+    `stiffness` is k_b l^2 / (8 (A_1 + A_2)) of the rest shape, shape (H, 1), as `rest_angle`.
+    """
+    return stiffness * (angle - rest_angle) ** 2

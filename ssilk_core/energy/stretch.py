@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Membrane energies of triangles: St. Venant-Kirchhoff and Baraff-Witkin."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..assets import Floats, Mesh
+from ..errors import need
+from ..fabrics import Fabric
+from .operators import SparseOperator
+
+
+def rest_frames(mesh: Mesh) -> tuple[Floats, Floats]:
+    """Return the inverse rest shape matrices (F, 2, 2) [1/m] and true areas (F,) [m2] of the triangles.
+
+    The in-plane frame has its first axis along the first edge; any orthonormal frame gives the same isotropic
+    energy, and this one exists for every triangle that has an area.
+
+    Raises:
+        SsilkError: a triangle has no area.
+    """
+    a, b, c = (mesh.points[mesh.faces[:, corner]] for corner in range(3))
+    first, second = b - a, c - a
+    normal = np.cross(first, second)
+    doubled = np.linalg.norm(normal, axis=1)
+    longest = np.maximum(np.linalg.norm(first, axis=1), np.linalg.norm(second, axis=1))
+    flat = int(np.count_nonzero(doubled <= 1e-9 * np.maximum(longest, 1e-30) ** 2 + 1e-30))
+    need(
+        flat == 0,
+        mesh.path,
+        f"{flat} of {len(mesh.faces)} triangles have no area",
+        "each triangle needs one",
+        "merge or dissolve the degenerate faces",
+    )
+    u = first / np.linalg.norm(first, axis=1, keepdims=True)
+    v = np.cross(normal / doubled[:, None], u)
+    shape = np.stack(
+        [
+            np.stack([np.sum(first * u, 1), np.sum(second * u, 1)], -1),
+            np.stack([np.sum(first * v, 1), np.sum(second * v, 1)], -1),
+        ],
+        axis=1,
+    )
+    return np.linalg.inv(shape), doubled / 2
+
+
+def deformation_gradient_operator(mesh: Mesh, device: torch.device, dtype: torch.dtype) -> SparseOperator:
+    """Return the operator from positions to both columns of F (3x2): rows w_u of all triangles, then w_v."""
+    inverse, _ = rest_frames(mesh)
+    count = len(mesh.faces)
+    # F = [b - a, c - a] @ inverse, so the weights of (a, b, c) in column k are (-sum, inverse[0, k], inverse[1, k]).
+    rows, columns, values = [], [], []
+    for k in range(2):
+        weights = np.stack([-inverse[:, 0, k] - inverse[:, 1, k], inverse[:, 0, k], inverse[:, 1, k]], axis=1)
+        rows.append(np.repeat(np.arange(count) + k * count, 3))
+        columns.append(mesh.faces.reshape(-1))
+        values.append(weights.reshape(-1))
+    return SparseOperator(
+        np.concatenate(rows),
+        np.concatenate(columns),
+        np.concatenate(values),
+        (2 * count, mesh.vertex_count),
+        device,
+        dtype,
+    )
+
+
+def stvk_density(gradient: Tensor, mu: float, lame_lambda: float) -> Tensor:
+    """Energy per rest area [J/m2], mu |G|^2 + lambda/2 tr(G)^2 with G = (F^T F - I)/2.
+
+    Args:
+        gradient: columns w_u, then w_v, shape (2 F, 3, N).
+        mu, lame_lambda: Lame parameters [N/m].
+
+    Returns:
+        Shape (F, N).
+    """
+    w_u, w_v = gradient.chunk(2)
+    g_uu = 0.5 * ((w_u * w_u).sum(1) - 1)
+    g_vv = 0.5 * ((w_v * w_v).sum(1) - 1)
+    g_uv = 0.5 * (w_u * w_v).sum(1)
+    return mu * (g_uu**2 + g_vv**2 + 2 * g_uv**2) + 0.5 * lame_lambda * (g_uu + g_vv) ** 2
+
+
+def baraff_witkin_density(gradient: Tensor, stretch: float, shear: float) -> Tensor:
+    """Energy per rest area [J/m2], k_s ((|w_u|-1)^2 + (|w_v|-1)^2) + k_sh (w_u . w_v)^2; arguments as above."""
+    w_u, w_v = gradient.chunk(2)
+    # The length has no gradient at zero; a floor far under any real stretch keeps it finite there.
+    length_u = (w_u * w_u).sum(1).clamp_min(1e-12).sqrt()
+    length_v = (w_v * w_v).sum(1).clamp_min(1e-12).sqrt()
+    return stretch * ((length_u - 1) ** 2 + (length_v - 1) ** 2) + shear * (w_u * w_v).sum(1) ** 2
+
+
+def stretch_density(gradient: Tensor, fabric: Fabric) -> Tensor:
+    """Energy per rest area [J/m2] of the fabric's own stretch model, shape (F, N)."""
+    if fabric.stretch_model == "stvk":
+        return stvk_density(gradient, fabric.lame_mu, fabric.lame_lambda)
+    return baraff_witkin_density(gradient, fabric.stretch, fabric.shear)

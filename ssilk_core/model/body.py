@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The part of the body that a garment collides with, posed by skinning matrices."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..assets import Body, Ints
+from ..energy.collision import PosedBody
+from ..mesh import topology
+
+
+class CollisionBody:
+    """Body vertices and normals under skinning matrices, for the vertices listed (all by default)."""
+
+    def __init__(self, body: Body, joint_count: int, *, vertices: Ints | None = None, device: torch.device) -> None:
+        chosen = np.arange(body.mesh.vertex_count) if vertices is None else vertices
+        dense = body.skin.dense(joint_count)[chosen]
+        joints = np.flatnonzero(dense.any(axis=0))
+        normals = topology.vertex_normals(body.mesh.points, body.mesh.faces)[chosen]
+
+        def tensor(values: np.ndarray) -> Tensor:
+            return torch.as_tensor(values, dtype=torch.float32, device=device)
+
+        self.joints = torch.as_tensor(joints, device=device)
+        self.weights = tensor(dense[:, joints])
+        self.points = tensor(body.mesh.points[chosen])[:, :, None]
+        self.normals = tensor(normals)[:, :, None]
+
+    @torch.no_grad()
+    def posed(self, character: Tensor) -> PosedBody:
+        """Pose by skinning matrices (J, 3, 4, N); normals turn with the blended matrices."""
+        blended = (self.weights @ character[self.joints].flatten(1)).reshape(-1, 3, 4, character.shape[-1])
+        linear = blended[:, :, :3]
+        points = (linear * self.points[:, None]).sum(2) + blended[:, :, 3]
+        normals = (linear * self.normals[:, None]).sum(2)
+        return PosedBody(points, normals / normals.norm(dim=1, keepdim=True).clamp_min(1e-8))

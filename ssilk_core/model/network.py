@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The whole model: initialiser P, stepper S, decoder D and the deformation they drive (paper, Figure 2)."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ..assets import Deformer, Floats, GarmentPose, Scene, SkinWeights
+from ..config import ModelConfig
+from ..kinematics import matrix_from_quaternion, quaternion_from_matrix
+from .decoder import Decoder
+from .descriptors import joints_in_view
+from .integrators import INTEGRATORS
+
+
+def mlp(inputs: int, widths: tuple[int, ...], outputs: int, generator: torch.Generator, last: float) -> nn.Sequential:
+    """Return a smooth multilayer perceptron; the last layer starts `last` times its usual size."""
+    sizes = [inputs, *widths, outputs]
+    layers: list[nn.Module] = []
+    for index, (fan_in, fan_out) in enumerate(zip(sizes, sizes[1:])):
+        linear = nn.Linear(fan_in, fan_out)
+        final = index == len(sizes) - 2
+        with torch.no_grad():
+            scale = (last if final else 1.0) * (2 / fan_in) ** 0.5
+            linear.weight.copy_(scale * torch.randn(fan_out, fan_in, generator=generator))
+            linear.bias.zero_()
+        layers += [linear] if final else [linear, nn.SiLU()]
+    return nn.Sequential(*layers)
+
+
+class GarmentModel(nn.Module):
+    """A garment on a character, as a latent simulator.
+
+    Args:
+        scene: what is simulated.
+        config: sizes of the network.
+        joints: character joints in the descriptors, as `descriptors.joints_in_view` gives them.
+        seed: of the initial parameters.
+    """
+
+    def __init__(self, scene: Scene, config: ModelConfig, joints: np.ndarray, seed: int = 0) -> None:
+        super().__init__()
+        self.scene, self.config, self.joints = scene, config, np.asarray(joints, dtype=np.int64)
+        generator = torch.Generator().manual_seed(seed)
+        self.decoder = Decoder(scene, config.shapes, config.smoothing, generator)
+        static, dynamic = self._descriptor_sizes()
+        z = config.latent
+        self.initialiser = mlp(static, config.widths, z, generator, 1.0)
+        # Zero: training starts as pure Verlet integration.
+        self.integrator = INTEGRATORS[config.scheme](z, config.bound)
+        self.stepper = mlp(self.integrator.states * z + static + dynamic, config.widths, z, generator, 0.0)
+        # Small: training starts as plain skinning.
+        self.output = mlp(z, config.widths, self.decoder.output_count, generator, 0.01)
+
+    def _descriptor_sizes(self) -> tuple[int, int]:
+        inner = int((self.scene.character.skeleton.parents[self.joints] >= 0).sum())
+        return 6 * inner + 3 * len(self.joints), 12 * inner + 12 + 3 * len(self.joints)
+
+    def initial(self, static: Tensor) -> Tensor:
+        """Return quasi-static latents (N, latent) from static descriptors (Eq. 1)."""
+        return self.integrator.limited(self.initialiser(static))
+
+    def step(self, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor) -> Tensor:
+        """Return z_t from the two latents before it, the quasi-static one of frame t, and its dynamic descriptor."""
+        return self.integrator(self.stepper, before, now, rest, pose)
+
+    def pose(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Return activations (K, N) in [-1, 1] and proxy rotations (P, 3, 3, N) of latents (N, latent) (Eq. 7)."""
+        return self.decoder.activations(self.output(z))
+
+    def vertices(self, z: Tensor, character: Tensor) -> Tensor:
+        """Decode latents (N, latent) over character skinning matrices (J, 3, 4, N) to positions (V, 3, N) [m]."""
+        return self.decoder(*self.pose(z), character)
+
+    @torch.no_grad()
+    def deformer(self) -> Deformer:
+        """Return the trained garment for files: shapes for weights in [0, 1], with W^g and W^p made sparse.
+
+        An activation a in [-1, 1] is the weight w = (a + 1) / 2 of the shape 2 B_k. The last shape, -sum_k B_k at a
+        constant weight of one, puts the middle of the range back to the rest shape.
+        """
+        scene, decoder = self.scene, self.decoder
+        dense = np.zeros((scene.garment.mesh.vertex_count, len(scene.joint_names)))
+        dense[:, decoder.used.cpu().numpy()] = decoder.skin_weights().double().cpu().numpy()
+        skin = SkinWeights.from_dense(scene.rig.path, dense)
+        free = decoder.blendshapes().double().permute(2, 0, 1).cpu().numpy()
+        shapes = np.zeros((decoder.shape_count, scene.garment.mesh.vertex_count, 3))
+        shapes[:, decoder.free.cpu().numpy()] = 2 * free
+        if decoder.shape_count:
+            shapes = np.concatenate([shapes, -shapes.sum(0, keepdims=True) / 2])
+        return Deformer(scene, skin, shapes)
+
+    @torch.no_grad()
+    def file_pose(self, activation: Tensor, rotations: Tensor) -> tuple[Floats, Floats]:
+        """Return what a file stores: local proxy quaternions (N, P, 4) and shape weights (N, K + 1) in [0, 1]."""
+        scene = self.scene
+        bind = scene.bind_transforms[:, :3, :3]
+        joints = scene.character.skeleton.joint_count
+        above = np.swapaxes(bind[scene.rig.parents], -1, -2)
+        turned = rotations.double().permute(3, 0, 1, 2).cpu().numpy()
+        local = quaternion_from_matrix(above @ turned @ bind[joints:])
+        weights = (activation.double().T.cpu().numpy() + 1) / 2
+        if self.decoder.shape_count:
+            weights = np.concatenate([weights, np.ones((len(weights), 1))], axis=1)
+        return local, weights.clip(0, 1)
+
+    def network_pose(self, pose: GarmentPose) -> tuple[Tensor, Tensor]:
+        """Invert `file_pose`: activations (K, N) and rotations (P, 3, 3, N), on the model's device."""
+        scene, parameter = self.scene, self.decoder.shapes
+        bind = scene.bind_transforms[:, :3, :3]
+        joints = scene.character.skeleton.joint_count
+        own = np.swapaxes(bind[joints:], -1, -2)
+        turned = bind[scene.rig.parents] @ matrix_from_quaternion(pose.rotations) @ own
+        activation = 2 * pose.weights[:, : self.decoder.shape_count].astype(np.float64).T - 1
+        return (
+            torch.as_tensor(activation, dtype=torch.float32, device=parameter.device),
+            torch.as_tensor(turned.transpose(1, 2, 3, 0), dtype=torch.float32, device=parameter.device),
+        )
+
+
+def model_joints(scene: Scene, colliding: Floats) -> np.ndarray:
+    """Return the joints a garment must see: those it is skinned to and those of the body faces it can reach.
+
+    Args:
+        scene: character, garment and rig.
+        colliding: flag of each joint that moves a reachable body vertex, shape (J,).
+    """
+    skeleton = scene.character.skeleton
+    used = np.array(colliding, dtype=bool)
+    for skin in (scene.rig.skin, scene.plain_skin):
+        indices = skin.indices[skin.weights > 0]
+        used[indices[indices < skeleton.joint_count]] = True
+    for parent in scene.rig.parents:
+        if parent < skeleton.joint_count:
+            used[parent] = True
+    return joints_in_view(skeleton, used)

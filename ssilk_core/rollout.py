@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Roll a trained garment over a motion of any length, in constant memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .assets import Floats, GarmentPose, Motion
+from .errors import need
+from .kinematics import motion_transforms, resample, slerp, skinning_matrices, split_at_cuts
+from .model.descriptors import gravity_features, pose_features
+from .model.network import GarmentModel
+
+CHUNK = 256  # frames decoded at once
+HISTORY = 2  # frames before a chunk that its descriptors look back on
+DOWN = (0.0, -1.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """Consecutive frames of a rollout at the model's rate; tensors as `GarmentModel.pose` returns them."""
+
+    start: int
+    activation: Tensor
+    rotations: Tensor
+
+
+@torch.no_grad()
+def roll(model: GarmentModel, motion: Motion, chunk: int = CHUNK) -> Iterator[Step]:
+    """Yield the garment's pose over a motion at the model's rate, some frames at a time.
+
+    The state starts from the initialiser, and anew after each cut of the motion (a root that jumps).
+
+    Raises:
+        SsilkError: the motion is not at the model's rate.
+    """
+    fps = model.config.fps
+    need(
+        abs(motion.fps - fps) < 1e-6, motion.path, f"{motion.fps:g} frames per second", f"the model steps at {fps:g}"
+    )
+    offset = 0
+    for span in split_at_cuts(motion):
+        state: list[Tensor] = []
+        for start in range(0, span.frame_count, chunk):
+            stop = min(start + chunk, span.frame_count)
+            states = _advance(model, span, start, stop, state)
+            state = states[-2:]
+            yield Step(offset + start, *model.pose(torch.cat(states[-(stop - start) :])))
+        offset += span.frame_count
+
+
+def _advance(model: GarmentModel, span: Motion, start: int, stop: int, state: list[Tensor]) -> list[Tensor]:
+    """Return the states up to frame `stop`, each (1, latent), after those in `state`."""
+    before = min(start, HISTORY)
+    device = next(model.parameters()).device
+    features = pose_features(span.clip(start - before, stop), model.scene.character.skeleton, model.joints)
+
+    def tensor(values: Floats) -> Tensor:
+        return torch.as_tensor(values[before:], dtype=torch.float32, device=device)
+
+    down = torch.tensor(DOWN, device=device).expand(stop - start, 3)
+    static = torch.cat([tensor(features.static), gravity_features(tensor(features.down), down)], dim=1)
+    dynamic = torch.cat([static, tensor(features.dynamic)], dim=1)
+    rest, pose = model.initial(static).unsqueeze(1), dynamic.unsqueeze(1)
+    states = list(state) or [*rest[:HISTORY]]
+    for t in range(0 if state else len(states), stop - start):
+        states.append(model.step(states[-2], states[-1], rest[t], pose[t]))
+    return states
+
+
+def garment_poses(model: GarmentModel, motion: Motion, fps: float, chunk: int = CHUNK) -> Iterator[GarmentPose]:
+    """Yield what a shot stores, at `fps`, over a motion of any rate.
+
+    The model rolls at its own rate; where the shot's differs, rotations are interpolated by slerp and weights by
+    lines between the two nearest steps.
+    """
+    steps = roll(model, resample(motion, model.config.fps), chunk)
+    poses = (GarmentPose(step.start, *model.file_pose(step.activation, step.rotations)) for step in steps)
+    return poses if abs(fps - model.config.fps) < 1e-6 else resample_poses(poses, model.config.fps, fps)
+
+
+def resample_poses(poses: Iterator[GarmentPose], source: float, target: float) -> Iterator[GarmentPose]:
+    """Yield poses at rate `target` from consecutive poses at rate `source`, keeping one chunk in memory."""
+    done, tail = 0, None
+    for pose in poses:
+        joined = pose if tail is None else _joined(tail, pose)
+        last = joined.start + joined.frame_count - 1
+        count = int(np.floor(last * target / source + 1e-6)) + 1 - done
+        position = np.minimum((done + np.arange(count)) * source / target, last) - joined.start
+        if count:
+            yield _sampled(joined, position, done)
+        done += max(count, 0)
+        tail = GarmentPose(last, joined.rotations[-1:], joined.weights[-1:])
+
+
+def _joined(a: GarmentPose, b: GarmentPose) -> GarmentPose:
+    return GarmentPose(a.start, np.concatenate([a.rotations, b.rotations]), np.concatenate([a.weights, b.weights]))
+
+
+def _sampled(pose: GarmentPose, position: Floats, start: int) -> GarmentPose:
+    low = np.minimum(position.astype(int), pose.frame_count - 1)
+    high = np.minimum(low + 1, pose.frame_count - 1)
+    t = position - low
+    rotations = slerp(pose.rotations[low], pose.rotations[high], t[:, None])
+    weights = pose.weights[low] * (1 - t[:, None]) + pose.weights[high] * t[:, None]
+    return GarmentPose(start, rotations, weights.clip(0, 1))
+
+
+@torch.no_grad()
+def decode(model: GarmentModel, motion: Motion, pose: GarmentPose) -> Floats:
+    """Return the decoder's own vertices [m], shape (F, V, 3), of poses as a shot stores them.
+
+    `motion` is at the shot's rate. The decoder runs in float32 about the frame's root, so that a character far
+    from the origin loses no precision; the root's position is added back in float64.
+    """
+    skeleton = model.scene.character.skeleton
+    world = motion_transforms(motion.clip(pose.start, pose.start + pose.frame_count), skeleton.parents)
+    origin = world[:, :1, :3, 3].copy()
+    world[..., :3, 3] -= origin
+    device = next(model.parameters()).device
+    matrices = skinning_matrices(world, skeleton.bind_transforms)[:, :, :3]
+    character = torch.as_tensor(matrices.transpose(1, 2, 3, 0), dtype=torch.float32, device=device)
+    x = model.decoder(*model.network_pose(pose), character)
+    return x.permute(2, 0, 1).double().cpu().numpy() + origin

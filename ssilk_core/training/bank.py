@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""All motions of a training run as tensors on one device, and windows drawn from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..assets import Floats, Motion, Skeleton
+from ..errors import need
+from ..kinematics import motion_transforms, resample, skinning_matrices, split_at_cuts
+from ..model.descriptors import gravity_features, pose_features
+
+
+@dataclass(frozen=True, eq=False)
+class MotionBank:
+    """Motions at the model's rate, one after the other.
+
+    Attributes:
+        matrices: skinning matrices of every frame, shape (F, J * 12), moved so that each clip's root starts at
+            the origin (single precision is finest there).
+        static, dynamic, down: the descriptors of `model.descriptors.PoseFeatures`.
+        starts, stops: first frame and end of each clip, shape (clips,).
+    """
+
+    matrices: Tensor
+    static: Tensor
+    dynamic: Tensor
+    down: Tensor
+    starts: Tensor
+    stops: Tensor
+
+    @property
+    def frame_count(self) -> int:
+        return len(self.static)
+
+    @property
+    def joint_count(self) -> int:
+        return self.matrices.shape[1] // 12
+
+    def character(self, frames: Tensor) -> Tensor:
+        """Return skinning matrices (J, 3, 4, N) of frame indices (N,)."""
+        return self.matrices[frames].T.reshape(-1, 3, 4, len(frames))
+
+    def static_descriptor(self, frames: Tensor, direction: Tensor) -> Tensor:
+        """Return static descriptors (N, S) of frames (N,) under unit gravity directions (N, 3)."""
+        return torch.cat([self.static[frames], gravity_features(self.down[frames], direction)], dim=1)
+
+    def dynamic_descriptor(self, frames: Tensor, direction: Tensor) -> Tensor:
+        """Return dynamic descriptors (N, D) of frames (N,) under unit gravity directions (N, 3)."""
+        return torch.cat([self.static_descriptor(frames, direction), self.dynamic[frames]], dim=1)
+
+
+def build_bank(
+    motions: Sequence[Motion], skeleton: Skeleton, joints: np.ndarray, fps: float, device: torch.device
+) -> MotionBank:
+    """Resample motions to `fps` and place them on a device.
+
+    Raises:
+        SsilkError: there is no motion.
+    """
+    need(motions, "motions", "none given", "at least one is needed", "name motion files with --motions")
+    spans = [span for motion in motions for span in split_at_cuts(motion)]
+    clips = [resample(span, fps) for span in spans if span.frame_count > span.fps / fps * 3]
+    need(clips, motions[0].path, "every motion is shorter than four frames", "longer ones are needed")
+    features = [pose_features(clip, skeleton, joints) for clip in clips]
+    matrices = [centred_matrices(clip, skeleton)[0] for clip in clips]
+    ends = np.cumsum([clip.frame_count for clip in clips])
+
+    def tensor(arrays: list[Floats]) -> Tensor:
+        return torch.as_tensor(np.concatenate(arrays), dtype=torch.float32, device=device)
+
+    return MotionBank(
+        tensor([m[:, :, :3].reshape(len(m), -1) for m in matrices]),
+        tensor([f.static for f in features]),
+        tensor([f.dynamic for f in features]),
+        tensor([f.down for f in features]),
+        torch.as_tensor(ends - [clip.frame_count for clip in clips], device=device),
+        torch.as_tensor(ends, device=device),
+    )
+
+
+def centred_matrices(motion: Motion, skeleton: Skeleton) -> tuple[Floats, Floats]:
+    """Return skinning matrices (F, J, 4, 4) moved to have the first root at the origin, and that root (3,) [m]."""
+    world = motion_transforms(motion, skeleton.parents)
+    origin = world[0, 0, :3, 3].copy()
+    world[..., :3, 3] -= origin
+    return skinning_matrices(world, skeleton.bind_transforms), origin

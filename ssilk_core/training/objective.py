@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The training objective: physics energies of decoded windows and of single poses (paper, Sections 3.5, 3.6)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ..energy import GarmentEnergy
+from ..model.body import CollisionBody
+from ..model.descriptors import GRAVITY
+from ..model.network import GarmentModel
+from .bank import MotionBank
+from .windows import WindowSampler
+
+Terms = dict[str, Tensor]
+
+
+class Objective:
+    """Computes energies of a model's decoded states; each term is [J] per frame, unreduced."""
+
+    def __init__(self, model: GarmentModel, energy: GarmentEnergy, body: CollisionBody, bank: MotionBank) -> None:
+        self.model, self.energy, self.body, self.bank = model, energy, body, bank
+        self.dt = 1 / model.config.fps
+
+    def potential(self, x: Tensor, direction: Tensor, character: Tensor) -> Terms:
+        """Return every term but inertia of positions x (V, 3, N) under gravity directions (N, 3)."""
+        energy = self.energy
+        root = character[0, :, 3].detach()  # keeps the value of gravity small; constant in the parameters
+        return {
+            "stretch": energy.stretch(x),
+            "bending": energy.bending(x),
+            "gravity": energy.gravity(x - root, GRAVITY * direction.T),
+            "collision": energy.collision(x, self.body.posed(character)),
+        }
+
+    def static(self, frames: Tensor, direction: Tensor) -> Terms:
+        """Return the terms of the initialiser's quasi-static states on single poses (Section 3.1)."""
+        z = self.model.initial(self.bank.static_descriptor(frames, direction))
+        character = self.bank.character(frames)
+        return self.potential(self.model.vertices(z, character), direction, character)
+
+    def window(self, sampler: WindowSampler, noise: Tensor) -> tuple[Terms, Terms, Tensor]:
+        """Roll one window of every slot.
+
+        Args:
+            sampler: where the windows stand.
+            noise: added to the two first latents, shape (2, batch, latent).
+
+        Returns:
+            Terms of the frames from the third on, terms of the initialiser on the first two frames, and the
+            last two latents (2, batch, latent) for the next window.
+        """
+        model, bank, length = self.model, self.bank, sampler.config.window
+        batch = len(sampler.first)
+        frames = (sampler.first + torch.arange(length, device=sampler.first.device)[:, None]).reshape(-1)
+        direction = sampler.direction.repeat(length, 1)
+        static = bank.static_descriptor(frames, direction)
+        pose = torch.cat([static, bank.dynamic[frames]], dim=1).reshape(length, batch, -1)
+        rest = model.initial(static)
+        # Detached: the initialiser learns rest states from their own energy, not what helps the next frames.
+        target = rest.detach().reshape(length, batch, -1)
+        start = torch.where(sampler.carried[None, :, None], sampler.latents, target[:2])
+        z = [*model.integrator.limited(start + noise).unbind(0)]
+        for t in range(2, length):
+            z.append(model.step(z[-2], z[-1], target[t], pose[t]))
+        quiet = rest[: 2 * batch]
+        with torch.no_grad():
+            past = model.vertices(torch.cat(z[:2]), bank.character(frames[: 2 * batch]))
+        # The windows from the third frame on and the initialiser's own states share one decoding.
+        seen, facing = (
+            torch.cat([frames[2 * batch :], frames[: 2 * batch]]),
+            torch.cat([direction[2 * batch :], direction[: 2 * batch]]),
+        )
+        character = bank.character(seen)
+        x = model.vertices(torch.cat([*z[2:], quiet]), character)
+        terms = self.potential(x, facing, character)
+        count = (length - 2) * batch
+        dynamic = {name: value[:count] for name, value in terms.items()}
+        resting = {name: value[count:] for name, value in terms.items()}
+        rolled = torch.cat([past, x[..., :count].detach()], dim=-1)
+        predicted = 2 * rolled[..., batch:-batch] - rolled[..., : -2 * batch]
+        dynamic["inertia"] = self.energy.inertia(x[..., :count], predicted, self.dt)
+        return dynamic, resting, torch.stack(z[-2:]).detach()
+
+
+def total(terms: Terms) -> Tensor:
+    """Return the sum of all terms, averaged over frames [J]."""
+    return sum(value.mean() for value in terms.values())  # type: ignore[return-value]

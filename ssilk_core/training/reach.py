@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which part of the body a garment can ever touch, so that nothing else is posed or searched."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..assets import LOOSE, Floats, Ints, Motion, Scene
+from ..kinematics import motion_transforms, skin_points, skinning_matrices
+from ..mesh import topology
+
+SLACK = 0.08  # [m] play that blendshapes and stretch add to the geometric reach
+POSES = 48  # poses that the reach is measured on
+
+
+@dataclass(frozen=True, eq=False)
+class Reach:
+    """The part of the body that can be touched: its vertices, and flags of the joints that move them."""
+
+    vertices: Ints
+    joints: Floats
+
+
+def reachable_body(scene: Scene, motions: Sequence[Motion]) -> Reach:
+    """Find the body vertices that come within reach of the garment in any of a spread of poses.
+
+    A loose vertex hangs from its anchor, the nearest pinned or tight vertex along the cloth, and stays within
+    the length of cloth between them; pinned and tight vertices stay within `SLACK` of plain skinning.
+    """
+    from scipy.spatial import cKDTree
+
+    body, skeleton, garment = scene.character.merged_body(), scene.character.skeleton, scene.garment.mesh
+    held = np.flatnonzero(scene.classes != LOOSE)
+    anchors, lengths = _tethers(scene)
+    reached = np.zeros(body.mesh.vertex_count, dtype=bool)
+    for frame in _spread_frames(motions):
+        matrices = skinning_matrices(motion_transforms(frame, skeleton.parents), skeleton.bind_transforms)
+        posed = skin_points(body.mesh.points, body.skin, matrices)[0]
+        plain = skin_points(garment.points, scene.plain_skin, matrices)[0]
+        if len(held):
+            reached |= cKDTree(plain[held]).query(posed)[0] < SLACK
+        for anchor, length in zip(anchors, lengths):
+            reached |= np.linalg.norm(posed - plain[anchor], axis=1) < length + SLACK
+    vertices = np.flatnonzero(reached)
+    joints = np.zeros(skeleton.joint_count, dtype=bool)
+    joints[body.skin.indices[vertices][body.skin.weights[vertices] > 0.05]] = True
+    return Reach(vertices, joints)
+
+
+def _tethers(scene: Scene) -> tuple[Ints, Floats]:
+    """Return anchors (A,) and, for each, the longest run of cloth to a loose vertex that hangs from it [m].
+
+    Edge paths are used, which are never shorter than the geodesic: the reach errs on the safe side.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import dijkstra
+
+    mesh = scene.garment.mesh
+    held, loose = np.flatnonzero(scene.classes != LOOSE), np.flatnonzero(scene.classes == LOOSE)
+    if not len(held) or not len(loose):
+        return np.zeros(0, dtype=int), np.zeros(0)
+    pairs = topology.edges(mesh.faces)
+    lengths = np.linalg.norm(mesh.points[pairs[:, 1]] - mesh.points[pairs[:, 0]], axis=1)
+    graph = coo_matrix((lengths, (pairs[:, 0], pairs[:, 1])), shape=(mesh.vertex_count,) * 2)
+    distance, _, source = dijkstra(graph, directed=False, indices=held, min_only=True, return_predecessors=True)
+    tied = loose[np.isfinite(distance[loose])]
+    anchors, group = np.unique(source[tied], return_inverse=True)
+    longest = np.zeros(len(anchors))
+    np.maximum.at(longest, group, distance[tied])
+    return anchors, longest
+
+
+def _spread_frames(motions: Sequence[Motion]) -> list[Motion]:
+    """Return about `POSES` single frames, spread evenly over all motions."""
+    ends = np.cumsum([motion.frame_count for motion in motions])
+    picks = np.unique(np.linspace(0, ends[-1] - 1, POSES).astype(int))
+    clip = np.searchsorted(ends, picks, side="right")
+    starts = ends - [motion.frame_count for motion in motions]
+    return [motions[c].clip(p - starts[c], p - starts[c] + 1) for c, p in zip(clip, picks)]

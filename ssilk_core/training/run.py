@@ -1,0 +1,274 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A training run: from a scene and motions to a model file (paper, Section 3.7)."""
+
+from __future__ import annotations
+
+import platform
+import signal
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from .. import __version__
+from ..assets import Motion, Scene
+from ..checkpoint import model_file, save_model
+from ..config import ModelConfig, TrainConfig
+from ..energy import GarmentEnergy
+from ..errors import need
+from ..events import Checkpoint, Message, Progress, Reporter, Started
+from ..fabrics import Fabric
+from ..kinematics import split_at_cuts
+from ..model.body import CollisionBody
+from ..model.network import GarmentModel, model_joints
+from .bank import build_bank
+from .memory import decoded_frames, fitting_batch, free_memory, step_memory
+from .objective import Objective
+from .reach import reachable_body
+from .state import RunState, canonical, load_state, save_state, state_path
+from .step import Stepper
+from .validation import Score, Validator
+from .windows import WindowSampler
+
+# A rollout closer than this to the quasi-static state of each pose has learned no dynamics worth the name.
+NO_DYNAMICS = 2e-3  # [m]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainJob:
+    """Everything a training needs.
+
+    Attributes:
+        scene: character with its body, garment, rig.
+        motions, held_out: what is trained on, and what is validated on.
+        output: the model file to write; the run's state lies beside it.
+        inputs: hashes of the input files by name, for the provenance.
+    """
+
+    scene: Scene
+    motions: Sequence[Motion]
+    held_out: Sequence[Motion]
+    model: ModelConfig
+    train: TrainConfig
+    fabric: Fabric
+    output: Path
+    device: str = "auto"
+    resume: bool = False
+    inputs: dict[str, str] | None = None
+
+
+@dataclass(frozen=True)
+class Trained:
+    """How a run ended: `finished` is False when it was interrupted; `score` is that of the best model kept."""
+
+    finished: bool
+    iterations: int
+    score: Score
+    plain: Score
+
+
+def chosen_device(name: str) -> torch.device:
+    """Return the device that "auto" or a torch device name means.
+
+    Raises:
+        SsilkError: the device does not exist here.
+    """
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.empty(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        need(False, f"--device {name}", "no such device here", "'auto', 'cpu' or 'cuda' are common", str(error)[:80])
+    return device
+
+
+def split_motions(motions: Sequence[Motion]) -> tuple[list[Motion], list[Motion]]:
+    """Return 80 % of the clips to train on and 20 % to validate on, spread evenly; one clip is cut in two."""
+    if len(motions) == 1:
+        cut = int(motions[0].frame_count * 0.8)
+        need(cut > 0, motions[0].path, "one motion of one frame", "longer motions are needed to train")
+        return [motions[0].clip(0, cut)], [motions[0].clip(cut, motions[0].frame_count)]
+    held = set(range(4, len(motions), 5)) or {len(motions) - 1}
+    return [m for i, m in enumerate(motions) if i not in held], [m for i, m in enumerate(motions) if i in held]
+
+
+class Run:
+    """A training run that has been set up and can be stepped."""
+
+    def __init__(self, job: TrainJob, report: Reporter) -> None:
+        self.report, self.device = report, chosen_device(job.device)
+        reach = reachable_body(job.scene, job.motions)
+        self.job = job = self._fitted(job, len(reach.vertices))
+        joints = model_joints(job.scene, reach.joints)
+        scene, skeleton = job.scene, job.scene.character.skeleton
+        self.model = GarmentModel(scene, job.model, joints, job.train.seed).to(self.device)
+        bank = build_bank(job.motions, skeleton, joints, job.model.fps, self.device)
+        held = build_bank(job.held_out, skeleton, joints, job.model.fps, self.device)
+        energy = GarmentEnergy(scene.garment.mesh, job.fabric, device=self.device)
+        body = CollisionBody(scene.character.merged_body(), skeleton.joint_count, vertices=reach.vertices,
+                             device=self.device)  # fmt: skip
+        generator = torch.Generator(self.device).manual_seed(job.train.seed)
+        sampler = WindowSampler(bank, job.train, job.model.latent, generator)
+        self.stepper = Stepper(self.model, Objective(self.model, energy, body, bank), sampler, job.train)
+        self.validator = Validator(held, energy, body, scene.plain_skin, self.model.decoder.rest, job.model.fps,
+                                   job.train.valid_frames)  # fmt: skip
+        self.iteration, self.best = 0, float("inf")
+        self._announce(len(reach.vertices), len(joints))
+
+    def _fitted(self, job: TrainJob, body_vertices: int) -> TrainJob:
+        """Lower the batch until the predicted memory fits, and say so."""
+        free = free_memory(self.device)
+        batch, warm = fitting_batch(job.scene, job.model, job.train, body_vertices, free)
+        needed = step_memory(job.scene, job.model, decoded_frames(job.train, job.train.batch), body_vertices)
+        if (batch, warm) == (job.train.batch, job.train.warm_batch):
+            return job
+        self.report(Message(
+            f"{needed / 2**30:.1f} GiB are needed and {free / 2**30:.1f} GiB are free on {self.device}: the batch goes from "
+            f"{job.train.batch} to {batch} windows and from {job.train.warm_batch} to {warm} single poses.", "warning"))  # fmt: skip
+        return replace(job, train=replace(job.train, batch=batch, warm_batch=warm))
+
+    def _announce(self, body_vertices: int, joints: int) -> None:
+        job, mesh = self.job, self.job.scene.garment.mesh
+        for motion in (*job.motions, *job.held_out):
+            if len(spans := split_at_cuts(motion)) > 1:
+                self.report(
+                    Message(f"{motion.path}: the root jumps {len(spans) - 1} times; each span is used by itself.")
+                )
+        frames = decoded_frames(job.train, job.train.batch)
+        self.report(Started("train", job.train.iterations, {
+            "garment": mesh.path, "vertices": mesh.vertex_count, "proxies": job.scene.rig.proxy_count,
+            "blendshapes": job.model.shapes, "joints in view": joints, "body vertices": body_vertices,
+            "parameters": sum(p.numel() for p in self.model.parameters()), "device": str(self.device),
+            "memory predicted [MiB]": step_memory(job.scene, job.model, frames, body_vertices) >> 20,
+        }))  # fmt: skip
+
+    def asked(self) -> dict[str, Any]:
+        """Return what makes this run the run it is; a resumed run must be asked the same."""
+        job = self.job
+        return canonical({
+            "model": asdict(job.model), "train": asdict(job.train), "fabric": asdict(job.fabric),
+            "inputs": job.inputs or {}, "garment": job.scene.garment.mesh.path,
+        })  # fmt: skip
+
+    def save_state(self) -> None:
+        """Write the run's state beside the model."""
+        save_state(state_path(self.job.output), self.stepper, RunState(self.iteration, self.best, self.asked()))
+
+    def resume(self) -> None:
+        """Take up the state that lies beside the model."""
+        state = load_state(state_path(self.job.output), self.stepper, self.asked())
+        self.iteration, self.best = state.iteration, state.best
+
+    def validate(self) -> Score:
+        """Score the model on the held-out clips and keep it when it is the best so far."""
+        score = self.validator.score(self.model)
+        need(np.isfinite(score.total), str(self.job.output), f"training diverged by iteration {self.iteration}",
+             "the best model before it is kept", "lower the step size (--set rate=...) and resume")  # fmt: skip
+        if score.total < self.best:
+            self.best = score.total
+            provenance = self.provenance(score)
+            save_model(self.job.output, model_file(self.model, self.job.fabric, provenance))
+            self.report(Checkpoint(str(self.job.output), self.iteration, True))
+        return score
+
+    def provenance(self, score: Score) -> dict[str, Any]:
+        """Return how the model came to be."""
+        return canonical({
+            **self.asked(), "iteration": self.iteration, "seed": self.job.train.seed, "ssilk": __version__,
+            "torch": torch.__version__, "python": platform.python_version(), "device": device_name(self.device),
+            "motions": [motion.path for motion in self.job.motions],
+            "validation": {**score.terms, "total": score.total, "collisions": score.collisions},
+        })  # fmt: skip
+
+
+def device_name(device: torch.device) -> str:
+    """Return what the hardware calls itself."""
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else f"{device.type} ({platform.machine()})"
+
+
+@contextmanager
+def interruptible() -> Iterator[threading.Event]:
+    """Yield an event that SIGINT and SIGTERM set, so that work stops between two steps; the second one is immediate."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def ask(number: int, frame: object) -> None:
+        stop.set()
+        signal.signal(number, before[signal.Signals(number)])
+
+    for number in before:
+        signal.signal(number, ask)
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def train(job: TrainJob, report: Reporter, stop: threading.Event | None = None) -> Trained:
+    """Train a model, keeping the best on disk and the run's state beside it.
+
+    Args:
+        job: what to train.
+        report: takes the events.
+        stop: set from outside to stop after the current step; the state is saved then.
+
+    Raises:
+        SsilkError: the inputs do not suffice, or training diverged.
+    """
+    run = Run(job, report)
+    if job.resume:
+        run.resume()
+        report(Message(f"resumed at iteration {run.iteration} of {job.train.iterations}"))
+    plain = run.validator.plain_score()
+    score = _loop(run, report, stop or threading.Event(), plain)
+    finished = run.iteration >= run.job.train.iterations
+    return Trained(finished, run.iteration, score, plain)
+
+
+def _loop(run: Run, report: Reporter, stop: threading.Event, plain: Score) -> Score:
+    config, began, first = run.job.train, time.monotonic(), run.iteration
+    score: Score | None = None
+    while run.iteration < config.iterations and not stop.is_set():
+        run.stepper.run(run.iteration)
+        run.iteration += 1
+        elapsed = time.monotonic() - began
+        left = elapsed / (run.iteration - first) * (config.iterations - run.iteration)
+        if run.iteration % 20 == 0 or run.iteration == config.iterations:
+            terms = {name: float(value) for name, value in run.stepper.terms.items()}
+            report(Progress(run.iteration, config.iterations, left, terms))
+        rolling = run.iteration >= max(1, config.warm_iterations)
+        if rolling and (run.iteration % config.validate_every == 0 or run.iteration == config.iterations):
+            score = run.validate()
+            report(_judgement(run, score, plain))
+            run.save_state()
+    if score is None:
+        score = run.validate()
+    run.save_state()
+    skipped = int(run.stepper.skipped)
+    if skipped:
+        report(Message(f"{skipped} steps were left out because a gradient was not finite.", "warning"))
+    return score
+
+
+def _judgement(run: Run, score: Score, plain: Score) -> Message:
+    share = 1 - score.total / plain.total
+    terms = ", ".join(f"{name} {value:.4g}" for name, value in score.terms.items())
+    text = (
+        f"validation at {run.iteration}: total {score.total:.4g} J, {share:.1%} under plain skinning's {plain.total:.4g} J "
+        f"({terms}), collisions {score.collisions:.2%}, motion of its own {score.dynamics * 1000:.0f} mm"
+    )
+    if score.dynamics < NO_DYNAMICS:
+        return Message(f"{text}; nothing dynamic is being learned: check that the motions move and that classes are loose",
+                       "warning")  # fmt: skip
+    return Message(text)

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The state of a training run on disk, so that it goes on exactly where it stopped."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..errors import SsilkError, need
+from ..files import replacing
+from .step import Stepper
+
+
+@dataclass(frozen=True)
+class RunState:
+    """Counters of a run: iterations done, the best validation total so far [J], and what the run was asked to do."""
+
+    iteration: int
+    best: float
+    asked: dict[str, Any]
+
+
+def state_path(model: str | Path) -> Path:
+    """Return where the state of the run that writes `model` lies."""
+    return Path(model).with_suffix(".resume.safetensors")
+
+
+def save_state(path: Path, stepper: Stepper, state: RunState) -> None:
+    """Write everything that the next iteration depends on."""
+    from safetensors.torch import save_file
+
+    with replacing(path) as temporary:
+        save_file(
+            {name: value.detach().cpu().contiguous().clone() for name, value in _tensors(stepper).items()},
+            temporary,
+            {"ssilk_state": json.dumps(asdict(state))},
+        )
+
+
+def load_state(path: Path, stepper: Stepper, asked: dict[str, Any]) -> RunState:
+    """Restore a run into a freshly built `stepper`.
+
+    Raises:
+        SsilkError: there is no state, it is damaged, or it belongs to a run that was asked something else.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    need(path.is_file(), str(path), "there is no training to resume", "the file is written beside the model",
+         "train without --resume")  # fmt: skip
+    try:
+        with safe_open(path, "pt") as stream:
+            state = RunState(**json.loads((stream.metadata() or {}).get("ssilk_state", "{}")))
+            tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
+    except (SafetensorError, ValueError, TypeError) as error:
+        raise SsilkError(
+            f"{path}: the training state is damaged ({error}); delete it and train without --resume."
+        ) from error
+    differing = sorted(key for key in asked if asked[key] != state.asked.get(key))
+    need(not differing, str(path), f"the run was started with another {', '.join(differing)}",
+         "a resumed run repeats the same command", "use the same options or train without --resume")  # fmt: skip
+    _restore(stepper, tensors)
+    return state
+
+
+def _tensors(stepper: Stepper) -> dict[str, Tensor]:
+    tensors = {f"model.{name}": value for name, value in stepper.model.state_dict().items()}
+    tensors |= {f"sampler.{name}": value for name, value in stepper.sampler.state().items()}
+    for index, moments in stepper.optimiser.state_dict()["state"].items():
+        tensors |= {f"adam.{index}.{name}": torch.as_tensor(value) for name, value in moments.items()}
+    return tensors
+
+
+def _restore(stepper: Stepper, tensors: dict[str, Tensor]) -> None:
+    def group(prefix: str) -> dict[str, Tensor]:
+        return {name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)}
+
+    stepper.model.load_state_dict(group("model."))
+    stepper.sampler.restore(group("sampler."))
+    moments: dict[int, dict[str, Tensor]] = {}
+    for name, value in group("adam.").items():
+        index, _, key = name.partition(".")
+        moments.setdefault(int(index), {})[key] = value
+    document = stepper.optimiser.state_dict()
+    stepper.optimiser.load_state_dict({"state": moments, "param_groups": document["param_groups"]})
+
+
+def canonical(value: Any) -> Any:
+    """Return a value as it comes back from JSON, so that it can be compared with one that did."""
+    return json.loads(json.dumps(value, default=lambda other: np.asarray(other).tolist()))

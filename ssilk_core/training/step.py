@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One optimiser step of each phase, eager or replayed as a CUDA graph."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+from ..config import TrainConfig
+from ..model.network import GarmentModel
+from .objective import Objective, total
+from .windows import WindowSampler, random_directions
+
+
+def learning_rate(config: TrainConfig, iteration: int) -> float:
+    """Step size at an iteration: linear warm-up, then a cosine to the final rate, in each phase anew."""
+    warm = config.warm_iterations
+    if iteration < warm:
+        # At a constant rate the warm start's energy climbs again.
+        done, span, peak, final = iteration, warm, config.warm_rate, 0.1 * config.warm_rate
+    else:
+        done, span, peak, final = iteration - warm, config.iterations - warm, config.rate, config.final_rate
+    ramp = min(1.0, (done + 1) / max(1, config.rate_warmup))
+    return ramp * (final + (peak - final) * 0.5 * (1 + math.cos(math.pi * done / max(1, span))))
+
+
+class Stepper:
+    """Draws a batch, computes the objective and moves the parameters.
+
+    Attributes:
+        terms: energies of the last step [J], updated in place so that reading them needs no new launch.
+        skipped: steps left out because a gradient was not finite.
+    """
+
+    def __init__(
+        self, model: GarmentModel, objective: Objective, sampler: WindowSampler, config: TrainConfig
+    ) -> None:
+        self.model, self.objective, self.sampler, self.config = model, objective, sampler, config
+        self.device = sampler.first.device
+        on_gpu = self.device.type == "cuda"
+        slow = [
+            value
+            for name, value in model.named_parameters()
+            if name.startswith("integrator.") or "skin_offset" in name
+        ]
+        fast = [value for value in model.parameters() if all(value is not other for other in slow)]
+        self.factors = [1.0, config.skin_rate]
+        # A captured graph reads the step size from a tensor; elsewhere a number is faster.
+        self.optimiser = torch.optim.Adam(
+            [
+                {"params": group, "lr": torch.tensor(0.0, device=self.device) if on_gpu else 0.0}
+                for group in (fast, slow)
+            ],
+            capturable=on_gpu,
+            foreach=True,
+        )
+        self.terms: dict[str, Tensor] = {}
+        self.skipped = torch.zeros((), dtype=torch.int64, device=self.device)
+        self._graphs: dict[str, torch.cuda.CUDAGraph] = {}
+
+    def warm(self) -> None:
+        """Train P and D on single random poses under static energies."""
+        sampler, config, bank = self.sampler, self.config, self.objective.bank
+        draw = torch.rand(config.warm_batch, generator=sampler.generator, device=self.device)
+        frames = (draw * bank.frame_count).long().clamp_max(bank.frame_count - 1)
+        direction = random_directions(config.warm_batch, config.rotated, sampler.generator, self.device)
+        terms = self.objective.static(frames, direction)
+        self._descend(total(terms), {name: value.mean() for name, value in terms.items()})
+
+    def windows(self) -> None:
+        """Train everything on one window of every slot."""
+        shape = self.sampler.latents.shape
+        noise = torch.randn(shape, generator=self.sampler.generator, device=self.device) * self.config.noise
+        dynamic, resting, latents = self.objective.window(self.sampler, noise)
+        length = self.config.window
+        # Every frame weighs the same, the two that the initialiser answers for included.
+        loss = (total(dynamic) * (length - 2) + total(resting) * 2) / length
+        self._descend(loss, {name: value.mean() for name, value in dynamic.items()})
+        self.sampler.advance(latents)
+
+    def _descend(self, loss: Tensor, terms: dict[str, Tensor]) -> None:
+        self.optimiser.zero_grad(set_to_none=False)
+        loss.backward()
+        parameters = [value for value in self.model.parameters() if value.grad is not None]
+        norm = nn.utils.clip_grad_norm_(parameters, self.config.clip)
+        # A step whose gradient is not finite is left out: its gradients become zero.
+        finite = torch.isfinite(norm)
+        for gradient in (value.grad for value in parameters):
+            assert gradient is not None
+            gradient.copy_(torch.where(finite, gradient, 0.0))
+        self.skipped += ~finite
+        self.optimiser.step()
+        for name, value in terms.items():
+            self.terms.setdefault(name, torch.zeros((), device=self.device)).copy_(value.detach())
+
+    def run(self, iteration: int) -> None:
+        """Do the step of an iteration, in the phase that it belongs to."""
+        rate = learning_rate(self.config, iteration)
+        for group, factor in zip(self.optimiser.param_groups, self.factors):
+            if self.device.type == "cuda":
+                group["lr"].fill_(rate * factor)
+            else:
+                group["lr"] = rate * factor
+        name = "warm" if iteration < self.config.warm_iterations else "windows"
+        body = self.warm if name == "warm" else self.windows
+        if self.device.type == "cuda":
+            self._replay(name, body)
+        else:
+            body()
+
+    def _replay(self, name: str, body: Callable[[], None]) -> None:
+        """Replay a step as one CUDA graph, captured on its first use after a few eager steps."""
+        if name not in self._graphs:
+            side = torch.cuda.Stream()
+            side.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(side):
+                for _ in range(3):
+                    body()
+            torch.cuda.current_stream().wait_stream(side)
+            graph = torch.cuda.CUDAGraph()
+            graph.register_generator_state(self.sampler.generator)
+            with torch.cuda.graph(graph):
+                body()
+            self._graphs[name] = graph
+        self._graphs[name].replay()

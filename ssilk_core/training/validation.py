@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How good a model is on whole clips: each term by itself, beside plain skinning."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ..assets import SkinWeights
+from ..energy import TERMS, GarmentEnergy
+from ..energy.collision import PosedBody, signed_distance
+from ..model.body import CollisionBody
+from ..model.descriptors import GRAVITY
+from ..model.network import GarmentModel
+from .bank import MotionBank
+
+DECODED_AT_ONCE = 256  # frames
+
+
+@dataclass(frozen=True)
+class Score:
+    """Means over all frames of all clips.
+
+    Attributes:
+        terms: each energy [J]; gravity is relative to plain skinning.
+        collisions: share of garment vertices inside the body.
+        dynamics: RMS distance between the rollout and the quasi-static state of the same pose [m].
+    """
+
+    terms: dict[str, float]
+    collisions: float
+    dynamics: float = 0.0
+
+    @property
+    def total(self) -> float:
+        """Sum of all terms [J]."""
+        return sum(self.terms.values())
+
+
+class Validator:
+    """Rolls a model over whole clips and scores it against plain skinning on the same frames."""
+
+    def __init__(self, bank: MotionBank, energy: GarmentEnergy, body: CollisionBody, plain: SkinWeights, rest: Tensor,
+                 fps: float, frames: int) -> None:  # fmt: skip
+        self.bank, self.energy, self.body, self.fps = bank, energy, body, fps
+        self.plain_weights = torch.as_tensor(plain.dense(bank.joint_count), dtype=rest.dtype, device=rest.device)
+        self.rest = rest
+        self.clips = [
+            range(int(start), min(int(stop), int(start) + frames)) for start, stop in zip(bank.starts, bank.stops)
+        ]
+        self.down = torch.tensor([0.0, -1.0, 0.0], device=rest.device)
+
+    def plain_vertices(self, character: Tensor) -> Tensor:
+        """Return plain skinning's positions (V, 3, N) [m]."""
+        blended = (self.plain_weights @ character.flatten(1)).reshape(-1, 3, 4, character.shape[-1])
+        return (blended[:, :, :3] * self.rest[:, None, :, None]).sum(2) + blended[:, :, 3]
+
+    @torch.no_grad()
+    def score(self, model: GarmentModel) -> Score:
+        """Return the mean score of a model over all clips."""
+        return self._mean([self._clip(clip, model) for clip in self.clips])
+
+    @torch.no_grad()
+    def plain_score(self) -> Score:
+        """Return the mean score of plain skinning over all clips."""
+        return self._mean([self._clip(clip, None) for clip in self.clips])
+
+    def _mean(self, scores: list[dict[str, Tensor]]) -> Score:
+        joined = {name: float(torch.cat([score[name] for score in scores]).mean()) for name in scores[0]}
+        return Score({name: joined[name] for name in TERMS}, joined["collisions"], joined["dynamics"] ** 0.5)
+
+    def _clip(self, clip: range, model: GarmentModel | None) -> dict[str, Tensor]:
+        frames = torch.arange(clip.start, clip.stop, device=self.rest.device)
+        states = None if model is None else roll_states(model, self.bank, frames, self.down)
+        parts, tail = [], None
+        for start in range(0, len(frames), DECODED_AT_ONCE):
+            window = slice(start, start + DECODED_AT_ONCE)
+            character = self.bank.character(frames[window])
+            plain = self.plain_vertices(character)
+            x, still = plain, plain
+            if model is not None and states is not None:
+                x = model.vertices(states[window], character)
+                direction = self.down.expand(len(frames[window]), 3)
+                quiet = model.initial(self.bank.static_descriptor(frames[window], direction))
+                still = model.vertices(quiet, character)
+            joined = x if tail is None else torch.cat([tail, x], dim=-1)
+            parts.append(self._terms(x, plain, still, self.body.posed(character), joined))
+            tail = joined[..., -2:]
+        return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+
+    def _terms(self, x: Tensor, plain: Tensor, still: Tensor, body: PosedBody, joined: Tensor) -> dict[str, Tensor]:
+        energy = self.energy
+        distance = signed_distance(x, body)
+        moving = joined[..., 2:]
+        inertia = energy.inertia(moving, 2 * joined[..., 1:-1] - joined[..., :-2], 1 / self.fps)
+        return {
+            "stretch": energy.stretch(x),
+            "bending": energy.bending(x),
+            "gravity": energy.gravity(x - plain, GRAVITY * self.down[:, None]),
+            "inertia": torch.cat([inertia.new_zeros(x.shape[-1] - len(inertia)), inertia]),
+            "collision": energy.collision_of(distance),
+            "collisions": (distance < 0).double().mean(0),
+            "dynamics": ((x - still) ** 2).sum(1).mean(0),
+        }
+
+
+@torch.no_grad()
+def roll_states(model: GarmentModel, bank: MotionBank, frames: Tensor, down: Tensor) -> Tensor:
+    """Roll a model over consecutive frames of a bank, from its quasi-static start; states (N, latent)."""
+    direction = down.expand(len(frames), 3)
+    rest = model.initial(bank.static_descriptor(frames, direction)).unsqueeze(1)
+    pose = bank.dynamic_descriptor(frames, direction).unsqueeze(1)
+    z = [*rest[:2]]
+    for t in range(2, len(frames)):
+        z.append(model.step(z[-2], z[-1], rest[t], pose[t]))
+    return torch.cat(z)

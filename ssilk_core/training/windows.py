@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which frames each slot of a batch trains on, and the states carried from window to window."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ..config import TrainConfig
+from ..errors import need
+from .bank import MotionBank
+
+
+def random_directions(count: int, rotated: float, generator: torch.Generator, device: torch.device) -> Tensor:
+    """Return unit gravity directions (count, 3): uniform on the sphere for a share `rotated`, else straight down.
+
+    Turning the character by R under a fixed gravity g is turning gravity by R^T under a fixed character: every
+    other energy is unchanged by rotations. A turn about g itself changes nothing, so the sphere covers SO(3).
+    """
+    draw = torch.randn(count, 3, generator=generator, device=device)
+    anywhere = draw / draw.norm(dim=1, keepdim=True).clamp_min(1e-6)
+    turned = torch.rand(count, 1, generator=generator, device=device) < rotated
+    return torch.where(turned, anywhere, anywhere.new_tensor([0.0, -1.0, 0.0]))
+
+
+class WindowSampler:
+    """Draws windows; a share of the slots goes on in the clip, and under the gravity, where it stopped.
+
+    Attributes:
+        first: first frame of each slot's window, shape (batch,).
+        direction: gravity direction of each slot, shape (batch, 3).
+        latents: the two states that a continued window starts from, shape (2, batch, latent).
+        carried: which slots continue, shape (batch,).
+    """
+
+    def __init__(self, bank: MotionBank, config: TrainConfig, latent: int, generator: torch.Generator) -> None:
+        self.bank, self.config, self.generator = bank, config, generator
+        device = bank.static.device
+        stops = bank.stops.repeat_interleave(bank.stops - bank.starts)
+        frames = torch.arange(bank.frame_count, device=device)
+        self.stop_of = stops
+        self.candidates = frames[frames + config.window <= stops]
+        longest = int((bank.stops - bank.starts).max())
+        need(len(self.candidates), "motions", f"the longest clip has {longest} frames at the model's rate",
+             f"a window of {config.window} poses must fit", "give longer motions or set --train window=N")  # fmt: skip
+        self.first = self._fresh()
+        self.direction = random_directions(config.batch, config.rotated, generator, device).clone()
+        self.latents = torch.zeros(2, config.batch, latent, device=device)
+        self.carried = torch.zeros(config.batch, dtype=torch.bool, device=device)
+
+    def _fresh(self) -> Tensor:
+        pick = torch.rand(self.config.batch, generator=self.generator, device=self.candidates.device)
+        return self.candidates[(pick * len(self.candidates)).long().clamp_max(len(self.candidates) - 1)]
+
+    def advance(self, latents: Tensor) -> None:
+        """Move on: keep the last two `latents` (2, batch, latent) of the window, then choose the next windows."""
+        config, device = self.config, self.first.device
+        following = self.first + config.window - 2
+        fits = following + config.window <= self.stop_of[self.first]
+        wish = torch.rand(config.batch, generator=self.generator, device=device) < config.carry
+        fresh = random_directions(config.batch, config.rotated, self.generator, device)
+        chosen = self._fresh()
+        go_on = fits & wish
+        self.first.copy_(torch.where(go_on, following, chosen))
+        self.direction.copy_(torch.where(go_on[:, None], self.direction, fresh))
+        self.latents.copy_(latents.detach())
+        self.carried.copy_(go_on)
+
+    def state(self) -> dict[str, Tensor]:
+        """Return what a resumed run needs to go on exactly, the random state included."""
+        return {
+            "first": self.first, "direction": self.direction, "latents": self.latents, "carried": self.carried,
+            "generator": self.generator.get_state(),
+        }  # fmt: skip
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Take back what `state` returned."""
+        for name in ("first", "direction", "latents", "carried"):
+            getattr(self, name).copy_(state[name])
+        self.generator.set_state(state["generator"].cpu().to(torch.uint8))
