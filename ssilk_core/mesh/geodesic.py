@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssilk_core.assets import Floats, Ints
-from ssilk_core.mesh.topology import components, edge_use, edges
+from ssilk_core.mesh.topology import components, edge_keys, edge_use, edges, half_edges
 
 
 def distances(points: Floats, faces: Ints, sources: Ints) -> Floats:
@@ -111,11 +111,9 @@ def _manifold_faces(faces: Ints) -> NDArray[np.int64]:
 
 def _sheets(faces: Ints) -> list[NDArray[np.int64]]:
     """Return the faces in groups that hang together by edges; touching at a point alone does not join them."""
-    half = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
-    _, edge = np.unique(half, axis=0, return_inverse=True)
-    owner = np.repeat(np.arange(len(faces)), 3)
-    by_edge = np.argsort(edge.reshape(-1), kind="stable")
-    same = np.diff(edge.reshape(-1)[by_edge]) == 0
+    owner, edge = np.repeat(np.arange(len(faces)), 3), edge_keys(half_edges(faces))
+    by_edge = np.argsort(edge, kind="stable")
+    same = np.diff(edge[by_edge]) == 0
     pairs = np.column_stack([owner[by_edge][:-1][same], owner[by_edge][1:][same]])
     label = components(pairs, len(faces))
     return [np.flatnonzero(label == sheet) for sheet in range(label.max(initial=-1) + 1)]

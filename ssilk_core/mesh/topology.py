@@ -11,12 +11,26 @@ from ssilk_core.assets import Floats, Ints
 
 def edges(faces: Ints) -> NDArray[np.int64]:
     """Return each undirected edge once, as (low, high) in ascending order, shape (E, 2)."""
-    return np.unique(np.sort(_half_edges(faces), axis=1), axis=0)
+    return edge_use(faces)[0]
 
 
 def edge_use(faces: Ints) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the edges, shape (E, 2), and how many faces use each, shape (E,): 1 is a border, over 2 non-manifold."""
-    return np.unique(np.sort(_half_edges(faces), axis=1), axis=0, return_counts=True)
+    half = np.sort(half_edges(faces), axis=1)
+    _, first, uses = np.unique(edge_keys(half), return_index=True, return_counts=True)
+    return half[first], uses
+
+
+def half_edges(faces: Ints) -> NDArray[np.int64]:
+    """Return the directed edges of every face in corner order, shape (3 F, 2)."""
+    faces = np.asarray(faces, dtype=np.int64)
+    return np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
+
+
+def edge_keys(pairs: Ints) -> NDArray[np.int64]:
+    """Return one number for each pair of vertices (E, 2), alike in both directions, ascending with (low, high)."""
+    low, high = np.sort(pairs, axis=1).T
+    return low * (high.max(initial=0) + 1) + high
 
 
 def border_vertices(faces: Ints, vertex_count: int) -> NDArray[np.bool_]:
@@ -38,9 +52,9 @@ def hinges(faces: Ints) -> NDArray[np.int64]:
     Each row is (v0, v1, o0, o1): the edge runs v0 -> v1 in the face that holds o0, and o1 lies in the other
     face. Edges used by one face, or by more than two, have no hinge.
     """
-    half, opposite = _half_edges(faces), np.roll(faces, 1, axis=1).reshape(-1)
-    _, group, uses = np.unique(np.sort(half, axis=1), axis=0, return_inverse=True, return_counts=True)
-    order = np.argsort(group.reshape(-1), kind="stable")
+    half, opposite = half_edges(faces), np.roll(faces, 1, axis=1).reshape(-1)
+    _, group, uses = np.unique(edge_keys(half), return_inverse=True, return_counts=True)
+    order = np.argsort(group, kind="stable")
     starts = np.concatenate([[0], np.cumsum(uses)[:-1]])[uses == 2]
     first, second = order[starts], order[starts + 1]
     return np.column_stack([half[first], opposite[first], opposite[second]])
@@ -108,12 +122,6 @@ def smooth(values: Floats, pairs: Ints, rounds: int) -> Floats:
             total[owners] += np.add.reduceat(result[tails], starts, axis=0)
         result = total * share[:, None]
     return result
-
-
-def _half_edges(faces: Ints) -> NDArray[np.int64]:
-    """Return the directed edges of every face in corner order, shape (3 F, 2)."""
-    faces = np.asarray(faces, dtype=np.int64)
-    return np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
 
 
 def _face_crosses(points: Floats, faces: Ints) -> Floats:

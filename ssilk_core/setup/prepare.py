@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ssilk_core import events
-from ssilk_core.assets import CLASS_NAMES, LOOSE, Character, Garment, ProxyRig, Scene
+from ssilk_core.assets import CLASS_NAMES, LOOSE, Character, Garment, Ints, ProxyRig, Scene
 from ssilk_core.setup.classes import ClassOptions, classify
 from ssilk_core.setup.rig import RigOptions, build_rig
 from ssilk_core.setup.weights import WeightOptions, transfer_weights
@@ -44,13 +44,13 @@ def prepare_scene(
     garment = replace(garment, skin=skin, classes=classes)
     if rig is None:
         rig = build_rig(character, garment, rig_options, report=report)
-        report(events.Message(_describe_rig(garment, rig)))
+        report(events.Message(_describe_rig(rig, bool(np.any(classes == LOOSE)))))
     return Scene(character, garment, rig)
 
 
 def _find_classes(
     character: Character, garment: Garment, options: ClassOptions | None, report: events.Reporter
-) -> np.ndarray:
+) -> Ints:
     """Classify by authored weights, or by unsmoothed ones from the body: they jump where limbs part."""
     unsmoothed = WeightOptions(tight_rounds=0, loose_rounds=0)
     skin = garment.skin or transfer_weights(character, garment.mesh, options=unsmoothed)
@@ -60,9 +60,9 @@ def _find_classes(
     return classes
 
 
-def _describe_rig(garment: Garment, rig: ProxyRig) -> str:
+def _describe_rig(rig: ProxyRig, any_loose: bool) -> str:
     if rig.proxy_count:
-        return f"{garment.mesh.path}: no proxy joints, {rig.proxy_count} placed on the loose part"
-    if np.equal(garment.classes, LOOSE).any():
-        return f"{garment.mesh.path}: no proxy joints, loose vertices follow the body"
-    return f"{garment.mesh.path}: nothing loose, no proxy joints needed"
+        return f"{rig.path}: no proxy joints, {rig.proxy_count} placed on the loose part"
+    if any_loose:
+        return f"{rig.path}: no proxy joints, loose vertices follow the body"
+    return f"{rig.path}: nothing loose, no proxy joints needed"
