@@ -281,7 +281,7 @@ def test_payload_variant_and_layer_offset_are_composed(tmp_path):
 
 def test_of_several_characters_one_is_chosen():
     stage = author(author(Usd.Stage.CreateInMemory(), root="/World/A"), root="/World/B")
-    with pytest.raises(SsilkError, match=r"/World/A \(Rig\), /World/B \(Rig\).*--root"):
+    with pytest.raises(SsilkError, match=r"2 skeletons.*/World/A \(Rig\), /World/B \(Rig\).*--root"):
         read_character(stage)
     assert read_character(stage, root="B").path.endswith("/World/B")
     assert read_character(stage, root="/World/A/Rig").path.endswith("/World/A")

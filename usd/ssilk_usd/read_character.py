@@ -12,8 +12,9 @@ from ssilk_core.errors import need
 from ssilk_core.events import Message, Reporter, silent
 
 from .read_mesh import is_drawn, is_garment, read_mesh
-from .read_skeleton import SkelSource, bound_skeleton, character_skeleton, find_skeleton
+from .read_skeleton import bound_skeleton, character_skeleton, find_skeleton
 from .read_skin import SKEL, read_skin
+from .read_spaces import SkelSource
 from .read_stage import (
     PRIMS,
     StageLike,

@@ -11,8 +11,9 @@ from ssilk_core.errors import need
 
 from .read_character import geom_to_core, is_skinned
 from .read_mesh import CLASS, PROXIES, is_drawn, is_garment, read_mesh
-from .read_skeleton import SkelSource, bound_skeleton, find_skeleton, skeletons
+from .read_skeleton import bound_skeleton, find_skeleton, skeletons
 from .read_skin import PLAIN, read_influences, read_skin
+from .read_spaces import SkelSource
 from .read_stage import (
     EARLIEST,
     PRIMS,

@@ -13,8 +13,9 @@ from ssilk_core.assets import Floats, Ints, Motion, Skeleton
 from ssilk_core.errors import fail, need
 from ssilk_core.kinematics import matrix_from_quaternion, quaternion_from_matrix, rigid
 
-from .read_skeleton import joints_to_core, need_similarity, skeletons
+from .read_skeleton import skeletons
 from .read_skin import match_joints
+from .read_spaces import joints_to_core, need_similarity
 from .read_stage import (
     PRIMS,
     USD_SUFFIXES,

@@ -1,24 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finding a character's skeleton in a stage, telling its joints from proxies, and placing it in the core.
-
-Three spaces of a stage matter. *World* is what a viewer sees. *Skeleton space* is the Skeleton prim's own:
-local-to-world takes it to world. *Bind space* holds `bindTransforms`, and meshes after `geomBindTransform`;
-UsdSkel calls it world at bind time, many exporters write skeleton space. `SkelSource` tells them apart.
-"""
+"""Finding a character's skeleton in a stage, checking it, and telling its own joints from proxies."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from pxr import Usd, UsdGeom, UsdSkel
 
 from ssilk_core.assets import Floats, Ints, Skeleton
 from ssilk_core.errors import fail, need
-from ssilk_core.kinematics import world_transforms
 
 from .read_mesh import PROXIES
 from .read_skin import match_joints
+from .read_spaces import SkelSource, joints_to_core, need_similarity
 from .read_stage import (
     PRIMS,
     column_matrix,
@@ -31,97 +24,6 @@ from .read_stage import (
 )
 from .units import StageUnits
 
-_RIGID_TOLERANCE = 1e-3
-_TILTED = 0.5  # cosine below which a skeleton's up axis is not the stage's
-
-
-@dataclass(frozen=True, eq=False)
-class SkelSource:
-    """A skeleton as authored, all joints with proxies, and its way to the core.
-
-    Attributes:
-        stage: kept, because prims do not keep theirs.
-        root, prim: the SkelRoot and the Skeleton.
-        units: of the stage.
-        joints, parents: UsdSkel joint paths and parent indices, -1 for roots, length N.
-        bind, rest: joint to bind space, joint to parent; stage units, column vectors, shape (N, 4, 4).
-        placement: skeleton space to world at the earliest time, a similarity, shape (4, 4).
-        owners: path of the garment mesh whose proxy a joint is; empty for the character's own joints.
-    """
-
-    stage: Usd.Stage
-    root: Usd.Prim
-    prim: Usd.Prim
-    units: StageUnits
-    joints: tuple[str, ...]
-    parents: Ints
-    bind: Floats
-    rest: Floats
-    placement: Floats
-    owners: tuple[str, ...]
-
-    @property
-    def character_joints(self) -> Ints:
-        """Indices of the joints that are no proxies."""
-        return np.flatnonzero([not owner for owner in self.owners])
-
-    @property
-    def joint_scale(self) -> float:
-        """Metres per unit of length in joint and skeleton space."""
-        return similarity_scale(self.placement) * self.units.meters_per_unit
-
-    @property
-    def bind_to_core(self) -> Floats:
-        """Bind space to the core's bind space [m], a similarity, shape (4, 4).
-
-        Lengths become those that the posed character has in world. Axes become y up: the stage's, unless the
-        character's xforms tilt its bind space by a quarter turn (exporters convert axes so); then they are undone.
-        """
-        matrix = np.eye(4)
-        matrix[:3, :3] = self.units.rotation @ self._tilt() * self.joint_scale / self._bind_scale
-        return matrix
-
-    @property
-    def world_to_bind(self) -> Floats:
-        """World to bind space, where the character stands at the earliest time, shape (4, 4)."""
-        return self._skeleton_to_bind() @ np.linalg.inv(self.placement)
-
-    def binds_to_core(self, bind: Floats) -> Floats:
-        """Return bind transforms (..., 4, 4) in the core's bind space [m]."""
-        return self.bind_to_core @ bind @ _scale(1 / self.joint_scale)
-
-    def binds_from_core(self, bind: Floats) -> Floats:
-        """Return the core's bind transforms (..., 4, 4) as the stage holds them."""
-        return np.linalg.inv(self.bind_to_core) @ bind @ _scale(self.joint_scale)
-
-    @property
-    def _bind_scale(self) -> float:
-        """Scale that the bind transforms share: 1, or that of a scaled character where they are in world."""
-        determinants = np.linalg.det(self.bind[:, :3, :3])
-        scale = float(np.cbrt(determinants.mean()))
-        common = scale > 0 and np.allclose(determinants, scale**3, rtol=_RIGID_TOLERANCE)
-        return scale if common else 1.0
-
-    def _skeleton_to_bind(self) -> Floats:
-        """Skeleton space to bind space: what takes the rest pose to the bind pose, where one transform does."""
-        rest = world_transforms(self.rest, self.parents)
-        matrix = self.bind[0] @ np.linalg.inv(rest[0])
-        size = np.abs(self.bind[:, :3, 3]).max() + self._bind_scale
-        agree = np.abs(matrix @ rest - self.bind).max() < _RIGID_TOLERANCE * size
-        return matrix if agree else _scale(self._bind_scale)
-
-    def _tilt(self) -> Floats:
-        """Quarter turn (3, 3), in the stage's axes, that sets bind space upright; the identity if it is."""
-        linear = np.linalg.inv(self.world_to_bind)[:3, :3]
-        stage_up = self.units.rotation.T @ np.array([0.0, 1.0, 0.0])
-        up = linear.T @ stage_up / np.cbrt(np.linalg.det(linear))
-        if abs(up @ stage_up) > _TILTED:
-            return np.eye(3)
-        axis = np.argmax(np.abs(up))
-        up = np.eye(3)[axis] * np.sign(up[axis])
-        side = np.cross(up, stage_up)
-        return np.stack([side, stage_up, np.cross(side, stage_up)]).T @ np.stack([side, up, np.cross(side, up)])
-
 
 def find_skeleton(stage: Usd.Stage, *, root: str | None = None) -> SkelSource:
     """Find the one skeleton of a stage, or the one that `root` names (its SkelRoot or itself, path or name).
@@ -129,8 +31,7 @@ def find_skeleton(stage: Usd.Stage, *, root: str | None = None) -> SkelSource:
     Raises:
         SsilkError: there is none, there are several and `root` names none, or the skeleton is malformed.
     """
-    found = skeletons(stage)
-    where = stage_name(stage)
+    where, found = stage_name(stage), skeletons(stage)
     need(
         found,
         where,
@@ -138,20 +39,23 @@ def find_skeleton(stage: Usd.Stage, *, root: str | None = None) -> SkelSource:
         "a character is a SkelRoot with a Skeleton and meshes bound to it",
         "export the character with its armature",
     )
-    chosen = found
-    if root is not None:
-        roots = named([prim for prim, _ in found], root)
-        chosen = [pair for pair in found if pair[0] in roots] or [
-            pair for pair in found if pair[1] in named([skeleton for _, skeleton in found], root)
-        ]
-    allowed = ", ".join(f"{top.GetPath()} ({skeleton.GetName()})" for top, skeleton in found)
+    chosen = found if root is None else _pairs_named(found, root)
+    there_are = "there are " + ", ".join(f"{top.GetPath()} ({skeleton.GetName()})" for top, skeleton in found)
+    need(chosen, where, f"no SkelRoot or Skeleton is named '{root}'", there_are, "choose one with --root")
     need(
-        chosen, where, f"no SkelRoot or Skeleton is named '{root}'", f"there are {allowed}", "choose one with --root"
-    )
-    need(
-        len(chosen) == 1, where, f"there are {len(chosen)} skeletons: {allowed}", "one is used", "choose with --root"
+        len(chosen) == 1,
+        where,
+        f"{len(chosen)} skeletons could be the character's",
+        there_are,
+        "choose one with --root, by the path of its Skeleton if need be",
     )
     return _source(*chosen[0])
+
+
+def _pairs_named(pairs: list[tuple[Usd.Prim, Usd.Prim]], name: str) -> list[tuple[Usd.Prim, Usd.Prim]]:
+    """Return the pairs whose SkelRoot, or else whose Skeleton, has this path or name."""
+    roots, skeletons_named = (named([pair[side] for pair in pairs], name) for side in (0, 1))
+    return [pair for pair in pairs if pair[0] in roots] or [pair for pair in pairs if pair[1] in skeletons_named]
 
 
 def skeletons(stage: Usd.Stage) -> list[tuple[Usd.Prim, Usd.Prim]]:
@@ -186,48 +90,6 @@ def character_skeleton(source: SkelSource) -> Skeleton:
     rest = joints_to_core(source.rest[kept], parents, source.placement, source.units)
     names = tuple(source.joints[index] for index in kept)
     return Skeleton(location(source.prim), names, parents, source.binds_to_core(source.bind[kept]), rest)
-
-
-def joints_to_core(local: Floats, parents: Ints, placement: Floats, units: StageUnits) -> Floats:
-    """Return joint-to-parent transforms in metres, y up, with the placement folded into the roots.
-
-    Args:
-        local: joint to parent in stage units, column vectors, shape (..., J, 4, 4).
-        parents: index of each joint's parent, -1 for roots.
-        placement: skeleton space to world, similarities, shape (4, 4) or (..., 4, 4).
-        units: of the stage.
-    """
-    scale = similarity_scale(placement) * units.meters_per_unit
-    result = np.array(local, dtype=np.float64)
-    result[..., :3, 3] *= scale
-    roots = np.flatnonzero(np.asarray(parents) < 0)
-    world = units.matrix @ placement[..., None, :, :] @ local[..., roots, :, :]
-    result[..., roots, :, :] = world @ _scale(1 / scale)
-    return result
-
-
-def similarity_scale(matrices: Floats) -> float:
-    """Return the uniform scale of a similarity (4, 4), or of the first of several (..., 4, 4)."""
-    first = matrices.reshape(-1, 4, 4)[0]
-    return float(np.cbrt(np.linalg.det(first[:3, :3])))
-
-
-def need_similarity(prim: Usd.Prim, matrices: Floats) -> Floats:
-    """Return the world matrices of a skeleton, shape (..., 4, 4), if all scale uniformly and by the same factor.
-
-    Raises:
-        SsilkError: they mirror, shear, scale differently along the axes, or change scale over time.
-    """
-    linear, scale = matrices[..., :3, :3], similarity_scale(matrices)
-    uniform = np.abs(np.swapaxes(linear, -1, -2) @ linear - np.eye(3) * scale**2) < _RIGID_TOLERANCE * scale**2
-    need(
-        scale > 0 and uniform.all(),
-        location(prim),
-        "the xforms above the skeleton mirror, shear, animate scale or scale unequally",
-        "they may move, turn and scale uniformly by one factor",
-        "apply the scale and export again",
-    )
-    return matrices
 
 
 def _source(root: Usd.Prim, prim: Usd.Prim) -> SkelSource:
@@ -305,7 +167,3 @@ def _owners(root: Usd.Prim, joints: tuple[str, ...], parents: Ints) -> tuple[str
     for index, parent in enumerate(parents):
         owners.append(listed_by.get(index, owners[parent] if parent >= 0 else ""))
     return tuple(owners)
-
-
-def _scale(factor: float) -> Floats:
-    return np.diag([factor, factor, factor, 1.0])

@@ -22,8 +22,9 @@ from ssilk_core.files import replacing
 from .author import bind_skin, define_mesh, matrix_array, prim_names, sorted_influences
 from .read_garment import find_garment, fitted_skeleton, garment_to_core, plain_skin
 from .read_mesh import CLASS, PROXIES, is_garment
-from .read_skeleton import SkelSource, find_skeleton
+from .read_skeleton import find_skeleton
 from .read_skin import PLAIN, SKEL, leaf, match_joints, read_influences
+from .read_spaces import SkelSource
 from .read_stage import (
     LAYER_SUFFIXES,
     PRIMS,

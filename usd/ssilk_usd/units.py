@@ -61,10 +61,6 @@ class StageUnits:
         """Return offsets [m], y up, shape (..., 3), in the stage's units and axes."""
         return self.points_from_core(vectors)
 
-    def transforms_to_core(self, transforms: Floats) -> Floats:
-        """Return rigid joint-to-world transforms of the stage, shape (..., 4, 4), in metres, y up."""
-        return self.matrix @ transforms @ _scale(1 / self.meters_per_unit)
-
     def transforms_from_core(self, transforms: Floats) -> Floats:
         """Return rigid joint-to-world transforms [m], y up, shape (..., 4, 4), in the stage's units and axes."""
         return np.linalg.inv(self.matrix) @ transforms @ _scale(self.meters_per_unit)
