@@ -7,7 +7,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ssilk_core.assets import Character, Floats, Garment, Ints, Mesh
-from ssilk_core.demo.garments_mesh import Fit, fit, loft, outline, relax
+from ssilk_core.demo.garments_dress import hooded_dress
+from ssilk_core.demo.garments_fit import Fit, fit, outline, relax, through
+from ssilk_core.demo.garments_mesh import loft
 from ssilk_core.errors import need
 
 CLEARANCE = 0.012  # [m]; more than the 6 mm that must remain, because triangles cut corners
@@ -26,16 +28,15 @@ def build_garment(name: str, character: Character) -> Garment:
 
 def cape(fit: Fit) -> tuple[Floats, Ints]:
     """Cut a cape: collar and yoke on the shoulders, open at the front, flared to the calves."""
-    keys = cape_keys(fit)
-    grid, depth = through(keys, 81)
-    cling = np.interp(depth, [0, 0.09, 0.19], [0.5, 0.5, 0.0])[:, None]
-    return loft(relax(fit, grid, CLEARANCE, cling=cling, rounds=60), 0.0205)
+    s = fit.size
+    grid, depth = through(cape_keys(fit, s), 81)
+    cling = np.interp(depth, [0, 0.055 * s, 0.12 * s], [0.5, 0.4, 0.0])[:, None]
+    return loft(relax(fit, grid, CLEARANCE, cling=cling, rounds=60), 0.0205 * s)
 
 
-def cape_keys(fit: Fit) -> Floats:
+def cape_keys(fit: Fit, s: float) -> Floats:
     """Return the lines across a cape that shape it, from collar to hem, shape (6, 61, 3)."""
     nape, shoulder, knee = fit.joint("Neck"), fit.joint("LeftArm"), fit.joint("LeftLeg")
-    s = shoulder[0] / 0.162
     return np.stack(
         [
             arc(150, 0.078 * s, nape + (0, 0.02 * s, -0.075 * s), nape + (0, -0.04 * s, 0.075 * s)),
@@ -72,15 +73,6 @@ def arc(degrees: float, half_width: float, middle: ArrayLike, end: ArrayLike) ->
     return line
 
 
-def through(keys: Floats, count: int) -> tuple[Floats, Floats]:
-    """Return a smooth grid of `count` rows through key lines (K, C, 3), and each row's depth from the top [m]."""
-    from scipy.interpolate import PchipInterpolator
-
-    at = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(keys, axis=0), axis=-1).mean(axis=1))])
-    depth = np.linspace(0, at[-1], count)
-    return PchipInterpolator(at, keys)(depth), depth
-
-
 def fringe_skirt(fit: Fit) -> tuple[Floats, Ints]:
     """Cut a skirt: a waistband on the hips, and 32 strips that hang from it to the knees, free of each other."""
     strips, band = 32, 8
@@ -105,8 +97,7 @@ def halve(quads: Ints, forward: Ints) -> Ints:
 
 def skirt_surface(fit: Fit, columns: int, band: int) -> Floats:
     """Return a closed grid from the waist to the knees whose first `band` rows cling to the hips."""
-    hips, shoulder, knee = fit.joint("Hips"), fit.joint("LeftArm"), fit.joint("LeftLeg")
-    s = shoulder[0] / 0.162
+    s, hips, knee = fit.size, fit.joint("Hips"), fit.joint("LeftLeg")
     top, hem, edge = hips[1] + 0.125 * s, knee[1] - 0.01 * s, 0.0125 * s
     heights = np.arange(top, hem, -edge)
     rows = [outline(fit, height, CLEARANCE, half_width=0.27 * s, count=columns) for height in heights]
@@ -120,5 +111,5 @@ def skirt_surface(fit: Fit, columns: int, band: int) -> Floats:
     return relax(fit, grid, CLEARANCE, cling=cling, rounds=25, closed=True)
 
 
-CUTS = {"cape": cape, "fringe_skirt": fringe_skirt}
+CUTS = {"cape": cape, "fringe_skirt": fringe_skirt, "hooded_dress": hooded_dress}
 GARMENTS = tuple(CUTS)
