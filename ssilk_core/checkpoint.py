@@ -171,8 +171,13 @@ def _model_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Model
     garment = Garment(mesh, skin("plain", paths["garment"]), tensors["scene.classes"])
     parameters = {name[6:]: value for name, value in tensors.items() if name.startswith("model.")}
     for name, value in parameters.items():
-        need(np.isfinite(value).all(), paths["garment"], f"parameter '{name}' holds NaN or infinity", "all are finite",
-             "train again")  # fmt: skip
+        need(
+            np.isfinite(value).all(),
+            paths["garment"],
+            f"parameter '{name}' holds NaN or infinity",
+            "all are finite",
+            "train again",
+        )
     return ModelFile(
         Scene(Character(paths["skeleton"], skeleton, ()), garment, rig),
         ModelConfig(**document["config"]),

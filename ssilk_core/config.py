@@ -125,8 +125,18 @@ PRESETS = {
             name="draft",
             model=ModelConfig(latent=32, widths=(128, 128), shapes=24),
             train=TrainConfig(
-                iterations=700, warm=0.55, warm_batch=48, warm_rate=2e-3, batch=4, window=16, rotated=0.3, rate=6e-4,
-                final_rate=1e-4, rate_warmup=20, validate_every=100, valid_frames=90,
+                iterations=700,
+                warm=0.55,
+                warm_batch=48,
+                warm_rate=2e-3,
+                batch=4,
+                window=16,
+                rotated=0.3,
+                rate=6e-4,
+                final_rate=1e-4,
+                rate_warmup=20,
+                validate_every=100,
+                valid_frames=90,
             ),
         ),
         Preset(
@@ -136,7 +146,7 @@ PRESETS = {
         ),
         Preset(name="final", model=ModelConfig(), train=TrainConfig()),
     )
-}  # fmt: skip
+}
 
 
 def preset_named(name: str) -> Preset:
@@ -166,7 +176,9 @@ def overridden(config: Config, assignments: list[str]) -> Config:
         name, _, text = assignment.partition("=")
         need(name in types, f"option '{assignment}'", "no such setting", f"settings are {', '.join(types)}")
         try:
-            changes[name] = tuple(int(n) for n in text.split(",")) if types[name] is tuple else _converted(types[name], text)
+            changes[name] = (
+                tuple(int(n) for n in text.split(",")) if types[name] is tuple else _converted(types[name], text)
+            )
         except (ValueError, KeyError):
             need(
                 False,

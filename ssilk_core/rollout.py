@@ -12,7 +12,7 @@ from torch import Tensor
 
 from .assets import Floats, GarmentPose, Motion
 from .errors import need
-from .kinematics import motion_transforms, resample, slerp, skinning_matrices, split_at_cuts
+from .kinematics import motion_transforms, resample, skinning_matrices, slerp, split_at_cuts
 from .model.descriptors import gravity_features, pose_features
 from .model.network import GarmentModel
 
@@ -91,7 +91,7 @@ def resample_poses(poses: Iterator[GarmentPose], source: float, target: float) -
         joined = pose if tail is None else _joined(tail, pose)
         last = joined.start + joined.frame_count - 1
         count = int(np.floor(last * target / source + 1e-6)) + 1 - done
-        position = np.minimum((done + np.arange(count)) * source / target, last) - joined.start
+        position = np.minimum((done + np.arange(count)) * source / target, last).astype(float) - joined.start
         if count:
             yield _sampled(joined, position, done)
         done += max(count, 0)

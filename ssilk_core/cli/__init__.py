@@ -18,14 +18,22 @@ VERBS = (inspect, rig, train, bake, verify, view, demo)
 
 # Distribution extra that brings each optional library.
 EXTRAS = {
-    "torch": "train", "pxr": "usd", "igl": "setup", "scipy": "setup", "trimesh": "setup", "embreex": "view",
-    "imageio_ffmpeg": "view", "PIL": "view",
-}  # fmt: skip
+    "torch": "train",
+    "pxr": "usd",
+    "igl": "setup",
+    "scipy": "setup",
+    "trimesh": "setup",
+    "embreex": "view",
+    "imageio_ffmpeg": "view",
+    "PIL": "view",
+}
 
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of all verbs."""
-    top = argparse.ArgumentParser(prog="ssilk", description="Neural loose garments, trained by physics alone, baked as UsdSkel.")
+    top = argparse.ArgumentParser(
+        prog="ssilk", description="Neural loose garments, trained by physics alone, baked as UsdSkel."
+    )
     top.add_argument("--version", action="version", version=f"ssilk {__version__}")
     verbs = top.add_subparsers(dest="verb", metavar="VERB", required=True)
     for module in VERBS:
@@ -35,7 +43,9 @@ def parser() -> argparse.ArgumentParser:
             description=module.__doc__,
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        verb.add_argument("--json", action="store_true", help="events as JSON, one object per line, on standard output")
+        verb.add_argument(
+            "--json", action="store_true", help="events as JSON, one object per line, on standard output"
+        )
         verb.set_defaults(run=module.run)
         module.add_arguments(verb)
     return top

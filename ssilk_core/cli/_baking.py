@@ -15,8 +15,9 @@ from ssilk_core.errors import VerificationError, need
 from ssilk_core.events import Message, Progress, Reporter
 
 if TYPE_CHECKING:
-    from ssilk_core.model.network import GarmentModel
     from ssilk_usd.units import StageUnits
+
+    from ssilk_core.model.network import GarmentModel
 
 CHUNK = 256  # frames in memory at once
 
@@ -107,20 +108,26 @@ def open_bake(request: BakeRequest) -> Bake:
     Raises:
         SsilkError: a file is missing or does not fit the others.
     """
-    from ssilk_core.checkpoint import load_model, network
-    from ssilk_core.files import sha256
     from ssilk_usd.read_character import read_character
     from ssilk_usd.read_motion import read_motion
     from ssilk_usd.read_stage import open_stage
     from ssilk_usd.units import StageUnits
+
+    from ssilk_core.checkpoint import load_model, network
+    from ssilk_core.files import sha256
 
     file = load_model(request.model)
     stage = open_stage(request.stage)
     character = read_character(stage, root=request.root, garment=None)
     skeleton = file.scene.character.skeleton
     missing = sorted(set(skeleton.joint_names) - set(character.skeleton.joint_names))
-    need(not missing, request.stage, f"the skeleton lacks {len(missing)} of the model's joints ({', '.join(missing[:3])})",
-         "a model bakes on the character it was trained with", "train on this character")  # fmt: skip
+    need(
+        not missing,
+        request.stage,
+        f"{len(missing)} of the model's joints are missing ({', '.join(missing[:3])})",
+        "a model bakes on the character it was trained with",
+        "train on this character",
+    )
     scene = replace(file.scene, character=replace(character, skeleton=skeleton))
     source = read_motion(request.motion, skeleton)
     motion = source if request.fps is None else _at_rate(source, request.fps)
@@ -144,6 +151,6 @@ def _at_rate(motion: Motion, fps: float) -> Motion:
 
 def _plain(scene: Scene) -> Deformer:
     """Return the garment under plain skinning: no proxies, no shapes."""
-    none = ProxyRig(scene.rig.path, (), np.zeros(0), np.zeros((0, 4, 4)), scene.plain_skin)
+    none = ProxyRig(scene.rig.path, (), np.zeros(0, dtype=np.int32), np.zeros((0, 4, 4)), scene.plain_skin)
     bare = replace(scene, rig=none)
     return Deformer(bare, scene.plain_skin, np.zeros((0, scene.garment.mesh.vertex_count, 3)))

@@ -34,19 +34,37 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
     from ._baking import BakeRequest, open_bake
 
-    bake = open_bake(BakeRequest(
-        model=str(options.model), stage=str(options.stage), motion=str(options.motion), fps=options.fps,
-        root=options.root, plain=options.plain, device=options.device,
-    ))  # fmt: skip
+    bake = open_bake(
+        BakeRequest(
+            model=str(options.model),
+            stage=str(options.stage),
+            motion=str(options.motion),
+            fps=options.fps,
+            root=options.root,
+            plain=options.plain,
+            device=options.device,
+        )
+    )
     report(Started("bake", bake.motion.frame_count, {"output": str(options.output)}))
     summary = write_shot(
-        options.output, bake.deformer, bake.motion, bake.poses(), units=bake.units, start=bake.motion.start,
-        include_body=not options.no_body, provenance=bake.provenance,
-    )  # fmt: skip
+        options.output,
+        bake.deformer,
+        bake.motion,
+        bake.poses(),
+        units=bake.units,
+        start=bake.motion.start,
+        include_body=not options.no_body,
+        provenance=bake.provenance,
+    )
     detail: dict[str, object] = {
-        "shot": str(options.output), "frames": summary.frame_count, "fps": summary.fps, "joints": summary.joint_count,
-        "proxies": summary.proxy_count, "blendshapes": summary.shape_count, "bytes": options.output.stat().st_size,
-    }  # fmt: skip
+        "shot": str(options.output),
+        "frames": summary.frame_count,
+        "fps": summary.fps,
+        "joints": summary.joint_count,
+        "proxies": summary.proxy_count,
+        "blendshapes": summary.shape_count,
+        "bytes": options.output.stat().st_size,
+    }
     if options.no_verify:
         report(Message("not verified, as asked", "warning"))
     else:

@@ -11,7 +11,9 @@ from ssilk_core.events import Reporter
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
-    verb.add_argument("--out", type=Path, default=Path("demo_out"), help="folder for everything the demo makes (default demo_out)")
+    verb.add_argument(
+        "--out", type=Path, default=Path("demo_out"), help="folder for everything the demo makes (default demo_out)"
+    )
 
 
 def run(options: argparse.Namespace, report: Reporter) -> int:

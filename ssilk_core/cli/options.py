@@ -21,21 +21,33 @@ if TYPE_CHECKING:
 def add_scene(verb: argparse.ArgumentParser) -> None:
     """Add the options that say which character and garment are meant."""
     verb.add_argument("stage", type=Path, help="USD file with the character (SkelRoot, Skeleton, body meshes)")
-    verb.add_argument("--garment", metavar="FILE[:/PRIM]|PRIM", help="garment: a file of its own, or a mesh of the stage")
+    verb.add_argument(
+        "--garment", metavar="FILE[:/PRIM]|PRIM", help="garment: a file of its own, or a mesh of the stage"
+    )
     verb.add_argument("--root", metavar="PRIM", help="SkelRoot of the character, where the stage has several")
     verb.add_argument(
-        "--body", metavar="PRIM", action="append", default=[], help="body mesh (repeatable; default: all under the SkelRoot)"
+        "--body",
+        metavar="PRIM",
+        action="append",
+        default=[],
+        help="body mesh (repeatable; default: all under the SkelRoot)",
     )
 
 
 def add_setup(verb: argparse.ArgumentParser) -> None:
     """Add the options of automatic classes and proxies."""
     group = verb.add_argument_group("automatic classes and rig")
-    group.add_argument("--proxies", type=int, default=RigOptions.proxies, help="proxy joints on the loose part (default %(default)s)")
+    group.add_argument(
+        "--proxies", type=int, default=RigOptions.proxies, help="proxy joints on the loose part (default %(default)s)"
+    )
     for name, kind in (("classes", ClassOptions), ("rig", RigOptions)):
         names = ", ".join(f"{key}={value:g}" for key, value in vars(kind()).items())
         group.add_argument(
-            f"--{name}", action="append", default=[], metavar="NAME=VALUE", help=f"change a threshold (repeatable): {names}"
+            f"--{name}",
+            action="append",
+            default=[],
+            metavar="NAME=VALUE",
+            help=f"change a threshold (repeatable): {names}",
         )
 
 
@@ -43,7 +55,9 @@ def read(options: argparse.Namespace, report: Reporter) -> tuple[Character, Garm
     """Read the character, the garment and its authored rig, as the options of `add_scene` say."""
     from ssilk_usd.read_scene import read_scene
 
-    need(options.stage.exists(), str(options.stage), "there is no such file", "a USD stage with a character is needed")
+    need(
+        options.stage.exists(), str(options.stage), "there is no such file", "a USD stage with a character is needed"
+    )
     return read_scene(options.stage, root=options.root, bodies=options.body, garment=options.garment, report=report)
 
 

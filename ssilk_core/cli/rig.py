@@ -27,15 +27,22 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Prepare the scene and write it."""
     import numpy as np
+    from ssilk_usd.rig_io import write_rigged_stage
 
     from ssilk_core.assets import CLASS_NAMES
-    from ssilk_usd.rig_io import write_rigged_stage
 
     scene = shared.load_scene(options, report, anew=options.anew)
     write_rigged_stage(options.stage, scene, options.output)
     counts = np.bincount(scene.classes, minlength=3)
-    report(Result("rig", {
-        "stage": str(options.output), "garment": scene.garment.mesh.path, "proxies": scene.rig.proxy_count,
-        **{f"{name} vertices": int(count) for name, count in zip(CLASS_NAMES, counts)},
-    }))  # fmt: skip
+    report(
+        Result(
+            "rig",
+            {
+                "stage": str(options.output),
+                "garment": scene.garment.mesh.path,
+                "proxies": scene.rig.proxy_count,
+                **{f"{name} vertices": int(count) for name, count in zip(CLASS_NAMES, counts)},
+            },
+        )
+    )
     return EXIT_OK

@@ -22,31 +22,65 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
     shared.add_scene(verb)
     shared.add_setup(verb)
-    verb.add_argument("--motions", type=Path, nargs="+", required=True, metavar="PATH", help="motion files or folders to train on")
-    verb.add_argument("--valid", type=Path, nargs="+", default=[], metavar="PATH", help="motions to validate on (default: every fifth of --motions)")
-    verb.add_argument("-o", "--output", type=Path, required=True, metavar="MODEL", help="model to write (.safetensors)")
-    verb.add_argument("--preset", choices=PRESETS, default="preview", help="schedule and size of the network (default preview)")
+    verb.add_argument(
+        "--motions", type=Path, nargs="+", required=True, metavar="PATH", help="motion files or folders to train on"
+    )
+    verb.add_argument(
+        "--valid",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="PATH",
+        help="motions to validate on (default: every fifth of --motions)",
+    )
+    verb.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="MODEL", help="model to write (.safetensors)"
+    )
+    verb.add_argument(
+        "--preset", choices=PRESETS, default="preview", help="schedule and size of the network (default preview)"
+    )
     verb.add_argument("--fabric", choices=FABRICS, default="default", help="material (default: that of the paper)")
     verb.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1, ... (default auto)")
     verb.add_argument("--resume", action="store_true", help="go on from the state beside the model")
     verb.add_argument("--seed", type=int, default=0, help="of everything random (default 0)")
-    verb.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="settings", help="change one setting of the preset (repeatable)")
+    verb.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        dest="settings",
+        help="change one setting of the preset (repeatable)",
+    )
 
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Train; return 0 when finished, 130 when interrupted."""
     from ssilk_core.training.run import interruptible, train
 
-    need(options.output.suffix == ".safetensors", str(options.output), "not a name for a model", "it ends in .safetensors")
+    need(
+        options.output.suffix == ".safetensors",
+        str(options.output),
+        "not a name for a model",
+        "it ends in .safetensors",
+    )
     job = _job(options, report)
     with interruptible() as stop:
         trained = train(job, report, stop)
     share = 1 - trained.score.total / trained.plain.total
-    report(Result("train", {
-        "model": str(options.output), "iterations": trained.iterations, "total [J]": round(trained.score.total, 5),
-        "plain skinning [J]": round(trained.plain.total, 5), "lower by": f"{share:.1%}",
-        "collisions": f"{trained.score.collisions:.2%}", **{f"{k} [J]": round(v, 5) for k, v in trained.score.terms.items()},
-    }))  # fmt: skip
+    report(
+        Result(
+            "train",
+            {
+                "model": str(options.output),
+                "iterations": trained.iterations,
+                "total [J]": round(trained.score.total, 5),
+                "plain skinning [J]": round(trained.plain.total, 5),
+                "lower by": f"{share:.1%}",
+                "collisions": f"{trained.score.collisions:.2%}",
+                **{f"{k} [J]": round(v, 5) for k, v in trained.score.terms.items()},
+            },
+        )
+    )
     if not trained.finished:
         report(Message(f"stopped at iteration {trained.iterations}; --resume goes on from there."))
         return EXIT_INTERRUPTED
@@ -54,9 +88,10 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
 
 def _job(options: argparse.Namespace, report: Reporter):  # type: ignore[no-untyped-def]  # TrainJob is heavy to import
+    from ssilk_usd.read_motion import motion_files, read_motions
+
     from ssilk_core.files import sha256
     from ssilk_core.training.run import TrainJob, split_motions
-    from ssilk_usd.read_motion import motion_files, read_motions
 
     preset = preset_named(options.preset)
     scene = shared.load_scene(options, report)
@@ -68,13 +103,22 @@ def _job(options: argparse.Namespace, report: Reporter):  # type: ignore[no-unty
     model, train = _settings(options.settings, preset.model, preset.train, options.seed)
     files = [options.stage, *motion_files([*options.motions, *options.valid])]
     return TrainJob(
-        scene=scene, motions=motions, held_out=held, model=model, train=train, fabric=fabric_named(options.fabric),
-        output=options.output, device=options.device, resume=options.resume,
+        scene=scene,
+        motions=motions,
+        held_out=held,
+        model=model,
+        train=train,
+        fabric=fabric_named(options.fabric),
+        output=options.output,
+        device=options.device,
+        resume=options.resume,
         inputs={str(path): sha256(path) for path in files},
-    )  # fmt: skip
+    )
 
 
-def _settings(settings: list[str], model: ModelConfig, train: TrainConfig, seed: int) -> tuple[ModelConfig, TrainConfig]:
+def _settings(
+    settings: list[str], model: ModelConfig, train: TrainConfig, seed: int
+) -> tuple[ModelConfig, TrainConfig]:
     """Apply "name=value" settings to whichever of the two has the name."""
     own = [setting for setting in settings if setting.partition("=")[0] in ModelConfig.__dataclass_fields__]
     others = [setting for setting in settings if setting not in own]

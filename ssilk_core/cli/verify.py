@@ -28,10 +28,17 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
     from ._baking import BakeRequest, open_bake
 
-    need(options.shot.is_file(), str(options.shot), "there is no such shot", "a file written by 'ssilk bake' is needed")
+    need(
+        options.shot.is_file(), str(options.shot), "there is no such shot", "a file written by 'ssilk bake' is needed"
+    )
     carried = read_provenance(options.shot).get("request")
-    need(isinstance(carried, dict), str(options.shot), "the file does not say how it was baked",
-         "a shot written by 'ssilk bake' is needed")  # fmt: skip
+    carried = carried if isinstance(carried, dict) else {}
+    need(
+        carried,
+        str(options.shot),
+        "the file does not say how it was baked",
+        "a shot written by 'ssilk bake' is needed",
+    )
     known = {item.name for item in fields(BakeRequest)}
     request = BakeRequest(**{key: value for key, value in carried.items() if key in known})
     moved = {key: getattr(options, key) for key in ("model", "stage", "motion") if getattr(options, key)}

@@ -18,7 +18,9 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("shots", type=Path, nargs="+", metavar="SHOT", help="shots of one length and rate")
     verb.add_argument("-o", "--output", type=Path, required=True, help="film (.mp4) or contact sheet (.png)")
     verb.add_argument("--label", action="append", default=[], help="a word for each shot (repeatable)")
-    verb.add_argument("--fps", type=float, default=30.0, help="at most so many frames per second of film (default 30)")
+    verb.add_argument(
+        "--fps", type=float, default=30.0, help="at most so many frames per second of film (default 30)"
+    )
     verb.add_argument("--columns", type=int, default=6, help="moments in a row of the sheet (default 6)")
     verb.add_argument("--rows", type=int, default=1, help="rows of the sheet (default 1)")
     verb.add_argument("--azimuth", type=float, default=None, help="side from which the camera looks [degrees]")
@@ -28,9 +30,10 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Draw."""
+    from ssilk_usd.play import Shot
+
     from ssilk_core.view.output import FILM, check_suffix
     from ssilk_core.view.shots import film_of_shots, sheet_of_shots
-    from ssilk_usd.play import Shot
 
     film = check_suffix(options.output) == FILM
     players = [Shot(path) for path in options.shots]
@@ -40,7 +43,13 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         count = film_of_shots(options.output, players, labels=labels, fps=options.fps, look=look, report=report)
     else:
         count = sheet_of_shots(
-            options.output, players, labels=labels, columns=options.columns, rows=options.rows, look=look, report=report
+            options.output,
+            players,
+            labels=labels,
+            columns=options.columns,
+            rows=options.rows,
+            look=look,
+            report=report,
         )
     report(Result("view", {"picture": str(options.output), "frames": count}))
     return EXIT_OK

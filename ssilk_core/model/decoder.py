@@ -52,6 +52,8 @@ class Decoder(nn.Module):
     support: Tensor
     logits: Tensor
     order: Tensor
+    identity: Tensor
+    smoother: Tensor
 
     def __init__(self, scene: Scene, shapes: int, smoothing: float, generator: torch.Generator) -> None:
         super().__init__()
@@ -68,6 +70,7 @@ class Decoder(nn.Module):
         self._constant("columns", np.searchsorted(used, rig.skin.indices).clip(max=len(used) - 1))
         self._constant("support", support)
         self._constant("logits", np.log(np.where(support, rig.skin.weights, 1.0)))
+        self._constant("identity", np.array([1.0, 0, 0, 0, 1, 0]))
         self._constant_levels(scene)
         self.skin_offset = nn.Parameter(torch.zeros(len(free), support.shape[1]))
         self.shapes = nn.Parameter(1e-3 * torch.randn(len(free), 3, shapes, generator=generator))
@@ -106,8 +109,7 @@ class Decoder(nn.Module):
         """Split network output (N, K + 6 P) into activations (K, N) in [-1, 1] and rotations (P, 3, 3, N)."""
         a = torch.tanh(output[:, : self.shape_count].T)
         delta = output[:, self.shape_count :].T.reshape(self.proxy_count, 6, len(output))
-        identity = delta.new_tensor([1.0, 0, 0, 0, 1, 0])[:, None]
-        return a, rotation_from_six_d(identity + delta)
+        return a, rotation_from_six_d(self.identity[:, None] + delta)
 
     def blendshapes(self) -> Tensor:
         """Return B (free vertices, 3, K) [m]; with smoothing, B = (I + s L)^-1 U and U is what is trained."""

@@ -63,9 +63,9 @@ class Verlet(Integrator):
 
 
 class SpringVerlet(Verlet):
-    """Eq. 3 with a spring to the quasi-static state: z_t = zbar + k (P(theta_t) - zbar) + S([zbar, z_{t-1}, P, pose]).
+    """Eq. 3 with a spring: z_t = zbar + k (P(theta_t) - zbar) + S([zbar, z_{t-1}, P(theta_t), pose]).
 
-    Without S every dimension is a damped spring towards equilibrium, stable for any k in (0, 1]; S learns what
+    Without S every dimension is a damped spring towards the quasi-static state, stable for any k in (0, 1]; S learns what
     such a spring misses. Stiffnesses start spread from slow swings to immediate following.
     """
 

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -19,7 +21,7 @@ def mlp(inputs: int, widths: tuple[int, ...], outputs: int, generator: torch.Gen
     """Return a smooth multilayer perceptron; the last layer starts `last` times its usual size."""
     sizes = [inputs, *widths, outputs]
     layers: list[nn.Module] = []
-    for index, (fan_in, fan_out) in enumerate(zip(sizes, sizes[1:])):
+    for index, (fan_in, fan_out) in enumerate(pairwise(sizes)):
         linear = nn.Linear(fan_in, fan_out)
         final = index == len(sizes) - 2
         with torch.no_grad():

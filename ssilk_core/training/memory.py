@@ -51,7 +51,7 @@ def decoded_frames(config: TrainConfig, batch: int) -> int:
 def fitting_batch(
     scene: Scene, model: ModelConfig, config: TrainConfig, body_vertices: int, available: int
 ) -> tuple[int, int]:
-    """Return the largest batch and warm batch, at most the configured ones, whose step fits into `available` bytes."""
+    """Return the largest batch and warm batch, up to the configured ones, whose steps fit into `available` bytes."""
     per_frame = step_memory(scene, model, 1, body_vertices) - step_memory(scene, model, 0, body_vertices)
     frames = int(max(1, (SHARE * available - step_memory(scene, model, 0, body_vertices)) // per_frame))
     return max(1, min(config.batch, frames // config.window)), max(1, min(config.warm_batch, frames))

@@ -112,13 +112,15 @@ class Run:
         bank = build_bank(job.motions, skeleton, joints, job.model.fps, self.device)
         held = build_bank(job.held_out, skeleton, joints, job.model.fps, self.device)
         energy = GarmentEnergy(scene.garment.mesh, job.fabric, device=self.device)
-        body = CollisionBody(scene.character.merged_body(), skeleton.joint_count, vertices=reach.vertices,
-                             device=self.device)  # fmt: skip
+        body = CollisionBody(
+            scene.character.merged_body(), skeleton.joint_count, vertices=reach.vertices, device=self.device
+        )
         generator = torch.Generator(self.device).manual_seed(job.train.seed)
         sampler = WindowSampler(bank, job.train, job.model.latent, generator)
         self.stepper = Stepper(self.model, Objective(self.model, energy, body, bank), sampler, job.train)
-        self.validator = Validator(held, energy, body, scene.plain_skin, self.model.decoder.rest, job.model.fps,
-                                   job.train.valid_frames)  # fmt: skip
+        self.validator = Validator(
+            held, energy, body, scene.plain_skin, self.model.decoder.rest, job.model.fps, job.train.valid_frames
+        )
         self.iteration, self.best = 0, float("inf")
         self._announce(len(reach.vertices), len(joints))
 
@@ -129,9 +131,13 @@ class Run:
         needed = step_memory(job.scene, job.model, decoded_frames(job.train, job.train.batch), body_vertices)
         if (batch, warm) == (job.train.batch, job.train.warm_batch):
             return job
-        self.report(Message(
-            f"{needed / 2**30:.1f} GiB are needed and {free / 2**30:.1f} GiB are free on {self.device}: the batch goes from "
-            f"{job.train.batch} to {batch} windows and from {job.train.warm_batch} to {warm} single poses.", "warning"))  # fmt: skip
+        self.report(
+            Message(
+                f"{needed / 2**30:.1f} GiB are needed and {free / 2**30:.1f} GiB are free on {self.device}: the batch goes "
+                f"from {job.train.batch} to {batch} windows and from {job.train.warm_batch} to {warm} single poses.",
+                "warning",
+            )
+        )
         return replace(job, train=replace(job.train, batch=batch, warm_batch=warm))
 
     def _announce(self, body_vertices: int, joints: int) -> None:
@@ -142,20 +148,36 @@ class Run:
                     Message(f"{motion.path}: the root jumps {len(spans) - 1} times; each span is used by itself.")
                 )
         frames = decoded_frames(job.train, job.train.batch)
-        self.report(Started("train", job.train.iterations, {
-            "garment": mesh.path, "vertices": mesh.vertex_count, "proxies": job.scene.rig.proxy_count,
-            "blendshapes": job.model.shapes, "joints in view": joints, "body vertices": body_vertices,
-            "parameters": sum(p.numel() for p in self.model.parameters()), "device": str(self.device),
-            "memory predicted [MiB]": step_memory(job.scene, job.model, frames, body_vertices) >> 20,
-        }))  # fmt: skip
+        self.report(
+            Started(
+                "train",
+                job.train.iterations,
+                {
+                    "garment": mesh.path,
+                    "vertices": mesh.vertex_count,
+                    "proxies": job.scene.rig.proxy_count,
+                    "blendshapes": job.model.shapes,
+                    "joints in view": joints,
+                    "body vertices": body_vertices,
+                    "parameters": sum(p.numel() for p in self.model.parameters()),
+                    "device": str(self.device),
+                    "memory predicted [MiB]": step_memory(job.scene, job.model, frames, body_vertices) >> 20,
+                },
+            )
+        )
 
     def asked(self) -> dict[str, Any]:
         """Return what makes this run the run it is; a resumed run must be asked the same."""
         job = self.job
-        return canonical({
-            "model": asdict(job.model), "train": asdict(job.train), "fabric": asdict(job.fabric),
-            "inputs": job.inputs or {}, "garment": job.scene.garment.mesh.path,
-        })  # fmt: skip
+        return canonical(
+            {
+                "model": asdict(job.model),
+                "train": asdict(job.train),
+                "fabric": asdict(job.fabric),
+                "inputs": job.inputs or {},
+                "garment": job.scene.garment.mesh.path,
+            }
+        )
 
     def save_state(self) -> None:
         """Write the run's state beside the model."""
@@ -169,8 +191,13 @@ class Run:
     def validate(self) -> Score:
         """Score the model on the held-out clips and keep it when it is the best so far."""
         score = self.validator.score(self.model)
-        need(np.isfinite(score.total), str(self.job.output), f"training diverged by iteration {self.iteration}",
-             "the best model before it is kept", "lower the step size (--set rate=...) and resume")  # fmt: skip
+        need(
+            np.isfinite(score.total),
+            str(self.job.output),
+            f"training diverged by iteration {self.iteration}",
+            "the best model before it is kept",
+            "lower the step size (--set rate=...) and resume",
+        )
         if score.total < self.best:
             self.best = score.total
             provenance = self.provenance(score)
@@ -180,12 +207,19 @@ class Run:
 
     def provenance(self, score: Score) -> dict[str, Any]:
         """Return how the model came to be."""
-        return canonical({
-            **self.asked(), "iteration": self.iteration, "seed": self.job.train.seed, "ssilk": __version__,
-            "torch": torch.__version__, "python": platform.python_version(), "device": device_name(self.device),
-            "motions": [motion.path for motion in self.job.motions],
-            "validation": {**score.terms, "total": score.total, "collisions": score.collisions},
-        })  # fmt: skip
+        return canonical(
+            {
+                **self.asked(),
+                "iteration": self.iteration,
+                "seed": self.job.train.seed,
+                "ssilk": __version__,
+                "torch": torch.__version__,
+                "python": platform.python_version(),
+                "device": device_name(self.device),
+                "motions": [motion.path for motion in self.job.motions],
+                "validation": {**score.terms, "total": score.total, "collisions": score.collisions},
+            }
+        )
 
 
 def device_name(device: torch.device) -> str:
@@ -195,7 +229,7 @@ def device_name(device: torch.device) -> str:
 
 @contextmanager
 def interruptible() -> Iterator[threading.Event]:
-    """Yield an event that SIGINT and SIGTERM set, so that work stops between two steps; the second one is immediate."""
+    """Yield an event that SIGINT and SIGTERM set, so that work stops between two steps; a second one is immediate."""
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield stop
@@ -265,10 +299,12 @@ def _judgement(run: Run, score: Score, plain: Score) -> Message:
     share = 1 - score.total / plain.total
     terms = ", ".join(f"{name} {value:.4g}" for name, value in score.terms.items())
     text = (
-        f"validation at {run.iteration}: total {score.total:.4g} J, {share:.1%} under plain skinning's {plain.total:.4g} J "
+        f"validation at {run.iteration}: total {score.total:.4g} J, {share:.1%} under plain skinning's {plain.total:.4g} "
         f"({terms}), collisions {score.collisions:.2%}, motion of its own {score.dynamics * 1000:.0f} mm"
     )
     if score.dynamics < NO_DYNAMICS:
-        return Message(f"{text}; nothing dynamic is being learned: check that the motions move and that classes are loose",
-                       "warning")  # fmt: skip
+        return Message(
+            f"{text}; nothing dynamic is being learned: check that the motions move and that classes are loose",
+            "warning",
+        )
     return Message(text)

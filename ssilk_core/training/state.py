@@ -51,8 +51,13 @@ def load_state(path: Path, stepper: Stepper, asked: dict[str, Any]) -> RunState:
     """
     from safetensors import SafetensorError, safe_open
 
-    need(path.is_file(), str(path), "there is no training to resume", "the file is written beside the model",
-         "train without --resume")  # fmt: skip
+    need(
+        path.is_file(),
+        str(path),
+        "there is no training to resume",
+        "the file is written beside the model",
+        "train without --resume",
+    )
     try:
         with safe_open(path, "pt") as stream:
             state = RunState(**json.loads((stream.metadata() or {}).get("ssilk_state", "{}")))
@@ -62,8 +67,13 @@ def load_state(path: Path, stepper: Stepper, asked: dict[str, Any]) -> RunState:
             f"{path}: the training state is damaged ({error}); delete it and train without --resume."
         ) from error
     differing = sorted(key for key in asked if asked[key] != state.asked.get(key))
-    need(not differing, str(path), f"the run was started with another {', '.join(differing)}",
-         "a resumed run repeats the same command", "use the same options or train without --resume")  # fmt: skip
+    need(
+        not differing,
+        str(path),
+        f"the run was started with another {', '.join(differing)}",
+        "a resumed run repeats the same command",
+        "use the same options or train without --resume",
+    )
     _restore(stepper, tensors)
     return state
 

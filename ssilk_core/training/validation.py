@@ -42,8 +42,16 @@ class Score:
 class Validator:
     """Rolls a model over whole clips and scores it against plain skinning on the same frames."""
 
-    def __init__(self, bank: MotionBank, energy: GarmentEnergy, body: CollisionBody, plain: SkinWeights, rest: Tensor,
-                 fps: float, frames: int) -> None:  # fmt: skip
+    def __init__(
+        self,
+        bank: MotionBank,
+        energy: GarmentEnergy,
+        body: CollisionBody,
+        plain: SkinWeights,
+        rest: Tensor,
+        fps: float,
+        frames: int,
+    ) -> None:
         self.bank, self.energy, self.body, self.fps = bank, energy, body, fps
         self.plain_weights = torch.as_tensor(plain.dense(bank.joint_count), dtype=rest.dtype, device=rest.device)
         self.rest = rest

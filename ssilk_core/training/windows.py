@@ -20,7 +20,8 @@ def random_directions(count: int, rotated: float, generator: torch.Generator, de
     draw = torch.randn(count, 3, generator=generator, device=device)
     anywhere = draw / draw.norm(dim=1, keepdim=True).clamp_min(1e-6)
     turned = torch.rand(count, 1, generator=generator, device=device) < rotated
-    return torch.where(turned, anywhere, anywhere.new_tensor([0.0, -1.0, 0.0]))
+    down = -torch.eye(3, device=device)[1]  # made on the device: a captured graph may not copy from the host
+    return torch.where(turned, anywhere, down)
 
 
 class WindowSampler:
@@ -41,8 +42,13 @@ class WindowSampler:
         self.stop_of = stops
         self.candidates = frames[frames + config.window <= stops]
         longest = int((bank.stops - bank.starts).max())
-        need(len(self.candidates), "motions", f"the longest clip has {longest} frames at the model's rate",
-             f"a window of {config.window} poses must fit", "give longer motions or set --train window=N")  # fmt: skip
+        need(
+            len(self.candidates),
+            "motions",
+            f"the longest clip has {longest} frames at the model's rate",
+            f"a window of {config.window} poses must fit",
+            "give longer motions or set --train window=N",
+        )
         self.first = self._fresh()
         self.direction = random_directions(config.batch, config.rotated, generator, device).clone()
         self.latents = torch.zeros(2, config.batch, latent, device=device)
@@ -69,9 +75,12 @@ class WindowSampler:
     def state(self) -> dict[str, Tensor]:
         """Return what a resumed run needs to go on exactly, the random state included."""
         return {
-            "first": self.first, "direction": self.direction, "latents": self.latents, "carried": self.carried,
+            "first": self.first,
+            "direction": self.direction,
+            "latents": self.latents,
+            "carried": self.carried,
             "generator": self.generator.get_state(),
-        }  # fmt: skip
+        }
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Take back what `state` returned."""
