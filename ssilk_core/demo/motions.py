@@ -9,11 +9,13 @@ from dataclasses import replace
 import numpy as np
 
 from ssilk_core.assets import Floats, Motion, Skeleton
-from ssilk_core.demo.motions_acts import gesture, idle, jump, spin
 from ssilk_core.demo.motions_biped import Biped, Track
 from ssilk_core.demo.motions_cartwheel import cartwheel
 from ssilk_core.demo.motions_curves import FPS
 from ssilk_core.demo.motions_gait import RUN, WALK, Gait, locomotion
+from ssilk_core.demo.motions_gestures import gesture, idle
+from ssilk_core.demo.motions_jump import jump
+from ssilk_core.demo.motions_spin import spin
 from ssilk_core.errors import need
 from ssilk_core.kinematics import (
     invert_rigid,

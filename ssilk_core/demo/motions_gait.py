@@ -9,7 +9,7 @@ import numpy as np
 
 from ssilk_core.assets import Floats
 from ssilk_core.demo.motions_biped import OUT, Biped, Track
-from ssilk_core.demo.motions_curves import FPS, about, bump, clock, ease, keyed, travel, turned
+from ssilk_core.demo.motions_curves import FPS, about, apply, bump, clock, ease, keyed, travel, turned
 
 BEFORE, AFTER = 0.3, 0.6  # seconds of standing around a clip
 START = -0.25  # phase at which both feet carry; at 0 the left one is in the middle of its stance
@@ -92,14 +92,11 @@ def carry(biped: Biped, gait: Gait, phase: Floats, pace: Floats, gone: Floats, c
     scale, still = biped.scale, biped.stand(len(phase))
     once, side = np.sin(2 * np.pi * phase), np.cos(2 * np.pi * phase)
     heading = course.heading(gone)
-    sway = 0.02 * scale * pace * side
     bend = np.gradient(heading) * FPS  # people lean into a bend
     angles = np.stack([np.radians(gait.lean / 2) * pace, heading + np.radians(5) * pace * once,
                        -np.radians(2.5) * pace * side + 0.05 * bend], axis=-1)  # fmt: skip
-    hips = still.hips + course.point(gone)
-    hips = hips + np.stack([np.cos(heading) * sway, np.zeros_like(sway), -np.sin(heading) * sway], axis=-1)
-    ahead = 0.02 * scale * pace
-    hips = hips + np.stack([np.sin(heading) * ahead, np.zeros_like(sway), np.cos(heading) * ahead], axis=-1)
+    shift = 0.02 * scale * pace[:, None] * np.stack([side, 0 * side, 0 * side + 1], axis=-1)
+    hips = still.hips + course.point(gone) + apply(about(1, heading), shift)
     hips[:, 1] += scale * pace * (gait.rise * np.cos(4 * np.pi * phase) - gait.drop)
     spine = np.stack(
         [np.radians(gait.lean / 2) * pace, -np.radians(11) * pace * once, np.radians(3) * pace * side], axis=-1
@@ -158,8 +155,7 @@ def plants(
     heading = course.heading(at)
     home = biped.stance()[side]
     width = (0.095 + inner * (gait.width - 0.095)) * biped.scale * OUT[side]
-    out = np.stack([np.cos(heading) * width, np.zeros_like(width), -np.sin(heading) * width], axis=-1)
-    middle = (
-        np.array([0.0, home[1], 0.0]) + np.stack([np.sin(heading), 0 * heading, np.cos(heading)], axis=-1) * home[2]
-    )
-    return heading, course.point(at) + middle + out
+    # The course is the line of the pelvis, so a bend turns the stand about the pelvis.
+    pelvis = biped.at("Hips")[2]
+    offset = np.stack([width, 0 * width, 0 * width + home[2] - pelvis], axis=-1)
+    return heading, course.point(at) + (0.0, home[1], pelvis) + apply(about(1, heading), offset)

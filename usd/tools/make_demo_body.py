@@ -14,10 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from pxr import Gf, Kind, Usd, UsdGeom, UsdSkel, Vt
+from ssilk_usd.stages import demo_body_path
 
 from ssilk_core.files import replacing
 from ssilk_core.kinematics import local_transforms
-from ssilk_usd.stages import demo_body_path
 
 INFLUENCES = 4
 TO_Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
