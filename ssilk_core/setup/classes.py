@@ -20,7 +20,9 @@ from ssilk_core.mesh.topology import components, edge_use, edges, islands, smoot
 from ssilk_core.setup.surface import SurfacePoints, closest_on_surface
 
 Mask = NDArray[np.bool_]
-HANG_ROUNDS = 30  # of averaging heights over the cloth: looks past a collar that curls in towards the neck
+HANG_RADIUS = 0.06  # [m] around a border vertex: wide enough to look past a collar that curls in towards the neck
+HANG_DROP = 0.005  # [m] that a border from which cloth hangs stands above the mean of that neighbourhood
+TILT = (1.3e-3, -0.7e-3, 1.1e-3)  # turns rays off the axes, along which they slip through edges of regular meshes
 
 
 @dataclass(frozen=True)
@@ -31,29 +33,33 @@ class ClassOptions:
         tight_distance: farthest that held cloth lies from the body [m].
         tear_rate: change of skinning weights along an edge, half the sum of absolute differences per length
             [1/m], above which plain skinning tears; bodies themselves stay below about 30.
-        torn_distance: farthest that held cloth lies from the body where skinning tears [m].
+        tear_width: how far around a tear, along the cloth, it counts as torn [m].
+        torn_distance: farthest that torn cloth lies from the body and is still held [m].
         support: least upward part of the body's normal where it carries cloth (cosine with up).
         wrapped: least share of rays into the body that must meet the garment again where it is wrapped.
         thickness: length of those rays in which the garment is not looked for, to clear folds nearby [m].
         strip_width: cloth narrower than this hangs free, as fringes do, and wraps nothing [m].
         rounds: rounds of averaging with the neighbours that tidy the border between held and loose.
-        speck_area: patches smaller than this join what surrounds them [m2].
+        speck_reach: patches that nowhere lead this far away from what surrounds them join it [m].
         pinned_width: width of the pinned band, along the cloth [m].
         pinned_distance: farthest that a border lies from the body and still pins the garment [m].
+        pinned_length: shortest border from which the garment hangs [m]; without one it is pinned at its top.
         yoke_width: width of the band below that border, along the cloth, in which it holds near cloth [m].
     """
 
     tight_distance: float = 0.05
     tear_rate: float = 30.0
-    torn_distance: float = 0.025
+    tear_width: float = 0.04
+    torn_distance: float = 0.035
     support: float = 0.5
     wrapped: float = 0.3
     thickness: float = 0.05
     strip_width: float = 0.08
     rounds: int = 4
-    speck_area: float = 0.012
+    speck_reach: float = 0.04
     pinned_width: float = 0.025
     pinned_distance: float = 0.03
+    pinned_length: float = 0.25
     yoke_width: float = 0.08
 
     def __post_init__(self) -> None:
@@ -78,11 +84,13 @@ def classify(
     pairs, island = edges(mesh.faces), islands(mesh.faces, mesh.vertex_count)
     body = closest_on_surface(mesh.points, character.merged_body().mesh)
     tears = _tear_rate(mesh, skin.dense(character.skeleton.joint_count), pairs) > options.tear_rate
-    near = body.distance < np.where(tears, options.torn_distance, options.tight_distance)
-    rim = _hanging_border(mesh, body.distance < options.pinned_distance, island)
+    torn = _band(mesh, tears, options.tear_width)
+    near = body.distance < np.where(torn, options.torn_distance, options.tight_distance)
+    rim = _hanging_border(mesh, body.distance < options.pinned_distance, island, options.pinned_length)
     held = near & _holding(mesh, body, near, rim, options)
     held = smooth(held[:, None].astype(float), pairs, options.rounds)[:, 0] > 0.5
-    held = _without_specks(held | rim, mesh, pairs, options.speck_area)
+    held = _with_specks(held, mesh, pairs, options.speck_reach)
+    held = ~_with_specks(~held, mesh, pairs, options.speck_reach) | _band(mesh, rim, options.pinned_width)
     _need_held(held, mesh, island)
     classes = np.where(held, TIGHT, LOOSE).astype(np.int8)
     classes[held & _band(mesh, rim | _tops(mesh, held, rim, island, options), options.pinned_width)] = PINNED
@@ -139,27 +147,20 @@ def _wrapped(mesh: Mesh, normals: Floats, near: Mask, thickness: float) -> Float
     tree.init(mesh.points, mesh.faces)
     hits = np.zeros(mesh.vertex_count)
     for lean in (np.zeros_like(along), across, -across, along, -along):
-        rays = lean - normals
+        rays = lean - normals + TILT
         rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
         face, _, _ = tree.intersect_ray_first(mesh.points, mesh.faces, mesh.points + thickness * rays, rays)
         hits += (face >= 0) & near[mesh.faces[face]].all(axis=1)
     return hits / 5
 
 
-def _without_specks(held: Mask, mesh: Mesh, pairs: Ints, smallest: float) -> Mask:
-    """Turn patches of `held` (V,) and of its opposite that are smaller than `smallest` [m2] into the other kind.
-
-    Smallest first, so that a speck within a speck joins what surrounds both. An island of one kind is no speck.
-    """
-    areas, held = vertex_areas(mesh.points, mesh.faces), held.copy()
-    while True:
-        across = held[pairs[:, 0]] != held[pairs[:, 1]]
-        patch = components(pairs[~across], mesh.vertex_count)
-        size = np.bincount(patch, areas)
-        size[np.setdiff1d(patch, patch[pairs[across]])] = np.inf
-        if size.min() >= smallest:
-            return held
-        held[patch == size.argmin()] ^= True
+def _with_specks(kind: Mask, mesh: Mesh, pairs: Ints, reach: float) -> Mask:
+    """Return `kind` (V,) with the patches outside it, specks and hems, that nowhere lead `reach` [m] away from it."""
+    away = distances(mesh.points, mesh.faces, np.flatnonzero(kind))
+    patch = components(pairs[~kind[pairs].any(axis=1)], mesh.vertex_count)
+    farthest = np.zeros(mesh.vertex_count)
+    np.maximum.at(farthest, patch, away)
+    return kind | (farthest[patch] <= reach)
 
 
 def _need_held(held: Mask, mesh: Mesh, island: Ints) -> None:
@@ -184,16 +185,31 @@ def _tops(mesh: Mesh, held: Mask, rim: Mask, island: Ints, options: ClassOptions
     return result
 
 
-def _hanging_border(mesh: Mesh, near: Mask, island: Ints) -> Mask:
-    """Return, for each island, the highest stretch of `near` border that stands above the cloth around it, (V,)."""
+def _hanging_border(mesh: Mesh, near: Mask, island: Ints, shortest: float) -> Mask:
+    """Return, for each island, the highest stretch of `near` border that stands above the cloth around it, (V,).
+
+    Stretches shorter than `shortest` [m], such as the lower half of an armhole, hold nothing up.
+    """
     pairs, uses = edge_use(mesh.faces)
-    rims, height = pairs[uses == 1], mesh.points @ UP
-    hangs = near & (height > smooth(height[:, None], pairs, HANG_ROUNDS)[:, 0])
-    hangs &= np.isin(np.arange(mesh.vertex_count), rims)
-    stretch = components(rims[hangs[rims].all(axis=1)], mesh.vertex_count)
-    mean_height = np.bincount(stretch, height) / np.bincount(stretch)
+    rims = pairs[(uses == 1) & near[pairs].all(axis=1)]
+    border, index = np.unique(rims, return_inverse=True)
+    rims = rims[(_drops(mesh, border) > HANG_DROP)[index.reshape(-1, 2)].all(axis=1)]
+    stretch = components(rims, mesh.vertex_count)
+    height = np.bincount(stretch, mesh.points @ UP) / np.bincount(stretch)
+    lengths = np.linalg.norm(mesh.points[rims[:, 0]] - mesh.points[rims[:, 1]], axis=1)
+    long = (np.bincount(stretch[rims[:, 0]], lengths, minlength=len(height)) >= shortest)[stretch]
     result = np.zeros(mesh.vertex_count, dtype=bool)
-    for number in np.unique(island[hangs]):
-        here = stretch[hangs & (island == number)]
-        result |= stretch == here[mean_height[here].argmax()]
+    for number in np.unique(island[long]):
+        here = stretch[long & (island == number)]
+        result |= stretch == here[height[here].argmax()]
     return result
+
+
+def _drops(mesh: Mesh, vertices: Ints) -> Floats:
+    """Return how far `vertices` (N,) stand above the mean of the cloth around them [m], shape (N,)."""
+    from scipy.spatial import cKDTree
+
+    areas, height = vertex_areas(mesh.points, mesh.faces), mesh.points @ UP
+    around = cKDTree(mesh.points).query_ball_point(mesh.points[vertices], HANG_RADIUS)
+    means = [np.average(height[near], weights=areas[near] + 1e-12) for near in around]
+    return height[vertices] - np.array(means)
