@@ -62,6 +62,8 @@ class TrainConfig:
         carry: share of windows that continue from the state where the last window of their slot ended.
         rotated: share of windows that get a random rotation, uniform on SO(3); the others stay upright.
         noise: standard deviation added to the first two latents of a window.
+        noise_correlation: of the noise on the first latent with that on the second; 0 is the paper's.
+        through_time: back-propagate through the whole window, as the paper does, or through each step by itself.
         warm_rate: Adam's step size in the warm start, decaying to a tenth.
         rate, final_rate: Adam's step size in training proper, after its warm-up and at the end (cosine in between).
         skin_rate: factor on the step size of skinning weights, alpha and beta.
@@ -78,6 +80,8 @@ class TrainConfig:
     carry: float = 0.7
     rotated: float = 1.0
     noise: float = 0.1
+    noise_correlation: float = 0.99
+    through_time: bool = False
     warm_rate: float = 1e-3
     rate: float = 5e-4
     final_rate: float = 2e-5

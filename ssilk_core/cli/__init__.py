@@ -76,5 +76,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_BAD_INPUT
 
 
-if __name__ == "__main__":
-    sys.exit(main() or EXIT_OK)

@@ -1,21 +1,112 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check a stage before training (preflight)."""
+"""Check a character, a garment and motions before training (preflight).
+
+Every finding names the prim, the count, what was found, why it matters and what to do. --fix writes a copy of the
+garment's file in which everything is repaired that is safe to repair, and reports what is left. The exit code is 0
+when nothing is worse than a warning, and 2 when there are errors.
+"""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from ssilk_core.events import Reporter
+from ssilk_core.config import PRESETS, preset_named
+from ssilk_core.errors import EXIT_BAD_INPUT, EXIT_OK
+from ssilk_core.events import Reporter, Result, silent
+
+from . import options as shared
+
+if TYPE_CHECKING:
+    from ssilk_core.preflight.inspection import Inspected
+    from ssilk_core.preflight.units import FileUnits
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
-    verb.add_argument(
-        "--out", type=Path, default=Path("demo_out"), help="folder for everything the demo makes (default demo_out)"
-    )
+    shared.add_scene(verb)
+    verb.add_argument("--motion", type=Path, nargs="+", default=[], metavar="PATH", help="motion files or folders to check too")
+    verb.add_argument("--preset", choices=PRESETS, default="preview", help="training to estimate memory and time for (default preview)")
+    verb.add_argument("--fix", type=Path, metavar="OUT", help="write a repaired copy of the garment's file (.usdc, .usd or .usda)")
 
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
-    """Run the demo."""
-    raise NotImplementedError
+    """Inspect; return 0, or 2 when there are errors."""
+    from ssilk_core.preflight.inspection import inspect
+    from ssilk_core.preflight.table import format_findings
+
+    world, repaired = _world(options, report), None
+    if options.fix:
+        repaired = _fix(options, world)
+        world = _world(_moved(options), silent)
+    findings = inspect(world)
+    if options.json:
+        detail = {"fixed": {"output": str(options.fix), "repaired": repaired}} if options.fix else {}
+        report(Result("inspect", {"findings": findings, **detail}))
+    else:
+        if options.fix:
+            print(f"{options.fix}: {', '.join(repaired or ['nothing to repair'])}. What is left in it:\n")
+        print(format_findings(findings))
+    return EXIT_BAD_INPUT if any(finding.severity == "error" for finding in findings) else EXIT_OK
+
+
+def _world(options: argparse.Namespace, report: Reporter) -> Inspected:
+    """Read everything that is inspected."""
+    from ssilk_core.preflight.inspection import Inspected
+    from ssilk_core.preflight.motion import MotionFile
+    from ssilk_usd.facts import animated
+    from ssilk_usd.read_motion import read_motions
+    from ssilk_usd.repair import repair_lock
+
+    character, garment, rig = shared.read(options, report)
+    motions = read_motions(options.motion, character.skeleton)
+    return Inspected(
+        character=character, garment=garment, rig=rig, stage=_units(options.stage), wardrobe=_units(_wardrobe(options)[0]),
+        locked=repair_lock(*_wardrobe(options)), motions=motions, preset=preset_named(options.preset),
+        files=[MotionFile(motion.path, *animated(motion, character.skeleton)) for motion in motions],
+    )  # fmt: skip
+
+
+def _wardrobe(options: argparse.Namespace) -> tuple[Path, str | None]:
+    """Return the file that the garment stands in, and the prim that was asked for."""
+    from ssilk_usd.read_stage import USD_SUFFIXES, split_location
+
+    file, prim = split_location(options.garment) if options.garment else ("", None)
+    return (Path(file), prim) if Path(file).suffix in USD_SUFFIXES else (options.stage, options.garment)
+
+
+def _units(path: Path) -> FileUnits:
+    from ssilk_core.preflight.units import FileUnits
+    from ssilk_usd.facts import stage_facts
+
+    facts = stage_facts(path)
+    return FileUnits(
+        facts.path, facts.units.meters_per_unit, facts.units.up_axis, facts.meters_authored, facts.axis_authored
+    )
+
+
+def _fix(options: argparse.Namespace, world: Inspected) -> list[str]:
+    """Write the repaired copy; return what was repaired."""
+    from ssilk_core.preflight.fit import misplacement
+    from ssilk_core.preflight.repair import plan_repair
+    from ssilk_core.preflight.units import misread
+    from ssilk_usd.repair import write_repaired
+    from ssilk_usd.units import StageUnits
+
+    file, prim = _wardrobe(options)
+    body = world.character.merged_body().mesh
+    guess = misread(body) if world.stage == world.wardrobe else misplacement(world.garment.mesh, body)
+    units = world.wardrobe.corrected(guess)
+    repair = plan_repair(world.character, world.garment, world.rig, topology=not world.locked)
+    target = StageUnits(units.meters_per_unit, units.up_axis)
+    write_repaired(file, options.fix, repair, target, garment=prim, root=options.root)
+    stated = [] if units == world.wardrobe else [f"metersPerUnit {target.meters_per_unit:g} and upAxis {target.up_axis} stated"]
+    return [*repair.done, *stated]
+
+
+def _moved(options: argparse.Namespace) -> argparse.Namespace:
+    """Return the options with the repaired copy in place of the file that it was made from."""
+    file, prim = _wardrobe(options)
+    own = {} if file == options.stage else {"garment": f"{options.fix}:{prim}" if prim else str(options.fix)}
+    return argparse.Namespace(**{**vars(options), **(own or {"stage": options.fix})})

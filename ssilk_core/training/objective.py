@@ -62,8 +62,16 @@ class Objective:
         target = rest.detach().reshape(length, batch, -1)
         start = torch.where(sampler.carried[None, :, None], sampler.latents, target[:2])
         z = [*model.integrator.limited(start + noise).unbind(0)]
-        for t in range(2, length):
-            z.append(model.step(z[-2], z[-1], target[t], pose[t]))
+        with torch.set_grad_enabled(sampler.config.through_time):
+            for t in range(2, length):
+                z.append(model.step(z[-2], z[-1], target[t], pose[t]))
+        rolled = torch.cat(z[2:])
+        if not sampler.config.through_time:
+            # The same steps once more, all at once, from states that carry no gradient.
+            states = torch.cat(z)
+            rolled = model.step(
+                states[: -2 * batch], states[batch:-batch], *(v[2:].flatten(0, 1) for v in (target, pose))
+            )
         quiet = rest[: 2 * batch]
         with torch.no_grad():
             past = model.vertices(torch.cat(z[:2]), bank.character(frames[: 2 * batch]))
@@ -73,13 +81,13 @@ class Objective:
             torch.cat([direction[2 * batch :], direction[: 2 * batch]]),
         )
         character = bank.character(seen)
-        x = model.vertices(torch.cat([*z[2:], quiet]), character)
+        x = model.vertices(torch.cat([rolled, quiet]), character)
         terms = self.potential(x, facing, character)
         count = (length - 2) * batch
         dynamic = {name: value[:count] for name, value in terms.items()}
         resting = {name: value[count:] for name, value in terms.items()}
-        rolled = torch.cat([past, x[..., :count].detach()], dim=-1)
-        predicted = 2 * rolled[..., batch:-batch] - rolled[..., : -2 * batch]
+        path = torch.cat([past, x[..., :count].detach()], dim=-1)
+        predicted = 2 * path[..., batch:-batch] - path[..., : -2 * batch]
         dynamic["inertia"] = self.energy.inertia(x[..., :count], predicted, self.dt)
         return dynamic, resting, torch.stack(z[-2:]).detach()
 

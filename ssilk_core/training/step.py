@@ -72,9 +72,7 @@ class Stepper:
 
     def windows(self) -> None:
         """Train everything on one window of every slot."""
-        shape = self.sampler.latents.shape
-        noise = torch.randn(shape, generator=self.sampler.generator, device=self.device) * self.config.noise
-        dynamic, resting, latents = self.objective.window(self.sampler, noise)
+        dynamic, resting, latents = self.objective.window(self.sampler, self.sampler.noise())
         length = self.config.window
         # Every frame weighs the same, the two that the initialiser answers for included.
         loss = (total(dynamic) * (length - 2) + total(resting) * 2) / length

@@ -58,6 +58,17 @@ class WindowSampler:
         pick = torch.rand(self.config.batch, generator=self.generator, device=self.candidates.device)
         return self.candidates[(pick * len(self.candidates)).long().clamp_max(len(self.candidates) - 1)]
 
+    def noise(self) -> Tensor:
+        """Return noise for the first two latents of each window, shape (2, batch, latent).
+
+        Mostly alike on both: the garment is put elsewhere, not thrown. Independent noise of this size is a velocity
+        ten times that of everyday motion.
+        """
+        config = self.config
+        first, second = torch.randn(self.latents.shape, generator=self.generator, device=self.latents.device)
+        second = config.noise_correlation * first + (1 - config.noise_correlation**2) ** 0.5 * second
+        return config.noise * torch.stack([first, second])
+
     def advance(self, latents: Tensor) -> None:
         """Move on: keep the last two `latents` (2, batch, latent) of the window, then choose the next windows."""
         config, device = self.config, self.first.device

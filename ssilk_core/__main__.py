@@ -1,0 +1,8 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`python -m ssilk_core` is the command line."""
+
+import sys
+
+from ssilk_core.cli import main
+
+sys.exit(main())

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What holds the garment on the body: vertex classes and islands."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ssilk_core.assets import CLASS_NAMES, LOOSE, Ints, Mesh
+from ssilk_core.mesh.topology import islands
+
+from .finding import Finding, Findings, listing
+
+
+def class_coverage(mesh: Mesh, classes: Ints) -> Findings:
+    """Yield how many vertices are pinned, tight and loose, classes (V,)."""
+    counts = np.bincount(classes, minlength=len(CLASS_NAMES))
+    told = ", ".join(f"{count:,} {name}" for name, count in zip(CLASS_NAMES, counts))
+    notes = {
+        "; nothing is loose, so that no proxies are needed": counts[LOOSE] == 0,
+        "; nothing is loose or tight, so that it only follows the skeleton": counts[0] == mesh.vertex_count,
+    }
+    yield Finding(
+        severity="info",
+        code="classes",
+        prim=mesh.path,
+        found=f"of {mesh.vertex_count:,} vertices {told}" + next((n for n, holds in reversed(notes.items()) if holds), ""),
+    )
+
+
+def unheld_islands(mesh: Mesh, classes: Ints) -> Findings:
+    """Yield the islands of a garment without any pinned or tight vertex; vertices in no face are not counted."""
+    island = islands(mesh.faces, mesh.vertex_count)
+    adrift = np.setdiff1d(island[np.unique(mesh.faces)], island[np.flatnonzero(classes != LOOSE)])
+    if len(adrift):
+        lost = np.flatnonzero(np.isin(island, adrift))
+        yield Finding(
+            severity="error",
+            code="unheld-islands",
+            prim=mesh.path,
+            count=len(lost),
+            found=f"{len(adrift)} of {len(np.unique(island[mesh.faces]))} islands have neither pinned nor tight vertices",
+            why="nothing holds them: they fall off the body",
+            fix="paint a part of each pinned or tight (primvars:ssilk:class), or sew it to the rest",
+            elements="vertices",
+            indices=listing(lost),
+        )
