@@ -69,6 +69,7 @@ class TrainConfig:
         skin_rate: factor on the step size of skinning weights, alpha and beta.
         clip: bound on the global gradient norm.
         validate_every: iterations between validations; valid_frames: frames of each clip used for them.
+        average: decay of the running average of the parameters, which is what is validated and kept; 0 for none.
         seed: of everything random.
     """
 
@@ -88,6 +89,7 @@ class TrainConfig:
     rate_warmup: int = 500
     skin_rate: float = 0.1
     clip: float = 1.0
+    average: float = 0.998
     validate_every: int = 1000
     valid_frames: int = 300
     seed: int = 0
@@ -139,6 +141,7 @@ PRESETS = {
                 rate=6e-4,
                 final_rate=1e-4,
                 rate_warmup=20,
+                average=0.98,
                 validate_every=100,
                 valid_frames=90,
             ),

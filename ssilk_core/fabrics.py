@@ -22,6 +22,8 @@ class Fabric:
         bending: dihedral stiffness [N m] (per radian squared).
         collision: penalty stiffness for each vertex [N/m, per vertex].
         margin: distance to the body at which the penalty starts [m].
+        drag: resistance of the air [kg/(m2 s)], for each area and velocity through air that moves with the
+            character's root. Half a second of swinging on for light cloth; zero is the paper's vacuum.
     """
 
     name: str
@@ -34,6 +36,7 @@ class Fabric:
     bending: float = 1e-5
     collision: float = 10.0
     margin: float = 4e-3
+    drag: float = 0.3
 
     def __post_init__(self) -> None:
         need(

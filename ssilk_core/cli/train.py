@@ -13,7 +13,7 @@ from pathlib import Path
 from ssilk_core.config import PRESETS, ModelConfig, TrainConfig, overridden, preset_named
 from ssilk_core.errors import EXIT_INTERRUPTED, EXIT_OK, need
 from ssilk_core.events import Message, Reporter, Result
-from ssilk_core.fabrics import FABRICS, fabric_named
+from ssilk_core.fabrics import FABRICS, Fabric, fabric_named
 
 from . import options as shared
 
@@ -40,6 +40,13 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         "--preset", choices=PRESETS, default="preview", help="schedule and size of the network (default preview)"
     )
     verb.add_argument("--fabric", choices=FABRICS, default="default", help="material (default: that of the paper)")
+    verb.add_argument(
+        "--material",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help=f"change a property of the fabric (repeatable): {', '.join(Fabric.__dataclass_fields__)}",
+    )
     verb.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1, ... (default auto)")
     verb.add_argument("--resume", action="store_true", help="go on from the state beside the model")
     verb.add_argument("--seed", type=int, default=0, help="of everything random (default 0)")
@@ -108,7 +115,7 @@ def _job(options: argparse.Namespace, report: Reporter):  # type: ignore[no-unty
         held_out=held,
         model=model,
         train=train,
-        fabric=fabric_named(options.fabric),
+        fabric=overridden(fabric_named(options.fabric), options.material),
         output=options.output,
         device=options.device,
         resume=options.resume,

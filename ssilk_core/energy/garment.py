@@ -16,6 +16,7 @@ from .operators import difference_operator
 from .stretch import deformation_gradient_operator, rest_frames, stretch_density
 
 TERMS = ("stretch", "bending", "gravity", "inertia", "collision")
+"""The paper's terms; drag is trained with, but not counted, so that totals compare with its."""
 
 
 class GarmentEnergy:
@@ -63,6 +64,14 @@ class GarmentEnergy:
     def inertia(self, x: Tensor, predicted: Tensor, dt: float) -> Tensor:
         """Return sum m/(2 dt^2) |x - predicted|^2; predicted = 2 x_{t-1} - x_{t-2} carries no gradient."""
         return self.mass @ ((x - predicted.detach()) ** 2).sum(1) / (2 * dt * dt)
+
+    def drag(self, x: Tensor, carried: Tensor, dt: float) -> Tensor:
+        """Return sum c a/(2 dt) |x - carried|^2, whose force is -c a v with v = (x - carried) / dt.
+
+        `carried` is where the air took the last positions (V, 3, N); it carries no gradient.
+        """
+        weight = self.fabric.drag / self.fabric.density * self.mass
+        return weight @ ((x - carried.detach()) ** 2).sum(1) / (2 * dt)
 
     def collision(self, x: Tensor, body: PosedBody) -> Tensor:
         return self.collision_of(signed_distance(x, body))

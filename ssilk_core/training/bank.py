@@ -23,11 +23,13 @@ class MotionBank:
     Attributes:
         matrices: skinning matrices of every frame, shape (F, J * 12), moved so that each clip's root starts at
             the origin (single precision is finest there).
+        root: position of the first joint [m], in the same place, shape (F, 3).
         static, dynamic, down: the descriptors of `model.descriptors.PoseFeatures`.
         starts, stops: first frame and end of each clip, shape (clips,).
     """
 
     matrices: Tensor
+    root: Tensor
     static: Tensor
     dynamic: Tensor
     down: Tensor
@@ -69,6 +71,7 @@ def build_bank(
     need(clips, motions[0].path, "every motion is shorter than four frames", "longer ones are needed")
     features = [pose_features(clip, skeleton, joints) for clip in clips]
     matrices = [centred_matrices(clip, skeleton)[0] for clip in clips]
+    roots = [m[:, 0, :3, :3] @ skeleton.bind_transforms[0, :3, 3] + m[:, 0, :3, 3] for m in matrices]
     ends = np.cumsum([clip.frame_count for clip in clips])
 
     def tensor(arrays: list[Floats]) -> Tensor:
@@ -76,6 +79,7 @@ def build_bank(
 
     return MotionBank(
         tensor([m[:, :, :3].reshape(len(m), -1) for m in matrices]),
+        tensor(roots),
         tensor([f.static for f in features]),
         tensor([f.dynamic for f in features]),
         tensor([f.down for f in features]),

@@ -89,6 +89,10 @@ class Objective:
         path = torch.cat([past, x[..., :count].detach()], dim=-1)
         predicted = 2 * path[..., batch:-batch] - path[..., : -2 * batch]
         dynamic["inertia"] = self.energy.inertia(x[..., :count], predicted, self.dt)
+        if self.energy.fabric.drag:
+            root = bank.root[frames].T
+            carried = path[..., batch:-batch] + root[:, 2 * batch :] - root[:, batch:-batch]
+            dynamic["drag"] = self.energy.drag(x[..., :count], carried, self.dt)
         return dynamic, resting, torch.stack(z[-2:]).detach()
 
 

@@ -133,7 +133,7 @@ class Run:
             return job
         self.report(
             Message(
-                f"{needed / 2**30:.1f} GiB are needed and {free / 2**30:.1f} GiB are free on {self.device}: the batch goes "
+                f"{needed / 2**30:.1f} GiB needed, {free / 2**30:.1f} GiB free on {self.device}: the batch goes "
                 f"from {job.train.batch} to {batch} windows and from {job.train.warm_batch} to {warm} single poses.",
                 "warning",
             )
@@ -190,7 +190,7 @@ class Run:
 
     def validate(self) -> Score:
         """Score the model on the held-out clips and keep it when it is the best so far."""
-        score = self.validator.score(self.model)
+        score = self.validator.score(self.stepper.averaged)
         need(
             np.isfinite(score.total),
             str(self.job.output),
@@ -201,7 +201,7 @@ class Run:
         if score.total < self.best:
             self.best = score.total
             provenance = self.provenance(score)
-            save_model(self.job.output, model_file(self.model, self.job.fabric, provenance))
+            save_model(self.job.output, model_file(self.stepper.averaged, self.job.fabric, provenance))
             self.report(Checkpoint(str(self.job.output), self.iteration, True))
         return score
 
@@ -299,7 +299,8 @@ def _judgement(run: Run, score: Score, plain: Score) -> Message:
     share = 1 - score.total / plain.total
     terms = ", ".join(f"{name} {value:.4g}" for name, value in score.terms.items())
     text = (
-        f"validation at {run.iteration}: total {score.total:.4g} J, {share:.1%} under plain skinning's {plain.total:.4g} "
+        f"validation at {run.iteration}: total {score.total:.4g} J, "
+        f"{share:.1%} under plain skinning's {plain.total:.4g} J "
         f"({terms}), collisions {score.collisions:.2%}, motion of its own {score.dynamics * 1000:.0f} mm"
     )
     if score.dynamics < NO_DYNAMICS:

@@ -80,6 +80,7 @@ def load_state(path: Path, stepper: Stepper, asked: dict[str, Any]) -> RunState:
 
 def _tensors(stepper: Stepper) -> dict[str, Tensor]:
     tensors = {f"model.{name}": value for name, value in stepper.model.state_dict().items()}
+    tensors |= {f"averaged.{name}": value for name, value in stepper.averaged.state_dict().items()}
     tensors |= {f"sampler.{name}": value for name, value in stepper.sampler.state().items()}
     for index, moments in stepper.optimiser.state_dict()["state"].items():
         tensors |= {f"adam.{index}.{name}": torch.as_tensor(value) for name, value in moments.items()}
@@ -91,6 +92,7 @@ def _restore(stepper: Stepper, tensors: dict[str, Tensor]) -> None:
         return {name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)}
 
     stepper.model.load_state_dict(group("model."))
+    stepper.averaged.load_state_dict(group("averaged."))
     stepper.sampler.restore(group("sampler."))
     moments: dict[int, dict[str, Tensor]] = {}
     for name, value in group("adam.").items():

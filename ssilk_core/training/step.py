@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable
 
@@ -32,6 +33,7 @@ class Stepper:
 
     Attributes:
         terms: energies of the last step [J], updated in place so that reading them needs no new launch.
+        averaged: running average of the model's parameters.
         skipped: steps left out because a gradient was not finite.
     """
 
@@ -57,6 +59,7 @@ class Stepper:
             capturable=on_gpu,
             foreach=True,
         )
+        self.averaged = copy.deepcopy(model).requires_grad_(False)
         self.terms: dict[str, Tensor] = {}
         self.skipped = torch.zeros((), dtype=torch.int64, device=self.device)
         self._graphs: dict[str, torch.cuda.CUDAGraph] = {}
@@ -91,6 +94,9 @@ class Stepper:
             gradient.copy_(torch.where(finite, gradient, 0.0))
         self.skipped += ~finite
         self.optimiser.step()
+        with torch.no_grad():
+            for mean, value in zip(self.averaged.parameters(), self.model.parameters()):
+                mean.lerp_(value, 1 - self.config.average)
         for name, value in terms.items():
             self.terms.setdefault(name, torch.zeros((), device=self.device)).copy_(value.detach())
 
