@@ -22,6 +22,8 @@ class ModelConfig:
         scheme: how z is integrated: "verlet" (Eq. 3), "direct" (Eq. 11), "direct_residual" (Eq. 12), or
             "spring_verlet", Eq. 3 with a spring to the quasi-static state.
         bound: soft bound on each latent dimension; zero leaves the latents free, as the paper does.
+        push: soft bound on what S and the spring add to each dimension in one step; zero for none.
+        stiffness: largest spring constant of "spring_verlet", in (0, 1].
         smoothing: strength of the Laplacian preconditioner of the blendshapes; zero trains each vertex by itself.
         fps: rate at which the model steps [1/s].
     """
@@ -31,6 +33,8 @@ class ModelConfig:
     shapes: int = 64
     scheme: str = "spring_verlet"
     bound: float = 4.0
+    push: float = 0.15
+    stiffness: float = 0.2
     smoothing: float = 0.0
     fps: float = 30.0
 
@@ -79,7 +83,7 @@ class TrainConfig:
     batch: int = 32
     window: int = 32
     carry: float = 0.7
-    rotated: float = 1.0
+    rotated: float = 0.5
     noise: float = 0.1
     noise_correlation: float = 0.99
     through_time: bool = False

@@ -9,12 +9,19 @@ from abc import ABC, abstractmethod
 import torch
 from torch import Tensor, nn
 
+from ..config import ModelConfig
+
+
+def limited(values: Tensor, bound: float) -> Tensor:
+    """Return b tanh(values / b), the identity around zero; unlimited for a bound of zero."""
+    return bound * torch.tanh(values / bound) if bound else values
+
 
 class Integrator(nn.Module, ABC):
     """Advances z from two past states.
 
-    With a bound b > 0 each new state is b tanh(z / b): the state can never leave [-b, b], so a rollout of any
-    length stays where the decoder was trained. Around zero the map is the identity.
+    With `config.bound` each new state is limited, so that it can never leave the range where the decoder was
+    trained, however long the rollout.
 
     Attributes:
         states: latent vectors that the stepper S sees beside the pose.
@@ -22,9 +29,9 @@ class Integrator(nn.Module, ABC):
 
     states = 2
 
-    def __init__(self, latent: int, bound: float) -> None:
+    def __init__(self, config: ModelConfig) -> None:
         super().__init__()
-        self.bound = bound
+        self.config = config
 
     def forward(self, stepper: nn.Module, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor) -> Tensor:
         """Return z_t, shape (batch, latent).
@@ -35,52 +42,56 @@ class Integrator(nn.Module, ABC):
             rest: the quasi-static state P(theta_t) of the pose at t.
             pose: dynamic descriptor at t.
         """
-        return self.limited(self.advance(stepper, before, now, rest, pose))
+        return self.bounded(self.advance(stepper, before, now, rest, pose))
 
-    def limited(self, z: Tensor) -> Tensor:
-        """Return the state within its bound."""
-        return self.bound * torch.tanh(z / self.bound) if self.bound else z
+    def bounded(self, z: Tensor) -> Tensor:
+        """Return states within their bound."""
+        return limited(z, self.config.bound)
 
     @abstractmethod
     def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor) -> Tensor: ...
 
 
 class Verlet(Integrator):
-    """z_t = zbar + S([zbar, z_{t-1}, pose]) with zbar = alpha z_{t-1} + beta (z_{t-1} - z_{t-2}) (Eqs. 2, 3)."""
+    """z_t = zbar + S([zbar, z_{t-1}, pose]) with zbar = alpha z_{t-1} + beta (z_{t-1} - z_{t-2}) (Eqs. 2, 3).
 
-    def __init__(self, latent: int, bound: float) -> None:
-        super().__init__(latent, bound)
-        self.alpha = nn.Parameter(torch.full((latent,), 1.0))
+    With `config.push` what S adds in a step, a latent acceleration, is limited: the state cannot be flung.
+    """
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__(config)
+        self.alpha = nn.Parameter(torch.full((config.latent,), 1.0))
         # 1 would turn noise on the first two states into a steady drift; 0.9 lets it die within a second.
-        self.beta = nn.Parameter(torch.full((latent,), 0.9))
+        self.beta = nn.Parameter(torch.full((config.latent,), 0.9))
 
     def extrapolated(self, before: Tensor, now: Tensor) -> Tensor:
         return self.alpha * now + self.beta * (now - before)
 
     def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor) -> Tensor:
         forward = self.extrapolated(before, now)
-        return forward + stepper(torch.cat([forward, now, pose], dim=1))
+        return forward + limited(stepper(torch.cat([forward, now, pose], dim=1)), self.config.push)
 
 
 class SpringVerlet(Verlet):
     """Eq. 3 with a spring: z_t = zbar + k (P(theta_t) - zbar) + S([zbar, z_{t-1}, P(theta_t), pose]).
 
-    Without S every dimension is a damped spring towards the quasi-static state, stable for any k in (0, 1]; S learns what
-    such a spring misses. Stiffnesses start spread from slow swings to immediate following.
+    Without S every dimension is a damped spring towards the quasi-static state, stable for any k in (0, 1]; S
+    learns what such a spring misses. Stiffnesses start spread from slow swings to quick following and stay under
+    `config.stiffness`; spring and S together are limited by `config.push`.
     """
 
     states = 3
-    slowest, fastest = 0.02, 0.95
+    slowest = 0.01
 
-    def __init__(self, latent: int, bound: float) -> None:
-        super().__init__(latent, bound)
-        start = torch.logspace(math.log10(self.slowest), math.log10(self.fastest), latent)
-        self.stiffness = nn.Parameter(torch.logit(start))
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__(config)
+        start = torch.logspace(math.log10(self.slowest), math.log10(0.9 * config.stiffness), config.latent)
+        self.share = nn.Parameter(torch.logit(start / config.stiffness))
 
     def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor) -> Tensor:
         forward = self.extrapolated(before, now)
-        pulled = torch.lerp(forward, rest, torch.sigmoid(self.stiffness))
-        return pulled + stepper(torch.cat([pulled, now, rest, pose], dim=1))
+        pull = self.config.stiffness * torch.sigmoid(self.share) * (rest - forward)
+        return forward + limited(pull + stepper(torch.cat([forward, now, rest, pose], dim=1)), self.config.push)
 
 
 class Direct(Integrator):

@@ -51,7 +51,7 @@ class GarmentModel(nn.Module):
         z = config.latent
         self.initialiser = mlp(static, config.widths, z, generator, 1.0)
         # Zero: training starts as pure Verlet integration.
-        self.integrator = INTEGRATORS[config.scheme](z, config.bound)
+        self.integrator = INTEGRATORS[config.scheme](config)
         self.stepper = mlp(self.integrator.states * z + static + dynamic, config.widths, z, generator, 0.0)
         # Small: training starts as plain skinning.
         self.output = mlp(z, config.widths, self.decoder.output_count, generator, 0.01)
@@ -62,7 +62,7 @@ class GarmentModel(nn.Module):
 
     def initial(self, static: Tensor) -> Tensor:
         """Return quasi-static latents (N, latent) from static descriptors (Eq. 1)."""
-        return self.integrator.limited(self.initialiser(static))
+        return self.integrator.bounded(self.initialiser(static))
 
     def step(self, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor) -> Tensor:
         """Return z_t from the two latents before it, the quasi-static one of frame t, and its dynamic descriptor."""
