@@ -13,12 +13,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ssilk_core.config import PRESETS, preset_named
-from ssilk_core.errors import EXIT_BAD_INPUT, EXIT_OK
+from ssilk_core.errors import EXIT_BAD_INPUT, EXIT_OK, need
 from ssilk_core.events import Reporter, Result, silent
 
 from . import options as shared
 
 if TYPE_CHECKING:
+    from ssilk_usd.units import StageUnits
+
     from ssilk_core.preflight.inspection import Inspected
     from ssilk_core.preflight.units import FileUnits
 
@@ -26,9 +28,18 @@ if TYPE_CHECKING:
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
     shared.add_scene(verb)
-    verb.add_argument("--motion", type=Path, nargs="+", default=[], metavar="PATH", help="motion files or folders to check too")
-    verb.add_argument("--preset", choices=PRESETS, default="preview", help="training to estimate memory and time for (default preview)")
-    verb.add_argument("--fix", type=Path, metavar="OUT", help="write a repaired copy of the garment's file (.usdc, .usd or .usda)")
+    verb.add_argument(
+        "--motion", type=Path, nargs="+", default=[], metavar="PATH", help="motion files or folders to check too"
+    )
+    verb.add_argument(
+        "--preset",
+        choices=PRESETS,
+        default="preview",
+        help="training to estimate memory and time for (default preview)",
+    )
+    verb.add_argument(
+        "--fix", type=Path, metavar="OUT", help="write a repaired copy of the garment's file (.usdc, .usd or .usda)"
+    )
 
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
@@ -53,17 +64,19 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
 def _world(options: argparse.Namespace, report: Reporter) -> Inspected:
     """Read everything that is inspected."""
-    from ssilk_core.preflight.inspection import Inspected
-    from ssilk_core.preflight.motion import MotionFile
     from ssilk_usd.facts import animated
     from ssilk_usd.read_motion import read_motions
     from ssilk_usd.repair import repair_lock
 
+    from ssilk_core.preflight.inspection import Inspected
+    from ssilk_core.preflight.motion import MotionFile
+
     character, garment, rig = shared.read(options, report)
+    file, prim = _wardrobe(options)
     motions = read_motions(options.motion, character.skeleton)
     return Inspected(
-        character=character, garment=garment, rig=rig, stage=_units(options.stage), wardrobe=_units(_wardrobe(options)[0]),
-        locked=repair_lock(*_wardrobe(options)), motions=motions, preset=preset_named(options.preset),
+        character=character, garment=garment, rig=rig, stage=_units(options.stage), wardrobe=_units(file),
+        locked=repair_lock(file, prim), motions=motions, preset=preset_named(options.preset),
         files=[MotionFile(motion.path, *animated(motion, character.skeleton)) for motion in motions],
     )  # fmt: skip
 
@@ -77,8 +90,9 @@ def _wardrobe(options: argparse.Namespace) -> tuple[Path, str | None]:
 
 
 def _units(path: Path) -> FileUnits:
-    from ssilk_core.preflight.units import FileUnits
     from ssilk_usd.facts import stage_facts
+
+    from ssilk_core.preflight.units import FileUnits
 
     facts = stage_facts(path)
     return FileUnits(
@@ -88,21 +102,33 @@ def _units(path: Path) -> FileUnits:
 
 def _fix(options: argparse.Namespace, world: Inspected) -> list[str]:
     """Write the repaired copy; return what was repaired."""
-    from ssilk_core.preflight.fit import misplacement
+    from ssilk_usd.repair import write_repaired, write_with_units
+
     from ssilk_core.preflight.repair import plan_repair
-    from ssilk_core.preflight.units import misread
-    from ssilk_usd.repair import write_repaired
-    from ssilk_usd.units import StageUnits
 
     file, prim = _wardrobe(options)
-    body = world.character.merged_body().mesh
-    guess = misread(body) if world.stage == world.wardrobe else misplacement(world.garment.mesh, body)
-    units = world.wardrobe.corrected(guess)
+    units, stated = _corrected_units(world)
+    need(not (options.fix.exists() and options.fix.samefile(file)), str(options.fix), "this is the file to repair",
+         "--fix writes a copy", "name another file")  # fmt: skip
+    # Units first: everything else is measured in them.
+    write_with_units(file, options.fix, units)
+    world = _world(_moved(options), silent)
     repair = plan_repair(world.character, world.garment, world.rig, topology=not world.locked)
-    target = StageUnits(units.meters_per_unit, units.up_axis)
-    write_repaired(file, options.fix, repair, target, garment=prim, root=options.root)
-    stated = [] if units == world.wardrobe else [f"metersPerUnit {target.meters_per_unit:g} and upAxis {target.up_axis} stated"]
-    return [*repair.done, *stated]
+    write_repaired(options.fix, options.fix, repair, garment=prim, root=options.root)
+    return [*stated, *repair.done]
+
+
+def _corrected_units(world: Inspected) -> tuple[StageUnits, list[str]]:
+    """Return what the garment's file should state, and in words what it did not."""
+    from ssilk_usd.units import StageUnits
+
+    from ssilk_core.preflight.fit import misplacement
+    from ssilk_core.preflight.units import misread
+
+    body, old = world.character.merged_body().mesh, world.wardrobe
+    units = old.corrected(misread(body) if world.stage == old else misplacement(world.garment.mesh, body))
+    told = [] if units == old else [f"metersPerUnit {units.meters_per_unit:g} and upAxis {units.up_axis} stated"]
+    return StageUnits(units.meters_per_unit, units.up_axis), told
 
 
 def _moved(options: argparse.Namespace) -> argparse.Namespace:

@@ -12,7 +12,7 @@ from ssilk_core.config import Preset, TrainConfig
 from ssilk_core.events import format_seconds
 from ssilk_core.kinematics import quaternion_from_matrix
 
-from .finding import Finding, Findings, listing, names
+from .finding import Finding, Findings, joint_leaves, listing
 
 # Seconds that one vertex in one frame takes, in a whole optimiser step. Measured: "draft" with a garment of 2,700
 # vertices and 64 frames takes 0.2 s on two CPU threads. Devices that nobody has measured are not listed.
@@ -46,7 +46,7 @@ def memory(scene: Scene, preset: Preset, body_vertices: int) -> Findings:
         severity="warning" if lowered else "info",
         code="memory",
         prim=scene.garment.mesh.path,
-        found=f"preset '{preset.name}' needs about {needed / 2**30:.2g} GiB; {free / 2**30:.2g} GiB are free on {device}"
+        found=f"preset '{preset.name}' needs about {needed / 2**30:.2g} of {free / 2**30:.2g} GiB free on {device}"
         + (note if lowered else ""),
         why="smaller batches learn more slowly for each step" if lowered else "",
         fix="free memory, take another device, or a smaller preset" if lowered else "",
@@ -55,7 +55,9 @@ def memory(scene: Scene, preset: Preset, body_vertices: int) -> Findings:
     found = f"preset '{preset.name}' takes about {format_seconds(seconds)} on {device}" if seconds else (
         f"the time that preset '{preset.name}' takes is not known: training was never measured on {device}"
     )  # fmt: skip
-    why = "scaled by vertices and frames from a garment of 2,700 vertices on two CPU threads; yours may differ by half"
+    why = (
+        "scaled by vertices and frames from a garment of 2,700 vertices on two CPU threads; yours may differ by half"
+    )
     yield Finding(severity="info", code="time", prim=scene.garment.mesh.path, found=found, why=why if seconds else "")
 
 
@@ -79,8 +81,7 @@ def irrelevant_joints(scene: Scene, colliding: np.ndarray) -> Findings:
             code="irrelevant-joints",
             prim=skeleton.path,
             count=len(unseen),
-            found=f"{names([skeleton.joint_names[joint].rpartition('/')[2] for joint in unseen])} cannot matter to the "
-            "garment",
+            found=f"{joint_leaves(skeleton, unseen)} cannot matter to the garment",
             why="they neither carry it nor move a part of the body that it reaches; the network does not see them",
             elements="joints",
             indices=listing(unseen),
@@ -90,4 +91,6 @@ def irrelevant_joints(scene: Scene, colliding: np.ndarray) -> Findings:
 def rest_motion(scene: Scene) -> Motion:
     """Return the rest pose as a motion of one frame."""
     rest = scene.character.skeleton.rest_transforms
-    return Motion(scene.character.skeleton.path, 1.0, quaternion_from_matrix(rest[None, :, :3, :3]), rest[None, :, :3, 3])
+    return Motion(
+        scene.character.skeleton.path, 1.0, quaternion_from_matrix(rest[None, :, :3, :3]), rest[None, :, :3, 3]
+    )

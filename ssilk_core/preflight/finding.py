@@ -10,6 +10,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ssilk_core.assets import Skeleton
+
 Severity = Literal["error", "warning", "info"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "info")  # the worst first
 
@@ -42,6 +44,12 @@ class Finding:
 
 
 Findings = Iterator[Finding]
+_ONE = {"vertices": "vertex", "isolated vertices": "isolated vertex"}
+
+
+def amount(count: int, elements: str) -> str:
+    """Return a number of elements in words: "1 vertex", "1,200 faces"."""
+    return f"{count:,} {elements}" if count != 1 else f"1 {_ONE.get(elements, elements.removesuffix('s'))}"
 
 
 def listing(indices: ArrayLike) -> tuple[int, ...]:
@@ -49,6 +57,7 @@ def listing(indices: ArrayLike) -> tuple[int, ...]:
     return tuple(np.asarray(indices, dtype=np.int64).tolist())
 
 
-def names(words: list[str], most: int = 6) -> str:
-    """Return words separated by commas, the last ones as a number when they are too many to read."""
+def joint_leaves(skeleton: Skeleton, joints: ArrayLike, most: int = 6) -> str:
+    """Return the leaf names of joints (N,), the last ones as a number when they are too many to read."""
+    words = [skeleton.joint_names[joint].rpartition("/")[2] for joint in np.asarray(joints)]
     return ", ".join(words[:most]) + (f" and {len(words) - most} more" if len(words) > most else "")

@@ -12,7 +12,7 @@ from ssilk_core.fabrics import FABRICS
 from ssilk_core.mesh.topology import components, edge_use, edges
 from ssilk_core.setup.surface import closest_on_surface
 
-from .finding import Finding, Findings, listing
+from .finding import Finding, Findings, amount, listing
 
 MARGIN = FABRICS["default"].margin  # [m]
 SHALLOW = 5e-3  # [m]; penetration up to here is pushed out by --fix
@@ -38,21 +38,19 @@ class Misplacement:
 def alignment(mesh: Mesh, body: Mesh, *, fixable: bool = False) -> Findings:
     """Yield that the garment is not where the body is, with the scale or up axis that would put it there.
 
-    `fixable` says that its file states neither units nor axis, so that --fix may write them.
+    `fixable` says that its file leaves units or axis open, so that --fix may write them.
     """
-    distance, height = _distance(mesh.points, body), float(np.ptp(body.points[:, 1]))
-    size = np.ptp(mesh.points, axis=0).max()
-    apart = distance.min() > 0.1 * height or not 0.04 * height < size < 5 * height
     guess = misplacement(mesh, body)
-    if not apart and guess is None:
+    if not _apart(mesh.points, body) and guess is None:
         return
+    distance, size = _distance(mesh.points, body), np.ptp(mesh.points, axis=0).max()
     yield Finding(
         severity="error",
         code="alignment",
         prim=mesh.path,
         count=mesh.vertex_count,
-        found=f"the garment is {size:.3g} m in size and lies {distance.min():.3g} to {distance.max():.3g} m from the body, "
-        f"which is {height:.3g} m high" + _described(guess),
+        found=f"the garment is {size:.3g} m in size and lies {distance.min():.3g} to {distance.max():.3g} m from "
+        f"the body, which is {_height(body):.3g} m high{_described(guess)}",
         why="a garment is trained where it lies: it must be fitted to the body in its bind pose",
         fix="set metersPerUnit and upAxis of its file, or apply its transforms and move it onto the body",
         fixable=fixable and guess is not None,
@@ -61,22 +59,35 @@ def alignment(mesh: Mesh, body: Mesh, *, fixable: bool = False) -> Findings:
 
 
 def misplacement(mesh: Mesh, body: Mesh) -> Misplacement | None:
-    """Return the scale and turn that make a garment fit far better than it does; None where none does or need be."""
-    step = max(1, mesh.vertex_count // SAMPLES)
-    points, height = mesh.points[::step], float(np.ptp(body.points[:, 1]))
-    misfit = {
-        Misplacement(scale, up): _misfit(scale * points @ turn.T, body, height)
-        for scale in SCALES
-        for up, turn in TURNS.items()
-    }
-    best = min(misfit, key=lambda guess: misfit[guess])
-    as_is = misfit[Misplacement(1.0, "")]
-    return best if as_is > 0.15 * height and misfit[best] < 0.25 * as_is else None
+    """Return the simplest scale and turn that put a garment on the body; None if it is there, or none does.
+
+    Only what lies apart from the body is taken to be scaled: a wide gown is far from it, too, but touches it.
+    """
+    points = mesh.points[:: max(1, mesh.vertex_count // SAMPLES)]
+    if _near(points, body):
+        return None
+    scales = SCALES if _apart(mesh.points, body) else (1.0,)
+    guesses = (Misplacement(scale, up) for up in TURNS for scale in scales)
+    return next((guess for guess in guesses if _worn(guess.scale * points @ TURNS[guess.up].T, body)), None)
 
 
-def _misfit(points: Floats, body: Mesh, height: float) -> float:
-    """Return the median distance to the body [m]; infinite for what is too small to be worn."""
-    return float(np.median(_distance(points, body))) if np.ptp(points, axis=0).max() > 0.04 * height else np.inf
+def _height(body: Mesh) -> float:
+    return float(np.ptp(body.points[:, 1]))
+
+
+def _apart(points: Floats, body: Mesh) -> bool:
+    """Return whether points are too far from the body, too small or too large to have to do with it."""
+    size, height = np.ptp(points, axis=0).max(), _height(body)
+    return not 0.04 * height < size < 5 * height or bool(_distance(points, body).min() > 0.1 * height)
+
+
+def _near(points: Floats, body: Mesh) -> bool:
+    return not _apart(points, body) and bool(np.median(_distance(points, body)) < 0.15 * _height(body))
+
+
+def _worn(points: Floats, body: Mesh) -> bool:
+    """Return whether points could be a garment that is worn: near the body, and mostly outside it."""
+    return _near(points, body) and bool(np.mean(signed_distance(points, body) < 0) < 0.5)
 
 
 def _distance(points: Floats, body: Mesh) -> Floats:
@@ -101,7 +112,7 @@ def body_holes(body: Mesh) -> Findings:
             code="body-not-watertight",
             prim=body.path,
             count=len(rim),
-            found=f"the body is open along {np.count_nonzero(uses == 1)} edges",
+            found=f"the body is open along {amount(int(np.count_nonzero(uses == 1)), 'edges')}",
             why="near a hole it is uncertain what is inside, so that cloth may slip through unnoticed",
             fix="close the holes that cloth can reach; others do no harm",
             elements="vertices",
@@ -150,7 +161,7 @@ def penetration(mesh: Mesh, body: Mesh) -> Findings:
             code="inside-margin",
             prim=mesh.path,
             count=len(near),
-            found=f"the nearest of them is {1000 * signed[near].min():.1f} mm from the body, where collisions start at "
+            found=f"the nearest of them is {1000 * signed[near].min():.1f} mm from the body; collisions start at "
             f"{1000 * MARGIN:g} mm",
             why="there the cloth is pushed away a little even at rest",
             fixable=bool(repaired[near].all()),
@@ -189,4 +200,3 @@ def push_out(points: Floats, pairs: Ints, body: Mesh) -> Floats:
 
 def _outward(points: Floats, body: Mesh) -> Floats:
     return closest_on_surface(points, body).normals
-

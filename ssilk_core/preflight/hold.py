@@ -23,7 +23,8 @@ def class_coverage(mesh: Mesh, classes: Ints) -> Findings:
         severity="info",
         code="classes",
         prim=mesh.path,
-        found=f"of {mesh.vertex_count:,} vertices {told}" + next((n for n, holds in reversed(notes.items()) if holds), ""),
+        found=f"of {mesh.vertex_count:,} vertices {told}"
+        + next((n for n, holds in reversed(notes.items()) if holds), ""),
     )
 
 
@@ -38,7 +39,7 @@ def unheld_islands(mesh: Mesh, classes: Ints) -> Findings:
             code="unheld-islands",
             prim=mesh.path,
             count=len(lost),
-            found=f"{len(adrift)} of {len(np.unique(island[mesh.faces]))} islands have neither pinned nor tight vertices",
+            found=f"{len(adrift)} of {len(np.unique(island[mesh.faces]))} islands have no pinned or tight vertex",
             why="nothing holds them: they fall off the body",
             fix="paint a part of each pinned or tight (primvars:ssilk:class), or sew it to the rest",
             elements="vertices",

@@ -22,8 +22,11 @@ from .motion import MotionFile
 from .repair import merge_targets
 from .units import FileUnits
 
-# What --fix repairs by removing vertices or faces.
-TOPOLOGICAL = ("isolated-vertices", "duplicate-vertices", "duplicate-faces", "degenerate-faces")
+# What --fix repairs by changing vertices or faces.
+RESHAPING = (
+    "isolated-vertices", "duplicate-vertices", "duplicate-faces", "degenerate-faces", "inconsistent-winding",
+    "inside-out",
+)  # fmt: skip
 # With these, automatic classes and proxies would only fail in other words.
 BLOCKING = ("alignment", "character-size", "isolated-vertices", "degenerate-faces")
 
@@ -54,8 +57,15 @@ class Inspected:
 def inspect(world: Inspected) -> list[Finding]:
     """Return everything that there is to say, the worst first."""
     found = [*_on_files(world), *_on_mesh(world), *_on_fit(world), *_on_motions(world)]
-    found += _on_scene(world, any(finding.code in BLOCKING for finding in found))
+    found = [_unfixable(finding, world.locked) if finding.code in RESHAPING else finding for finding in found]
+    found += _on_scene(world, any(finding.severity == "error" and finding.code in BLOCKING for finding in found))
     return sorted(found, key=lambda finding: SEVERITIES.index(finding.severity))
+
+
+def _unfixable(finding: Finding, locked: str) -> Finding:
+    """Return a finding as one for the artist to fix, when the mesh is `locked`."""
+    reason = f"; --fix leaves the mesh alone because of its {locked}"
+    return replace(finding, fixable=False, fix=finding.fix + reason) if locked else finding
 
 
 def _on_files(world: Inspected) -> Findings:
@@ -68,11 +78,6 @@ def _on_files(world: Inspected) -> Findings:
 
 
 def _on_mesh(world: Inspected) -> Findings:
-    for finding in _mesh_findings(world):
-        yield replace(finding, fixable=finding.fixable and not (world.locked and finding.code in TOPOLOGICAL))
-
-
-def _mesh_findings(world: Inspected) -> Findings:
     mesh, target = world.garment.mesh, merge_targets(world.garment, world.rig, world.character)
     merged = np.flatnonzero(np.bincount(target, minlength=len(target))[target] > 1)
     corners = target[mesh.faces]
@@ -128,7 +133,9 @@ def _on_scene(world: Inspected, blocked: bool) -> Findings:
         if any(hold.unheld_islands(garment.mesh, garment.classes)):
             return
     try:
-        scene = prepare_scene(world.character, garment, world.rig, rig_options=RigOptions(proxies=world.preset.proxies))
+        scene = prepare_scene(
+            world.character, garment, world.rig, rig_options=RigOptions(proxies=world.preset.proxies)
+        )
     except SsilkError as error:
         yield Finding(severity="error", code="not-riggable", prim=garment.mesh.path, found=str(error))
         return

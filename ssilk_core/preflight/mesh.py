@@ -8,7 +8,7 @@ import numpy as np
 from ssilk_core.assets import Floats, Ints, Mesh
 from ssilk_core.mesh.topology import edge_use, face_areas
 
-from .finding import Finding, Findings, listing
+from .finding import Finding, Findings, amount, listing
 
 SAME_PLACE = 1e-6  # [m]; vertices closer than this share their place
 NO_AREA = 1e-9  # of the square of the longest edge: what the membrane energy refuses
@@ -24,7 +24,7 @@ def isolated_vertices(mesh: Mesh) -> Findings:
             code="isolated-vertices",
             prim=mesh.path,
             count=len(lone),
-            found=f"{len(lone)} of {mesh.vertex_count} vertices belong to no face",
+            found=f"{amount(len(lone), 'vertices')} of {mesh.vertex_count:,} in no face",
             why="nothing holds them, so that no energy is defined for them",
             fix="delete loose geometry",
             fixable=True,
@@ -35,7 +35,9 @@ def isolated_vertices(mesh: Mesh) -> Findings:
 
 def duplicate_vertices(mesh: Mesh, mergeable: Ints) -> Findings:
     """Yield the vertices that share their place with another one; `mergeable` (N,) are those that --fix merges."""
-    copies = np.setdiff1d(np.flatnonzero(shared_places(mesh.points)), np.setdiff1d(np.arange(mesh.vertex_count), mesh.faces))
+    copies = np.setdiff1d(
+        np.flatnonzero(shared_places(mesh.points)), np.setdiff1d(np.arange(mesh.vertex_count), mesh.faces)
+    )
     if len(copies):
         merged = np.isin(copies, mergeable)
         yield Finding(
@@ -43,10 +45,12 @@ def duplicate_vertices(mesh: Mesh, mergeable: Ints) -> Findings:
             code="duplicate-vertices",
             prim=mesh.path,
             count=len(copies),
-            found=f"{len(copies)} vertices share their place with others: panels meet there without being sewn",
+            found=f"{amount(len(copies), 'vertices')} at the same place as others: panels that are not sewn",
             why="the cloth comes apart there as soon as it moves",
             fix="merge by distance, unless the cloth is meant to open there"
-            + ("" if merged.all() else f" (--fix merges {np.count_nonzero(merged)}, whose weights and classes agree)"),
+            + (
+                "" if merged.all() else f" (--fix merges {np.count_nonzero(merged)}, whose weights and classes agree)"
+            ),
             fixable=bool(merged.all()),
             elements="vertices",
             indices=listing(copies),
@@ -63,7 +67,7 @@ def duplicate_faces(mesh: Mesh) -> Findings:
             code="duplicate-faces",
             prim=mesh.path,
             count=len(copies),
-            found=f"{len(copies)} triangles lie on others with the same vertices",
+            found=f"{amount(len(copies), 'triangles')} with the same vertices as an earlier one",
             why="the cloth is twice as heavy and stiff there, and does not bend along their edges",
             fix="delete the doubles",
             fixable=True,
@@ -73,9 +77,8 @@ def duplicate_faces(mesh: Mesh) -> Findings:
 
 
 def non_manifold_edges(mesh: Mesh) -> Findings:
-    """Yield the edges that more than two faces use, faces that lie on each other counting once."""
-    distinct = np.unique(np.sort(mesh.faces, axis=1), axis=0)
-    pairs, uses = edge_use(distinct)
+    """Yield the edges that more than two faces use; doubles and collapsed faces, told elsewhere, do not count."""
+    pairs, uses = edge_use(distinct_faces(mesh.faces))
     bad = pairs[uses > 2]
     if len(bad):
         yield Finding(
@@ -83,7 +86,7 @@ def non_manifold_edges(mesh: Mesh) -> Findings:
             code="non-manifold-edges",
             prim=mesh.path,
             count=len(np.unique(bad)),
-            found=f"{len(bad)} edges are shared by more than two triangles",
+            found=f"{amount(len(bad), 'edges')} in more than two triangles",
             why="cloth does not bend along such an edge, and distances along the cloth are less exact",
             fix="delete inner faces, or split the parts that meet there",
             elements="vertices",
@@ -102,7 +105,7 @@ def degenerate_faces(mesh: Mesh, collapsing: int) -> Findings:
             code="degenerate-faces",
             prim=mesh.path,
             count=int(flat.sum()),
-            found=f"{flat.sum()} of {len(mesh.faces)} triangles have no area",
+            found=f"{amount(int(flat.sum()), 'triangles')} of {len(mesh.faces):,} without area",
             why="a membrane without area has no energy, and training refuses it",
             fix="dissolve degenerate geometry"
             + ("" if collapsing else "; --fix removes only faces whose corners coincide, others would leave a slit"),
@@ -116,12 +119,18 @@ def degenerate_faces(mesh: Mesh, collapsing: int) -> Findings:
             code="sliver-faces",
             prim=mesh.path,
             count=int(sliver.sum()),
-            found=f"{sliver.sum()} triangles are more than {SLIVER:.0f} times as long as high",
+            found=f"{amount(int(sliver.sum()), 'triangles')} more than {SLIVER:.0f} times as long as high",
             why="the cloth is stiff there and training slows down",
             fix="collapse their short edges or remesh",
             elements="faces",
             indices=listing(np.flatnonzero(sliver)),
         )
+
+
+def distinct_faces(faces: Ints) -> Ints:
+    """Return each triangle with three different corners once, as its sorted corners, shape (N, 3)."""
+    corners = np.unique(np.sort(faces, axis=1), axis=0)
+    return corners[(np.diff(corners, axis=1) > 0).all(axis=1)]
 
 
 def shared_places(points: Floats) -> Ints:

@@ -11,7 +11,7 @@ import numpy as np
 from ssilk_core.assets import Floats, Ints, Motion, Skeleton
 from ssilk_core.kinematics import CUT_SPEED, split_at_cuts
 
-from .finding import Finding, Findings, listing, names
+from .finding import Finding, Findings, joint_leaves, listing
 
 SNAP = 120.0  # [degrees] in one frame; the fastest human joints turn by about 7,000 degrees a second
 STILL = 0.5  # [degrees]
@@ -45,7 +45,7 @@ def root_jumps(motion: Motion) -> Findings:
             prim=motion.path,
             count=len(starts),
             found=f"the root jumps, by up to {far:.2g} m (first to frame {starts[0]} of {motion.frame_count})",
-            why=f"nothing moves faster than {CUT_SPEED:g} m/s; training uses each span by itself, a bake goes through it",
+            why=f"nothing moves faster than {CUT_SPEED:g} m/s; training uses each span by itself, a bake does not",
             fix="cut the clip there, or repair the root's curve",
             elements="frames",
             indices=listing(starts),
@@ -63,7 +63,7 @@ def joint_snaps(motion: Motion, skeleton: Skeleton) -> Findings:
             code="joint-snaps",
             prim=motion.path,
             count=len(frames),
-            found=f"'{skeleton.joint_names[joint].rpartition('/')[2]}' turns by {angles.max():.0f} degrees in one frame",
+            found=f"{joint_leaves(skeleton, [joint])} turns by {angles.max():.0f} degrees in one frame",
             why="the cloth on it is whipped around; a flip in captured or Euler curves mostly, not a movement",
             fix="filter the rotation curves, or leave the clip out",
             elements="frames",
@@ -124,7 +124,7 @@ def missing_joints(file: MotionFile, skeleton: Skeleton) -> Findings:
             code="missing-joints",
             prim=file.path,
             count=len(missing),
-            found=f"it does not animate {_leaves(skeleton, missing)}",
+            found=f"it does not animate {joint_leaves(skeleton, missing)}",
             why="they stay in the rest pose",
             elements="joints",
             indices=listing(missing),
@@ -142,7 +142,7 @@ def still_joints(motions: Sequence[Motion], skeleton: Skeleton) -> Findings:
             code="still-joints",
             prim=skeleton.path,
             count=len(still),
-            found=f"{_leaves(skeleton, still)} never turn in the {len(motions)} motions",
+            found=f"{joint_leaves(skeleton, still)} never turn in the {len(motions)} motions",
             why="the garment cannot learn to follow what it never sees; in the shot these joints should be still too",
             elements="joints",
             indices=listing(still),
@@ -153,7 +153,3 @@ def _angles(after: Floats, before: Floats) -> Floats:
     """Return the angles between unit quaternions [degrees], shape (F, J)."""
     cosine = np.abs((after * before).sum(axis=-1))
     return np.degrees(2 * np.arccos(np.clip(cosine, 0, 1)))
-
-
-def _leaves(skeleton: Skeleton, joints: Ints) -> str:
-    return names([skeleton.joint_names[joint].rpartition("/")[2] for joint in joints])

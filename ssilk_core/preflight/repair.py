@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from ssilk_core.assets import Character, Floats, Garment, Ints, Mesh, ProxyRig
 from ssilk_core.mesh.topology import border_vertices, edge_use, edges
 
+from .finding import amount
 from .fit import MARGIN, push_out
-from .mesh import SAME_PLACE
+from .mesh import SAME_PLACE, distinct_faces
 from .winding import outward_flips
 
 Mask = NDArray[np.bool_]
@@ -28,8 +29,10 @@ class MeshRepair:
         polygons: the old polygon of each new one, shape (P',).
         corners: the old corner of each new one, shape (sum of counts,).
         counts: corners of each new polygon, shape (P',).
+        flipped: which new polygons run the other way, shape (P',).
         offsets: how far the new vertices move [m], shape (V', 3).
         done: what was repaired, in words.
+        reshapes: whether vertices and faces may differ from the old ones, or only positions.
     """
 
     kept: Ints
@@ -37,8 +40,10 @@ class MeshRepair:
     polygons: Ints
     corners: Ints
     counts: Ints
+    flipped: Mask
     offsets: Floats
     done: tuple[str, ...]
+    reshapes: bool = True
 
 
 def plan_repair(character: Character, garment: Garment, rig: ProxyRig | None, *, topology: bool = True) -> MeshRepair:
@@ -49,25 +54,39 @@ def plan_repair(character: Character, garment: Garment, rig: ProxyRig | None, *,
 
     Args:
         rig: proxies authored for the garment, whose weights must agree too where vertices merge.
-        topology: whether vertices and faces may go; if not, they are only flipped and pushed.
+        topology: whether vertices and faces may change; if not, vertices are only pushed out.
     """
     mesh, body = garment.mesh, character.merged_body().mesh
-    target = merge_targets(garment, rig, character) if topology else np.arange(mesh.vertex_count)
-    polygons, corners, counts, removed = _kept_polygons(mesh, target, topology)
+    offsets = push_out(mesh.points, edges(mesh.faces), body)
+    pushed = {("vertices", f"pushed out to {1000 * MARGIN:g} mm"): int(offsets.any(axis=1).sum())}
+    if not topology:
+        return _moved_only(mesh, offsets, _told(pushed))
+    target = merge_targets(garment, rig, character)
+    polygons, corners, counts = _kept_polygons(mesh, target)
     vertices = target[mesh.indices_of_corners[corners]]
-    flips = outward_flips(mesh.points, counts, vertices, body)
-    corners = corners[_flipped_order(counts, flips)]
-    kept = np.unique(vertices) if topology else np.arange(mesh.vertex_count)
+    flipped = outward_flips(mesh.points, counts, vertices, body)
+    kept = np.unique(vertices)
     new_index = np.full(mesh.vertex_count, -1)
     new_index[kept] = np.arange(len(kept))
-    offsets = push_out(mesh.points, edges(mesh.faces), body)[kept]
     merged = int(np.count_nonzero(target != np.arange(len(target))))
     done = _told({
-        "vertices merged": merged, "isolated vertices removed": mesh.vertex_count - len(kept) - merged,
-        "faces removed": removed, "faces flipped": int(flips.sum()),
-        f"vertices pushed out to {1000 * MARGIN:g} mm": int(offsets.any(axis=1).sum()),
+        ("vertices", "merged into others"): merged,
+        ("isolated vertices", "removed"): mesh.vertex_count - len(kept) - merged,
+        ("faces", "removed"): len(_counts(mesh)) - len(polygons), ("faces", "flipped"): int(flipped.sum()), **pushed,
     })  # fmt: skip
-    return MeshRepair(kept, new_index[target], polygons, corners, counts, offsets, done)
+    order = _flipped_order(counts, flipped)
+    return MeshRepair(kept, new_index[target], polygons, corners[order], counts, flipped, offsets[kept], done)
+
+
+def _moved_only(mesh: Mesh, offsets: Floats, done: tuple[str, ...]) -> MeshRepair:
+    every, counts = np.arange(mesh.vertex_count), _counts(mesh)
+    corners, flipped = np.arange(counts.sum()), np.zeros(len(counts), dtype=bool)
+    return MeshRepair(every, every, np.arange(len(counts)), corners, counts, flipped, offsets, done, reshapes=False)
+
+
+def _counts(mesh: Mesh) -> Ints:
+    assert mesh.polygon_counts is not None  # filled in by Mesh
+    return mesh.polygon_counts.astype(np.int64)
 
 
 def merge_targets(garment: Garment, rig: ProxyRig | None, character: Character) -> Ints:
@@ -106,21 +125,15 @@ def _alike(garment: Garment, rig: ProxyRig | None, character: Character) -> Ints
 
 def _crowded(faces: Ints, target: Ints) -> Mask:
     """Return the vertices (V,) on edges that merging would give more faces than two, and more than before."""
-    _, before = edge_use(faces)
-    merged = target[faces]
-    whole = (merged != np.roll(merged, 1, axis=1)).all(axis=1)
-    pairs, uses = edge_use(np.unique(np.sort(merged[whole], axis=1), axis=0))
-    worst = max(2, int(before.max()))
+    pairs, uses = edge_use(distinct_faces(target[faces]))
+    worst = max(2, int(edge_use(distinct_faces(faces))[1].max()))
     return np.isin(target, pairs[uses > worst])
 
 
-def _kept_polygons(mesh: Mesh, target: Ints, topology: bool) -> tuple[Ints, Ints, Ints, int]:
-    """Return polygons, corners and counts that stay when vertices merge into `target` (V,), and how many go."""
-    assert mesh.polygon_counts is not None
-    counts, vertices = mesh.polygon_counts.astype(np.int64), target[mesh.indices_of_corners]
+def _kept_polygons(mesh: Mesh, target: Ints) -> tuple[Ints, Ints, Ints]:
+    """Return polygons, corners and counts that stay when vertices merge into `target` (V,)."""
+    counts, vertices = _counts(mesh), target[mesh.indices_of_corners]
     every, corners = np.arange(len(counts)), np.arange(len(vertices))
-    if not topology:
-        return every, corners, counts, 0
     owner = np.repeat(every, counts)
     before = corners - 1
     before[np.cumsum(counts) - counts] += counts
@@ -128,7 +141,7 @@ def _kept_polygons(mesh: Mesh, target: Ints, topology: bool) -> tuple[Ints, Ints
     left = np.bincount(owner, stays, minlength=len(counts)).astype(np.int64)
     whole = (left >= 3) & _first_of_kind(owner[stays], vertices[stays], len(counts))
     stays &= whole[owner]
-    return every[whole], corners[stays], left[whole], int(np.count_nonzero(~whole))
+    return every[whole], corners[stays], left[whole]
 
 
 def _first_of_kind(owner: Ints, vertices: Ints, count: int) -> Mask:
@@ -152,5 +165,5 @@ def _flipped_order(counts: Ints, flips: Mask) -> Ints:
     return np.where(np.repeat(flips, counts), last - (position - start), position)
 
 
-def _told(amounts: dict[str, int]) -> tuple[str, ...]:
-    return tuple(f"{amount} {what}" for what, amount in amounts.items() if amount)
+def _told(counts: dict[tuple[str, str], int]) -> tuple[str, ...]:
+    return tuple(f"{amount(count, elements)} {what}" for (elements, what), count in counts.items() if count)

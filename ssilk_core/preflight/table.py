@@ -7,7 +7,7 @@ import textwrap
 from collections.abc import Iterator, Sequence
 from itertools import groupby
 
-from .finding import SEVERITIES, Finding
+from .finding import SEVERITIES, Finding, amount
 
 WIDTH = 110
 MOST_PLACES = 5  # of one kind of finding that are printed; --json has all
@@ -25,7 +25,7 @@ def format_findings(findings: Sequence[Finding]) -> str:
 def summary(findings: Sequence[Finding]) -> str:
     """Return how many findings of each severity there are, in one line."""
     counts = [(severity, sum(finding.severity == severity for finding in findings)) for severity in SEVERITIES[:2]]
-    told = " and ".join(f"{count} {severity}{'' if count == 1 else 's'}" for severity, count in counts if count)
+    told = " and ".join(amount(count, f"{severity}s") for severity, count in counts if count)
     return f"{told}." if told else "Nothing wrong was found."
 
 
@@ -47,7 +47,7 @@ def _all_fixable(group: list[Finding]) -> bool:
 
 
 def _count(finding: Finding) -> str:
-    return f"{finding.count:,} {finding.elements} in " if finding.elements else ""
+    return f"{amount(finding.count, finding.elements)} in " if finding.elements else ""
 
 
 def _wrapped(text: str, indent: str) -> list[str]:

@@ -58,12 +58,13 @@ def body_size(body: Mesh, units: FileUnits) -> Findings:
     """Yield that the character's height is not that of any figure, with the units that would be."""
     height = float(np.ptp(body.points[:, 1]))
     guess = misread(body)
-    if not HEIGHTS[0] <= height <= HEIGHTS[1] or (guess and guess.up):
+    plausible = HEIGHTS[0] <= height <= HEIGHTS[1]
+    if not plausible or (guess and guess.up):
         hint = f"; it is plausible with metersPerUnit {units.meters_per_unit * guess.scale:g}" if guess else ""
         hint += f" and upAxis {guess.up}" if guess and guess.up else ""
         authored = units.axis_authored if guess and guess.up else units.meters_authored
         yield Finding(
-            severity="error",
+            severity="warning" if plausible else "error",  # some characters do lie, or walk on four legs
             code="character-size",
             prim=body.path,
             found=f"the character is {height:.3g} m high and {np.ptp(body.points[:, 2]):.3g} m deep{hint}",
@@ -79,7 +80,9 @@ def misread(body: Mesh) -> Misplacement | None:
     lying = deep > LYING * high and deep > 0.5 * wide
     height = deep if lying else high
     scales = [scale for scale in SCALES if HEIGHTS[0] <= scale * height <= HEIGHTS[1]]
-    best = min([1.0] if 1.0 in scales else scales, key=lambda scale: abs(np.log(scale * height / USUAL_HEIGHT)), default=None)
+    best = min(
+        [1.0] if 1.0 in scales else scales, key=lambda scale: abs(np.log(scale * height / USUAL_HEIGHT)), default=None
+    )
     if best is None or (best == 1 and not lying):
         return None
     return Misplacement(best, "Z" if lying else "")

@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ssilk inspect` as its users run it: on files, with exit codes, as text and as JSON, and repairing."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from pxr import Sdf, Usd, UsdGeom, UsdSkel, Vt
+
+from ssilk_core.cli import main
+
+SHARED = Path(__file__).parents[3] / "shared" / "data"
+needs_shared = pytest.mark.skipif(not SHARED.exists(), reason=f"{SHARED} is not here")
+
+
+def define_mesh(stage: Usd.Stage, path: str, points: np.ndarray, faces: np.ndarray) -> Usd.Prim:
+    mesh = UsdGeom.Mesh.Define(stage, path)
+    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points.astype(np.float32)))
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray(len(faces), 3))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.reshape(-1).astype(np.int32)))
+    return mesh.GetPrim()
+
+
+def write_hero(path: Path) -> Path:
+    """A pillar 1.7 m high with two joints, in metres, y up."""
+    body = trimesh.creation.cylinder(0.15, 1.7, sections=24).subdivide().subdivide()
+    points = body.vertices[:, [0, 2, 1]] * [1, 1, -1] + [0, 0.85, 0]
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, "Y")
+    root = UsdSkel.Root.Define(stage, "/Hero")
+    rig = UsdSkel.Skeleton.Define(stage, "/Hero/Rig")
+    rig.CreateJointsAttr(["Hips", "Hips/Spine"])
+    rig.CreateBindTransformsAttr(Vt.Matrix4dArray.FromNumpy(np.tile(np.eye(4), (2, 1, 1))))
+    binding = UsdSkel.BindingAPI.Apply(root.GetPrim())
+    binding.CreateSkeletonRel().SetTargets([rig.GetPath()])
+    skin = UsdSkel.BindingAPI.Apply(define_mesh(stage, "/Hero/Body", points, body.faces))
+    skin.CreateJointIndicesPrimvar(False, 1).Set((points[:, 1] > 0.8).astype(int).tolist())
+    skin.CreateJointWeightsPrimvar(False, 1).Set([1.0] * len(points))
+    stage.GetRootLayer().Save()
+    return path
+
+
+def tube(radius: float = 0.17, columns: int = 32, rows: int = 13) -> tuple[np.ndarray, np.ndarray]:
+    """Cloth around the pillar, its normals outward."""
+    angle, y = np.arange(columns) * 2 * np.pi / columns, np.linspace(0.9, 1.4, rows)
+    points = np.stack(np.broadcast_arrays(radius * np.sin(angle), y[:, None], radius * np.cos(angle)), -1).reshape(
+        -1, 3
+    )
+    row, column = (part.reshape(-1) for part in np.mgrid[0 : rows - 1, 0:columns])
+    a, b = row * columns + column, row * columns + (column + 1) % columns
+    return points, np.concatenate([np.c_[a, b, b + columns], np.c_[a, b + columns, a + columns]])
+
+
+def write_damaged(path: Path) -> Path:
+    """The tube inside out, pressed 3 mm into the body at its lowest row, with a lone vertex and a doubled face.
+
+    The file holds metres but states no units, so that it is read a hundred times too small.
+    """
+    points, faces = tube()
+    points[:32, [0, 2]] *= 0.147 / 0.17
+    faces = np.r_[faces, faces[:1]][:, ::-1]
+    stage = Usd.Stage.CreateNew(str(path))
+    prim = define_mesh(stage, "/Tube", np.r_[points, [[1, 1, 1]]], faces)
+    classes = np.r_[np.where(points[:, 1] > 1.3, 1, 2), 2]
+    primvar = UsdGeom.PrimvarsAPI(prim).CreatePrimvar("ssilk:class", Sdf.ValueTypeNames.IntArray, "vertex")
+    primvar.Set(classes.astype(int).tolist())
+    stage.GetRootLayer().Save()
+    return path
+
+
+def inspect(capsys: pytest.CaptureFixture, *arguments: object) -> tuple[int, dict]:
+    """Exit code, and findings by code with what else the result event says."""
+    code = main(["inspect", *map(str, arguments), "--preset", "draft", "--json"])
+    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    (result,) = (event for event in events if event["event"] == "result")
+    return code, {
+        **result["detail"],
+        "findings": {finding["code"]: finding for finding in result["detail"]["findings"]},
+    }
+
+
+def test_a_damaged_garment_is_repaired_and_then_passes(tmp_path, capsys):
+    hero, cloth, out = (
+        write_hero(tmp_path / "hero.usda"),
+        write_damaged(tmp_path / "tube.usda"),
+        tmp_path / "out.usdc",
+    )
+    code, before = inspect(capsys, hero, "--garment", cloth)
+    assert code == 2
+    assert {"alignment", "isolated-vertices", "duplicate-faces", "units"} <= set(before["findings"])
+    assert before["findings"]["isolated-vertices"]["indices"] == [416]
+    assert all(finding["fixable"] for finding in before["findings"].values() if finding["severity"] != "info")
+    code, fixed = inspect(capsys, hero, "--garment", cloth, "--fix", out)
+    assert fixed["fixed"] == {"output": str(out), "repaired": [
+        "metersPerUnit 1 and upAxis Y stated", "1 isolated vertex removed", "1 face removed", "768 faces flipped",
+        "32 vertices pushed out to 4 mm",
+    ]}  # fmt: skip
+    assert code == 0 and all(finding["severity"] == "info" for finding in fixed["findings"].values())
+    assert inspect(capsys, hero, "--garment", out) == (0, {"findings": fixed["findings"]})
+    assert [file.name for file in sorted(tmp_path.iterdir())] == ["hero.usda", "out.usdc", "tube.usda"]
+
+
+def test_findings_are_printed_for_people(tmp_path, capsys):
+    hero, cloth = write_hero(tmp_path / "hero.usda"), write_damaged(tmp_path / "tube.usda")
+    assert main(["inspect", str(hero), "--garment", f"{cloth}:/Tube"]) == 2
+    text = capsys.readouterr().out
+    assert "ERROR  isolated-vertices  (--fix repairs it)" in text and "fix: delete loose geometry" in text
+    assert text.index("ERROR") < text.index("WARNING") < text.index("INFO")
+
+
+def test_a_garment_in_the_stage_of_its_character_is_repaired_there(tmp_path, capsys):
+    hero = write_hero(tmp_path / "hero.usda")
+    stage = Usd.Stage.Open(str(hero))
+    points, faces = tube()
+    define_mesh(stage, "/Hero/Tube", np.r_[points, [[0, 1, 1]]], faces)
+    stage.GetRootLayer().Save()
+    out = tmp_path / "out.usda"
+    code, fixed = inspect(capsys, hero, "--garment", "Tube", "--fix", out)
+    assert code == 0 and fixed["fixed"]["repaired"] == ["1 isolated vertex removed"]
+    written = Usd.Stage.Open(str(out))
+    assert written.GetPrimAtPath("/Hero/Body") and written.GetPrimAtPath("/Hero/Rig")
+    assert len(UsdGeom.Mesh(written.GetPrimAtPath("/Hero/Tube")).GetPointsAttr().Get()) == len(points)
+
+
+def test_what_cannot_be_read_or_written_is_one_sentence(tmp_path, capsys):
+    hero, cloth = write_hero(tmp_path / "hero.usda"), write_damaged(tmp_path / "tube.usda")
+    assert main(["inspect", str(tmp_path / "nobody.usda")]) == 2
+    assert "there is no such file" in capsys.readouterr().err
+    before = cloth.read_bytes()
+    assert main(["inspect", str(hero), "--garment", str(cloth), "--fix", str(cloth)]) == 2
+    assert "--fix writes a copy" in capsys.readouterr().err and cloth.read_bytes() == before
+
+
+@needs_shared
+@pytest.mark.parametrize("garment", ["tshirt", "long_sleeve", "pants"])
+def test_clean_garments_raise_no_alarm(garment, capsys):
+    code, found = inspect(capsys, SHARED / "character.usdc", "--garment", SHARED / "garments" / f"{garment}.usdc")
+    assert code == 0 and all(finding["severity"] == "info" for finding in found["findings"].values())
+
+
+@needs_shared
+def test_jumping_roots_are_found_in_captured_motion(capsys):
+    clips = [SHARED / "motions" / f"{name}.usdc" for name in ("07_01", "07_04")]
+    pants = SHARED / "garments" / "pants.usdc"
+    code, found = inspect(capsys, SHARED / "character.usdc", "--garment", pants, "--motion", *clips)
+    assert code == 0
+    assert found["findings"]["root-jumps"]["prim"].endswith("07_04.usdc:/Animation")
+    assert "LHipJoint" in found["findings"]["still-joints"]["found"]
