@@ -57,7 +57,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         report(Result("inspect", {"findings": findings, **detail}))
     else:
         if options.fix:
-            print(f"{options.fix}: {', '.join(repaired or ['nothing to repair'])}. What is left in it:\n")
+            print(f"{options.fix}:", *(repaired or ["nothing to repair"]), sep="\n  ", end="\n\n")
         print(format_findings(findings))
     return EXIT_BAD_INPUT if any(finding.severity == "error" for finding in findings) else EXIT_OK
 

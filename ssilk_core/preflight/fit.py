@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ssilk_core.assets import Floats, Ints, Mesh
 from ssilk_core.fabrics import FABRICS
@@ -15,6 +16,7 @@ from ssilk_core.setup.surface import closest_on_surface
 from .finding import Finding, Findings, amount, listing
 
 MARGIN = FABRICS["default"].margin  # [m]
+Mask = NDArray[np.bool_]
 SHALLOW = 5e-3  # [m]; penetration up to here is pushed out by --fix
 DEEP_SHARE = 0.25  # of the vertices inside the body, from which on the garment cannot be meant to be so
 SAMPLES = 400  # vertices that the alignment is measured on
@@ -40,21 +42,19 @@ def alignment(mesh: Mesh, body: Mesh, *, fixable: bool = False) -> Findings:
 
     `fixable` says that its file leaves units or axis open, so that --fix may write them.
     """
-    guess = misplacement(mesh, body)
-    if not _apart(mesh.points, body) and guess is None:
+    guess, points = misplacement(mesh, body), mesh.points[np.unique(mesh.faces)]
+    if not _apart(points, body) and guess is None:
         return
-    distance, size = _distance(mesh.points, body), np.ptp(mesh.points, axis=0).max()
+    distance, size = _distance(points, body), np.ptp(points, axis=0).max()
     yield Finding(
         severity="error",
         code="alignment",
         prim=mesh.path,
-        count=mesh.vertex_count,
         found=f"the garment is {size:.3g} m in size and lies {distance.min():.3g} to {distance.max():.3g} m from "
         f"the body, which is {_height(body):.3g} m high{_described(guess)}",
         why="a garment is trained where it lies: it must be fitted to the body in its bind pose",
         fix="set metersPerUnit and upAxis of its file, or apply its transforms and move it onto the body",
         fixable=fixable and guess is not None,
-        elements="vertices",
     )
 
 
@@ -63,10 +63,11 @@ def misplacement(mesh: Mesh, body: Mesh) -> Misplacement | None:
 
     Only what lies apart from the body is taken to be scaled: a wide gown is far from it, too, but touches it.
     """
-    points = mesh.points[:: max(1, mesh.vertex_count // SAMPLES)]
+    every = mesh.points[np.unique(mesh.faces)]
+    points = every[:: max(1, len(every) // SAMPLES)]
     if _near(points, body):
         return None
-    scales = SCALES if _apart(mesh.points, body) else (1.0,)
+    scales = SCALES if _apart(every, body) else (1.0,)
     guesses = (Misplacement(scale, up) for up in TURNS for scale in scales)
     return next((guess for guess in guesses if _worn(guess.scale * points @ TURNS[guess.up].T, body)), None)
 
@@ -147,10 +148,11 @@ def penetration(mesh: Mesh, body: Mesh) -> Findings:
             code="penetration",
             prim=mesh.path,
             count=len(inside),
-            found=f"{len(inside) / mesh.vertex_count:.1%} of the vertices lie inside the body, up to "
+            found=f"{len(inside) / mesh.vertex_count:.1%} of all, inside the body, up to "
             f"{-1000 * signed.min():.1f} mm deep",
             why="this is the rest shape: cloth and collisions fight each other in every frame",
-            fix="push these vertices out in the bind pose, or give the garment more room",
+            fix="push these vertices out in the bind pose, or give the garment more room"
+            + _partly(repaired[inside], f"pushes patches out that are at most {1000 * SHALLOW:g} mm deep"),
             fixable=bool(repaired[inside].all()),
             elements="vertices",
             indices=listing(inside),
@@ -168,6 +170,12 @@ def penetration(mesh: Mesh, body: Mesh) -> Findings:
             elements="vertices",
             indices=listing(near),
         )
+
+
+def _partly(repaired: Mask, does: str) -> str:
+    """Return what --fix does when it repairs some but not all."""
+    count = int(repaired.sum())
+    return f"; --fix {does}: {count} of these" if 0 < count < len(repaired) else ""
 
 
 def signed_distance(points: Floats, body: Mesh) -> Floats:

@@ -11,7 +11,7 @@ import numpy as np
 from ssilk_core.assets import Floats, Ints, Motion, Skeleton
 from ssilk_core.kinematics import CUT_SPEED, split_at_cuts
 
-from .finding import Finding, Findings, joint_leaves, listing
+from .finding import Finding, Findings, amount, joint_leaves, listing
 
 SNAP = 120.0  # [degrees] in one frame; the fastest human joints turn by about 7,000 degrees a second
 STILL = 0.5  # [degrees]
@@ -142,7 +142,7 @@ def still_joints(motions: Sequence[Motion], skeleton: Skeleton) -> Findings:
             code="still-joints",
             prim=skeleton.path,
             count=len(still),
-            found=f"{joint_leaves(skeleton, still)} never turn in the {len(motions)} motions",
+            found=f"{joint_leaves(skeleton, still)} never turn in {amount(len(motions), 'motions')}",
             why="the garment cannot learn to follow what it never sees; in the shot these joints should be still too",
             elements="joints",
             indices=listing(still),

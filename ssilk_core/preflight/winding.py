@@ -10,7 +10,7 @@ from ssilk_core.assets import Floats, Ints, Mesh
 from ssilk_core.mesh.topology import components, edge_keys
 from ssilk_core.setup.surface import closest_on_surface
 
-from .finding import Finding, Findings, amount, listing
+from .finding import Finding, Findings, listing
 
 Mask = NDArray[np.bool_]
 # Share of a surface that must face the body before it counts as inside out; cloth that hangs free faces anywhere.
@@ -27,7 +27,7 @@ def inconsistent_winding(mesh: Mesh) -> Findings:
             code="inconsistent-winding",
             prim=mesh.path,
             count=len(wrong),
-            found=f"{amount(len(wrong), 'triangles')} of {len(mesh.faces):,} run against their neighbours",
+            found=f"wound against their neighbours, of {len(mesh.faces):,}",
             why="normals jump there: shading breaks, and proxies and classes are placed by normals",
             fix="recalculate the normals of the mesh",
             fixable=True,
@@ -49,7 +49,7 @@ def inside_out(mesh: Mesh, body: Mesh) -> Findings:
             code="inside-out",
             prim=mesh.path,
             count=len(wrong),
-            found=f"{amount(len(wrong), 'triangles')} of {len(mesh.faces):,} on surfaces that face the body",
+            found=f"on surfaces that face the body, of {len(mesh.faces):,}",
             why="it is shaded from the wrong side, and proxies are turned the wrong way",
             fix="flip the normals of the mesh",
             fixable=True,

@@ -261,6 +261,8 @@ def test_shallow_penetration_is_pushed_out_as_a_whole_patch_or_not_at_all():
     assert np.flatnonzero(offsets.any(axis=1)).tolist() == list(range(32))
     after = fit.signed_distance((points + offsets)[:32], body)
     assert after.min() >= fit.MARGIN and after.max() < 1.5 * fit.MARGIN
+    found = only(fit.penetration(Mesh(cloth.path, points, cloth.faces), body))
+    assert found.count == 64 and not found.fixable and "32 of these" in found.fix
 
 
 def test_rest_pose():
