@@ -40,7 +40,7 @@ class Misplacement:
 def alignment(mesh: Mesh, body: Mesh, *, fixable: bool = False) -> Findings:
     """Yield that the garment is not where the body is, with the scale or up axis that would put it there.
 
-    `fixable` says that its file leaves units or axis open, so that --fix may write them.
+    `fixable` says that its file leaves these open, so that --fix may write them.
     """
     guess, points = misplacement(mesh, body), mesh.points[np.unique(mesh.faces)]
     if not _apart(points, body) and guess is None:
@@ -54,7 +54,7 @@ def alignment(mesh: Mesh, body: Mesh, *, fixable: bool = False) -> Findings:
         f"the body, which is {_height(body):.3g} m high{_described(guess)}",
         why="a garment is trained where it lies: it must be fitted to the body in its bind pose",
         fix="set metersPerUnit and upAxis of its file, or apply its transforms and move it onto the body",
-        fixable=fixable and guess is not None,
+        fixable=fixable,
     )
 
 

@@ -93,7 +93,7 @@ def _on_fit(world: Inspected) -> Findings:
     mesh, body, file = world.garment.mesh, world.character.merged_body().mesh, world.wardrobe
     yield from fit.body_holes(body)
     yield from fit.body_inside_out(body)
-    free = file != world.stage and not (file.meters_authored and file.axis_authored)
+    free = file != world.stage and file.open_to(fit.misplacement(mesh, body))
     misplaced = list(fit.alignment(mesh, body, fixable=free))
     yield from misplaced
     if not misplaced:  # what lies elsewhere is neither inside the body nor inside out

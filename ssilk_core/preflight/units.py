@@ -34,6 +34,12 @@ class FileUnits:
         axis = self.up_axis if self.axis_authored else up or self.up_axis
         return FileUnits(self.path, meters, axis, True, True)
 
+    def open_to(self, guess: Misplacement | None) -> bool:
+        """Return whether there is a guess that contradicts nothing authored."""
+        if guess is None:
+            return False
+        return not (guess.scale != 1 and self.meters_authored) and not (guess.up and self.axis_authored)
+
 
 def unauthored(units: FileUnits) -> Findings:
     """Yield which of metersPerUnit and upAxis a file leaves out."""
@@ -62,7 +68,6 @@ def body_size(body: Mesh, units: FileUnits) -> Findings:
     if not plausible or (guess and guess.up):
         hint = f"; it is plausible with metersPerUnit {units.meters_per_unit * guess.scale:g}" if guess else ""
         hint += f" and upAxis {guess.up}" if guess and guess.up else ""
-        authored = units.axis_authored if guess and guess.up else units.meters_authored
         yield Finding(
             severity="warning" if plausible else "error",  # some characters do lie, or walk on four legs
             code="character-size",
@@ -70,7 +75,7 @@ def body_size(body: Mesh, units: FileUnits) -> Findings:
             found=f"the character is {height:.3g} m high and {np.ptp(body.points[:, 2]):.3g} m deep{hint}",
             why="gravity and stiffness are physical: cloth on a giant barely moves, on a thimble it flutters",
             fix=f"set metersPerUnit and upAxis so that it is {HEIGHTS[0]} to {HEIGHTS[1]} m high",
-            fixable=guess is not None and not authored,
+            fixable=units.open_to(guess),
         )
 
 
