@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 from .errors import need
 
+SURFACES = ("triangles", "vertices")
 SCHEMES = ("spring_verlet", "verlet", "direct", "direct_residual")
 
 
@@ -74,6 +75,7 @@ class TrainConfig:
         clip: bound on the global gradient norm.
         validate_every: iterations between validations; valid_frames: frames of each clip used for them.
         average: decay of the running average of the parameters, which is what is validated and kept; 0 for none.
+        surface: nearest body point on "triangles", or at "vertices", which is faster and blunter.
         seed: of everything random.
     """
 
@@ -94,11 +96,13 @@ class TrainConfig:
     skin_rate: float = 0.1
     clip: float = 1.0
     average: float = 0.998
+    surface: str = "triangles"
     validate_every: int = 1000
     valid_frames: int = 300
     seed: int = 0
 
     def __post_init__(self) -> None:
+        need(self.surface in SURFACES, "training", f"surface '{self.surface}'", f"it is one of {', '.join(SURFACES)}")
         need(self.window >= 3, "training", f"a window of {self.window} poses", "inertia needs at least 3")
         need(
             self.iterations >= 1 and self.batch >= 1 and self.warm_batch >= 1 and self.validate_every >= 1,
@@ -146,6 +150,7 @@ PRESETS = {
                 final_rate=1e-4,
                 rate_warmup=20,
                 average=0.98,
+                surface="vertices",
                 validate_every=100,
                 valid_frames=90,
             ),
@@ -153,7 +158,7 @@ PRESETS = {
         Preset(
             name="preview",
             model=ModelConfig(),
-            train=TrainConfig(iterations=12_000, warm=0.3, warm_batch=1024, batch=32, window=32, validate_every=1500),
+            train=TrainConfig(iterations=8_000, warm=0.3, warm_batch=1024, batch=32, window=32, validate_every=800),
         ),
         Preset(name="final", model=ModelConfig(), train=TrainConfig()),
     )

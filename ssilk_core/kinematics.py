@@ -115,12 +115,16 @@ def motion_transforms(motion: Motion, parents: Ints) -> Floats:
     return world_transforms(rigid(matrix_from_quaternion(motion.rotations), motion.translations), parents)
 
 
-def resample(motion: Motion, fps: float) -> Motion:
-    """Return the motion at `fps`: slerp for rotations, lines for translations; its duration is kept."""
-    if abs(motion.fps - fps) < 1e-9 * fps or motion.frame_count == 1:
-        return motion if motion.fps == fps else Motion(motion.path, fps, motion.rotations, motion.translations)
+def resample(motion: Motion, fps: float, *, cover: bool = False) -> Motion:
+    """Return the motion at `fps`: slerp for rotations, lines for translations.
+
+    The frames end at or before the motion's end; with `cover`, at or after it, its last pose being held.
+    """
+    if abs(motion.fps - fps) < 1e-9 * fps:
+        return motion
     last = motion.frame_count - 1
-    count = int(np.floor(last * fps / motion.fps + 1e-6)) + 1
+    exact = last * fps / motion.fps
+    count = int(np.ceil(exact - 1e-6) if cover else np.floor(exact + 1e-6)) + 1
     position = np.minimum(np.arange(count) * motion.fps / fps, last)
     rotations, translations = sample_motion(motion, position)
     return Motion(motion.path, fps, rotations, translations)

@@ -79,7 +79,7 @@ def garment_poses(model: GarmentModel, motion: Motion, fps: float, chunk: int = 
     The model rolls at its own rate; where the shot's differs, rotations are interpolated by slerp and weights by
     lines between the two nearest steps.
     """
-    steps = roll(model, resample(motion, model.config.fps), chunk)
+    steps = roll(model, resample(motion, model.config.fps, cover=True), chunk)
     poses = (GarmentPose(step.start, *model.file_pose(step.activation, step.rotations)) for step in steps)
     return poses if abs(fps - model.config.fps) < 1e-6 else resample_poses(poses, model.config.fps, fps)
 

@@ -8,15 +8,25 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from . import kernels
 from .nearest import nearest_vertex
+from .surface_point import nearest_on_rings
+
+# Further than this from every body vertex [m], the tangent plane at the nearest vertex says all that is needed.
+FAR = 0.08
 
 
 @dataclass(frozen=True, eq=False)
 class PosedBody:
-    """Body vertices [m] and unit vertex normals for each frame, both (B, 3, N)."""
+    """Body vertices [m] and unit vertex normals for each frame, both (B, 3, N).
+
+    `rings` (B, D, 2) are the triangles around each vertex (`surface_point.triangle_rings`); without them the
+    nearest body point is the nearest vertex.
+    """
 
     points: Tensor
     normals: Tensor
+    rings: Tensor | None = None
 
 
 def gather_frames(values: Tensor, index: Tensor) -> Tensor:
@@ -25,12 +35,34 @@ def gather_frames(values: Tensor, index: Tensor) -> Tensor:
 
 
 def signed_distance(x: Tensor, body: PosedBody) -> Tensor:
-    """Distance along the nearest body vertex's normal [m], n_b . (x - b), shape (V, N); gradient n_b."""
+    """Distance along the normal of the nearest body point b [m], n_b . (x - b), shape (V, N); its gradient is n_b."""
     with torch.no_grad():
         index = nearest_vertex(x, body.points)
-        normal = gather_frames(body.normals, index)
-        offset = (normal * gather_frames(body.points, index)).sum(1)
+        normal, point = gather_frames(body.normals, index), gather_frames(body.points, index)
+        offset = (normal * point).sum(1)
+        if body.rings is not None and kernels.available(x.device):
+            normal, offset = kernels.surface_kernel(x, index, body.points, body.normals, body.rings)
+        elif body.rings is not None:
+            normal, offset = _on_triangles(x, index, normal, offset, ((x - point) ** 2).sum(1) < FAR**2, body)
     return (normal * x).sum(1) - offset
+
+
+def _on_triangles(
+    x: Tensor, index: Tensor, normal: Tensor, offset: Tensor, near: Tensor, body: PosedBody
+) -> tuple[Tensor, Tensor]:
+    """Replace normals (V, 3, N) and offsets (V, N) by those of the nearest surface point where `near` (V, N)."""
+    assert body.rings is not None
+    row, frame = near.nonzero(as_tuple=True)
+    points, normals = body.points.transpose(0, 1).contiguous(), body.normals.transpose(0, 1).contiguous()
+    corners, weights = nearest_on_rings(
+        x.transpose(0, 1)[:, row, frame], index[row, frame], frame, points, body.rings
+    )
+    point = (points[:, corners, frame] * weights).sum(1)
+    found = (normals[:, corners, frame] * weights).sum(1)
+    found = found / found.norm(dim=0).clamp_min(1e-8)
+    normal[row, :, frame] = found.T
+    offset[row, frame] = (found * point).sum(0)
+    return normal, offset
 
 
 def collision_energy(distance: Tensor, stiffness: float, margin: float) -> Tensor:

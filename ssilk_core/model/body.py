@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ..assets import Body, Ints
 from ..energy.collision import PosedBody
+from ..energy.surface_point import triangle_rings
 from ..mesh import topology
 
 
@@ -24,16 +25,26 @@ class CollisionBody:
         def tensor(values: np.ndarray) -> Tensor:
             return torch.as_tensor(values, dtype=torch.float32, device=device)
 
+        place = np.full(body.mesh.vertex_count, -1)
+        place[chosen] = np.arange(len(chosen))
+        faces = place[body.mesh.faces]
+        rings = triangle_rings(faces[(faces >= 0).all(axis=1)], len(chosen))
+        self.rings = torch.as_tensor(rings, device=device)
         self.joints = torch.as_tensor(joints, device=device)
         self.weights = tensor(dense[:, joints])
         self.points = tensor(body.mesh.points[chosen])[:, :, None]
         self.normals = tensor(normals)[:, :, None]
 
     @torch.no_grad()
-    def posed(self, character: Tensor) -> PosedBody:
-        """Pose by skinning matrices (J, 3, 4, N); normals turn with the blended matrices."""
+    def posed(self, character: Tensor, *, surface: bool = True) -> PosedBody:
+        """Pose by skinning matrices (J, 3, 4, N); normals turn with the blended matrices.
+
+        Without `surface` only vertices are collided with.
+        """
         blended = (self.weights @ character[self.joints].flatten(1)).reshape(-1, 3, 4, character.shape[-1])
         linear = blended[:, :, :3]
         points = (linear * self.points[:, None]).sum(2) + blended[:, :, 3]
         normals = (linear * self.normals[:, None]).sum(2)
-        return PosedBody(points, normals / normals.norm(dim=1, keepdim=True).clamp_min(1e-8))
+        return PosedBody(
+            points, normals / normals.norm(dim=1, keepdim=True).clamp_min(1e-8), self.rings if surface else None
+        )

@@ -19,8 +19,11 @@ Terms = dict[str, Tensor]
 class Objective:
     """Computes energies of a model's decoded states; each term is [J] per frame, unreduced."""
 
-    def __init__(self, model: GarmentModel, energy: GarmentEnergy, body: CollisionBody, bank: MotionBank) -> None:
+    def __init__(
+        self, model: GarmentModel, energy: GarmentEnergy, body: CollisionBody, bank: MotionBank, surface: bool = True
+    ) -> None:
         self.model, self.energy, self.body, self.bank = model, energy, body, bank
+        self.surface = surface
         self.dt = 1 / model.config.fps
 
     def potential(self, x: Tensor, direction: Tensor, character: Tensor) -> Terms:
@@ -31,7 +34,7 @@ class Objective:
             "stretch": energy.stretch(x),
             "bending": energy.bending(x),
             "gravity": energy.gravity(x - root, GRAVITY * direction.T),
-            "collision": energy.collision(x, self.body.posed(character)),
+            "collision": energy.collision(x, self.body.posed(character, surface=self.surface)),
         }
 
     def static(self, frames: Tensor, direction: Tensor) -> Terms:

@@ -117,7 +117,12 @@ class Run:
         )
         generator = torch.Generator(self.device).manual_seed(job.train.seed)
         sampler = WindowSampler(bank, job.train, job.model.latent, generator)
-        self.stepper = Stepper(self.model, Objective(self.model, energy, body, bank), sampler, job.train)
+        self.stepper = Stepper(
+            self.model,
+            Objective(self.model, energy, body, bank, job.train.surface == "triangles"),
+            sampler,
+            job.train,
+        )
         self.validator = Validator(
             held, energy, body, scene.plain_skin, self.model.decoder.rest, job.model.fps, job.train.valid_frames
         )
