@@ -31,8 +31,9 @@ def dihedral_angles(edge: Tensor, left: Tensor, right: Tensor) -> Tensor:
     length = (edge * edge).sum(1).clamp_min(1e-18).sqrt()
     sine = -(normal_right * left).sum(1) * length
     cosine = (normal_left * normal_right).sum(1)
-    # Where a face collapses both vanish and atan2 has no gradient: such a hinge counts as flat.
-    collapsed = sine.abs() + cosine.abs() < 1e-24
+    # Where a face collapses both vanish and atan2 has no gradient: such a hinge counts as flat. Both are squared
+    # in the gradient, and the square of less than 1e-18 underflows in single precision.
+    collapsed = sine.abs() + cosine.abs() < 1e-18
     return torch.atan2(sine, torch.where(collapsed, 1.0, cosine))
 
 

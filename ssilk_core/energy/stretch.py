@@ -16,8 +16,8 @@ from .operators import SparseOperator
 def rest_frames(mesh: Mesh) -> tuple[Floats, Floats]:
     """Return the inverse rest shape matrices (F, 2, 2) [1/m] and true areas (F,) [m2] of the triangles.
 
-    The in-plane frame has its first axis along the first edge; any orthonormal frame gives the same isotropic
-    energy, and this one exists for every triangle that has an area.
+    Warp, the second in-plane axis, runs up the triangle, and along x where the triangle lies flat. StVK is the
+    same in any orthonormal frame; Baraff-Witkin is not, so the axes may not follow from the order of the corners.
 
     Raises:
         SsilkError: a triangle has no area.
@@ -35,8 +35,11 @@ def rest_frames(mesh: Mesh) -> tuple[Floats, Floats]:
         "each triangle needs one",
         "merge or dissolve the degenerate faces",
     )
-    u = first / np.linalg.norm(first, axis=1, keepdims=True)
-    v = np.cross(normal / doubled[:, None], u)
+    normal = normal / doubled[:, None]
+    along = np.where(np.abs(normal[:, 1:2]) < 0.99, [0.0, 1.0, 0.0], [1.0, 0.0, 0.0])
+    u = np.cross(along, normal)
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    v = np.cross(normal, u)
     shape = np.stack(
         [
             np.stack([np.sum(first * u, 1), np.sum(second * u, 1)], -1),

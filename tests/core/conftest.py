@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A toy world for tests: a strip of cloth on turned joints, two proxies, and a ball for a body."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from ssilk_core.assets import (
+    LOOSE,
+    PINNED,
+    TIGHT,
+    Body,
+    Character,
+    Garment,
+    Mesh,
+    Motion,
+    ProxyRig,
+    Scene,
+    Skeleton,
+    SkinWeights,
+)
+from ssilk_core.config import ModelConfig
+from ssilk_core.kinematics import local_transforms, quaternion_from_matrix, rigid
+from ssilk_core.model.network import GarmentModel
+
+ROWS, COLUMNS = 12, 5
+JOINTS = np.array([[0.0, 1.0, 0.0], [0.0, 1.3, 0.02], [0.3, 1.5, 0.0]])
+PROXIES = np.array([[0.0, 1.15, -0.15], [0.02, 0.95, -0.15]])
+
+
+@pytest.fixture(autouse=True, scope="session")
+def two_threads() -> None:
+    torch.set_num_threads(2)
+
+
+def grid(rows: int, columns: int, height: float = 0.55, width: float = 0.2) -> tuple[np.ndarray, np.ndarray]:
+    """A flat strip in the plane z = 0, from y = 0 down, its faces towards -z."""
+    y, x = np.meshgrid(-np.linspace(0, height, rows), np.linspace(-width / 2, width / 2, columns), indexing="ij")
+    points = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
+    row, column = (part.reshape(-1) for part in np.mgrid[0 : rows - 1, 0 : columns - 1])
+    a = row * columns + column
+    b, c, d = a + 1, a + columns, a + columns + 1
+    return points, np.concatenate([np.c_[a, b, c], np.c_[b, d, c]])
+
+
+def turned(positions: np.ndarray, seed: int) -> np.ndarray:
+    return rigid(Rotation.random(len(positions), random_state=seed).as_matrix(), positions)
+
+
+def dense_rig_weights(height: np.ndarray, proxies: int, classes: np.ndarray, plain: np.ndarray) -> np.ndarray:
+    weights = np.concatenate([plain, np.zeros((len(plain), proxies))], axis=1)
+    for vertex in np.flatnonzero(classes == LOOSE) if proxies else ():
+        distance = np.abs(height[vertex] - PROXIES[:proxies, 1]) + 0.05
+        weights[vertex] = 0
+        weights[vertex, len(JOINTS) :] = (1 / distance) / (1 / distance).sum()
+    return weights
+
+
+def build_scene(proxies: int = 2, shuffled: bool = False) -> Scene:
+    """The toy scene; `shuffled` hangs both proxies from the character, else the second from the first."""
+    binds = turned(JOINTS, 1)
+    skeleton = Skeleton(
+        "/toy", ("Hips", "Hips/Spine", "Hips/Spine/Arm"), [-1, 0, 1], binds, local_transforms(binds, [-1, 0, 1])
+    )
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.12)
+    body = Mesh("/toy/body", ball.vertices + [0, 1.15, 0], ball.faces)
+    lean = ((body.points[:, 1] - 1.03) / 0.24).clip(0, 1)
+    skin = SkinWeights("/toy/body", np.tile([0, 1], (body.vertex_count, 1)), np.stack([1 - lean, lean], axis=1))
+    points, faces = grid(ROWS, COLUMNS)
+    points = points + [0, 1.35, -0.15]
+    row = np.repeat(np.arange(ROWS), COLUMNS)
+    classes = np.where(row == 0, PINNED, np.where(row <= 2, TIGHT, LOOSE))
+    lean = ((points[:, 1] - 0.9) / 0.5).clip(0.1, 0.9)
+    plain = np.stack([1 - lean, lean, np.zeros(len(points))], axis=1)
+    garment = Garment(Mesh("/toy/strip", points, faces), SkinWeights.from_dense("/toy/strip", plain), classes)
+    parents = np.array([1, 0 if shuffled else 3])[:proxies]
+    rig = ProxyRig(
+        "/toy/rig",
+        ("Hips/Spine/P0", "Hips/Spine/P0/P1")[:proxies],
+        parents,
+        turned(PROXIES[:proxies], 2) if proxies else np.zeros((0, 4, 4)),
+        SkinWeights.from_dense("/toy/strip", dense_rig_weights(points[:, 1], proxies, classes, plain)),
+    )
+    return Scene(Character("/toy", skeleton, (Body(body, skin),)), garment, rig)
+
+
+def build_motion(
+    scene: Scene, frames: int, fps: float = 30.0, speed: float = 1.0, path: str = "/toy/motion"
+) -> Motion:
+    """A root that sways, bobs and turns, and joints that bend, from smooth curves of time."""
+    time = np.arange(frames)[:, None] / fps * speed
+    rest = scene.character.skeleton.rest_transforms
+    angles = 0.3 * np.sin(time[:, None] * [2.0, 3.0, 4.0] + np.arange(3)[:, None])  # (F, J, 3)
+    bend = Rotation.from_rotvec(angles.reshape(-1, 3)).as_matrix().reshape(frames, 3, 3, 3)
+    rotations = quaternion_from_matrix(rest[:, :3, :3] @ bend)
+    translations = np.broadcast_to(rest[:, :3, 3], (frames, 3, 3)).copy()
+    translations[:, 0] += 0.2 * np.concatenate([np.sin(3 * time), np.sin(5 * time) / 2, 1 - np.cos(2 * time)], axis=1)
+    return Motion(path, fps, rotations, translations)
+
+
+def build_model(scene: Scene, seed: int = 3, scale: float = 0.3, **options: object) -> GarmentModel:
+    """An untrained network whose every parameter is moved at random, so that nothing is zero by initialisation."""
+    config = ModelConfig(**({"latent": 8, "widths": (16,), "shapes": 4} | options))
+    model = GarmentModel(scene, config, np.arange(3), seed)
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for name, value in model.named_parameters():
+            small = 0.05 if "shapes" in name or "integrator" in name else scale
+            value.add_(small * torch.randn(value.shape, generator=generator))
+    return model
+
+
+@pytest.fixture(scope="session")
+def toy_scene() -> Callable[..., Scene]:
+    return build_scene
+
+
+@pytest.fixture(scope="session")
+def scene() -> Scene:
+    return build_scene()
+
+
+@pytest.fixture(scope="session")
+def toy_motion() -> Callable[..., Motion]:
+    return build_motion
+
+
+@pytest.fixture(scope="session")
+def toy_model() -> Callable[..., GarmentModel]:
+    return build_model
+
+
+@pytest.fixture(scope="session")
+def toy_grid() -> Callable[..., tuple[np.ndarray, np.ndarray]]:
+    return grid
