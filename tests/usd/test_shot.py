@@ -366,7 +366,7 @@ def test_names_that_do_not_spell_the_hierarchy_are_refused(tmp_path):
 
 @pytest.mark.parametrize("name", ["shot.abc", "shot"])
 def test_other_file_formats_are_refused(tmp_path, name):
-    with pytest.raises(SsilkError, match=r"ends in \.usdc, \.usd, \.usda"):
+    with pytest.raises(SsilkError, match=r"one of \.usdc, \.usd, \.usda"):
         write(tmp_path / name)
 
 

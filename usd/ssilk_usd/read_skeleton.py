@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import numpy as np
-from pxr import Usd, UsdGeom, UsdSkel
+from pxr import Sdf, Usd, UsdGeom, UsdSkel
 
 from ssilk_core.assets import Floats, Ints, Skeleton
 from ssilk_core.errors import fail, need
@@ -119,12 +119,14 @@ def _parents(joints: tuple[str, ...], where: str) -> Ints:
     """Return parent indices as UsdSkel reads them from joint paths: the nearest ancestor that is a joint."""
     repeated = next((name for name in joints if joints.count(name) > 1), None)
     need(repeated is None, where, f"joint '{repeated}' stands twice", "each joint needs its own path", "rename one")
+    broken = next((name for name in joints if not Sdf.Path.IsValidPathString(name)), None)
+    need(broken is None, where, f"joint '{broken}' is no path", "joints are paths like 'Hips/Spine'", "rename it")
     topology = UsdSkel.Topology(joints)
     valid, reason = topology.Validate()
     need(
         valid,
         where,
-        f"the joints are out of order ({reason})",
+        f"the joints are out of order ({reason.partition('.')[0]})",
         "parents come before their children and a joint is never its own ancestor",
         "reorder the joints",
     )

@@ -33,10 +33,18 @@ def needs_whole_files(read: Reader) -> Reader:
             return read(source, *args, **options)
         except Tf.ErrorException as error:
             where = stage_name(source) if isinstance(source, Usd.Stage) else str(source)
-            reason = " ".join(error.args[0].commentary.split()) if error.args else "unknown reason"
-            fail(where, f"it cannot be read as USD ({reason})", "a whole .usd, .usda, .usdc or .usdz file is needed")
+            fail(
+                where,
+                f"it cannot be read as USD ({usd_reason(error)})",
+                "a whole .usd, .usda, .usdc or .usdz file is needed",
+            )
 
     return cast(Reader, reader)
+
+
+def usd_reason(error: Tf.ErrorException) -> str:
+    """Return the first thing that USD complains of, on one line."""
+    return " ".join(error.args[0].commentary.split()) if error.args else "unknown reason"
 
 
 @needs_whole_files

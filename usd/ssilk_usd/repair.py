@@ -7,13 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from pxr import Sdf, Tf, Usd, UsdGeom
+from pxr import Usd, UsdGeom
 
-from ssilk_core.errors import fail, need
-from ssilk_core.files import replacing
-
+from .export import export
 from .read_garment import find_garment, fitted_skeleton, garment_to_core
-from .read_stage import LAYER_SUFFIXES, needs_whole_files, open_stage, value
+from .read_stage import needs_whole_files, open_stage, value
 from .repair_mesh import rewrite_mesh
 from .units import StageUnits
 
@@ -49,7 +47,7 @@ def write_with_units(source: str | Path, out: str | Path, units: StageUnits) -> 
     stage = Usd.Stage.Open(layer)
     UsdGeom.SetStageMetersPerUnit(stage, units.meters_per_unit)
     UsdGeom.SetStageUpAxis(stage, units.up_axis)
-    _export(layer, out)
+    export(layer, out)
 
 
 @needs_whole_files
@@ -81,17 +79,7 @@ def write_repaired(
     copy = Usd.Stage.Open(layer)
     offsets = repair.offsets @ np.linalg.inv(to_core[:3, :3]).T
     rewrite_mesh(UsdGeom.Mesh(copy.GetPrimAtPath(path)), repair, offsets)
-    _export(layer, out)
-
-
-def _export(layer: Sdf.Layer, out: str | Path) -> None:
-    suffix = Path(out).suffix
-    need(suffix in LAYER_SUFFIXES, str(out), f"the suffix is '{suffix}'", f"it is one of {', '.join(LAYER_SUFFIXES)}")
-    with replacing(out) as temporary:
-        try:
-            layer.Export(str(temporary))
-        except Tf.ErrorException as error:
-            fail(str(out), f"USD cannot write it ({error})", "the disk may be full", "free some space")
+    export(layer, out)
 
 
 def _has(prim: Usd.Prim, name: str) -> bool:

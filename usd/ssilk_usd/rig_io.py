@@ -12,21 +12,20 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdSkel, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from ssilk_core.assets import Floats, Garment, Ints, ProxyRig, Scene, Skeleton, SkinWeights
 from ssilk_core.errors import fail, need
 from ssilk_core.events import Message, Reporter, silent
-from ssilk_core.files import replacing
 
 from .author import bind_skin, define_mesh, matrix_array, prim_names, sorted_influences
+from .export import export, need_layer_suffix
 from .read_garment import find_garment, fitted_skeleton, garment_to_core, plain_skin
 from .read_mesh import CLASS, PROXIES, is_garment
 from .read_skeleton import find_skeleton
 from .read_skin import PLAIN, SKEL, leaf, match_joints, read_influences
 from .read_spaces import SkelSource
 from .read_stage import (
-    LAYER_SUFFIXES,
     PRIMS,
     StageLike,
     apply,
@@ -96,24 +95,14 @@ def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path) -> Non
     Raises:
         SsilkError: the output cannot be written.
     """
-    need(
-        Path(out).suffix in LAYER_SUFFIXES,
-        str(out),
-        f"the suffix is '{Path(out).suffix}'",
-        f"it is one of {', '.join(LAYER_SUFFIXES)}",
-        "choose another name",
-    )
+    need_layer_suffix(out)
     layer = _flattened(source, scene)
     stage = Usd.Stage.Open(layer)
     skel = find_skeleton(stage, root=_prim_path(scene.character.skeleton.path))
     mesh, to_bind = _place_garment(stage, skel, source, scene.garment)
     proxies = _append_proxies(skel, str(mesh.GetPath()), scene)
     _bind_garment(mesh, to_bind, skel, scene, proxies)
-    with replacing(out) as temporary:
-        try:
-            layer.Export(str(temporary))
-        except Tf.ErrorException as error:
-            fail(str(out), f"USD cannot write it ({error})", "the disk may be full", "free some space")
+    export(layer, out)
 
 
 def _find(prim: Usd.Prim, skel: SkelSource) -> list[int]:

@@ -16,9 +16,10 @@ from ssilk_core.files import replacing
 from ssilk_core.kinematics import combined_transforms, local_transforms, quaternion_from_matrix, skinning_matrices
 
 from .author import Asset, define_asset, extent_array, matrix_array, sorted_influences
+from .export import need_layer_suffix
+from .read_stage import usd_reason
 from .units import StageUnits
 
-SUFFIXES = (".usdc", ".usd", ".usda")
 # A save lets go of the samples (less than 1 kB a frame remains, for the tables of their times), but leaves each
 # attribute's older table behind in the file. At this many frames both stay small: about 10 MB in memory, and a
 # fifth of the file at 100,000 frames.
@@ -65,7 +66,7 @@ def write_shot(
         SsilkError: chunks that do not cover the motion in order, blendshape weights outside [0, 1], joint paths
             that do not spell the hierarchy, a file that cannot be written.
     """
-    need(Path(path).suffix in SUFFIXES, str(path), "not a name for a shot", f"it ends in {', '.join(SUFFIXES)}")
+    need_layer_suffix(path)
     bodies = deformer.scene.character.bodies if include_body else ()
     with replacing(path) as temporary:
         layer = Sdf.Layer.CreateNew(str(temporary))
@@ -234,13 +235,7 @@ class _Samples:
         try:
             self.layer.Save()
         except Tf.ErrorException as error:
-            reason = error.args[0].commentary if error.args else "unknown reason"
-            fail(
-                str(name),
-                f"writing failed ({reason})",
-                "the whole shot must fit",
-                "free space or choose another output",
-            )
+            fail(str(name), f"writing failed ({usd_reason(error)})", "free some space or choose another output")
         self.unsaved_count = 0
 
 
