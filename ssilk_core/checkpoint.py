@@ -51,7 +51,7 @@ class ModelFile:
 
 def save_model(path: str | Path, model: ModelFile) -> None:
     """Write a model file whole or not at all."""
-    from safetensors.numpy import save_file
+    from safetensors.numpy import save
 
     scene, skeleton, mesh, rig = (
         model.scene,
@@ -89,9 +89,8 @@ def save_model(path: str | Path, model: ModelFile) -> None:
         "provenance": model.provenance,
     }
     with replacing(path) as temporary:
-        save_file(
-            {k: np.ascontiguousarray(v) for k, v in tensors.items()}, temporary, {"ssilk": json.dumps(document)}
-        )
+        arrays = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
+        temporary.write_bytes(save(arrays, {"ssilk": json.dumps(document)}))
 
 
 def load_model(path: str | Path) -> ModelFile:
@@ -103,6 +102,8 @@ def load_model(path: str | Path) -> ModelFile:
     tensors, document = _read(Path(path))
     try:
         return _model_of(tensors, document)
+    except SsilkError as error:
+        raise SsilkError(f"{path}: the model cannot be used: {error}") from error
     except (KeyError, TypeError, ValueError) as error:
         raise SsilkError(
             f"{path}: the model file is incomplete or inconsistent ({type(error).__name__}: {error}); "
@@ -178,11 +179,19 @@ def _model_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Model
             "all are finite",
             "train again",
         )
+    joints = tensors["joints"]
+    need(
+        np.isin(joints, np.arange(skeleton.joint_count)).all(),
+        skeleton.path,
+        f"descriptors of joints {joints.tolist()}",
+        f"they lie in 0 to {skeleton.joint_count - 1}",
+        "train again",
+    )
     return ModelFile(
         Scene(Character(paths["skeleton"], skeleton, ()), garment, rig),
         ModelConfig(**document["config"]),
         Fabric(**document["fabric"]),
-        tensors["joints"],
+        joints,
         parameters,
         document["provenance"],
     )
@@ -208,7 +217,7 @@ def network(file: ModelFile, scene: Scene | None = None) -> GarmentModel:
     try:
         model.load_state_dict({name: torch.from_numpy(value.copy()) for name, value in file.parameters.items()})
     except RuntimeError as error:
-        problem = str(error).splitlines()[-1].strip()
+        problem = str(error).splitlines()[-1].partition(":")[0].strip()
         raise SsilkError(
             f"{file.scene.garment.mesh.path}: the model's parameters do not fit its header ({problem}); train again."
         ) from error

@@ -10,6 +10,14 @@ from .errors import need
 
 SURFACES = ("triangles", "vertices")
 SCHEMES = ("spring_verlet", "verlet", "direct", "direct_residual")
+MOST = 1e9  # of anything that has no other bound
+
+
+def _need_between(config: object, low: float, high: float, *names: str) -> None:
+    """Raise `SsilkError` unless each of these settings lies between two numbers, themselves included."""
+    for name in names:
+        value = getattr(config, name)
+        need(low <= value <= high, f"setting '{name}'", f"{value:g}", f"it lies between {low:g} and {high:g}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,12 +55,10 @@ class ModelConfig:
             f"integration scheme '{self.scheme}'",
             f"it is one of {', '.join(SCHEMES)}",
         )
-        need(
-            self.latent > 0 and self.shapes >= 0 and self.bound >= 0 and self.fps > 0 and min(self.widths) > 0,
-            "model",
-            "a negative or zero size",
-            "latent size, widths and rate are positive, shapes and bound not negative",
-        )
+        need(min(self.widths) > 0, "model", f"widths = {self.widths}", "each is at least 1")
+        _need_between(self, 1, MOST, "latent", "fps")
+        _need_between(self, 0, MOST, "shapes", "bound", "push", "smoothing")
+        _need_between(self, 1e-6, 1, "stiffness")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,18 +110,12 @@ class TrainConfig:
     def __post_init__(self) -> None:
         need(self.surface in SURFACES, "training", f"surface '{self.surface}'", f"it is one of {', '.join(SURFACES)}")
         need(self.window >= 3, "training", f"a window of {self.window} poses", "inertia needs at least 3")
-        need(
-            self.iterations >= 1 and self.batch >= 1 and self.warm_batch >= 1 and self.validate_every >= 1,
-            "training",
-            "fewer than one iteration or window",
-            "counts are positive",
-        )
-        need(
-            0 <= self.warm < 1 and 0 <= self.carry <= 1,
-            "training",
-            "a share outside 0 to 1",
-            "warm and carry are shares",
-        )
+        _need_between(self, 1, MOST, "iterations", "batch", "warm_batch", "validate_every")
+        _need_between(self, 3, MOST, "valid_frames")
+        _need_between(self, 0, 1, "carry", "rotated", "noise_correlation")
+        _need_between(self, 0, 0.99999, "warm", "average")
+        _need_between(self, 0, MOST, "noise", "warm_rate", "rate", "final_rate", "rate_warmup", "skin_rate", "clip")
+        _need_between(self, 0, 2**63 - 1, "seed")
 
     @property
     def warm_iterations(self) -> int:

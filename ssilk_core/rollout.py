@@ -91,7 +91,7 @@ def resample_poses(poses: Iterator[GarmentPose], source: float, target: float) -
         joined = pose if tail is None else _joined(tail, pose)
         last = joined.start + joined.frame_count - 1
         count = int(np.floor(last * target / source + 1e-6)) + 1 - done
-        position = np.minimum((done + np.arange(count)) * source / target, last).astype(float) - joined.start
+        position = np.minimum((done + np.arange(count)) * source / target, last) - float(joined.start)
         if count:
             yield _sampled(joined, position, done)
         done += max(count, 0)

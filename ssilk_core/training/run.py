@@ -21,7 +21,7 @@ from ..assets import Motion, Scene
 from ..checkpoint import model_file, save_model
 from ..config import ModelConfig, TrainConfig
 from ..energy import GarmentEnergy
-from ..errors import need
+from ..errors import fail, need
 from ..events import Checkpoint, Message, Progress, Reporter, Started
 from ..fabrics import Fabric
 from ..kinematics import split_at_cuts
@@ -85,7 +85,8 @@ def chosen_device(name: str) -> torch.device:
         device = torch.device(name)
         torch.empty(1, device=device)
     except (RuntimeError, AssertionError) as error:
-        need(False, f"--device {name}", "no such device here", "'auto', 'cpu' or 'cuda' are common", str(error)[:80])
+        reason = str(error).partition("\n")[0].rstrip(".")
+        fail(f"--device {name}", f"no such device here ({reason})", "'auto', 'cpu' and 'cuda' are common")
     return device
 
 

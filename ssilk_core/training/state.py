@@ -33,14 +33,11 @@ def state_path(model: str | Path) -> Path:
 
 def save_state(path: Path, stepper: Stepper, state: RunState) -> None:
     """Write everything that the next iteration depends on."""
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
     with replacing(path) as temporary:
-        save_file(
-            {name: value.detach().cpu().contiguous().clone() for name, value in _tensors(stepper).items()},
-            temporary,
-            {"ssilk_state": json.dumps(asdict(state))},
-        )
+        tensors = {name: value.detach().cpu().contiguous().clone() for name, value in _tensors(stepper).items()}
+        temporary.write_bytes(save(tensors, {"ssilk_state": json.dumps(asdict(state))}))
 
 
 def load_state(path: Path, stepper: Stepper, asked: dict[str, Any]) -> RunState:
@@ -60,13 +57,26 @@ def load_state(path: Path, stepper: Stepper, asked: dict[str, Any]) -> RunState:
     )
     try:
         with safe_open(path, "pt") as stream:
-            state = RunState(**json.loads((stream.metadata() or {}).get("ssilk_state", "{}")))
+            state = RunState(**json.loads((stream.metadata() or {})["ssilk_state"]))
             tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
-    except (SafetensorError, ValueError, TypeError) as error:
+        _need_same(path, asked, state.asked)
+        _restore(stepper, tensors)
+    except (SafetensorError, ValueError, TypeError, KeyError, RuntimeError) as error:
+        reason = str(error).rpartition("\n")[2].strip().rstrip(".")
         raise SsilkError(
-            f"{path}: the training state is damaged ({error}); delete it and train without --resume."
+            f"{path}: the training state is damaged ({reason}); delete it and train without --resume."
         ) from error
-    differing = sorted(key for key in asked if asked[key] != state.asked.get(key))
+    return state
+
+
+def _need_same(path: Path, asked: dict[str, Any], before: dict[str, Any]) -> None:
+    differing: list[str] = []
+    for key, value in asked.items():
+        old = before.get(key)
+        if isinstance(value, dict) and isinstance(old, dict):
+            differing += sorted(name for name in value.keys() | old.keys() if value.get(name) != old.get(name))
+        elif value != old:
+            differing.append(key)
     need(
         not differing,
         str(path),
@@ -74,8 +84,6 @@ def load_state(path: Path, stepper: Stepper, asked: dict[str, Any]) -> RunState:
         "a resumed run repeats the same command",
         "use the same options or train without --resume",
     )
-    _restore(stepper, tensors)
-    return state
 
 
 def _tensors(stepper: Stepper) -> dict[str, Tensor]:

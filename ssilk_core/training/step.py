@@ -95,8 +95,8 @@ class Stepper:
         self.skipped += ~finite
         self.optimiser.step()
         with torch.no_grad():
-            for mean, value in zip(self.averaged.parameters(), self.model.parameters()):
-                mean.lerp_(value, 1 - self.config.average)
+            for mean, latest in zip(self.averaged.parameters(), self.model.parameters()):
+                mean.lerp_(latest, 1 - self.config.average)
         for name, value in terms.items():
             self.terms.setdefault(name, torch.zeros((), device=self.device)).copy_(value.detach())
 

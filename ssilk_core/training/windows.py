@@ -47,7 +47,7 @@ class WindowSampler:
             "motions",
             f"the longest clip has {longest} frames at the model's rate",
             f"a window of {config.window} poses must fit",
-            "give longer motions or set --train window=N",
+            "give longer motions or set --set window=N",
         )
         self.first = self._fresh()
         self.direction = random_directions(config.batch, config.rotated, generator, device).clone()
