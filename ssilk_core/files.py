@@ -10,7 +10,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from .errors import SsilkError
+from .errors import SsilkError, fail, need
+
+WRITABLE = "choose an output folder that exists and that you may write to"
 
 
 @contextmanager
@@ -28,10 +30,7 @@ def replacing(target: str | Path) -> Iterator[Path]:
         handle, name = tempfile.mkstemp(prefix=f".{target.stem}.", suffix=target.suffix, dir=target.parent)
         os.close(handle)
     except OSError as error:
-        raise SsilkError(
-            f"{target}: cannot be written ({error.strerror or error}); choose an output folder that exists "
-            "and that you may write to."
-        ) from error
+        raise SsilkError(f"{target}: cannot be written ({error.strerror or error}); {WRITABLE}.") from error
     temporary = Path(name)
     try:
         yield temporary
@@ -45,6 +44,22 @@ def replacing(target: str | Path) -> Iterator[Path]:
         ) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def need_writable(target: str | Path) -> None:
+    """Check before long work that `target` can be written at its end; nothing is left behind.
+
+    Raises:
+        SsilkError: `target` is a folder, or its folder cannot be made or written to.
+    """
+    target = Path(target)
+    need(not target.is_dir(), str(target), "this is a folder", "a file is written", "add a file name")
+    folder = next(above for above in target.absolute().parents if above.exists())
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        fail(str(target), f"cannot be written ({error.strerror or error})", WRITABLE)
 
 
 def sha256(path: str | Path) -> str:

@@ -4,12 +4,12 @@
 from __future__ import annotations
 
 import argparse
-import errno
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
 from ssilk_core import __version__
-from ssilk_core.errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK, SsilkError
+from ssilk_core.errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, SsilkError, fail
 from ssilk_core.events import Failed, JsonReporter, Reporter, TextReporter
 
 from . import bake, demo, inspect, rig, train, verify, view
@@ -29,11 +29,17 @@ EXTRAS = {
 }
 
 
-def parser() -> argparse.ArgumentParser:
+class Parser(argparse.ArgumentParser):
+    """A parser that complains as everything else does, in one sentence."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise `SsilkError`."""
+        fail(self.prog, message, f"'{self.prog} --help' lists what is allowed")
+
+
+def parser() -> Parser:
     """Return the parser of all verbs."""
-    top = argparse.ArgumentParser(
-        prog="ssilk", description="Neural loose garments, trained by physics alone, baked as UsdSkel."
-    )
+    top = Parser(prog="ssilk", description="Neural loose garments, trained by physics alone, baked as UsdSkel.")
     top.add_argument("--version", action="version", version=f"ssilk {__version__}")
     verbs = top.add_subparsers(dest="verb", metavar="VERB", required=True)
     for module in VERBS:
@@ -42,6 +48,7 @@ def parser() -> argparse.ArgumentParser:
             help=(module.__doc__ or "").splitlines()[0],
             description=module.__doc__,
             formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
         )
         verb.add_argument(
             "--json", action="store_true", help="events as JSON, one object per line, on standard output"
@@ -53,9 +60,10 @@ def parser() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return its exit code (0 well, 2 bad input, 3 not verified, 130 interrupted)."""
-    options = parser().parse_args(arguments)
-    report: Reporter = JsonReporter() if options.json else TextReporter()
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    report: Reporter = JsonReporter() if "--json" in words else TextReporter()
     try:
+        options = parser().parse_args(words)
         return int(options.run(options, report))
     except SsilkError as error:
         report(Failed(str(error)))
@@ -70,9 +78,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
         report(Failed(f"'{options.verb}' needs {error.name}, which is not installed; pip install 'ssilk[{extra}]'."))
         return EXIT_BAD_INPUT
     except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EACCES, errno.EROFS, errno.ENOENT, errno.EISDIR, errno.ENOTDIR):
-            raise
-        report(Failed(f"{error.filename or 'output'}: {error.strerror}; free some space or choose another path."))
+        report(Failed(f"{error.filename or options.verb}: {error.strerror or error}; check the path and its disk."))
         return EXIT_BAD_INPUT
-
-

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ssilk_core.assets import Deformer, Floats, GarmentPose, Motion, ProxyRig, Scene
+from ssilk_core.assets import Deformer, Floats, GarmentPose, Motion, ProxyRig, Scene, Skeleton
 from ssilk_core.errors import VerificationError, need
 from ssilk_core.events import Message, Progress, Reporter
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from ssilk_core.model.network import GarmentModel
 
 CHUNK = 256  # frames in memory at once
+BIND_TOLERANCE = 1e-3  # [m]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,12 +93,14 @@ class Bake:
             report(Message(str(finding), "warning"))
         errors = [finding for finding in findings if finding.severity == "error"]
         if errors:
-            raise VerificationError(f"{path}: {len(errors)} checks fail, the first: {errors[0]}.")
+            raise VerificationError(
+                f"{path}: {len(errors)} checks failed, first at {errors[0].prim}: {errors[0].text}."
+            )
         found = compare_points(Shot(path), self.vertices(report))
         if not found.passed:
             raise VerificationError(
-                f"{path}: vertex {found.vertex} at time code {found.time:g} is {found.worst:.3g} m from the decoder's; "
-                f"at most {found.bound:.3g} m is allowed."
+                f"{path}: vertex {found.vertex} at time code {found.time:g} is {found.worst:.3g} m from where the "
+                f"decoder has it; at most {found.bound:.3g} m is allowed."
             )
         return {"largest error [m]": f"{found.worst:.3g}", "allowed [m]": f"{found.bound:.3g}"}
 
@@ -115,23 +118,18 @@ def open_bake(request: BakeRequest) -> Bake:
 
     from ssilk_core.checkpoint import load_model, network
     from ssilk_core.files import sha256
+    from ssilk_core.training.run import chosen_device
 
+    device = chosen_device(request.device)
     file = load_model(request.model)
     stage = open_stage(request.stage)
     character = read_character(stage, root=request.root, garment=None)
     skeleton = file.scene.character.skeleton
-    missing = sorted(set(skeleton.joint_names) - set(character.skeleton.joint_names))
-    need(
-        not missing,
-        request.stage,
-        f"{len(missing)} of the model's joints are missing ({', '.join(missing[:3])})",
-        "a model bakes on the character it was trained with",
-        "train on this character",
-    )
+    _need_same_skeleton(character.skeleton, skeleton)
     scene = replace(file.scene, character=replace(character, skeleton=skeleton))
     source = read_motion(request.motion, skeleton)
     motion = source if request.fps is None else _at_rate(source, request.fps)
-    model = None if request.plain else network(file, scene).to(request.device)
+    model = None if request.plain else network(file, scene).to(device)
     deformer = _plain(scene) if model is None else model.deformer()
     provenance = {
         "request": {key: value for key, value in vars(request).items() if value is not None},
@@ -140,6 +138,21 @@ def open_bake(request: BakeRequest) -> Bake:
         "training": file.provenance.get("ssilk", ""),
     }
     return Bake(request, model, deformer, motion, source, StageUnits.of(stage), provenance)
+
+
+def _need_same_skeleton(found: Skeleton, trained: Skeleton) -> None:
+    """Raise `SsilkError` unless a skeleton has the joints of the model's, bound at the same places."""
+    allowed, todo = "a model bakes on the character it was trained with", "train on this character"
+    missing = sorted(set(trained.joint_names) - set(found.joint_names))
+    need(not missing, found.path, f"{len(missing)} of the model's joints are missing ({', '.join(missing[:3])})",
+         allowed, todo)  # fmt: skip
+    same = found.joint_names == trained.joint_names
+    need(same, found.path, "its joints are more than the model's, or in another order", allowed, todo)
+    away = np.linalg.norm(found.bind_transforms[:, :3, 3] - trained.bind_transforms[:, :3, 3], axis=1)
+    joint = int(away.argmax())
+    need(away[joint] < BIND_TOLERANCE, found.path,
+         f"joint '{found.joint_names[joint]}' is bound {away[joint]:.3g} m from where the model has it",
+         allowed, todo)  # fmt: skip
 
 
 def _at_rate(motion: Motion, fps: float) -> Motion:

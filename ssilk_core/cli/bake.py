@@ -8,10 +8,13 @@ plain skinning, to compare with.
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 
 from ssilk_core.errors import EXIT_OK
 from ssilk_core.events import Message, Reporter, Result, Started
+
+from .options import INPUTS, check_output
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -28,12 +31,22 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--device", default="cpu", help="where the network runs (default cpu)")
 
 
+def _beside(options: argparse.Namespace) -> dict[str, str]:
+    """Return the inputs' paths as seen from the shot's folder: they hold when everything moves together."""
+    folder = options.output.absolute().parent
+    try:
+        return {name: os.path.relpath(getattr(options, name), folder) for name in INPUTS}
+    except ValueError:  # on another drive
+        return {}
+
+
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Bake and verify."""
     from ssilk_usd.shot import write_shot
 
     from ._baking import BakeRequest, open_bake
 
+    check_output(options.output, options.model, options.stage, options.motion)
     bake = open_bake(
         BakeRequest(
             model=str(options.model),
@@ -54,7 +67,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         units=bake.units,
         start=bake.motion.start,
         include_body=not options.no_body,
-        provenance=bake.provenance,
+        provenance={**bake.provenance, "beside": _beside(options)},
     )
     detail: dict[str, object] = {
         "shot": str(options.output),

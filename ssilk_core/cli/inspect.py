@@ -72,21 +72,13 @@ def _world(options: argparse.Namespace, report: Reporter) -> Inspected:
     from ssilk_core.preflight.motion import MotionFile
 
     character, garment, rig = shared.read(options, report)
-    file, prim = _wardrobe(options)
+    file, prim = shared.wardrobe(options)
     motions = read_motions(options.motion, character.skeleton)
     return Inspected(
         character=character, garment=garment, rig=rig, stage=_units(options.stage), wardrobe=_units(file),
         locked=repair_lock(file, prim), motions=motions, preset=preset_named(options.preset),
         files=[MotionFile(motion.path, *animated(motion, character.skeleton)) for motion in motions],
     )  # fmt: skip
-
-
-def _wardrobe(options: argparse.Namespace) -> tuple[Path, str | None]:
-    """Return the file that the garment stands in, and the prim that was asked for."""
-    from ssilk_usd.read_stage import USD_SUFFIXES, split_location
-
-    file, prim = split_location(options.garment) if options.garment else ("", None)
-    return (Path(file), prim) if Path(file).suffix in USD_SUFFIXES else (options.stage, options.garment)
 
 
 def _units(path: Path) -> FileUnits:
@@ -106,10 +98,11 @@ def _fix(options: argparse.Namespace, world: Inspected) -> list[str]:
 
     from ssilk_core.preflight.repair import plan_repair
 
-    file, prim = _wardrobe(options)
+    file, prim = shared.wardrobe(options)
     units, stated = _corrected_units(world)
     need(not (options.fix.exists() and options.fix.samefile(file)), str(options.fix), "this is the file to repair",
          "--fix writes a copy", "name another file")  # fmt: skip
+    shared.check_output(options.fix, options.stage)
     # Units first: everything else is measured in them.
     write_with_units(file, options.fix, units)
     world = _world(_moved(options), silent)
@@ -133,6 +126,6 @@ def _corrected_units(world: Inspected) -> tuple[StageUnits, list[str]]:
 
 def _moved(options: argparse.Namespace) -> argparse.Namespace:
     """Return the options with the repaired copy in place of the file that it was made from."""
-    file, prim = _wardrobe(options)
+    file, prim = shared.wardrobe(options)
     own = {} if file == options.stage else {"garment": f"{options.fix}:{prim}" if prim else str(options.fix)}
     return argparse.Namespace(**{**vars(options), **(own or {"stage": options.fix})})

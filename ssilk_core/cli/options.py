@@ -11,8 +11,11 @@ from typing import TYPE_CHECKING
 from ssilk_core.config import overridden
 from ssilk_core.errors import need
 from ssilk_core.events import Reporter
+from ssilk_core.files import need_writable
 from ssilk_core.setup.classes import ClassOptions
 from ssilk_core.setup.rig import RigOptions
+
+INPUTS = ("model", "stage", "motion")  # what a shot is baked from
 
 if TYPE_CHECKING:
     from ssilk_core.assets import Character, Garment, ProxyRig, Scene
@@ -49,6 +52,25 @@ def add_setup(verb: argparse.ArgumentParser) -> None:
             metavar="NAME=VALUE",
             help=f"change a threshold (repeatable): {names}",
         )
+
+
+def wardrobe(options: argparse.Namespace) -> tuple[Path, str | None]:
+    """Return the file that the garment stands in, and the prim that was asked for."""
+    from ssilk_usd.read_stage import USD_SUFFIXES, split_location
+
+    file, prim = split_location(options.garment) if options.garment else ("", None)
+    return (Path(file), prim) if Path(file).suffix in USD_SUFFIXES else (options.stage, options.garment)
+
+
+def check_output(output: Path, *inputs: Path | str | None) -> None:
+    """Check before any work that `output` can be written and is none of the `inputs`.
+
+    Raises:
+        SsilkError: it cannot, or it is.
+    """
+    need_writable(output)
+    same = output.exists() and any(Path(path).exists() and output.samefile(path) for path in inputs if path)
+    need(not same, str(output), "the output is also an input", "inputs are never overwritten", "name another file")
 
 
 def read(options: argparse.Namespace, report: Reporter) -> tuple[Character, Garment, ProxyRig | None]:

@@ -31,6 +31,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
     from ssilk_core.assets import CLASS_NAMES
 
+    shared.check_output(options.output, options.stage, shared.wardrobe(options)[0])
     scene = shared.load_scene(options, report, anew=options.anew)
     write_rigged_stage(options.stage, scene, options.output)
     counts = np.bincount(scene.classes, minlength=3)

@@ -70,6 +70,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         "not a name for a model",
         "it ends in .safetensors",
     )
+    shared.check_output(options.output)
     job = _job(options, report)
     with interruptible() as stop:
         trained = train(job, report, stop)
@@ -127,6 +128,10 @@ def _settings(
     settings: list[str], model: ModelConfig, train: TrainConfig, seed: int
 ) -> tuple[ModelConfig, TrainConfig]:
     """Apply "name=value" settings to whichever of the two has the name."""
+    known = [*ModelConfig.__dataclass_fields__, *TrainConfig.__dataclass_fields__]
+    for setting in settings:
+        name, where = setting.partition("=")[0], f"--set {setting}"
+        need(name in known, where, "no such setting", f"settings are {', '.join(known)}")
     own = [setting for setting in settings if setting.partition("=")[0] in ModelConfig.__dataclass_fields__]
     others = [setting for setting in settings if setting not in own]
     return overridden(model, own), overridden(train, [f"seed={seed}", *others])

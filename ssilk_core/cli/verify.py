@@ -9,17 +9,20 @@ from __future__ import annotations
 import argparse
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
-from ssilk_core.errors import EXIT_OK, need
+from ssilk_core.errors import EXIT_OK, fail, need
 from ssilk_core.events import Reporter, Result, Started
+
+from .options import INPUTS
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
     verb.add_argument("shot", type=Path, help="shot written by 'ssilk bake'")
-    verb.add_argument("--model", help="where the model lies now")
-    verb.add_argument("--stage", help="where the character's stage lies now")
-    verb.add_argument("--motion", help="where the motion lies now")
+    for name in INPUTS:
+        verb.add_argument(f"--{name}", metavar="PATH", help=f"where the {name} lies now")
+    verb.add_argument("--device", help="where the network runs (default: where it ran for the bake)")
 
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
@@ -31,18 +34,28 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     need(
         options.shot.is_file(), str(options.shot), "there is no such shot", "a file written by 'ssilk bake' is needed"
     )
-    carried = read_provenance(options.shot).get("request")
-    carried = carried if isinstance(carried, dict) else {}
+    provenance = read_provenance(options.shot)
+    carried: Any = provenance.get("request")
     need(
-        carried,
+        isinstance(carried, dict) and set(INPUTS) <= carried.keys(),
         str(options.shot),
         "the file does not say how it was baked",
         "a shot written by 'ssilk bake' is needed",
     )
     known = {item.name for item in fields(BakeRequest)}
     request = BakeRequest(**{key: value for key, value in carried.items() if key in known})
-    moved = {key: getattr(options, key) for key in ("model", "stage", "motion") if getattr(options, key)}
-    bake = open_bake(replace(request, **moved))
+    chosen = {name: getattr(options, name) or _found(options.shot, name, provenance) for name in INPUTS}
+    bake = open_bake(replace(request, **chosen, device=options.device or request.device))  # type: ignore[arg-type]
     report(Started("verify", bake.motion.frame_count, {"shot": str(options.shot)}))
     report(Result("verify", {"shot": str(options.shot), **bake.verify(options.shot, report)}))
     return EXIT_OK
+
+
+def _found(shot: Path, name: str, provenance: dict[str, Any]) -> str:
+    """Return where an input of the bake lies: where it lay then, or else where it lay as seen from the shot."""
+    path = Path(provenance["request"][name])
+    beside = shot.parent / provenance.get("beside", {}).get(name, path)
+    there = next((candidate for candidate in (path, beside) if candidate.exists()), None)
+    if there is None:
+        fail(str(shot), f"the {name} that it was baked from is not at {path}", f"--{name} says where it lies now")
+    return str(there)

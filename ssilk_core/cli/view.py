@@ -12,6 +12,8 @@ from pathlib import Path
 from ssilk_core.errors import EXIT_OK, need
 from ssilk_core.events import Reporter, Result
 
+from .options import check_output
+
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
@@ -36,6 +38,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     from ssilk_core.view.shots import film_of_shots, sheet_of_shots
 
     film = check_suffix(options.output) == FILM
+    check_output(options.output, *options.shots)
     players = [Shot(path) for path in options.shots]
     labels = options.label or ([path.stem for path in options.shots] if len(players) > 1 else [])
     look = _look(options, film)
@@ -61,8 +64,8 @@ def _look(options: argparse.Namespace, film: bool):  # type: ignore[no-untyped-d
     width, height = (480, 640) if film else (320, 440)
     if options.size:
         parts = options.size.lower().split("x")
-        need(len(parts) == 2 and all(part.isdigit() and int(part) >= 16 for part in parts), f"--size {options.size}",
-             "not a size", "WIDTHxHEIGHT in pixels is needed, 16 at least")  # fmt: skip
+        need(len(parts) == 2 and all(part.isdecimal() for part in parts), f"--size {options.size}", "not a size",
+             "WIDTHxHEIGHT in pixels is needed")  # fmt: skip
         width, height = int(parts[0]), int(parts[1])
     azimuth = Look.azimuth if options.azimuth is None else options.azimuth
     return Look(width=width, height=height, azimuth=azimuth, workers=options.workers)

@@ -42,6 +42,12 @@ class Look:
     samples: int = 4
     workers: int = 2
 
+    def __post_init__(self) -> None:
+        size = f"{self.width} x {self.height} pixels"
+        need(all(16 <= side <= 8192 for side in (self.width, self.height)), "view", size, "16 to 8192 each are drawn")
+        need(np.isfinite(self.azimuth), "view", f"azimuth = {self.azimuth}", "it must be finite")
+        need(self.workers > 0, "view", f"workers = {self.workers}", "at least 1 is needed")
+
 
 @dataclass(frozen=True, eq=False)
 class Panel:
@@ -77,6 +83,7 @@ def film_of_shots(
         SsilkError: another suffix, shots that do not match, nothing to draw, or a file that cannot be written.
     """
     check_suffix(path, (FILM,))
+    need(0 < fps < np.inf, "view", f"fps = {fps:g}", "a positive rate is needed")
     look = look or Look()
     step = int(np.ceil(players[0].fps / fps - 1e-6)) if players else 1
     frames = range(0, _frame_count(players), step)
