@@ -85,7 +85,8 @@ class SpringVerlet(Verlet):
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__(config)
-        start = torch.logspace(math.log10(self.slowest), math.log10(0.9 * config.stiffness), config.latent)
+        slowest = min(self.slowest, 0.05 * config.stiffness)
+        start = torch.logspace(math.log10(slowest), math.log10(0.9 * config.stiffness), config.latent)
         self.share = nn.Parameter(torch.logit(start / config.stiffness))
 
     def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor) -> Tensor:

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Integration schemes by hand numbers, and the bounds that hold by design."""
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from ssilk_core.config import SCHEMES, ModelConfig
+from ssilk_core.kinematics import motion_transforms, skinning_matrices
+from ssilk_core.model.integrators import INTEGRATORS, limited
+
+FREE = {"bound": 0.0, "push": 0.0}
+
+
+class Says(nn.Module):
+    """A stepper that records what it sees and always answers the same."""
+
+    def __init__(self, answer: float) -> None:
+        super().__init__()
+        self.answer, self.seen = answer, None
+
+    def forward(self, inputs: torch.Tensor) -> torch.Tensor:
+        self.seen = inputs
+        return torch.full((len(inputs), 2), self.answer)
+
+
+def integrator(scheme: str, **options):
+    return INTEGRATORS[scheme](ModelConfig(scheme=scheme, **({"latent": 2} | options)))
+
+
+BEFORE, NOW, REST, POSE = (torch.tensor([v]) for v in ([1.0, 2.0], [1.5, 1.0], [3.0, 4.0], [9.0]))
+
+
+@torch.no_grad()
+def test_verlet_is_equations_2_and_3():
+    scheme, says = integrator("verlet", **FREE), Says(0.25)
+    scheme.alpha.copy_(torch.tensor([0.9, 1.0]))
+    scheme.beta.copy_(torch.tensor([0.5, 0.8]))
+    found = scheme(says, BEFORE, NOW, REST, POSE)
+    # zbar = 0.9 * 1.5 + 0.5 * 0.5 and 1.0 - 0.8
+    np.testing.assert_allclose(found, [[1.6 + 0.25, 0.2 + 0.25]], rtol=1e-6)
+    np.testing.assert_allclose(says.seen, [[1.6, 0.2, 1.5, 1.0, 9.0]], rtol=1e-6)
+
+
+@torch.no_grad()
+def test_spring_verlet_pulls_towards_the_rest_state():
+    scheme, says = integrator("spring_verlet", stiffness=0.5, **FREE), Says(0.25)
+    scheme.alpha.fill_(1.0)
+    scheme.beta.fill_(0.5)
+    scheme.share.copy_(torch.logit(torch.tensor([0.2, 0.4])))
+    # zbar = (1.75, 0.5) and k = (0.1, 0.2)
+    found = scheme(says, BEFORE, NOW, REST, POSE)
+    np.testing.assert_allclose(found, [[1.75 + 0.1 * 1.25 + 0.25, 0.5 + 0.2 * 3.5 + 0.25]], rtol=1e-6)
+    np.testing.assert_allclose(says.seen, [[1.75, 0.5, 1.5, 1.0, 3.0, 4.0, 9.0]], rtol=1e-6)
+
+
+@torch.no_grad()
+def test_direct_is_equation_11_and_residual_equation_12():
+    says = Says(0.25)
+    np.testing.assert_allclose(integrator("direct", **FREE)(says, BEFORE, NOW, REST, POSE), [[0.25, 0.25]])
+    np.testing.assert_allclose(says.seen, [[1.0, 2.0, 1.5, 1.0, 9.0]])
+    np.testing.assert_allclose(integrator("direct_residual", **FREE)(says, BEFORE, NOW, REST, POSE), [[1.75, 1.25]])
+    np.testing.assert_allclose(says.seen, [[1.0, 2.0, 1.5, 1.0, 9.0]])
+
+
+@torch.no_grad()
+def test_without_bounds_verlet_is_exactly_the_papers_recurrence():
+    scheme, weights = integrator("verlet", **FREE), torch.randn(5, 2, generator=torch.Generator().manual_seed(0))
+
+    class Linear(nn.Module):
+        def forward(self, inputs: torch.Tensor) -> torch.Tensor:
+            return inputs @ weights
+
+    z = [torch.tensor([[0.1, -0.2]]), torch.tensor([[0.3, 0.1]])]
+    expected = [*z]
+    for _ in range(6):
+        z.append(scheme(Linear(), z[-2], z[-1], REST, POSE))
+        forward = scheme.alpha * expected[-1] + scheme.beta * (expected[-1] - expected[-2])
+        expected.append(forward + torch.cat([forward, expected[-1], POSE], dim=1) @ weights)
+    assert torch.equal(torch.cat(z), torch.cat(expected))
+    assert z[-1].abs().max() > 10  # nothing limits it
+
+
+@pytest.mark.parametrize("stiffness", [0.01, 0.2, 1.0])
+def test_springs_start_spread_under_their_limit(stiffness):
+    scheme = integrator("spring_verlet", stiffness=stiffness, latent=16)
+    share = torch.sigmoid(scheme.share.detach())
+    assert torch.isfinite(scheme.share).all() and (share.diff() > 0).all()
+    assert 0 < share[0] * stiffness <= 0.011 and share[-1].item() == pytest.approx(0.9, abs=1e-5)
+
+
+@pytest.mark.parametrize("k", [1e-6, 1e-3, 0.01, 0.1, 0.2, 0.5, 0.9, 1.0])
+def test_a_spring_alone_is_stable_for_every_stiffness(k):
+    scheme = integrator("spring_verlet")
+    alpha, beta = (float(v.detach()[0]) for v in (scheme.alpha, scheme.beta))
+    matrix = np.array([[(1 - k) * (alpha + beta), -(1 - k) * beta], [1, 0]])
+    assert np.abs(np.linalg.eigvals(matrix)).max() < 1
+
+
+@torch.no_grad()
+def test_a_spring_alone_settles_at_the_rest_state():
+    scheme = integrator("spring_verlet", latent=2)
+    before, now = torch.tensor([[-1.0, 2.0]]), torch.tensor([[-0.8, 1.5]])
+    rest = torch.tensor([[0.5, -0.5]])
+    for _ in range(1500):
+        before, now = now, scheme(Says(0.0), before, now, rest, POSE)
+    # The soft bound pulls a little towards zero, most where the spring is weakest.
+    free = integrator("spring_verlet", bound=0.0)
+    a, b = before, now
+    for _ in range(1500):
+        a, b = b, free(Says(0.0), a, b, rest, POSE)
+    np.testing.assert_allclose(b, rest, atol=1e-4)
+    np.testing.assert_allclose(now, rest, atol=0.2)
+    assert (now.abs() <= rest.abs()).all()
+
+
+def test_the_limit_is_soft_odd_and_the_identity_near_zero():
+    values = torch.linspace(-1e7, 1e7, 1001)
+    assert limited(values, 4.0).abs().max() <= 4
+    small = torch.tensor([-0.01, 0.0, 0.02])
+    np.testing.assert_allclose(limited(small, 4.0), small, rtol=1e-4)
+    assert torch.equal(limited(values, 0.0), values)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("answer", [1e6, float("inf")])
+def test_no_stepper_can_drive_the_state_out_of_its_bound(scheme, answer):
+    config = ModelConfig(latent=2, scheme=scheme)
+    step = INTEGRATORS[scheme](config)
+    z = [torch.zeros(1, 2), torch.zeros(1, 2)]
+    for count in range(10_000):
+        says = Says(answer if count // 50 % 2 else -answer)
+        z = [z[-1], step(says, z[-2], z[-1], REST, POSE)]
+        assert z[-1].abs().max() <= config.bound
+    assert torch.isfinite(z[-1]).all()
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("scheme", ["verlet", "spring_verlet"])
+def test_one_step_is_pushed_no_further_than_allowed(scheme):
+    step = integrator(scheme, push=0.15, bound=0.0)
+    for answer in (1e6, -1e6):
+        z = step(Says(answer), BEFORE, NOW, REST, POSE)
+        assert (z - step.extrapolated(BEFORE, NOW)).abs().max() <= 0.15 + 1e-6
+
+
+@torch.no_grad()
+def test_decoded_cloth_stays_within_reach_of_what_holds_it(scene, toy_motion, toy_model):
+    """Blendshapes end at their range and proxies turn about their own joints, whatever the state."""
+    model, motion = toy_model(scene, scale=4.0), toy_motion(scene, 64)
+    skeleton = scene.character.skeleton
+    matrices = skinning_matrices(motion_transforms(motion, skeleton.parents), skeleton.bind_transforms)
+    character = torch.tensor(matrices[:, :, :3].transpose(1, 2, 3, 0), dtype=torch.float32)
+    x = model.vertices(model.integrator.bounded(1e6 * torch.randn(64, 8)), character).permute(2, 0, 1).numpy()
+    points, (upper, lower) = scene.garment.mesh.points, scene.rig.bind_transforms[:, :3, 3]
+    free = scene.classes != 0
+    play = np.zeros(60)
+    play[free] = model.decoder.blendshapes().norm(dim=1).sum(1).numpy()
+    # A point on the lower proxy swings about it, which swings about the upper one, which the spine carries.
+    radius = np.maximum(np.linalg.norm(points - lower, axis=1) + np.linalg.norm(upper - lower), 0)
+    radius = np.maximum(radius, np.linalg.norm(points - upper, axis=1)) + play
+    anchor = (matrices[:, 1] @ np.append(upper, 1))[:, :3]
+    loose = scene.classes == 2
+    assert (np.linalg.norm(x - anchor[:, None], axis=2) <= radius + 1e-5)[:, loose].all()

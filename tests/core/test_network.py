@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The whole network: what it starts as, what a file stores of it, and which joints it sees."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from ssilk_core.assets import GarmentPose, SkinWeights
+from ssilk_core.config import SCHEMES, ModelConfig
+from ssilk_core.model.network import GarmentModel, mlp, model_joints
+
+
+def fresh(scene, **options) -> GarmentModel:
+    return GarmentModel(scene, ModelConfig(latent=8, widths=(16,), shapes=4, **options), np.arange(3), seed=1)
+
+
+def test_mlp_has_the_layers_asked_for_and_a_quiet_last_one():
+    network = mlp(5, (7, 9), 3, torch.Generator().manual_seed(0), 0.0)
+    assert [tuple(layer.weight.shape) for layer in network if hasattr(layer, "weight")] == [(7, 5), (9, 7), (3, 9)]
+    assert network(torch.randn(4, 5)).abs().max() == 0
+
+
+def test_training_starts_from_plain_verlet_and_almost_plain_skinning(scene):
+    model = fresh(scene, scheme="verlet", bound=0.0, push=0.0)
+    before, now = torch.randn(2, 6, 8, generator=torch.Generator().manual_seed(0))
+    pose = torch.randn(6, model.stepper[0].in_features - 16, generator=torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        stepped = model.step(before, now, now, pose)
+        np.testing.assert_allclose(stepped, now + 0.9 * (now - before), atol=1e-6)
+        activation, rotations = model.pose(now)
+    assert activation.abs().max() < 0.1
+    np.testing.assert_allclose(rotations, torch.eye(3)[None, ..., None].expand(2, 3, 3, 6), atol=0.1)
+
+
+def test_the_seed_alone_decides_the_parameters(scene):
+    torch.manual_seed(5)
+    first = fresh(scene).state_dict()
+    torch.manual_seed(6)
+    second = fresh(scene).state_dict()
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    other = GarmentModel(scene, ModelConfig(latent=8, widths=(16,), shapes=4), np.arange(3), seed=2).state_dict()
+    assert not torch.equal(first["initialiser.0.weight"], other["initialiser.0.weight"])
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_every_scheme_builds_and_steps(scene, scheme):
+    model = fresh(scene, scheme=scheme)
+    static = torch.randn(5, model.initialiser[0].in_features)
+    pose = torch.randn(5, model.stepper[0].in_features - model.integrator.states * 8)
+    rest = model.initial(static)
+    assert model.step(rest, rest, rest, pose).shape == (5, 8)
+
+
+def test_network_pose_inverts_file_pose(scene, toy_model):
+    model = toy_model(scene)
+    with torch.no_grad():
+        activation, rotations = model.pose(torch.randn(20, 8, generator=torch.Generator().manual_seed(2)))
+        back = model.network_pose(GarmentPose(0, *model.file_pose(activation, rotations)))
+    np.testing.assert_allclose(back[0], activation, atol=1e-6)
+    np.testing.assert_allclose(back[1], rotations, atol=1e-6)
+
+
+@pytest.mark.parametrize("shapes, proxies", [(0, 2), (4, 0), (0, 0)])
+def test_network_pose_inverts_file_pose_without_shapes_or_proxies(toy_scene, toy_model, shapes, proxies):
+    model = toy_model(toy_scene(proxies=proxies), shapes=shapes)
+    with torch.no_grad():
+        activation, rotations = model.pose(torch.randn(3, 8))
+        back = model.network_pose(GarmentPose(0, *model.file_pose(activation, rotations)))
+    assert back[0].shape == (shapes, 3) and back[1].shape == (proxies, 3, 3, 3)
+    np.testing.assert_allclose(back[0], activation, atol=1e-6)
+
+
+def test_file_weights_and_quaternions_are_valid_even_when_saturated(scene, toy_model):
+    model = toy_model(scene, scale=5.0)
+    with torch.no_grad():
+        rotations, weights = model.file_pose(*model.pose(100 * torch.randn(50, 8)))
+    assert weights.min() >= 0 and weights.max() <= 1 and (weights[:, -1] == 1).all()
+    assert weights[:, :-1].min() < 1e-6 and weights[:, :-1].max() > 1 - 1e-6
+    np.testing.assert_allclose(np.linalg.norm(rotations, axis=-1), 1, atol=1e-12)
+
+
+def test_the_network_sees_joints_that_carry_cloth_proxies_or_body_in_reach(toy_scene):
+    scene = toy_scene(proxies=0)
+    nothing = np.zeros(3, dtype=bool)
+    assert model_joints(scene, nothing).tolist() == [0, 1]
+    assert model_joints(scene, np.array([False, False, True])).tolist() == [0, 1, 2]
+    hips = SkinWeights("/toy", np.zeros((60, 1)), np.ones((60, 1)))
+    on_hips = replace(scene, garment=replace(scene.garment, skin=hips), rig=replace(scene.rig, skin=hips))
+    assert model_joints(on_hips, nothing).tolist() == [0]
+    hung = toy_scene(proxies=1)
+    proxied = SkinWeights("/toy", np.full((60, 1), 3), np.ones((60, 1)))
+    hung = replace(hung, garment=replace(hung.garment, skin=hips), rig=replace(hung.rig, skin=proxied))
+    assert model_joints(hung, nothing).tolist() == [0, 1]
