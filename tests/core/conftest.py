@@ -26,8 +26,13 @@ from ssilk_core.assets import (
     SkinWeights,
 )
 from ssilk_core.config import ModelConfig
+from ssilk_core.energy import GarmentEnergy
+from ssilk_core.fabrics import Fabric
 from ssilk_core.kinematics import local_transforms, quaternion_from_matrix, rigid
+from ssilk_core.model.body import CollisionBody
 from ssilk_core.model.network import GarmentModel
+from ssilk_core.training.bank import build_bank
+from ssilk_core.training.objective import Objective
 
 ROWS, COLUMNS = 12, 5
 JOINTS = np.array([[0.0, 1.0, 0.0], [0.0, 1.3, 0.02], [0.3, 1.5, 0.0]])
@@ -116,6 +121,15 @@ def build_model(scene: Scene, seed: int = 3, scale: float = 0.3, **options: obje
     return model
 
 
+def build_objective(scene: Scene, model: GarmentModel, *motions: Motion, surface: bool = True) -> Objective:
+    """What a training run puts together, of one fabric with every term switched on."""
+    cpu, skeleton = torch.device("cpu"), scene.character.skeleton
+    energy = GarmentEnergy(scene.garment.mesh, Fabric("toy", bending=1e-4, margin=0.02))
+    body = CollisionBody(scene.character.merged_body(), skeleton.joint_count, device=cpu)
+    bank = build_bank(motions, skeleton, model.joints, model.config.fps, cpu)
+    return Objective(model, energy, body, bank, surface)
+
+
 @pytest.fixture(scope="session")
 def toy_scene() -> Callable[..., Scene]:
     return build_scene
@@ -139,3 +153,8 @@ def toy_model() -> Callable[..., GarmentModel]:
 @pytest.fixture(scope="session")
 def toy_grid() -> Callable[..., tuple[np.ndarray, np.ndarray]]:
     return grid
+
+
+@pytest.fixture(scope="session")
+def toy_objective() -> Callable[..., Objective]:
+    return build_objective

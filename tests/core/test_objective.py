@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The training objective against a plain loop over slots and frames, in values and in gradients."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from ssilk_core.config import SCHEMES, TrainConfig
+from ssilk_core.model.descriptors import GRAVITY
+from ssilk_core.training.objective import Objective, total
+from ssilk_core.training.windows import WindowSampler
+
+CONFIG = TrainConfig(batch=3, window=6, rotated=0.5, noise=0.2)
+
+
+@pytest.fixture
+def objective(scene, toy_motion, toy_model, toy_objective) -> Objective:
+    return toy_objective(scene, toy_model(scene), toy_motion(scene, 40), toy_motion(scene, 20, speed=2.0))
+
+
+def sampler_of(objective: Objective, config: TrainConfig) -> WindowSampler:
+    sampler = WindowSampler(objective.bank, config, 8, torch.Generator().manual_seed(4))
+    sampler.advance(torch.randn(2, 3, 8, generator=torch.Generator().manual_seed(5)))
+    sampler.carried.copy_(torch.tensor([True, False, True]))
+    return sampler
+
+
+def at_frame(objective: Objective, z: torch.Tensor, frame: torch.Tensor, down: torch.Tensor) -> tuple:
+    """Positions and potential terms of one state at one frame."""
+    character, energy = objective.bank.character(frame), objective.energy
+    x = objective.model.vertices(z, character)
+    terms = {
+        "stretch": energy.stretch(x),
+        "bending": energy.bending(x),
+        "gravity": energy.gravity(x - character[0, :, 3], GRAVITY * down.T),
+        "collision": energy.collision(x, objective.body.posed(character)),
+    }
+    return x, terms
+
+
+def reference(objective: Objective, sampler: WindowSampler, noise: torch.Tensor, through_time: bool) -> tuple:
+    """The windows of all slots, one state at a time; time-major lists of terms, and the last two latents."""
+    model, bank, length = objective.model, objective.bank, sampler.config.window
+    dynamic = [[{} for _ in sampler.first] for _ in range(length - 2)]
+    resting = [[{} for _ in sampler.first] for _ in range(2)]
+    latents = []
+    for slot, first in enumerate(sampler.first):
+        down = sampler.direction[slot : slot + 1]
+        frames = [first[None] + t for t in range(length)]
+        rest = [model.initial(bank.static_descriptor(frame, down)) for frame in frames]
+        begun = sampler.latents[:, slot] if sampler.carried[slot] else torch.cat(rest[:2]).detach()
+        z = list(model.integrator.bounded(begun + noise[:, slot]).split(1))
+        x = [at_frame(objective, z[t], frames[t], down)[0].detach() for t in range(2)]
+        for t in range(2):
+            resting[t][slot] = at_frame(objective, rest[t], frames[t], down)[1]
+        for t in range(2, length):
+            past = z[-2:] if through_time else [v.detach() for v in z[-2:]]
+            z.append(model.step(*past, rest[t].detach(), bank.dynamic_descriptor(frames[t], down)))
+            now, terms = at_frame(objective, z[-1], frames[t], down)
+            terms["inertia"] = objective.energy.inertia(now, 2 * x[-1] - x[-2], objective.dt)
+            carried = x[-1] + (bank.root[frames[t]] - bank.root[frames[t - 1]]).T
+            terms["drag"] = objective.energy.drag(now, carried, objective.dt)
+            dynamic[t - 2][slot] = terms
+            x.append(now.detach())
+        latents.append(torch.stack(z[-2:])[:, 0].detach())
+    return flat(dynamic), flat(resting), torch.stack(latents, dim=1)
+
+
+def flat(rows: list) -> dict[str, torch.Tensor]:
+    return {name: torch.cat([slot[name] for row in rows for slot in row]) for name in rows[0][0]}
+
+
+def gradients(objective: Objective, loss: torch.Tensor) -> dict[str, torch.Tensor]:
+    names, values = zip(*objective.model.named_parameters())
+    found = torch.autograd.grad(loss, values, allow_unused=True, retain_graph=True)
+    return {name: torch.zeros_like(v) if g is None else g for name, v, g in zip(names, values, found)}
+
+
+@pytest.mark.parametrize("through_time", [False, True])
+def test_a_window_equals_a_plain_loop(objective, through_time):
+    sampler = sampler_of(objective, replace(CONFIG, through_time=through_time))
+    noise = sampler.noise()
+    found, expected = objective.window(sampler, noise), reference(objective, sampler, noise, through_time)
+    for mine, theirs in zip(found[:2], expected[:2]):
+        assert mine.keys() == theirs.keys()
+        for name, value in mine.items():
+            assert value.abs().min() > 0 or name == "collision"
+            np.testing.assert_allclose(value.detach(), theirs[name].detach(), rtol=2e-3, atol=1e-6, err_msg=name)
+    assert found[0]["collision"].max() > 0
+    np.testing.assert_allclose(found[2], expected[2], atol=1e-5)
+    mine, theirs = (
+        gradients(objective, total(dynamic) + total(resting)) for dynamic, resting, _ in (found, expected)
+    )
+    for name, value in mine.items():
+        np.testing.assert_allclose(
+            value, theirs[name], atol=2e-3 * float(theirs[name].abs().max()) + 1e-9, err_msg=name
+        )
+
+
+def test_through_time_the_stepper_answers_for_later_frames(objective):
+    slopes = []
+    for through_time in (False, True):
+        sampler = sampler_of(objective, replace(CONFIG, through_time=through_time))
+        dynamic, _, _ = objective.window(sampler, torch.zeros(2, 3, 8))
+        slopes.append(gradients(objective, dynamic["gravity"][-3:].sum())["stepper.0.weight"])
+    assert (slopes[0] - slopes[1]).norm() > 0.05 * slopes[1].norm()
+
+
+@pytest.mark.parametrize("through_time", [False, True])
+def test_the_initialiser_learns_from_rest_states_alone(objective, through_time):
+    sampler = sampler_of(objective, replace(CONFIG, through_time=through_time))
+    dynamic, resting, _ = objective.window(sampler, sampler.noise())
+    from_motion, from_rest = gradients(objective, total(dynamic)), gradients(objective, total(resting))
+    for name in from_motion:
+        if name.startswith("initialiser."):
+            assert from_motion[name].abs().max() == 0 and from_rest[name].abs().max() > 0
+        if name.startswith(("stepper.", "integrator.")):
+            assert from_rest[name].abs().max() == 0 and from_motion[name].abs().max() > 0
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_every_scheme_trains_every_parameter(scene, toy_motion, toy_model, toy_objective, scheme):
+    objective = toy_objective(scene, toy_model(scene, scheme=scheme), toy_motion(scene, 40))
+    sampler = sampler_of(objective, CONFIG)
+    dynamic, resting, _ = objective.window(sampler, sampler.noise())
+    unused = {"integrator.alpha", "integrator.beta", "integrator.share"} if scheme.startswith("direct") else set()
+    for name, value in gradients(objective, total(dynamic) + total(resting)).items():
+        assert torch.isfinite(value).all() and (name in unused or value.abs().max() > 0), name
+
+
+def test_static_terms_are_those_of_the_initialisers_states(objective):
+    frames, down = torch.tensor([3, 45]), torch.nn.functional.normalize(torch.randn(2, 3), dim=1)
+    terms = objective.static(frames, down)
+    for i in range(2):
+        z = objective.model.initial(objective.bank.static_descriptor(frames[i : i + 1], down[i : i + 1]))
+        expected = at_frame(objective, z, frames[i : i + 1], down[i : i + 1])[1]
+        for name in expected:
+            assert terms[name][i].item() == pytest.approx(expected[name].item(), rel=2e-3, abs=1e-6), name
+
+
+def test_total_is_the_mean_over_frames_of_the_sum_of_terms():
+    assert total({"a": torch.tensor([1.0, 3.0]), "b": torch.tensor([10.0])}).item() == 12
