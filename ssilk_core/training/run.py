@@ -211,6 +211,17 @@ class Run:
             self.report(Checkpoint(str(self.job.output), self.iteration, True))
         return score
 
+    def score_in_passing(self) -> Score:
+        """Score the model where the schedule has no validation, and keep it only if there is none on disk yet.
+
+        What counts as best stays as it was: a run that is interrupted here ends with the model of one that is not.
+        """
+        if np.isfinite(self.best):
+            return self.validator.score(self.stepper.averaged)
+        score = self.validate()
+        self.best = float("inf")
+        return score
+
     def provenance(self, score: Score) -> dict[str, Any]:
         """Return how the model came to be."""
         return canonical(
@@ -293,7 +304,7 @@ def _loop(run: Run, report: Reporter, stop: threading.Event, plain: Score) -> Sc
             report(_judgement(run, score, plain))
             run.save_state()
     if score is None:
-        score = run.validate()
+        score = run.score_in_passing()
     run.save_state()
     skipped = int(run.stepper.skipped)
     if skipped:

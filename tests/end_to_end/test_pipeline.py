@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a character in a stage to a verified shot and its picture, as users run it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pxr import Gf, Usd, UsdSkel, Vt
+
+from ssilk_core.checkpoint import load_model
+from ssilk_core.cli import main
+
+EVENTS = {"started", "progress", "message", "checkpoint", "result", "failed"}
+SHOT = "bake model.safetensors --stage rigged.usda --motion clip.usda"
+
+
+def run(command: str, *more: str) -> int:
+    return main([*shlex.split(command), *more])
+
+
+def events(capsys: pytest.CaptureFixture) -> list[dict]:
+    """All events printed so far; each line must be one."""
+    found = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert found and {event["event"] for event in found} <= EVENTS
+    return found
+
+
+def animation(stage: Usd.Stage) -> UsdSkel.Animation:
+    return UsdSkel.Animation(stage.GetPrimAtPath("/Hero/Animation"))
+
+
+@pytest.fixture
+def world(toy, tmp_path, monkeypatch):
+    """A folder of its own with the toy's files, as the working folder."""
+    monkeypatch.chdir(toy.copy(tmp_path))
+    return toy
+
+
+def test_from_character_to_picture(toy, tmp_path, monkeypatch, capsys):
+    for file in ("hero.usda", "clip.usda"):
+        shutil.copy(toy.folder / file, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    assert run("rig hero.usda --garment Skirt --proxies 4 -o rigged.usda") == 0
+    moved = move_first_proxy(Path("rigged.usda"))
+    capsys.readouterr()
+    assert run("train rigged.usda --motions clip.usda -o model.safetensors --json", *toy.training) == 0
+    names = [event["event"] for event in events(capsys)]
+    assert set(names) == {"started", "progress", "message", "checkpoint", "result"}
+    assert names.count("result") == names.count("started") == 1 and names[-1] == "result"
+    np.testing.assert_allclose(load_model("model.safetensors").scene.rig.bind_transforms[0, :3, 3], moved, atol=1e-5)
+    assert run(f"{SHOT} -o shot.usdc --json") == 0
+    assert events(capsys)[-1]["detail"]["frames"] == 40
+    assert run("verify shot.usdc --json") == 0
+    assert float(events(capsys)[-1]["detail"]["largest error [m]"]) < 1e-5
+    assert run("view shot.usdc -o sheet.png --columns 2 --size 48x64 --json") == 0
+    assert events(capsys)[-1] == {"event": "result", "task": "view", "detail": {"picture": "sheet.png", "frames": 2}}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        *("hero.usda", "clip.usda", "rigged.usda", "model.safetensors", "model.resume.safetensors"),
+        *("shot.usdc", "sheet.png"),
+    }
+
+
+def move_first_proxy(path: Path) -> np.ndarray:
+    """Move the first proxy of a rigged stage by hand, 2 cm up and 1 cm out; return where it stands then [m]."""
+    stage = Usd.Stage.Open(str(path))
+    skeleton = UsdSkel.Skeleton(stage.GetPrimAtPath("/Hero/Rig"))
+    binds = list(skeleton.GetBindTransformsAttr().Get())
+    binds[3] = binds[3] * Gf.Matrix4d().SetTranslate((0, 0.02, 0.01))
+    skeleton.GetBindTransformsAttr().Set(binds)
+    stage.GetRootLayer().Save()
+    return np.array(binds[3].ExtractTranslation())
+
+
+@pytest.mark.parametrize(("fps", "frames"), [(24, 32), (30, 40), (60, 79)])
+def test_shots_of_any_rate_are_verified(world, fps, frames, capsys):
+    capsys.readouterr()
+    assert run(f"{SHOT} --fps {fps} -o shot.usdc --json") == 0
+    detail = events(capsys)[-1]["detail"]
+    assert (detail["frames"], detail["fps"]) == (frames, fps)
+    stage = Usd.Stage.Open("shot.usdc")
+    assert stage.GetTimeCodesPerSecond() == stage.GetFramesPerSecond() == fps
+    weights = animation(stage).GetBlendShapeWeightsAttr()
+    values = np.array([weights.Get(time) for time in weights.GetTimeSamples()])
+    assert len(values) == frames and values.min() >= 0 and values.max() <= 1 and np.ptp(values) > 0
+
+
+def test_the_same_bake_gives_the_same_bytes(world):
+    assert run(f"{SHOT} -o shot.usdc --no-verify") == 0
+    first = Path("shot.usdc").read_bytes()
+    assert run(f"{SHOT} -o shot.usdc --no-verify") == 0
+    assert Path("shot.usdc").read_bytes() == first
+
+
+def test_plain_skinning_moves_with_the_body_alone(world):
+    assert run(f"{SHOT} -o plain.usdc --plain") == 0
+    stage = Usd.Stage.Open("plain.usdc")
+    assert len(animation(stage).GetJointsAttr().Get()) == 3
+    assert not animation(stage).GetBlendShapesAttr().Get()
+    assert run("verify plain.usdc") == 0
+
+
+def test_a_tampered_rotation_fails_verification(world, capsys):
+    assert run("verify shot.usda") == 0
+    stage = Usd.Stage.Open("shot.usda")
+    rotations = animation(stage).GetRotationsAttr()
+    turned = list(rotations.Get(12))
+    turned[1] = Gf.Quatf(0.9999, 0.0141, 0, 0).GetNormalized()
+    rotations.Set(Vt.QuatfArray(turned), 12)
+    stage.GetPrimAtPath("/Hero").GetAttribute("extent").Set([(-9, -9, -9), (9, 9, 9)], 12)
+    stage.GetRootLayer().Save()
+    capsys.readouterr()
+    assert run("verify shot.usda") == 3
+    assert "at time code 12" in capsys.readouterr().err
+
+
+def test_a_shot_is_verified_wherever_its_folder_goes(world, tmp_path, monkeypatch):
+    Path("shots").mkdir()
+    absolute = SHOT.replace("model.", f"{tmp_path}/model.").replace("clip.", f"{tmp_path}/clip.")
+    assert run(f"{absolute} -o shots/shot.usdc --no-verify") == 0
+    moved = tmp_path / "elsewhere"
+    moved.mkdir()
+    for name in ("model.safetensors", "rigged.usda", "clip.usda", "shots"):
+        Path(name).rename(moved / name)
+    monkeypatch.chdir(tmp_path.parent)
+    assert run(f"verify {moved}/shots/shot.usdc") == 0
+    (moved / "model.safetensors").rename(moved / "cape.safetensors")
+    assert run(f"verify {moved}/shots/shot.usdc") == 2
+    assert run(f"verify {moved}/shots/shot.usdc --model {moved}/cape.safetensors") == 0
+
+
+def test_an_interrupted_training_goes_on_to_the_same_model(world):
+    """Interrupted by SIGINT, resumed, and compared with one that was left alone.
+
+    Steps are so large that the model is best where it was interrupted, between two validations: a run that was
+    left alone never looks at it there.
+    """
+    settings = "--set iterations=120 --set validate_every=60 --set warm=0.4 --set warm_rate=1e-6 --set rate=0.1"
+    train = [*shlex.split("train rigged.usda --motions clip.usda"), *world.training, *shlex.split(settings)]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "ssilk_core", *train, "-o", "halved.safetensors", "--json"],
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    for line in process.stdout:
+        if json.loads(line)["event"] == "progress":
+            process.send_signal(signal.SIGINT)
+            break
+    told = [json.loads(line) for line in process.stdout]
+    assert process.wait() == 130 and "--resume" in told[-1]["text"]
+    assert load_model("halved.safetensors").provenance["iteration"] < 60
+    assert main([*train, "-o", "halved.safetensors", "--resume"]) == 0
+    assert main([*train, "-o", "whole.safetensors"]) == 0
+    assert Path("halved.safetensors").read_bytes() == Path("whole.safetensors").read_bytes()
