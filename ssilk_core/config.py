@@ -139,7 +139,7 @@ PRESETS = {
             name="draft",
             model=ModelConfig(latent=32, widths=(128, 128), shapes=24),
             train=TrainConfig(
-                iterations=700,
+                iterations=500,
                 warm=0.55,
                 warm_batch=48,
                 warm_rate=2e-3,
