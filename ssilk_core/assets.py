@@ -238,8 +238,16 @@ class Mesh:
             polygon_indices=_frozen(indices, np.int32),
             uvs=uvs,
         )
+        corners = self.indices_of_corners
         need(
-            uvs is None or uvs.shape == (len(self.indices_of_corners), 2),
+            np.sum(counts) == len(corners) and bool(((corners >= 0) & (corners < len(points))).all()),
+            self.path,
+            "the polygons do not fit their points",
+            f"counts that add up to {len(corners)} corners, and indices from 0 to {len(points) - 1}, are needed",
+            "re-export the mesh",
+        )
+        need(
+            uvs is None or uvs.shape == (len(corners), 2),
             self.path,
             "texture coordinates do not match the face corners",
             "one (u, v) for each corner is needed",

@@ -127,7 +127,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         with safe_open(path, "numpy") as stream:
             header = (stream.metadata() or {}).get("ssilk", "")
             tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
-    except SafetensorError as error:
+    except (SafetensorError, TypeError) as error:  # the latter for numbers that numpy lacks
         raise SsilkError(
             f"{path}: the model file is truncated or damaged ({error}); train again or fetch the file again."
         ) from error

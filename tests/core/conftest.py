@@ -90,7 +90,7 @@ def build_scene(proxies: int = 2, shuffled: bool = False) -> Scene:
         ("Hips/Spine/P0", "Hips/Spine/P0/P1")[:proxies],
         parents,
         turned(PROXIES[:proxies], 2) if proxies else np.zeros((0, 4, 4)),
-        SkinWeights.from_dense("/toy/strip", dense_rig_weights(points[:, 1], proxies, classes, plain)),
+        SkinWeights.from_dense("/toy/rig", dense_rig_weights(points[:, 1], proxies, classes, plain)),
     )
     return Scene(Character("/toy", skeleton, (Body(body, skin),)), garment, rig)
 
