@@ -127,7 +127,8 @@ class Run:
         self.validator = Validator(
             held, energy, body, scene.plain_skin, self.model.decoder.rest, job.model.fps, job.train.valid_frames
         )
-        self.iteration, self.best = 0, float("inf")
+        self.iteration = 0
+        self.best: Score | None = None
         self._announce(len(reach.vertices), len(joints))
 
     def _fitted(self, job: TrainJob, body_vertices: int) -> TrainJob:
@@ -204,22 +205,22 @@ class Run:
             "the best model before it is kept",
             "lower the step size (--set rate=...) and resume",
         )
-        if score.total < self.best:
-            self.best = score.total
+        if self.best is None or score.total < self.best.total:
+            self.best = score
             provenance = self.provenance(score)
             save_model(self.job.output, model_file(self.stepper.averaged, self.job.fabric, provenance))
             self.report(Checkpoint(str(self.job.output), self.iteration, True))
         return score
 
-    def score_in_passing(self) -> Score:
-        """Score the model where the schedule has no validation, and keep it only if there is none on disk yet.
+    def kept(self) -> Score:
+        """Return the score of the model on disk; write the present one where the schedule came to no validation yet.
 
-        What counts as best stays as it was: a run that is interrupted here ends with the model of one that is not.
+        That one does not count as best: a run that is interrupted here ends, resumed, like one that is not.
         """
-        if np.isfinite(self.best):
-            return self.validator.score(self.stepper.averaged)
+        if self.best is not None:
+            return self.best
         score = self.validate()
-        self.best = float("inf")
+        self.best = None
         return score
 
     def provenance(self, score: Score) -> dict[str, Any]:
@@ -282,14 +283,15 @@ def train(job: TrainJob, report: Reporter, stop: threading.Event | None = None) 
         run.resume()
         report(Message(f"resumed at iteration {run.iteration} of {job.train.iterations}"))
     plain = run.validator.plain_score()
-    score = _loop(run, report, stop or threading.Event(), plain)
+    _loop(run, report, stop or threading.Event(), plain)
+    score = run.kept()
+    run.save_state()
     finished = run.iteration >= run.job.train.iterations
     return Trained(finished, run.iteration, score, plain)
 
 
-def _loop(run: Run, report: Reporter, stop: threading.Event, plain: Score) -> Score:
+def _loop(run: Run, report: Reporter, stop: threading.Event, plain: Score) -> None:
     config, began, first = run.job.train, time.monotonic(), run.iteration
-    score: Score | None = None
     while run.iteration < config.iterations and not stop.is_set():
         run.stepper.run(run.iteration)
         run.iteration += 1
@@ -300,16 +302,11 @@ def _loop(run: Run, report: Reporter, stop: threading.Event, plain: Score) -> Sc
             report(Progress(run.iteration, config.iterations, left, terms))
         rolling = run.iteration >= max(1, config.warm_iterations)
         if rolling and (run.iteration % config.validate_every == 0 or run.iteration == config.iterations):
-            score = run.validate()
-            report(_judgement(run, score, plain))
+            report(_judgement(run, run.validate(), plain))
             run.save_state()
-    if score is None:
-        score = run.score_in_passing()
-    run.save_state()
     skipped = int(run.stepper.skipped)
     if skipped:
         report(Message(f"{skipped} steps were left out because a gradient was not finite.", "warning"))
-    return score
 
 
 def _judgement(run: Run, score: Score, plain: Score) -> Message:
@@ -320,9 +317,6 @@ def _judgement(run: Run, score: Score, plain: Score) -> Message:
         f"{share:.1%} under plain skinning's {plain.total:.4g} J "
         f"({terms}), collisions {score.collisions:.2%}, motion of its own {score.dynamics * 1000:.0f} mm"
     )
-    if score.dynamics < NO_DYNAMICS:
-        return Message(
-            f"{text}; nothing dynamic is being learned: check that the motions move and that classes are loose",
-            "warning",
-        )
+    if score.dynamics < NO_DYNAMICS and run.job.scene.rig.proxy_count:
+        return Message(f"{text}; nothing dynamic is being learned: check that the motions move", "warning")
     return Message(text)

@@ -15,14 +15,15 @@ from torch import Tensor
 from ..errors import SsilkError, need
 from ..files import replacing
 from .step import Stepper
+from .validation import Score
 
 
 @dataclass(frozen=True)
 class RunState:
-    """Counters of a run: iterations done, the best validation total so far [J], and what the run was asked to do."""
+    """Iterations done, the best score so far (of the model on disk), and what the run was asked to do."""
 
     iteration: int
-    best: float
+    best: Score | None
     asked: dict[str, Any]
 
 
@@ -57,7 +58,9 @@ def load_state(path: Path, stepper: Stepper, asked: dict[str, Any]) -> RunState:
     )
     try:
         with safe_open(path, "pt") as stream:
-            state = RunState(**json.loads((stream.metadata() or {})["ssilk_state"]))
+            document = json.loads((stream.metadata() or {})["ssilk_state"])
+            best = document.pop("best")
+            state = RunState(best=None if best is None else Score(**best), **document)
             tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
         _need_same(path, asked, state.asked)
         _restore(stepper, tensors)

@@ -68,18 +68,23 @@ class Validator:
     @torch.no_grad()
     def score(self, model: GarmentModel) -> Score:
         """Return the mean score of a model over all clips."""
-        return self._mean([self._clip(clip, model) for clip in self.clips])
+        return self._mean([self.frame_terms(clip, model) for clip in self.clips])
 
     @torch.no_grad()
     def plain_score(self) -> Score:
         """Return the mean score of plain skinning over all clips."""
-        return self._mean([self._clip(clip, None) for clip in self.clips])
+        return self._mean([self.frame_terms(clip, None) for clip in self.clips])
 
     def _mean(self, scores: list[dict[str, Tensor]]) -> Score:
         joined = {name: float(torch.cat([score[name] for score in scores]).mean()) for name in scores[0]}
         return Score({name: joined[name] for name in TERMS}, joined["collisions"], joined["dynamics"] ** 0.5)
 
-    def _clip(self, clip: range, model: GarmentModel | None) -> dict[str, Tensor]:
+    @torch.no_grad()
+    def frame_terms(self, clip: range, model: GarmentModel | None) -> dict[str, Tensor]:
+        """Return what `Score` averages for each frame of a range of the bank, shape (N,).
+
+        Without a model it is plain skinning that is scored. Distances to the quasi-static state come squared [m2].
+        """
         frames = torch.arange(clip.start, clip.stop, device=self.rest.device)
         states = None if model is None else roll_states(model, self.bank, frames, self.down)
         parts, tail = [], None
