@@ -12,7 +12,7 @@ from torch import Tensor
 
 from .assets import Floats, GarmentPose, Motion
 from .errors import need
-from .kinematics import motion_transforms, resample, skinning_matrices, slerp, split_at_cuts
+from .kinematics import frames_at, motion_transforms, resample, skinning_matrices, slerp, split_at_cuts
 from .model.descriptors import gravity_features, pose_features
 from .model.network import GarmentModel
 
@@ -67,21 +67,35 @@ def _advance(model: GarmentModel, span: Motion, start: int, stop: int, state: li
     static = torch.cat([tensor(features.static), gravity_features(tensor(features.down), down)], dim=1)
     dynamic = torch.cat([static, tensor(features.dynamic)], dim=1)
     rest, pose = model.initial(static).unsqueeze(1), dynamic.unsqueeze(1)
-    states = list(state) or [*rest[:HISTORY]]
-    for t in range(0 if state else len(states), stop - start):
-        states.append(model.step(states[-2], states[-1], rest[t], pose[t]))
+    states = list(state)
+    for t in range(stop - start):
+        begun = start + t >= HISTORY
+        states.append(model.step(states[-2], states[-1], rest[t], pose[t]) if begun else rest[t])
     return states
 
 
 def garment_poses(model: GarmentModel, motion: Motion, fps: float, chunk: int = CHUNK) -> Iterator[GarmentPose]:
-    """Yield what a shot stores, at `fps`, over a motion of any rate.
+    """Yield what a shot stores, at `fps`, over a motion of any rate: the frames of `resample(motion, fps)`.
 
     The model rolls at its own rate; where the shot's differs, rotations are interpolated by slerp and weights by
     lines between the two nearest steps.
     """
     steps = roll(model, resample(motion, model.config.fps, cover=True), chunk)
-    poses = (GarmentPose(step.start, *model.file_pose(step.activation, step.rotations)) for step in steps)
-    return poses if abs(fps - model.config.fps) < 1e-6 else resample_poses(poses, model.config.fps, fps)
+    poses: Iterator[GarmentPose] = (
+        GarmentPose(step.start, *model.file_pose(step.activation, step.rotations)) for step in steps
+    )
+    if abs(fps - model.config.fps) >= 1e-6:
+        poses = resample_poses(poses, model.config.fps, fps)
+    return _first(poses, frames_at(motion, fps))
+
+
+def _first(poses: Iterator[GarmentPose], count: int) -> Iterator[GarmentPose]:
+    """Yield the poses of the first `count` frames."""
+    for pose in poses:
+        kept = min(pose.frame_count, count - pose.start)
+        if kept <= 0:
+            return
+        yield GarmentPose(pose.start, pose.rotations[:kept], pose.weights[:kept])
 
 
 def resample_poses(poses: Iterator[GarmentPose], source: float, target: float) -> Iterator[GarmentPose]:

@@ -58,11 +58,7 @@ class Bake:
             return
         from ssilk_core.rollout import garment_poses
 
-        done = 0
-        for pose in garment_poses(self.model, self.source, self.motion.fps, CHUNK):
-            frames = min(pose.frame_count, count - done)
-            yield replace(pose, rotations=pose.rotations[:frames], weights=pose.weights[:frames])
-            done += frames
+        yield from garment_poses(self.model, self.source, self.motion.fps, CHUNK)
 
     def vertices(self, report: Reporter) -> Iterator[Floats]:
         """Yield the decoder's own garment points (V, 3) [m] of each frame."""

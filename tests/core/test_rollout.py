@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rollouts: chunks, rates, cuts, very short and very long motions."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation, Slerp
+
+from ssilk_core.assets import GarmentPose, Motion
+from ssilk_core.errors import SsilkError
+from ssilk_core.kinematics import deform, resample
+from ssilk_core.model.descriptors import gravity_features, pose_features
+from ssilk_core.rollout import decode, garment_poses, resample_poses, roll
+
+
+@pytest.fixture(scope="module")
+def model(scene, toy_model):
+    # Weak enough not to be chaotic, so that rounding in another order stays rounding.
+    return toy_model(scene, scale=0.1).eval()
+
+
+def joined(steps) -> tuple[torch.Tensor, torch.Tensor]:
+    steps = list(steps)
+    starts = np.cumsum([0] + [step.activation.shape[-1] for step in steps])
+    assert [step.start for step in steps] == starts[:-1].tolist()
+    return torch.cat([s.activation for s in steps], -1), torch.cat([s.rotations for s in steps], -1)
+
+
+def gathered(poses) -> GarmentPose:
+    poses = list(poses)
+    starts = np.cumsum([0] + [pose.frame_count for pose in poses])
+    assert [pose.start for pose in poses] == starts[:-1].tolist() and all(pose.frame_count for pose in poses)
+    return GarmentPose(0, np.concatenate([p.rotations for p in poses]), np.concatenate([p.weights for p in poses]))
+
+
+@torch.no_grad()
+def plain_loop(model, motion: Motion) -> list[torch.Tensor]:
+    """States of a motion without cuts, one frame at a time over the descriptors of the whole motion."""
+    features = pose_features(motion, model.scene.character.skeleton, model.joints)
+    count = motion.frame_count
+    down = torch.tensor([0.0, -1, 0]).expand(count, 3)
+    static, dynamic, turned = (
+        torch.tensor(v, dtype=torch.float32) for v in (features.static, features.dynamic, features.down)
+    )
+    static = torch.cat([static, gravity_features(turned, down)], dim=1)
+    z = []
+    for t in range(count):
+        rest = model.initial(static[t : t + 1])
+        seen = torch.cat([static[t : t + 1], dynamic[t : t + 1]], dim=1)
+        z.append(rest if t < 2 else model.step(z[-2], z[-1], rest, seen))
+    return z
+
+
+def test_a_rollout_is_the_plain_recurrence(model, scene, toy_motion):
+    motion = toy_motion(scene, 50)
+    expected = model.pose(torch.cat(plain_loop(model, motion)))
+    for mine, theirs in zip(joined(roll(model, motion)), expected):
+        np.testing.assert_allclose(mine, theirs.detach(), atol=1e-5)
+    assert expected[0].diff(dim=1).abs().max() > 0.01  # it moves
+
+
+@pytest.mark.parametrize("chunk", [1, 2, 3, 7, 49, 50, 1000])
+def test_chunks_change_nothing(model, scene, toy_motion, chunk):
+    motion = toy_motion(scene, 50)
+    for mine, theirs in zip(joined(roll(model, motion, chunk)), joined(roll(model, motion))):
+        np.testing.assert_allclose(mine, theirs, atol=2e-5)
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3])
+@pytest.mark.parametrize("fps", [24.0, 30.0, 60.0])
+def test_the_shortest_motions_work(model, scene, toy_motion, frames, fps):
+    pose = gathered(garment_poses(model, toy_motion(scene, frames, fps), fps))
+    assert pose.frame_count == frames and np.isfinite(pose.rotations).all()
+
+
+@pytest.mark.parametrize("frames", [2, 3, 140, 141])
+@pytest.mark.parametrize(
+    "source, target", [(60, 60), (24, 24), (30, 30), (60, 30), (24, 30), (30, 24), (25, 60), (59.94, 59.94)]
+)
+def test_poses_cover_exactly_the_frames_of_the_motion(model, scene, toy_motion, frames, source, target):
+    motion = toy_motion(scene, frames, source)
+    pose = gathered(garment_poses(model, motion, target, 10))
+    assert pose.frame_count == resample(motion, target).frame_count
+    if source == target:
+        assert pose.frame_count == frames
+
+
+@pytest.mark.parametrize("chunk", [2, 5, 64])
+@pytest.mark.parametrize("target", [24.0, 60.0, 59.94])
+def test_resampled_poses_lie_on_the_arcs_between_steps(chunk, target):
+    rng = np.random.default_rng(0)
+    rotations = Rotation.from_rotvec(np.cumsum(0.1 * rng.normal(size=(20, 3)), axis=0))
+    quaternions, weights = np.roll(rotations.as_quat(), 1, axis=1)[:, None], rng.random((20, 2))
+    pieces = (GarmentPose(s, quaternions[s : s + chunk], weights[s : s + chunk]) for s in range(0, 20, chunk))
+    found = gathered(resample_poses(pieces, 30.0, target))
+    time = np.arange(found.frame_count) / target
+    assert time[-1] <= 19 / 30 + 1e-6 < time[-1] + 1 / target + 2e-6
+    time = time.clip(max=19 / 30)
+    expected = Slerp(np.arange(20) / 30, rotations)(time).as_matrix()
+    turned = Rotation.from_quat(np.roll(found.rotations[:, 0], -1, axis=1)).as_matrix()
+    np.testing.assert_allclose(turned, expected, atol=1e-9)
+    for shape in range(2):
+        np.testing.assert_allclose(
+            found.weights[:, shape], np.interp(time, np.arange(20) / 30, weights[:, shape]), atol=1e-6
+        )
+
+
+def test_after_a_cut_the_garment_starts_from_the_initialiser(model, scene, toy_motion):
+    motion = toy_motion(scene, 40)
+    jumped = motion.translations.copy()
+    jumped[17:, 0] += [0, 0, 50]
+    cut = replace(motion, translations=jumped)
+    found = joined(roll(model, cut, chunk=8))
+    for span, part in ((slice(0, 17), motion.clip(0, 17)), (slice(17, 40), motion.clip(17, 40))):
+        for mine, theirs in zip(found, joined(roll(model, part))):
+            np.testing.assert_allclose(mine[..., span], theirs, atol=2e-5)
+    uncut = joined(roll(model, motion))[0]
+    assert (found[0] - uncut)[:, 17:].abs().max() > 1e-3
+
+
+def test_a_motion_of_another_rate_is_refused(model, scene, toy_motion):
+    with pytest.raises(SsilkError, match="24 frames per second; the model steps at 30"):
+        list(roll(model, toy_motion(scene, 5, 24.0)))
+
+
+@pytest.mark.parametrize("start, count", [(0, 12), (5, 4)])
+def test_decoded_vertices_are_what_a_file_reader_deforms_even_far_away(model, scene, toy_motion, start, count):
+    motion = toy_motion(scene, 12)
+    motion = replace(
+        motion,
+        translations=motion.translations + np.array([[[3000.0, 40, -7000]], *[[[0.0] * 3]] * 2]).transpose(1, 0, 2),
+    )
+    pose = gathered(garment_poses(model, motion, 30.0))
+    part = GarmentPose(start, pose.rotations[start : start + count], pose.weights[start : start + count])
+    found = decode(model, motion, part)
+    assert found.shape == (count, 60, 3)
+    np.testing.assert_allclose(found, deform(model.deformer(), motion, part), atol=1e-5)
+
+
+def test_ten_thousand_frames_of_a_loop_stay_where_they_are(model, scene, toy_motion):
+    """With random weights: no bound is learned, all are built in."""
+    loop = toy_motion(scene, 200)
+    times = 50
+    motion = Motion("/loop", 30.0, np.tile(loop.rotations, (times, 1, 1)), np.tile(loop.translations, (times, 1, 1)))
+    model = type(model)(scene, model.config, model.joints, 5)
+    generator = torch.Generator().manual_seed(5)
+    with torch.no_grad():
+        for value in model.parameters():
+            value.add_(0.5 * torch.randn(value.shape, generator=generator))
+    extent, weights = [], []
+    for pose in garment_poses(model, motion, 30.0):
+        vertices = decode(model, motion, pose)
+        extent.append(np.abs(vertices).max(axis=(1, 2)))
+        weights.append((pose.weights.min(), pose.weights.max()))
+    extent = np.concatenate(extent)
+    assert extent.shape == (10_000,) and np.isfinite(extent).all()
+    first, last = extent[:2000].max(), extent[-2000:].max()
+    assert last < 1.5 * first
+    assert np.min(weights) >= 0 and np.max(weights) <= 1
