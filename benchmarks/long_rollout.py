@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Roll trained models over 10,000 frames of a looped clip and compare each energy term between the loops.
+
+    python benchmarks/long_rollout.py cape.safetensors --stage character.usdc --motions FOLDER
+
+A loop is the clip played forward and backward, slowing to a stop for a quarter of a second at either end: it is
+seamless and every loop is the same motion. The first loop starts from the quasi-static initialiser, so it holds
+the transient from there into the swing; the second and the last do not.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from subjects import RESULTS, Subject, arguments, clip_of, open_subject, parsed, table, write_results
+from timing import back_and_forth
+from torch import Tensor
+
+from ssilk_core.energy import TERMS
+from ssilk_core.files import replacing
+from ssilk_core.training.validation import roll_states
+
+CLIPS = ("02_04", "02_02", "49_08a")
+HEADER = ("garment", "clip", "loops x frames", "term", "first [J]", "second [J]", "last [J]", "first to last",
+          "second to last")  # fmt: skip
+COLOURS = ("#c0392b", "#2980b9", "#27ae60", "#8e44ad", "#d68910")
+
+
+def loop_means(subject: Subject, clip: str, frames: int, options: Any) -> tuple[dict[str, Tensor], int, float]:
+    """Return the mean of each term in each loop [J], shape (loops,), the length of a loop and the largest |z|."""
+    motion, length = back_and_forth(clip_of(options, clip, subject), subject.file.config.fps, frames)
+    validator = subject.validator(motion)
+    terms = validator.frame_terms(validator.clips[0], subject.model)
+    states = roll_states(subject.model, validator.bank, torch.arange(motion.frame_count), validator.down)
+    return {name: terms[name].reshape(-1, length).mean(1) for name in TERMS}, length, float(states.abs().max())
+
+
+def drift(before: Tensor, last: Tensor) -> str:
+    """Return a change as text."""
+    return f"{float((last - before) / before.abs()):+.3%}"
+
+
+def rows_of(garment: str, clip: str, means: dict[str, Tensor], length: int) -> list[list[str]]:
+    """Return one line for each term and one for the total."""
+    loops = f"{len(means['stretch'])} x {length}"
+    every = {**means, "total": torch.stack(list(means.values())).sum(0)}
+    return [
+        [garment, clip, loops, name, *(f"{float(m[i]):.5g}" for i in (0, 1, -1)), drift(m[0], m[-1]),
+         drift(m[1], m[-1])]  # fmt: skip
+        for name, m in every.items()
+    ]
+
+
+def draw(path: Path, title: str, means: dict[str, Tensor], span: float = 0.05) -> None:
+    """Draw each term's loop means relative to the second loop, within +- `span`, as a PNG."""
+    from PIL import Image, ImageDraw
+
+    width, height, left, top = 640, 300, 60, 40
+    image = Image.new("RGB", (width, height), "white")
+    pen = ImageDraw.Draw(image)
+    inner = height - 2 * top
+
+    def y(change: float) -> float:
+        return top + inner / 2 * (1 - max(-1, min(1, change / span)))
+
+    for level in (-span, -0.01, 0, 0.01, span):
+        pen.line([(left, y(level)), (width - 10, y(level))], fill="#dddddd" if level else "#888888")
+        pen.text((8, y(level) - 5), f"{level:+.0%}", fill="#444444")
+    for name, colour, place in zip(TERMS, COLOURS, range(len(TERMS))):
+        change = ((means[name] - means[name][1]) / means[name][1].abs()).tolist()
+        step = (width - 10 - left) / (len(change) - 1)
+        pen.line([(left + i * step, y(value)) for i, value in enumerate(change)], fill=colour, width=2)
+        pen.text((left + 110 * place, height - 22), name, fill=colour)
+    pen.text((left, 12), f"{title}: mean of each loop, relative to the second", fill="black")
+    with replacing(path) as temporary:
+        image.save(temporary)
+
+
+def main() -> None:
+    parser = arguments(__doc__ or "")
+    parser.add_argument("--clips", nargs="+", default=CLIPS, help=f"clips to loop (default {' '.join(CLIPS)})")
+    parser.add_argument("--frames", type=int, default=10_000, help="at least so many (default 10000)")
+    options = parsed(parser)
+    rows, measured = [], {}
+    for path in options.models:
+        subject = open_subject(path, options.stage, options.device)
+        for clip in options.clips:
+            means, length, largest = loop_means(subject, clip, options.frames, options)
+            rows += rows_of(subject.name, clip, means, length)
+            figures = {name: values.tolist() for name, values in means.items()}
+            measured[f"{subject.name} {clip}"] = {"frames of a loop": length, "largest |z|": largest, "J": figures}
+            draw(RESULTS / f"{options.name}_{subject.name}_{clip}.png", f"{subject.name}, {clip} looped", means)
+            print(table(HEADER, rows), f"largest |z| {largest:.3f}", flush=True)
+    write_results(options, table(HEADER, rows), measured)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every measurement shares: a trained model on its character, its energies, and where results go."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from ssilk_usd.read_character import read_character
+from ssilk_usd.read_motion import read_motion
+from ssilk_usd.read_stage import open_stage
+from torch import Tensor
+
+from ssilk_core import __version__
+from ssilk_core.assets import Motion, Scene
+from ssilk_core.checkpoint import ModelFile, load_model, network
+from ssilk_core.energy import GarmentEnergy
+from ssilk_core.errors import need
+from ssilk_core.files import replacing
+from ssilk_core.model.body import CollisionBody
+from ssilk_core.model.network import GarmentModel
+from ssilk_core.training.bank import build_bank
+from ssilk_core.training.run import chosen_device, device_name
+from ssilk_core.training.validation import Validator
+
+RESULTS = Path(__file__).parent / "results"
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """A trained garment on a whole character; `body` holds every body vertex, reachable or not."""
+
+    name: str
+    file: ModelFile
+    scene: Scene
+    model: GarmentModel
+    energy: GarmentEnergy
+    body: CollisionBody
+
+    @property
+    def device(self) -> torch.device:
+        return self.model.decoder.rest.device
+
+    def validator(self, motion: Motion) -> Validator:
+        """Return a validator of this garment that holds one whole motion at the model's rate."""
+        skeleton, fps = self.scene.character.skeleton, self.file.config.fps
+        bank = build_bank([motion], skeleton, self.model.joints, fps, self.device)
+        return Validator(
+            bank, self.energy, self.body, self.scene.plain_skin, self.model.decoder.rest, fps, bank.frame_count
+        )
+
+    def frame_terms(self, motion: Motion, *, plain: bool = False) -> dict[str, Tensor]:
+        """Return `Validator.frame_terms` over all frames of a motion, shape (N,)."""
+        validator = self.validator(motion)
+        spans = [validator.frame_terms(span, None if plain else self.model) for span in validator.clips]
+        return {name: torch.cat([span[name] for span in spans]) for name in spans[0]}
+
+
+def open_subject(path: Path, stage: Path, device: str) -> Subject:
+    """Load a model and put it on the character of a stage."""
+    file, place = load_model(path), chosen_device(device)
+    skeleton = file.scene.character.skeleton
+    character = read_character(open_stage(stage), root=None, garment=None)
+    need(character.skeleton.joint_names == skeleton.joint_names, str(stage), "its joints are not the model's",
+         "a model is measured on the character it was trained with")  # fmt: skip
+    scene = replace(file.scene, character=replace(character, skeleton=skeleton))
+    energy = GarmentEnergy(scene.garment.mesh, file.fabric, device=place)
+    body = CollisionBody(character.merged_body(), skeleton.joint_count, device=place)
+    return Subject(path.stem, file, scene, network(file, scene).to(place), energy, body)
+
+
+def arguments(purpose: str) -> argparse.ArgumentParser:
+    """Return a parser of what every measurement is asked: models, the character, a device, threads."""
+    parser = argparse.ArgumentParser(description=purpose)
+    parser.add_argument("models", type=Path, nargs="+", metavar="MODEL", help="files written by 'ssilk train'")
+    parser.add_argument("--stage", type=Path, required=True, help="USD file with the character")
+    parser.add_argument("--motions", type=Path, required=True, metavar="FOLDER", help="folder of motion files")
+    parser.add_argument("--device", default="cpu", help="where everything runs (default cpu)")
+    parser.add_argument("--threads", type=int, default=2, help="processor threads (default 2)")
+    parser.add_argument("--name", help="of the result files (default: the script's)")
+    return parser
+
+
+def parsed(parser: argparse.ArgumentParser) -> argparse.Namespace:
+    """Parse the command line and set the number of threads."""
+    options = parser.parse_args()
+    options.name = options.name or Path(sys.argv[0]).stem
+    torch.set_num_threads(options.threads)
+    return options
+
+
+def clip_of(options: argparse.Namespace, name: str, subject: Subject) -> Motion:
+    """Read one clip of the motions' folder."""
+    return read_motion(options.motions / f"{name}.usdc", subject.scene.character.skeleton)
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """Return a Markdown table, its first column to the left and the others to the right."""
+    lines = [header, ["---", *["---:"] * (len(header) - 1)], *rows]
+    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines) + "\n"
+
+
+def write_results(options: argparse.Namespace, markdown: str, measured: Mapping[str, Any]) -> None:
+    """Print a table and write it, with its command and hardware, beside the figures it came from."""
+    command = "python benchmarks/" + shlex.join([Path(word).name if "/" in word else word for word in sys.argv])
+    made = {
+        "command": command,
+        "hardware": f"{device_name(chosen_device(options.device))}, {options.threads} of {os.cpu_count()} cores",
+        "versions": f"ssilk {__version__}, torch {torch.__version__}, Python {platform.python_version()}",
+    }
+    print(markdown)
+    with replacing(RESULTS / f"{options.name}.json") as temporary:
+        temporary.write_text(json.dumps({**made, "measured": measured}, indent=1) + "\n")
+    foot = f"\n`{command}`  \n{made['hardware']}; {made['versions']}\n"
+    with replacing(RESULTS / f"{options.name}.md") as temporary:
+        temporary.write_text(markdown + foot)

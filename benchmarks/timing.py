@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Play a clip at a changing speed: back and forth as a seamless loop, or to a stop."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ssilk_core.assets import Floats, Motion
+from ssilk_core.kinematics import sample_motion
+
+EASE = 0.25  # [s] to start or to stop
+
+
+def _played(motion: Motion, fps: float, seconds: Floats) -> Motion:
+    position = np.clip(seconds * motion.fps, 0, motion.frame_count - 1)
+    return Motion(motion.path, fps, *sample_motion(motion, position))
+
+
+def back_and_forth(motion: Motion, fps: float, frames: int) -> tuple[Motion, int]:
+    """Loop a clip forward and backward and return at least `frames` frames, with the length of a loop.
+
+    Speed falls to zero and rises again within `EASE` at either end, so that positions and velocities are continuous
+    and each loop is exactly the one before it.
+    """
+    duration = (motion.frame_count - 1) / motion.fps
+    half = round((duration + EASE) * fps)
+    time = np.linspace(0, duration + EASE, half + 1)
+    first = np.minimum(time, EASE) ** 2 / (2 * EASE) + np.maximum(time - EASE, 0)
+    late = np.maximum(time - duration, 0)  # the mirror image of the start
+    there = first - late**2 / (2 * EASE)
+    loop = np.concatenate([there, there[-2:0:-1]])
+    return _played(motion, fps, np.tile(loop, -(-frames // len(loop)))), len(loop)
+
+
+def stopped(motion: Motion, fps: float, stop: float, hold: float) -> tuple[Motion, int]:
+    """Play a clip until `stop` [s], come to rest within `EASE`, and hold that pose for `hold` seconds.
+
+    Returns:
+        The motion, and its first frame at rest.
+    """
+    time = np.arange(round((stop + EASE + hold) * fps) + 1) / fps
+    late = np.clip(time - stop, 0, EASE)
+    return _played(motion, fps, np.minimum(time, stop) + late - late**2 / (2 * EASE)), int(np.ceil((stop + EASE) * fps))
