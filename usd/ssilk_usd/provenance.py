@@ -14,4 +14,5 @@ def read_provenance(source: StageLike) -> dict[str, Any]:
     Raises:
         SsilkError: not a readable stage.
     """
-    return dict(open_stage(source).GetRootLayer().customLayerData.get("ssilk", {}))
+    stage = open_stage(source)  # the layer lives only as long as its stage
+    return dict(stage.GetRootLayer().customLayerData.get("ssilk", {}))
