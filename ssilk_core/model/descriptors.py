@@ -51,7 +51,7 @@ def joints_in_view(skeleton: Skeleton, used: Floats) -> np.ndarray:
 
 
 def pose_features(motion: Motion, skeleton: Skeleton, joints: np.ndarray) -> PoseFeatures:
-    """Return the descriptors of every frame of a motion; the first frames repeat as their own past."""
+    """Return the descriptors of every frame of a motion; the first frame also stands for what was before it."""
     world = motion_transforms(motion, skeleton.parents)[:, joints]
     local = matrix_from_quaternion(motion.rotations[:, joints])
     inner = [i for i, joint in enumerate(joints) if skeleton.parents[joint] >= 0]
@@ -73,7 +73,7 @@ def six_d(rotations: Floats) -> Floats:
 
 
 def _past(values: Floats, steps: int) -> Floats:
-    """Return the values `steps` frames earlier; before the first frame, time continues backwards evenly."""
+    """Return the values `steps` frames earlier; before the first frame, the first holds."""
     return values[np.maximum(np.arange(len(values)) - steps, 0)]
 
 

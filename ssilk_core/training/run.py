@@ -31,7 +31,7 @@ from .bank import build_bank
 from .memory import decoded_frames, fitting_batch, free_memory, step_memory
 from .objective import Objective
 from .reach import reachable_body
-from .state import RunState, canonical, load_state, save_state, state_path
+from .state import RunState, batches_before, canonical, load_state, save_state, state_path
 from .step import Stepper
 from .validation import Score, Validator
 from .windows import WindowSampler
@@ -132,9 +132,12 @@ class Run:
         self._announce(len(reach.vertices), len(joints))
 
     def _fitted(self, job: TrainJob, body_vertices: int) -> TrainJob:
-        """Lower the batch until the predicted memory fits, and say so."""
+        """Lower the batch until the predicted memory fits, and say so; a resumed run keeps the batch it had."""
         free = free_memory(self.device)
-        batch, warm = fitting_batch(job.scene, job.model, job.train, body_vertices, free)
+        if job.resume:
+            batch, warm = batches_before(state_path(job.output), job.train)
+        else:
+            batch, warm = fitting_batch(job.scene, job.model, job.train, body_vertices, free)
         needed = step_memory(job.scene, job.model, decoded_frames(job.train, job.train.batch), body_vertices)
         if (batch, warm) == (job.train.batch, job.train.warm_batch):
             return job
@@ -203,7 +206,7 @@ class Run:
             str(self.job.output),
             f"training diverged by iteration {self.iteration}",
             "the best model before it is kept",
-            "lower the step size (--set rate=...) and resume",
+            "train again with smaller steps (--set rate=...)",
         )
         if self.best is None or score.total < self.best.total:
             self.best = score

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..config import TrainConfig
 from ..errors import SsilkError, need
 from ..files import replacing
 from .step import Stepper
@@ -47,7 +50,26 @@ def load_state(path: Path, stepper: Stepper, asked: dict[str, Any]) -> RunState:
     Raises:
         SsilkError: there is no state, it is damaged, or it belongs to a run that was asked something else.
     """
-    from safetensors import SafetensorError, safe_open
+    with _damage_named(path):
+        state, tensors = _read(path)
+        _need_same(path, asked, state.asked)
+        _restore(stepper, tensors)
+    return state
+
+
+def batches_before(path: Path, config: TrainConfig) -> tuple[int, int]:
+    """Return the batch and warm batch of the run at `path`, up to those of `config`: memory may have lowered them.
+
+    Raises:
+        SsilkError: there is no state, or it is damaged.
+    """
+    with _damage_named(path):
+        before = _read(path)[0].asked["train"]
+        return min(config.batch, before["batch"]), min(config.warm_batch, before["warm_batch"])
+
+
+def _read(path: Path) -> tuple[RunState, dict[str, Tensor]]:
+    from safetensors import safe_open
 
     need(
         path.is_file(),
@@ -56,20 +78,25 @@ def load_state(path: Path, stepper: Stepper, asked: dict[str, Any]) -> RunState:
         "the file is written beside the model",
         "train without --resume",
     )
+    with safe_open(path, "pt") as stream:
+        document = json.loads((stream.metadata() or {})["ssilk_state"])
+        best = document.pop("best")
+        tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
+    return RunState(best=None if best is None else Score(**best), **document), tensors
+
+
+@contextmanager
+def _damage_named(path: Path) -> Iterator[None]:
+    """Turn whatever a damaged file gives rise to into one sentence."""
+    from safetensors import SafetensorError
+
     try:
-        with safe_open(path, "pt") as stream:
-            document = json.loads((stream.metadata() or {})["ssilk_state"])
-            best = document.pop("best")
-            state = RunState(best=None if best is None else Score(**best), **document)
-            tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
-        _need_same(path, asked, state.asked)
-        _restore(stepper, tensors)
+        yield
     except (SafetensorError, ValueError, TypeError, KeyError, RuntimeError) as error:
         reason = str(error).rpartition("\n")[2].strip().rstrip(".")
         raise SsilkError(
             f"{path}: the training state is damaged ({reason}); delete it and train without --resume."
         ) from error
-    return state
 
 
 def _need_same(path: Path, asked: dict[str, Any], before: dict[str, Any]) -> None:
