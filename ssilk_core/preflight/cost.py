@@ -57,8 +57,8 @@ def memory(scene: Scene, preset: Preset, body_vertices: int) -> Findings:
         f"the time that preset '{preset.name}' takes is not known: training was never measured on {device}"
     )  # fmt: skip
     why = (
-        "scaled by vertices and frames from a garment of 2,700 vertices on two CPU threads or one H100; yours may differ "
-        "by half"
+        "scaled by vertices and frames from a garment of 2,700 vertices on two CPU threads or one H100; "
+        "yours may differ by half"
     )
     yield Finding(severity="info", code="time", prim=scene.garment.mesh.path, found=found, why=why if seconds else "")
 
