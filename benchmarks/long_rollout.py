@@ -46,11 +46,11 @@ def rows_of(garment: str, clip: str, means: dict[str, Tensor], length: int) -> l
     """Return one line for each term and one for the total."""
     loops = f"{len(means['stretch'])} x {length}"
     every = {**means, "total": torch.stack(list(means.values())).sum(0)}
-    return [
-        [garment, clip, loops, name, *(f"{float(m[i]):.5g}" for i in (0, 1, -1)), drift(m[0], m[-1]),
-         drift(m[1], m[-1])]  # fmt: skip
-        for name, m in every.items()
-    ]
+    rows = []
+    for name, m in every.items():
+        values = [f"{float(m[i]):.5g}" for i in (0, 1, -1)]
+        rows.append([garment, clip, loops, name, *values, drift(m[0], m[-1]), drift(m[1], m[-1])])
+    return rows
 
 
 def draw(path: Path, title: str, means: dict[str, Tensor], span: float = 0.05) -> None:
