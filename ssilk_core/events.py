@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 from dataclasses import asdict, dataclass, field
-from typing import Protocol, TextIO
+from typing import Any, Protocol, TextIO
 
 
 @dataclass(frozen=True)
@@ -73,8 +74,17 @@ class JsonReporter:
         self.stream = stream or sys.stdout
 
     def __call__(self, event: Event) -> None:
-        line = {"event": type(event).__name__.lower(), **asdict(event)}
+        line = {"event": type(event).__name__.lower(), **_finite(asdict(event))}
         print(json.dumps(line, allow_nan=False, default=str), file=self.stream, flush=True)
+
+
+def _finite(value: Any) -> Any:
+    """Return a value with None for NaN and infinity, which JSON lacks."""
+    if isinstance(value, dict):
+        return {name: _finite(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 class TextReporter:

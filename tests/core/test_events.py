@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Events as JSON lines for machines and as text for people."""
+
+import io
+import json
+
+import pytest
+
+from ssilk_core import events
+from ssilk_core.events import (
+    Checkpoint,
+    Failed,
+    JsonReporter,
+    Message,
+    Progress,
+    Result,
+    Started,
+    TextReporter,
+    describe,
+    format_seconds,
+)
+
+EVERY = [
+    Started("train", 10, {"garment": "/cape"}),
+    Progress(3, 10, 12.5, {"stretch": 0.25}),
+    Message("resumed", "info"),
+    Checkpoint("m.safetensors", 5, True),
+    Result("train", {"total [J]": 1.5}),
+    Failed("x: no; do that."),
+]
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def lines(*given: events.Event) -> list[dict]:
+    stream = io.StringIO()
+    report = JsonReporter(stream)
+    for event in given:
+        report(event)
+    return [json.loads(line, parse_constant=pytest.fail) for line in stream.getvalue().splitlines()]
+
+
+def test_each_event_is_one_json_object_on_one_line():
+    found = lines(*EVERY)
+    assert [line["event"] for line in found] == ["started", "progress", "message", "checkpoint", "result", "failed"]
+    assert found[0] == {"event": "started", "task": "train", "total": 10, "detail": {"garment": "/cape"}}
+    assert found[1] == {"event": "progress", "done": 3, "total": 10, "seconds_left": 12.5, "terms": {"stretch": 0.25}}
+    assert found[3] == {"event": "checkpoint", "path": "m.safetensors", "done": 5, "best": True}
+
+
+def test_numbers_that_json_lacks_become_null():
+    (found,) = lines(Progress(1, 2, float("inf"), {"stretch": float("nan"), "bending": 1.0}))
+    assert found["seconds_left"] is None and found["terms"] == {"stretch": None, "bending": 1.0}
+    (found,) = lines(Result("train", {"list": [float("nan"), 2], "text": "NaN"}))
+    assert found["detail"] == {"list": [None, 2], "text": "NaN"}
+
+
+def test_line_breaks_within_an_event_do_not_break_its_line():
+    assert lines(Failed("one\ntwo"))[0]["error"] == "one\ntwo"
+
+
+def test_text_for_people():
+    assert describe(EVERY[0]) == "train ..."
+    assert describe(Message("careful", "warning")) == "warning: careful"
+    assert describe(EVERY[5]) == "error: x: no; do that."
+    assert describe(EVERY[4]) == "  total [J]: 1.5"
+    assert describe(EVERY[3]) == ""
+
+
+def test_a_terminal_renews_one_line_and_ends_it_before_the_next_text(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(events.time, "monotonic", lambda: now[0])
+    stream = Terminal()
+    report = TextReporter(stream)
+    for done in (1, 2, 3):  # the second comes too soon
+        report(Progress(done, 10, 65.0, {"stretch": 0.12345}))
+        now[0] += 0.06
+    report(Message("done"))
+    assert stream.getvalue() == (
+        "\r\x1b[K  1/10  1 min 05 s left  stretch 0.1235\r\x1b[K  3/10  1 min 05 s left  stretch 0.1235\ndone\n"
+    )
+
+
+def test_a_log_gets_a_line_now_and_then_and_the_last_one_always(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(events.time, "monotonic", lambda: now[0])
+    stream = io.StringIO()
+    report = TextReporter(stream)
+    for done in range(1, 31):
+        report(Progress(done, 30))
+        now[0] += 1
+    assert stream.getvalue().split() == ["1/30", "11/30", "21/30", "30/30"]
+
+
+@pytest.mark.parametrize(
+    "seconds, text",
+    [
+        (0.2, "0 s"),
+        (59.4, "59 s"),
+        (59.6, "1 min 00 s"),
+        (185, "3 min 05 s"),
+        (3599.7, "1 h 00 min"),
+        (7800, "2 h 10 min"),
+    ],
+)
+def test_durations_read_as_people_say_them(seconds, text):
+    assert format_seconds(seconds) == text

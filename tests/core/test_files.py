@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files appear whole or not at all."""
+
+import errno
+import hashlib
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from ssilk_core.errors import SsilkError
+from ssilk_core.files import need_writable, replacing, sha256
+
+
+def test_a_file_appears_when_it_is_whole(tmp_path):
+    target = tmp_path / "new" / "shot.usdc"
+    with replacing(target) as temporary:
+        temporary.write_text("whole")
+        assert temporary.parent == target.parent and temporary.suffix == ".usdc" and temporary.name.startswith(".")
+        assert not target.exists()
+    assert target.read_text() == "whole" and list(target.parent.iterdir()) == [target]
+
+
+def test_permissions_are_those_of_any_new_file(tmp_path):
+    with replacing(tmp_path / "a") as temporary:
+        temporary.touch()
+    (tmp_path / "b").touch()
+    modes = [stat.S_IMODE((tmp_path / name).stat().st_mode) for name in "ab"]
+    assert modes[0] == modes[1]
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
+def test_whatever_fails_leaves_the_old_file_and_nothing_else(tmp_path, error):
+    target = tmp_path / "model.safetensors"
+    target.write_text("old")
+    with pytest.raises(error), replacing(target) as temporary:
+        temporary.write_text("half")
+        raise error
+    assert target.read_text() == "old" and list(tmp_path.iterdir()) == [target]
+
+
+def test_a_full_disk_is_one_sentence(tmp_path):
+    words = r"out.bin: writing failed \(No space left on device\); free some space"
+    with pytest.raises(SsilkError, match=words), replacing(tmp_path / "out.bin"):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_target_that_is_a_folder_or_lies_in_a_file_is_refused(tmp_path):
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(SsilkError, match="writing failed"), replacing(tmp_path / "folder") as temporary:
+        temporary.touch()
+    (tmp_path / "file").touch()
+    with pytest.raises(SsilkError, match="cannot be written"), replacing(tmp_path / "file" / "below"):
+        pytest.fail("nothing can be written there")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder"]
+
+
+def test_need_writable_makes_nothing_and_refuses_what_cannot_be(tmp_path):
+    need_writable(tmp_path / "deep" / "er" / "shot.usdc")
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(SsilkError, match=r"this is a folder.*add a file name"):
+        need_writable(tmp_path)
+    (tmp_path / "file").touch()
+    with pytest.raises(SsilkError, match="cannot be written"):
+        need_writable(tmp_path / "file" / "below")
+    with pytest.raises(SsilkError, match="cannot be written"):
+        need_writable(Path("/proc/none/shot.usdc"))
+
+
+def test_sha256_is_that_of_the_bytes(tmp_path):
+    content = os.urandom((1 << 20) + 17)
+    (tmp_path / "a").write_bytes(content)
+    assert sha256(tmp_path / "a") == hashlib.sha256(content).hexdigest()
