@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from ssilk_core.assets import Body, Mesh, SkinWeights
 from ssilk_core.energy import GarmentEnergy, nearest
 from ssilk_core.energy.collision import PosedBody, collision_energy, signed_distance
+from ssilk_core.energy.surface_point import nearest_on_rings, triangle_rings
 from ssilk_core.fabrics import Fabric
 from ssilk_core.kinematics import skin_points
 from ssilk_core.model.body import CollisionBody
@@ -144,3 +145,68 @@ def test_a_rigidly_turned_body_has_exactly_turned_normals():
     turn = torch.tensor(Rotation.random(random_state=5).as_matrix(), dtype=torch.float32)
     posed = collider.posed(torch.cat([turn, torch.ones(3, 1)], dim=1)[None, ..., None])
     np.testing.assert_allclose(posed.normals[..., 0], collider.normals[..., 0] @ turn.T, atol=1e-6)
+
+
+def surface_of(mesh: trimesh.Trimesh) -> PosedBody:
+    """A posed body that is collided with on its triangles, with the mesh's own vertex normals."""
+    rings = torch.tensor(triangle_rings(mesh.faces, len(mesh.vertices)))
+    points, normals = (torch.tensor(v.copy())[:, :, None] for v in (mesh.vertices, mesh.vertex_normals))
+    return PosedBody(points, normals, rings)
+
+
+def test_rings_hold_every_triangle_around_a_vertex():
+    mesh = trimesh.creation.icosphere(subdivisions=1)
+    rings = triangle_rings(mesh.faces, 42)
+    for vertex, ring in enumerate(rings):
+        expected = sorted(sorted(set(face) - {vertex}) for face in mesh.faces.tolist() if vertex in face)
+        assert sorted(sorted(pair) for pair in ring.tolist() if pair != [vertex, vertex]) == expected
+
+
+def test_the_nearest_point_around_a_vertex_matches_brute_force():
+    rng = np.random.default_rng(3)
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.3)
+    mesh.vertices += 0.02 * rng.normal(size=mesh.vertices.shape)
+    x = rng.normal(size=(300, 3))
+    x *= rng.uniform(0.2, 0.45, size=(300, 1)) / np.linalg.norm(x, axis=1, keepdims=True)
+    index = torch.tensor(brute_force(x, mesh.vertices))
+    points = torch.tensor(mesh.vertices.T.copy())[:, :, None]
+    rings = torch.tensor(triangle_rings(mesh.faces, len(mesh.vertices)))
+    corners, weights = nearest_on_rings(torch.tensor(x.T), index, torch.zeros_like(index), points, rings)
+    assert weights.min() > -1e-12
+    np.testing.assert_allclose(weights.sum(0), 1)
+    found = (mesh.vertices[corners] * weights.numpy()[..., None]).sum(0)
+    for query, vertex, point in zip(x, index.tolist(), found):
+        around = mesh.triangles[(mesh.faces == vertex).any(axis=1)]
+        nearest_points = trimesh.triangles.closest_point(around, np.tile(query, (len(around), 1)))
+        assert np.linalg.norm(query - point) == pytest.approx(np.linalg.norm(query - nearest_points, axis=1).min())
+
+
+def test_distance_to_triangles_is_nearer_the_truth_than_to_vertices():
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.3)
+    way = np.random.default_rng(1).normal(size=(400, 3))
+    radius = np.linspace(0.25, 0.35, 400)
+    x = torch.tensor(way / np.linalg.norm(way, axis=1, keepdims=True) * radius[:, None])[:, :, None]
+    body = surface_of(mesh)
+    on_triangles, at_vertices = (
+        signed_distance(x, found)[:, 0].numpy() for found in (body, PosedBody(body.points, body.normals))
+    )
+    nearest_points = trimesh.proximity.closest_point_naive(mesh, x[..., 0].numpy())[0]
+    outside = np.where(radius > np.linalg.norm(nearest_points, axis=1), 1, -1)
+    exact = outside * np.linalg.norm(x[..., 0].numpy() - nearest_points, axis=1)
+    errors = [np.abs(found - exact).max() for found in (on_triangles, at_vertices)]
+    assert errors[0] < 1e-3 < 2e-3 < errors[1]
+
+
+def test_distance_far_from_the_surface_is_that_to_the_nearest_vertex():
+    body, x = surface_of(trimesh.creation.icosphere(subdivisions=2, radius=0.3)), torch.full((1, 3, 1), 5.0).double()
+    assert torch.equal(signed_distance(x, body), signed_distance(x, PosedBody(body.points, body.normals)))
+
+
+def test_frames_of_a_moving_body_do_not_mix():
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.3)
+    still = surface_of(mesh)
+    shift = torch.tensor([0.0, 0.5, -1.0]).double()
+    moving = PosedBody(still.points + shift * torch.ones(1, 3, 1), still.normals.expand(-1, -1, 3), still.rings)
+    x = torch.tensor(mesh.vertices[::7] * 1.05)[:, :, None]
+    together = signed_distance(x + shift * torch.ones(1, 3, 1), moving)
+    np.testing.assert_allclose(together, signed_distance(x, still).expand(-1, 3), atol=1e-12)
