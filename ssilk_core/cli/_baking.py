@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ssilk_core.model.network import GarmentModel
 
 CHUNK = 256  # frames in memory at once
-BIND_TOLERANCE = 1e-3  # [m]
+BIND_TOLERANCE = 1e-3  # [m] between positions, and between the entries of rotation matrices
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,17 +137,22 @@ def open_bake(request: BakeRequest) -> Bake:
 
 
 def _need_same_skeleton(found: Skeleton, trained: Skeleton) -> None:
-    """Raise `SsilkError` unless a skeleton has the joints of the model's, bound at the same places."""
+    """Raise `SsilkError` unless a skeleton has the joints of the model, with its bind transforms."""
     allowed, todo = "a model bakes on the character it was trained with", "train on this character"
     missing = sorted(set(trained.joint_names) - set(found.joint_names))
     need(not missing, found.path, f"{len(missing)} of the model's joints are missing ({', '.join(missing[:3])})",
          allowed, todo)  # fmt: skip
     same = found.joint_names == trained.joint_names
     need(same, found.path, "its joints are more than the model's, or in another order", allowed, todo)
-    away = np.linalg.norm(found.bind_transforms[:, :3, 3] - trained.bind_transforms[:, :3, 3], axis=1)
+    away = np.linalg.norm((found.bind_transforms - trained.bind_transforms)[:, :3, 3], axis=1)
     joint = int(away.argmax())
     need(away[joint] < BIND_TOLERANCE, found.path,
          f"joint '{found.joint_names[joint]}' is bound {away[joint]:.3g} m from where the model has it",
+         allowed, todo)  # fmt: skip
+    turned = np.abs((found.bind_transforms - trained.bind_transforms)[:, :3, :3]).max(axis=(1, 2))
+    joint = int(turned.argmax())
+    need(turned[joint] < BIND_TOLERANCE, found.path,
+         f"joint '{found.joint_names[joint]}' is bound at another rotation than the model has it",
          allowed, todo)  # fmt: skip
 
 

@@ -137,6 +137,14 @@ def scaled_bind(stage: Usd.Stage) -> None:
     binds.Set([Gf.Matrix4d().SetScale((1, 2, 1)), *list(binds.Get())[1:]])
 
 
+def turned_bind(stage: Usd.Stage) -> None:
+    """Turn the bind pose of the second joint by 90 degrees where it stands."""
+    attribute = stage.GetPrimAtPath("/Hero/Rig").GetAttribute("bindTransforms")
+    binds = list(attribute.Get())
+    binds[1] = Gf.Matrix4d().SetRotate(Gf.Rotation((0, 1, 0), 90)) * binds[1]
+    attribute.Set(binds)
+
+
 def unheld_island(stage: Usd.Stage) -> None:
     """Add a triangle two metres off to the skirt."""
     mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/Hero/Skirt"))
@@ -561,6 +569,12 @@ MODELS = [
         BAKE,
         ("rigged.usda", "bound 1", "trained with"),
         attribute("rigged.usda", RIGGED, "bindTransforms", lambda a: with_rows((1, 3, 1), 2.5)(a)),
+    ),
+    Case(
+        "model on a character of other axes",
+        BAKE,
+        ("rigged.usda", "'Hips/Spine' is bound at another rotation", "trained with"),
+        edited("rigged.usda", turned_bind),
     ),
 ]
 
