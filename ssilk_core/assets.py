@@ -426,7 +426,7 @@ class Motion:
         fps: frames per second [1/s].
         rotations: local joint rotations, unit quaternions (w, x, y, z), shape (F, J, 4).
         translations: local joint translations [m], shape (F, J, 3); roots are in world space.
-        start: time code of the first frame in the file that the motion came from.
+        start: index of the first frame, counted from time zero at `fps`; it begins at `start / fps` seconds.
     """
 
     path: str

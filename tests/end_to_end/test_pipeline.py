@@ -94,6 +94,27 @@ def test_shots_of_any_rate_are_verified(world, fps, frames, capsys):
     assert len(values) == frames and values.min() >= 0 and values.max() <= 1 and np.ptp(values) > 0
 
 
+LATE = """#usda 1.0
+(
+    framesPerSecond = 30
+    metersPerUnit = 1
+    subLayers = [@./clip.usda@ (offset = 120)]
+    timeCodesPerSecond = 60
+    upAxis = "Y"
+)
+"""
+
+
+@pytest.mark.parametrize(("rate", "fps"), [("", 30), ("--fps 24", 24)])
+def test_a_shot_starts_at_the_time_of_its_motion(world, rate, fps):
+    """At 60 time codes and 30 frames a second, time code 120 is 2 s."""
+    Path("late.usda").write_text(LATE)
+    assert run(f"{SHOT.replace('clip', 'late')} {rate} --plain --no-verify -o shot.usdc") == 0
+    stage = Usd.Stage.Open("shot.usdc")
+    assert stage.GetStartTimeCode() / stage.GetTimeCodesPerSecond() == 2
+    assert stage.GetTimeCodesPerSecond() == fps
+
+
 def test_the_same_bake_gives_the_same_bytes(world):
     assert run(f"{SHOT} -o shot.usdc --no-verify") == 0
     first = Path("shot.usdc").read_bytes()

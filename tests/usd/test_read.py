@@ -505,6 +505,12 @@ def test_frames_per_second_sets_the_rate_where_it_is_authored(codes, fps, frames
     np.testing.assert_allclose(degrees_of(motion), np.arange(frames) * codes / rate * 60, atol=1e-4)
 
 
+@pytest.mark.parametrize(("codes", "fps", "start"), [(60, 30, 60), (30, 30, 120), (24, None, 120), (1, 24, 2880)])
+def test_a_motion_starts_at_its_own_time_whatever_the_time_codes(codes, fps, start):
+    motion = read_motion(clip(JOINTS, {120: 0, 121: 60}, codes=codes, fps=fps), SKELETON)
+    assert motion.start == start and motion.start / motion.fps == 120 / codes
+
+
 def test_a_single_sample_is_a_motion_of_one_frame():
     motion = read_motion(clip(JOINTS, {7: 30}), SKELETON)
     assert (motion.frame_count, motion.start) == (1, 7)

@@ -88,7 +88,8 @@ def read_motion(source: StageLike, skeleton: Skeleton, *, prim: str | None = Non
     )
     local[:, match < 0] = skeleton.rest_transforms[match < 0]
     _check_lengths(local[:, match >= 0], skeleton.rest_transforms[match >= 0], skeleton.parents[match >= 0], where)
-    return Motion(where, fps, quaternion_from_matrix(local[..., :3, :3]), local[..., :3, 3], float(codes[0]))
+    start = float(codes[0] * fps / stage.GetTimeCodesPerSecond())
+    return Motion(where, fps, quaternion_from_matrix(local[..., :3, :3]), local[..., :3, 3], start)
 
 
 def _find_animation(stage: Usd.Stage, prim: str | None, root: str | None) -> tuple[Usd.Prim, Usd.Prim | None]:
