@@ -40,4 +40,6 @@ def stopped(motion: Motion, fps: float, stop: float, hold: float) -> tuple[Motio
     """
     time = np.arange(round((stop + EASE + hold) * fps) + 1) / fps
     late = np.clip(time - stop, 0, EASE)
-    return _played(motion, fps, np.minimum(time, stop) + late - late**2 / (2 * EASE)), int(np.ceil((stop + EASE) * fps))
+    return _played(motion, fps, np.minimum(time, stop) + late - late**2 / (2 * EASE)), int(
+        np.ceil((stop + EASE) * fps)
+    )

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from .assets import Floats, GarmentPose, Motion
 from .errors import need
-from .kinematics import frames_at, motion_transforms, resample, skinning_matrices, slerp, split_at_cuts
+from .kinematics import motion_transforms, resample, skinning_matrices, slerp, split_at_cuts
 from .model.descriptors import gravity_features, pose_features
 from .model.network import GarmentModel
 
@@ -31,27 +31,20 @@ class Step:
 
 
 @torch.no_grad()
-def roll(model: GarmentModel, motion: Motion, chunk: int = CHUNK) -> Iterator[Step]:
-    """Yield the garment's pose over a motion at the model's rate, some frames at a time.
-
-    The state starts from the initialiser, and anew after each cut of the motion (a root that jumps).
+def roll(model: GarmentModel, span: Motion, chunk: int = CHUNK) -> Iterator[Step]:
+    """Yield the garment's pose over a motion without cuts, at the model's rate, some frames at a time.
 
     Raises:
         SsilkError: the motion is not at the model's rate.
     """
     fps = model.config.fps
-    need(
-        abs(motion.fps - fps) < 1e-6, motion.path, f"{motion.fps:g} frames per second", f"the model steps at {fps:g}"
-    )
-    offset = 0
-    for span in split_at_cuts(motion):
-        state: list[Tensor] = []
-        for start in range(0, span.frame_count, chunk):
-            stop = min(start + chunk, span.frame_count)
-            states = _advance(model, span, start, stop, state)
-            state = states[-2:]
-            yield Step(offset + start, *model.pose(torch.cat(states[-(stop - start) :])))
-        offset += span.frame_count
+    need(abs(span.fps - fps) < 1e-6, span.path, f"{span.fps:g} frames per second", f"the model steps at {fps:g}")
+    state: list[Tensor] = []
+    for start in range(0, span.frame_count, chunk):
+        stop = min(start + chunk, span.frame_count)
+        states = _advance(model, span, start, stop, state)
+        state = states[-2:]
+        yield Step(start, *model.pose(torch.cat(states[-(stop - start) :])))
 
 
 def _advance(model: GarmentModel, span: Motion, start: int, stop: int, state: list[Tensor]) -> list[Tensor]:
@@ -78,37 +71,36 @@ def garment_poses(model: GarmentModel, motion: Motion, fps: float, chunk: int = 
     """Yield what a shot stores, at `fps`, over a motion of any rate: the frames of `resample(motion, fps)`.
 
     The model rolls at its own rate; where the shot's differs, rotations are interpolated by slerp and weights by
-    lines between the two nearest steps.
+    lines between the two nearest steps. After a cut of the motion (a root that jumps) the garment starts anew from
+    the initialiser, and nothing is interpolated across it.
     """
-    steps = roll(model, resample(motion, model.config.fps, cover=True), chunk)
-    poses: Iterator[GarmentPose] = (
-        GarmentPose(step.start, *model.file_pose(step.activation, step.rotations)) for step in steps
-    )
-    if abs(fps - model.config.fps) >= 1e-6:
-        poses = resample_poses(poses, model.config.fps, fps)
-    return _first(poses, frames_at(motion, fps))
+    first = source_frame = 0
+    for span in split_at_cuts(motion):
+        stop = int(np.floor((source_frame + span.frame_count - 1) * fps / motion.fps + 1e-6)) + 1
+        steps = roll(model, resample(span, model.config.fps, cover=True), chunk)
+        poses = (GarmentPose(step.start, *model.file_pose(step.activation, step.rotations)) for step in steps)
+        shift = (first / fps - source_frame / motion.fps) * model.config.fps
+        for pose in resample_poses(poses, model.config.fps, fps, shift=shift, count=stop - first):
+            yield replace(pose, start=first + pose.start)
+        first, source_frame = stop, source_frame + span.frame_count
 
 
-def _first(poses: Iterator[GarmentPose], count: int) -> Iterator[GarmentPose]:
-    """Yield the poses of the first `count` frames."""
-    for pose in poses:
-        kept = min(pose.frame_count, count - pose.start)
-        if kept <= 0:
-            return
-        yield GarmentPose(pose.start, pose.rotations[:kept], pose.weights[:kept])
+def resample_poses(
+    poses: Iterator[GarmentPose], source: float, target: float, *, shift: float = 0.0, count: int
+) -> Iterator[GarmentPose]:
+    """Yield `count` poses at rate `target` from consecutive poses at rate `source`, keeping one chunk in memory.
 
-
-def resample_poses(poses: Iterator[GarmentPose], source: float, target: float) -> Iterator[GarmentPose]:
-    """Yield poses at rate `target` from consecutive poses at rate `source`, keeping one chunk in memory."""
+    The first lies `shift` source frames after the first given one; outside the given ones the nearest is held.
+    """
     done, tail = 0, None
     for pose in poses:
         joined = pose if tail is None else _joined(tail, pose)
         last = joined.start + joined.frame_count - 1
-        count = int(np.floor(last * target / source + 1e-6)) + 1 - done
-        position = np.minimum((done + np.arange(count)) * source / target, last) - float(joined.start)
-        if count:
-            yield _sampled(joined, position, done)
-        done += max(count, 0)
+        reached = min(int(np.floor((last - shift) * target / source + 1e-6)) + 1, count)
+        position = (done + np.arange(max(reached - done, 0))) * source / target + shift
+        if len(position):
+            yield _sampled(joined, position.clip(joined.start, last) - float(joined.start), done)
+        done = max(reached, done)
         tail = GarmentPose(last, joined.rotations[-1:], joined.weights[-1:])
 
 

@@ -109,7 +109,7 @@ def _job(options: argparse.Namespace, report: Reporter):  # type: ignore[no-unty
         motions, held = split_motions(motions)
         report(Message(f"validating on {len(held)} of {len(motions) + len(held)} motions, training on the rest"))
     model, train = _settings(options.settings, preset.model, preset.train, options.seed)
-    files = [options.stage, *motion_files([*options.motions, *options.valid])]
+    files = {options.stage, shared.wardrobe(options)[0], *motion_files([*options.motions, *options.valid])}
     return TrainJob(
         scene=scene,
         motions=motions,
@@ -120,7 +120,7 @@ def _job(options: argparse.Namespace, report: Reporter):  # type: ignore[no-unty
         output=options.output,
         device=options.device,
         resume=options.resume,
-        inputs={str(path): sha256(path) for path in files},
+        inputs={str(path): sha256(path) for path in sorted(files)},
     )
 
 

@@ -64,7 +64,7 @@ class Objective:
         # Detached: the initialiser learns rest states from their own energy, not what helps the next frames.
         target = rest.detach().reshape(length, batch, -1)
         start = torch.where(sampler.carried[None, :, None], sampler.latents, target[:2])
-        z = [*model.integrator.bounded(start + noise).unbind(0)]
+        z = [*(start + noise).unbind(0)]
         with torch.set_grad_enabled(sampler.config.through_time):
             for t in range(2, length):
                 z.append(model.step(z[-2], z[-1], target[t], pose[t]))

@@ -13,7 +13,7 @@ from ..kinematics import motion_transforms, skin_points, skinning_matrices
 from ..mesh import topology
 
 SLACK = 0.08  # [m] play that blendshapes and stretch add to the geometric reach
-POSES = 48  # poses that the reach is measured on
+POSES = 200  # poses that the reach is measured on
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +31,7 @@ def reachable_body(scene: Scene, motions: Sequence[Motion]) -> Reach:
     the length of cloth between them; pinned and tight vertices stay within `SLACK` of plain skinning.
     """
     from scipy.spatial import cKDTree
+    from scipy.spatial.distance import cdist
 
     body, skeleton, garment = scene.character.merged_body(), scene.character.skeleton, scene.garment.mesh
     held = np.flatnonzero(scene.classes != LOOSE)
@@ -42,8 +43,7 @@ def reachable_body(scene: Scene, motions: Sequence[Motion]) -> Reach:
         plain = skin_points(garment.points, scene.plain_skin, matrices)[0]
         if len(held):
             reached |= cKDTree(plain[held]).query(posed)[0] < SLACK
-        for anchor, length in zip(anchors, lengths):
-            reached |= np.linalg.norm(posed - plain[anchor], axis=1) < length + SLACK
+        reached |= (cdist(plain[anchors], posed) < lengths[:, None] + SLACK).any(axis=0)
     vertices = np.flatnonzero(reached)
     joints = np.zeros(skeleton.joint_count, dtype=bool)
     joints[body.skin.indices[vertices][body.skin.weights[vertices] > 0.05]] = True

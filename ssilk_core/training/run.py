@@ -31,7 +31,7 @@ from .bank import build_bank
 from .memory import decoded_frames, fitting_batch, free_memory, step_memory
 from .objective import Objective
 from .reach import reachable_body
-from .state import RunState, batches_before, canonical, load_state, save_state, state_path
+from .state import RunState, batches_before, canonical, load_state, save_state, scene_digest, state_path
 from .step import Stepper
 from .validation import Score, Validator
 from .windows import WindowSampler
@@ -105,7 +105,7 @@ class Run:
 
     def __init__(self, job: TrainJob, report: Reporter) -> None:
         self.report, self.device = report, chosen_device(job.device)
-        reach = reachable_body(job.scene, job.motions)
+        reach = reachable_body(job.scene, [*job.motions, *job.held_out])
         self.job = job = self._fitted(job, len(reach.vertices))
         joints = model_joints(job.scene, reach.joints)
         scene, skeleton = job.scene, job.scene.character.skeleton
@@ -124,9 +124,12 @@ class Run:
             sampler,
             job.train,
         )
+        # Validation looks at the whole body: what training leaves out must not go unnoticed.
+        whole = CollisionBody(scene.character.merged_body(), skeleton.joint_count, device=self.device)
         self.validator = Validator(
-            held, energy, body, scene.plain_skin, self.model.decoder.rest, job.model.fps, job.train.valid_frames
+            held, energy, whole, scene.plain_skin, self.model.decoder.rest, job.model.fps, job.train.valid_frames
         )
+        self.digest = scene_digest(job.scene)
         self.iteration = 0
         self.best: Score | None = None
         self._announce(len(reach.vertices), len(joints))
@@ -186,6 +189,7 @@ class Run:
                 "fabric": asdict(job.fabric),
                 "inputs": job.inputs or {},
                 "garment": job.scene.garment.mesh.path,
+                "scene": self.digest,
             }
         )
 
@@ -287,8 +291,8 @@ def train(job: TrainJob, report: Reporter, stop: threading.Event | None = None) 
         report(Message(f"resumed at iteration {run.iteration} of {job.train.iterations}"))
     plain = run.validator.plain_score()
     _loop(run, report, stop or threading.Event(), plain)
-    score = run.kept()
     run.save_state()
+    score = run.kept()
     finished = run.iteration >= run.job.train.iterations
     return Trained(finished, run.iteration, score, plain)
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..assets import Scene
 from ..config import TrainConfig
 from ..errors import SsilkError, need
 from ..files import replacing
@@ -138,6 +140,19 @@ def _restore(stepper: Stepper, tensors: dict[str, Tensor]) -> None:
         moments.setdefault(int(index), {})[key] = value
     document = stepper.optimiser.state_dict()
     stepper.optimiser.load_state_dict({"state": moments, "param_groups": document["param_groups"]})
+
+
+def scene_digest(scene: Scene) -> str:
+    """Return a hash of all that a scene holds, however it was prepared: meshes, weights, classes, rig and bind pose."""
+    digest = hashlib.sha256(json.dumps(scene.joint_names).encode())
+    bodies = scene.character.bodies
+    body = [array for b in bodies for array in (b.mesh.points, b.mesh.faces, b.skin.indices, b.skin.weights)]
+    garment = (scene.garment.mesh.points, scene.garment.mesh.faces, scene.classes)
+    plain, rig = scene.plain_skin, scene.rig.skin
+    skins = (plain.indices, plain.weights, rig.indices, rig.weights)
+    for array in (*body, *garment, *skins, scene.parents, scene.bind_transforms):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
 
 
 def canonical(value: Any) -> Any:

@@ -15,6 +15,8 @@ from ..model.network import GarmentModel
 from .objective import Objective, total
 from .windows import WindowSampler, random_directions
 
+EAGER_STEPS = 3  # before a CUDA graph is captured: allocators, handles and kernels settle
+
 
 def learning_rate(config: TrainConfig, iteration: int) -> float:
     """Step size at an iteration: linear warm-up, then a cosine to the final rate, in each phase anew."""
@@ -62,7 +64,8 @@ class Stepper:
         self.averaged = copy.deepcopy(model).requires_grad_(False)
         self.terms: dict[str, Tensor] = {}
         self.skipped = torch.zeros((), dtype=torch.int64, device=self.device)
-        self._graphs: dict[str, torch.cuda.CUDAGraph] = {}
+        self._graph: torch.cuda.CUDAGraph | None = None
+        self._phase, self._eager = "", 0
 
     def warm(self) -> None:
         """Train P and D on single random poses under static energies."""
@@ -115,18 +118,22 @@ class Stepper:
         else:
             body()
 
-    def _replay(self, name: str, body: Callable[[], None]) -> None:
-        """Replay a step as one CUDA graph, captured on its first use after a few eager steps."""
-        if name not in self._graphs:
+    def _replay(self, phase: str, body: Callable[[], None]) -> None:
+        """Replay a step as one CUDA graph, captured in each phase after a few eager steps; every call is one step."""
+        if phase != self._phase:
+            torch.cuda.synchronize(self.device)
+            self._graph, self._phase, self._eager = None, phase, EAGER_STEPS  # the old graph's memory is freed
+        if self._eager:
+            self._eager -= 1
             side = torch.cuda.Stream()
             side.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(side):
-                for _ in range(3):
-                    body()
-            torch.cuda.current_stream().wait_stream(side)
-            graph = torch.cuda.CUDAGraph()
-            graph.register_generator_state(self.sampler.generator)
-            with torch.cuda.graph(graph):
                 body()
-            self._graphs[name] = graph
-        self._graphs[name].replay()
+            torch.cuda.current_stream().wait_stream(side)
+            return
+        if self._graph is None:
+            self._graph = torch.cuda.CUDAGraph()
+            self._graph.register_generator_state(self.sampler.generator)
+            with torch.cuda.graph(self._graph):
+                body()
+        self._graph.replay()

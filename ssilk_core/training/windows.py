@@ -77,7 +77,8 @@ class WindowSampler:
         wish = torch.rand(config.batch, generator=self.generator, device=device) < config.carry
         fresh = random_directions(config.batch, config.rotated, self.generator, device)
         chosen = self._fresh()
-        go_on = fits & wish
+        # A state that is not finite ends here, or it would spoil every window after it.
+        go_on = fits & wish & latents.isfinite().all(dim=2).all(dim=0)
         self.first.copy_(torch.where(go_on, following, chosen))
         self.direction.copy_(torch.where(go_on[:, None], self.direction, fresh))
         self.latents.copy_(latents.detach())

@@ -51,7 +51,7 @@ def reference(objective: Objective, sampler: WindowSampler, noise: torch.Tensor,
         frames = [first[None] + t for t in range(length)]
         rest = [model.initial(bank.static_descriptor(frame, down)) for frame in frames]
         begun = sampler.latents[:, slot] if sampler.carried[slot] else torch.cat(rest[:2]).detach()
-        z = list(model.integrator.bounded(begun + noise[:, slot]).split(1))
+        z = list((begun + noise[:, slot]).split(1))
         x = [at_frame(objective, z[t], frames[t], down)[0].detach() for t in range(2)]
         for t in range(2):
             resting[t][slot] = at_frame(objective, rest[t], frames[t], down)[1]

@@ -94,10 +94,10 @@ def test_resampled_poses_lie_on_the_arcs_between_steps(chunk, target):
     rotations = Rotation.from_rotvec(np.cumsum(0.1 * rng.normal(size=(20, 3)), axis=0))
     quaternions, weights = np.roll(rotations.as_quat(), 1, axis=1)[:, None], rng.random((20, 2))
     pieces = (GarmentPose(s, quaternions[s : s + chunk], weights[s : s + chunk]) for s in range(0, 20, chunk))
-    found = gathered(resample_poses(pieces, 30.0, target))
-    time = np.arange(found.frame_count) / target
-    assert time[-1] <= 19 / 30 + 1e-6 < time[-1] + 1 / target + 2e-6
-    time = time.clip(max=19 / 30)
+    count = int(19 / 30 * target + 1e-6) + 1
+    found = gathered(resample_poses(pieces, 30.0, target, count=count))
+    assert found.frame_count == count
+    time = (np.arange(count) / target).clip(max=19 / 30)
     expected = Slerp(np.arange(20) / 30, rotations)(time).as_matrix()
     turned = Rotation.from_quat(np.roll(found.rotations[:, 0], -1, axis=1)).as_matrix()
     np.testing.assert_allclose(turned, expected, atol=1e-9)
@@ -112,12 +112,25 @@ def test_after_a_cut_the_garment_starts_from_the_initialiser(model, scene, toy_m
     jumped = motion.translations.copy()
     jumped[17:, 0] += [0, 0, 50]
     cut = replace(motion, translations=jumped)
-    found = joined(roll(model, cut, chunk=8))
+    found = gathered(garment_poses(model, cut, motion.fps, chunk=8))
     for span, part in ((slice(0, 17), motion.clip(0, 17)), (slice(17, 40), motion.clip(17, 40))):
-        for mine, theirs in zip(found, joined(roll(model, part))):
-            np.testing.assert_allclose(mine[..., span], theirs, atol=2e-5)
-    uncut = joined(roll(model, motion))[0]
-    assert (found[0] - uncut)[:, 17:].abs().max() > 1e-3
+        alone = gathered(garment_poses(model, part, motion.fps))
+        np.testing.assert_allclose(found.weights[span], alone.weights, atol=2e-5)
+        np.testing.assert_allclose(found.rotations[span], alone.rotations, atol=2e-5)
+    uncut = gathered(garment_poses(model, motion, motion.fps))
+    assert np.abs(found.weights - uncut.weights)[17:].max() > 1e-3
+
+
+@pytest.mark.parametrize("fps", [24.0, 30.0, 60.0])
+def test_nothing_is_interpolated_across_a_cut(model, scene, toy_motion, fps):
+    motion = toy_motion(scene, 40, 48.0)
+    jumped = motion.translations.copy()
+    jumped[17:, 0] += [0, 0, 50]
+    found = gathered(garment_poses(model, replace(motion, translations=jumped), fps))
+    assert found.frame_count == int(39 / 48 * fps + 1e-6) + 1
+    before = int(16 / 48 * fps + 1e-6) + 1
+    alone = gathered(garment_poses(model, motion.clip(0, 17), fps))
+    np.testing.assert_allclose(found.weights[:before], alone.weights, atol=2e-5)
 
 
 def test_a_motion_of_another_rate_is_refused(model, scene, toy_motion):
