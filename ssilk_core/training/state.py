@@ -143,7 +143,7 @@ def _restore(stepper: Stepper, tensors: dict[str, Tensor]) -> None:
 
 
 def scene_digest(scene: Scene) -> str:
-    """Return a hash of all that a scene holds, however it was prepared: meshes, weights, classes, rig and bind pose."""
+    """Return a hash of all that a scene holds, however it was prepared: meshes, weights, classes, rig, bind pose."""
     digest = hashlib.sha256(json.dumps(scene.joint_names).encode())
     bodies = scene.character.bodies
     body = [array for b in bodies for array in (b.mesh.points, b.mesh.faces, b.skin.indices, b.skin.weights)]
