@@ -8,7 +8,8 @@ Nothing is ever unpickled. Tensors are named "scene.*" (the garment, its rig and
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +26,10 @@ if TYPE_CHECKING:
     from .model.network import GarmentModel
 
 FORMAT = 1
+# Parts of the header that are no plain values, as tuples (JSON: lists) and dicts.
+HEADER: dict[str, Any] = {
+    "joint_names": (), "proxy_names": (), "paths": {}, "config": {}, "fabric": {}, "provenance": {},
+}  # fmt: skip
 HEADER_LIMIT = 64 << 20  # bytes; a header this large is damage or mischief, not a model
 
 
@@ -97,16 +102,21 @@ def load_model(path: str | Path) -> ModelFile:
     """Read a model file.
 
     Raises:
-        SsilkError: there is no such file, it is truncated, foreign, or of another format version.
+        SsilkError: there is no such file, it is truncated, foreign, of another format version, or its parameters
+            do not fit the sizes in its header.
     """
     tensors, document = _read(Path(path))
     try:
-        return _model_of(tensors, document)
+        _need_header(document)
+        model = _model_of(tensors, document)
+        _need_fit(model)
+        return model
     except SsilkError as error:
         raise SsilkError(f"{path}: the model cannot be used: {error}") from error
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:  # the last for sizes beyond all memory
+        first = str(error).partition("\n")[0]
         raise SsilkError(
-            f"{path}: the model file is incomplete or inconsistent ({type(error).__name__}: {error}); "
+            f"{path}: the model file is incomplete or inconsistent ({type(error).__name__}: {first}); "
             "train again or fetch the file again."
         ) from error
 
@@ -134,11 +144,30 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     need(header, str(path), "a safetensors file without SSILK's header", "a file written by 'ssilk train' is needed")
     try:
         document = json.loads(header)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise SsilkError(f"{path}: the model's header is damaged ({error}); train again.") from error
     found = document.get("format") if isinstance(document, dict) else None
     need(found == FORMAT, str(path), f"model format {found}", f"this version reads format {FORMAT}", "train it again")
     return tensors, document
+
+
+def _need_header(document: dict[str, Any]) -> None:
+    """Raise `TypeError` unless everything in a header has the type that was written."""
+    _need_types(document, HEADER)
+    _need_types(document["config"], vars(ModelConfig()))
+    _need_types(document["fabric"], vars(Fabric("")))
+    for words in (document["joint_names"], document["proxy_names"], document["paths"].values()):
+        _need_types(dict(enumerate(words)), dict.fromkeys(range(len(words)), ""))
+    widths = document["config"].get("widths", [])
+    _need_types(dict(enumerate(widths)), dict.fromkeys(range(len(widths)), 0))
+
+
+def _need_types(values: Mapping[Any, object], likes: Mapping[Any, object]) -> None:
+    """Raise `TypeError` unless values from JSON have the types of those with the same names in `likes`."""
+    for name, value in values.items():
+        kind = type(likes.get(name, value))
+        if type(value) not in {float: (int, float), tuple: (list,)}.get(kind, (kind,)):
+            raise TypeError(f"{name!r} is {str(value)[:40]}, which is no {kind.__name__}")
 
 
 def _model_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> ModelFile:
@@ -181,7 +210,7 @@ def _model_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Model
         )
     joints = tensors["joints"]
     need(
-        np.isin(joints, np.arange(skeleton.joint_count)).all(),
+        joints.ndim == 1 and np.isin(joints, np.arange(skeleton.joint_count)).all(),
         skeleton.path,
         f"descriptors of joints {joints.tolist()}",
         f"they lie in 0 to {skeleton.joint_count - 1}",
@@ -197,6 +226,27 @@ def _model_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Model
     )
 
 
+def _need_fit(model: ModelFile) -> None:
+    """Raise `SsilkError` unless the parameters have the shapes that the header implies, before memory is taken."""
+    import torch
+
+    from .model.network import GarmentModel
+
+    with torch.device("meta"):
+        # Smoothing has no parameters of its own, but takes the square of the garment's size in memory.
+        empty = GarmentModel(model.scene, replace(model.config, smoothing=0.0), model.joints)
+    expected = {name: tuple(value.shape) for name, value in empty.state_dict().items()}
+    found = {name: value.shape for name, value in model.parameters.items()}
+    odd = next((name for name in {**expected, **found} if expected.get(name) != found.get(name)), "")
+    need(
+        not odd,
+        f"parameter '{odd}'",
+        f"the model's parameters do not fit its header: shape {found.get(odd)}",
+        f"{expected.get(odd)} is needed",
+        "train again",
+    )
+
+
 def model_file(model: GarmentModel, fabric: Fabric, provenance: dict[str, Any]) -> ModelFile:
     """Return a network as it would be written."""
     parameters = {name: value.detach().cpu().numpy() for name, value in model.state_dict().items()}
@@ -204,21 +254,11 @@ def model_file(model: GarmentModel, fabric: Fabric, provenance: dict[str, Any]) 
 
 
 def network(file: ModelFile, scene: Scene | None = None) -> GarmentModel:
-    """Return the network of a model file, on its own scene or on one that adds the character's body.
-
-    Raises:
-        SsilkError: the parameters do not fit the sizes in the header.
-    """
+    """Return the network of a model file, on its own scene or on one that adds the character's body."""
     import torch
 
     from .model.network import GarmentModel
 
     model = GarmentModel(scene or file.scene, file.config, file.joints)
-    try:
-        model.load_state_dict({name: torch.from_numpy(value.copy()) for name, value in file.parameters.items()})
-    except RuntimeError as error:
-        problem = str(error).splitlines()[-1].partition(":")[0].strip()
-        raise SsilkError(
-            f"{file.scene.garment.mesh.path}: the model's parameters do not fit its header ({problem}); train again."
-        ) from error
+    model.load_state_dict({name: torch.from_numpy(value.copy()) for name, value in file.parameters.items()})
     return model.eval()

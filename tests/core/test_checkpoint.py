@@ -139,6 +139,14 @@ def test_a_missing_file_a_folder_and_a_foreign_safetensors_file_are_refused(tmp_
         assert_one_sentence(error, tmp_path)
 
 
+def test_a_header_nested_too_deep_is_refused(tmp_path):
+    path = tmp_path / "deep.safetensors"
+    save_file({"weight": np.zeros(3)}, path, {"ssilk": "[" * 100_000})
+    with pytest.raises(SsilkError, match="header is damaged") as error:
+        load_model(path)
+    assert_one_sentence(error, path)
+
+
 def set_tensor(name: str, value: object) -> Callable[[dict, dict], None]:
     return lambda tensors, document: tensors.__setitem__(name, np.asarray(value))
 
@@ -177,11 +185,29 @@ DAMAGE = {
     "a parameter too many": (set_tensor("model.more", [1.0]), "do not fit its header"),
     "a parameter of another shape": (set_tensor("model.output.0.bias", np.zeros(3)), "do not fit its header"),
     "another size in the config": (configure(latent=9), "do not fit its header"),
+    "half a size in the config": (configure(latent=32.5), "incomplete.*'latent' is 32.5, which is no int"),
+    "a size in the config that is a float": (configure(latent=1e8), "incomplete.*'latent'"),
+    "a size in the config that is true or false": (configure(shapes=True), "incomplete.*'shapes'"),
+    "half a width": (configure(widths=[16.5]), "incomplete.*16.5"),
+    "widths that are one number": (configure(widths=16), "incomplete.*'widths'"),
+    "sizes beyond memory": (configure(latent=10**8, widths=[10**6, 10**6]), "do not fit its header"),
+    "sizes beyond all memory": (configure(latent=10**9, widths=[10**18, 10**18]), "incomplete.*RuntimeError"),
+    "sizes beyond all integers": (configure(widths=[10**30]), "incomplete"),
+    "a scheme that is a list": (configure(scheme=["verlet"]), "incomplete.*'scheme'"),
     "an unknown setting": (configure(temperature=1), "incomplete.*temperature"),
     "an impossible setting": (configure(latent=-1), "latent"),
     "a setting of another type": (configure(latent="many"), "incomplete"),
     "an unknown scheme": (configure(scheme="magic"), "'magic'"),
     "an unknown fabric": (set_header("fabric", {"name": "f", "density": -1.0}), "density = -1.0"),
+    "a density in words": (set_header("fabric", {"name": "f", "density": "1"}), "incomplete.*'density'"),
+    "a fabric of no name": (set_header("fabric", {"name": None}), "incomplete.*'name'"),
+    "provenance is a list": (set_header("provenance", [1]), r"incomplete.*'provenance' is \[1\], which is no dict"),
+    "a joint that is a number": (set_header("joint_names", ["a", 7, "b"]), "incomplete.*7, which is no str"),
+    "joints that are one word": (set_header("joint_names", "abc"), "incomplete.*'joint_names'"),
+    "a path that is a number": (
+        set_header("paths", {"skeleton": "/a", "garment": 3, "rig": "/c"}),
+        "incomplete.*3, which is no str",
+    ),
     "fabric is a word": (set_header("fabric", "silk"), "incomplete"),
     "a cycle of joints": (set_tensor("scene.skeleton.parents", [1, 2, 0]), "stands before its parent"),
     "too few parents": (set_tensor("scene.skeleton.parents", [-1]), "1 parents for 3 joints"),
@@ -195,6 +221,7 @@ DAMAGE = {
     "weights without indices": (set_tensor("scene.rig.indices", [[0]]), "indices of shape"),
     "weights on no joint": (set_tensor("scene.rig.indices", np.full((60, 2), 77)), "outside 0 to 4"),
     "descriptors of no joint": (set_tensor("joints", [7]), "0 to 2"),
+    "descriptors of joints in a table": (set_tensor("joints", [[0], [1], [2]]), "0 to 2"),
     "descriptors of part of a joint": (set_tensor("joints", [0.5]), "0 to 2"),
     "proxies before their parents": (set_tensor("scene.rig.parents", [4, 1]), "before its parent"),
     "bind transforms that scale": (

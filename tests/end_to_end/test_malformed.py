@@ -531,9 +531,15 @@ MODELS = [
         ),
     ),
     Case(
+        "model whose provenance is a list",
+        BAKE,
+        ("model.safetensors", "'provenance' is [1]"),
+        tensors("model.safetensors", lambda values, document: document.update(provenance=[1])),
+    ),
+    Case(
         "model of mismatched sizes",
         BAKE,
-        ("do not fit",),
+        ("model.safetensors", "do not fit"),
         tensors("model.safetensors", lambda values, document: document["config"].update(latent=9)),
     ),
     Case(
