@@ -19,7 +19,8 @@ WRITABLE = "choose an output folder that exists and that you may write to"
 def replacing(target: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside `target`; rename it onto `target` on success, remove it on failure.
 
-    The temporary name keeps the suffix of `target`, because USD chooses the file format by it.
+    The temporary name keeps the suffix of `target`, because USD chooses the file format by it. Errors raised
+    meanwhile that name the temporary file name `target` instead: nobody knows the other.
 
     Raises:
         SsilkError: `target` cannot be written (no such folder, no permission, no space).
@@ -38,6 +39,8 @@ def replacing(target: str | Path) -> Iterator[Path]:
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)
         temporary.replace(target)
+    except SsilkError as error:
+        raise type(error)(str(error).replace(str(temporary), str(target))) from error
     except OSError as error:
         raise SsilkError(
             f"{target}: writing failed ({error.strerror or error}); free some space or choose another output."

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from ssilk_core.config import PRESETS, preset_named
 from ssilk_core.errors import EXIT_BAD_INPUT, EXIT_OK, need
 from ssilk_core.events import Reporter, Result, silent
+from ssilk_core.files import replacing
 
 from . import options as shared
 
@@ -50,7 +51,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     world, repaired = _world(options, report), None
     if options.fix:
         repaired = _fix(options, world)
-        world = _world(_moved(options), silent)
+        world = _world(_moved(options, options.fix), silent)
     findings = inspect(world)
     if options.json:
         detail = {"fixed": {"output": str(options.fix), "repaired": repaired}} if options.fix else {}
@@ -103,11 +104,12 @@ def _fix(options: argparse.Namespace, world: Inspected) -> list[str]:
     need(not (options.fix.exists() and options.fix.samefile(file)), str(options.fix), "this is the file to repair",
          "--fix writes a copy", "name another file")  # fmt: skip
     shared.check_output(options.fix, options.stage)
-    # Units first: everything else is measured in them.
-    write_with_units(file, options.fix, units)
-    world = _world(_moved(options), silent)
-    repair = plan_repair(world.character, world.garment, world.rig, topology=not world.locked)
-    write_repaired(options.fix, options.fix, repair, garment=prim, root=options.root)
+    with replacing(options.fix) as half_done:
+        # Units first: everything else is measured in them.
+        write_with_units(file, half_done, units)
+        world = _world(_moved(options, half_done), silent)
+        repair = plan_repair(world.character, world.garment, world.rig, topology=not world.locked)
+        write_repaired(half_done, half_done, repair, garment=prim, root=options.root)
     return [*stated, *repair.done]
 
 
@@ -124,8 +126,8 @@ def _corrected_units(world: Inspected) -> tuple[StageUnits, list[str]]:
     return StageUnits(units.meters_per_unit, units.up_axis), told
 
 
-def _moved(options: argparse.Namespace) -> argparse.Namespace:
-    """Return the options with the repaired copy in place of the file that it was made from."""
+def _moved(options: argparse.Namespace, copy: Path) -> argparse.Namespace:
+    """Return the options with a repaired copy in place of the file that it was made from."""
     file, prim = shared.wardrobe(options)
-    own = {} if file == options.stage else {"garment": f"{options.fix}:{prim}" if prim else str(options.fix)}
-    return argparse.Namespace(**{**vars(options), **(own or {"stage": options.fix})})
+    own = {} if file == options.stage else {"garment": f"{copy}:{prim}" if prim else str(copy)}
+    return argparse.Namespace(**{**vars(options), **(own or {"stage": copy})})

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from ssilk_core.errors import SsilkError
+from ssilk_core.errors import SsilkError, VerificationError
 from ssilk_core.files import need_writable, replacing, sha256
 
 
@@ -73,3 +73,11 @@ def test_sha256_is_that_of_the_bytes(tmp_path):
     content = os.urandom((1 << 20) + 17)
     (tmp_path / "a").write_bytes(content)
     assert sha256(tmp_path / "a") == hashlib.sha256(content).hexdigest()
+
+
+def test_errors_name_the_target_however_deep_they_come_from(tmp_path):
+    target = tmp_path / "shot.usda"
+    with pytest.raises(VerificationError) as caught, replacing(target) as outer, replacing(outer) as inner:
+        raise VerificationError(f"{inner}: vertex 3 is off, and {inner}:/Hero too.")
+    assert str(caught.value) == f"{target}: vertex 3 is off, and {target}:/Hero too."
+    assert not list(tmp_path.iterdir())

@@ -103,6 +103,20 @@ def test_a_damaged_garment_is_repaired_and_then_passes(tmp_path, capsys):
     assert [file.name for file in sorted(tmp_path.iterdir())] == ["hero.usda", "out.usdc", "tube.usda"]
 
 
+def test_a_repair_that_fails_halfway_leaves_the_older_copy(tmp_path, capsys):
+    """The garment has an odd primvar, which only the second half of the repair meets."""
+    hero, cloth = write_hero(tmp_path / "hero.usda"), write_damaged(tmp_path / "tube.usda")
+    stage = Usd.Stage.Open(str(cloth))
+    primvars = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/Tube"))
+    primvars.CreatePrimvar("dye", Sdf.ValueTypeNames.FloatArray, "vertex").Set([1.0, 2.0])
+    stage.GetRootLayer().Save()
+    out = tmp_path / "out.usda"
+    out.write_text("older")
+    assert main(["inspect", str(hero), "--garment", str(cloth), "--fix", str(out)]) == 2
+    assert "dye" in capsys.readouterr().err
+    assert out.read_text() == "older" and len(list(tmp_path.iterdir())) == 3
+
+
 def test_findings_are_printed_for_people(tmp_path, capsys):
     hero, cloth = write_hero(tmp_path / "hero.usda"), write_damaged(tmp_path / "tube.usda")
     assert main(["inspect", str(hero), "--garment", f"{cloth}:/Tube"]) == 2
