@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import torch
@@ -12,35 +11,52 @@ from ..assets import Scene
 from ..config import ModelConfig, TrainConfig
 
 SHARE = 0.8  # of the free memory that a training may plan for
+UNKNOWN = 8 << 30  # bytes that are planned for where the system cannot be asked portably
+MEMINFO = Path("/proc/meminfo")
+CONTAINER = Path("/sys/fs/cgroup")
+# Limit, usage, statistics and the name of reclaimable cache in them, for versions 2 and 1 of control groups.
+CONTROL_GROUPS = (
+    ("memory.max", "memory.current", "memory.stat", "inactive_file"),
+    ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "memory/memory.stat", "total_inactive_file"),
+)
 
 
 def free_memory(device: torch.device) -> int:
     """Return the bytes that can still be had on a device; on the CPU the container's limit counts."""
     if device.type == "cuda":
         return int(torch.cuda.mem_get_info(device)[0])
-    if device.type != "cpu":
-        return 8 << 30  # no portable question exists for other devices
-    pages = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 8 << 30
-    try:
-        meminfo = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
-        pages = int(meminfo["MemAvailable"].split()[0]) * 1024
-    except (OSError, KeyError):
-        return pages
-    return pages
+    if device.type != "cpu" or not MEMINFO.is_file():
+        return UNKNOWN
+    machine = int(_numbers(MEMINFO)["MemAvailable:"]) * 1024
+    left = (_left_in_container(*names) for names in CONTROL_GROUPS if (CONTAINER / names[0]).is_file())
+    return int(min([machine, *left]))
+
+
+def _left_in_container(limit: str, usage: str, statistics: str, cache: str) -> float:
+    """Return the bytes under a control group's limit, counting file cache that the kernel would give up as free."""
+    most = (CONTAINER / limit).read_text().strip()
+    if most == "max":
+        return float("inf")
+    stat = CONTAINER / statistics
+    reclaimable = int(_numbers(stat).get(cache, 0)) if stat.is_file() else 0
+    return max(0, int(most) - int((CONTAINER / usage).read_text()) + reclaimable)
+
+
+def _numbers(path: Path) -> dict[str, str]:
+    """Return the second word of each line by its first."""
+    return {words[0]: words[1] for line in path.read_text().splitlines() if len(words := line.split()) > 1}
 
 
 def step_memory(scene: Scene, config: ModelConfig, frames: int, body_vertices: int) -> int:
     """Predict the bytes that one training step holds at its peak, for `frames` decoded at once.
 
-    Counts the float32 numbers that the backward pass keeps for each vertex, triangle, hinge and joint; the
-    constants were fitted to measured peaks (benchmarks/memory.py).
+    Counts float32 numbers for each frame and vertex, body vertex, joint and unit of the network, and one table of
+    squared distances; the constants were fitted to measured peaks, on the safe side (benchmarks/memory.py).
     """
-    mesh = scene.garment.mesh
-    vertices, faces = mesh.vertex_count, len(mesh.faces)
-    joints = len(scene.joint_names)
-    numbers = 60 * vertices + 26 * faces + 42 * (faces * 3 // 2) + 60 * joints + 30 * body_vertices
-    network = 40 * sum(config.widths) + 20 * config.latent
-    return 4 * frames * (numbers + network) + (256 << 20)
+    vertices = scene.garment.mesh.vertex_count
+    numbers = 225 * vertices + 22 * body_vertices + 60 * len(scene.joint_names)
+    network = 12 * sum(config.widths) + 20 * config.latent
+    return 4 * frames * (numbers + network) + 4 * vertices * body_vertices + (40 << 20)
 
 
 def decoded_frames(config: TrainConfig, batch: int) -> int:

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Memory is predicted before it is used, and batches are lowered until they fit."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from ssilk_core.config import ModelConfig, TrainConfig
+from ssilk_core.training import memory
+from ssilk_core.training.memory import SHARE, decoded_frames, fitting_batch, free_memory, step_memory
+
+MODEL, CONFIG = ModelConfig(), TrainConfig(batch=32, window=16, warm_batch=700)
+
+
+def test_more_of_anything_needs_more(scene):
+    base = step_memory(scene, MODEL, 64, 1000)
+    assert step_memory(scene, MODEL, 65, 1000) > base
+    assert step_memory(scene, MODEL, 64, 1001) > base
+    assert step_memory(scene, replace(MODEL, widths=(256, 512, 513)), 64, 1000) > base
+
+
+def test_frames_cost_the_same_each(scene):
+    costs = [step_memory(scene, MODEL, frames, 1000) for frames in (0, 10, 20)]
+    assert costs[2] - costs[1] == costs[1] - costs[0] > 10 * 4 * 3 * 60  # the positions alone
+
+
+def test_the_larger_phase_counts():
+    assert decoded_frames(CONFIG, 32) == 700
+    assert decoded_frames(CONFIG, 64) == 1024
+    assert decoded_frames(replace(CONFIG, warm=0.0), 32) == 512
+
+
+def test_what_fits_is_left_as_it_is(scene):
+    assert fitting_batch(scene, MODEL, CONFIG, 1000, 1 << 40) == (32, 700)
+
+
+@pytest.mark.parametrize("megabytes", [150, 200, 300])
+def test_a_lowered_batch_fits_and_one_more_would_not(scene, megabytes):
+    available = megabytes << 20
+    config = replace(CONFIG, batch=10_000, warm_batch=100_000)
+    batch, warm = fitting_batch(scene, MODEL, config, 1000, available)
+    assert 1 < batch < 10_000 and 1 < warm < 100_000
+    assert step_memory(scene, MODEL, max(batch * 16, warm), 1000) <= SHARE * available
+    assert step_memory(scene, MODEL, (batch + 1) * 16, 1000) > SHARE * available
+    assert step_memory(scene, MODEL, warm + 1, 1000) > SHARE * available
+
+
+def test_at_least_one_window_is_trained_on(scene):
+    assert fitting_batch(scene, MODEL, CONFIG, 1000, 1 << 20) == (1, 1)
+
+
+def test_free_memory_is_within_the_machine():
+    total = int(Path("/proc/meminfo").read_text().split()[1]) * 1024 if Path("/proc/meminfo").exists() else 1 << 50
+    assert 0 < free_memory(torch.device("cpu")) <= total
+
+
+@pytest.mark.parametrize(
+    "files, expected",
+    [
+        ({"memory.max": "3000000\n", "memory.current": "1000000\n"}, 2_000_000),
+        (
+            {
+                "memory.max": "3000000\n",
+                "memory.current": "1000000\n",
+                "memory.stat": "anon 5\ninactive_file 400000\n",
+            },
+            2_400_000,
+        ),
+        ({"memory.max": "1000\n", "memory.current": "5000\n"}, 0),
+        ({"memory.max": "max\n", "memory.current": "1000000\n"}, None),
+        ({"memory/memory.limit_in_bytes": "3000000\n", "memory/memory.usage_in_bytes": "500000\n"}, 2_500_000),
+        ({}, None),
+    ],
+)
+def test_the_limit_of_a_container_counts(tmp_path, monkeypatch, files, expected):
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    unlimited = free_memory(torch.device("cpu"))
+    monkeypatch.setattr(memory, "CONTAINER", tmp_path)
+    found = free_memory(torch.device("cpu"))
+    assert found == expected if expected is not None else found > min(unlimited, 1 << 28) // 2
