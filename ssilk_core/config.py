@@ -33,7 +33,6 @@ class ModelConfig:
         bound: soft bound on each latent dimension; zero leaves the latents free, as the paper does.
         push: soft bound on what S and the spring add to each dimension in one step; zero for none.
         stiffness: largest spring constant of "spring_verlet", in (0, 1].
-        smoothing: strength of the Laplacian preconditioner of the blendshapes; zero trains each vertex by itself.
         fps: rate at which the model steps [1/s].
     """
 
@@ -44,7 +43,6 @@ class ModelConfig:
     bound: float = 4.0
     push: float = 0.15
     stiffness: float = 0.2
-    smoothing: float = 0.0
     fps: float = 30.0
 
     def __post_init__(self) -> None:
@@ -57,7 +55,7 @@ class ModelConfig:
         )
         need(min(self.widths) > 0, "model", f"widths = {self.widths}", "each is at least 1")
         _need_between(self, 1, MOST, "latent", "fps")
-        _need_between(self, 0, MOST, "shapes", "bound", "push", "smoothing")
+        _need_between(self, 0, MOST, "shapes", "bound", "push")
         _need_between(self, 1e-6, 1, "stiffness")
 
 
@@ -124,12 +122,11 @@ class TrainConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class Preset:
-    """A model and a schedule under one name, with the proxies that the automatic rig gets."""
+    """A model and a schedule under one name."""
 
     name: str
     model: ModelConfig
     train: TrainConfig
-    proxies: int = 20
 
 
 PRESETS = {

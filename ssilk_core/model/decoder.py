@@ -16,7 +16,6 @@ import torch
 from torch import Tensor, nn
 
 from ..assets import PINNED, Scene
-from ..mesh import topology
 
 
 def rotation_from_six_d(values: Tensor) -> Tensor:
@@ -53,9 +52,8 @@ class Decoder(nn.Module):
     logits: Tensor
     order: Tensor
     identity: Tensor
-    smoother: Tensor
 
-    def __init__(self, scene: Scene, shapes: int, smoothing: float, generator: torch.Generator) -> None:
+    def __init__(self, scene: Scene, shapes: int, generator: torch.Generator) -> None:
         super().__init__()
         rig = scene.rig
         self.proxy_count, self.shape_count = rig.proxy_count, shapes
@@ -74,9 +72,6 @@ class Decoder(nn.Module):
         self._constant_levels(scene)
         self.skin_offset = nn.Parameter(torch.zeros(len(free), support.shape[1]))
         self.shapes = nn.Parameter(1e-3 * torch.randn(len(free), 3, shapes, generator=generator))
-        self.smoothing = smoothing
-        if smoothing:
-            self._constant("smoother", _smoother(scene, free, smoothing))
 
     def _constant(self, name: str, values: np.ndarray) -> None:
         """Register a constant that is rebuilt from the scene, hence not saved; floats become float32."""
@@ -111,12 +106,6 @@ class Decoder(nn.Module):
         delta = output[:, self.shape_count :].T.reshape(self.proxy_count, 6, len(output))
         return a, rotation_from_six_d(self.identity[:, None] + delta)
 
-    def blendshapes(self) -> Tensor:
-        """Return B (free vertices, 3, K) [m]; with smoothing, B = (I + s L)^-1 U and U is what is trained."""
-        if not self.smoothing:
-            return self.shapes
-        return (self.smoother @ self.shapes.flatten(1)).reshape(self.shapes.shape)
-
     def skin_weights(self) -> Tensor:
         """Return dense weights (V, used joints): a softmax over each vertex's support, pinned rows frozen."""
         logits = self.logits.index_add(0, self.free, self.skin_offset)
@@ -146,17 +135,6 @@ class Decoder(nn.Module):
         blended = (self.skin_weights() @ flat).reshape(-1, 3, 4, character.shape[-1])
         canonical = self.rest[:, :, None]
         if self.shape_count:
-            offsets = (self.blendshapes().flatten(0, 1) @ activation).reshape(len(self.free), 3, activation.shape[1])
+            offsets = (self.shapes.flatten(0, 1) @ activation).reshape(len(self.free), 3, activation.shape[1])
             canonical = canonical.expand(-1, -1, offsets.shape[-1]).index_add(0, self.free, offsets)
         return (blended[:, :, :3] * canonical[:, None]).sum(2) + blended[:, :, 3]
-
-
-def _smoother(scene: Scene, free: np.ndarray, smoothing: float) -> np.ndarray:
-    """Return (I + s L)^-1 over the free vertices, L the graph Laplacian with pinned neighbours held at zero."""
-    pairs = topology.edges(scene.garment.mesh.faces)
-    count = scene.garment.mesh.vertex_count
-    laplacian = np.zeros((count, count))
-    laplacian[pairs[:, 0], pairs[:, 1]] = laplacian[pairs[:, 1], pairs[:, 0]] = -1
-    np.fill_diagonal(laplacian, -laplacian.sum(1))
-    inner = laplacian[np.ix_(free, free)]
-    return np.linalg.inv(np.eye(len(free)) + smoothing * inner)

@@ -46,7 +46,7 @@ class GarmentModel(nn.Module):
         super().__init__()
         self.scene, self.config, self.joints = scene, config, np.asarray(joints, dtype=np.int64)
         generator = torch.Generator().manual_seed(seed)
-        self.decoder = Decoder(scene, config.shapes, config.smoothing, generator)
+        self.decoder = Decoder(scene, config.shapes, generator)
         static, dynamic = self._descriptor_sizes()
         z = config.latent
         self.initialiser = mlp(static, config.widths, z, generator, 1.0)
@@ -87,7 +87,7 @@ class GarmentModel(nn.Module):
         dense = np.zeros((scene.garment.mesh.vertex_count, len(scene.joint_names)))
         dense[:, decoder.used.cpu().numpy()] = decoder.skin_weights().double().cpu().numpy()
         skin = SkinWeights.from_dense(scene.rig.path, dense)
-        free = decoder.blendshapes().double().permute(2, 0, 1).cpu().numpy()
+        free = decoder.shapes.double().permute(2, 0, 1).cpu().numpy()
         shapes = np.zeros((decoder.shape_count, scene.garment.mesh.vertex_count, 3))
         shapes[:, decoder.free.cpu().numpy()] = 2 * free
         if decoder.shape_count:

@@ -13,7 +13,6 @@ from ssilk_core.assets import Character, Garment, Motion, ProxyRig, Scene
 from ssilk_core.config import Preset
 from ssilk_core.errors import SsilkError
 from ssilk_core.setup.prepare import prepare_scene
-from ssilk_core.setup.rig import RigOptions
 
 from . import cost, fit, hold, motion, pose, units, winding
 from . import mesh as meshes
@@ -133,9 +132,7 @@ def _on_scene(world: Inspected, blocked: bool) -> Findings:
         if any(hold.unheld_islands(garment.mesh, garment.classes)):
             return
     try:
-        scene = prepare_scene(
-            world.character, garment, world.rig, rig_options=RigOptions(proxies=world.preset.proxies)
-        )
+        scene = prepare_scene(world.character, garment, world.rig)
     except SsilkError as error:
         yield Finding(severity="error", code="not-riggable", prim=garment.mesh.path, found=str(error))
         return
