@@ -2,7 +2,8 @@
 """Bake a trained garment over a motion as one UsdSkel shot, and prove it by re-skinning the file.
 
 The shot holds joints, blendshapes and their animation, no vertex caches. --plain bakes the same garment under
-plain skinning, to compare with.
+plain skinning, to compare with. A shot that fails the proof (exit code 3) is not kept, and an older file of its name
+stays as it was.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from pathlib import Path
 
 from ssilk_core.errors import EXIT_OK
 from ssilk_core.events import Message, Reporter, Result, Started
+from ssilk_core.files import replacing
 
 from .options import INPUTS, check_output
 
@@ -59,16 +61,20 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         )
     )
     report(Started("bake", bake.motion.frame_count, {"output": str(options.output)}))
-    summary = write_shot(
-        options.output,
-        bake.deformer,
-        bake.motion,
-        bake.poses(),
-        units=bake.units,
-        start=bake.motion.start,
-        include_body=not options.no_body,
-        provenance={**bake.provenance, "beside": _beside(options)},
-    )
+    with replacing(options.output) as unproven:
+        summary = write_shot(
+            unproven,
+            bake.deformer,
+            bake.motion,
+            bake.poses(),
+            units=bake.units,
+            start=bake.motion.start,
+            include_body=not options.no_body,
+            provenance={**bake.provenance, "beside": _beside(options)},
+        )
+        if options.no_verify:
+            report(Message("not verified, as asked", "warning"))
+        proof = {} if options.no_verify else bake.verify(unproven, report)
     detail: dict[str, object] = {
         "shot": str(options.output),
         "frames": summary.frame_count,
@@ -77,10 +83,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         "proxies": summary.proxy_count,
         "blendshapes": summary.shape_count,
         "bytes": options.output.stat().st_size,
+        **proof,
     }
-    if options.no_verify:
-        report(Message("not verified, as asked", "warning"))
-    else:
-        detail |= bake.verify(options.output, report)
     report(Result("bake", detail))
     return EXIT_OK

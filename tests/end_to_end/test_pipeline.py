@@ -18,7 +18,7 @@ import torch
 from pxr import Gf, Usd, UsdSkel, Vt
 
 from ssilk_core.checkpoint import load_model
-from ssilk_core.cli import main
+from ssilk_core.cli import _baking, main
 
 EVENTS = {"started", "progress", "message", "checkpoint", "result", "failed"}
 SHOT = "bake model.safetensors --stage rigged.usda --motion clip.usda"
@@ -142,6 +142,19 @@ def test_a_tampered_rotation_fails_verification(world, capsys):
     capsys.readouterr()
     assert run("verify shot.usda") == 3
     assert "at time code 12" in capsys.readouterr().err
+
+
+def test_a_shot_that_fails_its_proof_is_not_kept(world, monkeypatch, capsys):
+    """The decoder is moved by 1 cm, so that no written file agrees with it."""
+    honest = _baking.Bake._decoded
+    monkeypatch.setattr(_baking.Bake, "_decoded", lambda bake, pose: honest(bake, pose) + 0.01)
+    Path("shots").mkdir()
+    Path("shots/shot.usdc").write_text("older")
+    capsys.readouterr()
+    assert run(f"{SHOT} -o shots/shot.usdc") == 3
+    assert "error: shots/shot.usdc: vertex" in capsys.readouterr().err
+    assert Path("shots/shot.usdc").read_text() == "older"
+    assert [path.name for path in Path("shots").iterdir()] == ["shot.usdc"]
 
 
 def test_a_shot_is_verified_wherever_its_folder_goes(world, tmp_path, monkeypatch):
