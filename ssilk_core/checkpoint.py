@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -233,8 +233,7 @@ def _need_fit(model: ModelFile) -> None:
     from .model.network import GarmentModel
 
     with torch.device("meta"):
-        # Smoothing has no parameters of its own, but takes the square of the garment's size in memory.
-        empty = GarmentModel(model.scene, replace(model.config, smoothing=0.0), model.joints)
+        empty = GarmentModel(model.scene, model.config, model.joints)
     expected = {name: tuple(value.shape) for name, value in empty.state_dict().items()}
     found = {name: value.shape for name, value in model.parameters.items()}
     odd = next((name for name in {**expected, **found} if expected.get(name) != found.get(name)), "")

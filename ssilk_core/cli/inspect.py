@@ -129,5 +129,5 @@ def _corrected_units(world: Inspected) -> tuple[StageUnits, list[str]]:
 def _moved(options: argparse.Namespace, copy: Path) -> argparse.Namespace:
     """Return the options with a repaired copy in place of the file that it was made from."""
     file, prim = shared.wardrobe(options)
-    own = {} if file == options.stage else {"garment": f"{copy}:{prim}" if prim else str(copy)}
+    own: dict[str, object] = {} if file == options.stage else {"garment": f"{copy}:{prim}" if prim else str(copy)}
     return argparse.Namespace(**{**vars(options), **(own or {"stage": copy})})
