@@ -109,7 +109,7 @@ def open_bake(request: BakeRequest) -> Bake:
     """
     from ssilk_usd.read_character import read_character
     from ssilk_usd.read_motion import read_motion
-    from ssilk_usd.read_stage import open_stage
+    from ssilk_usd.read_stage import open_stage, split_location
     from ssilk_usd.units import StageUnits
 
     from ssilk_core.checkpoint import load_model, network
@@ -130,7 +130,7 @@ def open_bake(request: BakeRequest) -> Bake:
     provenance = {
         "request": {key: value for key, value in vars(request).items() if value is not None},
         "model_sha256": sha256(request.model),
-        "motion_sha256": sha256(request.motion),
+        "motion_sha256": sha256(split_location(request.motion)[0]),
         "training": file.provenance.get("ssilk", ""),
     }
     return Bake(request, model, deformer, motion, source, StageUnits.of(stage), provenance)

@@ -23,7 +23,13 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
     verb.add_argument("model", type=Path, help="model written by 'ssilk train'")
     verb.add_argument("--stage", type=Path, required=True, help="USD file with the character")
-    verb.add_argument("--motion", type=Path, required=True, metavar="SHOT", help="USD file with the motion")
+    verb.add_argument(
+        "--motion",
+        type=Path,
+        required=True,
+        metavar="SHOT[:/PRIM]",
+        help="USD file with the motion; PRIM is the SkelAnimation, where there are several",
+    )
     verb.add_argument("-o", "--output", type=Path, required=True, help="shot to write (.usdc, .usd or .usda)")
     verb.add_argument("--fps", type=float, help="frames per second of the shot (default: the motion's)")
     verb.add_argument("--root", metavar="PRIM", help="SkelRoot of the character, where the stage has several")
@@ -44,11 +50,12 @@ def _beside(options: argparse.Namespace) -> dict[str, str]:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Bake and verify."""
+    from ssilk_usd.read_stage import split_location
     from ssilk_usd.shot import write_shot
 
     from ._baking import BakeRequest, open_bake
 
-    check_output(options.output, options.model, options.stage, options.motion)
+    check_output(options.output, options.model, options.stage, split_location(str(options.motion))[0])
     bake = open_bake(
         BakeRequest(
             model=str(options.model),

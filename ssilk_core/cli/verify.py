@@ -53,9 +53,13 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
 def _found(shot: Path, name: str, provenance: dict[str, Any]) -> str:
     """Return where an input of the bake lies: where it lay then, or else where it lay as seen from the shot."""
+    from ssilk_usd.read_stage import split_location
+
     path = Path(provenance["request"][name])
     beside = shot.parent / provenance.get("beside", {}).get(name, path)
-    there = next((candidate for candidate in (path, beside) if candidate.exists()), None)
+    there = next(
+        (candidate for candidate in (path, beside) if Path(split_location(str(candidate))[0]).exists()), None
+    )
     if there is None:
         fail(str(shot), f"the {name} that it was baked from is not at {path}", f"--{name} says where it lies now")
     return str(there)

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from pxr import Gf, Usd, UsdSkel, Vt
+from pxr import Gf, Sdf, Usd, UsdSkel, Vt
 
 from ssilk_core.checkpoint import load_model
 from ssilk_core.cli import _baking, main
@@ -142,6 +142,23 @@ def test_a_tampered_rotation_fails_verification(world, capsys):
     capsys.readouterr()
     assert run("verify shot.usda") == 3
     assert "at time code 12" in capsys.readouterr().err
+
+
+def test_of_several_animations_one_is_named(world, tmp_path):
+    """It is verified where its folder goes too, and its file is never overwritten."""
+    layer = Sdf.Layer.FindOrOpen("clip.usda")
+    Sdf.CopySpec(layer, "/Clip", layer, "/Other")
+    layer.Export("clips.usda")
+    Path("shots").mkdir()
+    named = SHOT.replace("clip.usda", f"{tmp_path}/clips.usda:/Other")
+    assert run(SHOT.replace("clip", "clips") + " -o shots/shot.usdc") == 2
+    assert run(f"{named} -o clips.usda") == 2
+    assert run(f"{named} -o shots/shot.usdc") == 0
+    Path("moved").mkdir()
+    for name in ("clips.usda", "shots"):
+        Path(name).rename(f"moved/{name}")
+    assert run("verify moved/shots/shot.usdc") == 0
+    assert run("inspect rigged.usda --motion moved/clips.usda:/Clip") == 0
 
 
 def test_a_shot_that_fails_its_proof_is_not_kept(world, monkeypatch, capsys):

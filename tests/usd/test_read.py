@@ -10,7 +10,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from scipy.spatial.transform import Rotation
 from ssilk_usd.read_character import read_character
 from ssilk_usd.read_garment import read_garment
-from ssilk_usd.read_motion import read_motion, read_motions
+from ssilk_usd.read_motion import motion_files, read_motion, read_motions
 from ssilk_usd.read_polygons import triangulate
 from ssilk_usd.read_scene import read_scene
 
@@ -529,6 +529,26 @@ def test_joints_are_matched_by_leaf_name_and_lacking_ones_rest():
         np.testing.assert_allclose(world[:, joint], SKELETON.rest_transforms[[joint, joint]], atol=1e-9)
     turned_by = Rotation.from_quat(motion.rotations[1][[0, 1, 3]][:, [1, 2, 3, 0]]).magnitude()
     np.testing.assert_allclose(np.degrees(turned_by), 60, atol=1e-4)
+
+
+def two_clips(path: Path) -> Path:
+    one, other = clip(JOINTS, {0: 0, 1: 60}), clip(JOINTS, {5: 0, 7: 60})
+    Sdf.CopySpec(other.GetRootLayer(), "/Clip", one.GetRootLayer(), "/Other")
+    one.GetRootLayer().Export(str(path))
+    return path
+
+
+def test_of_several_animations_one_is_named_with_the_file(tmp_path):
+    path = two_clips(tmp_path / "two.usda")
+    with pytest.raises(
+        SsilkError, match=f"several animations: /Clip, /Other; one is read; name one, such as {path}:/Clip"
+    ):
+        read_motion(path, SKELETON)
+    motions = read_motions([f"{path}:/Other", Path(f"{path}:/Clip")], SKELETON)
+    assert [(motion.path, motion.start) for motion in motions] == [(f"{path}:/Other", 5), (f"{path}:/Clip", 0)]
+    assert motion_files([Path(f"{path}:/Other"), tmp_path]) == [path, path]
+    with pytest.raises(SsilkError, match="no SkelAnimation is named '/Hat'"):
+        read_motion(f"{path}:/Hat", SKELETON)
 
 
 def test_motion_file_in_other_units_and_axes():

@@ -26,6 +26,7 @@ from .read_stage import (
     named,
     needs_whole_files,
     open_stage,
+    split_location,
     world_matrix,
 )
 from .units import StageUnits
@@ -35,16 +36,21 @@ _MOST_FRAMES = 1_000_000
 
 
 def read_motions(paths: Iterable[str | Path], skeleton: Skeleton) -> list[Motion]:
-    """Read several motions; a folder stands for all USD files in it, by name.
+    """Read several motions, "file[:/Prim/Path]" each; a folder stands for all USD files in it, by name.
 
     Raises:
         SsilkError: a folder without USD files, or any of `read_motion`.
     """
-    return [read_motion(path, skeleton) for path in motion_files(paths)]
+    return [read_motion(path, skeleton) for path in _listed_folders(paths)]
 
 
 def motion_files(paths: Iterable[str | Path]) -> list[Path]:
-    """Return the files that files and folders stand for, folders sorted by name."""
+    """Return the files that motions are read from, folders sorted by name."""
+    return [Path(split_location(str(path))[0]) for path in _listed_folders(paths)]
+
+
+def _listed_folders(paths: Iterable[str | Path]) -> list[Path]:
+    """Return the paths with the USD files of a folder in its place."""
     files: list[Path] = []
     for path in map(Path, paths):
         within = sorted(file for file in path.iterdir() if file.suffix in USD_SUFFIXES) if path.is_dir() else [path]
@@ -62,7 +68,7 @@ def read_motion(source: StageLike, skeleton: Skeleton, *, prim: str | None = Non
     then by unique leaf names; joints that the animation lacks stay at rest.
 
     Args:
-        source: a file with a SkelAnimation, or a stage with an animated character.
+        source: a file with a SkelAnimation, as "file[:/Prim/Path]", or a stage with an animated character.
         skeleton: whose joints the motion is for.
         prim: the SkelAnimation, by path or name, where there are several.
         root: the character, where several are animated.
@@ -70,6 +76,9 @@ def read_motion(source: StageLike, skeleton: Skeleton, *, prim: str | None = Non
     Raises:
         SsilkError: no or several animations, an animation of another skeleton, scales, or malformed data.
     """
+    if not isinstance(source, Usd.Stage):
+        source, asked = split_location(str(source))
+        prim = prim or asked
     stage = open_stage(source)
     animation, placed = _find_animation(stage, prim, root)
     where = location(animation)
@@ -109,7 +118,13 @@ def _find_animation(stage: Usd.Stage, prim: str | None, root: str | None) -> tup
         f"a motion is a SkelAnimation; there are {listed(every)}",
         "export the animation, or name another prim",
     )
-    need(len(found) == 1, where, f"there are several animations: {listed(found)}", "one is read", "name one")
+    need(
+        len(found) == 1,
+        where,
+        f"there are several animations: {listed(found)}",
+        "one is read",
+        f"name one, such as {where}:{found[0].GetPath()}",
+    )
     return found[0], bound.get(found[0])
 
 
