@@ -23,13 +23,13 @@ from torch import Tensor
 from ssilk_core import __version__
 from ssilk_core.assets import Motion, Scene
 from ssilk_core.checkpoint import ModelFile, load_model, network
+from ssilk_core.devices import chosen_device, device_name
 from ssilk_core.energy import GarmentEnergy
 from ssilk_core.errors import need
 from ssilk_core.files import replacing
 from ssilk_core.model.body import CollisionBody
 from ssilk_core.model.network import GarmentModel
 from ssilk_core.training.bank import build_bank
-from ssilk_core.training.run import chosen_device, device_name
 from ssilk_core.training.validation import Validator
 
 RESULTS = Path(__file__).parent / "results"

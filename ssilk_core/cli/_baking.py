@@ -113,8 +113,8 @@ def open_bake(request: BakeRequest) -> Bake:
     from ssilk_usd.units import StageUnits
 
     from ssilk_core.checkpoint import load_model, network
+    from ssilk_core.devices import chosen_device
     from ssilk_core.files import sha256
-    from ssilk_core.training.run import chosen_device
 
     device = chosen_device(request.device)
     file = load_model(request.model)

@@ -34,8 +34,8 @@ def training_cost(scene: Scene, motions: Sequence[Motion], preset: Preset) -> Fi
 
 def memory(scene: Scene, preset: Preset, body_vertices: int) -> Findings:
     """Yield how much memory and time a preset takes with a garment that reaches `body_vertices`."""
+    from ssilk_core.devices import chosen_device
     from ssilk_core.training.memory import decoded_frames, fitting_batch, free_memory, step_memory
-    from ssilk_core.training.run import chosen_device
 
     model, train, device = preset.model, preset.train, chosen_device("auto")
     free = free_memory(device)

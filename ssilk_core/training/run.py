@@ -20,8 +20,9 @@ from .. import __version__
 from ..assets import Motion, Scene
 from ..checkpoint import model_file, save_model
 from ..config import ModelConfig, TrainConfig
+from ..devices import chosen_device, device_name
 from ..energy import GarmentEnergy
-from ..errors import fail, need
+from ..errors import need
 from ..events import Checkpoint, Message, Progress, Reporter, Started
 from ..fabrics import Fabric
 from ..kinematics import split_at_cuts
@@ -71,23 +72,6 @@ class Trained:
     iterations: int
     score: Score
     plain: Score
-
-
-def chosen_device(name: str) -> torch.device:
-    """Return the device that "auto" or a torch device name means.
-
-    Raises:
-        SsilkError: the device does not exist here.
-    """
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(name)
-        torch.empty(1, device=device)
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).partition("\n")[0].rstrip(".")
-        fail(f"--device {name}", f"no such device here ({reason})", "'auto', 'cpu' and 'cuda' are common")
-    return device
 
 
 def split_motions(motions: Sequence[Motion]) -> tuple[list[Motion], list[Motion]]:
@@ -245,11 +229,6 @@ class Run:
                 "validation": {**score.terms, "total": score.total, "collisions": score.collisions},
             }
         )
-
-
-def device_name(device: torch.device) -> str:
-    """Return what the hardware calls itself."""
-    return torch.cuda.get_device_name(device) if device.type == "cuda" else f"{device.type} ({platform.machine()})"
 
 
 @contextmanager

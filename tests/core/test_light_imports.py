@@ -18,11 +18,11 @@ CORE, USD = ROOT / "ssilk_core", ROOT / "usd" / "ssilk_usd"
 # From the inside out: a module imports its own layer or those before it.
 LAYERS = (
     {"errors"},
-    {"assets", "config", "fabrics", "events", "files"},
+    {"assets", "config", "devices", "fabrics", "events", "files"},
     {"mesh", "kinematics"},
     {"model", "energy"},
     {"checkpoint"},
-    {"demo", "view", "training", "rollout", "evaluation", "preflight", "setup"},
+    {"demo", "view", "training", "rollout", "preflight", "setup"},
     {"cli"},
     {"__main__"},
 )
@@ -81,6 +81,12 @@ def test_the_core_points_inward(path, package):
         assert target[0] != "ssilk_usd" or own == "cli", target
         if target[0] == "ssilk_core" and target[1] != "__version__":
             assert layer(target[1]) <= layer(own), target
+
+
+@pytest.mark.parametrize("verb", ["_baking", "bake", "verify"])
+def test_baking_needs_no_training(verb):
+    targets = imports(CORE / "cli" / f"{verb}.py", ("ssilk_core", "cli"))
+    assert not [target for target in targets if target[:2] == ("ssilk_core", "training")]
 
 
 @pytest.mark.parametrize(("path", "package"), modules(USD), ids=lambda value: getattr(value, "stem", None))

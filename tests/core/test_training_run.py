@@ -15,11 +15,12 @@ import torch
 
 from ssilk_core.checkpoint import load_model
 from ssilk_core.config import ModelConfig, TrainConfig
+from ssilk_core.devices import chosen_device
 from ssilk_core.errors import SsilkError
 from ssilk_core.events import Checkpoint, Event, Message, Progress, Started, silent
 from ssilk_core.fabrics import Fabric
 from ssilk_core.training import run as training
-from ssilk_core.training.run import TrainJob, chosen_device, interruptible, split_motions, train
+from ssilk_core.training.run import TrainJob, interruptible, split_motions, train
 from ssilk_core.training.state import state_path
 from ssilk_core.training.step import Stepper, learning_rate
 

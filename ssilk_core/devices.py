@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where networks run: devices by name."""
+
+from __future__ import annotations
+
+import platform
+from typing import TYPE_CHECKING
+
+from .errors import fail
+
+if TYPE_CHECKING:
+    import torch
+
+
+def chosen_device(name: str) -> torch.device:
+    """Return the device that "auto" or a torch device name means.
+
+    Raises:
+        SsilkError: the device does not exist here.
+    """
+    import torch
+
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.empty(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).partition("\n")[0].rstrip(".")
+        fail(f"--device {name}", f"no such device here ({reason})", "'auto', 'cpu' and 'cuda' are common")
+    return device
+
+
+def device_name(device: torch.device) -> str:
+    """Return what the hardware calls itself."""
+    import torch
+
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else f"{device.type} ({platform.machine()})"
