@@ -157,7 +157,7 @@ def test_decoded_cloth_stays_within_reach_of_what_holds_it(scene, toy_motion, to
     points, (upper, lower) = scene.garment.mesh.points, scene.rig.bind_transforms[:, :3, 3]
     free = scene.classes != 0
     play = np.zeros(60)
-    play[free] = model.decoder.blendshapes().norm(dim=1).sum(1).numpy()
+    play[free] = model.decoder.shapes.norm(dim=1).sum(1).numpy()
     # A point on the lower proxy swings about it, which swings about the upper one, which the spine carries.
     radius = np.maximum(np.linalg.norm(points - lower, axis=1) + np.linalg.norm(upper - lower), 0)
     radius = np.maximum(radius, np.linalg.norm(points - upper, axis=1)) + play

@@ -10,6 +10,7 @@ import torch
 from ssilk_core.config import SCHEMES, TrainConfig
 from ssilk_core.model.descriptors import GRAVITY
 from ssilk_core.training.objective import Objective, total
+from ssilk_core.training.step import Stepper
 from ssilk_core.training.windows import WindowSampler
 
 CONFIG = TrainConfig(batch=3, window=6, rotated=0.5, noise=0.2)
@@ -142,3 +143,18 @@ def test_static_terms_are_those_of_the_initialisers_states(objective):
 
 def test_total_is_the_mean_over_frames_of_the_sum_of_terms():
     assert total({"a": torch.tensor([1.0, 3.0]), "b": torch.tensor([10.0])}).item() == 12
+
+
+def test_a_step_weighs_every_frame_the_same(objective):
+    """Those the initialiser answers for included, and the gradient of exactly that reaches the optimiser."""
+    sampler = sampler_of(objective, replace(CONFIG, noise=0.0, clip=1e9, rate=0.0))
+    dynamic, resting, _ = objective.window(sampler, torch.zeros(2, 3, 8))
+    frames = sum(torch.cat([dynamic[name], resting[name]]).mean() for name in resting)  # terms that all frames have
+    rest = sum(dynamic[name].mean() for name in ("inertia", "drag")) * 4 / 6
+    expected = gradients(objective, frames + rest)
+    stepper = Stepper(objective.model, objective, sampler, sampler.config)
+    stepper.windows()
+    for name, value in objective.model.named_parameters():
+        assert value.grad is not None
+        np.testing.assert_allclose(value.grad, expected[name], atol=1e-5 * float(expected[name].abs().max()) + 1e-12)
+    assert stepper.terms["inertia"].item() == pytest.approx(dynamic["inertia"].mean().item(), rel=1e-5)
