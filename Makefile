@@ -25,4 +25,4 @@ $(STAMP): pyproject.toml constraints.txt
 	touch $(STAMP)
 
 clean:
-	rm -rf $(VENV) demo_out
+	rm -rf $(VENV) demo_out build ssilk.egg-info

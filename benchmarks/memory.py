@@ -162,7 +162,8 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     if options.only:
-        print(json.dumps(measure(*json.loads(options.only), torch.device(options.device))))
+        vertices, body, frames, surface = json.loads(options.only)
+        print(json.dumps(measure(vertices, body, frames, surface, torch.device(options.device))))
         return
     from subjects import table, write_results
 

@@ -47,7 +47,7 @@ class Fabric:
         )
         for item in fields(self):
             value = getattr(self, item.name)
-            if isinstance(value, float):
+            if isinstance(value, (int, float)):
                 need(
                     0 <= value < float("inf"),
                     f"fabric '{self.name}'",

@@ -16,17 +16,17 @@ from . import bake, demo, inspect, rig, train, verify, view
 
 VERBS = (inspect, rig, train, bake, verify, view, demo)
 
-# Distribution extra that brings each optional library.
+# The extra of the distribution that brings all that a verb needs.
 EXTRAS = {
-    "torch": "train",
-    "pxr": "usd",
-    "igl": "setup",
-    "scipy": "setup",
-    "trimesh": "setup",
-    "embreex": "view",
-    "imageio_ffmpeg": "view",
-    "PIL": "view",
+    "inspect": "train",
+    "rig": "setup",
+    "train": "train",
+    "bake": "bake",
+    "verify": "bake",
+    "view": "view",
+    "demo": "all",
 }
+OPTIONAL = ("torch", "pxr", "igl", "scipy", "trimesh", "embreex", "imageio_ffmpeg", "PIL")
 
 
 class Parser(argparse.ArgumentParser):
@@ -72,10 +72,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         report(Failed("interrupted; nothing half written was left behind."))
         return EXIT_INTERRUPTED
     except ModuleNotFoundError as error:
-        extra = EXTRAS.get((error.name or "").partition(".")[0])
-        if extra is None:
+        if (error.name or "").partition(".")[0] not in OPTIONAL:
             raise
-        report(Failed(f"'{options.verb}' needs {error.name}, which is not installed; pip install 'ssilk[{extra}]'."))
+        extra = EXTRAS[options.verb]
+        report(
+            Failed(f"'{options.verb}' needs {error.name}, which is not installed; install the extra ssilk[{extra}].")
+        )
         return EXIT_BAD_INPUT
     except OSError as error:
         report(Failed(f"{error.filename or options.verb}: {error.strerror or error}; check the path and its disk."))

@@ -83,7 +83,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
                 "iterations": trained.iterations,
                 "total [J]": round(trained.score.total, 5),
                 "plain skinning [J]": round(trained.plain.total, 5),
-                "lower by": f"{share:.1%}",
+                ("lower by" if share >= 0 else "higher by"): f"{abs(share):.1%}",
                 "collisions": f"{trained.score.collisions:.2%}",
                 **{f"{k} [J]": round(v, 5) for k, v in trained.score.terms.items()},
             },

@@ -283,7 +283,7 @@ def _loop(run: Run, report: Reporter, stop: threading.Event, plain: Score) -> No
         run.iteration += 1
         elapsed = time.monotonic() - began
         left = elapsed / (run.iteration - first) * (config.iterations - run.iteration)
-        if run.iteration % 20 == 0 or run.iteration == config.iterations:
+        if run.iteration % 20 == 0 or run.iteration in (first + 1, config.iterations):
             terms = {name: float(value) for name, value in run.stepper.terms.items()}
             report(Progress(run.iteration, config.iterations, left, terms))
         rolling = run.iteration >= max(1, config.warm_iterations)
