@@ -166,7 +166,7 @@ def test_events_say_what_is_trained_and_how_it_goes(job):
     (started,) = (event for event in events if isinstance(event, Started))
     assert started.total == 40 and started.detail["vertices"] == 60 and started.detail["proxies"] == 2
     progress = [event for event in events if isinstance(event, Progress)]
-    assert [event.done for event in progress] == [20, 40]
+    assert [event.done for event in progress] == [1, 20, 40]
     assert progress[-1].seconds_left == 0
     assert set(progress[-1].terms) == {"stretch", "bending", "gravity", "inertia", "collision", "drag"}
     judged = [event.text for event in events if isinstance(event, Message) and "validation at" in event.text]
