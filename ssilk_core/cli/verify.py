@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ssilk_core.errors import EXIT_OK, fail, need
-from ssilk_core.events import Reporter, Result, Started
+from ssilk_core.events import Message, Reporter, Result, Started
 
 from .options import INPUTS
 
@@ -46,6 +46,9 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     request = BakeRequest(**{key: value for key, value in carried.items() if key in known})
     chosen = {name: getattr(options, name) or _found(options.shot, name, provenance) for name in INPUTS}
     bake = open_bake(replace(request, **chosen, device=options.device or request.device))  # type: ignore[arg-type]
+    for name in ("model", "motion"):
+        if provenance.get(f"{name}_sha256") != bake.provenance[f"{name}_sha256"]:
+            report(Message(f"{chosen[name]}: the {name} has changed since the shot was baked from it", "warning"))
     report(Started("verify", bake.motion.frame_count, {"shot": str(options.shot)}))
     report(Result("verify", {"shot": str(options.shot), **bake.verify(options.shot, report)}))
     return EXIT_OK

@@ -10,14 +10,16 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from pxr import Gf, Sdf, Usd, UsdSkel, Vt
+from ssilk_usd.provenance import read_provenance
 
-from ssilk_core.checkpoint import load_model
+from ssilk_core.checkpoint import load_model, save_model
 from ssilk_core.cli import _baking, main
 
 EVENTS = {"started", "progress", "message", "checkpoint", "result", "failed"}
@@ -142,6 +144,15 @@ def test_a_tampered_rotation_fails_verification(world, capsys):
     capsys.readouterr()
     assert run("verify shot.usda") == 3
     assert "at time code 12" in capsys.readouterr().err
+
+
+def test_a_model_written_anew_since_the_bake_is_mentioned(world, capsys):
+    assert run("verify shot.usda") == 0 and "has changed" not in capsys.readouterr().err
+    model = read_provenance("shot.usda")["request"]["model"]
+    before = load_model(model)
+    save_model(model, replace(before, provenance={**before.provenance, "seed": 1}))
+    assert run("verify shot.usda") == 0
+    assert "warning: " in (said := capsys.readouterr().err) and "the model has changed since" in said
 
 
 def test_of_several_animations_one_is_named(world, tmp_path):
