@@ -38,13 +38,20 @@ def signed_distance(x: Tensor, body: PosedBody) -> Tensor:
     """Distance along the normal of the nearest body point b [m], n_b . (x - b), shape (V, N); its gradient is n_b."""
     with torch.no_grad():
         index = nearest_vertex(x, body.points)
-        normal, point = gather_frames(body.normals, index), gather_frames(body.points, index)
-        offset = (normal * point).sum(1)
         if body.rings is not None and kernels.available(x.device):
             normal, offset = kernels.surface_kernel(x, index, body.points, body.normals, body.rings)
-        elif body.rings is not None:
-            normal, offset = _on_triangles(x, index, normal, offset, ((x - point) ** 2).sum(1) < FAR**2, body)
+        else:
+            normal, offset = _on_planes(x, index, body)
     return (normal * x).sum(1) - offset
+
+
+def _on_planes(x: Tensor, index: Tensor, body: PosedBody) -> tuple[Tensor, Tensor]:
+    """Return normals n_b (V, 3, N) and offsets n_b . b (V, N) of the nearest body points."""
+    normal, point = gather_frames(body.normals, index), gather_frames(body.points, index)
+    offset = (normal * point).sum(1)
+    if body.rings is None:
+        return normal, offset
+    return _on_triangles(x, index, normal, offset, ((x - point) ** 2).sum(1) < FAR**2, body)
 
 
 def _on_triangles(

@@ -27,7 +27,7 @@ def nearest_kernel(left: Tensor, right: Tensor) -> Tensor:
     frames, _, vertices = left.shape
     found = torch.empty(frames, vertices, dtype=torch.int64, device=left.device)
     grid = (frames, -(-vertices // BLOCK_GARMENT))
-    _kernels()[0][grid](left, right, found, vertices, right.shape[2], BLOCK_GARMENT, BLOCK_BODY)
+    _nearest()[grid](left, right, found, vertices, right.shape[2], BLOCK_GARMENT, BLOCK_BODY)
     return found.T.contiguous()
 
 
@@ -42,7 +42,7 @@ def surface_kernel(x: Tensor, index: Tensor, points: Tensor, normals: Tensor, ri
     by_frame = [values.permute(2, 1, 0).contiguous() for values in (x, points, normals)]
     normal, offset = x.new_empty(frames, 3, vertices), x.new_empty(frames, vertices)
     grid = (frames, -(-vertices // BLOCK_GARMENT))
-    _kernels()[1][grid](
+    _surface()[grid](
         *by_frame,
         index.T.contiguous(),
         rings.int().contiguous(),
@@ -57,8 +57,8 @@ def surface_kernel(x: Tensor, index: Tensor, points: Tensor, normals: Tensor, ri
 
 
 @cache
-def _kernels() -> tuple[Any, Any]:
-    """Define the kernels; Triton compiles them at their first use."""
+def _nearest() -> Any:
+    """Define the kernel of `nearest_kernel`; Triton compiles it at its first use."""
     import triton
     import triton.language as tl
 
@@ -87,6 +87,15 @@ def _kernels() -> tuple[Any, Any]:
         least = tl.min(best, axis=1)
         winner = tl.min(tl.where(best == least[:, None], index, 2147483647), axis=1)
         tl.store(found + frame * vertices + v, winner.to(tl.int64), mask=inside)
+
+    return nearest
+
+
+@cache
+def _surface() -> Any:
+    """Define the kernel of `surface_kernel`."""
+    import triton
+    import triton.language as tl
 
     @triton.jit
     def surface(x, points, normals, index, rings, normal, offset, vertices, body, degree, block: tl.constexpr):  # type: ignore[no-untyped-def]
@@ -148,4 +157,4 @@ def _kernels() -> tuple[Any, Any]:
         tl.store(out + 2 * vertices, nz, mask=inside)
         tl.store(offset + frame * vertices + v, nx * bx + ny * by + nz * bz, mask=inside)
 
-    return nearest, surface
+    return surface
