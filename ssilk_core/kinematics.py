@@ -115,9 +115,9 @@ def motion_transforms(motion: Motion, parents: Ints) -> Floats:
     return world_transforms(rigid(matrix_from_quaternion(motion.rotations), motion.translations), parents)
 
 
-def frames_at(motion: Motion, fps: float) -> int:
-    """Return how many frames at rate `fps` begin within a motion, its first and its last pose included."""
-    return int(np.floor((motion.frame_count - 1) * fps / motion.fps + 1e-6)) + 1
+def frames_at(frame_count: int, source: float, target: float) -> int:
+    """Return how many frames at rate `target` begin within frames at rate `source`, the first and last included."""
+    return int(np.floor((frame_count - 1) * target / source + 1e-6)) + 1
 
 
 def resample(motion: Motion, fps: float, *, cover: bool = False) -> Motion:
@@ -128,7 +128,9 @@ def resample(motion: Motion, fps: float, *, cover: bool = False) -> Motion:
     if abs(motion.fps - fps) < 1e-9 * fps:
         return motion
     last = motion.frame_count - 1
-    count = int(np.ceil(last * fps / motion.fps - 1e-6)) + 1 if cover else frames_at(motion, fps)
+    count = (
+        int(np.ceil(last * fps / motion.fps - 1e-6)) + 1 if cover else frames_at(motion.frame_count, motion.fps, fps)
+    )
     position = np.minimum(np.arange(count) * motion.fps / fps, last)
     rotations, translations = sample_motion(motion, position)
     return Motion(motion.path, fps, rotations, translations)

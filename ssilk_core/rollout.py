@@ -12,7 +12,7 @@ from torch import Tensor
 
 from .assets import Floats, GarmentPose, Motion
 from .errors import need
-from .kinematics import motion_transforms, resample, skinning_matrices, slerp, split_at_cuts
+from .kinematics import frames_at, motion_transforms, resample, skinning_matrices, slerp, split_at_cuts
 from .model.descriptors import gravity_features, pose_features
 from .model.network import GarmentModel
 
@@ -60,11 +60,8 @@ def _advance(model: GarmentModel, span: Motion, start: int, stop: int, state: li
     static = torch.cat([tensor(features.static), gravity_features(tensor(features.down), down)], dim=1)
     dynamic = torch.cat([static, tensor(features.dynamic)], dim=1)
     rest, pose = model.initial(static).unsqueeze(1), dynamic.unsqueeze(1)
-    states = list(state)
-    for t in range(stop - start):
-        begun = start + t >= HISTORY
-        states.append(model.step(states[-2], states[-1], rest[t], pose[t]) if begun else rest[t])
-    return states
+    resting = max(0, HISTORY - start)
+    return model.roll([*state, *rest[:resting]], rest[resting:], pose[resting:])
 
 
 def garment_poses(model: GarmentModel, motion: Motion, fps: float, chunk: int = CHUNK) -> Iterator[GarmentPose]:
@@ -76,7 +73,7 @@ def garment_poses(model: GarmentModel, motion: Motion, fps: float, chunk: int = 
     """
     first = source_frame = 0
     for span in split_at_cuts(motion):
-        stop = int(np.floor((source_frame + span.frame_count - 1) * fps / motion.fps + 1e-6)) + 1
+        stop = frames_at(source_frame + span.frame_count, motion.fps, fps)
         steps = roll(model, resample(span, model.config.fps, cover=True), chunk)
         poses = (GarmentPose(step.start, *model.file_pose(step.activation, step.rotations)) for step in steps)
         shift = (first / fps - source_frame / motion.fps) * model.config.fps

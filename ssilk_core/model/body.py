@@ -11,6 +11,7 @@ from ..assets import Body, Ints
 from ..energy.collision import PosedBody
 from ..energy.surface_point import triangle_rings
 from ..mesh import topology
+from .decoder import blended, transformed
 
 
 class CollisionBody:
@@ -41,10 +42,9 @@ class CollisionBody:
 
         Without `surface` only vertices are collided with.
         """
-        blended = (self.weights @ character[self.joints].flatten(1)).reshape(-1, 3, 4, character.shape[-1])
-        linear = blended[:, :, :3]
-        points = (linear * self.points[:, None]).sum(2) + blended[:, :, 3]
-        normals = (linear * self.normals[:, None]).sum(2)
+        affine = blended(self.weights, character[self.joints])
+        points = transformed(affine, self.points)
+        normals = (affine[:, :, :3] * self.normals[:, None]).sum(2)
         return PosedBody(
             points, normals / normals.norm(dim=1, keepdim=True).clamp_min(1e-8), self.rings if surface else None
         )

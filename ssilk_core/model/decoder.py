@@ -34,6 +34,16 @@ def compose(left: Tensor, right: Tensor) -> Tensor:
     return torch.cat([product[..., :3, :], product[..., 3:, :] + moved], dim=-2)
 
 
+def blended(weights: Tensor, matrices: Tensor) -> Tensor:
+    """Blend skinning matrices (J, 3, 4, N) by dense weights (V, J) to one for each vertex, (V, 3, 4, N)."""
+    return (weights @ matrices.flatten(1)).reshape(-1, *matrices.shape[1:])
+
+
+def transformed(affine: Tensor, points: Tensor) -> Tensor:
+    """Apply an affine transform (V, 3, 4, N) to each point (V, 3, N or 1); returns (V, 3, N)."""
+    return (affine[:, :, :3] * points[:, None]).sum(2) + affine[:, :, 3]
+
+
 class Decoder(nn.Module):
     """Blendshapes, proxy kinematics and skinning with trainable B, W^g and W^p (Eqs. 5, 7 and 8).
 
@@ -131,10 +141,8 @@ class Decoder(nn.Module):
     def forward(self, activation: Tensor, rotations: Tensor, character: Tensor) -> Tensor:
         """Return vertices (V, 3, N) [m] from activations (K, N), rotations (P, 3, 3, N), character (J, 3, 4, N)."""
         matrices = self.proxy_matrices(rotations, character) if self.proxy_count else character
-        flat = matrices[self.used].flatten(1)
-        blended = (self.skin_weights() @ flat).reshape(-1, 3, 4, character.shape[-1])
         canonical = self.rest[:, :, None]
         if self.shape_count:
             offsets = (self.shapes.flatten(0, 1) @ activation).reshape(len(self.free), 3, activation.shape[1])
             canonical = canonical.expand(-1, -1, offsets.shape[-1]).index_add(0, self.free, offsets)
-        return (blended[:, :, :3] * canonical[:, None]).sum(2) + blended[:, :, 3]
+        return transformed(blended(self.skin_weights(), matrices[self.used]), canonical)

@@ -68,6 +68,19 @@ class GarmentModel(nn.Module):
         """Return z_t from the two latents before it, the quasi-static one of frame t, and its dynamic descriptor."""
         return self.integrator(self.stepper, before, now, rest, pose)
 
+    def roll(self, states: list[Tensor], rest: Tensor, pose: Tensor) -> list[Tensor]:
+        """Return `states`, each (batch, latent), followed by those of the next frames.
+
+        Args:
+            states: at least the two before the first of these frames.
+            rest: quasi-static latents of the frames, shape (F, batch, latent).
+            pose: their dynamic descriptors, shape (F, batch, D).
+        """
+        states = list(states)
+        for still, seen in zip(rest, pose):
+            states.append(self.step(states[-2], states[-1], still, seen))
+        return states
+
     def pose(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Return activations (K, N) in [-1, 1] and proxy rotations (P, 3, 3, N) of latents (N, latent) (Eq. 7)."""
         return self.decoder.activations(self.output(z))

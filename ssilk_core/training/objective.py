@@ -64,10 +64,8 @@ class Objective:
         # Detached: the initialiser learns rest states from their own energy, not what helps the next frames.
         target = rest.detach().reshape(length, batch, -1)
         start = torch.where(sampler.carried[None, :, None], sampler.latents, target[:2])
-        z = [*(start + noise).unbind(0)]
         with torch.set_grad_enabled(sampler.config.through_time):
-            for t in range(2, length):
-                z.append(model.step(z[-2], z[-1], target[t], pose[t]))
+            z = model.roll([*(start + noise)], target[2:], pose[2:])
         rolled = torch.cat(z[2:])
         if not sampler.config.through_time:
             # The same steps once more, all at once, from states that carry no gradient.

@@ -12,6 +12,7 @@ from ..assets import SkinWeights
 from ..energy import TERMS, GarmentEnergy
 from ..energy.collision import PosedBody, signed_distance
 from ..model.body import CollisionBody
+from ..model.decoder import blended, transformed
 from ..model.descriptors import GRAVITY
 from ..model.network import GarmentModel
 from .bank import MotionBank
@@ -62,8 +63,7 @@ class Validator:
 
     def plain_vertices(self, character: Tensor) -> Tensor:
         """Return plain skinning's positions (V, 3, N) [m]."""
-        blended = (self.plain_weights @ character.flatten(1)).reshape(-1, 3, 4, character.shape[-1])
-        return (blended[:, :, :3] * self.rest[:, None, :, None]).sum(2) + blended[:, :, 3]
+        return transformed(blended(self.plain_weights, character), self.rest[:, :, None])
 
     @torch.no_grad()
     def score(self, model: GarmentModel) -> Score:
@@ -125,7 +125,4 @@ def roll_states(model: GarmentModel, bank: MotionBank, frames: Tensor, down: Ten
     direction = down.expand(len(frames), 3)
     rest = model.initial(bank.static_descriptor(frames, direction)).unsqueeze(1)
     pose = bank.dynamic_descriptor(frames, direction).unsqueeze(1)
-    z = [*rest[:2]]
-    for t in range(2, len(frames)):
-        z.append(model.step(z[-2], z[-1], rest[t], pose[t]))
-    return torch.cat(z)
+    return torch.cat(model.roll([*rest[:2]], rest[2:], pose[2:]))
