@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from . import kernels
+from .. import kernels
 from .nearest import nearest_vertex
 from .surface_point import nearest_on_rings
 
@@ -39,7 +39,9 @@ def signed_distance(x: Tensor, body: PosedBody) -> Tensor:
     with torch.no_grad():
         index = nearest_vertex(x, body.points)
         if body.rings is not None and kernels.available(x.device):
-            normal, offset = kernels.surface_kernel(x, index, body.points, body.normals, body.rings)
+            from ..kernels.surface import surface_kernel
+
+            normal, offset = surface_kernel(x, index, body.points, body.normals, body.rings)
         else:
             normal, offset = _on_planes(x, index, body)
     return (normal * x).sum(1) - offset

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from . import kernels
+from .. import kernels
 
 CHUNK = 1 << 27  # scores held at once where no kernel serves
 
@@ -34,7 +34,9 @@ def nearest_vertex(x: Tensor, body: Tensor) -> Tensor:
     if x.device.type == "cpu":
         return _on_cpu(left, right)
     if kernels.available(x.device):
-        return kernels.nearest_kernel(left, right)
+        from ..kernels.nearest import nearest_kernel
+
+        return nearest_kernel(left, right)
     return _by_products(left, right)
 
 

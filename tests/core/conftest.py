@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 
 import numpy as np
@@ -33,6 +34,9 @@ from ssilk_core.model.body import CollisionBody
 from ssilk_core.model.network import GarmentModel
 from ssilk_core.training.bank import build_bank
 from ssilk_core.training.objective import Objective
+
+if not torch.cuda.is_available():
+    os.environ["TRITON_INTERPRET"] = "1"  # kernels then run, slowly, on the CPU; read when Triton is imported
 
 ROWS, COLUMNS = 12, 5
 JOINTS = np.array([[0.0, 1.0, 0.0], [0.0, 1.3, 0.02], [0.3, 1.5, 0.0]])

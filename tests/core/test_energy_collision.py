@@ -17,9 +17,8 @@ from ssilk_core.fabrics import Fabric
 from ssilk_core.kinematics import skin_points
 from ssilk_core.model.body import CollisionBody
 
-CUDA = pytest.mark.skipif(
-    not (torch.cuda.is_available() and importlib.util.find_spec("triton")), reason="the kernel needs CUDA and triton"
-)
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"  # on a CPU kernels run in Triton's interpreter
+KERNELS = pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="kernels need Triton")
 
 
 def plane() -> PosedBody:
@@ -107,12 +106,14 @@ def test_ties_go_to_the_lower_index_on_both_paths():
     np.testing.assert_array_equal(nearest._by_products(*sides(torch.tensor(x), torch.tensor(body))), expected)
 
 
-@CUDA
+@KERNELS
 @pytest.mark.parametrize("vertices, body_vertices, frames", [(1, 1, 1), (300, 77, 5), (129, 4001, 3)])
 def test_the_kernel_finds_what_the_cpu_finds(vertices, body_vertices, frames):
+    from ssilk_core.kernels.nearest import nearest_kernel
+
     rng = np.random.default_rng(2)
     x, body = (torch.tensor(rng.normal(size=(n, 3, frames)), dtype=torch.float32) for n in (vertices, body_vertices))
-    found = nearest.nearest_vertex(x.cuda(), body.cuda()).cpu()
+    found = nearest_kernel(*(side.to(DEVICE) for side in sides(x, body))).cpu()
     excess = [
         np.linalg.norm(x[..., f] - body[found[:, f], :, f], axis=1)
         - np.linalg.norm(x[:, None, :, f] - body[None, ..., f], axis=2).min(1)

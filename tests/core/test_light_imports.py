@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-HEAVY = ("torch", "pxr", "igl", "scipy", "trimesh", "PIL", "embreex", "imageio_ffmpeg", "anny", "bpy")
+HEAVY = ("torch", "pxr", "igl", "scipy", "trimesh", "PIL", "embreex", "imageio_ffmpeg", "anny", "bpy", "triton")
 ROOT = Path(__file__).parents[2]
 CORE, USD = ROOT / "ssilk_core", ROOT / "usd" / "ssilk_usd"
 
@@ -19,7 +19,7 @@ CORE, USD = ROOT / "ssilk_core", ROOT / "usd" / "ssilk_usd"
 LAYERS = (
     {"errors"},
     {"assets", "config", "devices", "fabrics", "events", "files"},
-    {"mesh", "kinematics"},
+    {"mesh", "kinematics", "kernels"},
     {"model", "energy"},
     {"checkpoint"},
     {"demo", "view", "training", "rollout", "preflight", "setup"},

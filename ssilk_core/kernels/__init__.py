@@ -1,0 +1,16 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Triton kernels for CUDA. Each has a plain PyTorch twin beside its caller, used everywhere else.
+
+The modules of this package import Triton and are themselves imported only where `available` said yes.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+
+import torch
+
+
+def available(device: torch.device) -> bool:
+    """Return whether the kernels serve a device: CUDA with Triton installed. The one place that chooses."""
+    return device.type == "cuda" and importlib.util.find_spec("triton") is not None
