@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import os
 import tempfile
@@ -13,6 +14,7 @@ from pathlib import Path
 from .errors import SsilkError, fail, need
 
 WRITABLE = "choose an output folder that exists and that you may write to"
+UNFINISHED = ".{}.partial-"  # how temporary names begin, the stem of the target in place of the braces
 
 
 @contextmanager
@@ -28,7 +30,8 @@ def replacing(target: str | Path) -> Iterator[Path]:
     target = Path(target)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{target.stem}.", suffix=target.suffix, dir=target.parent)
+        prefix = UNFINISHED.format(target.stem)
+        handle, name = tempfile.mkstemp(prefix=prefix, suffix=target.suffix, dir=target.parent)
         os.close(handle)
     except OSError as error:
         raise SsilkError(f"{target}: cannot be written ({error.strerror or error}); {WRITABLE}.") from error
@@ -38,6 +41,8 @@ def replacing(target: str | Path) -> Iterator[Path]:
         umask = os.umask(0)
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)
+        with temporary.open("rb+") as stream:
+            os.fsync(stream.fileno())  # or a loss of power could leave an empty file under the target's name
         temporary.replace(target)
     except SsilkError as error:
         raise type(error)(str(error).replace(str(temporary), str(target))) from error
@@ -47,6 +52,17 @@ def replacing(target: str | Path) -> Iterator[Path]:
         ) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def remove_unfinished(target: str | Path) -> None:
+    """Remove what processes that were killed while they wrote `target` have left beside it.
+
+    Nobody else may be writing `target` meanwhile.
+    """
+    target = Path(target)
+    names = f"{glob.escape(UNFINISHED.format(target.stem))}*{glob.escape(target.suffix)}"
+    for path in target.parent.glob(names):
+        path.unlink(missing_ok=True)
 
 
 def need_writable(target: str | Path) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from ssilk_core.errors import SsilkError, VerificationError
-from ssilk_core.files import need_writable, replacing, sha256
+from ssilk_core.files import need_writable, remove_unfinished, replacing, sha256
 
 
 def test_a_file_appears_when_it_is_whole(tmp_path):
@@ -38,6 +38,29 @@ def test_whatever_fails_leaves_the_old_file_and_nothing_else(tmp_path, error):
         temporary.write_text("half")
         raise error
     assert target.read_text() == "old" and list(tmp_path.iterdir()) == [target]
+
+
+def test_bytes_reach_the_disk_before_the_name_does(tmp_path, monkeypatch):
+    target, seen = tmp_path / "model.safetensors", []
+    sync, rename = os.fsync, Path.replace
+    monkeypatch.setattr(os, "fsync", lambda number: (seen.append(os.fstat(number).st_size), sync(number)))
+    monkeypatch.setattr(Path, "replace", lambda self, other: (seen.append(other), rename(self, other)))
+    with replacing(target) as temporary:
+        temporary.write_bytes(b"whole")
+    assert seen == [5, target]
+
+
+def test_what_killed_processes_left_of_a_file_is_removed_and_nothing_else(tmp_path):
+    targets = [tmp_path / name for name in ("mo[d]el.safetensors", "mo[d]el.resume.safetensors", "d.safetensors")]
+    unfinished = [replacing(target) for target in targets]  # held until the test ends: no writer comes to its own
+    for target, writing in zip(targets, unfinished):
+        writing.__enter__().write_text("half")
+        target.write_text("older")
+    remove_unfinished(targets[0])
+    left = [path.name for path in tmp_path.iterdir() if path.name.startswith(".")]
+    assert len(left) == 2 and not any(name.startswith(".mo[d]el.partial-") for name in left)
+    assert all(target.read_text() == "older" for target in targets)
+    remove_unfinished(tmp_path / "none" / "model.safetensors")
 
 
 def test_a_full_disk_is_one_sentence(tmp_path):
