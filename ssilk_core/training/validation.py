@@ -16,6 +16,7 @@ from ..model.decoder import blended, transformed
 from ..model.descriptors import GRAVITY
 from ..model.network import GarmentModel
 from .bank import MotionBank
+from .parallel import ALONE, Team
 
 DECODED_AT_ONCE = 256  # frames
 
@@ -52,8 +53,9 @@ class Validator:
         rest: Tensor,
         fps: float,
         frames: int,
+        team: Team = ALONE,
     ) -> None:
-        self.bank, self.energy, self.body, self.fps = bank, energy, body, fps
+        self.bank, self.energy, self.body, self.fps, self.team = bank, energy, body, fps, team
         self.plain_weights = torch.as_tensor(plain.dense(bank.joint_count), dtype=rest.dtype, device=rest.device)
         self.rest = rest
         self.clips = [
@@ -65,17 +67,19 @@ class Validator:
         """Return plain skinning's positions (V, 3, N) [m]."""
         return transformed(blended(self.plain_weights, character), self.rest[:, :, None])
 
-    @torch.no_grad()
     def score(self, model: GarmentModel) -> Score:
         """Return the mean score of a model over all clips."""
-        return self._mean([self.frame_terms(clip, model) for clip in self.clips])
+        return self._mean(model)
 
-    @torch.no_grad()
     def plain_score(self) -> Score:
         """Return the mean score of plain skinning over all clips."""
-        return self._mean([self.frame_terms(clip, None) for clip in self.clips])
+        return self._mean(None)
 
-    def _mean(self, scores: list[dict[str, Tensor]]) -> Score:
+    def _mean(self, model: GarmentModel | None) -> Score:
+        """Return the mean over all clips, dealt out to the processes of the team; all get the same score."""
+        own = [self.frame_terms(clip, model) for clip in self.clips[self.team.rank :: self.team.size]]
+        dealt = self.team.gather([{name: value.cpu() for name, value in terms.items()} for terms in own])
+        scores = [dealt[index % self.team.size][index // self.team.size] for index in range(len(self.clips))]
         joined = {name: float(torch.cat([score[name] for score in scores]).mean()) for name in scores[0]}
         return Score({name: joined[name] for name in TERMS}, joined["collisions"], joined["dynamics"] ** 0.5)
 
