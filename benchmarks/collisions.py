@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from subjects import Subject, arguments, clip_of, open_subject, parsed, table, write_results
+from reports import table, write_results
+from subjects import Subject, arguments, clip_of, open_subject, parsed
 from torch import Tensor
 
 from ssilk_core.assets import CLASS_NAMES, Floats, Ints, Motion

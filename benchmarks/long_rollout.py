@@ -14,18 +14,18 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from subjects import RESULTS, Subject, arguments, clip_of, open_subject, parsed, table, write_results
+from plots import COLOURS, Panel, canvas, save
+from reports import RESULTS, table, write_results
+from subjects import Subject, arguments, clip_of, open_subject, parsed
 from timing import back_and_forth
 from torch import Tensor
 
 from ssilk_core.energy import TERMS
-from ssilk_core.files import replacing
 from ssilk_core.training.validation import roll_states
 
 CLIPS = ("02_04", "02_02", "49_08a")
 HEADER = ("garment", "clip", "loops x frames", "term", "first [J]", "second [J]", "last [J]", "first to last",
           "second to last")  # fmt: skip
-COLOURS = ("#c0392b", "#2980b9", "#27ae60", "#8e44ad", "#d68910")
 
 
 def loop_means(subject: Subject, clip: str, frames: int, options: Any) -> tuple[dict[str, Tensor], int, float]:
@@ -55,27 +55,16 @@ def rows_of(garment: str, clip: str, means: dict[str, Tensor], length: int) -> l
 
 def draw(path: Path, title: str, means: dict[str, Tensor], span: float = 0.05) -> None:
     """Draw each term's loop means relative to the second loop, within +- `span`, as a PNG."""
-    from PIL import Image, ImageDraw
-
-    width, height, left, top = 640, 300, 60, 40
-    image = Image.new("RGB", (width, height), "white")
-    pen = ImageDraw.Draw(image)
-    inner = height - 2 * top
-
-    def y(change: float) -> float:
-        return top + inner / 2 * (1 - max(-1, min(1, change / span)))
-
+    image, pen = canvas(640, 300)
+    panel = Panel(pen, (60, 40, 630, 260), (0, len(means["stretch"]) - 1), (-span, span))
+    panel.title(f"{title}: mean of each loop, relative to the second")
     for level in (-span, -0.01, 0, 0.01, span):
-        pen.line([(left, y(level)), (width - 10, y(level))], fill="#dddddd" if level else "#888888")
-        pen.text((8, y(level) - 5), f"{level:+.0%}", fill="#444444")
-    for name, colour, place in zip(TERMS, COLOURS, range(len(TERMS))):
-        change = ((means[name] - means[name][1]) / means[name][1].abs()).tolist()
-        step = (width - 10 - left) / (len(change) - 1)
-        pen.line([(left + i * step, y(value)) for i, value in enumerate(change)], fill=colour, width=2)
-        pen.text((left + 110 * place, height - 22), name, fill=colour)
-    pen.text((left, 12), f"{title}: mean of each loop, relative to the second", fill="black")
-    with replacing(path) as temporary:
-        image.save(temporary)
+        panel.across(level, f"{level:+.0%}", "#dddddd" if level else "#888888")
+    for place, (name, colour) in enumerate(zip(TERMS, COLOURS)):
+        change = (means[name] - means[name][1]) / means[name][1].abs()
+        panel.curve(enumerate(change.tolist()), colour)
+        pen.text((60 + 110 * place, 278), name, fill=colour)
+    save(image, path)
 
 
 def main() -> None:

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from reports import table, write_results
 
 from ssilk_core.assets import (
     LOOSE,
@@ -165,8 +166,6 @@ def main() -> None:
         vertices, body, frames, surface = json.loads(options.only)
         print(json.dumps(measure(vertices, body, frames, surface, torch.device(options.device))))
         return
-    from subjects import table, write_results
-
     cases = [(vertices, BODY, frames, "triangles") for vertices in VERTICES for frames in FRAMES]
     cases += [(vertices, BODY // 4, FRAMES[-1], "triangles") for vertices in VERTICES]
     cases += [(vertices, BODY, FRAMES[-1], "vertices") for vertices in VERTICES]

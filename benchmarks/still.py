@@ -16,7 +16,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from subjects import Subject, arguments, clip_of, open_subject, parsed, table, write_results
+from reports import table, write_results
+from subjects import Subject, arguments, clip_of, open_subject, parsed
 from timing import stopped
 from torch import Tensor
 

@@ -1,18 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every measurement shares: a trained model on its character, its energies, and where results go."""
+"""What measurements of trained models share: a model on its character, its energies, and the command line."""
 
 from __future__ import annotations
 
 import argparse
-import json
-import os
-import platform
-import shlex
 import sys
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from ssilk_usd.read_character import read_character
@@ -20,19 +14,15 @@ from ssilk_usd.read_motion import read_motion
 from ssilk_usd.read_stage import open_stage
 from torch import Tensor
 
-from ssilk_core import __version__
 from ssilk_core.assets import Motion, Scene
 from ssilk_core.checkpoint import ModelFile, load_model, network
-from ssilk_core.devices import chosen_device, device_name
+from ssilk_core.devices import chosen_device
 from ssilk_core.energy import GarmentEnergy
 from ssilk_core.errors import need
-from ssilk_core.files import replacing
 from ssilk_core.model.body import CollisionBody
 from ssilk_core.model.network import GarmentModel
 from ssilk_core.training.bank import build_bank
 from ssilk_core.training.validation import Validator
-
-RESULTS = Path(__file__).parent / "results"
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,25 +91,3 @@ def parsed(parser: argparse.ArgumentParser) -> argparse.Namespace:
 def clip_of(options: argparse.Namespace, name: str, subject: Subject) -> Motion:
     """Read one clip of the motions' folder."""
     return read_motion(options.motions / f"{name}.usdc", subject.scene.character.skeleton)
-
-
-def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Return a Markdown table, its first column to the left and the others to the right."""
-    lines = [header, ["---", *["---:"] * (len(header) - 1)], *rows]
-    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines) + "\n"
-
-
-def write_results(options: argparse.Namespace, markdown: str, measured: Mapping[str, Any]) -> None:
-    """Print a table and write it, with its command and hardware, beside the figures it came from."""
-    command = "python benchmarks/" + shlex.join([Path(word).name if "/" in word else word for word in sys.argv])
-    made = {
-        "command": command,
-        "hardware": f"{device_name(chosen_device(options.device))}, {options.threads} of {os.cpu_count()} cores",
-        "versions": f"ssilk {__version__}, torch {torch.__version__}, Python {platform.python_version()}",
-    }
-    print(markdown)
-    with replacing(RESULTS / f"{options.name}.json") as temporary:
-        temporary.write_text(json.dumps({**made, "measured": measured}, indent=1) + "\n")
-    foot = f"\n`{command}`  \n{made['hardware']}; {made['versions']}\n"
-    with replacing(RESULTS / f"{options.name}.md") as temporary:
-        temporary.write_text(markdown + foot)
