@@ -2,7 +2,8 @@
 """Model files: safetensors that hold everything needed to run, with provenance in the header.
 
 Nothing is ever unpickled. Tensors are named "scene.*" (the garment, its rig and the skeleton) and "model.*"
-(parameters); the header holds one JSON document under "ssilk".
+(parameters), each in the narrowest type that holds it; the header holds one JSON document under "ssilk". Packed
+matrices are 16-bit integers, "scale.model.*" beside them.
 """
 
 from __future__ import annotations
@@ -21,15 +22,18 @@ from .config import ModelConfig
 from .errors import SsilkError, need
 from .fabrics import Fabric
 from .files import replacing
+from .packing import narrowest, packed, unpacked
 
 if TYPE_CHECKING:
     from .model.network import GarmentModel
 
-FORMAT = 1
+FORMAT = 2
+READABLE = (1, FORMAT)  # 1 knew nothing of packed matrices
 # Parts of the header that are no plain values, as tuples (JSON: lists) and dicts.
 HEADER: dict[str, Any] = {
     "joint_names": (), "proxy_names": (), "paths": {}, "config": {}, "fabric": {}, "provenance": {},
 }  # fmt: skip
+WEIGHTS = ("scene.plain.weights", "scene.rig.weights")
 HEADER_LIMIT = 64 << 20  # bytes; a header this large is damage or mischief, not a model
 
 
@@ -54,8 +58,15 @@ class ModelFile:
     provenance: dict[str, Any] = field(default_factory=dict)
 
 
-def save_model(path: str | Path, model: ModelFile) -> None:
-    """Write a model file whole or not at all."""
+def save_model(path: str | Path, model: ModelFile, *, pack: bool = False) -> None:
+    """Write a model file whole or not at all.
+
+    Args:
+        path: the file, .safetensors.
+        model: what it holds.
+        pack: matrices of parameters in 16 bits and skinning weights in single precision, which halves the file;
+            `benchmarks/precision.py` measures what it changes.
+    """
     from safetensors.numpy import save
 
     scene, skeleton, mesh, rig = (
@@ -93,9 +104,19 @@ def save_model(path: str | Path, model: ModelFile) -> None:
         "fabric": asdict(model.fabric),
         "provenance": model.provenance,
     }
+    tensors = {name: narrowest(np.ascontiguousarray(value)) for name, value in tensors.items()}
     with replacing(path) as temporary:
-        arrays = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
-        temporary.write_bytes(save(arrays, {"ssilk": json.dumps(document)}))
+        temporary.write_bytes(save(_packed(tensors) if pack else tensors, {"ssilk": json.dumps(document)}))
+
+
+def _packed(tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the tensors of a file with matrices packed; vectors stay as they are: errors in alpha add up in time."""
+    weights = {name: tensors[name].astype(np.float32) for name in WEIGHTS}
+    matrices = {
+        name: packed(value) for name, value in tensors.items() if name.startswith("model.") and value.ndim > 1
+    }
+    steps = {name: pair[0] for name, pair in matrices.items()}
+    return {**tensors, **weights, **steps, **{f"scale.{name}": pair[1] for name, pair in matrices.items()}}
 
 
 def load_model(path: str | Path) -> ModelFile:
@@ -147,7 +168,8 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     except (ValueError, RecursionError) as error:
         raise SsilkError(f"{path}: the model's header is damaged ({error}); train again.") from error
     found = document.get("format") if isinstance(document, dict) else None
-    need(found == FORMAT, str(path), f"model format {found}", f"this version reads format {FORMAT}", "train it again")
+    allowed = f"this version reads formats {' and '.join(map(str, READABLE))}"
+    need(found in READABLE, str(path), f"model format {found}", allowed, "train it again")
     return tensors, document
 
 
@@ -199,15 +221,7 @@ def _model_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Model
         skin("rig", paths["rig"]),
     )
     garment = Garment(mesh, skin("plain", paths["garment"]), tensors["scene.classes"])
-    parameters = {name[6:]: value for name, value in tensors.items() if name.startswith("model.")}
-    for name, value in parameters.items():
-        need(
-            np.isfinite(value).all(),
-            paths["garment"],
-            f"parameter '{name}' holds NaN or infinity",
-            "all are finite",
-            "train again",
-        )
+    parameters = _parameters(tensors, paths["garment"])
     joints = tensors["joints"]
     need(
         joints.ndim == 1 and np.isin(joints, np.arange(skeleton.joint_count)).all(),
@@ -220,10 +234,21 @@ def _model_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Model
         Scene(Character(paths["skeleton"], skeleton, ()), garment, rig),
         ModelConfig(**document["config"]),
         Fabric(**document["fabric"]),
-        joints,
+        joints.astype(np.int64),
         parameters,
         document["provenance"],
     )
+
+
+def _parameters(tensors: dict[str, np.ndarray], where: str) -> dict[str, np.ndarray]:
+    """Return the parameters of a file by name, unpacked where they are packed."""
+    stored = {name: value for name, value in tensors.items() if name.startswith("model.")}
+    for name, value in stored.items():
+        if value.dtype.kind == "i":
+            stored[name] = unpacked(value, tensors[f"scale.{name}"])
+        finite = np.isfinite(stored[name]).all()
+        need(finite, where, f"parameter '{name[6:]}' holds NaN or infinity", "all are finite", "train again")
+    return {name[6:]: value for name, value in stored.items()}
 
 
 def _need_fit(model: ModelFile) -> None:

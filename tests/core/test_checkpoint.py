@@ -17,6 +17,7 @@ from safetensors.numpy import load_file, save_file
 from ssilk_core.checkpoint import load_model, model_file, network, save_model
 from ssilk_core.errors import SsilkError
 from ssilk_core.fabrics import FABRICS
+from ssilk_core.packing import STEPS, narrowest
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +91,72 @@ def test_models_without_shapes_or_proxies_round_trip(toy_scene, toy_model, tmp_p
     again = network(load_model(tmp_path / "m.safetensors"))
     assert again.deformer().shape_count == model.deformer().shape_count
     assert again.scene.rig.proxy_count == proxies
+
+
+def test_a_packed_model_is_what_it_was_to_16_bits(path, model, tmp_path):
+    small = tmp_path / "small.safetensors"
+    save_model(small, load_model(path), pack=True)
+    read = load_model(small)
+    for name, value in model.state_dict().items():
+        mine, found = value.numpy(), read.parameters[name]
+        assert found.dtype == np.float32
+        if value.ndim == 1:
+            np.testing.assert_array_equal(found, mine)
+        else:
+            largest = np.abs(mine).max(axis=tuple(range(1, mine.ndim)), keepdims=True)
+            assert (np.abs(found - mine) <= 0.501 * largest / STEPS + 1e-30).all(), name
+    for mine, found in ((model.scene.plain_skin, read.scene.plain_skin), (model.scene.rig.skin, read.scene.rig.skin)):
+        np.testing.assert_array_equal(found.indices, mine.indices)
+        np.testing.assert_allclose(found.weights, mine.weights, rtol=0, atol=1e-7)
+    np.testing.assert_array_equal(read.scene.garment.mesh.points, model.scene.garment.mesh.points)
+    matrices = sum(value.numel() for value in model.state_dict().values() if value.ndim > 1)
+    assert small.stat().st_size < path.stat().st_size - 1.5 * matrices
+
+
+@torch.no_grad()
+def test_a_packed_model_moves_as_the_whole_one_does(path, model, tmp_path):
+    small = tmp_path / "small.safetensors"
+    save_model(small, load_model(path), pack=True)
+    z = torch.randn(4, 8, generator=torch.Generator().manual_seed(0))
+    character = torch.randn(3, 3, 4, 4, generator=torch.Generator().manual_seed(1))
+    moved = (network(load_model(small)).vertices(z, character) - model.vertices(z, character)).abs().max()
+    assert 0 < moved < 1e-4
+
+
+def test_packing_what_was_packed_changes_nothing(path, tmp_path):
+    first, second = tmp_path / "first.safetensors", tmp_path / "second.safetensors"
+    save_model(first, load_model(path), pack=True)
+    save_model(second, load_model(first), pack=True)
+    again, once = load_model(second).parameters, load_model(first).parameters
+    for name, value in once.items():
+        np.testing.assert_allclose(again[name], value, rtol=0, atol=1e-6 * np.abs(value).max())
+
+
+def test_files_of_the_first_format_are_read(path):
+    before = load_model(path)
+    rewrite(path, set_header("format", 1))
+    np.testing.assert_array_equal(
+        load_model(path).parameters["integrator.alpha"], before.parameters["integrator.alpha"]
+    )
+
+
+@pytest.mark.parametrize(
+    ("values", "kind"),
+    [
+        ([0, 255], np.uint8),
+        ([0, 40_000], np.uint16),
+        ([-1, 30], np.int16),
+        ([-1, 70_000], np.int32),
+        (np.zeros(0, np.int64), np.uint8),
+        ([0.5, 0.25], np.float32),
+        ([0.5, 0.1], np.float64),
+        (np.float32([0.5, 0.1]), np.float32),
+    ],
+)
+def test_arrays_are_stored_as_narrow_as_they_stay_exact(values, kind):
+    stored = narrowest(np.asarray(values))
+    assert stored.dtype == kind
+    np.testing.assert_array_equal(stored, values)
 
 
 def test_a_file_cut_short_anywhere_is_refused(path):
@@ -172,8 +239,12 @@ def configure(**changes: object) -> Callable[[dict, dict], None]:
 
 
 DAMAGE = {
-    "another format": (set_header("format", 99), "model format 99; this version reads format 1"),
+    "another format": (set_header("format", 99), "model format 99; this version reads formats 1 and 2"),
     "header is a list": (lambda tensors, document: document.clear(), "model format None"),
+    "integers without their scale": (
+        set_tensor("model.output.0.weight", np.ones((16, 8), np.int16)),
+        "incomplete.*scale.model.output.0.weight",
+    ),
     "NaN parameter": (poison("model.stepper.0.weight"), "'stepper.0.weight' holds NaN"),
     "NaN points": (poison("scene.mesh.points"), "NaN or infinity"),
     "no points": (drop("scene.mesh.points"), "incomplete.*scene.mesh.points"),
