@@ -104,9 +104,9 @@ def save_model(path: str | Path, model: ModelFile, *, pack: bool = False) -> Non
         "fabric": asdict(model.fabric),
         "provenance": model.provenance,
     }
-    tensors = {name: narrowest(np.ascontiguousarray(value)) for name, value in tensors.items()}
+    arrays = {name: narrowest(np.ascontiguousarray(value)) for name, value in tensors.items()}
     with replacing(path) as temporary:
-        temporary.write_bytes(save(_packed(tensors) if pack else tensors, {"ssilk": json.dumps(document)}))
+        temporary.write_bytes(save(_packed(arrays) if pack else arrays, {"ssilk": json.dumps(document)}))
 
 
 def _packed(tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
