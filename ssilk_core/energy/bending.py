@@ -28,13 +28,13 @@ def dihedral_angles(edge: Tensor, left: Tensor, right: Tensor) -> Tensor:
     """
     normal_left, normal_right = cross(edge, left), cross(right, edge)
     # With lengths left in, atan2(|e| n_r . left', n_l . n_r) needs no normalisation but that of the edge.
-    length = (edge * edge).sum(1).clamp_min(1e-18).sqrt()
-    sine = -(normal_right * left).sum(1) * length
+    square = (edge * edge).sum(1)
+    sine = -(normal_right * left).sum(1) * square.clamp_min(1e-18).sqrt()
     cosine = (normal_left * normal_right).sum(1)
-    # Where a face collapses both vanish and atan2 has no gradient: such a hinge counts as flat. Both are squared
-    # in the gradient, and the square of less than 1e-18 underflows in single precision.
-    collapsed = sine.abs() + cosine.abs() < 1e-18
-    return torch.atan2(sine, torch.where(collapsed, 1.0, cosine))
+    # Where a face collapses both vanish but for rounding: such a hinge counts as flat and pulls nowhere. Both are
+    # squared in the gradient of atan2, and the square of less than 1e-18 underflows in single precision.
+    collapsed = sine.abs() + cosine.abs() < (1e-6 * square**2).clamp_min(1e-18)
+    return torch.atan2(torch.where(collapsed, 0.0, sine), torch.where(collapsed, 1.0, cosine))
 
 
 def bending_energy(angle: Tensor, rest_angle: Tensor, stiffness: Tensor) -> Tensor:
