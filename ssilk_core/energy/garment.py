@@ -7,13 +7,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..assets import Mesh
+from .. import kernels
+from ..assets import Floats, Ints, Mesh
 from ..fabrics import Fabric
+from ..kernels.corners import elastic_tables
 from ..mesh import topology
 from .bending import bending_energy, dihedral_angles
 from .collision import PosedBody, collision_energy, signed_distance
 from .operators import difference_operator
-from .stretch import deformation_gradient_operator, rest_frames, stretch_density
+from .stretch import column_weights, deformation_gradient_operator, rest_frames, stretch_density
 
 TERMS = ("stretch", "bending", "gravity", "inertia", "collision")
 """The paper's terms; drag is trained with, but not counted, so that totals compare with its."""
@@ -35,24 +37,24 @@ class GarmentEnergy:
             return torch.tensor(values, dtype=dtype, device=device)
 
         _, areas = rest_frames(mesh)
-        hinges = topology.hinges(mesh.faces)
-        lengths = np.linalg.norm(mesh.points[hinges[:, 1]] - mesh.points[hinges[:, 0]], axis=1)
-        both_areas = _hinge_areas(mesh, hinges)
+        hinges = topology.hinges(mesh.faces) if fabric.bending else np.zeros((0, 4), dtype=np.int64)
         self.fabric = fabric
         self.area = tensor(areas)[:, None]
         self.mass = tensor(fabric.density * topology.vertex_areas(mesh.points, mesh.faces))
         self._gradient = deformation_gradient_operator(mesh, device, dtype)
         heads = hinges[:, [1, 2, 3]].T.reshape(-1)
         self._hinge = difference_operator(heads, np.tile(hinges[:, 0], 3), mesh.vertex_count, device, dtype)
-        self.bending_stiffness = tensor(fabric.bending * lengths**2 / (8 * both_areas))[:, None]
+        self.bending_stiffness = tensor(fabric.bending * _hinge_shapes(mesh, hinges))[:, None]
         rest = tensor(mesh.points)[:, :, None]
         self.rest_angle = dihedral_angles(*self._hinge(rest).chunk(3)) if len(hinges) else rest.new_zeros(0, 1)
+        numbers = torch.hstack([self.bending_stiffness, self.rest_angle])
+        self._tables = elastic_tables(mesh.vertex_count, mesh.faces, column_weights(mesh), areas, hinges, numbers)
 
     def stretch(self, x: Tensor) -> Tensor:
         return (self.area * stretch_density(self._gradient(x), self.fabric)).sum(0)
 
     def bending(self, x: Tensor) -> Tensor:
-        if self.rest_angle.shape[0] == 0 or self.fabric.bending == 0:
+        if len(self.rest_angle) == 0:
             return x.new_zeros(x.shape[-1])
         angle = dihedral_angles(*self._hinge(x).chunk(3))
         return bending_energy(angle, self.rest_angle, self.bending_stiffness).sum(0)
@@ -80,8 +82,51 @@ class GarmentEnergy:
         """Return the penalty of given signed distances (V, N)."""
         return collision_energy(distance, self.fabric.collision, self.fabric.margin).sum(0)
 
+    def elastic(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Return stretch and bending; this and the next two use fused kernels where there are any."""
+        if not self._fused(x):
+            return self.stretch(x), self.bending(x)
+        from ..kernels.elastic import elastic_kernel
 
-def _hinge_areas(mesh: Mesh, hinges: np.ndarray) -> np.ndarray:
-    """Return the summed areas of the two faces at each hinge [m2], shape (H,)."""
+        return elastic_kernel(x, self._tables, self.fabric)
+
+    def potential(
+        self, x: Tensor, root: Tensor, gravity: Tensor, normal: Tensor, offset: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return gravity, of heights over `root` (3, N), and the collision with one plane for each vertex.
+
+        Neither the planes, unit normals (V, 3, N) and offsets (V, N), nor `root` carry a gradient.
+        """
+        normal, offset, root = normal.detach(), offset.detach(), root.detach()
+        if not self._fused(x):
+            return self.gravity(x - root, gravity), self.collision_of((normal * x).sum(1) - offset)
+        from ..kernels.pointwise import potential_kernel
+
+        return potential_kernel(
+            x, self.mass, root, gravity, (normal, offset), self.fabric.collision, self.fabric.margin
+        )
+
+    def kinetic(self, x: Tensor, last: Tensor, before: Tensor, shift: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+        """Return inertia and drag of the first M frames of x (V, 3, N); neither the past nor the air has a gradient.
+
+        Args:
+            last, before: positions one and two frames ago (V, 3, M).
+            shift: how far the air went since (3, M), with the character's root.
+        """
+        if not self._fused(x):
+            moving = x[..., : last.shape[-1]]
+            return self.inertia(moving, 2 * last - before, dt), self.drag(moving, last + shift, dt)
+        from ..kernels.pointwise import kinetic_kernel
+
+        weights = 1 / (dt * dt), self.fabric.drag / self.fabric.density / dt
+        return kinetic_kernel(x, self.mass, last, before, shift, *weights)
+
+    def _fused(self, x: Tensor) -> bool:
+        return x.dtype == torch.float32 and kernels.available(x.device)
+
+
+def _hinge_shapes(mesh: Mesh, hinges: Ints) -> Floats:
+    """Return l^2 / (8 (A_1 + A_2)) of each hinge at rest, with its edge's length and the areas beside it, (H,)."""
     x0, x1, left, right = (mesh.points[hinges[:, i]] for i in range(4))
-    return sum(np.linalg.norm(np.cross(x1 - x0, tip - x0), axis=1) / 2 for tip in (left, right))
+    areas = sum(np.linalg.norm(np.cross(x1 - x0, tip - x0), axis=1) / 2 for tip in (left, right))
+    return np.sum((x1 - x0) ** 2, axis=1) / (8 * areas)

@@ -50,21 +50,24 @@ def rest_frames(mesh: Mesh) -> tuple[Floats, Floats]:
     return np.linalg.inv(shape), doubled / 2
 
 
+def column_weights(mesh: Mesh) -> Floats:
+    """Return the weights (F, 3, 2) of each triangle's corners in both columns of its deformation gradient [1/m].
+
+    Raises:
+        SsilkError: a triangle has no area.
+    """
+    inverse, _ = rest_frames(mesh)
+    # F = [b - a, c - a] @ inverse
+    return np.concatenate([-inverse.sum(1, keepdims=True), inverse], axis=1)
+
+
 def deformation_gradient_operator(mesh: Mesh, device: torch.device, dtype: torch.dtype) -> SparseOperator:
     """Return the operator from positions to both columns of F (3x2): rows w_u of all triangles, then w_v."""
-    inverse, _ = rest_frames(mesh)
     count = len(mesh.faces)
-    # F = [b - a, c - a] @ inverse, so the weights of (a, b, c) in column k are (-sum, inverse[0, k], inverse[1, k]).
-    rows, columns, values = [], [], []
-    for k in range(2):
-        weights = np.stack([-inverse[:, 0, k] - inverse[:, 1, k], inverse[:, 0, k], inverse[:, 1, k]], axis=1)
-        rows.append(np.repeat(np.arange(count) + k * count, 3))
-        columns.append(mesh.faces.reshape(-1))
-        values.append(weights.reshape(-1))
     return SparseOperator(
-        np.concatenate(rows),
-        np.concatenate(columns),
-        np.concatenate(values),
+        np.repeat(np.arange(2 * count), 3),
+        np.tile(mesh.faces.reshape(-1), 2),
+        column_weights(mesh).transpose(2, 0, 1).reshape(-1),
         (2 * count, mesh.vertex_count),
         device,
         dtype,

@@ -1,0 +1,257 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Energies of single vertices; `GarmentEnergy.gravity`, `.collision_of`, `.inertia` and `.drag` are the plain twins.
+
+A program owns a block of frames and, for values, a few vertices, whose share of the sum it writes; for gradients one
+vertex. Nothing is written twice: results do not depend on the order.
+"""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+from torch import Tensor
+from torch.autograd import Function
+from torch.autograd.function import once_differentiable
+
+from .vectors import dot, load3, store3
+
+FRAMES, WARPS = 128, 2  # frames and warps of one program
+VERTICES = 16  # that the program of a value sums over
+
+
+def potential_kernel(
+    x: Tensor,
+    mass: Tensor,
+    root: Tensor,
+    gravity: Tensor,
+    planes: tuple[Tensor, Tensor],
+    stiffness: float,
+    margin: float,
+) -> tuple[Tensor, Tensor]:
+    """Return -sum m g.(x - root) and sum stiffness min(n.x - offset - margin, 0)^2 [J], both (N,).
+
+    Args:
+        x: positions (V, 3, N), the only argument with a gradient; mass: (V,).
+        root: where heights are taken from (3, N); gravity: acceleration (3, N) or (3, 1).
+        planes: that each vertex collides with: unit normals (V, 3, N) and offsets (V, N).
+    """
+    rows = [values.detach().expand(3, x.shape[-1]).contiguous() for values in (root, gravity)]
+    normal, offset = (values.detach().contiguous() for values in planes)
+    return _Potential.apply(x.contiguous(), mass, *rows, normal, offset, stiffness, margin)
+
+
+def kinetic_kernel(
+    x: Tensor, mass: Tensor, last: Tensor, before: Tensor, shift: Tensor, inertia: float, drag: float
+) -> tuple[Tensor, Tensor]:
+    """Return inertia/2 sum m |x - 2 last + before|^2 and drag/2 sum m |x - last - shift|^2 [J], both (M,).
+
+    Args:
+        x: positions (V, 3, N), the only argument with a gradient; mass: (V,).
+        last, before: positions one and two frames ago (V, 3, M) of the first M frames of x; the others count nothing.
+        shift: where the air went since the last frame (3, M).
+    """
+    past = [_sliced(values.detach()) for values in (last, before)]
+    return _Kinetic.apply(x.contiguous(), mass, *past, shift.detach().contiguous(), inertia, drag)
+
+
+def _sliced(values: Tensor) -> Tensor:
+    """Return (V, 3, M) as some frames of contiguous values; a copy only of what is not."""
+    _, width, step = values.stride()
+    return values if step == 1 and values.stride(0) == 3 * width else values.contiguous()
+
+
+def _blocks(frames: int) -> int:
+    return triton.cdiv(frames, FRAMES)
+
+
+class _Potential(Function):
+    @staticmethod
+    def forward(ctx, x, mass, root, gravity, normal, offset, stiffness, margin):
+        vertices, _, frames = x.shape
+        ctx.save_for_backward(x, mass, gravity, normal, offset)
+        ctx.penalty = stiffness, margin
+        shares = x.new_empty(2, triton.cdiv(vertices, VERTICES), frames)
+        _potential[shares.shape[1], _blocks(frames)](
+            *(x, mass, root, gravity, normal, offset, shares),
+            *(stiffness, margin, vertices, frames, VERTICES, FRAMES),
+            num_warps=WARPS,
+        )
+        return tuple(shares.sum(1))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *upstream):
+        x = ctx.saved_tensors[0]
+        vertices, _, frames = x.shape
+        grad = x.new_empty(x.shape)
+        _potential_gradient[vertices, _blocks(frames)](
+            *ctx.saved_tensors,
+            *(values.contiguous() for values in upstream),
+            *(grad, *ctx.penalty, frames, FRAMES),
+            num_warps=WARPS,
+        )
+        return grad, *[None] * 7
+
+
+class _Kinetic(Function):
+    @staticmethod
+    def forward(ctx, x, mass, last, before, shift, inertia, drag):
+        vertices, _, moving = last.shape
+        ctx.save_for_backward(x, mass, last, before, shift)
+        ctx.weights = inertia, drag
+        ctx.sizes = x.stride(1), last.stride(1), before.stride(1), moving
+        shares = x.new_empty(2, triton.cdiv(vertices, VERTICES), moving)
+        _kinetic[shares.shape[1], _blocks(moving)](
+            *(x, mass, last, before, shift, shares, inertia, drag),
+            *(*ctx.sizes, vertices, VERTICES, FRAMES),
+            num_warps=WARPS,
+        )
+        return tuple(shares.sum(1))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *upstream):
+        x = ctx.saved_tensors[0]
+        vertices, _, frames = x.shape
+        grad = x.new_empty(x.shape)
+        _kinetic_gradient[vertices, _blocks(frames)](
+            *ctx.saved_tensors,
+            *(values.contiguous() for values in upstream),
+            *(grad, *ctx.weights, *ctx.sizes, FRAMES),
+            num_warps=WARPS,
+        )
+        return grad, *[None] * 6
+
+
+@triton.jit
+def _depth(px, py, pz, nx, ny, nz, offset, margin):
+    """How far a point lies within the margin: negative, else zero."""
+    depth = dot(nx, ny, nz, px, py, pz) - offset - margin
+    return tl.where(depth > 0, 0.0, depth)  # unlike a minimum this passes NaN on
+
+
+@triton.jit
+def _potential(
+    x,
+    mass,
+    root,
+    gravity,
+    normal,
+    offset,
+    shares,
+    stiffness,
+    margin,
+    vertices,
+    frames,
+    chunk: tl.constexpr,
+    block: tl.constexpr,
+):
+    part = tl.program_id(0).to(tl.int64)
+    n = tl.program_id(1) * block + tl.arange(0, block)
+    inside = n < frames
+    rx, ry, rz = load3(root, frames, n, inside)
+    gx, gy, gz = load3(gravity, frames, n, inside)
+    weight, penalty = tl.zeros((block,), tl.float32), tl.zeros((block,), tl.float32)
+    first = part * chunk
+    for v in range(first, tl.minimum(first + chunk, vertices)):
+        px, py, pz = load3(x + v * 3 * frames, frames, n, inside)
+        nx, ny, nz = load3(normal + v * 3 * frames, frames, n, inside)
+        depth = _depth(px, py, pz, nx, ny, nz, tl.load(offset + v * frames + n, mask=inside, other=0.0), margin)
+        penalty += depth * depth
+        weight += tl.load(mass + v) * dot(px - rx, py - ry, pz - rz, gx, gy, gz)
+    share = shares + part * frames + n
+    tl.store(share, -weight, mask=inside)
+    tl.store(share + tl.num_programs(0).to(tl.int64) * frames, stiffness * penalty, mask=inside)
+
+
+@triton.jit
+def _potential_gradient(
+    x, mass, gravity, normal, offset, to_gravity, to_collision, grad, stiffness, margin, frames, block: tl.constexpr
+):
+    v = tl.program_id(0).to(tl.int64)
+    n = tl.program_id(1) * block + tl.arange(0, block)
+    inside = n < frames
+    px, py, pz = load3(x + v * 3 * frames, frames, n, inside)
+    nx, ny, nz = load3(normal + v * 3 * frames, frames, n, inside)
+    gx, gy, gz = load3(gravity, frames, n, inside)
+    depth = _depth(px, py, pz, nx, ny, nz, tl.load(offset + v * frames + n, mask=inside, other=0.0), margin)
+    out = 2 * stiffness * depth * tl.load(to_collision + n, mask=inside, other=0.0)
+    down = -tl.load(mass + v) * tl.load(to_gravity + n, mask=inside, other=0.0)
+    base = grad + v * 3 * frames
+    store3(base, frames, n, inside, out * nx + down * gx, out * ny + down * gy, out * nz + down * gz)
+
+
+@triton.jit
+def _moved(x, last, before, width, last_width, before_width, v, n, inside):
+    """What vertex v moved since the last frame, and by how much more than in the frame before that."""
+    px, py, pz = load3(x + v * 3 * width, width, n, inside)
+    lx, ly, lz = load3(last + v * 3 * last_width, last_width, n, inside)
+    bx, by, bz = load3(before + v * 3 * before_width, before_width, n, inside)
+    dx, dy, dz = px - lx, py - ly, pz - lz
+    return dx, dy, dz, dx - (lx - bx), dy - (ly - by), dz - (lz - bz)
+
+
+@triton.jit
+def _kinetic(
+    x,
+    mass,
+    last,
+    before,
+    shift,
+    shares,
+    inertia,
+    drag,
+    width,
+    last_width,
+    before_width,
+    moving,
+    vertices,
+    chunk: tl.constexpr,
+    block: tl.constexpr,
+):
+    part = tl.program_id(0).to(tl.int64)
+    n = tl.program_id(1) * block + tl.arange(0, block)
+    inside = n < moving
+    sx, sy, sz = load3(shift, moving, n, inside)
+    thrown, blown = tl.zeros((block,), tl.float32), tl.zeros((block,), tl.float32)
+    first = part * chunk
+    for v in range(first, tl.minimum(first + chunk, vertices)):
+        weight = tl.load(mass + v)
+        dx, dy, dz, ax, ay, az = _moved(x, last, before, width, last_width, before_width, v, n, inside)
+        thrown += weight * dot(ax, ay, az, ax, ay, az)
+        dx, dy, dz = dx - sx, dy - sy, dz - sz
+        blown += weight * dot(dx, dy, dz, dx, dy, dz)
+    share = shares + part * moving + n
+    tl.store(share, 0.5 * inertia * thrown, mask=inside)
+    tl.store(share + tl.num_programs(0).to(tl.int64) * moving, 0.5 * drag * blown, mask=inside)
+
+
+@triton.jit
+def _kinetic_gradient(
+    x,
+    mass,
+    last,
+    before,
+    shift,
+    to_inertia,
+    to_drag,
+    grad,
+    inertia,
+    drag,
+    width,
+    last_width,
+    before_width,
+    moving,
+    block: tl.constexpr,
+):
+    v = tl.program_id(0).to(tl.int64)
+    n = tl.program_id(1) * block + tl.arange(0, block)
+    inside = n < moving
+    sx, sy, sz = load3(shift, moving, n, inside)
+    dx, dy, dz, ax, ay, az = _moved(x, last, before, width, last_width, before_width, v, n, inside)
+    weight = tl.load(mass + v)
+    # Both are zero for frames without a past.
+    thrown = inertia * weight * tl.load(to_inertia + n, mask=inside, other=0.0)
+    blown = drag * weight * tl.load(to_drag + n, mask=inside, other=0.0)
+    gx, gy, gz = thrown * ax + blown * (dx - sx), thrown * ay + blown * (dy - sy), thrown * az + blown * (dz - sz)
+    store3(grad + v * 3 * width, width, n, n < width, gx, gy, gz)
