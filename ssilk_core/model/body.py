@@ -7,11 +7,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..assets import Body, Ints
+from ..assets import Body, Ints, SkinWeights
 from ..energy.collision import PosedBody
 from ..energy.surface_point import triangle_rings
 from ..mesh import topology
-from .decoder import blended, transformed
+from .skinning import Skinning
 
 
 class CollisionBody:
@@ -19,8 +19,7 @@ class CollisionBody:
 
     def __init__(self, body: Body, joint_count: int, *, vertices: Ints | None = None, device: torch.device) -> None:
         chosen = np.arange(body.mesh.vertex_count) if vertices is None else vertices
-        dense = body.skin.dense(joint_count)[chosen]
-        joints = np.flatnonzero(dense.any(axis=0))
+        body.skin.check_joints(joint_count)
         normals = topology.vertex_normals(body.mesh.points, body.mesh.faces)[chosen]
 
         def tensor(values: np.ndarray) -> Tensor:
@@ -31,8 +30,8 @@ class CollisionBody:
         faces = place[body.mesh.faces]
         rings = triangle_rings(faces[(faces >= 0).all(axis=1)], len(chosen))
         self.rings = torch.as_tensor(rings, device=device)
-        self.joints = torch.as_tensor(joints, device=device)
-        self.weights = tensor(dense[:, joints])
+        skin = SkinWeights(body.skin.path, body.skin.indices[chosen], body.skin.weights[chosen])
+        self.skin = Skinning(skin).to(device)
         self.points = tensor(body.mesh.points[chosen])[:, :, None]
         self.normals = tensor(normals)[:, :, None]
 
@@ -42,9 +41,5 @@ class CollisionBody:
 
         Without `surface` only vertices are collided with.
         """
-        affine = blended(self.weights, character[self.joints])
-        points = transformed(affine, self.points)
-        normals = (affine[:, :, :3] * self.normals[:, None]).sum(2)
-        return PosedBody(
-            points, normals / normals.norm(dim=1, keepdim=True).clamp_min(1e-8), self.rings if surface else None
-        )
+        points, normals = self.skin.surface(self.points[:, :, 0], self.normals[:, :, 0], character)
+        return PosedBody(points, normals, self.rings if surface else None)

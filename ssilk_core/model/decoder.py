@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """From blendshape weights and proxy rotations to vertices, differentiably (paper, Sections 3.3 and 3.4).
 
-Layouts keep frames last: transforms (joints, 3, 4, N), positions (V, 3, N). Linear blend skinning is then one
-dense matrix product over joints, and every element-wise step runs over contiguous memory.
+Layouts keep frames last: transforms (joints, 3, 4, N), positions (V, 3, N).
 
 A skinning matrix S_j takes the bind pose to the posed world. A proxy turns about its own bind position p inside
 its parent's frame, so S_p = S_parent [R', p - R' p], with R' the network's rotation in the axes of the bind pose.
@@ -15,7 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from .. import kernels
 from ..assets import PINNED, Scene
+from .skinning import Skinning
 
 
 def rotation_from_six_d(values: Tensor) -> Tensor:
@@ -34,16 +35,6 @@ def compose(left: Tensor, right: Tensor) -> Tensor:
     return torch.cat([product[..., :3, :], product[..., 3:, :] + moved], dim=-2)
 
 
-def blended(weights: Tensor, matrices: Tensor) -> Tensor:
-    """Blend skinning matrices (J, 3, 4, N) by dense weights (V, J) to one for each vertex, (V, 3, 4, N)."""
-    return (weights @ matrices.flatten(1)).reshape(-1, *matrices.shape[1:])
-
-
-def transformed(affine: Tensor, points: Tensor) -> Tensor:
-    """Apply an affine transform (V, 3, 4, N) to each point (V, 3, N or 1); returns (V, 3, N)."""
-    return (affine[:, :, :3] * points[:, None]).sum(2) + affine[:, :, 3]
-
-
 class Decoder(nn.Module):
     """Blendshapes, proxy kinematics and skinning with trainable B, W^g and W^p (Eqs. 5, 7 and 8).
 
@@ -55,55 +46,38 @@ class Decoder(nn.Module):
 
     rest: Tensor
     pivots: Tensor
+    parents: Tensor
     free: Tensor
-    used: Tensor
-    columns: Tensor
-    support: Tensor
     logits: Tensor
-    order: Tensor
     identity: Tensor
 
     def __init__(self, scene: Scene, shapes: int, generator: torch.Generator) -> None:
         super().__init__()
         rig = scene.rig
         self.proxy_count, self.shape_count = rig.proxy_count, shapes
+        self.above = tuple(rig.parents.tolist())  # as numbers too, which need not be fetched from a GPU
+        self.skin = Skinning(rig.skin, range(scene.character.skeleton.joint_count, len(scene.joint_names)))
         free = np.flatnonzero(scene.classes != PINNED)
-        # Joints that no vertex uses are left out of the product.
-        used = np.unique(rig.skin.indices[rig.skin.weights > 0])
-        support = rig.skin.weights > 0
         self._constant("rest", scene.garment.mesh.points)
         self._constant("pivots", rig.bind_transforms[:, :3, 3])
+        self._constant("parents", rig.parents)
         self._constant("free", free)
-        self._constant("used", used)
-        self._constant("columns", np.searchsorted(used, rig.skin.indices).clip(max=len(used) - 1))
-        self._constant("support", support)
-        self._constant("logits", np.log(np.where(support, rig.skin.weights, 1.0)))
+        # Minus infinity stays what it is: training gives no vertex another joint.
+        weights = rig.skin.weights
+        self._constant("logits", np.log(weights, out=np.full_like(weights, -np.inf), where=weights > 0))
         self._constant("identity", np.array([1.0, 0, 0, 0, 1, 0]))
-        self._constant_levels(scene)
-        self.skin_offset = nn.Parameter(torch.zeros(len(free), support.shape[1]))
+        self.skin_offset = nn.Parameter(torch.zeros(len(free), weights.shape[1]))
         self.shapes = nn.Parameter(1e-3 * torch.randn(len(free), 3, shapes, generator=generator))
 
     def _constant(self, name: str, values: np.ndarray) -> None:
         """Register a constant that is rebuilt from the scene, hence not saved; floats become float32."""
         tensor = torch.as_tensor(np.array(values))
-        tensor = tensor.float() if tensor.is_floating_point() else tensor
-        self.register_buffer(name, tensor.long() if tensor.dtype == torch.int32 else tensor, persistent=False)
+        self.register_buffer(name, tensor.float() if tensor.is_floating_point() else tensor, persistent=False)
 
-    def _constant_levels(self, scene: Scene) -> None:
-        """Group proxies by depth; positions run over character joints, then proxies level by level."""
-        joints, parents = scene.character.skeleton.joint_count, scene.rig.parents
-        depth = np.zeros(len(parents), dtype=int)
-        for proxy, parent in enumerate(parents):
-            depth[proxy] = depth[parent - joints] + 1 if parent >= joints else 0
-        by_level = np.argsort(depth, kind="stable")
-        position = np.arange(joints + len(parents))
-        position[joints + by_level] = joints + np.arange(len(parents))
-        self.level_count = int(depth.max(initial=-1)) + 1
-        for level in range(self.level_count):
-            members = np.flatnonzero(depth == level)
-            self._constant(f"level_{level}", members)
-            self._constant(f"above_{level}", position[parents[members]])
-        self._constant("order", position)
+    @property
+    def used(self) -> Tensor:
+        """Joints that move any vertex, the columns of `skin_weights`."""
+        return self.skin.used
 
     @property
     def output_count(self) -> int:
@@ -112,16 +86,20 @@ class Decoder(nn.Module):
 
     def activations(self, output: Tensor) -> tuple[Tensor, Tensor]:
         """Split network output (N, K + 6 P) into activations (K, N) in [-1, 1] and rotations (P, 3, 3, N)."""
-        a = torch.tanh(output[:, : self.shape_count].T)
+        activation, six_d = self._split(output)
+        return activation, rotation_from_six_d(six_d)
+
+    def _split(self, output: Tensor) -> tuple[Tensor, Tensor]:
         delta = output[:, self.shape_count :].T.reshape(self.proxy_count, 6, len(output))
-        return a, rotation_from_six_d(self.identity[:, None] + delta)
+        return torch.tanh(output[:, : self.shape_count].T), self.identity[:, None] + delta
+
+    def _influence_weights(self) -> Tensor:
+        """Return weights (V, I): a softmax over each vertex's support, pinned rows frozen."""
+        return torch.softmax(self.logits.index_add(0, self.free, self.skin_offset), dim=1)
 
     def skin_weights(self) -> Tensor:
-        """Return dense weights (V, used joints): a softmax over each vertex's support, pinned rows frozen."""
-        logits = self.logits.index_add(0, self.free, self.skin_offset)
-        weights = torch.softmax(logits.masked_fill(~self.support, -torch.inf), dim=1)
-        dense = weights.new_zeros(len(weights), len(self.used))
-        return dense.scatter_add(1, self.columns, weights.masked_fill(~self.support, 0.0))
+        """Return the weights as a matrix (V, used joints)."""
+        return self.skin.dense(self._influence_weights())
 
     def proxy_matrices(self, rotations: Tensor, character: Tensor) -> Tensor:
         """Forward kinematics: skinning matrices of all joints, (J + P, 3, 4, N).
@@ -132,17 +110,35 @@ class Decoder(nn.Module):
         """
         offset = self.pivots[:, :, None] - torch.einsum("pabn,pb->pan", rotations, self.pivots)
         own = torch.cat([rotations, offset[:, :, None]], dim=2)
-        matrices: Tensor = character
-        for level in range(self.level_count):
-            members, above = getattr(self, f"level_{level}"), getattr(self, f"above_{level}")
-            matrices = torch.cat([matrices, compose(matrices[above], own[members])])
-        return matrices[self.order]
+        matrices = [*character]
+        for parent, turn in zip(self.above, own):
+            matrices.append(compose(matrices[parent], turn))
+        return torch.stack(matrices)
+
+    def _matrices(self, six_d: Tensor, character: Tensor) -> Tensor:
+        """Return skinning matrices of all joints (J + P, 3, 4, N) from 6D rotations (P, 6, N)."""
+        if kernels.available(character.device):
+            from ..kernels.proxies import proxies_kernel
+
+            return proxies_kernel(six_d, self.pivots, self.parents, character)
+        return self.proxy_matrices(rotation_from_six_d(six_d), character)
+
+    def _offsets(self, activation: Tensor) -> Tensor | None:
+        """Return how far blendshapes move the rest shape (V, 3, N); pinned vertices stay."""
+        if not self.shape_count:
+            return None
+        # Rows of zeros for pinned vertices cost less than putting the others in their places in every frame.
+        shapes = self.shapes.new_zeros(len(self.rest), 3, self.shape_count).index_copy(0, self.free, self.shapes)
+        return (shapes.flatten(0, 1) @ activation).reshape(len(self.rest), 3, activation.shape[1])
+
+    def _skinned(self, activation: Tensor, matrices: Tensor) -> Tensor:
+        return self.skin(self.rest, self._offsets(activation), self._influence_weights(), matrices)
+
+    def vertices(self, output: Tensor, character: Tensor) -> Tensor:
+        """Return vertices (V, 3, N) [m] from network output (N, K + 6 P) and character (J, 3, 4, N)."""
+        activation, six_d = self._split(output)
+        return self._skinned(activation, self._matrices(six_d, character))
 
     def forward(self, activation: Tensor, rotations: Tensor, character: Tensor) -> Tensor:
         """Return vertices (V, 3, N) [m] from activations (K, N), rotations (P, 3, 3, N), character (J, 3, 4, N)."""
-        matrices = self.proxy_matrices(rotations, character) if self.proxy_count else character
-        canonical = self.rest[:, :, None]
-        if self.shape_count:
-            offsets = (self.shapes.flatten(0, 1) @ activation).reshape(len(self.free), 3, activation.shape[1])
-            canonical = canonical.expand(-1, -1, offsets.shape[-1]).index_add(0, self.free, offsets)
-        return transformed(blended(self.skin_weights(), matrices[self.used]), canonical)
+        return self._skinned(activation, self.proxy_matrices(rotations, character))

@@ -12,9 +12,9 @@ from ..assets import SkinWeights
 from ..energy import TERMS, GarmentEnergy
 from ..energy.collision import PosedBody, signed_distance
 from ..model.body import CollisionBody
-from ..model.decoder import blended, transformed
 from ..model.descriptors import GRAVITY
 from ..model.network import GarmentModel
+from ..model.skinning import Skinning
 from .bank import MotionBank
 from .parallel import ALONE, Team
 
@@ -56,7 +56,7 @@ class Validator:
         team: Team = ALONE,
     ) -> None:
         self.bank, self.energy, self.body, self.fps, self.team = bank, energy, body, fps, team
-        self.plain_weights = torch.as_tensor(plain.dense(bank.joint_count), dtype=rest.dtype, device=rest.device)
+        self.plain = Skinning(plain).to(rest.device)
         self.rest = rest
         self.clips = [
             range(int(start), min(int(stop), int(start) + frames)) for start, stop in zip(bank.starts, bank.stops)
@@ -65,7 +65,7 @@ class Validator:
 
     def plain_vertices(self, character: Tensor) -> Tensor:
         """Return plain skinning's positions (V, 3, N) [m]."""
-        return transformed(blended(self.plain_weights, character), self.rest[:, :, None])
+        return self.plain(self.rest, None, self.plain.weights, character)
 
     def score(self, model: GarmentModel) -> Score:
         """Return the mean score of a model over all clips."""

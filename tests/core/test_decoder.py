@@ -80,7 +80,7 @@ def test_forward_kinematics_equals_local_transforms_composed(toy_scene, toy_moti
     assert np.abs(expected[3:] - skinning(scene, motion)[:, 1, :3].transpose(1, 2, 0)[None]).max() > 0.05
 
 
-def test_a_reordered_rig_is_decoded_level_by_level(toy_scene, toy_model):
+def test_a_reordered_rig_is_decoded_parents_first(toy_scene, toy_model):
     """Proxies of different depths may come in any order that keeps parents first."""
     from dataclasses import replace
 

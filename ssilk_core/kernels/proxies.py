@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Forward kinematics of proxies from 6D rotations, and its gradient; `model.decoder` holds the plain twin.
+
+A program is one warp that owns a block of frames and walks over the proxies, parents first; backwards for the
+gradient, which it passes on from each proxy to its parent. No frame is another program's: there are no races.
+"""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+from torch.autograd import Function
+from torch.autograd.function import once_differentiable
+
+from .vectors import cross, dot, load3, store3
+
+BLOCK = 32  # frames of one program: few, since the walk is what takes time
+SHORTEST = tl.constexpr(1e-8)  # length that a vector is divided by at least
+
+
+def proxies_kernel(six_d: Tensor, pivots: Tensor, parents: Tensor, character: Tensor) -> Tensor:
+    """Return skinning matrices of the character's joints, then of the proxies (J + P, 3, 4, N).
+
+    Args:
+        six_d: 6D rotations in bind-pose axes (P, 6, N), the only argument with a gradient.
+        pivots: bind positions (P, 3); parents: combined index of each proxy's parent, before its own (P,), int32.
+        character: skinning matrices of the character's joints (J, 3, 4, N).
+    """
+    return _Proxies.apply(six_d.contiguous(), pivots, parents, character.detach())
+
+
+class _Proxies(Function):
+    @staticmethod
+    def forward(ctx, six_d, pivots, parents, character):
+        proxies, _, frames = six_d.shape
+        matrices = character.new_empty(len(character) + proxies, *character.shape[1:])
+        matrices[: len(character)] = character
+        _compose[(triton.cdiv(frames, BLOCK),)](
+            six_d, pivots, parents, matrices, len(character), proxies, frames, BLOCK, num_warps=1
+        )
+        ctx.save_for_backward(six_d, pivots, parents, matrices)
+        return matrices
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, upstream):
+        six_d, pivots, parents, matrices = ctx.saved_tensors
+        proxies, _, frames = six_d.shape
+        joints = len(matrices) - proxies
+        total = upstream[joints:].clone(memory_format=torch.contiguous_format)
+        grad = torch.empty_like(six_d)
+        _compose_gradient[(triton.cdiv(frames, BLOCK),)](
+            six_d, pivots, parents, matrices, total, grad, joints, proxies, frames, BLOCK, num_warps=1
+        )
+        return grad, None, None, None
+
+
+@triton.jit
+def _unit(x, y, z):
+    """A vector's direction, the inverse of its length, and whether the length is enough for one."""
+    length = tl.sqrt(dot(x, y, z, x, y, z))
+    scale = 1 / tl.maximum(length, SHORTEST)
+    return scale * x, scale * y, scale * z, scale, length >= SHORTEST
+
+
+@triton.jit
+def _unit_gradient(x, y, z, scale, enough, gx, gy, gz):
+    """The gradient of a vector whose direction (x, y, z) has the gradient (gx, gy, gz)."""
+    along = tl.where(enough, dot(x, y, z, gx, gy, gz), 0.0)
+    return scale * (gx - along * x), scale * (gy - along * y), scale * (gz - along * z)
+
+
+@triton.jit
+def _axes(six_d, frames, n, inside):
+    """The three axes of a 6D rotation by Gram-Schmidt."""
+    ax, ay, az = load3(six_d, frames, n, inside)
+    bx, by, bz = load3(six_d + 3 * frames, frames, n, inside)
+    ax, ay, az, _, _ = _unit(ax, ay, az)
+    along = dot(ax, ay, az, bx, by, bz)
+    bx, by, bz, _, _ = _unit(bx - along * ax, by - along * ay, bz - along * az)
+    cx, cy, cz = cross(ax, ay, az, bx, by, bz)
+    return ax, ay, az, bx, by, bz, cx, cy, cz
+
+
+@triton.jit
+def _axes_gradient(six_d, frames, n, inside, gax, gay, gaz, gbx, gby, gbz, gcx, gcy, gcz):
+    """The gradient of a 6D rotation from those of its three axes."""
+    ax, ay, az = load3(six_d, frames, n, inside)
+    vx, vy, vz = load3(six_d + 3 * frames, frames, n, inside)
+    ax, ay, az, scale_a, enough_a = _unit(ax, ay, az)
+    along = dot(ax, ay, az, vx, vy, vz)
+    bx, by, bz, scale_b, enough_b = _unit(vx - along * ax, vy - along * ay, vz - along * az)
+    # The third axis is a x b.
+    tx, ty, tz = cross(gcx, gcy, gcz, ax, ay, az)
+    gvx, gvy, gvz = _unit_gradient(bx, by, bz, scale_b, enough_b, gbx + tx, gby + ty, gbz + tz)
+    tx, ty, tz = cross(bx, by, bz, gcx, gcy, gcz)
+    # The second is v - (a.v) a before it gets its length.
+    part = dot(ax, ay, az, gvx, gvy, gvz)
+    gax, gay, gaz = gax + tx - along * gvx, gay + ty - along * gvy, gaz + tz - along * gvz
+    gax, gay, gaz = gax - part * vx, gay - part * vy, gaz - part * vz
+    gax, gay, gaz = _unit_gradient(ax, ay, az, scale_a, enough_a, gax, gay, gaz)
+    return gax, gay, gaz, gvx - part * ax, gvy - part * ay, gvz - part * az
+
+
+@triton.jit
+def _kept(pivot, ax, ay, az, bx, by, bz, cx, cy, cz):
+    """The translation p - R p that keeps a pivot in place."""
+    px, py, pz = tl.load(pivot), tl.load(pivot + 1), tl.load(pivot + 2)
+    return px - dot(ax, bx, cx, px, py, pz), py - dot(ay, by, cy, px, py, pz), pz - dot(az, bz, cz, px, py, pz)
+
+
+@triton.jit
+def _compose(six_d, pivots, parents, matrices, joints, proxies, frames, block: tl.constexpr):
+    n = tl.program_id(0) * block + tl.arange(0, block)
+    inside = n < frames
+    for p in range(proxies):
+        ax, ay, az, bx, by, bz, cx, cy, cz = _axes(six_d + p * 6 * frames, frames, n, inside)
+        ox, oy, oz = _kept(pivots + p * 3, ax, ay, az, bx, by, bz, cx, cy, cz)
+        above = matrices + tl.load(parents + p) * 12 * frames
+        made = matrices + (joints + p) * 12 * frames
+        for row in tl.static_range(3):
+            sx, sy, sz = load3(above + row * 4 * frames, frames, n, inside)
+            shift = tl.load(above + (row * 4 + 3) * frames + n, mask=inside, other=0.0)
+            a, b, c = dot(sx, sy, sz, ax, ay, az), dot(sx, sy, sz, bx, by, bz), dot(sx, sy, sz, cx, cy, cz)
+            store3(made + row * 4 * frames, frames, n, inside, a, b, c)
+            tl.store(made + (row * 4 + 3) * frames + n, dot(sx, sy, sz, ox, oy, oz) + shift, mask=inside)
+        tl.debug_barrier()  # what was written is read again by the children
+
+
+@triton.jit
+def _compose_gradient(six_d, pivots, parents, matrices, total, grad, joints, proxies, frames, block: tl.constexpr):
+    n = tl.program_id(0) * block + tl.arange(0, block)
+    inside = n < frames
+    for done in range(proxies):
+        p = proxies - 1 - done
+        parent = tl.load(parents + p)
+        ax, ay, az, bx, by, bz, cx, cy, cz = _axes(six_d + p * 6 * frames, frames, n, inside)
+        ox, oy, oz = _kept(pivots + p * 3, ax, ay, az, bx, by, bz, cx, cy, cz)
+        gax = tl.zeros((block,), tl.float32)
+        gay, gaz, gbx, gby, gbz, gcx, gcy, gcz, gox, goy, goz = gax, gax, gax, gax, gax, gax, gax, gax, gax, gax, gax
+        for row in tl.static_range(3):
+            sx, sy, sz = load3(matrices + (parent * 12 + row * 4) * frames, frames, n, inside)
+            here = total + (p * 12 + row * 4) * frames
+            ha, hb, hc = load3(here, frames, n, inside)
+            ho = tl.load(here + 3 * frames + n, mask=inside, other=0.0)
+            gax, gay, gaz = gax + sx * ha, gay + sy * ha, gaz + sz * ha
+            gbx, gby, gbz = gbx + sx * hb, gby + sy * hb, gbz + sz * hb
+            gcx, gcy, gcz = gcx + sx * hc, gcy + sy * hc, gcz + sz * hc
+            gox, goy, goz = gox + sx * ho, goy + sy * ho, goz + sz * ho
+            if parent >= joints:
+                up = total + ((parent - joints) * 12 + row * 4) * frames
+                ua, ub, uc = load3(up, frames, n, inside)
+                uo = tl.load(up + 3 * frames + n, mask=inside, other=0.0)
+                ua += dot(ha, hb, hc, ax, bx, cx) + ho * ox
+                ub += dot(ha, hb, hc, ay, by, cy) + ho * oy
+                uc += dot(ha, hb, hc, az, bz, cz) + ho * oz
+                store3(up, frames, n, inside, ua, ub, uc)
+                tl.store(up + 3 * frames + n, uo + ho, mask=inside)
+        px, py, pz = tl.load(pivots + p * 3), tl.load(pivots + p * 3 + 1), tl.load(pivots + p * 3 + 2)
+        gax, gay, gaz = gax - px * gox, gay - px * goy, gaz - px * goz
+        gbx, gby, gbz = gbx - py * gox, gby - py * goy, gbz - py * goz
+        gcx, gcy, gcz = gcx - pz * gox, gcy - pz * goy, gcz - pz * goz
+        gax, gay, gaz, gbx, gby, gbz = _axes_gradient(
+            six_d + p * 6 * frames, frames, n, inside, gax, gay, gaz, gbx, gby, gbz, gcx, gcy, gcz
+        )
+        store3(grad + p * 6 * frames, frames, n, inside, gax, gay, gaz)
+        store3(grad + (p * 6 + 3) * frames, frames, n, inside, gbx, gby, gbz)
+        tl.debug_barrier()  # what was added to a parent is read again when its turn comes

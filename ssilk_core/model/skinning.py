@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Linear blend skinning: sparse in kernels where they serve, one dense matrix product over joints elsewhere.
+
+Layouts keep frames last: matrices (joints, 3, 4, N) take the bind pose to the posed world, positions are (V, 3, N).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from .. import kernels
+from ..assets import Ints, SkinWeights
+
+PARTS = 16  # programs that share the gradient of a joint's matrix, so that few joints fill a GPU too
+
+
+def blended(weights: Tensor, matrices: Tensor) -> Tensor:
+    """Blend skinning matrices (J, 3, 4, N) by dense weights (V, J) to one for each vertex, (V, 3, 4, N)."""
+    return (weights @ matrices.flatten(1)).reshape(-1, *matrices.shape[1:])
+
+
+def transformed(affine: Tensor, points: Tensor) -> Tensor:
+    """Apply an affine transform (V, 3, 4, N) to each point (V, 3, N or 1); returns (V, 3, N)."""
+    return turned(affine, points) + affine[:, :, 3]
+
+
+def turned(affine: Tensor, directions: Tensor) -> Tensor:
+    """Apply the linear part of an affine transform (V, 3, 4, N) to each direction (V, 3, N or 1)."""
+    return (affine[:, :, :3] * directions[:, None]).sum(2)
+
+
+class Skinning(nn.Module):
+    """The influences of a mesh, in the orders in which skinning and its gradients go through them.
+
+    Args:
+        skin: joints of each vertex; weights of zero stand for no influence.
+        trainable: consecutive joints whose matrices may carry a gradient. Others count as constant.
+
+    Attributes:
+        weights: those of `skin`, shape (V, I).
+        used: joints that move any vertex; the columns of dense weights.
+    """
+
+    weights: Tensor
+    used: Tensor
+    columns: Tensor
+    joints: Tensor
+    counts: Tensor
+    entries: Tensor
+    starts: Tensor
+
+    def __init__(self, skin: SkinWeights, trainable: range = range(0)) -> None:
+        super().__init__()
+        support = skin.weights > 0
+        used = np.unique(skin.indices[support])
+        self.first_trainable = trainable.start
+        entries, starts = by_joint(skin.indices, support, trainable)
+        constants = {
+            "weights": skin.weights.astype(np.float32),
+            "used": used.astype(np.int64),
+            "columns": np.searchsorted(used, skin.indices).clip(max=len(used) - 1),
+            "joints": skin.indices.copy(),
+            # Influences after a vertex's last one are skipped; others of zero weight add nothing.
+            "counts": (support.shape[1] - support[:, ::-1].argmax(axis=1)).astype(np.int32),
+            "entries": entries,
+            "starts": starts,
+        }
+        for name, values in constants.items():
+            self.register_buffer(name, torch.from_numpy(values), persistent=False)
+
+    def dense(self, weights: Tensor) -> Tensor:
+        """Return weights (V, I) as a matrix (V, used joints)."""
+        return weights.new_zeros(len(weights), len(self.used)).scatter_add(1, self.columns, weights)
+
+    def forward(self, rest: Tensor, offsets: Tensor | None, weights: Tensor, matrices: Tensor) -> Tensor:
+        """Return skinned points (V, 3, N), differentiable in all but the rest shape.
+
+        Args:
+            rest: points (V, 3); offsets: added to them (V, 3, N), or None.
+            weights: of the influences (V, I), zero where there is none; matrices: of all joints (J, 3, 4, N).
+        """
+        if kernels.available(rest.device):
+            from ..kernels.skinning import skin_kernel
+
+            movers = (self.first_trainable, self.entries, self.starts)
+            return skin_kernel(rest, offsets, weights, matrices, (self.joints, self.counts), movers)
+        points = rest[:, :, None] if offsets is None else rest[:, :, None] + offsets
+        return transformed(blended(self.dense(weights), matrices[self.used]), points)
+
+    def surface(self, points: Tensor, normals: Tensor, matrices: Tensor) -> tuple[Tensor, Tensor]:
+        """Return skinned points and unit normals (V, 3, N) of points and normals (V, 3); without gradients."""
+        if kernels.available(points.device):
+            from ..kernels.skinning import skin_surface_kernel
+
+            return skin_surface_kernel(points, normals, self.weights, matrices, (self.joints, self.counts))
+        affine = blended(self.dense(self.weights), matrices[self.used])
+        direction = turned(affine, normals[:, :, None])
+        return transformed(affine, points[:, :, None]), direction / direction.norm(dim=1, keepdim=True).clamp_min(
+            1e-8
+        )
+
+
+def by_joint(indices: Ints, support: np.ndarray, trainable: range) -> tuple[Ints, Ints]:
+    """Sort influences by joint and split each joint's evenly.
+
+    Args:
+        indices: joints (V, I); support: which of them count (V, I); trainable: consecutive joints, T of them.
+
+    Returns:
+        Flat influences of these joints (E,), and where their parts begin and the last one ends (T, PARTS + 1); int32.
+    """
+    chosen = np.flatnonzero(support & np.isin(indices, trainable))
+    joint = indices.reshape(-1)[chosen]
+    order = np.argsort(joint, kind="stable")
+    first, stop = (np.searchsorted(joint[order], np.array(trainable) + side) for side in (0, 1))
+    starts = first[:, None] + (stop - first)[:, None] * np.arange(PARTS + 1) // PARTS
+    return chosen[order].astype(np.int32), starts.astype(np.int32)
