@@ -70,6 +70,8 @@ class TrainConfig:
         batch, window: windows for each step, and poses in each window.
         carry: share of windows that continue from the state where the last window of their slot ended.
         rotated: share of windows that get a random rotation, uniform on SO(3); the others stay upright.
+        resting: single poses that go on training the initialiser beside the windows.
+        kick: chance in each frame that a carried state is moved by noise; windows that begin anew always are.
         noise: standard deviation added to the first two latents of a window.
         noise_correlation: of the noise on the first latent with that on the second; 0 is the paper's.
         through_time: back-propagate through the whole window, as the paper does, or through each step by itself.
@@ -90,6 +92,8 @@ class TrainConfig:
     window: int = 32
     carry: float = 0.7
     rotated: float = 0.5
+    resting: int = 64
+    kick: float = 0.03
     noise: float = 0.1
     noise_correlation: float = 0.99
     through_time: bool = False
@@ -108,9 +112,9 @@ class TrainConfig:
     def __post_init__(self) -> None:
         need(self.surface in SURFACES, "training", f"surface '{self.surface}'", f"it is one of {', '.join(SURFACES)}")
         need(self.window >= 3, "training", f"a window of {self.window} poses", "inertia needs at least 3")
-        _need_between(self, 1, MOST, "iterations", "batch", "warm_batch", "validate_every")
+        _need_between(self, 1, MOST, "iterations", "batch", "warm_batch", "resting", "validate_every")
         _need_between(self, 3, MOST, "valid_frames")
-        _need_between(self, 0, 1, "carry", "rotated", "noise_correlation")
+        _need_between(self, 0, 1, "carry", "rotated", "noise_correlation", "kick")
         _need_between(self, 0, 0.99999, "warm", "average")
         _need_between(self, 0, MOST, "noise", "warm_rate", "rate", "final_rate", "rate_warmup", "skin_rate", "clip")
         _need_between(self, 0, 2**63 - 1, "seed")

@@ -139,10 +139,15 @@ def resample(motion: Motion, fps: float, *, cover: bool = False) -> Motion:
 CUT_SPEED = 25.0  # [m/s]; a root faster than this has been moved, not animated
 
 
-def split_at_cuts(motion: Motion) -> list[Motion]:
-    """Return the spans of a motion between jumps of its root (a teleport, an edit), in order; mostly just one."""
+def split_at_cuts(motion: Motion, *, most_turn: float = np.inf) -> list[Motion]:
+    """Return the spans of a motion between jumps of its root (a teleport, an edit), in order; mostly just one.
+
+    With `most_turn` [rad/s] it is also cut where any joint turns faster than that, as captured joints do that flip.
+    """
     step = np.linalg.norm(np.diff(motion.translations[:, 0], axis=0), axis=1) * motion.fps
-    ends = [*(np.flatnonzero(step > CUT_SPEED) + 1), motion.frame_count]
+    cosine = np.abs((motion.rotations[1:] * motion.rotations[:-1]).sum(-1)).clip(max=1.0)
+    turn = 2 * np.arccos(cosine).max(axis=1) * motion.fps
+    ends = [*(np.flatnonzero((step > CUT_SPEED) | (turn > most_turn)) + 1), motion.frame_count]
     return [motion.clip(start, stop) for start, stop in zip([0, *ends[:-1]], ends)]
 
 

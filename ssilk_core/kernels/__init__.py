@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Triton kernels for CUDA. Each has a plain PyTorch twin beside its caller, used everywhere else.
 
-The modules of this package import Triton and are themselves imported only where `available` said yes.
+Modules with kernels import Triton, and are themselves imported only where `available` said yes.
 """
 
 from __future__ import annotations

@@ -13,8 +13,16 @@ from ..config import ModelConfig
 
 
 def limited(values: Tensor, bound: float) -> Tensor:
-    """Return b tanh(values / b), the identity around zero; unlimited for a bound of zero."""
-    return bound * torch.tanh(values / bound) if bound else values
+    """Return values kept within a bound b; unlimited for a bound of zero.
+
+    The identity up to b / 2, so that a state well within its bound is not drawn towards zero step by step; from
+    there it bends smoothly, h + h tanh((|v| - h) / h) with h = b / 2, and never passes b.
+    """
+    if not bound:
+        return values
+    half = bound / 2
+    inner = values.clamp(-half, half)
+    return inner + half * torch.tanh((values - inner) / half)
 
 
 class Integrator(nn.Module, ABC):
@@ -73,7 +81,11 @@ class Verlet(Integrator):
 
 
 class SpringVerlet(Verlet):
-    """Eq. 3 with a spring: z_t = zbar + k (P(theta_t) - zbar) + S([zbar, z_{t-1}, P(theta_t), pose]).
+    """Eq. 3 with a spring: z_t = zbar + k (P(theta_t) - zbar) + s S([z_{t-1}, v, d, pose]).
+
+    S sees the state, its velocity v = z_{t-1} - z_{t-2} and its distance d = P(theta_t) - zbar from rest, each
+    scaled to order one: given as states side by side, velocities would be small differences of large inputs, and
+    those are learnt last. `reach` s scales what S gives to what it has to give.
 
     Without S every dimension is a damped spring towards the quasi-static state, stable for any k in (0, 1]; S
     learns what such a spring misses. Stiffnesses start spread from slow swings to quick following and stay under
@@ -82,6 +94,7 @@ class SpringVerlet(Verlet):
 
     states = 3
     slowest = 0.01
+    velocity_scale, distance_scale, reach = 10.0, 3.0, 0.1
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__(config)
@@ -91,8 +104,10 @@ class SpringVerlet(Verlet):
 
     def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor) -> Tensor:
         forward = self.extrapolated(before, now)
-        pull = self.config.stiffness * torch.sigmoid(self.share) * (rest - forward)
-        return forward + limited(pull + stepper(torch.cat([forward, now, rest, pose], dim=1)), self.config.push)
+        away = rest - forward
+        seen = [now, self.velocity_scale * (now - before), self.distance_scale * away, pose]
+        pull = self.config.stiffness * torch.sigmoid(self.share) * away
+        return forward + limited(pull + self.reach * stepper(torch.cat(seen, dim=1)), self.config.push)
 
 
 class Direct(Integrator):

@@ -87,7 +87,7 @@ class GarmentModel(nn.Module):
 
     def vertices(self, z: Tensor, character: Tensor) -> Tensor:
         """Decode latents (N, latent) over character skinning matrices (J, 3, 4, N) to positions (V, 3, N) [m]."""
-        return self.decoder(*self.pose(z), character)
+        return self.decoder.vertices(self.output(z), character)
 
     @torch.no_grad()
     def deformer(self) -> Deformer:

@@ -7,6 +7,8 @@ import torch
 from torch import Tensor
 
 from ..energy import GarmentEnergy
+from ..energy.collision import nearest_planes
+from ..energy.nearest import BLOCK, compact_blocks
 from ..model.body import CollisionBody
 from ..model.descriptors import GRAVITY
 from ..model.network import GarmentModel
@@ -24,18 +26,17 @@ class Objective:
     ) -> None:
         self.model, self.energy, self.body, self.bank = model, energy, body, bank
         self.surface = surface
+        points = model.scene.garment.mesh.points
+        self.blocks = torch.as_tensor(compact_blocks(points, BLOCK), device=bank.static.device)
         self.dt = 1 / model.config.fps
 
     def potential(self, x: Tensor, direction: Tensor, character: Tensor) -> Terms:
         """Return every term but inertia of positions x (V, 3, N) under gravity directions (N, 3)."""
-        energy = self.energy
-        root = character[0, :, 3].detach()  # keeps the value of gravity small; constant in the parameters
-        return {
-            "stretch": energy.stretch(x),
-            "bending": energy.bending(x),
-            "gravity": energy.gravity(x - root, GRAVITY * direction.T),
-            "collision": energy.collision(x, self.body.posed(character, surface=self.surface)),
-        }
+        energy, root = self.energy, character[0, :, 3]  # heights over the root keep the value of gravity small
+        stretch, bending = energy.elastic(x)
+        planes = nearest_planes(x, self.body.posed(character, surface=self.surface), self.blocks)
+        gravity, collision = energy.potential(x, root, GRAVITY * direction.T, *planes)
+        return {"stretch": stretch, "bending": bending, "gravity": gravity, "collision": collision}
 
     def static(self, frames: Tensor, direction: Tensor) -> Terms:
         """Return the terms of the initialiser's quasi-static states on single poses (Section 3.1)."""
@@ -51,8 +52,8 @@ class Objective:
             noise: added to the two first latents, shape (2, batch, latent).
 
         Returns:
-            Terms of the frames from the third on, terms of the initialiser on the first two frames, and the
-            last two latents (2, batch, latent) for the next window.
+            Terms of the frames from the third on, terms of the initialiser on `resting` of the frames, and the last
+            two latents (2, batch, latent) for the next window.
         """
         model, bank, length = self.model, self.bank, sampler.config.window
         batch = len(sampler.first)
@@ -60,10 +61,9 @@ class Objective:
         direction = sampler.direction.repeat(length, 1)
         static = bank.static_descriptor(frames, direction)
         pose = torch.cat([static, bank.dynamic[frames]], dim=1).reshape(length, batch, -1)
-        rest = model.initial(static)
-        # Detached: the initialiser learns rest states from their own energy, not what helps the next frames.
-        target = rest.detach().reshape(length, batch, -1)
-        start = torch.where(sampler.carried[None, :, None], sampler.latents, target[:2])
+        with torch.no_grad():  # the initialiser learns rest states from their own energy, not what helps later frames
+            target = model.initial(static).reshape(length, batch, -1)
+            start = torch.where(sampler.carried[None, :, None], sampler.latents, target[:2])
         with torch.set_grad_enabled(sampler.config.through_time):
             z = model.roll([*(start + noise)], target[2:], pose[2:])
         rolled = torch.cat(z[2:])
@@ -73,27 +73,24 @@ class Objective:
             rolled = model.step(
                 states[: -2 * batch], states[batch:-batch], *(v[2:].flatten(0, 1) for v in (target, pose))
             )
-        quiet = rest[: 2 * batch]
+        resting_count = min(sampler.config.resting, len(frames))
+        quiet = model.initial(static[:resting_count])
         with torch.no_grad():
             past = model.vertices(torch.cat(z[:2]), bank.character(frames[: 2 * batch]))
         # The windows from the third frame on and the initialiser's own states share one decoding.
-        seen, facing = (
-            torch.cat([frames[2 * batch :], frames[: 2 * batch]]),
-            torch.cat([direction[2 * batch :], direction[: 2 * batch]]),
-        )
+        seen = torch.cat([frames[2 * batch :], frames[:resting_count]])
+        facing = torch.cat([direction[2 * batch :], direction[:resting_count]])
         character = bank.character(seen)
         x = model.vertices(torch.cat([rolled, quiet]), character)
         terms = self.potential(x, facing, character)
         count = (length - 2) * batch
         dynamic = {name: value[:count] for name, value in terms.items()}
         resting = {name: value[count:] for name, value in terms.items()}
-        path = torch.cat([past, x[..., :count].detach()], dim=-1)
-        predicted = 2 * path[..., batch:-batch] - path[..., : -2 * batch]
-        dynamic["inertia"] = self.energy.inertia(x[..., :count], predicted, self.dt)
-        if self.energy.fabric.drag:
-            root = bank.root[frames].T
-            carried = path[..., batch:-batch] + root[:, 2 * batch :] - root[:, batch:-batch]
-            dynamic["drag"] = self.energy.drag(x[..., :count], carried, self.dt)
+        path = torch.cat([past, x[..., : count - batch].detach()], dim=-1)
+        root = bank.root[frames].T
+        dynamic["inertia"], dynamic["drag"] = self.energy.kinetic(
+            x, path[..., batch:], path[..., :-batch], root[:, 2 * batch :] - root[:, batch:-batch], self.dt
+        )
         return dynamic, resting, torch.stack(z[-2:]).detach()
 
 

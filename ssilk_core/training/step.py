@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from ..config import TrainConfig
 from ..model.network import GarmentModel
+from .faults import Faults
 from .objective import Objective, total
 from .windows import WindowSampler, random_directions
 
@@ -30,40 +31,38 @@ def learning_rate(config: TrainConfig, iteration: int) -> float:
     return ramp * (final + (peak - final) * 0.5 * (1 + math.cos(math.pi * done / max(1, span))))
 
 
+Share = Callable[[list[Tensor]], None]
+
+
 class Stepper:
     """Draws a batch, computes the objective and moves the parameters.
+
+    Args:
+        share: given the gradients before they are used, to average them over processes; nothing by default.
 
     Attributes:
         terms: energies of the last step [J], updated in place so that reading them needs no new launch.
         averaged: running average of the model's parameters.
-        skipped: steps left out because a gradient was not finite.
+        faults: steps that were undone because something was not finite.
     """
 
     def __init__(
-        self, model: GarmentModel, objective: Objective, sampler: WindowSampler, config: TrainConfig
+        self,
+        model: GarmentModel,
+        objective: Objective,
+        sampler: WindowSampler,
+        config: TrainConfig,
+        share: Share | None = None,
     ) -> None:
         self.model, self.objective, self.sampler, self.config = model, objective, sampler, config
+        self.share = share
         self.device = sampler.first.device
-        on_gpu = self.device.type == "cuda"
-        slow = [
-            value
-            for name, value in model.named_parameters()
-            if name.startswith("integrator.") or "skin_offset" in name
-        ]
-        fast = [value for value in model.parameters() if all(value is not other for other in slow)]
+        self.optimiser = _optimiser(model, self.device)
         self.factors = [1.0, config.skin_rate]
-        # A captured graph reads the step size from a tensor; elsewhere a number is faster.
-        self.optimiser = torch.optim.Adam(
-            [
-                {"params": group, "lr": torch.tensor(0.0, device=self.device) if on_gpu else 0.0}
-                for group in (fast, slow)
-            ],
-            capturable=on_gpu,
-            foreach=True,
-        )
         self.averaged = copy.deepcopy(model).requires_grad_(False)
         self.terms: dict[str, Tensor] = {}
-        self.skipped = torch.zeros((), dtype=torch.int64, device=self.device)
+        self.faults = Faults(self.device)
+        self._iteration = torch.zeros((), dtype=torch.int64, device=self.device)
         self._graph: torch.cuda.CUDAGraph | None = None
         self._phase, self._eager = "", 0
 
@@ -74,38 +73,42 @@ class Stepper:
         frames = (draw * bank.frame_count).long().clamp_max(bank.frame_count - 1)
         direction = random_directions(config.warm_batch, config.rotated, sampler.generator, self.device)
         terms = self.objective.static(frames, direction)
-        self._descend(total(terms), {name: value.mean() for name, value in terms.items()})
+        means = {name: value.mean() for name, value in terms.items()}
+        self._descend(sum(means.values()), means, {"frames": frames, "directions": direction})  # type: ignore[arg-type]
 
     def windows(self) -> None:
         """Train everything on one window of every slot."""
-        dynamic, resting, latents = self.objective.window(self.sampler, self.sampler.noise())
-        length = self.config.window
-        # Every frame weighs the same, the two that the initialiser answers for included.
-        loss = (total(dynamic) * (length - 2) + total(resting) * 2) / length
-        self._descend(loss, {name: value.mean() for name, value in dynamic.items()})
+        noise = self.sampler.noise()
+        dynamic, resting, latents = self.objective.window(self.sampler, noise)
+        moving, still = (next(iter(terms.values())).shape[0] for terms in (dynamic, resting))
+        # Every frame weighs the same, those that the initialiser answers for included.
+        loss = (total(dynamic) * moving + total(resting) * still) / (moving + still)
+        means = {name: value.mean() for name, value in dynamic.items()}
+        self._descend(loss, means, {**self.sampler.window(), "noise": noise})
         self.sampler.advance(latents)
 
-    def _descend(self, loss: Tensor, terms: dict[str, Tensor]) -> None:
-        self.optimiser.zero_grad(set_to_none=False)
+    def _descend(self, loss: Tensor, terms: dict[str, Tensor], window: dict[str, Tensor]) -> None:
+        self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        parameters = [value for value in self.model.parameters() if value.grad is not None]
-        norm = nn.utils.clip_grad_norm_(parameters, self.config.clip)
-        # A step whose gradient is not finite is left out: its gradients become zero.
-        finite = torch.isfinite(norm)
-        for gradient in (value.grad for value in parameters):
-            assert gradient is not None
-            gradient.copy_(torch.where(finite, gradient, 0.0))
-        self.skipped += ~finite
+        gradients = [value.grad for value in self.model.parameters() if value.grad is not None]
+        if self.share is not None:
+            self.share(gradients)
+        norm = nn.utils.get_total_norm(gradients, foreach=True)
+        bad = ~(norm.isfinite() & loss.isfinite())
+        torch._foreach_mul_(gradients, (self.config.clip / (norm + 1e-12)).clamp_max(1.0))
+        # The fused optimiser leaves parameters, moments and step counts as they are where this is one.
+        self.optimiser.found_inf = bad.float()  # type: ignore[attr-defined]
         self.optimiser.step()
-        with torch.no_grad():
-            for mean, latest in zip(self.averaged.parameters(), self.model.parameters()):
-                mean.lerp_(latest, 1 - self.config.average)
+        torch._foreach_lerp_([*self.averaged.parameters()], [*self.model.parameters()], 1 - self.config.average)
+        terms = {name: value.detach() for name, value in terms.items()}
+        self.faults.record(bad, self._iteration, terms, window)
         for name, value in terms.items():
-            self.terms.setdefault(name, torch.zeros((), device=self.device)).copy_(value.detach())
+            self.terms.setdefault(name, torch.zeros((), device=self.device)).copy_(value)
 
     def run(self, iteration: int) -> None:
         """Do the step of an iteration, in the phase that it belongs to."""
         rate = learning_rate(self.config, iteration)
+        self._iteration.fill_(iteration)
         for group, factor in zip(self.optimiser.param_groups, self.factors):
             if self.device.type == "cuda":
                 group["lr"].fill_(rate * factor)
@@ -137,3 +140,13 @@ class Stepper:
             with torch.cuda.graph(self._graph):
                 body()
         self._graph.replay()
+
+
+def _optimiser(model: GarmentModel, device: torch.device) -> torch.optim.Adam:
+    """Return Adam over two groups: networks and shapes, then integration and skinning, which move more slowly."""
+    slow = [v for name, v in model.named_parameters() if name.startswith("integrator.") or "skin_offset" in name]
+    fast = [value for value in model.parameters() if all(value is not other for other in slow)]
+    on_gpu = device.type == "cuda"
+    # A captured graph reads the step size from a tensor; elsewhere a number is faster.
+    groups = [{"params": group, "lr": torch.tensor(0.0, device=device) if on_gpu else 0.0} for group in (fast, slow)]
+    return torch.optim.Adam(groups, capturable=on_gpu, fused=True)

@@ -62,12 +62,14 @@ class WindowSampler:
         """Return noise for the first two latents of each window, shape (2, batch, latent).
 
         Mostly alike on both: the garment is put elsewhere, not thrown. Independent noise of this size is a velocity
-        ten times that of everyday motion.
+        ten times that of everyday motion. Windows that begin anew always get it, those that go on now and then.
         """
-        config = self.config
-        first, second = torch.randn(self.latents.shape, generator=self.generator, device=self.latents.device)
+        config, device = self.config, self.latents.device
+        first, second = torch.randn(self.latents.shape, generator=self.generator, device=device)
         second = config.noise_correlation * first + (1 - config.noise_correlation**2) ** 0.5 * second
-        return config.noise * torch.stack([first, second])
+        chance = 1 - (1 - config.kick) ** (config.window - 2)
+        kicked = torch.rand(config.batch, 1, generator=self.generator, device=device) < chance
+        return config.noise * torch.stack([first, second]) * (kicked | ~self.carried[:, None])
 
     def advance(self, latents: Tensor) -> None:
         """Move on: keep the last two `latents` (2, batch, latent) of the window, then choose the next windows."""
@@ -84,18 +86,16 @@ class WindowSampler:
         self.latents.copy_(latents.detach())
         self.carried.copy_(go_on)
 
+    def window(self) -> dict[str, Tensor]:
+        """Return where the windows stand, by name."""
+        return {name: getattr(self, name) for name in ("first", "direction", "latents", "carried")}
+
     def state(self) -> dict[str, Tensor]:
         """Return what a resumed run needs to go on exactly, the random state included."""
-        return {
-            "first": self.first,
-            "direction": self.direction,
-            "latents": self.latents,
-            "carried": self.carried,
-            "generator": self.generator.get_state(),
-        }
+        return {**self.window(), "generator": self.generator.get_state()}
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Take back what `state` returned."""
-        for name in ("first", "direction", "latents", "carried"):
-            getattr(self, name).copy_(state[name])
+        for name, value in self.window().items():
+            value.copy_(state[name])
         self.generator.set_state(state["generator"].cpu().to(torch.uint8))

@@ -13,7 +13,7 @@ from ssilk_core.training.objective import Objective, total
 from ssilk_core.training.step import Stepper
 from ssilk_core.training.windows import WindowSampler
 
-CONFIG = TrainConfig(batch=3, window=6, rotated=0.5, noise=0.2)
+CONFIG = TrainConfig(batch=3, window=6, resting=6, rotated=0.5, noise=0.2)
 
 
 @pytest.fixture
