@@ -12,9 +12,9 @@ from ssilk_core import __version__
 from ssilk_core.errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, SsilkError, fail
 from ssilk_core.events import Failed, JsonReporter, Reporter, TextReporter
 
-from . import bake, demo, inspect, rig, train, verify, view
+from . import bake, demo, inspect, rig, simulate, train, verify, view
 
-VERBS = (inspect, rig, train, bake, verify, view, demo)
+VERBS = (inspect, rig, train, bake, simulate, verify, view, demo)
 
 # The extra of the distribution that brings all that a verb needs.
 EXTRAS = {
@@ -22,6 +22,7 @@ EXTRAS = {
     "rig": "setup",
     "train": "train",
     "bake": "bake",
+    "simulate": "train",
     "verify": "bake",
     "view": "view",
     "demo": "all",

@@ -22,7 +22,7 @@ LAYERS = (
     {"mesh", "kinematics", "kernels"},
     {"model", "energy"},
     {"checkpoint"},
-    {"demo", "view", "training", "rollout", "preflight", "setup"},
+    {"demo", "view", "simulate", "training", "rollout", "preflight", "setup"},
     {"cli"},
     {"__main__"},
 )

@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Simulate a garment over motions, without a network: the accurate and slow end, and the reference for models.
+
+Every frame minimises the energy that networks are trained with, for every vertex. The result is a shot whose garment
+has its points at each frame, with the body playing beside it. Several motions advance together, which a GPU takes
+hardly longer for, into one file each.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ssilk_core.config import overridden
+from ssilk_core.errors import EXIT_OK, need
+from ssilk_core.events import Progress, Reporter, Result, Started
+from ssilk_core.fabrics import FABRICS, Fabric, fabric_named
+
+from . import options as shared
+
+if TYPE_CHECKING:
+    import torch
+
+    from ssilk_core.assets import Motion, Scene
+    from ssilk_core.simulate import SimulationOptions
+
+
+def add_arguments(verb: argparse.ArgumentParser) -> None:
+    """Add the options of this verb."""
+    shared.add_scene(verb)
+    shared.add_setup(verb)
+    verb.add_argument(
+        "--motion", type=Path, nargs="+", required=True, metavar="SHOT[:/PRIM]", help="USD files with motions"
+    )
+    verb.add_argument(
+        "-o", "--output", type=Path, required=True,
+        help="shot to write (.usdc, .usd or .usda), or a folder where there are several motions",
+    )  # fmt: skip
+    verb.add_argument("--fabric", choices=FABRICS, default="default", help="material (default: that of the paper)")
+    verb.add_argument(
+        "--material",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help=f"change a property of the fabric (repeatable): {', '.join(Fabric.__dataclass_fields__)}",
+    )
+    verb.add_argument("--fps", type=float, default=30.0, help="frames per second (default 30, as models are trained)")
+    verb.add_argument("--substeps", type=int, default=1, help="steps in each frame (default 1)")
+    verb.add_argument("--tolerance", type=float, default=1e-2, metavar="G",
+                      help="accelerations that may be out of balance, in units of g (default 0.01)")  # fmt: skip
+    verb.add_argument("--precision", choices=("float64", "float32"), default="float64",
+                      help="of positions and energies (default float64)")  # fmt: skip
+    verb.add_argument("--batch", type=int, default=64, help="motions that advance together (default 64)")
+    verb.add_argument("--no-body", action="store_true", help="leave the body meshes out")
+    verb.add_argument("--device", default="cpu", help="where it runs (default cpu)")
+
+
+def run(options: argparse.Namespace, report: Reporter) -> int:
+    """Simulate and write."""
+    from ssilk_usd.read_motion import motion_files, read_motion
+
+    from ssilk_core.devices import chosen_device
+    from ssilk_core.simulate import SimulationOptions
+    from ssilk_core.simulate.newton import SolverOptions
+
+    outputs = _outputs(options.output, options.motion)
+    for output in outputs:
+        shared.check_output(output, options.stage, *motion_files(options.motion))
+    device = chosen_device(options.device)
+    scene = shared.load_scene(options, report)
+    motions = [read_motion(str(path), scene.character.skeleton) for path in options.motion]
+    settings = SimulationOptions(
+        fps=options.fps,
+        substeps=options.substeps,
+        batch=options.batch,
+        precision=options.precision,
+        solver=SolverOptions(tolerance=options.tolerance),
+        rest=SolverOptions(tolerance=options.tolerance, iterations=150),
+    )
+    fabric = overridden(fabric_named(options.fabric), options.material)
+    found = _written(options, outputs, scene, fabric, motions, settings, device, report)
+    report(Result("simulate", {"shots": ", ".join(map(str, outputs)), **found}))
+    return EXIT_OK
+
+
+def _outputs(output: Path, motions: Sequence[Path]) -> list[Path]:
+    """Return the file that each motion's shot is written to."""
+    from ssilk_usd.read_stage import LAYER_SUFFIXES, split_location
+
+    if output.suffix in LAYER_SUFFIXES:
+        need(len(motions) == 1, str(output), f"one file for {len(motions)} motions", "each shot is a file of its own",
+             "name a folder")  # fmt: skip
+        return [output]
+    names = [Path(split_location(str(motion))[0]).stem for motion in motions]
+    same = sorted({name for name in names if names.count(name) > 1})
+    need(not same, "--motion", f"several files are called {', '.join(same)}", "shots are named after their motions",
+         "simulate them into separate folders")  # fmt: skip
+    return [output / f"{name}.usdc" for name in names]
+
+
+def _written(
+    options: argparse.Namespace,
+    outputs: Sequence[Path],
+    scene: Scene,
+    fabric: Fabric,
+    motions: Sequence[Motion],
+    settings: SimulationOptions,
+    device: torch.device,
+    report: Reporter,
+) -> dict[str, object]:
+    """Simulate into open files, frame by frame, and return figures of the whole."""
+    from ssilk_usd.points import point_cache
+    from ssilk_usd.read_stage import open_stage
+    from ssilk_usd.units import StageUnits
+
+    from ssilk_core.simulate import Simulator, shots_of
+
+    simulator = Simulator(scene, fabric, settings, device=device)
+    shots = shots_of(motions, settings)
+    units, total = StageUnits.of(open_stage(options.stage)), sum(shot.frame_count for shot in shots)
+    report(Started("simulate", total, {"outputs": [str(path) for path in outputs]}))
+    figures = _Figures(settings.solver.tolerance)
+    with ExitStack() as stack:
+        caches = [
+            stack.enter_context(point_cache(path, scene, shot, units=units, include_body=not options.no_body,
+                                            provenance=_provenance(options, motion)))
+            for path, shot, motion in zip(outputs, shots, options.motion)
+        ]  # fmt: skip
+        start = time.monotonic()
+        for done, frame in enumerate(simulator.frames(motions), start=1):
+            caches[frame.shot].write(frame.number, frame.points)
+            figures.add(frame.imbalance, frame.iterations)
+            report(Progress(done, total, (time.monotonic() - start) / done * (total - done)))
+    return figures.of_all(total, time.monotonic() - start)
+
+
+def _provenance(options: argparse.Namespace, motion: Path) -> dict[str, object]:
+    names = ("fabric", "material", "fps", "substeps", "tolerance", "precision")
+    return {"simulated": {"stage": str(options.stage), "motion": str(motion)}
+            | {name: getattr(options, name) for name in names}}  # fmt: skip
+
+
+class _Figures:
+    """What a simulation came to."""
+
+    def __init__(self, tolerance: float) -> None:
+        self.tolerance, self.solved, self.iterations = tolerance, 0, 0
+
+    def add(self, imbalance: float, iterations: int) -> None:
+        self.solved += imbalance <= self.tolerance
+        self.iterations += iterations
+
+    def of_all(self, frames: int, seconds: float) -> dict[str, object]:
+        """Return figures to show."""
+        return {
+            "frames": frames,
+            "within the tolerance": f"{self.solved / frames:.1%}",
+            "iterations a frame": round(self.iterations / frames, 1),
+            "seconds a frame": float(f"{seconds / frames:.3g}"),
+        }

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Characters in motion: the spans of several motions, and their poses at one step of all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..assets import Floats, Motion, Scene
+from ..energy.collision import PosedBody
+from ..kinematics import (
+    frames_at,
+    matrix_from_quaternion,
+    rigid,
+    sample_motion,
+    skinning_matrices,
+    split_at_cuts,
+    world_transforms,
+)
+from ..model.body import CollisionBody
+from ..model.skinning import blended, transformed
+
+
+@dataclass(frozen=True, eq=False)
+class Span:
+    """A part of a shot without cuts, at the rate of the solver's steps.
+
+    Attributes:
+        shot: index of the motion that it is of.
+        first: frame of the shot that it begins with.
+        substeps: steps for each frame of the shot.
+        motion: its poses, one for each step.
+    """
+
+    shot: int
+    first: int
+    substeps: int
+    motion: Motion
+
+    @property
+    def frame_count(self) -> int:
+        """Frames of the shot that it covers."""
+        return (self.motion.frame_count - 1) // self.substeps + 1
+
+
+def spans_of(motion: Motion, shot: int, fps: float, substeps: int) -> list[Span]:
+    """Return the spans of a motion between its cuts, whose frames are those of a shot at `fps`."""
+    spans, first, source = [], 0, 0
+    for part in split_at_cuts(motion):
+        stop = frames_at(source + part.frame_count, motion.fps, fps)
+        count = (stop - first - 1) * substeps + 1
+        if count > 0:
+            position = (first + np.arange(count) / substeps) * motion.fps / fps - source
+            poses = sample_motion(part, position.clip(0, part.frame_count - 1))
+            spans.append(Span(shot, first, substeps, Motion(motion.path, fps * substeps, *poses)))
+        first, source = stop, source + part.frame_count
+    return spans
+
+
+def played(motion: Motion, spans: Sequence[Span]) -> Motion:
+    """Return the motion as its spans play it: the character of a shot, frame by frame."""
+    fps, substeps = spans[0].motion.fps / spans[0].substeps, spans[0].substeps
+    parts = [span.motion for span in spans]
+    rotations = np.concatenate([part.rotations[::substeps] for part in parts])
+    translations = np.concatenate([part.translations[::substeps] for part in parts])
+    return Motion(motion.path, fps, rotations, translations, motion.start * fps / motion.fps)
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Characters at one step, each about its own root.
+
+    Attributes:
+        root: position of the first joint [m], float64, shape (3, N).
+        body: relative to the root.
+        plain: the garment under plain skinning, relative to the root, shape (V, 3, N).
+    """
+
+    root: Tensor
+    body: PosedBody
+    plain: Tensor
+
+
+class Actors:
+    """Poses the character and the plainly skinned garment of a scene."""
+
+    def __init__(self, scene: Scene, device: torch.device, dtype: torch.dtype) -> None:
+        self.skeleton, self.dtype = scene.character.skeleton, dtype
+        joints = self.skeleton.joint_count
+        self.body = CollisionBody(scene.character.merged_body(), joints, device=device)
+        self.weights = torch.as_tensor(scene.plain_skin.dense(joints), dtype=dtype, device=device)
+        self.rest = torch.as_tensor(np.array(scene.garment.mesh.points), dtype=dtype, device=device)[:, :, None]
+
+    def poses(self, spans: Sequence[Span], step: int) -> Poses:
+        """Return the poses of all spans at a step."""
+        rotations = np.stack([span.motion.rotations[step] for span in spans])
+        return self.posed(rotations, np.stack([span.motion.translations[step] for span in spans]))
+
+    def posed(self, rotations: Floats, translations: Floats) -> Poses:
+        """Return poses of local joint rotations (N, J, 4) and translations (N, J, 3)."""
+        world = world_transforms(rigid(matrix_from_quaternion(rotations), translations), self.skeleton.parents)
+        root = world[:, 0, :3, 3].copy()
+        world[:, :, :3, 3] -= root[:, None]
+        matrices = skinning_matrices(world, self.skeleton.bind_transforms)[:, :, :3].transpose(1, 2, 3, 0)
+        character = torch.as_tensor(matrices.copy(), dtype=self.dtype, device=self.rest.device)
+        plain = transformed(blended(self.weights, character), self.rest)
+        return Poses(
+            torch.as_tensor(root.T.copy(), device=self.rest.device), self.body.posed(character.float()), plain
+        )

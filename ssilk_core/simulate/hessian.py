@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The Hessian of a garment's energy as 3 x 3 blocks, summed from faces, hinges and single vertices."""
+
+from __future__ import annotations
+
+from itertools import combinations_with_replacement
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..assets import Ints
+from ..energy.operators import SparseOperator
+from .blocks import BlockMatrix, BlockPattern
+from .hinges import Hinges
+from .membrane import Membrane, outer
+
+
+class Hessian:
+    """Assembles the positive Hessian over the vertices `free` (U,), in float32; positions are (V, 3, N).
+
+    Args:
+        corners: vertices of the hinges, shape (H, 4).
+    """
+
+    def __init__(
+        self, membrane: Membrane, hinges: Hinges | None, corners: Ints, free: Ints, vertex_count: int
+    ) -> None:
+        device = membrane.area.device
+        self.membrane, self.hinges, self.free_count = membrane, hinges, len(free)
+        # A row of the membrane's operator holds a face's corners in ascending order of the vertices.
+        matrix = membrane.operator.matrix
+        faces = matrix.col_indices().cpu().numpy().reshape(2, -1, 3)[0]
+        weights = matrix.values().cpu().numpy().reshape(2, -1, 3)
+        order = np.argsort(corners, axis=1, kind="stable")
+        near = np.concatenate([faces[:, pair] for pair in combinations_with_replacement(range(3), 2)])
+        sides = list(combinations_with_replacement(range(4), 2))
+        across = np.concatenate([np.take_along_axis(corners, order, axis=1)[:, side] for side in sides])
+        self.pattern = BlockPattern(np.concatenate([near, across]), free, vertex_count, device)
+        self.sum_faces = self._face_sum(near, weights)
+        if hinges:
+            slopes = order * len(corners) + np.arange(len(corners))[:, None]  # rows of Hinges.slopes
+            self.left, self.right = (
+                torch.as_tensor(np.concatenate([slopes[:, side[end]] for side in sides]), device=device)
+                for end in range(2)
+            )
+            self.sum_hinges = self.pattern.summation(
+                self.pattern.slots(across), np.arange(len(across)), np.ones(len(across)), len(across)
+            )
+
+    def _face_sum(self, near: Ints, weights: np.ndarray) -> SparseOperator:
+        """Return the operator from `Membrane.stiffness` to blocks: w_ik w_jl times the block k, l for pairs i, j."""
+        count = weights.shape[1]
+        slots, rows, sources, products = self.pattern.slots(near), [], [], []
+        for number, (i, j) in enumerate(combinations_with_replacement(range(3), 2)):
+            for first, second in np.ndindex(2, 2):
+                rows.append(slots[number * count : (number + 1) * count])
+                sources.append((2 * first + second) * count + np.arange(count))
+                products.append(weights[first, :, i] * weights[second, :, j])
+        parts = [np.concatenate(part) for part in (rows, sources, products)]
+        return self.pattern.summation(parts[0], parts[1], parts[2], 4 * count)
+
+    def __call__(self, x: Tensor, weight: Tensor, pushed: Tensor | None) -> BlockMatrix:
+        """Return the Hessian at x.
+
+        Args:
+            weight: stiffness of each free vertex alike in all directions [N/m], shape (U, 1).
+            pushed: vectors whose outer product is added at each free vertex, shape (U, 3, N), or None.
+        """
+        blocks = self.sum_faces(self.membrane.stiffness(x))
+        if self.hinges:
+            slopes = self.hinges.slopes(x)
+            blocks += self.sum_hinges(outer(slopes[self.left], slopes[self.right]))
+        diagonal = blocks[: self.free_count]
+        diagonal += weight[:, None, None] * torch.eye(3, device=x.device)[:, :, None]
+        if pushed is not None:
+            diagonal += outer(pushed, pushed)
+        return self.pattern.matrix(blocks)

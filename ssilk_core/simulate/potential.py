@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a frame minimises: the training energy, with its gradient and a positive Hessian.
+
+Implicit Euler with time step dt is the minimum of
+
+    stretch + bending + gravity + collision + m/(2 dt^2) |x - (2 x' - x'')|^2 + drag a/(2 dt) |x - carried|^2
+
+(`energy.GarmentEnergy`); a quasi-static state leaves the last two out. The nearest body points are found anew for
+every state, the trial states of a line search included; in gradient and Hessian they hold still, as in training.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..assets import PINNED, Scene
+from ..energy import GarmentEnergy
+from ..energy.collision import PosedBody, signed_distance
+from ..fabrics import Fabric
+from ..mesh import topology
+from ..model.descriptors import GRAVITY
+from .blocks import BlockMatrix
+from .hessian import Hessian
+from .hinges import Hinges
+from .membrane import Membrane
+
+JUMP = 1.0  # of the way that a vertex has moved: a surface that comes closer by more has jumped
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """All that a frame's energy depends on but the garment; N frames.
+
+    Attributes:
+        body: in the coordinates of the positions, float32.
+        gravity: acceleration [m/s2], shape (3, N).
+        predicted: 2 x' - x'' [m], shape (V, 3, N), or None for a quasi-static state.
+        carried: where the air took x' [m], shape (V, 3, N), or None likewise.
+        dt: time step [s]. In a quasi-static state it damps the steps of the solver alone.
+    """
+
+    body: PosedBody | None
+    gravity: Tensor
+    predicted: Tensor | None = None
+    carried: Tensor | None = None
+    dt: float = 0.1
+
+    def picked(self, frames: Tensor) -> Setting:
+        """Return the setting of some of the frames, indices (M,)."""
+        body = self.body and PosedBody(self.body.points[..., frames], self.body.normals[..., frames], self.body.rings)
+        predicted, carried = (v if v is None else v[..., frames] for v in (self.predicted, self.carried))
+        return Setting(body, self.gravity[..., frames], predicted, carried, self.dt)
+
+
+@dataclass(frozen=True, eq=False)
+class Planes:
+    """Planes through the body points b nearest to positions `at` (V, 3, N).
+
+    Attributes:
+        normal: unit normals n, shape (V, 3, N).
+        offset: n . b [m], shape (V, N).
+    """
+
+    normal: Tensor
+    offset: Tensor
+    at: Tensor
+
+    def distance(self, x: Tensor) -> Tensor:
+        """Return signed distances [m], shape (V, N)."""
+        return (self.normal * x).sum(1) - self.offset
+
+    def picked(self, frames: Tensor) -> Planes:
+        """Return the planes of some of the frames, indices (M,)."""
+        return Planes(self.normal[..., frames], self.offset[..., frames], self.at[..., frames])
+
+    def renewed(self, fresh: Planes) -> Planes:
+        """Return `fresh` planes, but the old ones where they would jump towards a vertex that has hardly moved."""
+        jump = self.distance(fresh.at) - fresh.distance(fresh.at) > JUMP * (fresh.at - self.at).norm(dim=1)
+        wide = jump[:, None]
+        return Planes(
+            torch.where(wide, self.normal, fresh.normal),
+            torch.where(jump, self.offset, fresh.offset),
+            torch.where(wide, self.at, fresh.at),
+        )
+
+
+class Potential:
+    """The energy of one garment in any setting; positions are (V, 3, N).
+
+    Attributes:
+        free: indices of the vertices that move: all with mass that are not pinned, shape (U,).
+
+    Args:
+        dtype: of positions, energies and gradients; Hessians are float32.
+    """
+
+    def __init__(
+        self, scene: Scene, fabric: Fabric, *, device: torch.device, dtype: torch.dtype = torch.float64
+    ) -> None:
+        mesh = scene.garment.mesh
+        energy = GarmentEnergy(mesh, fabric, device=device, dtype=dtype)
+        hinges = topology.hinges(mesh.faces) if fabric.bending else np.zeros((0, 4), dtype=np.int64)
+        self.fabric, self.dtype = fabric, dtype
+        self.mass: Tensor = energy.mass[:, None]
+        self.membrane = Membrane(mesh, fabric, device, dtype)
+        self.hinges = Hinges(hinges, energy, mesh.vertex_count) if len(hinges) else None
+        free = np.flatnonzero((scene.classes != PINNED) & (topology.vertex_areas(mesh.points, mesh.faces) > 0))
+        self.free = torch.as_tensor(free, device=device)
+        self._hessian = Hessian(self.membrane, self.hinges, hinges, free, mesh.vertex_count)
+
+    @torch.enable_grad()
+    def planes(self, x: Tensor, setting: Setting) -> Planes | None:
+        """Return the planes through the body points nearest to x."""
+        if setting.body is None:
+            return None
+        at = x.detach().float().requires_grad_(True)
+        distance = signed_distance(at, setting.body)
+        (normal,) = torch.autograd.grad(distance.sum(), at)
+        offset = (normal * at.detach()).sum(1) - distance.detach()
+        return Planes(normal.to(x.dtype), offset.to(x.dtype), x)
+
+    def energy(self, x: Tensor, setting: Setting, planes: Planes | None) -> Tensor:
+        """Return the energy [J] of each frame, shape (N,)."""
+        total = self.membrane.energy(x) - (self.mass * (x * setting.gravity).sum(1)).sum(0)
+        if self.hinges:
+            total = total + self.hinges.energy(x)
+        for weight, target in self._anchors(setting):
+            total = total + (0.5 * weight * ((x - target) ** 2).sum(1)).sum(0)
+        if planes:
+            total = total + self.fabric.collision * (self._depth(x, planes) ** 2).sum(0)
+        return total
+
+    def gradient(self, x: Tensor, setting: Setting, planes: Planes | None) -> Tensor:
+        """Return the gradient [N] in all vertices, shape (V, 3, N)."""
+        total = self.membrane.gradient(x) - self.mass[:, None] * setting.gravity
+        if self.hinges:
+            total += self.hinges.gradient(x)
+        for weight, target in self._anchors(setting):
+            total += weight[:, None] * (x - target)
+        if planes:
+            total += 2 * self.fabric.collision * self._depth(x, planes)[:, None] * planes.normal
+        return total
+
+    def hessian(self, x: Tensor, setting: Setting, planes: Planes | None) -> BlockMatrix:
+        """Return the Hessian over the free vertices, made positive semi-definite, in float32."""
+        still = [] if setting.predicted is not None else [(self.mass / setting.dt**2, None)]
+        weight = sum((weight for weight, _ in [*self._anchors(setting), *still]), torch.zeros_like(self.mass))
+        pushed = None
+        if planes:
+            inside = (self._depth(x, planes) < 0)[:, None]
+            pushed = (2 * self.fabric.collision) ** 0.5 * (planes.normal * inside)[self.free].float()
+        return self._hessian(x, weight[self.free].float(), pushed)
+
+    def imbalance(self, gradient: Tensor) -> Tensor:
+        """Return the RMS acceleration, over the free mass, that a gradient (V, 3, N) leaves, in units of g: (N,)."""
+        force, mass = gradient[self.free], self.mass[self.free]
+        return ((force * force).sum(1) / mass).sum(0).div(mass.sum()).sqrt() / GRAVITY
+
+    def _anchors(self, setting: Setting) -> list[tuple[Tensor, Tensor]]:
+        """Return stiffness [N/m] (V, 1) and target (V, 3, N) of inertia and drag, where they act."""
+        found = []
+        if setting.predicted is not None:
+            found.append((self.mass / setting.dt**2, setting.predicted))
+        if setting.carried is not None and self.fabric.drag:
+            found.append((self.fabric.drag / self.fabric.density * self.mass / setting.dt, setting.carried))
+        return found
+
+    def _depth(self, x: Tensor, planes: Planes) -> Tensor:
+        """Return how far each vertex is beyond the margin, negative there, else zero [m], shape (V, N)."""
+        return (planes.distance(x) - self.fabric.margin).clamp_max(0)

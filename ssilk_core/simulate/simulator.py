@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The reference simulator: implicit Euler on the training energy, several shots at once.
+
+A shot starts with the quasi-static state of its first pose, and with the velocity that plain skinning has then: a
+character that walks at once does not walk out of its garment. Each step works about the character's root of that
+step, where single precision of the body is finest; between steps positions are kept in the world, in float64.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..assets import Floats, Motion, Scene
+from ..errors import need
+from ..events import Progress, Reporter, silent
+from ..fabrics import Fabric
+from ..model.descriptors import GRAVITY
+from .actors import Actors, Poses, Span, played, spans_of
+from .newton import Solution, SolverOptions, minimise_from
+from .potential import Potential, Setting
+
+PRECISIONS = {"float64": torch.float64, "float32": torch.float32}
+MOST_SUBSTEPS = 1000
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulationOptions:
+    """How a simulation advances.
+
+    Attributes:
+        fps: frames per second; the default is what garments are trained at.
+        substeps: steps in each frame.
+        batch: shots that advance together.
+        precision: "float64" or "float32", of positions, energies and forces; linear systems are float32 in either.
+        gravity: acceleration [m/s2].
+        solver: of every step.
+        rest: of quasi-static states, which inertia does not help to converge.
+    """
+
+    fps: float = 30.0
+    substeps: int = 1
+    batch: int = 64
+    precision: str = "float64"
+    gravity: tuple[float, float, float] = (0.0, -GRAVITY, 0.0)
+    solver: SolverOptions = field(default_factory=SolverOptions)
+    rest: SolverOptions = field(default_factory=lambda: SolverOptions(iterations=150))
+
+    def __post_init__(self) -> None:
+        need(0 < self.fps <= 10_000, "simulation", f"{self.fps:g} frames per second", "a positive rate is needed")
+        need(0 < self.substeps <= MOST_SUBSTEPS, "simulation", f"substeps = {self.substeps}",
+             f"1 to {MOST_SUBSTEPS} are allowed")  # fmt: skip
+        need(self.batch > 0, "simulation", f"batch = {self.batch}", "at least 1 is needed")
+        need(self.precision in PRECISIONS, "simulation", f"precision '{self.precision}'", "it is float64 or float32")
+        need(np.isfinite(self.gravity).all(), "simulation", f"gravity {self.gravity}", "it must be finite")
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedFrame:
+    """One frame of one shot.
+
+    Attributes:
+        shot, number: which shot, and which of its frames.
+        points: garment vertices in the world [m], float64, shape (V, 3).
+        energy: what was minimised [J], heights counted from the character's root.
+        imbalance, iterations: of `newton.Solution`, in the last step of the frame.
+    """
+
+    shot: int
+    number: int
+    points: Floats
+    energy: float
+    imbalance: float
+    iterations: int
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """The last two positions in the world (V, 3, N), the earlier from the second step on, and the last poses."""
+
+    last: Tensor
+    before: Tensor | None
+    poses: Poses
+
+    def first(self, count: int) -> _State:
+        """Return the state of the first `count` shots."""
+        poses = replace(self.poses, root=self.poses.root[:, :count], plain=self.poses.plain[..., :count])
+        before = None if self.before is None else self.before[..., :count]
+        return _State(self.last[..., :count], before, poses)
+
+
+class Simulator:
+    """Advances one garment on any motions of its character.
+
+    Args:
+        device: where everything runs.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        fabric: Fabric,
+        options: SimulationOptions | None = None,
+        *,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.options, device = options or SimulationOptions(), torch.device(device)
+        dtype = PRECISIONS[self.options.precision]
+        self.potential = Potential(scene, fabric, device=device, dtype=dtype)
+        self.actors = Actors(scene, device, dtype)
+        self.gravity = torch.tensor(self.options.gravity, dtype=dtype, device=device)[:, None]
+        self.dt = 1 / (self.options.fps * self.options.substeps)
+
+    def frames(self, motions: Sequence[Motion]) -> Iterator[SimulatedFrame]:
+        """Yield all frames of all shots: in order within a shot, batches of shots side by side."""
+        options = self.options
+        spans = [s for shot, m in enumerate(motions) for s in spans_of(m, shot, options.fps, options.substeps)]
+        spans.sort(key=lambda span: -span.motion.frame_count)
+        for start in range(0, len(spans), options.batch):
+            yield from self._advanced(spans[start : start + options.batch])
+
+    def _advanced(self, spans: Sequence[Span]) -> Iterator[SimulatedFrame]:
+        """Yield the frames of spans, the longest first."""
+        state: _State | None = None
+        for step in range(spans[0].motion.frame_count):
+            running = [span for span in spans if span.motion.frame_count > step]
+            poses = self.actors.poses(running, step)
+            previous = state and state.first(len(running))
+            solution = self._stepped(poses, previous) if previous else self.rest(poses, poses.plain)
+            world = solution.x.double() + poses.root
+            state = _State(world, previous.last if previous else None, poses)
+            if step % self.options.substeps == 0:
+                yield from _frames(running, step // self.options.substeps, world, solution)
+
+    def rest(self, poses: Poses, start: Tensor) -> Solution:
+        """Return the quasi-static states of poses nearest to `start` (V, 3, N), relative to the roots."""
+        setting = Setting(poses.body, self.gravity.expand(3, start.shape[-1]))
+        return minimise_from(self.potential, start, setting, self.options.rest)
+
+    def _stepped(self, poses: Poses, previous: _State) -> Solution:
+        """Return the states one step later."""
+        local = (previous.last - previous.poses.root).to(self.potential.dtype)
+        follows = local - previous.poses.plain + poses.plain
+        shift = poses.root - previous.poses.root
+        predicted = follows if previous.before is None else local + (previous.last - previous.before - shift)
+        predicted = predicted.to(local.dtype)
+        setting = Setting(poses.body, self.gravity.expand(3, local.shape[-1]), predicted, local, self.dt)
+        start = self._best([self._pinned(x, poses) for x in (predicted, local, follows)], setting)
+        return minimise_from(self.potential, start, setting, self.options.solver)
+
+    def _pinned(self, x: Tensor, poses: Poses) -> Tensor:
+        """Return positions (V, 3, N) with the vertices that do not move freely under plain skinning."""
+        free = self.potential.free
+        return poses.plain.index_copy(0, free, x[free].to(poses.plain.dtype))
+
+    def _best(self, starts: list[Tensor], setting: Setting) -> Tensor:
+        """Return for each frame the start of least energy."""
+        potential = self.potential
+        energies = [potential.energy(x, setting, potential.planes(x, setting)) for x in starts]
+        chosen = torch.stack(energies).nan_to_num(nan=torch.inf).argmin(0)
+        best = starts[0]
+        for number, start in enumerate(starts[1:], start=1):
+            best = torch.where(chosen == number, start, best)
+        return best
+
+
+def _frames(spans: Sequence[Span], frame: int, world: Tensor, solution: Solution) -> Iterator[SimulatedFrame]:
+    points = world.permute(2, 0, 1).cpu().numpy()
+    figures = [values.tolist() for values in (solution.energy, solution.imbalance, solution.iterations)]
+    for span, x, energy, imbalance, iterations in zip(spans, points, *figures):
+        yield SimulatedFrame(span.shot, span.first + frame, x, energy, imbalance, iterations)
+
+
+def simulate(
+    scene: Scene,
+    fabric: Fabric,
+    motions: Sequence[Motion],
+    options: SimulationOptions | None = None,
+    *,
+    device: torch.device | str = "cpu",
+    report: Reporter = silent,
+) -> list[Floats]:
+    """Return the garment's vertices over each motion, at `options.fps`, in the world [m], each (frames, V, 3).
+
+    Raises:
+        SsilkError: no motion, no body, or a state whose energy is not finite.
+    """
+    need(motions, "simulation", "no motion given", "at least one is needed")
+    simulator = Simulator(scene, fabric, options, device=device)
+    counts = [shot.frame_count for shot in shots_of(motions, simulator.options)]
+    points = [np.zeros((count, scene.garment.mesh.vertex_count, 3)) for count in counts]
+    for done, frame in enumerate(simulator.frames(motions), start=1):
+        points[frame.shot][frame.number] = frame.points
+        report(Progress(done, sum(counts)))
+    return points
+
+
+def shots_of(motions: Sequence[Motion], options: SimulationOptions) -> list[Motion]:
+    """Return each character's motion at the frames of its simulated shot."""
+    spans = [spans_of(motion, 0, options.fps, options.substeps) for motion in motions]
+    return [played(motion, parts) for motion, parts in zip(motions, spans)]
+
+
+def minimise(
+    scene: Scene,
+    fabric: Fabric,
+    motion: Motion,
+    options: SimulationOptions | None = None,
+    *,
+    device: torch.device | str = "cpu",
+) -> Floats:
+    """Return the quasi-static garment in each pose of a motion by itself, in the world [m], shape (F, V, 3)."""
+    simulator = Simulator(scene, fabric, options, device=device)
+    poses = simulator.actors.posed(motion.rotations, motion.translations)
+    solution = simulator.rest(poses, poses.plain)
+    return (solution.x.double() + poses.root).permute(2, 0, 1).cpu().numpy()

@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The parts of the reference simulator against autograd, dense algebra and generic minimisers, in float64."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import minimize
+
+from ssilk_core.assets import Scene
+from ssilk_core.energy import GarmentEnergy
+from ssilk_core.energy.bending import dihedral_angles
+from ssilk_core.energy.collision import PosedBody
+from ssilk_core.energy.stretch import stretch_density
+from ssilk_core.errors import SsilkError
+from ssilk_core.fabrics import Fabric
+from ssilk_core.model.body import CollisionBody
+from ssilk_core.simulate.conjugate import inverse_blocks, solve
+from ssilk_core.simulate.hinges import Hinges
+from ssilk_core.simulate.membrane import Membrane, outer, positive
+from ssilk_core.simulate.newton import SolverOptions, line_search, minimise_from, newton_step
+from ssilk_core.simulate.potential import Planes, Potential, Setting
+
+CPU = torch.device("cpu")
+DOWN = torch.tensor([[0.0], [-9.81], [0.0]], dtype=torch.float64)
+FABRICS = {
+    "stvk": Fabric("stvk", bending=1e-3, margin=0.02),
+    "baraff_witkin": Fabric("bw", stretch_model="baraff_witkin", bending=1e-3, margin=0.02),
+}
+
+
+def crumpled(scene: Scene, frames: int = 2, size: float = 0.004) -> torch.Tensor:
+    rest = torch.as_tensor(scene.garment.mesh.points.copy())[:, :, None]
+    return rest + size * torch.randn(len(rest), 3, frames, generator=torch.Generator().manual_seed(5)).double()
+
+
+def body_of(scene: Scene, frames: int) -> PosedBody:
+    joints = scene.character.skeleton.joint_count
+    identity = torch.eye(4)[:3, :, None].expand(joints, 3, 4, frames)
+    return CollisionBody(scene.character.merged_body(), joints, device=CPU).posed(identity.contiguous())
+
+
+def moving(scene: Scene, frames: int = 2) -> tuple[torch.Tensor, Setting]:
+    """A crumpled strip on its way, touching the ball."""
+    x = crumpled(scene, frames) + torch.tensor([0.0, 0.0, 0.03], dtype=torch.float64)[:, None]
+    past, air = crumpled(scene, frames, 0.01), crumpled(scene, frames, 0.02)
+    return x, Setting(body_of(scene, frames), DOWN.expand(3, frames), past, air, 1 / 30)
+
+
+@pytest.fixture(params=FABRICS)
+def potential(request: pytest.FixtureRequest, scene: Scene) -> Potential:
+    return Potential(scene, FABRICS[request.param], device=CPU)
+
+
+def test_the_energy_is_that_of_training(potential: Potential, scene: Scene) -> None:
+    x, setting = moving(scene)
+    energy = GarmentEnergy(scene.garment.mesh, potential.fabric, dtype=torch.float64)
+    body = PosedBody(setting.body.points.double(), setting.body.normals.double(), setting.body.rings)
+    terms = [
+        energy.stretch(x),
+        energy.bending(x),
+        energy.gravity(x, DOWN),
+        energy.inertia(x, setting.predicted, setting.dt),
+        energy.drag(x, setting.carried, setting.dt),
+        energy.collision(x, body),
+    ]
+    assert min(float(term.abs().min()) for term in terms) > 0
+    found = potential.energy(x, setting, potential.planes(x, setting))
+    torch.testing.assert_close(found, sum(terms), rtol=1e-6, atol=1e-9)
+
+
+def test_the_gradient_is_that_of_autograd(potential: Potential, scene: Scene) -> None:
+    x, setting = moving(scene)
+    planes = potential.planes(x, setting)
+    at = x.clone().requires_grad_(True)
+    (expected,) = torch.autograd.grad(potential.energy(at, setting, planes).sum(), at)
+    torch.testing.assert_close(potential.gradient(x, setting, planes), expected, rtol=1e-9, atol=1e-11)
+
+
+def test_the_membrane_has_the_hessian_of_autograd_where_it_is_stretched(scene: Scene) -> None:
+    # Under tension nothing is clamped, so the positive Hessian is the Hessian.
+    for fabric in FABRICS.values():
+        membrane = Membrane(scene.garment.mesh, fabric, CPU, torch.float64)
+        w_u, w_v = torch.randn(2, 1, 3, generator=torch.Generator().manual_seed(1)).double() * 0.1
+        w_u, w_v = w_u + torch.tensor([1.3, 0, 0]), w_v + torch.tensor([0, 1.4, 0])
+        if fabric.stretch_model == "baraff_witkin":
+            w_v = w_v - 0.9 * (w_u * w_v).sum() / (w_u * w_u).sum() * w_u  # little shear, which has no sign
+        columns = torch.cat([w_u, w_v])
+        expected = torch.autograd.functional.hessian(
+            lambda f, fabric=fabric: stretch_density(f[:, :, None], fabric).sum(), columns
+        ).reshape(6, 6)
+        membrane.operator = lambda x: x
+        membrane.area = torch.ones(1, 1)
+        blocks = membrane.stiffness(columns[:, :, None])[..., 0].reshape(2, 2, 3, 3)
+        found = blocks.permute(0, 2, 1, 3).reshape(6, 6)
+        torch.testing.assert_close(found, expected.float(), rtol=1e-5, atol=1e-4)
+
+
+def test_two_by_two_matrices_lose_their_negative_eigenvalues_only() -> None:
+    entries = torch.randn(3, 500, generator=torch.Generator().manual_seed(2)).double()
+    dense = torch.stack([entries[0], entries[1], entries[1], entries[2]], -1).reshape(-1, 2, 2)
+    values, vectors = torch.linalg.eigh(dense)
+    expected = vectors @ torch.diag_embed(values.clamp_min(0)) @ vectors.transpose(1, 2)
+    uu, uv, vv = positive(*entries)
+    torch.testing.assert_close(torch.stack([uu, uv, uv, vv], -1).reshape(-1, 2, 2), expected)
+
+
+def dense_hessian(potential: Potential, x: torch.Tensor, setting: Setting, planes: Planes | None) -> torch.Tensor:
+    """The positive Hessian (U, 3, U, 3) of the first frame, from its products with unit vectors."""
+    matrix, count = potential.hessian(x, setting, planes), len(potential.free)
+    units = torch.eye(3 * count).reshape(-1, count, 3)
+    return torch.stack([(matrix @ unit[None])[0] for unit in units]).reshape(count, 3, count, 3)
+
+
+def test_the_assembled_hessian_is_the_gauss_newton_hessian(potential: Potential, scene: Scene) -> None:
+    """Against the same parts summed densely: faces through the operator, hinges through autograd's angle."""
+    x, setting = moving(scene, 1)
+    x = x * 1.15  # stretched everywhere
+    planes = potential.planes(x, setting)
+    count, free = len(x), potential.free
+    weights = potential.membrane.operator.matrix.to_dense().double()
+    faces = weights.shape[0] // 2
+    k = potential.membrane.stiffness(x)[..., 0].double().reshape(2, 2, faces, 3, 3)
+    w = weights.reshape(2, faces, count)
+    expected = torch.einsum("kfi,klfab,lfj->iajb", w, k, w)
+    slopes = torch.autograd.functional.jacobian(
+        lambda x: _angles(potential.hinges, x), x
+    )[:, :, :, 0] * (2 * potential.hinges.stiffness[:, :, None]).sqrt()  # fmt: skip
+    expected += torch.einsum("hia,hjb->iajb", slopes, slopes)
+    inertia = potential.mass[:, 0] * (900 + potential.fabric.drag / potential.fabric.density * 30)
+    push = (planes.distance(x)[:, 0] < potential.fabric.margin) * 2 * potential.fabric.collision
+    n = planes.normal[..., 0]
+    own = inertia[:, None, None] * torch.eye(3) + push[:, None, None] * n[:, :, None] * n[:, None]
+    for v in range(count):
+        expected[v, :, v] += own[v]
+    assert (push > 0).any()
+    found = dense_hessian(potential, x, setting, planes)
+    torch.testing.assert_close(found, expected[free][:, :, free].float(), rtol=1e-3, atol=2e-3)
+
+
+def _angles(hinges: Hinges, x: torch.Tensor) -> torch.Tensor:
+    return dihedral_angles(*hinges.operator(x).chunk(3))[:, 0]
+
+
+def test_no_hessian_has_a_negative_eigenvalue(potential: Potential, scene: Scene) -> None:
+    x, setting = moving(scene, 1)
+    still = replace(setting, predicted=None, carried=None, dt=1e9)
+    squeezed = 0.7 * crumpled(scene, 1, 0.01)
+    matrix = dense_hessian(potential, squeezed, still, potential.planes(squeezed, still))
+    side = 3 * len(potential.free)
+    values = torch.linalg.eigvalsh(matrix.reshape(side, side).double())
+    assert values[0] > -1e-6 * values[-1]
+
+
+def test_blocks_are_inverted() -> None:
+    roots = torch.randn(40, 3, 3, generator=torch.Generator().manual_seed(3)).double()
+    blocks = roots @ roots.transpose(1, 2) + 0.1 * torch.eye(3)
+    torch.testing.assert_close(inverse_blocks(blocks), torch.linalg.inv(blocks))
+
+
+def test_conjugate_gradients_solve_each_frame_by_itself() -> None:
+    generator = torch.Generator().manual_seed(4)
+    roots = torch.randn(3, 12, 12, generator=generator).double()
+    matrices = roots @ roots.transpose(1, 2) + torch.tensor([0.1, 1.0, 100.0])[:, None, None] * torch.eye(12)
+    right = torch.randn(3, 4, 3, generator=generator).double()
+    z, _ = solve(
+        lambda v: (matrices @ v.reshape(3, 12, 1)).reshape(3, 4, 3), lambda r: r, right, 1e-9, iterations=200
+    )
+    expected = torch.linalg.solve(matrices, right.reshape(3, 12, 1)).reshape(3, 4, 3)
+    torch.testing.assert_close(z, expected, rtol=1e-6, atol=1e-8)
+
+
+def test_a_line_search_accepts_no_worse_state(potential: Potential, scene: Scene) -> None:
+    x, setting = moving(scene, 3)
+    planes = potential.planes(x, setting)
+    gradient = potential.gradient(x, setting, planes)
+    step, _ = newton_step(potential, x, setting, planes, gradient, 50)
+    wild = step * torch.tensor([1.0, 300.0, -1.0], dtype=torch.float64)
+    length = line_search(potential, x, setting, planes, gradient, wild)
+    assert length[0] > 0 and 0 < length[1] < 1 and length[2] == 0  # uphill, no step is good enough
+    before, after = (potential.energy(at, setting, planes) for at in (x, x + length * wild))
+    assert (after[:2] < before[:2]).all() and after[2] == before[2]
+
+
+def test_the_solver_is_as_low_as_a_generic_minimiser(potential: Potential, scene: Scene) -> None:
+    """One step of implicit Euler, without the body, by L-BFGS-B."""
+    x, setting = moving(scene, 1)
+    setting = replace(setting, body=None)
+    found = minimise_from(potential, x, setting, SolverOptions(tolerance=1e-6))
+    assert found.imbalance < 1e-6
+    shape, free = x[potential.free].shape, potential.free
+
+    def at(values: np.ndarray) -> torch.Tensor:
+        return x.index_copy(0, free, torch.as_tensor(values.reshape(shape)))
+
+    def value(values: np.ndarray) -> tuple[float, np.ndarray]:
+        gradient = potential.gradient(at(values), setting, None)[free]
+        return float(potential.energy(at(values), setting, None)), gradient.numpy().reshape(-1)
+
+    start = found.x[free].numpy().reshape(-1) + 1e-3 * np.random.default_rng(0).standard_normal(len(free) * 3)
+    options = {"maxiter": 3000, "maxfun": 6000, "ftol": 1e-16, "gtol": 1e-10}
+    by_bfgs = minimize(value, start, jac=True, method="L-BFGS-B", options=options)
+    assert abs(float(found.energy) - by_bfgs.fun) < 1e-8
+    np.testing.assert_allclose(found.x[free].numpy().reshape(-1), by_bfgs.x, atol=2e-5)
+
+
+def test_frames_of_a_batch_do_not_see_each_other(potential: Potential, scene: Scene) -> None:
+    x, setting = moving(scene, 3)
+    options = SolverOptions(tolerance=1e-5)
+    together = minimise_from(potential, x, setting, options)
+    for frame in range(3):
+        one = torch.tensor([frame])
+        alone = minimise_from(potential, x[..., one], setting.picked(one), options)
+        torch.testing.assert_close(together.x[..., one], alone.x, rtol=0, atol=1e-6)
+        torch.testing.assert_close(together.energy[one], alone.energy, rtol=0, atol=1e-9)
+
+
+def test_pinned_vertices_stay_and_the_solution_is_in_balance(potential: Potential, scene: Scene) -> None:
+    x, setting = moving(scene, 2)
+    found = minimise_from(potential, x, setting, SolverOptions(tolerance=1e-3))
+    pinned = scene.classes == 0
+    assert torch.equal(found.x[pinned], x[pinned])
+    gradient = potential.gradient(found.x, setting, potential.planes(found.x, setting))[potential.free]
+    force = (gradient.norm(dim=1) / potential.mass[potential.free] / 9.81).square().mean(0).sqrt()
+    assert (found.imbalance <= 1e-3).all() and (force < 3e-3).all()
+    before = potential.energy(x, setting, potential.planes(x, setting))
+    assert (found.energy < before).all()
+
+
+def test_states_that_are_not_finite_are_refused(potential: Potential, scene: Scene) -> None:
+    x, setting = moving(scene, 2)
+    x[3, 1, 1] = torch.nan
+    with pytest.raises(SsilkError, match=r"first state of 1 of 2 frames has no finite energy"):
+        minimise_from(potential, x, setting, SolverOptions())
+
+
+def test_outer_products() -> None:
+    a, b = torch.randn(2, 4, 3, 5)
+    torch.testing.assert_close(outer(a, b), torch.einsum("man,mbn->mabn", a, b))

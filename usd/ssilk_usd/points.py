@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Write a simulated garment as a point cache: a shot whose garment has its points at each frame, beside its body."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from pxr import Sdf, Tf, Usd, UsdGeom, UsdSkel, Vt
+
+from ssilk_core.assets import Deformer, Floats, GarmentPose, Motion, ProxyRig, Scene
+from ssilk_core.errors import fail, need
+from ssilk_core.files import replacing
+
+from .author import extent_array
+from .export import need_layer_suffix
+from .read_mesh import is_garment
+from .read_stage import PRIMS, usd_reason
+from .shot import write_shot
+from .units import StageUnits
+
+FRAMES_PER_SAVE = 128  # 5 MB of points in memory for a garment of 3,000 vertices
+POSES_AT_ONCE = 256
+
+
+class PointCache:
+    """A file under way, whose frames may come in any order."""
+
+    def __init__(self, path: Path, frame_count: int, vertex_count: int, units: StageUnits, start: float) -> None:
+        self.path, self.frame_count, self.vertex_count = path, frame_count, vertex_count
+        self.units, self.start, self.unsaved_count = units, start, 0
+        self.written = np.zeros(frame_count, dtype=bool)
+        self.layer = Sdf.Layer.FindOrOpen(str(path))
+        stage = Usd.Stage.Open(self.layer)
+        self.garment, self.root = _unbind(stage), stage.GetDefaultPrim().GetPath()
+
+    def write(self, frame: int, points: Floats) -> None:
+        """Write the garment's points [m], y up, shape (V, 3), of one frame of the shot.
+
+        Raises:
+            SsilkError: no such frame, points of another garment, or points that are not finite.
+        """
+        where = f"{self.path}: frame {frame}"
+        need(0 <= frame < self.frame_count, where, "no such frame", f"frames run from 0 to {self.frame_count - 1}")
+        need(points.shape == (self.vertex_count, 3), where, f"points of shape {points.shape}",
+             f"({self.vertex_count}, 3) is needed")  # fmt: skip
+        need(np.isfinite(points).all(), where, "NaN or infinity among the points", "all must be finite")
+        placed = np.ascontiguousarray(self.units.points_from_core(points), dtype=np.float32)
+        low, high = placed.min(axis=0), placed.max(axis=0)
+        time = self.start + frame
+        self._set("points", time, Vt.Vec3fArray.FromNumpy(placed))
+        self._set("extent", time, extent_array(low, high))
+        around = np.array(self.layer.QueryTimeSample(self.root.AppendProperty("extent"), time))
+        box = extent_array(np.minimum(low, around[0]), np.maximum(high, around[1]))
+        self.layer.SetTimeSample(self.root.AppendProperty("extent"), time, box)
+        self.written[frame] = True
+        self.unsaved_count += 1
+        if self.unsaved_count >= FRAMES_PER_SAVE:
+            self.save()
+
+    def _set(self, name: str, time: float, value: object) -> None:
+        self.layer.SetTimeSample(self.garment.AppendProperty(name), time, value)
+
+    def save(self) -> None:
+        """Write what is pending to the file."""
+        try:
+            self.layer.Save()
+        except Tf.ErrorException as error:
+            fail(str(self.path), f"writing failed ({usd_reason(error)})", "free some space or choose another output")
+        self.unsaved_count = 0
+
+
+@contextmanager
+def point_cache(
+    path: str | Path,
+    scene: Scene,
+    motion: Motion,
+    *,
+    units: StageUnits,
+    include_body: bool = True,
+    provenance: Mapping[str, object] | None = None,
+) -> Iterator[PointCache]:
+    """Yield a cache that takes the garment's points frame by frame; the file appears once all are in it.
+
+    Character, body and time codes are those of a shot by `write_shot`; the garment is bound to nothing.
+
+    Args:
+        path: the file to write: .usdc, .usd, or .usda for people.
+        motion: the character's motion at the frames of the shot, whose rate becomes the shot's.
+        units: units and up axis of the written stage.
+
+    Raises:
+        SsilkError: frames are missing at the end, or the file cannot be written.
+    """
+    need_layer_suffix(path)
+    with replacing(path) as temporary:
+        write_shot(
+            temporary,
+            _plain(scene),
+            motion,
+            _no_poses(motion.frame_count),
+            units=units,
+            start=motion.start,
+            include_body=include_body,
+            provenance=provenance,
+        )
+        cache = PointCache(temporary, motion.frame_count, scene.garment.mesh.vertex_count, units, motion.start)
+        yield cache
+        missing = int((~cache.written).sum())
+        need(missing == 0, str(path), f"{missing} of {motion.frame_count} frames have no points", "each needs some")
+        cache.save()
+        del cache  # the file is closed before it is renamed
+
+
+def _plain(scene: Scene) -> Deformer:
+    """Return the garment under plain skinning: no proxies, no shapes."""
+    none = ProxyRig(scene.rig.path, (), np.zeros(0, dtype=np.int32), np.zeros((0, 4, 4)), scene.plain_skin)
+    return Deformer(replace(scene, rig=none), scene.plain_skin, np.zeros((0, scene.garment.mesh.vertex_count, 3)))
+
+
+def _no_poses(frame_count: int) -> Iterator[GarmentPose]:
+    for start in range(0, frame_count, POSES_AT_ONCE):
+        frames = min(POSES_AT_ONCE, frame_count - start)
+        yield GarmentPose(start, np.zeros((frames, 0, 4)), np.zeros((frames, 0)))
+
+
+def _unbind(stage: Usd.Stage) -> Sdf.Path:
+    """Take the garment of a shot off its skeleton, and return its path."""
+    prim = next(p for p in Usd.PrimRange(stage.GetPseudoRoot(), PRIMS) if p.IsA(UsdGeom.Mesh) and is_garment(p))
+    prim.RemoveAPI(UsdSkel.BindingAPI)
+    for name in prim.GetAuthoredPropertyNames():
+        if name.startswith(("skel:", "primvars:skel:")):
+            prim.RemoveProperty(name)
+    return prim.GetPath()
