@@ -15,6 +15,9 @@ from ..errors import need
 from ..kinematics import motion_transforms, resample, skinning_matrices, split_at_cuts
 from ..model.descriptors import gravity_features, pose_features
 
+# Captured joints that flip turn faster than this [rad/s], people do not; the garment would learn from the blow.
+MOST_TURN = 40.0
+
 
 @dataclass(frozen=True, eq=False)
 class MotionBank:
@@ -58,16 +61,21 @@ class MotionBank:
 
 
 def build_bank(
-    motions: Sequence[Motion], skeleton: Skeleton, joints: np.ndarray, fps: float, device: torch.device
+    motions: Sequence[Motion],
+    skeleton: Skeleton,
+    joints: np.ndarray,
+    fps: float,
+    device: torch.device,
+    *,
+    most_turn: float = np.inf,
 ) -> MotionBank:
-    """Resample motions to `fps` and place them on a device.
+    """Resample motions to `fps` and place them on a device, cut where `usable_spans` says.
 
     Raises:
         SsilkError: there is no motion.
     """
     need(motions, "motions", "none given", "at least one is needed", "name motion files with --motions")
-    spans = [span for motion in motions for span in split_at_cuts(motion)]
-    clips = [resample(span, fps) for span in spans if span.frame_count > span.fps / fps * 3]
+    clips = [resample(span, fps) for span in usable_spans(motions, fps, most_turn)]
     need(clips, motions[0].path, "every motion is shorter than four frames", "longer ones are needed")
     features = [pose_features(clip, skeleton, joints) for clip in clips]
     matrices = [centred_matrices(clip, skeleton)[0] for clip in clips]
@@ -86,6 +94,15 @@ def build_bank(
         torch.as_tensor(ends - [clip.frame_count for clip in clips], device=device),
         torch.as_tensor(ends, device=device),
     )
+
+
+def usable_spans(motions: Sequence[Motion], fps: float, most_turn: float = np.inf) -> list[Motion]:
+    """Return what becomes the clips of a bank, in order: spans between cuts that hold four frames at `fps`.
+
+    Motions are cut where the root jumps, and where a joint turns faster than `most_turn` [rad/s].
+    """
+    spans = [span for motion in motions for span in split_at_cuts(motion, most_turn=most_turn)]
+    return [span for span in spans if span.frame_count > span.fps / fps * 3]
 
 
 def centred_matrices(motion: Motion, skeleton: Skeleton) -> tuple[Floats, Floats]:
