@@ -62,7 +62,8 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Train; return 0 when finished, 130 when interrupted."""
-    from ssilk_core.training.run import interruptible, train
+    from ssilk_core.training.run import train
+    from ssilk_core.training.signals import interruptible
 
     need(
         options.output.suffix == ".safetensors",
@@ -99,7 +100,7 @@ def _job(options: argparse.Namespace, report: Reporter):  # type: ignore[no-unty
     from ssilk_usd.read_motion import motion_files, read_motions
 
     from ssilk_core.files import sha256
-    from ssilk_core.training.run import TrainJob, split_motions
+    from ssilk_core.training.job import TrainJob, split_motions
 
     preset = preset_named(options.preset)
     scene = shared.load_scene(options, report)

@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
 
 from ..assets import Scene
 from ..config import ModelConfig, TrainConfig
+from ..errors import need
 
 SHARE = 0.8  # of the free memory that a training may plan for
 UNKNOWN = 8 << 30  # bytes that are planned for where the system cannot be asked portably
@@ -71,3 +73,37 @@ def fitting_batch(
     per_frame = step_memory(scene, model, 1, body_vertices) - step_memory(scene, model, 0, body_vertices)
     frames = int(max(1, (SHARE * available - step_memory(scene, model, 0, body_vertices)) // per_frame))
     return max(1, min(config.batch, frames // config.window)), max(1, min(config.warm_batch, frames))
+
+
+def need_one_window(
+    scene: Scene, model: ModelConfig, config: TrainConfig, body_vertices: int, available: int
+) -> None:
+    """Raise `SsilkError` unless a step on a single window fits into `available` bytes."""
+    needed = step_memory(scene, model, config.window, body_vertices)
+    need(
+        needed <= available,
+        scene.garment.mesh.path,
+        f"a batch of one window of {config.window} poses needs {needed / 2**30:.2g} GiB",
+        f"{available / 2**30:.2g} GiB are free",
+        "free some, take another device (--device), or shorter windows (--set window=...)",
+    )
+
+
+def suffices(work: Callable[[], None]) -> bool:
+    """Do `work`; return whether the device had the memory for it. Nothing that `work` made is held on failure."""
+    try:
+        work()
+    except RuntimeError as error:
+        if not _of_memory(error):
+            raise
+        return False
+    return True
+
+
+def _of_memory(error: BaseException | None) -> bool:
+    """Return whether an error comes from a lack of memory, which may hide behind one that ends a graph's capture."""
+    while error is not None:
+        if isinstance(error, torch.OutOfMemoryError) or "out of memory" in str(error):
+            return True
+        error = error.__cause__ or error.__context__
+    return False

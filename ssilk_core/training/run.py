@@ -3,65 +3,37 @@
 
 from __future__ import annotations
 
-import platform
-import signal
+import gc
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import isfinite
+from typing import NoReturn
 
-import numpy as np
 import torch
+from torch import Tensor
 
-from .. import __version__
-from ..assets import Motion, Scene
-from ..checkpoint import model_file, save_model
-from ..config import ModelConfig, TrainConfig
-from ..devices import chosen_device, device_name
-from ..energy import GarmentEnergy
-from ..errors import need
+from ..config import TrainConfig
+from ..devices import chosen_device
+from ..errors import fail, need
 from ..events import Checkpoint, Message, Progress, Reporter, Started
-from ..fabrics import Fabric
 from ..kinematics import split_at_cuts
-from ..model.body import CollisionBody
-from ..model.network import GarmentModel, model_joints
-from .bank import build_bank
-from .memory import decoded_frames, fitting_batch, free_memory, step_memory
-from .objective import Objective
-from .reach import reachable_body
-from .state import RunState, batches_before, canonical, load_state, save_state, scene_digest, state_path
-from .step import Stepper
-from .validation import Score, Validator
-from .windows import WindowSampler
+from .curve import Point, with_point
+from .job import TrainJob
+from .keeping import Keeper
+from .memory import decoded_frames, fitting_batch, free_memory, need_one_window, step_memory, suffices
+from .parts import build_parts
+from .state import Best, Lowered, RunState, learned, load_state, restore, restore_learned
+from .validation import Score
+from .watch import EVERY, SPAN, Watch
 
 # A rollout closer than this to the quasi-static state of each pose has learned no dynamics worth the name.
 NO_DYNAMICS = 2e-3  # [m]
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainJob:
-    """Everything a training needs.
-
-    Attributes:
-        scene: character with its body, garment, rig.
-        motions, held_out: what is trained on, and what is validated on.
-        output: the model file to write; the run's state lies beside it.
-        inputs: hashes of the input files by name, for the provenance.
-    """
-
-    scene: Scene
-    motions: Sequence[Motion]
-    held_out: Sequence[Motion]
-    model: ModelConfig
-    train: TrainConfig
-    fabric: Fabric
-    output: Path
-    device: str = "auto"
-    resume: bool = False
-    inputs: dict[str, str] | None = None
+SAVE_EVERY = 60.0  # [s] that a killed process loses at most, a step and a validation aside
+SLOWER = 0.25  # factor on the step sizes once training has not stayed finite
 
 
 @dataclass(frozen=True)
@@ -74,183 +46,237 @@ class Trained:
     plain: Score
 
 
-def split_motions(motions: Sequence[Motion]) -> tuple[list[Motion], list[Motion]]:
-    """Return 80 % of the clips to train on and 20 % to validate on, spread evenly; one clip is cut in two."""
-    if len(motions) == 1:
-        cut = int(motions[0].frame_count * 0.8)
-        need(cut > 0, motions[0].path, "one motion of one frame", "longer motions are needed to train")
-        return [motions[0].clip(0, cut)], [motions[0].clip(cut, motions[0].frame_count)]
-    held = set(range(4, len(motions), 5)) or {len(motions) - 1}
-    return [m for i, m in enumerate(motions) if i not in held], [m for i, m in enumerate(motions) if i in held]
-
-
 class Run:
-    """A training run that has been set up and can be stepped."""
+    """A training run that has been set up, or taken up where it stopped, and can be stepped.
+
+    Attributes:
+        state: what changes while the run goes on.
+        saved: iteration of the state on disk.
+    """
 
     def __init__(self, job: TrainJob, report: Reporter) -> None:
-        self.report, self.device = report, chosen_device(job.device)
-        reach = reachable_body(job.scene, [*job.motions, *job.held_out])
-        self.job = job = self._fitted(job, len(reach.vertices))
-        joints = model_joints(job.scene, reach.joints)
-        scene, skeleton = job.scene, job.scene.character.skeleton
-        self.model = GarmentModel(scene, job.model, joints, job.train.seed).to(self.device)
-        bank = build_bank(job.motions, skeleton, joints, job.model.fps, self.device)
-        held = build_bank(job.held_out, skeleton, joints, job.model.fps, self.device)
-        energy = GarmentEnergy(scene.garment.mesh, job.fabric, device=self.device)
-        body = CollisionBody(
-            scene.character.merged_body(), skeleton.joint_count, vertices=reach.vertices, device=self.device
-        )
-        generator = torch.Generator(self.device).manual_seed(job.train.seed)
-        sampler = WindowSampler(bank, job.train, job.model.latent, generator)
-        self.stepper = Stepper(
-            self.model,
-            Objective(self.model, energy, body, bank, job.train.surface == "triangles"),
-            sampler,
-            job.train,
-        )
-        # Validation looks at the whole body: what training leaves out must not go unnoticed.
-        whole = CollisionBody(scene.character.merged_body(), skeleton.joint_count, device=self.device)
-        self.validator = Validator(
-            held, energy, whole, scene.plain_skin, self.model.decoder.rest, job.model.fps, job.train.valid_frames
-        )
-        self.digest = scene_digest(job.scene)
-        self.iteration = 0
-        self.best: Score | None = None
-        self._announce(len(reach.vertices), len(joints))
-
-    def _fitted(self, job: TrainJob, body_vertices: int) -> TrainJob:
-        """Lower the batch until the predicted memory fits, and say so; a resumed run keeps the batch it had."""
-        free = free_memory(self.device)
-        if job.resume:
-            batch, warm = batches_before(state_path(job.output), job.train)
+        self.job, self.report, self.device = job, report, chosen_device(job.device)
+        self.keeper, identity = Keeper(job, self.device), job.identity()
+        self.state, tensors = load_state(self.keeper.state, identity) if job.resume else (RunState(identity), None)
+        self.parts = build_parts(job, self.device)
+        if not job.resume:
+            self._fit()
+        self._build_stepper()
+        self._announce()
+        self._since = self._saved_at = time.monotonic()
+        self.keeper.tidy()
+        if tensors is None:
+            self._write_state()
         else:
-            batch, warm = fitting_batch(job.scene, job.model, job.train, body_vertices, free)
-        needed = step_memory(job.scene, job.model, decoded_frames(job.train, job.train.batch), body_vertices)
-        if (batch, warm) == (job.train.batch, job.train.warm_batch):
-            return job
+            self._take_up(tensors)
+        self.keeper.save_curve(self.state, self.plain)
+
+    @cached_property
+    def plain(self) -> Score:
+        """Score of plain skinning."""
+        return self.parts.validator.plain_score()
+
+    @property
+    def config(self) -> TrainConfig:
+        """The schedule as it was asked for, with what had to be lowered."""
+        return self.state.lowered[-1].applied(self.job.train) if self.state.lowered else self.job.train
+
+    def _build_stepper(self) -> None:
+        seed = self.job.train.seed + len(self.state.lowered)  # so as not to draw the same windows once more
+        self.stepper = self.parts.stepper(self.config, seed)
+        self.stepper.faults.count.fill_(self.state.undone)
+        self.watch = Watch(self.stepper.faults)
+
+    def _rebuild_stepper(self, tensors: dict[str, Tensor]) -> None:
+        """Make a stepper of what was learned and of what is lowered now."""
+        del self.stepper, self.watch
+        gc.collect()
+        if self.device.type == "cuda":
+            torch.cuda.empty_cache()
+        self._build_stepper()
+        restore_learned(self.stepper, tensors)
+
+    def _take_up(self, tensors: dict[str, Tensor]) -> None:
+        restore(self.keeper.state, self.stepper, tensors)
+        self.saved, best = self.state.iteration, self.state.best
+        self.report(Message(f"resumed at iteration {self.state.iteration} of {self.job.train.iterations}"))
+        if best and best.iteration == self.state.iteration:
+            self._write_model(best.score)  # the run may have been killed before it was written
+        elif best and not self.job.output.is_file():
+            self.state.best = None
+
+    def _fit(self) -> None:
+        """Lower the batch until the predicted memory fits, and say so."""
+        job, config, free = self.job, self.job.train, free_memory(self.device)
+        need_one_window(job.scene, job.model, config, self.parts.reached, free)
+        batch, warm_batch = fitting_batch(job.scene, job.model, config, self.parts.reached, free)
+        if (batch, warm_batch) != (config.batch, config.warm_batch):
+            found = f"{self._memory() / 2**30:.1f} GiB needed, {free / 2**30:.1f} GiB free on {self.device}"
+            self._lower(found, batch, warm_batch)
+
+    def _memory(self) -> int:
+        """Predict what a step takes [bytes]."""
+        frames = decoded_frames(self.config, self.config.batch)
+        return step_memory(self.job.scene, self.job.model, frames, self.parts.reached)
+
+    def _lower(self, found: str, batch: int, warm_batch: int) -> None:
+        before, lowered = self.config, self.state.lowered
+        pace = lowered[-1].pace if lowered else 1.0
+        lowered.append(Lowered(self.state.iteration, batch, warm_batch, pace))
         self.report(
             Message(
-                f"{needed / 2**30:.1f} GiB needed, {free / 2**30:.1f} GiB free on {self.device}: the batch goes "
-                f"from {job.train.batch} to {batch} windows and from {job.train.warm_batch} to {warm} single poses.",
+                f"{found}: the batch goes from {before.batch} to {batch} windows and from {before.warm_batch} to "
+                f"{warm_batch} single poses.",
                 "warning",
             )
         )
-        return replace(job, train=replace(job.train, batch=batch, warm_batch=warm))
 
-    def _announce(self, body_vertices: int, joints: int) -> None:
-        job, mesh = self.job, self.job.scene.garment.mesh
-        for motion in (*job.motions, *job.held_out):
-            if len(spans := split_at_cuts(motion)) > 1:
-                self.report(
-                    Message(f"{motion.path}: the root jumps {len(spans) - 1} times; each span is used by itself.")
-                )
-        frames = decoded_frames(job.train, job.train.batch)
-        self.report(
-            Started(
-                "train",
-                job.train.iterations,
-                {
-                    "garment": mesh.path,
-                    "vertices": mesh.vertex_count,
-                    "proxies": job.scene.rig.proxy_count,
-                    "blendshapes": job.model.shapes,
-                    "joints in view": joints,
-                    "body vertices": body_vertices,
-                    "parameters": sum(p.numel() for p in self.model.parameters()),
-                    "device": str(self.device),
-                    "memory predicted [MiB]": step_memory(job.scene, job.model, frames, body_vertices) >> 20,
-                },
+    def _within_memory(self, work: Callable[[], None]) -> None:
+        """Do `work`, with half the batch for as long as the device runs out of memory.
+
+        Raises:
+            SsilkError: a batch of one does not fit.
+        """
+        while not suffices(work):
+            config, found = self.config, f"iteration {self.state.iteration}: {self.device} is out of memory"
+            need(
+                (config.warm_batch if self.state.iteration < config.warm_iterations else config.batch) > 1,
+                self.job.scene.garment.mesh.path,
+                f"{found} with a batch of one",
+                "a step needs more than is free",
+                "take another device, or shorter windows (--set window=...)",
             )
-        )
+            self._lower(found, max(1, config.batch // 2), max(1, config.warm_batch // 2))
+            self._rebuild_stepper(learned(self.stepper))
 
-    def asked(self) -> dict[str, Any]:
-        """Return what makes this run the run it is; a resumed run must be asked the same."""
-        job = self.job
-        return canonical(
-            {
-                "model": asdict(job.model),
-                "train": asdict(job.train),
-                "fabric": asdict(job.fabric),
-                "inputs": job.inputs or {},
-                "garment": job.scene.garment.mesh.path,
-                "scene": self.digest,
-            }
-        )
+    def _announce(self) -> None:
+        for motion in (*self.job.motions, *self.job.held_out):
+            if jumps := len(split_at_cuts(motion)) - 1:
+                self.report(Message(f"{motion.path}: the root jumps {jumps} times; each span is used by itself."))
+        detail = {**self.parts.detail(), "memory predicted [MiB]": self._memory() >> 20}
+        self.report(Started("train", self.job.train.iterations, detail))
 
-    def save_state(self) -> None:
-        """Write the run's state beside the model."""
-        save_state(state_path(self.job.output), self.stepper, RunState(self.iteration, self.best, self.asked()))
+    def step(self) -> None:
+        """Do one iteration."""
+        self._within_memory(lambda: self.stepper.run(self.state.iteration))
+        self.state.iteration += 1
 
-    def resume(self) -> None:
-        """Take up the state that lies beside the model."""
-        state = load_state(state_path(self.job.output), self.stepper, self.asked())
-        self.iteration, self.best = state.iteration, state.best
+    def look(self, seconds_left: float) -> None:
+        """Report how far training is, and look after steps that were undone."""
+        self.report(Progress(self.state.iteration, self.job.train.iterations, seconds_left, self._batch_terms()))
+        if told := self.watch.look():
+            self.report(Message(told, "warning"))
+        if self.watch.hopeless:
+            self._recover(f"more than half of the last {SPAN} steps were undone", self.watch.culprits)
 
-    def validate(self) -> Score:
+    def _batch_terms(self) -> dict[str, float]:
+        """Return energies of the last batch [J]; this waits for the device."""
+        return {name: float(value) for name, value in self.stepper.terms.items()}
+
+    @property
+    def validation_due(self) -> bool:
+        """Whether the schedule wants a validation now."""
+        config, iteration = self.job.train, self.state.iteration
+        scheduled = iteration % config.validate_every == 0 or iteration == config.iterations
+        return scheduled and iteration >= max(1, config.warm_iterations) and iteration != self.saved
+
+    def validate(self) -> None:
         """Score the model on the held-out clips and keep it when it is the best so far."""
-        score = self.validator.score(self.stepper.averaged)
-        need(
-            np.isfinite(score.total),
+        state, batch = self.state, self._batch_terms()
+        with self._untimed():
+            score = self._score()
+            if broken := _not_finite(score):
+                self._recover("validation is not finite", broken)
+                return
+            self.report(_judgement(state.iteration, score, self.plain, self.job.scene.rig.proxy_count > 0))
+            finite = {name: value for name, value in batch.items() if isfinite(value)}
+            state.curve = with_point(state.curve, Point(state.iteration, state.seconds, finite, score))
+            better = state.best is None or score.total < state.best.score.total
+            if better:
+                state.best = Best(state.iteration, score)
+            self._write_state()
+            self.keeper.save_curve(state, self.plain)
+            if better:
+                self._write_model(score)
+
+    def _score(self) -> Score:
+        found: list[Score] = []
+        self._within_memory(lambda: found.append(self.parts.validator.score(self.stepper.averaged)))
+        return found[0]
+
+    def _recover(self, found: str, broken: list[str]) -> None:
+        """Go back to the state on disk and on from there with smaller steps; that is tried once.
+
+        Raises:
+            SsilkError: it was tried before.
+        """
+        found = f"{found} at iteration {self.state.iteration} ({' and '.join(broken)} not finite)"
+        self.keeper.save_fault(self.stepper, found)
+        config, lowered = self.config, self.state.lowered
+        if lowered and lowered[-1].pace < 1:
+            self._give_up(found)
+        before, tensors = load_state(self.keeper.state, self.state.asked)
+        slower = Lowered(before.iteration, config.batch, config.warm_batch, SLOWER)
+        undone, seconds = int(self.stepper.faults.count), self.state.seconds
+        self.state = replace(before, lowered=[*lowered, slower], undone=undone, seconds=seconds)
+        self._rebuild_stepper(tensors)
+        text = f"{found}; back to iteration {before.iteration} with steps of {SLOWER:.0%}, see {self.keeper.fault}"
+        self.report(Message(text, "warning"))
+
+    def _give_up(self, found: str) -> NoReturn:
+        fail(
             str(self.job.output),
-            f"training diverged by iteration {self.iteration}",
-            "the best model before it is kept",
-            "train again with smaller steps (--set rate=...)",
+            f"training diverged: {found}",
+            "the best model before it is kept" if self.state.best else "there is no model yet",
+            f"study {self.keeper.fault}, or train again with smaller steps (--set rate=...)",
         )
-        if self.best is None or score.total < self.best.total:
-            self.best = score
-            provenance = self.provenance(score)
-            save_model(self.job.output, model_file(self.stepper.averaged, self.job.fabric, provenance))
-            self.report(Checkpoint(str(self.job.output), self.iteration, True))
-        return score
+
+    def save(self) -> None:
+        """Write the state, unless it is the one on disk."""
+        if self.saved != self.state.iteration:
+            self._batch_terms()
+            with self._untimed():
+                self._write_state()
+
+    @property
+    def save_due(self) -> bool:
+        """Whether enough time has gone by to save again."""
+        return time.monotonic() - self._saved_at >= SAVE_EVERY
+
+    def _write_state(self) -> None:
+        self.state.undone = int(self.stepper.faults.count)
+        self.keeper.save_state(self.stepper, self.state)
+        self.saved, self._saved_at = self.state.iteration, time.monotonic()
+
+    def _write_model(self, score: Score) -> None:
+        self.keeper.save_model(self.stepper.averaged, self.state, score)
+        self.report(Checkpoint(str(self.job.output), self.state.iteration, True))
+
+    @contextmanager
+    def _untimed(self) -> Iterator[None]:
+        """Leave what is done meanwhile out of the seconds of training."""
+        self.state.seconds += time.monotonic() - self._since
+        try:
+            yield
+        finally:
+            self._since = time.monotonic()
 
     def kept(self) -> Score:
         """Return the score of the model on disk; write the present one where the schedule came to no validation yet.
 
         That one does not count as best: a run that is interrupted here ends, resumed, like one that is not.
         """
-        if self.best is not None:
-            return self.best
-        score = self.validate()
-        self.best = None
+        if self.state.best:
+            return self.state.best.score
+        score = self._score()
+        if broken := _not_finite(score):
+            self._give_up(f"validation at iteration {self.state.iteration} ({' and '.join(broken)} not finite)")
+        self._write_model(score)
         return score
 
-    def provenance(self, score: Score) -> dict[str, Any]:
-        """Return how the model came to be."""
-        return canonical(
-            {
-                **self.asked(),
-                "iteration": self.iteration,
-                "seed": self.job.train.seed,
-                "ssilk": __version__,
-                "torch": torch.__version__,
-                "python": platform.python_version(),
-                "device": device_name(self.device),
-                "motions": [motion.path for motion in self.job.motions],
-                "validation": {**score.terms, "total": score.total, "collisions": score.collisions},
-            }
-        )
 
-
-@contextmanager
-def interruptible() -> Iterator[threading.Event]:
-    """Yield an event that SIGINT and SIGTERM set, so that work stops between two steps; a second one is immediate."""
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-
-    def ask(number: int, frame: object) -> None:
-        stop.set()
-        signal.signal(number, before[signal.Signals(number)])
-
-    for number in before:
-        signal.signal(number, ask)
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+def _not_finite(score: Score) -> list[str]:
+    return [name for name, value in score.terms.items() if not isfinite(value)]
 
 
 def train(job: TrainJob, report: Reporter, stop: threading.Event | None = None) -> Trained:
@@ -262,47 +288,38 @@ def train(job: TrainJob, report: Reporter, stop: threading.Event | None = None) 
         stop: set from outside to stop after the current step; the state is saved then.
 
     Raises:
-        SsilkError: the inputs do not suffice, or training diverged.
+        SsilkError: the inputs or the memory do not suffice, or training diverged.
     """
     run = Run(job, report)
-    if job.resume:
-        run.resume()
-        report(Message(f"resumed at iteration {run.iteration} of {job.train.iterations}"))
-    plain = run.validator.plain_score()
-    _loop(run, report, stop or threading.Event(), plain)
-    run.save_state()
+    _loop(run, stop or threading.Event())
+    run.save()
+    if run.state.undone:
+        report(Message(f"{run.state.undone} steps in all were undone.", "warning"))
     score = run.kept()
-    finished = run.iteration >= run.job.train.iterations
-    return Trained(finished, run.iteration, score, plain)
+    return Trained(run.state.iteration >= job.train.iterations, run.state.iteration, score, run.plain)
 
 
-def _loop(run: Run, report: Reporter, stop: threading.Event, plain: Score) -> None:
-    config, began, first = run.job.train, time.monotonic(), run.iteration
-    while run.iteration < config.iterations and not stop.is_set():
-        run.stepper.run(run.iteration)
-        run.iteration += 1
-        elapsed = time.monotonic() - began
-        left = elapsed / (run.iteration - first) * (config.iterations - run.iteration)
-        if run.iteration % 20 == 0 or run.iteration in (first + 1, config.iterations):
-            terms = {name: float(value) for name, value in run.stepper.terms.items()}
-            report(Progress(run.iteration, config.iterations, left, terms))
-        rolling = run.iteration >= max(1, config.warm_iterations)
-        if rolling and (run.iteration % config.validate_every == 0 or run.iteration == config.iterations):
-            report(_judgement(run, run.validate(), plain))
-            run.save_state()
-    skipped = int(run.stepper.skipped)
-    if skipped:
-        report(Message(f"{skipped} steps were left out because a gradient was not finite.", "warning"))
+def _loop(run: Run, stop: threading.Event) -> None:
+    began, steps, total = time.monotonic(), 0, run.job.train.iterations
+    while run.state.iteration < total and not stop.is_set():
+        run.step()
+        steps += 1
+        if run.state.iteration % EVERY == 0 or run.state.iteration == total or steps == 1:
+            run.look((time.monotonic() - began) / steps * (total - run.state.iteration))
+        if run.validation_due:
+            run.validate()
+        elif run.save_due:
+            run.save()
 
 
-def _judgement(run: Run, score: Score, plain: Score) -> Message:
+def _judgement(iteration: int, score: Score, plain: Score, moves: bool) -> Message:
     share = 1 - score.total / plain.total
     terms = ", ".join(f"{name} {value:.4g}" for name, value in score.terms.items())
     text = (
-        f"validation at {run.iteration}: total {score.total:.4g} J, "
+        f"validation at {iteration}: total {score.total:.4g} J, "
         f"{share:.1%} under plain skinning's {plain.total:.4g} J "
         f"({terms}), collisions {score.collisions:.2%}, motion of its own {score.dynamics * 1000:.0f} mm"
     )
-    if score.dynamics < NO_DYNAMICS and run.job.scene.rig.proxy_count:
+    if score.dynamics < NO_DYNAMICS and moves:
         return Message(f"{text}; nothing dynamic is being learned: check that the motions move", "warning")
     return Message(text)

@@ -7,7 +7,7 @@ import hashlib
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +19,64 @@ from ..assets import Scene
 from ..config import TrainConfig
 from ..errors import SsilkError, need
 from ..files import replacing
+from .curve import Point
 from .step import Stepper
 from .validation import Score
 
+SAMPLER = "sampler."  # begins the names of tensors that say where the windows stand; the others are what was learned
+
 
 @dataclass(frozen=True)
-class RunState:
-    """Iterations done, the best score so far (of the model on disk), and what the run was asked to do."""
+class Best:
+    """The model that was kept: the iteration it was taken at, and its score."""
 
     iteration: int
-    best: Score | None
+    score: Score
+
+
+@dataclass(frozen=True)
+class Lowered:
+    """What a run does with from an iteration on, because more did not work.
+
+    Attributes:
+        iteration: steps done until then.
+        batch, warm_batch: what fits into memory.
+        pace: factor on every step size, below one after steps that were not finite.
+    """
+
+    iteration: int
+    batch: int
+    warm_batch: int
+    pace: float = 1.0
+
+    def applied(self, config: TrainConfig) -> TrainConfig:
+        """Return the schedule with this instead of what was asked for."""
+        rates = {name: getattr(config, name) * self.pace for name in ("warm_rate", "rate", "final_rate")}
+        return replace(config, batch=self.batch, warm_batch=self.warm_batch, **rates)
+
+
+@dataclass
+class RunState:
+    """What changes while a run goes on, tensors aside.
+
+    Attributes:
+        asked: what the run was asked to do; a resumed run must be asked the same.
+        iteration: steps done.
+        best: the best model so far. A state is written before the model that it tells of: where a run was killed in
+            between, the model is in the state.
+        lowered: what had to be lowered, in order; the last holds.
+        undone: steps undone because something was not finite.
+        seconds: as in `curve.Point`.
+        curve: the validations.
+    """
+
     asked: dict[str, Any]
+    iteration: int = 0
+    best: Best | None = None
+    lowered: list[Lowered] = field(default_factory=list)
+    undone: int = 0
+    seconds: float = 0.0
+    curve: list[Point] = field(default_factory=list)
 
 
 def state_path(model: str | Path) -> Path:
@@ -41,36 +88,17 @@ def save_state(path: Path, stepper: Stepper, state: RunState) -> None:
     """Write everything that the next iteration depends on."""
     from safetensors.torch import save
 
+    tensors = learned(stepper) | {SAMPLER + name: _copied(value) for name, value in stepper.sampler.state().items()}
     with replacing(path) as temporary:
-        tensors = {name: value.detach().cpu().contiguous().clone() for name, value in _tensors(stepper).items()}
         temporary.write_bytes(save(tensors, {"ssilk_state": json.dumps(asdict(state))}))
 
 
-def load_state(path: Path, stepper: Stepper, asked: dict[str, Any]) -> RunState:
-    """Restore a run into a freshly built `stepper`.
+def load_state(path: Path, asked: dict[str, Any]) -> tuple[RunState, dict[str, Tensor]]:
+    """Return a state and its tensors.
 
     Raises:
         SsilkError: there is no state, it is damaged, or it belongs to a run that was asked something else.
     """
-    with _damage_named(path):
-        state, tensors = _read(path)
-        _need_same(path, asked, state.asked)
-        _restore(stepper, tensors)
-    return state
-
-
-def batches_before(path: Path, config: TrainConfig) -> tuple[int, int]:
-    """Return the batch and warm batch of the run at `path`, up to those of `config`: memory may have lowered them.
-
-    Raises:
-        SsilkError: there is no state, or it is damaged.
-    """
-    with _damage_named(path):
-        before = _read(path)[0].asked["train"]
-        return min(config.batch, before["batch"]), min(config.warm_batch, before["warm_batch"])
-
-
-def _read(path: Path) -> tuple[RunState, dict[str, Tensor]]:
     from safetensors import safe_open
 
     need(
@@ -80,11 +108,62 @@ def _read(path: Path) -> tuple[RunState, dict[str, Tensor]]:
         "the file is written beside the model",
         "train without --resume",
     )
-    with safe_open(path, "pt") as stream:
-        document = json.loads((stream.metadata() or {})["ssilk_state"])
-        best = document.pop("best")
-        tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
-    return RunState(best=None if best is None else Score(**best), **document), tensors
+    with _damage_named(path):
+        with safe_open(path, "pt") as stream:
+            state = _state_of(json.loads((stream.metadata() or {})["ssilk_state"]))
+            tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
+        _need_same(path, asked, state.asked)
+    return state, tensors
+
+
+def restore(path: Path, stepper: Stepper, tensors: dict[str, Tensor]) -> None:
+    """Put what `load_state` returned into a freshly built `stepper`.
+
+    Raises:
+        SsilkError: the tensors do not fit.
+    """
+    with _damage_named(path):
+        stepper.sampler.restore(_group(tensors, SAMPLER))
+        restore_learned(stepper, tensors)
+
+
+def learned(stepper: Stepper) -> dict[str, Tensor]:
+    """Return copies on the CPU of all that training changes: parameters, their average, the optimiser's moments."""
+    tensors = {f"model.{name}": value for name, value in stepper.model.state_dict().items()}
+    tensors |= {f"averaged.{name}": value for name, value in stepper.averaged.state_dict().items()}
+    for index, moments in stepper.optimiser.state_dict()["state"].items():
+        tensors |= {f"adam.{index}.{name}": torch.as_tensor(value) for name, value in moments.items()}
+    return {name: _copied(value) for name, value in tensors.items()}
+
+
+def restore_learned(stepper: Stepper, tensors: dict[str, Tensor]) -> None:
+    """Put what `learned` returned into a freshly built `stepper`, which may have another batch."""
+    stepper.model.load_state_dict(_group(tensors, "model."))
+    stepper.averaged.load_state_dict(_group(tensors, "averaged."))
+    moments: dict[int, dict[str, Tensor]] = {}
+    for name, value in _group(tensors, "adam.").items():
+        index, _, key = name.partition(".")
+        moments.setdefault(int(index), {})[key] = value
+    document = stepper.optimiser.state_dict()
+    stepper.optimiser.load_state_dict({"state": moments, "param_groups": document["param_groups"]})
+
+
+def _copied(value: Tensor) -> Tensor:
+    return value.detach().cpu().contiguous().clone()
+
+
+def _group(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)}
+
+
+def _state_of(document: dict[str, Any]) -> RunState:
+    best, lowered, curve = document.pop("best"), document.pop("lowered"), document.pop("curve")
+    return RunState(
+        best=None if best is None else Best(best["iteration"], Score(**best["score"])),
+        lowered=[Lowered(**item) for item in lowered],
+        curve=[Point(**{**item, "score": Score(**item["score"])}) for item in curve],
+        **document,
+    )
 
 
 @contextmanager
@@ -112,34 +191,10 @@ def _need_same(path: Path, asked: dict[str, Any], before: dict[str, Any]) -> Non
     need(
         not differing,
         str(path),
-        f"the run was started with another {', '.join(differing)}",
+        f"the run was started with another {', '.join(dict.fromkeys(differing))}",
         "a resumed run repeats the same command",
         "use the same options or train without --resume",
     )
-
-
-def _tensors(stepper: Stepper) -> dict[str, Tensor]:
-    tensors = {f"model.{name}": value for name, value in stepper.model.state_dict().items()}
-    tensors |= {f"averaged.{name}": value for name, value in stepper.averaged.state_dict().items()}
-    tensors |= {f"sampler.{name}": value for name, value in stepper.sampler.state().items()}
-    for index, moments in stepper.optimiser.state_dict()["state"].items():
-        tensors |= {f"adam.{index}.{name}": torch.as_tensor(value) for name, value in moments.items()}
-    return tensors
-
-
-def _restore(stepper: Stepper, tensors: dict[str, Tensor]) -> None:
-    def group(prefix: str) -> dict[str, Tensor]:
-        return {name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)}
-
-    stepper.model.load_state_dict(group("model."))
-    stepper.averaged.load_state_dict(group("averaged."))
-    stepper.sampler.restore(group("sampler."))
-    moments: dict[int, dict[str, Tensor]] = {}
-    for name, value in group("adam.").items():
-        index, _, key = name.partition(".")
-        moments.setdefault(int(index), {})[key] = value
-    document = stepper.optimiser.state_dict()
-    stepper.optimiser.load_state_dict({"state": moments, "param_groups": document["param_groups"]})
 
 
 def scene_digest(scene: Scene) -> str:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Memory is predicted before it is used, and batches are lowered until they fit."""
 
+import weakref
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,8 +9,17 @@ import pytest
 import torch
 
 from ssilk_core.config import ModelConfig, TrainConfig
+from ssilk_core.errors import SsilkError
 from ssilk_core.training import memory
-from ssilk_core.training.memory import SHARE, decoded_frames, fitting_batch, free_memory, step_memory
+from ssilk_core.training.memory import (
+    SHARE,
+    decoded_frames,
+    fitting_batch,
+    free_memory,
+    need_one_window,
+    step_memory,
+    suffices,
+)
 
 MODEL, CONFIG = ModelConfig(), TrainConfig(batch=32, window=16, warm_batch=700)
 
@@ -49,6 +59,43 @@ def test_a_lowered_batch_fits_and_one_more_would_not(scene, megabytes):
 
 def test_at_least_one_window_is_trained_on(scene):
     assert fitting_batch(scene, MODEL, CONFIG, 1000, 1 << 20) == (1, 1)
+
+
+def test_one_window_must_fit(scene):
+    needed = step_memory(scene, MODEL, CONFIG.window, 1000)
+    need_one_window(scene, MODEL, CONFIG, 1000, needed)
+    with pytest.raises(SsilkError, match=r"one window of 16 poses needs 0\.042 GiB; 0\.042 GiB are free; .*window="):
+        need_one_window(scene, MODEL, CONFIG, 1000, needed - 1)
+
+
+def test_a_lack_of_memory_is_told_from_other_errors():
+    done: list[int] = []
+    assert suffices(lambda: done.append(1)) and done == [1]
+
+    def lacking() -> None:
+        raise torch.OutOfMemoryError("tried to allocate")
+
+    def captured() -> None:
+        """The end of a graph's capture fails, too, and that is what is seen."""
+        try:
+            lacking()
+        finally:
+            raise RuntimeError("operation failed due to a previous error during capture")
+
+    assert not suffices(lacking) and not suffices(captured)
+    with pytest.raises(RuntimeError, match="must match the size"):
+        suffices(lambda: print(torch.ones(2) + torch.ones(3)))
+
+
+def test_what_did_not_fit_is_held_no_longer():
+    held = []
+
+    def work() -> None:
+        large = torch.zeros(10)
+        held.append(weakref.ref(large))
+        raise torch.OutOfMemoryError
+
+    assert not suffices(work) and held[0]() is None
 
 
 def test_free_memory_is_within_the_machine():

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
 
 from ssilk_core.checkpoint import load_model
 from ssilk_core.config import ModelConfig, TrainConfig
@@ -19,10 +20,20 @@ from ssilk_core.devices import chosen_device
 from ssilk_core.errors import SsilkError
 from ssilk_core.events import Checkpoint, Event, Message, Progress, Started, silent
 from ssilk_core.fabrics import Fabric
+from ssilk_core.model.network import GarmentModel
 from ssilk_core.training import run as training
-from ssilk_core.training.run import TrainJob, interruptible, split_motions, train
-from ssilk_core.training.state import state_path
+from ssilk_core.training import validation
+from ssilk_core.training.curve import Point, curve_path, with_point
+from ssilk_core.training.job import TrainJob, split_motions
+from ssilk_core.training.keeping import Keeper
+from ssilk_core.training.objective import Objective
+from ssilk_core.training.run import train
+from ssilk_core.training.signals import interruptible
+from ssilk_core.training.state import RunState, learned, load_state, state_path
 from ssilk_core.training.step import Stepper, learning_rate
+from ssilk_core.training.validation import Score
+from ssilk_core.training.watch import fault_path
+from ssilk_core.training.windows import WindowSampler
 
 SHORT = TrainConfig(
     iterations=14,
@@ -83,6 +94,16 @@ def stop_after(monkeypatch: pytest.MonkeyPatch, iterations: int) -> threading.Ev
     return stop
 
 
+def assert_same_state(one: TrainJob, other: TrainJob) -> None:
+    """States are equal to the last bit; only the time that was taken differs."""
+    (a, tensors), (b, others) = (load_state(state_path(job.output), job.identity()) for job in (one, other))
+    untimed = [
+        replace(state, seconds=0, curve=[replace(point, seconds=0) for point in state.curve]) for state in (a, b)
+    ]
+    assert untimed[0] == untimed[1] and tensors.keys() == others.keys()
+    assert all(torch.equal(value, others[name]) for name, value in tensors.items())
+
+
 def test_training_lowers_the_energy_of_held_out_motion(job):
     config = replace(SHORT, iterations=110, warm=0.6, warm_batch=16, warm_rate=6e-3, rate=2e-3, surface="vertices")
     trained = train(job("learning", config), silent)
@@ -96,7 +117,7 @@ def test_a_run_repeats_bit_for_bit(job, uninterrupted):
     again = job("again")
     train(again, silent)
     assert again.output.read_bytes() == uninterrupted.output.read_bytes()
-    assert state_path(again.output).read_bytes() == state_path(uninterrupted.output).read_bytes()
+    assert_same_state(again, uninterrupted)
 
 
 @pytest.mark.parametrize("stops", [[2], [4], [5], [9], [3, 4, 4], [13]])
@@ -110,7 +131,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(job, uninterrupte
     trained = train(replace(resumed, resume=True), silent)
     assert trained.finished
     assert resumed.output.read_bytes() == uninterrupted.output.read_bytes()
-    assert state_path(resumed.output).read_bytes() == state_path(uninterrupted.output).read_bytes()
+    assert_same_state(resumed, uninterrupted)
 
 
 def test_a_finished_run_resumed_changes_nothing(job, uninterrupted):
@@ -135,6 +156,21 @@ def test_a_run_is_not_resumed_with_other_options(uninterrupted, change, name):
         train(replace(uninterrupted, resume=True, **change), silent)
 
 
+@pytest.mark.parametrize("changed", ["motions", "held_out"])
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        (lambda motion: replace(motion, path="/a.usd:/Other"), "/a.usd:/Other"),
+        (lambda motion: motion.clip(0, 30), "/(a|held)"),
+        (lambda motion: replace(motion, start=7), "/(a|held)"),
+    ],
+)
+def test_a_run_is_not_resumed_on_another_animation_of_the_same_files(uninterrupted, changed, change, name):
+    first, *others = getattr(uninterrupted, changed)
+    with pytest.raises(SsilkError, match=rf"started with another .*{name}.*a resumed run repeats the same command"):
+        train(replace(uninterrupted, resume=True, **{changed: [change(first), *others]}), silent)
+
+
 def test_damaged_or_missing_states_are_refused(job, uninterrupted):
     missing = job("missing", resume=True)
     with pytest.raises(SsilkError, match="there is no training to resume"):
@@ -148,9 +184,9 @@ def test_damaged_or_missing_states_are_refused(job, uninterrupted):
 
 def test_the_best_model_is_kept(job, monkeypatch):
     """Validation totals are replaced by ones that fall, then rise."""
-    totals, score = iter([3.0, 1.0, 2.0, 5.0]), training.Validator.score
+    totals, score = iter([3.0, 1.0, 2.0, 5.0]), validation.Validator.score
     monkeypatch.setattr(
-        training.Validator, "score", lambda self, model: replace(score(self, model), terms={"all": next(totals)})
+        validation.Validator, "score", lambda self, model: replace(score(self, model), terms={"all": next(totals)})
     )
     events: list[Event] = []
     kept = job("best", replace(SHORT, validate_every=4, iterations=16, warm=0.0))
@@ -176,42 +212,90 @@ def test_events_say_what_is_trained_and_how_it_goes(job):
 def test_provenance_tells_how_the_model_came_to_be(uninterrupted):
     provenance = load_model(uninterrupted.output).provenance
     assert provenance["train"]["window"] == 5 and provenance["seed"] == 7
-    assert provenance["inputs"] == {"stage.usd": "abc"} and provenance["motions"] == ["/a", "/b"]
+    assert provenance["inputs"] == {"stage.usd": "abc"} and provenance["lowered"] == []
+    assert provenance["motions"] == {"/a": [[0, 60, 30]], "/b": [[0, 45, 30]]}
+    assert provenance["held out"] == {"/held": [[0, 40, 30]]}
     assert provenance["torch"] == torch.__version__ and provenance["device"].startswith("cpu")
     assert set(provenance["validation"]) >= {"stretch", "gravity", "total", "collisions"}
     json.dumps(provenance, allow_nan=False)
 
 
 def test_a_diverging_run_says_so_and_keeps_the_best_model(job):
+    """Smaller steps are tried once; these are too large even so."""
     wild = job(
         "diverging", replace(SHORT, iterations=20, warm=0.5, validate_every=10, rate=1e9, final_rate=1e9, average=0.0)
     )
-    with pytest.raises(SsilkError, match=r"training diverged by iteration 20; .*kept") as error:
-        train(wild, silent)
+    events: list[Event] = []
+    with pytest.raises(SsilkError, match=r"training diverged: .* at iteration 20 .*not finite.*kept") as error:
+        train(wild, events.append)
     assert "resume" not in str(error.value)  # with another step size it would be another run
+    (back,) = (
+        e.text for e in events if isinstance(e, Message) and "back to iteration 10 with steps of 25%" in e.text
+    )
+    assert str(fault_path(wild.output)) in back
     kept = load_model(wild.output)
     assert kept.provenance["iteration"] == 10 and all(np.isfinite(v).all() for v in kept.parameters.values())
 
 
-def test_steps_whose_gradient_is_not_finite_are_left_out_and_counted(job, monkeypatch):
-    step, count = training.Stepper.warm, [0]
+def poison(monkeypatch: pytest.MonkeyPatch, bad: Callable[[Stepper, int], bool], name: str = "bending") -> None:
+    """Make a term of the windows of some iterations NaN."""
+    run, window, poisoned = Stepper.run, Objective.window, [False]
 
-    def poisoned(self: Stepper) -> None:
-        count[0] += 1
-        if count[0] == 2:
-            hook = self.model.output[-1].bias.register_hook(lambda gradient: gradient * float("nan"))
-            before = [value.detach().clone() for value in self.model.decoder.parameters()]
-            self.optimiser.state.clear()  # no momentum, so that a step that is left out moves nothing
-            step(self)
-            hook.remove()
-            assert all(torch.equal(a, b) for a, b in zip(before, self.model.decoder.parameters()))
-        else:
-            step(self)
+    def watched(self: Stepper, iteration: int) -> None:
+        poisoned[0] = bad(self, iteration)
+        run(self, iteration)
 
-    monkeypatch.setattr(training.Stepper, "warm", poisoned)
+    def spoiled(self: Objective, sampler: WindowSampler, noise: torch.Tensor):
+        dynamic, resting, latents = window(self, sampler, noise)
+        return (dynamic | {name: dynamic[name] * float("nan")}) if poisoned[0] else dynamic, resting, latents
+
+    monkeypatch.setattr(Stepper, "run", watched)
+    monkeypatch.setattr(Objective, "window", spoiled)
+
+
+def test_an_undone_step_is_told_of_by_term_and_iteration_and_counted_across_resumes(job, monkeypatch):
+    spoiled = job("spoiled")
+    with monkeypatch.context() as patch:
+        poison(patch, lambda stepper, iteration: iteration == 7)
+        train(spoiled, silent, stop_after(patch, 9))
     events: list[Event] = []
-    train(job("poisoned", replace(SHORT, iterations=6, warm=0.6)), events.append)
-    assert any(isinstance(e, Message) and e.text.startswith("1 steps were left out") for e in events)
+    poison(monkeypatch, lambda stepper, iteration: iteration in (11, 12), "stretch")
+    train(replace(spoiled, resume=True), events.append)
+    told = [event.text for event in events if isinstance(event, Message) and "undone" in event.text]
+    assert told == ["2 steps up to iteration 13 were undone: stretch not finite.", "3 steps in all were undone."]
+    assert load_state(state_path(spoiled.output), spoiled.identity())[0].undone == 3
+
+
+def test_many_undone_steps_lead_back_to_the_last_state_and_smaller_steps(job, monkeypatch):
+    config = replace(SHORT, iterations=120, warm=0.0, validate_every=15)
+    poison(monkeypatch, lambda stepper, iteration: iteration >= 19 and stepper.config.rate == config.rate)
+    events: list[Event] = []
+    slowed = job("slowed", config)
+    assert train(slowed, events.append).finished
+    (back,) = (event.text for event in events if isinstance(event, Message) and "back to" in event.text)
+    assert back.startswith("more than half of the last 100 steps were undone at iteration 80 (bending not finite); ")
+    assert "back to iteration 75 with steps of 25%" in back
+    state = load_state(state_path(slowed.output), slowed.identity())[0]
+    assert [(item.iteration, item.pace) for item in state.lowered] == [(75, 0.25)]
+    assert state.undone == 61 and [point.iteration for point in state.curve] == [15, 30, 45, 60, 75, 90, 105, 120]
+    assert load_model(slowed.output).provenance["lowered"][0]["pace"] == 0.25
+
+
+def test_what_stays_broken_stops_with_the_window_to_study(job, monkeypatch, scene):
+    """Every window is spoiled; a step to iteration 140 is the last, as 60 is more than half of 100."""
+    poison(monkeypatch, lambda stepper, iteration: True)
+    broken = job("broken", replace(SHORT, iterations=400, warm=0.0, validate_every=1000, rotated=0.0))
+    with pytest.raises(SsilkError, match=r"undone at iteration 60 \(bending.*no model yet.*broken.fault.safetensors"):
+        train(broken, silent)
+    assert not broken.output.exists()
+    with safe_open(fault_path(broken.output), "pt") as stream:
+        document = json.loads(stream.metadata()["ssilk_fault"])
+        window = {name: stream.get_tensor(f"window.{name}") for name in ("first", "direction", "latents", "noise")}
+        assert "model.decoder.shapes" in stream.keys()  # noqa: SIM118
+    assert document["iteration"] == 60 and len(document["places"]) == 3 == len(window["first"])
+    assert window["direction"].tolist() == [[0, -1, 0]] * 3
+    for place, first in zip(document["places"], window["first"].tolist()):
+        assert place == ({"motion": "/a", "frame": first} if first < 60 else {"motion": "/b", "frame": first - 60})
 
 
 def test_the_batch_is_lowered_to_fit_and_that_is_said(job, monkeypatch):
@@ -220,12 +304,12 @@ def test_the_batch_is_lowered_to_fit_and_that_is_said(job, monkeypatch):
     events: list[Event] = []
     monkeypatch.setattr(Stepper, "run", lambda self, iteration: None)
     run = training.Run(small, events.append)
-    assert 1 <= run.job.train.batch < 4000 and 1 <= run.job.train.warm_batch < 90_000
+    assert 1 <= run.config.batch < 4000 and 1 <= run.config.warm_batch < 90_000
     warning = next(event for event in events if isinstance(event, Message))
-    assert warning.level == "warning" and f"from 4000 to {run.job.train.batch} windows" in warning.text
+    assert warning.level == "warning" and f"from 4000 to {run.config.batch} windows" in warning.text
     started = next(event for event in events if isinstance(event, Started))
     assert started.detail["memory predicted [MiB]"] <= 0.8 * 1024
-    assert run.stepper.sampler.first.shape == (run.job.train.batch,)
+    assert run.stepper.sampler.first.shape == (run.config.batch,)
 
 
 def test_a_run_lowered_to_fit_is_resumed_as_it_was(job, monkeypatch):
@@ -234,12 +318,159 @@ def test_a_run_lowered_to_fit_is_resumed_as_it_was(job, monkeypatch):
     runs = []
     for megabytes in (400, 500, 330):
         monkeypatch.setattr(training, "free_memory", lambda device, size=megabytes << 20: size)
-        run = training.Run(replace(big, resume=bool(runs)), silent)
-        if runs:
-            run.resume()
-        run.save_state()
-        runs.append(run.job.train)
+        runs.append(training.Run(replace(big, resume=bool(runs)), silent).config)
     assert runs[0] == runs[1] == runs[2] and runs[0].batch < 4000
+
+
+def test_a_batch_of_one_that_cannot_fit_is_refused(job, monkeypatch):
+    monkeypatch.setattr(training, "free_memory", lambda device: 30 << 20)
+    with pytest.raises(SsilkError, match=r"/toy/strip: a batch of one window of 5 poses needs .* GiB are free"):
+        train(job("tiny"), silent)
+
+
+def limited(monkeypatch: pytest.MonkeyPatch, windows: int, poses: int) -> None:
+    """Run out of memory above so many windows or single poses."""
+    window, static = Objective.window, Objective.static
+
+    def some(self: Objective, sampler: WindowSampler, noise: torch.Tensor):
+        if len(sampler.first) > windows:
+            raise torch.OutOfMemoryError("injected")
+        return window(self, sampler, noise)
+
+    def single(self: Objective, frames: torch.Tensor, direction: torch.Tensor):
+        if len(frames) > poses:
+            raise torch.OutOfMemoryError("injected")
+        return static(self, frames, direction)
+
+    monkeypatch.setattr(Objective, "window", some)
+    monkeypatch.setattr(Objective, "static", single)
+
+
+def test_a_run_that_is_out_of_memory_goes_on_with_half_the_batch(job, monkeypatch):
+    big, events = job("big", replace(SHORT, batch=12, warm_batch=16)), []
+    limited(monkeypatch, windows=3, poses=9)
+    assert not train(big, events.append, stop_after(monkeypatch, 9)).finished
+    told = [event.text for event in events if isinstance(event, Message) and "memory" in event.text]
+    assert told == [
+        "iteration 0: cpu is out of memory: the batch goes from 12 to 6 windows and from 16 to 8 single poses.",
+        "iteration 4: cpu is out of memory: the batch goes from 6 to 3 windows and from 8 to 4 single poses.",
+    ]
+    assert not train(replace(big, resume=True), events.append, stop_after(monkeypatch, 1)).finished
+    assert train(replace(big, resume=True), events.append).finished
+    assert told == [event.text for event in events if isinstance(event, Message) and "memory" in event.text]
+    assert [item["batch"] for item in load_model(big.output).provenance["lowered"]] == [6, 3]
+
+
+def test_nothing_that_was_learned_is_lost_with_half_the_batch(job, monkeypatch):
+    run = training.Run(job("halved", replace(SHORT, batch=8, warm_batch=8)), silent)
+    for _ in range(6):
+        run.step()
+    before = learned(run.stepper)
+    limited(monkeypatch, windows=2, poses=2)
+    monkeypatch.setattr(Stepper, "windows", lambda self: self.objective.window(self.sampler, self.sampler.noise()))
+    run.step()
+    after = learned(run.stepper)
+    assert run.config.batch == len(run.stepper.sampler.first) == 2 and run.state.iteration == 7
+    assert any(name.startswith("adam.") for name in before) and before.keys() == after.keys()
+    assert all(torch.equal(value, after[name]) for name, value in before.items())
+
+
+@pytest.mark.parametrize(("windows", "poses", "iteration"), [(9, 0, 0), (0, 9, 4)])
+def test_a_run_that_is_out_of_memory_with_a_batch_of_one_stops(job, monkeypatch, windows, poses, iteration):
+    limited(monkeypatch, windows, poses)
+    with pytest.raises(
+        SsilkError, match=rf"iteration {iteration}: cpu is out of memory with a batch of one; .*window"
+    ):
+        train(job(f"hopeless{windows}"), silent)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_a_gpu_that_is_out_of_memory_goes_on_with_half_the_batch(job, monkeypatch):
+    """About 60 GiB are needed where 2 GiB may be had; the batch is halved in eager steps or in a graph's capture."""
+    torch.cuda.set_per_process_memory_fraction((2 << 30) / torch.cuda.get_device_properties(0).total_memory)
+    monkeypatch.setattr(training, "free_memory", lambda device: 1 << 50)
+    big = job("gpu", replace(SHORT, iterations=40, batch=100_000, warm_batch=1_000_000), device="cuda")
+    try:
+        assert train(big, silent).finished
+    finally:
+        torch.cuda.set_per_process_memory_fraction(1.0)
+    assert load_model(big.output).provenance["lowered"][-1]["batch"] < 50_000
+
+
+def test_a_state_is_saved_by_time_too(job, monkeypatch):
+    saved, save = [], Keeper.save_state
+
+    def noted(self: Keeper, stepper: Stepper, state: RunState) -> None:
+        saved.append(state.iteration)
+        save(self, stepper, state)
+
+    monkeypatch.setattr(Keeper, "save_state", noted)
+    monkeypatch.setattr(training, "SAVE_EVERY", 0.0)
+    train(job("timed"), silent)
+    assert saved == [*range(15)]
+
+
+def test_a_model_that_was_not_written_any_more_is_in_the_state(job, monkeypatch):
+    """The process is killed between the state and the second model, at the validation that the state tells of."""
+    totals, score = iter([3.0, 2.0, 1.0, 0.5]), validation.Validator.score
+    monkeypatch.setattr(
+        validation.Validator, "score", lambda self, model: replace(score(self, model), terms={"all": next(totals)})
+    )
+    killed, write = job("killed"), Keeper.save_model
+
+    def second(self: Keeper, model: GarmentModel, state: RunState, score: Score) -> None:
+        if state.iteration == 10:
+            raise InterruptedError
+        write(self, model, state, score)
+
+    with monkeypatch.context() as patch, pytest.raises(InterruptedError):
+        patch.setattr(Keeper, "save_model", second)
+        train(killed, silent)
+    assert load_model(killed.output).provenance["iteration"] == 5
+    at_once = threading.Event()
+    at_once.set()
+    trained = train(replace(killed, resume=True), silent, at_once)
+    rescued = load_model(killed.output).provenance
+    assert (rescued["iteration"], rescued["validation"]["total"], trained.score.total) == (10, 2.0, 2.0)
+    with safe_open(state_path(killed.output), "pt") as stream, safe_open(killed.output, "pt") as model:
+        for name in model.keys():  # noqa: SIM118
+            if name.startswith("model."):
+                assert torch.equal(model.get_tensor(name), stream.get_tensor(name.replace("model.", "averaged.", 1)))
+
+
+def test_a_model_that_is_gone_is_no_longer_the_best(job):
+    lost = job("lost", replace(SHORT, iterations=30))
+    train(lost, silent)
+    (state, _) = load_state(state_path(lost.output), lost.identity())
+    assert state.best.iteration > 4
+    lost.output.unlink()
+    train(replace(lost, resume=True), silent)
+    assert load_model(lost.output).provenance["iteration"] == 30
+
+
+def test_the_learning_curve_goes_on_where_a_resumed_run_does(job, uninterrupted, monkeypatch):
+    resumed = job("curve")
+    train(resumed, silent, stop_after(monkeypatch, 7))
+    first = json.loads(curve_path(resumed.output).read_text())
+    train(replace(resumed, resume=True), silent)
+    last = json.loads(curve_path(resumed.output).read_text())
+    assert [point["iteration"] for point in last["points"]] == [5, 10, 14]
+    assert last["points"][:1] == first["points"] and last["plain"] == first["plain"]
+    assert 0 < last["points"][0]["seconds"] < last["points"][1]["seconds"] < last["points"][2]["seconds"]
+    whole = json.loads(curve_path(uninterrupted.output).read_text())
+    assert [p["validation"] for p in whole["points"]] == [p["validation"] for p in last["points"]]
+    best = min(whole["points"], key=lambda point: point["validation"]["total"])
+    provenance = load_model(uninterrupted.output).provenance
+    assert (best["iteration"], best["validation"]) == (provenance["iteration"], provenance["validation"])
+    assert best["batch"].keys() >= {"stretch", "inertia"}
+
+
+def test_a_long_curve_is_thinned_and_ends_at_the_last_validation():
+    curve: list[Point] = []
+    for iteration in range(1, 5001):
+        curve = with_point(curve, Point(iteration, iteration / 100, {}, Score({}, 0.0)))
+        assert curve[-1].iteration == iteration and len(curve) <= 400
+    assert curve[0].iteration == 1 and len(curve) > 200
 
 
 def test_interrupts_set_the_event_once_and_are_immediate_the_second_time():

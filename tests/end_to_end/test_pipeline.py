@@ -68,7 +68,7 @@ def test_from_character_to_picture(toy, tmp_path, monkeypatch, capsys):
     assert events(capsys)[-1] == {"event": "result", "task": "view", "detail": {"picture": "sheet.png", "frames": 2}}
     assert {path.name for path in tmp_path.iterdir()} == {
         *("hero.usda", "clip.usda", "rigged.usda", "model.safetensors", "model.resume.safetensors"),
-        *("shot.usdc", "sheet.png"),
+        *("model.curve.json", "shot.usdc", "sheet.png"),
     }
 
 

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The learning curve of a run: what each validation found, and when."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..files import replacing
+from .validation import Score
+
+MOST_POINTS = 400
+
+
+@dataclass(frozen=True)
+class Point:
+    """One validation.
+
+    Attributes:
+        iteration: steps done until then.
+        seconds: time that the steps took, over all resumed parts of the run, validations and writing left out [s].
+        batch: energies of the last training batch [J].
+        score: what the validation found.
+    """
+
+    iteration: int
+    seconds: float
+    batch: dict[str, float]
+    score: Score
+
+
+def curve_path(model: str | Path) -> Path:
+    """Return where the learning curve of the run that writes `model` lies."""
+    return Path(model).with_suffix(".curve.json")
+
+
+def with_point(curve: list[Point], point: Point) -> list[Point]:
+    """Return a curve with one point more; every second one is dropped when there are too many."""
+    curve = [*curve, point]
+    return curve if len(curve) <= MOST_POINTS else curve[::2]
+
+
+def write_curve(path: Path, curve: list[Point], plain: Score) -> None:
+    """Write {"plain": score of plain skinning, "points": [{"iteration", "seconds", "batch", "validation"}, ...]}."""
+    points = [
+        {"iteration": p.iteration, "seconds": round(p.seconds, 3), "batch": p.batch, "validation": summary(p.score)}
+        for p in curve
+    ]
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps({"plain": summary(plain), "points": points}, indent=1))
+
+
+def summary(score: Score) -> dict[str, Any]:
+    """Return a score as plain numbers by name: each term and the total [J], collisions, dynamics [m]."""
+    return {**score.terms, "total": score.total, "collisions": score.collisions, "dynamics": score.dynamics}

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a training run is asked to do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from ..assets import Motion, Scene
+from ..config import ModelConfig, TrainConfig
+from ..errors import need
+from ..fabrics import Fabric
+from .state import canonical, scene_digest
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainJob:
+    """Everything a training needs.
+
+    Attributes:
+        scene: character with its body, garment, rig.
+        motions, held_out: what is trained on, and what is validated on.
+        output: the model file to write; the run's other files lie beside it.
+        inputs: hashes of the input files by name, for the provenance.
+    """
+
+    scene: Scene
+    motions: Sequence[Motion]
+    held_out: Sequence[Motion]
+    model: ModelConfig
+    train: TrainConfig
+    fabric: Fabric
+    output: Path
+    device: str = "auto"
+    resume: bool = False
+    inputs: dict[str, str] | None = None
+
+    def identity(self) -> dict[str, Any]:
+        """Return what makes a run the run it is, as it comes back from JSON; a resumed run must be asked the same."""
+        return canonical(
+            {
+                "model": asdict(self.model),
+                "train": asdict(self.train),
+                "fabric": asdict(self.fabric),
+                "inputs": self.inputs or {},
+                "motions": _frames(self.motions),
+                "held out": _frames(self.held_out),
+                "garment": self.scene.garment.mesh.path,
+                "scene": scene_digest(self.scene),
+            }
+        )
+
+
+def _frames(motions: Sequence[Motion]) -> dict[str, list[tuple[float, int, float]]]:
+    """Return (first frame, number of frames, rate) of the motions by path, which names the prim."""
+    found: dict[str, list[tuple[float, int, float]]] = {}
+    for motion in motions:
+        found.setdefault(motion.path, []).append((motion.start, motion.frame_count, motion.fps))
+    return found
+
+
+def split_motions(motions: Sequence[Motion]) -> tuple[list[Motion], list[Motion]]:
+    """Return 80 % of the clips to train on and 20 % to validate on, spread evenly; one clip is cut in two."""
+    if len(motions) == 1:
+        cut = int(motions[0].frame_count * 0.8)
+        need(cut > 0, motions[0].path, "one motion of one frame", "longer motions are needed to train")
+        return [motions[0].clip(0, cut)], [motions[0].clip(cut, motions[0].frame_count)]
+    held = set(range(4, len(motions), 5)) or {len(motions) - 1}
+    return [m for i, m in enumerate(motions) if i not in held], [m for i, m in enumerate(motions) if i in held]

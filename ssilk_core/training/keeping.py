@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a run leaves on disk: the best model, the state to resume from, the learning curve, and what went wrong."""
+
+from __future__ import annotations
+
+import platform
+from dataclasses import asdict
+from typing import Any
+
+import torch
+
+from .. import __version__
+from ..checkpoint import model_file, save_model
+from ..devices import device_name
+from ..files import remove_unfinished
+from ..model.network import GarmentModel
+from .curve import curve_path, summary, write_curve
+from .job import TrainJob
+from .state import RunState, canonical, save_state, state_path
+from .step import Stepper
+from .validation import Score
+from .watch import fault_path, save_fault
+
+
+class Keeper:
+    """Writes the files of one run, all beside its model."""
+
+    def __init__(self, job: TrainJob, device: torch.device) -> None:
+        self.job, self.device = job, device
+        self.model, self.state = job.output, state_path(job.output)
+        self.curve, self.fault = curve_path(job.output), fault_path(job.output)
+
+    def tidy(self) -> None:
+        """Remove what a run that was killed while it wrote has left behind."""
+        for path in (self.model, self.state, self.curve, self.fault):
+            remove_unfinished(path)
+
+    def save_state(self, stepper: Stepper, state: RunState) -> None:
+        """Write the state."""
+        save_state(self.state, stepper, state)
+
+    def save_curve(self, state: RunState, plain: Score) -> None:
+        """Write the learning curve that is in the state, for whoever wants to look at it."""
+        write_curve(self.curve, state.curve, plain)
+
+    def save_model(self, model: GarmentModel, state: RunState, score: Score) -> None:
+        """Write a model with its provenance."""
+        save_model(self.model, model_file(model, self.job.fabric, self.provenance(state, score)))
+
+    def save_fault(self, stepper: Stepper, found: str) -> None:
+        """Write what a step that was not finite was computed from."""
+        save_fault(self.fault, stepper, self.job.motions, found)
+
+    def provenance(self, state: RunState, score: Score) -> dict[str, Any]:
+        """Return how the model came to be."""
+        return canonical(
+            {
+                **state.asked,
+                "iteration": state.iteration,
+                "lowered": [asdict(item) for item in state.lowered],
+                "seed": self.job.train.seed,
+                "ssilk": __version__,
+                "torch": torch.__version__,
+                "python": platform.python_version(),
+                "device": device_name(self.device),
+                "validation": summary(score),
+            }
+        )

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a run is built from: tensors of the scene and the motions on one device, and the network."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from ..config import TrainConfig
+from ..energy import GarmentEnergy
+from ..model.body import CollisionBody
+from ..model.network import GarmentModel, model_joints
+from .bank import MOST_TURN, MotionBank, build_bank
+from .job import TrainJob
+from .objective import Objective
+from .reach import reachable_body
+from .step import Stepper
+from .validation import Validator
+from .windows import WindowSampler
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """What stays as it is when a run begins anew with another batch.
+
+    Attributes:
+        bank: the motions to train on.
+        body: the part of the body that the garment can touch, of `reached` vertices.
+    """
+
+    model: GarmentModel
+    bank: MotionBank
+    energy: GarmentEnergy
+    body: CollisionBody
+    validator: Validator
+    reached: int
+    device: torch.device
+
+    def detail(self) -> dict[str, object]:
+        """Return what is trained, for people."""
+        scene = self.model.scene
+        return {
+            "garment": scene.garment.mesh.path,
+            "vertices": scene.garment.mesh.vertex_count,
+            "proxies": scene.rig.proxy_count,
+            "blendshapes": self.model.config.shapes,
+            "joints in view": len(self.model.joints),
+            "body vertices": self.reached,
+            "parameters": sum(value.numel() for value in self.model.parameters()),
+            "device": str(self.device),
+        }
+
+    def stepper(self, config: TrainConfig, seed: int) -> Stepper:
+        """Return a stepper at its beginning, whose draws have a seed of their own."""
+        generator = torch.Generator(self.device).manual_seed(seed)
+        sampler = WindowSampler(self.bank, config, self.model.config.latent, generator)
+        objective = Objective(self.model, self.energy, self.body, self.bank, config.surface == "triangles")
+        return Stepper(self.model, objective, sampler, config)
+
+
+def build_parts(job: TrainJob, device: torch.device) -> Parts:
+    """Build what a run needs.
+
+    Raises:
+        SsilkError: the motions are too short.
+    """
+    scene, skeleton, fps = job.scene, job.scene.character.skeleton, job.model.fps
+    reach = reachable_body(scene, [*job.motions, *job.held_out])
+    joints = model_joints(scene, reach.joints)
+    model = GarmentModel(scene, job.model, joints, job.train.seed).to(device)
+    bank = build_bank(job.motions, skeleton, joints, fps, device, most_turn=MOST_TURN)
+    held = build_bank(job.held_out, skeleton, joints, fps, device)
+    energy = GarmentEnergy(scene.garment.mesh, job.fabric, device=device)
+    body, count = scene.character.merged_body(), skeleton.joint_count
+    touched = CollisionBody(body, count, vertices=reach.vertices, device=device)
+    # Validation looks at the whole body: what training leaves out must not go unnoticed.
+    whole = CollisionBody(body, count, device=device)
+    validator = Validator(held, energy, whole, scene.plain_skin, model.decoder.rest, fps, job.train.valid_frames)
+    return Parts(model, bank, energy, touched, validator, len(reach.vertices), device)
