@@ -34,6 +34,7 @@ class Watch:
 
     def __init__(self, faults: Faults) -> None:
         self.faults, self.count = faults, int(faults.count)
+        self._before = self.count
         self._counts = deque([self.count], maxlen=SPAN // EVERY + 1)
         self._told, self._blamed = self.count, {name: int(value) for name, value in faults.terms.items()}
 
@@ -41,7 +42,7 @@ class Watch:
         """Return one sentence when steps were undone; of many, ever fewer are told of. It waits for the device."""
         self.count = int(self.faults.count)
         self._counts.append(self.count)
-        if self.count <= self._told or self.count < 1.5 * self._told:
+        if self.count == self._told or self.count - self._before < 1.5 * (self._told - self._before):
             return ""
         blamed = {name: int(value) for name, value in self.faults.terms.items()}
         names = [name for name, value in blamed.items() if value > self._blamed.get(name, 0)]
