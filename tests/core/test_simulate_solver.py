@@ -146,7 +146,7 @@ def _angles(hinges: Hinges, x: torch.Tensor) -> torch.Tensor:
 
 
 def test_no_hessian_has_a_negative_eigenvalue(potential: Potential, scene: Scene) -> None:
-    x, setting = moving(scene, 1)
+    _, setting = moving(scene, 1)
     still = replace(setting, predicted=None, carried=None, dt=1e9)
     squeezed = 0.7 * crumpled(scene, 1, 0.01)
     matrix = dense_hessian(potential, squeezed, still, potential.planes(squeezed, still))

@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The reference simulator against closed forms: what falls, hangs, stretches, swings and is braked."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from ssilk_core.assets import LOOSE, PINNED, Garment, Mesh, Motion, ProxyRig, Scene, SkinWeights
+from ssilk_core.errors import SsilkError
+from ssilk_core.fabrics import Fabric
+from ssilk_core.kinematics import (
+    motion_transforms,
+    resample,
+    skin_points,
+    skinning_matrices,
+)
+from ssilk_core.simulate import SimulationOptions, Simulator, minimise, shots_of, simulate
+from ssilk_core.simulate.actors import spans_of
+from ssilk_core.simulate.newton import SolverOptions, minimise_from
+from ssilk_core.simulate.potential import Potential, Setting
+
+CPU = torch.device("cpu")
+G = 9.81
+EXACT = SolverOptions(tolerance=1e-7, iterations=200)
+CALM = Fabric("calm", drag=0.0, bending=0.0)
+
+
+def dressed(scene: Scene, points: np.ndarray, faces: np.ndarray, pinned: np.ndarray) -> Scene:
+    """The character of a scene in another garment, which hangs from its first joint."""
+    skin = SkinWeights("/cloth", np.zeros((len(points), 1), dtype=int), np.ones((len(points), 1)))
+    garment = Garment(Mesh("/cloth", points, faces), skin, np.where(pinned, PINNED, LOOSE))
+    rig = ProxyRig("/cloth", (), np.zeros(0, dtype=int), np.zeros((0, 4, 4)), skin)
+    return replace(scene, garment=garment, rig=rig)
+
+
+def advance(
+    potential: Potential, x0: torch.Tensor, velocity: torch.Tensor, dt: float, steps: int, gravity: float = G
+) -> torch.Tensor:
+    """Positions (V, 3, steps + 1) of implicit Euler without a body, in still air."""
+    path = [x0 - dt * velocity, x0]
+    down = torch.tensor([[0.0], [-gravity], [0.0]], dtype=torch.float64)
+    for _ in range(steps):
+        setting = Setting(None, down, 2 * path[-1] - path[-2], path[-1], dt)
+        path.append(minimise_from(potential, path[-1], setting, EXACT).x)
+    return torch.cat(path[1:], dim=-1)
+
+
+def tensor(points: np.ndarray) -> torch.Tensor:
+    return torch.as_tensor(np.array(points))[:, :, None]
+
+
+def test_what_is_free_falls_along_the_parabola_of_implicit_euler(scene, toy_grid) -> None:
+    points, faces = toy_grid(5, 3)
+    potential = Potential(dressed(scene, points, faces, np.zeros(15, dtype=bool)), CALM, device=CPU)
+    x0, velocity, dt = tensor(points), torch.tensor([0.3, 2.0, -0.1], dtype=torch.float64)[:, None], 1 / 30
+    path = advance(potential, x0, velocity, dt, 20)
+    n = torch.arange(21, dtype=torch.float64)
+    fall = torch.tensor([0.0, -G, 0.0], dtype=torch.float64)[:, None] * dt**2 * n * (n + 1) / 2
+    torch.testing.assert_close(path, x0 + velocity * n * dt + fall, rtol=0, atol=1e-6)
+
+
+def test_a_strip_hangs_as_a_column_under_its_own_weight(scene, toy_grid) -> None:
+    # Without lateral coupling (lambda = 0) the tension at s from the lower end is rho g s = l mu (l^2 - 1) with the
+    # stretch l: its integral is the length.
+    length, mu, density = 0.6, 20.0, 1.0
+    points, faces = toy_grid(25, 3, height=length, width=0.06)
+    cloth = dressed(scene, points, faces, points[:, 1] > -1e-9)
+    fabric = replace(CALM, density=density, lame_mu=mu, lame_lambda=0.0)
+    potential = Potential(cloth, fabric, device=CPU)
+    down = torch.tensor([[0.0], [-G], [0.0]], dtype=torch.float64)
+    found = minimise_from(potential, tensor(points), Setting(None, down), SolverOptions(tolerance=1e-5))
+    assert found.imbalance < 1e-5
+    s = (np.arange(4000) + 0.5) / 4000 * length
+    stretch = np.array([max(np.roots([mu, 0, -mu, -density * G * t]).real) for t in s])
+    assert stretch.max() > 1.1
+    lowest = -float(found.x[:, 1].min())
+    assert lowest == pytest.approx(stretch.mean() * length, rel=3e-3)
+
+
+@pytest.mark.parametrize("model", ["stvk", "baraff_witkin"])
+def test_a_sheet_stretched_at_its_border_is_stretched_evenly(scene, toy_grid, model) -> None:
+    points, faces = toy_grid(7, 7, height=0.3, width=0.3)
+    border = (np.abs(points[:, 0]) > 0.1499) | (points[:, 1] > -1e-9) | (points[:, 1] < -0.2999)
+    potential = Potential(dressed(scene, points, faces, border), replace(CALM, stretch_model=model), device=CPU)
+    stretched = points * [1.2, 1.1, 1.0]
+    start = tensor(np.where(border[:, None], stretched, points))
+    found = minimise_from(potential, start, Setting(None, torch.zeros(3, 1).double()), EXACT)
+    torch.testing.assert_close(found.x, tensor(stretched), rtol=0, atol=1e-6)
+
+
+def swing(scene: Scene, dt: float, seconds: float, angle: float = 0.02) -> tuple[np.ndarray, float]:
+    """The angles [rad] of one weight on a triangle hung by its upper edge, at rest first, and its frequency [1/s]."""
+    length = 0.5
+    points = np.array([[-0.2, 0, 0], [0.2, 0, 0], [0, -length, 0]])
+    cloth = dressed(scene, points, np.array([[0, 2, 1]]), np.array([True, True, False]))
+    potential = Potential(cloth, replace(CALM, lame_mu=1e5, lame_lambda=0.0), device=CPU)
+    x0 = tensor(points).clone()
+    x0[2, :, 0] = torch.tensor([0, -length * np.cos(angle), length * np.sin(angle)])
+    path = advance(potential, x0, torch.zeros(3, 1), dt, round(seconds / dt))[2].numpy()
+    return np.arctan2(path[2], -path[1]), np.sqrt(G / length)
+
+
+def test_a_pendulum_swings_with_the_period_and_damping_of_implicit_euler(scene) -> None:
+    # x'' = -w^2 x under implicit Euler: a step multiplies by 1 / (1 - i w dt), turning by atan(w dt).
+    dt = 1 / 120
+    angles, frequency = swing(scene, dt, 2.5)
+    crossings = np.flatnonzero(np.diff(np.sign(angles)))
+    at = crossings + angles[crossings] / (angles[crossings] - angles[crossings + 1])
+    half = np.pi / np.arctan(frequency * dt)
+    assert np.diff(at) == pytest.approx(half, rel=2e-3)
+    decay = (1 + (frequency * dt) ** 2) ** -0.5
+    peaks = [np.abs(angles[a:b]).max() for a, b in zip(crossings, crossings[1:])]
+    assert peaks[1] / peaks[0] == pytest.approx(decay**half, rel=1e-2)
+
+
+def test_the_error_in_time_is_of_first_order(scene) -> None:
+    errors = []
+    for dt in (1 / 60, 1 / 120, 1 / 240):
+        angles, frequency = swing(scene, dt, 0.5)
+        errors.append(abs(angles[-1] - 0.02 * np.cos(frequency * 0.5)))
+    assert errors[0] / errors[1] == pytest.approx(2, abs=0.25)
+    assert errors[1] / errors[2] == pytest.approx(2, abs=0.15)
+
+
+def test_drag_only_decays_motion(scene, toy_grid) -> None:
+    points, faces = toy_grid(5, 3)
+    fabric = replace(CALM, drag=0.6)
+    potential = Potential(dressed(scene, points, faces, np.zeros(15, dtype=bool)), fabric, device=CPU)
+    velocity, dt = torch.tensor([1.0, 0.5, 0.0], dtype=torch.float64)[:, None], 1 / 30
+    path = advance(potential, tensor(points), velocity, dt, 12, gravity=0.0)
+    speeds = path.diff(dim=-1).mean(0) / dt
+    n = torch.arange(1, 13, dtype=torch.float64)
+    torch.testing.assert_close(speeds, velocity / (1 + fabric.drag / fabric.density * dt) ** n, rtol=1e-5, atol=1e-7)
+
+
+# --- whole shots of the toy character ---------------------------------------------------------------------------
+
+SHORT = SimulationOptions(solver=SolverOptions(tolerance=1e-5), rest=SolverOptions(tolerance=1e-4, iterations=200))
+CLOTH = Fabric("toy", bending=1e-4, margin=0.01)
+
+
+def test_a_batch_of_shots_equals_one_by_one(scene, toy_motion) -> None:
+    motions = [toy_motion(scene, 7), toy_motion(scene, 4, speed=1.5), toy_motion(scene, 6, fps=60.0)]
+    together = simulate(scene, CLOTH, motions, SHORT)
+    assert [len(points) for points in together] == [7, 4, 3]
+    for motion, points in zip(motions, together):
+        (alone,) = simulate(scene, CLOTH, [motion], SHORT)
+        np.testing.assert_allclose(points, alone, atol=2e-5)
+
+
+def test_pinned_vertices_are_skinned_plainly(scene, toy_motion) -> None:
+    motion = toy_motion(scene, 5, fps=60.0)
+    options = replace(SHORT, substeps=2)
+    (points,) = simulate(scene, CLOTH, [motion], options)
+    (shot,) = shots_of([motion], options)
+    skeleton = scene.character.skeleton
+    matrices = skinning_matrices(motion_transforms(shot, skeleton.parents), skeleton.bind_transforms)
+    plain = skin_points(scene.garment.mesh.points, scene.plain_skin, matrices)
+    pinned = scene.classes == PINNED
+    np.testing.assert_allclose(points[:, pinned], plain[:, pinned], atol=1e-9)
+    assert np.abs(points - plain)[:, ~pinned].max() > 0.01
+
+
+def test_a_shot_has_the_frames_of_its_motion(scene, toy_motion) -> None:
+    motion = toy_motion(scene, 40, fps=120.0)
+    for fps, substeps in ((30.0, 1), (24.0, 3), (120.0, 2)):
+        expected = resample(motion, fps)
+        (shot,) = shots_of([motion], SimulationOptions(fps=fps, substeps=substeps))
+        assert shot.fps == fps and shot.frame_count == expected.frame_count
+        np.testing.assert_allclose(shot.translations, expected.translations, atol=1e-12)
+        np.testing.assert_allclose(np.abs((shot.rotations * expected.rotations).sum(-1)), 1, atol=1e-12)
+
+
+def test_a_shot_begins_anew_after_a_cut(scene, toy_motion) -> None:
+    motion = toy_motion(scene, 9)
+    moved = motion.translations.copy()
+    moved[5:, 0] += [20.0, 0.0, 0.0]
+    cut = replace(motion, translations=moved)
+    first, second = spans_of(cut, 0, 30.0, 1)
+    assert (first.first, first.frame_count, second.first, second.frame_count) == (0, 5, 5, 4)
+    (points,) = simulate(scene, CLOTH, [cut], SHORT)
+    (alone,) = simulate(scene, CLOTH, [cut.clip(5, 9)], SHORT)
+    np.testing.assert_allclose(points[5:], alone, atol=2e-5)
+
+
+def test_a_garment_comes_to_rest_with_its_character(scene, toy_motion) -> None:
+    motion = toy_motion(scene, 8, speed=2.0)
+    held = np.r_[np.arange(8), np.full(30, 7)]
+    stopped = Motion("/stop", 30.0, motion.rotations[held], motion.translations[held])
+    options = SimulationOptions(solver=SolverOptions(tolerance=1e-3))
+    (points,) = simulate(scene, replace(CLOTH, drag=1.0), [stopped], options)
+    speed = np.linalg.norm(np.diff(points, axis=0), axis=2).mean(1) * 30
+    assert speed[5:8].max() > 0.5 and speed[-1] < 0.02
+
+
+def test_a_quasi_static_pose_hangs_lower_than_plain_skinning(scene, toy_motion) -> None:
+    poses = toy_motion(scene, 3)
+    points = minimise(scene, CLOTH, poses, SHORT)
+    simulator = Simulator(scene, CLOTH, SHORT)
+    at = simulator.actors.posed(poses.rotations, poses.translations)
+    setting = Setting(at.body, simulator.gravity.expand(3, 3))
+    x = torch.as_tensor(points.transpose(1, 2, 0)) - at.root
+    energies = [simulator.potential.energy(y, setting, simulator.potential.planes(y, setting)) for y in (x, at.plain)]
+    assert (energies[0] < energies[1]).all()
+
+
+def test_single_precision_stays_close(scene, toy_motion) -> None:
+    motion = toy_motion(scene, 5)
+    (double,) = simulate(scene, CLOTH, [motion], SHORT)
+    options = replace(SHORT, precision="float32", solver=SolverOptions(tolerance=1e-2))
+    (single,) = simulate(scene, CLOTH, [motion], options)
+    assert np.abs(single - double).max() < 2e-3
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [({"fps": 0.0}, "positive rate"), ({"substeps": 0}, "1 to 1000"), ({"precision": "float16"}, "float64 or float32"),
+     ({"gravity": (0.0, np.nan, 0.0)}, "finite"), ({"batch": 0}, "at least 1")],
+)  # fmt: skip
+def test_options_that_cannot_be_are_refused(change, words) -> None:
+    with pytest.raises(SsilkError, match=words):
+        SimulationOptions(**change)
+
+
+def test_no_motion_is_refused(scene) -> None:
+    with pytest.raises(SsilkError, match="no motion given"):
+        simulate(scene, CLOTH, [])

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ssilk simulate` on the toy world: what the files hold, what is refused, and what an interruption leaves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pxr import Usd, UsdGeom, UsdSkel
+from ssilk_usd.play import Shot
+
+from ssilk_core.cli import main
+from ssilk_core.simulate import Simulator
+
+
+@pytest.fixture
+def stage(toy, tmp_path, monkeypatch):
+    toy.copy(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    toy.write_clip(tmp_path / "brief.usda", frames=5)
+    toy.write_clip(tmp_path / "short.usda", frames=3)
+    return tmp_path
+
+
+def test_a_cache_holds_the_garment_beside_its_body(stage):
+    assert main(["simulate", "rigged.usda", "--motion", "brief.usda", "-o", "cache.usda"]) == 0
+    baked, cache = Shot(stage / "shot.usda"), Shot(stage / "cache.usda")
+    assert cache.fps == 30 and len(cache.frame_times) == 5
+    assert [mesh.is_garment for mesh in cache.meshes] == [mesh.is_garment for mesh in baked.meshes]
+    body = next(n for n, mesh in enumerate(cache.meshes) if not mesh.is_garment)
+    skirt = next(n for n, mesh in enumerate(cache.meshes) if mesh.is_garment)
+    for time in cache.frame_times:
+        np.testing.assert_allclose(cache.points(time)[body], baked.points(time)[body], atol=1e-6)
+    first, last = cache.points(cache.frame_times[0])[skirt], cache.points(cache.frame_times[-1])[skirt]
+    assert np.isfinite(last).all() and np.abs(last - first).max() > 0.01
+    # Nothing of the skeleton is left on the garment, and the bounds hold all that is drawn.
+    prim = cache.stage.GetPrimAtPath(cache.meshes[skirt].path)
+    assert not prim.HasAPI(UsdSkel.BindingAPI)
+    assert not [name for name in prim.GetPropertyNames() if "skel:" in name]
+    assert len(UsdGeom.Mesh(prim).GetPointsAttr().GetTimeSamples()) == 5
+    root = UsdGeom.Boundable(cache.stage.GetDefaultPrim())
+    low, high = np.array(root.GetExtentAttr().Get(Usd.TimeCode(cache.frame_times[-1])))
+    drawn = np.concatenate(cache.points(cache.frame_times[-1]))
+    assert (drawn >= low - 1e-5).all() and (drawn <= high + 1e-5).all()
+
+
+def test_several_motions_become_files_of_their_own(stage):
+    assert main(["simulate", "rigged.usda", "--motion", "brief.usda", "short.usda", "--no-body", "-o", "caches"]) == 0
+    lengths = {path.name: len(Shot(path).frame_times) for path in (stage / "caches").iterdir()}
+    assert lengths == {"brief.usdc": 5, "short.usdc": 3}
+    assert main(["simulate", "rigged.usda", "--motion", "short.usda", "--no-body", "-o", "alone.usdc"]) == 0
+    together, alone = Shot(stage / "caches" / "short.usdc"), Shot(stage / "alone.usdc")
+    for time in alone.frame_times:
+        np.testing.assert_allclose(together.garment_points(time), alone.garment_points(time), atol=1e-3)
+
+
+def test_an_interruption_leaves_nothing_half_written(stage, monkeypatch):
+    advanced = Simulator.frames
+
+    def interrupted(self, motions):
+        for frame in advanced(self, motions):
+            if frame.number == 1:
+                raise KeyboardInterrupt
+            yield frame
+
+    monkeypatch.setattr(Simulator, "frames", interrupted)
+    before = sorted(stage.iterdir())
+    assert main(["simulate", "rigged.usda", "--motion", "short.usda", "-o", "cache.usdc"]) == 130
+    assert sorted(stage.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        ("--motion brief.usda short.usda -o one.usdc", "one file for 2 motions"),
+        ("--motion brief.usda ./brief.usda -o caches", "several files are called brief"),
+        ("--motion brief.usda -o one.usdc --substeps 0", "substeps = 0"),
+        ("--motion brief.usda -o one.usdc --fps -3", "positive rate"),
+        ("--motion brief.usda -o one.usdc --tolerance 0", "tolerance = 0"),
+        ("--motion nowhere.usda -o one.usdc", "there is no such file"),
+        ("--motion brief.usda -o brief.usda", "output is also an input"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_in_one_sentence(stage, capsys, words, complaint):
+    assert main(["simulate", "rigged.usda", *words.split()]) == 2
+    assert complaint in capsys.readouterr().err
+    assert not (stage / "one.usdc").exists() and not (stage / "caches").exists()
