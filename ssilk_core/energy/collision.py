@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from .. import kernels
-from .nearest import nearest_vertex
+from .nearest import BLOCK, GROUP, consecutive_blocks, nearest_vertex
 from .surface_point import nearest_on_rings
 
 # Further than this from every body vertex [m], the tangent plane at the nearest vertex says all that is needed.
@@ -20,13 +20,17 @@ FAR = 0.08
 class PosedBody:
     """Body vertices [m] and unit vertex normals for each frame, both (B, 3, N).
 
-    `rings` (B, D, 2) are the triangles around each vertex (`surface_point.triangle_rings`); without them the
-    nearest body point is the nearest vertex.
+    Attributes:
+        rings: neighbours around each vertex (`surface_point.triangle_rings`); without them the nearest body point is
+            the nearest vertex.
+        groups: the vertices in compact groups (`nearest.compact_blocks` of `nearest.GROUP`), int32; they make the
+            search on a GPU fast, and change no result but which of several equally near vertices is meant.
     """
 
     points: Tensor
     normals: Tensor
     rings: Tensor | None = None
+    groups: Tensor | None = None
 
 
 def gather_frames(values: Tensor, index: Tensor) -> Tensor:
@@ -34,26 +38,42 @@ def gather_frames(values: Tensor, index: Tensor) -> Tensor:
     return values.gather(0, index[:, None, :].expand(-1, 3, -1))
 
 
-def signed_distance(x: Tensor, body: PosedBody) -> Tensor:
+def signed_distance(x: Tensor, body: PosedBody, blocks: Tensor | None = None) -> Tensor:
     """Distance along the normal of the nearest body point b [m], n_b . (x - b), shape (V, N); its gradient is n_b."""
-    with torch.no_grad():
-        index = nearest_vertex(x, body.points)
-        if body.rings is not None and kernels.available(x.device):
-            from ..kernels.surface import surface_kernel
-
-            normal, offset = surface_kernel(x, index, body.points, body.normals, body.rings)
-        else:
-            normal, offset = _on_planes(x, index, body)
+    normal, offset = nearest_planes(x, body, blocks)
     return (normal * x).sum(1) - offset
 
 
-def _on_planes(x: Tensor, index: Tensor, body: PosedBody) -> tuple[Tensor, Tensor]:
-    """Return normals n_b (V, 3, N) and offsets n_b . b (V, N) of the nearest body points."""
+@torch.no_grad()
+def nearest_planes(x: Tensor, body: PosedBody, blocks: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Return unit normals n_b (V, 3, N) and offsets n_b . b (V, N) of the nearest body points b, without gradients.
+
+    Args:
+        x: garment positions (V, 3, N).
+        body: the body in the same frames.
+        blocks: garment vertices in compact blocks (`nearest.compact_blocks` of `nearest.BLOCK`), int32; they make
+            the search on a GPU fast, and change no result.
+    """
+    if x.dtype == torch.float32 and kernels.available(x.device):
+        return _by_kernels(x, body, blocks)
+    index = nearest_vertex(x, body.points)
     normal, point = gather_frames(body.normals, index), gather_frames(body.points, index)
     offset = (normal * point).sum(1)
     if body.rings is None:
         return normal, offset
     return _on_triangles(x, index, normal, offset, ((x - point) ** 2).sum(1) < FAR**2, body)
+
+
+def _by_kernels(x: Tensor, body: PosedBody, blocks: Tensor | None) -> tuple[Tensor, Tensor]:
+    from ..kernels.nearest import nearest_kernel
+    from ..kernels.surface import surface_kernel
+
+    x, points, normals = x.contiguous(), body.points.contiguous(), body.normals.contiguous()
+    blocks = consecutive_blocks(len(x), BLOCK, x.device) if blocks is None else blocks
+    groups = consecutive_blocks(len(points), GROUP, x.device) if body.groups is None else body.groups
+    index = nearest_kernel(x, points, blocks, groups)
+    rings = index.new_zeros(len(points), 1) if body.rings is None else body.rings
+    return surface_kernel(x, index, points, normals, rings, FAR)
 
 
 def _on_triangles(

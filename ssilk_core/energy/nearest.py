@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nearest body vertex of each garment vertex, exact by brute force on every device.
-
-All paths minimise |x - b|^2 / 2 - |x|^2 / 2 = [x, 1] . [-b, |b|^2 / 2], with coordinates centred on the body so that
-the cancellation stays far under the length of a body edge. Ties go to the lower index.
-"""
+"""The nearest body vertex of each garment vertex, exact on every device."""
 
 from __future__ import annotations
 
@@ -11,13 +7,42 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .. import kernels
+from ..assets import Floats, Ints
 
-CHUNK = 1 << 27  # scores held at once where no kernel serves
+SCORES = 1 << 27  # held at once where products serve
+BLOCK, GROUP = 32, 8  # vertices of the garment and of the body that the kernel takes together
+
+
+def compact_blocks(points: Floats, size: int) -> Ints:
+    """Return indices of points (P, 3) in compact blocks, int32 (ceil(P / size), size), by halving their widest side.
+
+    The last block is filled up with its last index.
+    """
+    blocks, parts = [], [np.arange(len(points))]
+    while parts:
+        part = parts.pop()
+        if len(part) <= size:
+            blocks.append(np.pad(part, (0, size - len(part)), mode="edge"))
+            continue
+        widest = np.ptp(points[part], axis=0).argmax()
+        part = part[np.argsort(points[part, widest], kind="stable")]
+        half = -(-len(part) // size) // 2 * size  # only whole blocks to the left
+        parts += [part[half:], part[:half]]
+    return np.stack(blocks).astype(np.int32)
+
+
+def consecutive_blocks(count: int, size: int, device: torch.device) -> Tensor:
+    """Return indices 0 to count - 1 in blocks as they come, int32; the last is filled up with its last index."""
+    return (
+        torch.arange(-(-count // size) * size, dtype=torch.int32, device=device).clamp_max(count - 1).view(-1, size)
+    )
 
 
 def nearest_vertex(x: Tensor, body: Tensor) -> Tensor:
-    """Return the index of the nearest body vertex.
+    """Return the index of the nearest body vertex by brute force; equal distances go to the lower index.
+
+    All paths minimise |x - b|^2 / 2 - |x|^2 / 2 = [x, 1] . [-b, |b|^2 / 2], with coordinates centred on the body so
+    that the cancellation stays far under the length of a body edge.
 
     Args:
         x: garment positions, shape (V, 3, N).
@@ -31,16 +56,10 @@ def nearest_vertex(x: Tensor, body: Tensor) -> Tensor:
     half = 0.5 * (body * body).sum(1, keepdim=True)
     left = torch.cat([x, torch.ones_like(x[:, :1])], dim=1).permute(2, 1, 0).contiguous()
     right = torch.cat([-body, half], dim=1).permute(2, 1, 0).contiguous()
-    if x.device.type == "cpu":
-        return _on_cpu(left, right)
-    if kernels.available(x.device):
-        from ..kernels.nearest import nearest_kernel
-
-        return nearest_kernel(left, right)
-    return _by_products(left, right)
+    return _by_rows(left, right) if x.device.type == "cpu" else _by_products(left, right)
 
 
-def _on_cpu(left: Tensor, right: Tensor) -> Tensor:
+def _by_rows(left: Tensor, right: Tensor) -> Tensor:
     # One buffer serves all frames, and numpy's argmin uses the processor's vector units.
     score = left.new_empty(left.shape[2], right.shape[2])
     found = [torch.mm(a.T, b, out=score).numpy().argmin(-1) for a, b in zip(left, right)]
@@ -48,7 +67,7 @@ def _on_cpu(left: Tensor, right: Tensor) -> Tensor:
 
 
 def _by_products(left: Tensor, right: Tensor) -> Tensor:
-    step = max(1, CHUNK // (left.shape[2] * right.shape[2]))
+    step = max(1, SCORES // (left.shape[2] * right.shape[2]))
     found = [
         torch.bmm(left[i : i + step].transpose(1, 2), right[i : i + step]).argmin(-1)
         for i in range(0, len(left), step)

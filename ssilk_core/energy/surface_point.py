@@ -11,18 +11,32 @@ from ..assets import Ints
 
 
 def triangle_rings(faces: Ints, vertex_count: int) -> Ints:
-    """Return, for each vertex, the two other corners of every triangle around it, shape (B, D, 2).
+    """Return for each vertex how many numbers follow, then its neighbours in turn, shape (B, 1 + D).
 
-    Rows with fewer than D triangles are padded with the vertex itself, a triangle without extent.
+    A neighbour and the next span a triangle with the vertex. Where a triangle does not join the one before, the
+    vertex itself stands between them, and it fills up shorter rows: what it spans is an edge or a point.
     """
-    corners = np.concatenate([np.roll(faces, -turn, axis=1) for turn in range(3)])
-    order = np.argsort(corners[:, 0], kind="stable")
-    owner, others = corners[order, 0], corners[order, 1:]
-    counts = np.bincount(owner, minlength=vertex_count)
-    place = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
-    rings = np.repeat(np.arange(vertex_count)[:, None, None], 2, axis=2).repeat(max(counts.max(initial=0), 1), axis=1)
-    rings[owner, place] = others
-    return rings
+    following: list[dict[int, list[int]]] = [{} for _ in range(vertex_count)]
+    for a, b, c in faces.tolist():
+        following[a].setdefault(b, []).append(c)
+        following[b].setdefault(c, []).append(a)
+        following[c].setdefault(a, []).append(b)
+    walks = [_walk(vertex, after) for vertex, after in enumerate(following)]
+    longest = max(map(len, walks), default=0)
+    rows = [[len(walk), *walk] + [vertex] * (longest - len(walk)) for vertex, walk in enumerate(walks)]
+    return np.array(rows, dtype=np.int32).reshape(vertex_count, 1 + longest)
+
+
+def _walk(vertex: int, after: dict[int, list[int]]) -> list[int]:
+    """Use up all steps from one neighbour of a vertex to the next, in as few walks as the triangles allow."""
+    entered = {neighbour for followers in after.values() for neighbour in followers}
+    walk: list[int] = []
+    for start in sorted(after, key=lambda neighbour: neighbour in entered):  # walks of an open fan begin at its edge
+        while after[start]:
+            walk += [vertex, start] if walk else [start]
+            while after.get(walk[-1]):
+                walk.append(after[walk[-1]].pop(0))
+    return walk
 
 
 def nearest_on_rings(
@@ -34,7 +48,7 @@ def nearest_on_rings(
         x: queries, shape (3, M).
         vertex, frame: nearest body vertex and frame of each query, shape (M,).
         points: body vertices, shape (3, B, N).
-        rings: other corners of the triangles around each body vertex, shape (B, D, 2).
+        rings: neighbours around each body vertex (`triangle_rings`), shape (B, 1 + D).
 
     Returns:
         Body vertices at the corners of the winning triangle, shape (3, M), and barycentric coordinates, (3, M).
@@ -43,9 +57,11 @@ def nearest_on_rings(
     p = x - origin
     corners = vertex.repeat(3, 1)
     best, s_best, t_best = torch.zeros_like(p[0]), torch.zeros_like(p[0]), torch.zeros_like(p[0])
-    for ring in rings.unbind(1):
-        second, third = ring[vertex].unbind(1)
-        s, t, value = _closest_in_triangle(p, points[:, second, frame] - origin, points[:, third, frame] - origin)
+    third, e2 = vertex, torch.zeros_like(p)
+    for neighbour in rings[:, 1:].long().unbind(1):
+        second, third, e1 = third, neighbour[vertex], e2
+        e2 = points[:, third, frame] - origin
+        s, t, value = _closest_in_triangle(p, e1, e2)
         closer = value < best
         best = torch.where(closer, value, best)
         s_best, t_best = torch.where(closer, s, s_best), torch.where(closer, t, t_best)
@@ -57,7 +73,7 @@ def nearest_on_rings(
 def _closest_in_triangle(p: Tensor, e1: Tensor, e2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Minimise |p - s e1 - t e2|^2 over s, t >= 0, s + t <= 1; return s, t and the minimum less |p|^2.
 
-    The inside counts where it is feasible; otherwise the minimum lies on one of the three edges.
+    The least of the inside, where the plane's foot lies there, and of the three edges.
     """
     d1, d2 = (e1 * p).sum(0), (e2 * p).sum(0)
     a, b, c = (e1 * e1).sum(0), (e1 * e2).sum(0), (e2 * e2).sum(0)
@@ -72,15 +88,14 @@ def _closest_in_triangle(p: Tensor, e1: Tensor, e2: Tensor) -> tuple[Tensor, Ten
     inside = (s >= 0) & (t >= 0) & (s + t <= 1)
     along = ((d2 - d1 - b + a) / (a - 2 * b + c).clamp_min(tiny)).clamp(0, 1)
     options = [
+        (torch.where(inside, s, zero), torch.where(inside, t, zero)),
         ((d1 / a.clamp_min(tiny)).clamp(0, 1), zero),
         (zero, (d2 / c.clamp_min(tiny)).clamp(0, 1)),
         (1 - along, along),
     ]
-    best_s, best_t = torch.where(inside, s, zero), torch.where(inside, t, zero)
-    best = torch.where(inside, value(s, t), zero)  # the vertex itself is always feasible, with a value of zero
+    best, best_s, best_t = zero, zero, zero  # the vertex itself
     for s, t in options:
         found = value(s, t)
-        closer = (found < best) & ~inside
-        best = torch.where(closer, found, best)
-        best_s, best_t = torch.where(closer, s, best_s), torch.where(closer, t, best_t)
+        closer = found < best
+        best, best_s, best_t = (torch.where(closer, *pair) for pair in ((found, best), (s, best_s), (t, best_t)))
     return best_s, best_t, best

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ..assets import Body, Ints, SkinWeights
 from ..energy.collision import PosedBody
+from ..energy.nearest import GROUP, compact_blocks
 from ..energy.surface_point import triangle_rings
 from ..mesh import topology
 from .skinning import Skinning
@@ -30,6 +31,7 @@ class CollisionBody:
         faces = place[body.mesh.faces]
         rings = triangle_rings(faces[(faces >= 0).all(axis=1)], len(chosen))
         self.rings = torch.as_tensor(rings, device=device)
+        self.groups = torch.as_tensor(compact_blocks(body.mesh.points[chosen], GROUP), device=device)
         skin = SkinWeights(body.skin.path, body.skin.indices[chosen], body.skin.weights[chosen])
         self.skin = Skinning(skin).to(device)
         self.points = tensor(body.mesh.points[chosen])[:, :, None]
@@ -42,4 +44,4 @@ class CollisionBody:
         Without `surface` only vertices are collided with.
         """
         points, normals = self.skin.surface(self.points[:, :, 0], self.normals[:, :, 0], character)
-        return PosedBody(points, normals, self.rings if surface else None)
+        return PosedBody(points, normals, self.rings if surface else None, self.groups)

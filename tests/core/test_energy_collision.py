@@ -2,6 +2,7 @@
 """Distance to a body, its penalty, and the search for the nearest body vertex on every path."""
 
 import importlib.util
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,8 +11,9 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from ssilk_core.assets import Body, Mesh, SkinWeights
-from ssilk_core.energy import GarmentEnergy, nearest
-from ssilk_core.energy.collision import PosedBody, collision_energy, signed_distance
+from ssilk_core.energy import GarmentEnergy, collision, nearest
+from ssilk_core.energy.collision import PosedBody, collision_energy, nearest_planes, signed_distance
+from ssilk_core.energy.nearest import compact_blocks
 from ssilk_core.energy.surface_point import nearest_on_rings, triangle_rings
 from ssilk_core.fabrics import Fabric
 from ssilk_core.kinematics import skin_points
@@ -69,20 +71,9 @@ def brute_force(x: np.ndarray, body: np.ndarray) -> np.ndarray:
     return distance.argmin(1)
 
 
-def sides(x: torch.Tensor, body: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """The two factors as `nearest_vertex` hands them to a path."""
-    captured = {}
-    path, nearest._on_cpu = nearest._on_cpu, lambda left, right: captured.setdefault("sides", (left, right))
-    try:
-        nearest.nearest_vertex(x, body)
-    finally:
-        nearest._on_cpu = path
-    return captured["sides"]
-
-
 @pytest.mark.parametrize("vertices, body_vertices, frames", [(1, 1, 1), (137, 53, 4), (40, 1000, 7)])
-@pytest.mark.parametrize("chunk", [1, 1 << 27])
-def test_nearest_vertex_matches_brute_force_on_both_paths(vertices, body_vertices, frames, chunk, monkeypatch):
+@pytest.mark.parametrize("scores", [1, 1 << 27])
+def test_nearest_vertex_matches_brute_force_on_both_paths(vertices, body_vertices, frames, scores, monkeypatch):
     rng = np.random.default_rng(vertices)
     # Far from the origin, as a character may stand: the search is centred on the body.
     x = (rng.normal(size=(vertices, 3, frames)) + 50).astype(np.float32)
@@ -91,35 +82,140 @@ def test_nearest_vertex_matches_brute_force_on_both_paths(vertices, body_vertice
     found = nearest.nearest_vertex(torch.tensor(x), torch.tensor(body))
     assert found.dtype == torch.int64
     np.testing.assert_array_equal(found, expected)
-    monkeypatch.setattr(nearest, "CHUNK", chunk)
-    np.testing.assert_array_equal(nearest._by_products(*sides(torch.tensor(x), torch.tensor(body))), expected)
+    monkeypatch.setattr(nearest, "SCORES", scores)
+    monkeypatch.setattr(nearest, "_by_rows", nearest._by_products)
+    np.testing.assert_array_equal(nearest.nearest_vertex(torch.tensor(x), torch.tensor(body)), expected)
 
 
-def test_ties_go_to_the_lower_index_on_both_paths():
-    # Whole numbers about a mean of zero leave no rounding, so that ties are exact.
-    cube = np.stack(np.meshgrid([-2, 0, 2], [-2, 0, 2], [-2, 0, 2], indexing="ij"), axis=-1).reshape(-1, 3)
-    body = np.concatenate([cube, cube])[:, :, None].astype(np.float32)
-    x = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)[:, :, None].astype(np.float32)
+def twice_a_cube() -> tuple[np.ndarray, np.ndarray]:
+    """A lattice (54, 3, 1) of which every vertex comes twice, and points (27, 3, 1) equally near to many of them.
+
+    Whole numbers about a mean of zero leave no rounding, so that ties are exact.
+    """
+    cube = np.stack(np.meshgrid(*[[-2, 0, 2]] * 3, indexing="ij"), axis=-1).reshape(-1, 3, 1)
+    return np.concatenate([cube, cube]).astype(np.float32), (cube / 2).astype(np.float32)
+
+
+def test_ties_go_to_the_lower_index_on_both_paths(monkeypatch):
+    body, x = twice_a_cube()
     expected = brute_force(x, body)
     assert (expected < 27).all()
     np.testing.assert_array_equal(nearest.nearest_vertex(torch.tensor(x), torch.tensor(body)), expected)
-    np.testing.assert_array_equal(nearest._by_products(*sides(torch.tensor(x), torch.tensor(body))), expected)
+    monkeypatch.setattr(nearest, "_by_rows", nearest._by_products)
+    np.testing.assert_array_equal(nearest.nearest_vertex(torch.tensor(x), torch.tensor(body)), expected)
+
+
+@pytest.mark.parametrize("count", [1, 31, 32, 33, 500])
+def test_blocks_hold_every_point_once_and_are_compact(count):
+    points = np.random.default_rng(count).uniform(size=(count, 3))
+    blocks = compact_blocks(points, 32)
+    assert blocks.shape == (-(-count // 32), 32) and blocks.dtype == np.int32
+    flat = blocks.reshape(-1)
+    np.testing.assert_array_equal(np.sort(flat[:count]), np.arange(count))
+    assert (flat[count:] == flat[count - 1]).all()
+    if count > 100:  # a cube of 32 in 500 points has sides of 0.4; blocks as points come span all
+        sides = [np.ptp(points[block], axis=0).max() for block in blocks]
+        assert np.mean(sides) < 0.6
+
+
+def by_kernel(x: np.ndarray, body: np.ndarray, ordered: bool = True) -> np.ndarray:
+    """The kernel's answer, with blocks and groups that are compact in the first frame, or as vertices come."""
+    from ssilk_core.kernels.nearest import nearest_kernel
+
+    tables = [
+        torch.as_tensor(compact_blocks(np.nan_to_num(points[..., 0]), size))
+        if ordered
+        else nearest.consecutive_blocks(len(points), size, torch.device("cpu"))
+        for points, size in ((x, nearest.BLOCK), (body, nearest.GROUP))
+    ]
+    return nearest_kernel(*(torch.as_tensor(v).to(DEVICE) for v in (x, body, *tables))).cpu().numpy()
+
+
+def excess(x: np.ndarray, body: np.ndarray, found: np.ndarray) -> float:
+    """How much further than the nearest body vertex the found ones are at most, as a share of the largest number."""
+    x, body = x.astype(float), body.astype(float)
+    chosen = np.take_along_axis(body, found[:, None], axis=0)
+    least = np.linalg.norm(x[:, None] - body[None], axis=2).min(1)
+    return float((np.linalg.norm(x - chosen, axis=1) - least).max() / max(np.abs(x).max(), np.abs(body).max()))
 
 
 @KERNELS
-@pytest.mark.parametrize("vertices, body_vertices, frames", [(1, 1, 1), (300, 77, 5), (129, 4001, 3)])
-def test_the_kernel_finds_what_the_cpu_finds(vertices, body_vertices, frames):
-    from ssilk_core.kernels.nearest import nearest_kernel
-
+@pytest.mark.parametrize(
+    "vertices, body_vertices, frames, ordered",
+    [
+        (1, 1, 1, True),
+        (32, 8, 2, False),
+        (33, 9, 3, True),
+        (2, 3, 65, True),
+        (140, 77, 1, True),
+        (20, 513, 1, True),
+        (20, 513, 1, False),
+    ],
+)
+def test_the_kernel_finds_the_nearest_vertex(vertices, body_vertices, frames, ordered):
     rng = np.random.default_rng(2)
-    x, body = (torch.tensor(rng.normal(size=(n, 3, frames)), dtype=torch.float32) for n in (vertices, body_vertices))
-    found = nearest_kernel(*(side.to(DEVICE) for side in sides(x, body))).cpu()
-    excess = [
-        np.linalg.norm(x[..., f] - body[found[:, f], :, f], axis=1)
-        - np.linalg.norm(x[:, None, :, f] - body[None, ..., f], axis=2).min(1)
-        for f in range(frames)
-    ]
-    assert np.max(excess) < 1e-5
+    x, body = (rng.normal(size=(n, 3, frames)).astype(np.float32) for n in (vertices, body_vertices))
+    found = by_kernel(x, body, ordered)
+    assert found.shape == (vertices, frames)
+    np.testing.assert_array_equal(found, brute_force(x, body))
+
+
+@KERNELS
+@pytest.mark.parametrize("ordered", [True, False])
+@pytest.mark.parametrize("case", ["one point", "flat", "far", "huge", "far apart", "touching"])
+def test_the_kernel_is_exact_where_boxes_say_little(case, ordered):
+    rng = np.random.default_rng(6)
+    x, body = rng.normal(size=(40, 3, 2)), rng.normal(size=(90, 3, 2))
+    if case == "one point":
+        body[:] = body[:1]
+    elif case == "flat":
+        body[:, 1] = 0
+    elif case == "far":
+        x += 1e4
+    elif case == "huge":
+        x, body = 1e6 * x, 1e6 * body
+    elif case == "far apart":
+        x[::2] += 100
+    else:
+        x = body[:40].copy()
+    x, body = x.astype(np.float32), body.astype(np.float32)
+    assert excess(x, body, by_kernel(x, body, ordered)) < 1e-6
+
+
+@KERNELS
+def test_of_equally_near_vertices_the_kernel_takes_the_first_in_its_table():
+    body, x = twice_a_cube()
+    expected = brute_force(x, body)
+    np.testing.assert_array_equal(by_kernel(x, body, ordered=False), expected)
+    order = compact_blocks(body[..., 0], nearest.GROUP).reshape(-1)
+    np.testing.assert_array_equal(by_kernel(x, body), order[brute_force(x, body[order])])
+
+
+@KERNELS
+@pytest.mark.filterwarnings("ignore:All-NaN slice:RuntimeWarning")
+@pytest.mark.parametrize("broken", [np.nan, np.inf])
+def test_a_broken_vertex_finds_something_and_harms_no_other(broken):
+    rng = np.random.default_rng(7)
+    x, body = (rng.normal(size=(n, 3, 2)).astype(np.float32) for n in (40, 60))
+    whole = np.ones(x[:, 0].shape, dtype=bool)
+    whole[3], whole[17, 1] = False, False
+    x[3], x[17, 2, 1] = broken, broken
+    found = by_kernel(x, body)
+    np.testing.assert_array_equal(found[whole], brute_force(np.nan_to_num(x), body)[whole])
+    assert ((found >= 0) & (found < 60)).all()
+
+
+@KERNELS
+def test_the_kernel_finds_the_nearest_vertex_of_a_posed_body(scene, toy_motion):
+    from ssilk_core.training.bank import centred_matrices
+
+    merged, skeleton, garment = scene.character.merged_body(), scene.character.skeleton, scene.garment.mesh
+    matrices, _ = centred_matrices(toy_motion(scene, 3), skeleton)
+    character = torch.tensor(matrices[:, :, :3].transpose(1, 2, 3, 0), dtype=torch.float32)
+    body = CollisionBody(merged, skeleton.joint_count, device=torch.device("cpu")).posed(character)
+    x = skin_points(garment.points, scene.plain_skin, matrices).transpose(1, 2, 0).astype(np.float32)
+    np.testing.assert_array_equal(np.unique(body.groups), np.arange(len(merged.mesh.points)))
+    np.testing.assert_array_equal(by_kernel(x, body.points.numpy()), brute_force(x, body.points.numpy()))
 
 
 def test_body_is_posed_as_skinning_says_and_normals_turn_along(scene, toy_motion):
@@ -155,12 +251,31 @@ def surface_of(mesh: trimesh.Trimesh) -> PosedBody:
     return PosedBody(points, normals, rings)
 
 
-def test_rings_hold_every_triangle_around_a_vertex():
-    mesh = trimesh.creation.icosphere(subdivisions=1)
-    rings = triangle_rings(mesh.faces, 42)
-    for vertex, ring in enumerate(rings):
-        expected = sorted(sorted(set(face) - {vertex}) for face in mesh.faces.tolist() if vertex in face)
-        assert sorted(sorted(pair) for pair in ring.tolist() if pair != [vertex, vertex]) == expected
+def ring_triangles(vertex: int, row: list[int]) -> list[list[int]]:
+    """The two other corners of each triangle that a row of `triangle_rings` spans."""
+    count, *walk = row
+    assert set(walk[count:]) <= {vertex}
+    return sorted(sorted(pair) for pair in pairwise(walk[:count]) if vertex not in pair)
+
+
+@pytest.mark.parametrize("case", ["closed", "open", "torn", "turned", "crowded"])
+def test_rings_hold_every_triangle_around_a_vertex(case, toy_grid):
+    faces = trimesh.creation.icosphere(subdivisions=1).faces if case == "closed" else toy_grid(4, 4)[1]
+    if case == "torn":
+        faces = np.delete(faces, [2, 7, 8], axis=0)
+    elif case == "turned":  # some triangles face the other way
+        faces = np.where(np.arange(len(faces))[:, None] % 3 == 0, faces[:, ::-1], faces)
+    elif case == "crowded":  # several triangles share an edge
+        faces = np.concatenate([faces, [[0, 1, 9], [1, 0, 10], [5, 6, 0]]])
+    count = faces.max() + 2  # one vertex without triangles
+    for vertex, row in enumerate(triangle_rings(faces, count).tolist()):
+        expected = sorted(sorted(set(face) - {vertex}) for face in faces.tolist() if vertex in face)
+        assert ring_triangles(vertex, row) == expected
+
+
+def test_a_closed_fan_is_one_walk():
+    rings = triangle_rings(trimesh.creation.icosphere(subdivisions=1).faces, 42)
+    np.testing.assert_array_equal(np.unique(rings[:, 0]), [6, 7])  # five or six neighbours, and the first again
 
 
 def test_the_nearest_point_around_a_vertex_matches_brute_force():
@@ -211,3 +326,41 @@ def test_frames_of_a_moving_body_do_not_mix():
     x = torch.tensor(mesh.vertices[::7] * 1.05)[:, :, None]
     together = signed_distance(x + shift * torch.ones(1, 3, 1), moving)
     np.testing.assert_allclose(together, signed_distance(x, still).expand(-1, 3), atol=1e-12)
+
+
+@KERNELS
+@pytest.mark.parametrize("case", ["triangles", "open", "obtuse", "vertices"])
+def test_kernels_find_the_planes_that_their_twins_find(case, toy_grid):
+    rng = np.random.default_rng(8)
+    if case == "open":
+        points, faces = toy_grid(5, 4)
+        mesh = trimesh.Trimesh(points, faces, process=False)
+    elif case == "obtuse":  # many points over the upper triangle are nearest to the lowest vertex, and its far edge
+        points = [[0, 0, 0], [-0.1, 0.01, 0], [0.1, 0.01, 0], [0, 0.1, 0]]
+        mesh = trimesh.Trimesh(points, [[0, 2, 1], [1, 2, 3]], process=False)
+    else:
+        mesh = trimesh.creation.icosphere(subdivisions=1, radius=0.1)
+    mesh.apply_translation([0.5, 0.5, 0.5])
+    around = mesh.vertices + 0.003 * rng.normal(size=(3, *mesh.vertices.shape))
+    points, normals = (torch.tensor(v, dtype=torch.float32) for v in (around.transpose(1, 2, 0), mesh.vertex_normals))
+    rings = None if case == "vertices" else torch.as_tensor(triangle_rings(mesh.faces, len(points)))
+    body = PosedBody(points, normals[:, :, None].expand(-1, -1, 3).contiguous(), rings)
+    x = torch.tensor(mesh.sample(7, seed=1)[:, :, None] + 0.02 * rng.normal(size=(7, 3, 3)), dtype=torch.float32)
+    x[-1, :, 1] -= 0.4  # nothing but the nearest vertex counts this far away
+    expected = nearest_planes(x, body)
+    on_device = PosedBody(*(v if v is None else v.to(DEVICE) for v in (body.points, body.normals, body.rings)))
+    found = collision._by_kernels(x.to(DEVICE), on_device, None)
+    for value, twin in zip(found, expected):
+        np.testing.assert_allclose(value.cpu(), twin, atol=2e-6)
+
+
+@KERNELS
+def test_kernels_answer_alike_each_time():
+    mesh = trimesh.creation.icosphere(subdivisions=1, radius=0.1)
+    points, normals = (
+        torch.tensor(v.copy(), dtype=torch.float32)[:, :, None] for v in (mesh.vertices, mesh.vertex_normals)
+    )
+    body = [v.to(DEVICE) for v in (points, normals, torch.as_tensor(triangle_rings(mesh.faces, 42)))]
+    x = torch.tensor(mesh.sample(33, seed=2)[:, :, None], dtype=torch.float32, device=DEVICE)
+    once, again = (collision._by_kernels(x, PosedBody(*body), None) for _ in range(2))
+    assert torch.equal(once[0], again[0]) and torch.equal(once[1], again[1])
