@@ -52,7 +52,7 @@ def poses(subject: Subject, motion: Motion, step: int) -> list[tuple[Tensor, Ten
     validator, found = subject.validator(motion), []
     for clip in validator.clips:
         frames = torch.arange(clip.start, clip.stop)
-        states = roll_states(subject.model, validator.bank, frames, validator.down)[::step]
+        states = roll_states(subject.model, validator.bank, [clip], validator.down)[0][::step]
         character = validator.bank.character(frames[::step])
         found.append((character, subject.model.vertices(states, character), validator.plain_vertices(character)))
     return found

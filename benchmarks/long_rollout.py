@@ -33,7 +33,7 @@ def loop_means(subject: Subject, clip: str, frames: int, options: Any) -> tuple[
     motion, length = back_and_forth(clip_of(options, clip, subject), subject.file.config.fps, frames)
     validator = subject.validator(motion)
     terms = validator.frame_terms(validator.clips[0], subject.model)
-    states = roll_states(subject.model, validator.bank, torch.arange(motion.frame_count), validator.down)
+    states = roll_states(subject.model, validator.bank, [range(motion.frame_count)], validator.down)[0]
     return {name: terms[name].reshape(-1, length).mean(1) for name in TERMS}, length, float(states.abs().max())
 
 

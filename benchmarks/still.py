@@ -97,7 +97,7 @@ def rolled(subject: Subject, clip: str, stop: float, options: Any) -> tuple[Tens
     validator = subject.validator(motion)
     bank, frames = validator.bank, torch.arange(motion.frame_count)
     with torch.no_grad():
-        z = roll_states(subject.model, bank, frames, validator.down)[first - 1 :]
+        z = roll_states(subject.model, bank, [range(motion.frame_count)], validator.down)[0][first - 1 :]
         x = subject.model.vertices(z, bank.character(frames[first - 1 :]))
     last = bank.character(frames[-1:])
     posed = subject.body.posed(last)

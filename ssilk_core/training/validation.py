@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -77,20 +78,27 @@ class Validator:
 
     def _mean(self, model: GarmentModel | None) -> Score:
         """Return the mean over all clips, dealt out to the processes of the team; all get the same score."""
-        own = [self.frame_terms(clip, model) for clip in self.clips[self.team.rank :: self.team.size]]
+        clips = self.clips[self.team.rank :: self.team.size]
+        states = self._states(clips, model)
+        own = [self._clip_terms(clip, model, latents) for clip, latents in zip(clips, states)]
         dealt = self.team.gather([{name: value.cpu() for name, value in terms.items()} for terms in own])
         scores = [dealt[index % self.team.size][index // self.team.size] for index in range(len(self.clips))]
         joined = {name: float(torch.cat([score[name] for score in scores]).mean()) for name in scores[0]}
         return Score({name: joined[name] for name in TERMS}, joined["collisions"], joined["dynamics"] ** 0.5)
 
-    @torch.no_grad()
     def frame_terms(self, clip: range, model: GarmentModel | None) -> dict[str, Tensor]:
         """Return what `Score` averages for each frame of a range of the bank, shape (N,).
 
         Without a model it is plain skinning that is scored. Distances to the quasi-static state come squared [m2].
         """
+        return self._clip_terms(clip, model, self._states([clip], model)[0])
+
+    def _states(self, clips: Sequence[range], model: GarmentModel | None) -> Sequence[Tensor | None]:
+        return [None] * len(clips) if model is None else roll_states(model, self.bank, clips, self.down)
+
+    @torch.no_grad()
+    def _clip_terms(self, clip: range, model: GarmentModel | None, states: Tensor | None) -> dict[str, Tensor]:
         frames = torch.arange(clip.start, clip.stop, device=self.rest.device)
-        states = None if model is None else roll_states(model, self.bank, frames, self.down)
         parts, tail = [], None
         for start in range(0, len(frames), DECODED_AT_ONCE):
             window = slice(start, start + DECODED_AT_ONCE)
@@ -124,9 +132,18 @@ class Validator:
 
 
 @torch.no_grad()
-def roll_states(model: GarmentModel, bank: MotionBank, frames: Tensor, down: Tensor) -> Tensor:
-    """Roll a model over consecutive frames of a bank, from its quasi-static start; states (N, latent)."""
-    direction = down.expand(len(frames), 3)
-    rest = model.initial(bank.static_descriptor(frames, direction)).unsqueeze(1)
-    pose = bank.dynamic_descriptor(frames, direction).unsqueeze(1)
-    return torch.cat(model.roll([*rest[:2]], rest[2:], pose[2:]))
+def roll_states(model: GarmentModel, bank: MotionBank, clips: Sequence[range], down: Tensor) -> list[Tensor]:
+    """Roll a model over ranges of a bank side by side, each from its quasi-static start.
+
+    Returns:
+        For each range its states, shape (frames, latent).
+    """
+    offset = torch.arange(max(map(len, clips)), device=down.device)[:, None]
+    first, last = (torch.tensor([clip[end] for clip in clips], device=down.device) for end in (0, -1))
+    frames = torch.minimum(first + offset, last)  # shorter ones wait on their last frame
+    direction = down.expand(frames.numel(), 3)
+    static = bank.static_descriptor(frames.reshape(-1), direction)
+    pose = bank.dynamic_descriptor(frames.reshape(-1), direction)
+    rest, pose = (values.reshape(*frames.shape, -1) for values in (model.initial(static), pose))
+    states = torch.stack(model.roll([*rest[:2]], rest[2:], pose[2:]))
+    return [states[: len(clip), index] for index, clip in enumerate(clips)]
