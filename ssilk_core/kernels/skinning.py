@@ -19,7 +19,7 @@ from torch.autograd.function import once_differentiable
 from .vectors import dot, load3, store3
 
 BLOCK = 128  # frames of one program
-VERTICES = 4  # that one program takes in turn
+VERTICES = 1  # that one program takes in turn
 
 
 def skin_kernel(
