@@ -12,7 +12,7 @@ from pathlib import Path
 
 from ssilk_core.config import PRESETS, ModelConfig, TrainConfig, overridden, preset_named
 from ssilk_core.errors import EXIT_INTERRUPTED, EXIT_OK, need
-from ssilk_core.events import Message, Reporter, Result
+from ssilk_core.events import Message, Reporter, Result, silent
 from ssilk_core.fabrics import FABRICS, Fabric, fabric_named
 
 from . import options as shared
@@ -62,6 +62,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Train; return 0 when finished, 130 when interrupted."""
+    from ssilk_core.training.parallel import joined
     from ssilk_core.training.run import train
     from ssilk_core.training.signals import interruptible
 
@@ -72,9 +73,9 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         "it ends in .safetensors",
     )
     shared.check_output(options.output)
-    job = _job(options, report)
-    with interruptible() as stop:
-        trained = train(job, report, stop)
+    with joined(options.device) as (team, device), interruptible() as stop:
+        report = report if team.first else silent
+        trained = train(training_job(options, device, report), report, stop, team)
     share = 1 - trained.score.total / trained.plain.total
     report(
         Result(
@@ -96,20 +97,20 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     return EXIT_OK
 
 
-def _job(options: argparse.Namespace, report: Reporter):  # type: ignore[no-untyped-def]  # TrainJob is heavy to import
+def training_job(options: argparse.Namespace, device: str, report: Reporter):  # type: ignore[no-untyped-def]  # its type is heavy
+    """Read everything that the options name; return it as a `TrainJob` on a device."""
     from ssilk_usd.read_motion import motion_files, read_motions
 
     from ssilk_core.files import sha256
     from ssilk_core.training.job import TrainJob, split_motions
 
-    preset = preset_named(options.preset)
+    model, train, fabric = configured(options)
     scene = shared.load_scene(options, report)
     motions = read_motions(options.motions, scene.character.skeleton)
     held = read_motions(options.valid, scene.character.skeleton)
     if not held:
         motions, held = split_motions(motions)
         report(Message(f"validating on {len(held)} of {len(motions) + len(held)} motions, training on the rest"))
-    model, train = _settings(options.settings, preset.model, preset.train, options.seed)
     files = {options.stage, shared.wardrobe(options)[0], *motion_files([*options.motions, *options.valid])}
     return TrainJob(
         scene=scene,
@@ -117,12 +118,23 @@ def _job(options: argparse.Namespace, report: Reporter):  # type: ignore[no-unty
         held_out=held,
         model=model,
         train=train,
-        fabric=overridden(fabric_named(options.fabric), options.material),
+        fabric=fabric,
         output=options.output,
-        device=options.device,
+        device=device,
         resume=options.resume,
         inputs={str(path): sha256(path) for path in sorted(files)},
     )
+
+
+def configured(options: argparse.Namespace) -> tuple[ModelConfig, TrainConfig, Fabric]:
+    """Return what the options say about network, schedule and fabric.
+
+    Raises:
+        SsilkError: a setting that does not exist, or a value that it cannot have.
+    """
+    preset = preset_named(options.preset)
+    model, train = _settings(options.settings, preset.model, preset.train, options.seed)
+    return model, train, overridden(fabric_named(options.fabric), options.material)
 
 
 def _settings(

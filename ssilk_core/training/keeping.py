@@ -16,40 +16,48 @@ from ..files import remove_unfinished
 from ..model.network import GarmentModel
 from .curve import curve_path, summary, write_curve
 from .job import TrainJob
-from .state import RunState, canonical, save_state, state_path
+from .parallel import ALONE, Team
+from .state import RunState, canonical, copied, save_state, state_path
 from .step import Stepper
 from .validation import Score
 from .watch import fault_path, save_fault
 
 
 class Keeper:
-    """Writes the files of one run, all beside its model."""
+    """Writes the files of one run, all beside its model; of a team of processes, only the first writes."""
 
-    def __init__(self, job: TrainJob, device: torch.device) -> None:
-        self.job, self.device = job, device
+    def __init__(self, job: TrainJob, device: torch.device, team: Team = ALONE) -> None:
+        self.job, self.device, self.team = job, device, team
         self.model, self.state = job.output, state_path(job.output)
         self.curve, self.fault = curve_path(job.output), fault_path(job.output)
 
     def tidy(self) -> None:
         """Remove what a run that was killed while it wrote has left behind."""
-        for path in (self.model, self.state, self.curve, self.fault):
-            remove_unfinished(path)
+        if self.team.first:
+            for path in (self.model, self.state, self.curve, self.fault):
+                remove_unfinished(path)
 
     def save_state(self, stepper: Stepper, state: RunState) -> None:
-        """Write the state."""
-        save_state(self.state, stepper, state)
+        """Write the state, for which all of a team are needed."""
+        samplers = self.team.gather(copied(stepper.sampler.state()))
+        if self.team.first:
+            save_state(self.state, stepper, samplers, state)
+        self.team.gather(None)  # none goes on before it is there to be read
 
     def save_curve(self, state: RunState, plain: Score) -> None:
         """Write the learning curve that is in the state, for whoever wants to look at it."""
-        write_curve(self.curve, state.curve, plain)
+        if self.team.first:
+            write_curve(self.curve, state.curve, plain)
 
     def save_model(self, model: GarmentModel, state: RunState, score: Score) -> None:
         """Write a model with its provenance."""
-        save_model(self.model, model_file(model, self.job.fabric, self.provenance(state, score)))
+        if self.team.first:
+            save_model(self.model, model_file(model, self.job.fabric, self.provenance(state, score)))
 
     def save_fault(self, stepper: Stepper, found: str) -> None:
         """Write what a step that was not finite was computed from."""
-        save_fault(self.fault, stepper, self.job.motions, found)
+        if self.team.first:
+            save_fault(self.fault, stepper, self.job.motions, found)
 
     def provenance(self, state: RunState, score: Score) -> dict[str, Any]:
         """Return how the model came to be."""

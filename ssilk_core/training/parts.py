@@ -14,6 +14,7 @@ from ..model.network import GarmentModel, model_joints
 from .bank import MOST_TURN, MotionBank, build_bank
 from .job import TrainJob
 from .objective import Objective
+from .parallel import ALONE, Team
 from .reach import reachable_body
 from .step import Stepper
 from .validation import Validator
@@ -36,6 +37,7 @@ class Parts:
     validator: Validator
     reached: int
     device: torch.device
+    team: Team = ALONE
 
     def detail(self) -> dict[str, object]:
         """Return what is trained, for people."""
@@ -49,17 +51,19 @@ class Parts:
             "body vertices": self.reached,
             "parameters": sum(value.numel() for value in self.model.parameters()),
             "device": str(self.device),
+            "processes": self.team.size,
         }
 
     def stepper(self, config: TrainConfig, seed: int) -> Stepper:
-        """Return a stepper at its beginning, whose draws have a seed of their own."""
-        generator = torch.Generator(self.device).manual_seed(seed)
-        sampler = WindowSampler(self.bank, config, self.model.config.latent, generator)
+        """Return a stepper at its beginning, whose draws have a seed of their own; a team shares the batch."""
+        team, own = self.team, self.team.part(config)
+        generator = torch.Generator(self.device).manual_seed(team.seed(seed))
+        sampler = WindowSampler(self.bank, own, self.model.config.latent, generator)
         objective = Objective(self.model, self.energy, self.body, self.bank, config.surface == "triangles")
-        return Stepper(self.model, objective, sampler, config)
+        return Stepper(self.model, objective, sampler, own, team.average if team.size > 1 else None)
 
 
-def build_parts(job: TrainJob, device: torch.device) -> Parts:
+def build_parts(job: TrainJob, device: torch.device, team: Team = ALONE) -> Parts:
     """Build what a run needs.
 
     Raises:
@@ -76,5 +80,6 @@ def build_parts(job: TrainJob, device: torch.device) -> Parts:
     touched = CollisionBody(body, count, vertices=reach.vertices, device=device)
     # Validation looks at the whole body: what training leaves out must not go unnoticed.
     whole = CollisionBody(body, count, device=device)
-    validator = Validator(held, energy, whole, scene.plain_skin, model.decoder.rest, fps, job.train.valid_frames)
-    return Parts(model, bank, energy, touched, validator, len(reach.vertices), device)
+    rest, frames = model.decoder.rest, job.train.valid_frames
+    validator = Validator(held, energy, whole, scene.plain_skin, rest, fps, frames, team)
+    return Parts(model, bank, energy, touched, validator, len(reach.vertices), device, team)

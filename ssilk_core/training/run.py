@@ -25,6 +25,7 @@ from .curve import Point, with_point
 from .job import TrainJob
 from .keeping import Keeper
 from .memory import decoded_frames, fitting_batch, free_memory, need_one_window, step_memory, suffices
+from .parallel import ALONE, Team
 from .parts import build_parts
 from .state import Best, Lowered, RunState, learned, load_state, restore, restore_learned
 from .validation import Score
@@ -49,16 +50,18 @@ class Trained:
 class Run:
     """A training run that has been set up, or taken up where it stopped, and can be stepped.
 
+    Processes that train together hold one each and do the same with it; the first of them writes the files.
+
     Attributes:
         state: what changes while the run goes on.
         saved: iteration of the state on disk.
     """
 
-    def __init__(self, job: TrainJob, report: Reporter) -> None:
-        self.job, self.report, self.device = job, report, chosen_device(job.device)
-        self.keeper, identity = Keeper(job, self.device), job.identity()
+    def __init__(self, job: TrainJob, report: Reporter, team: Team = ALONE) -> None:
+        self.job, self.report, self.device, self.team = job, report, chosen_device(job.device), team
+        self.keeper, identity = Keeper(job, self.device, team), {**job.identity(), "processes": team.size}
         self.state, tensors = load_state(self.keeper.state, identity) if job.resume else (RunState(identity), None)
-        self.parts = build_parts(job, self.device)
+        self.parts = build_parts(job, self.device, team)
         if not job.resume:
             self._fit()
         self._build_stepper()
@@ -97,7 +100,7 @@ class Run:
         restore_learned(self.stepper, tensors)
 
     def _take_up(self, tensors: dict[str, Tensor]) -> None:
-        restore(self.keeper.state, self.stepper, tensors)
+        restore(self.keeper.state, self.stepper, tensors, self.team.rank)
         self.saved, best = self.state.iteration, self.state.best
         self.report(Message(f"resumed at iteration {self.state.iteration} of {self.job.train.iterations}"))
         if best and best.iteration == self.state.iteration:
@@ -107,16 +110,20 @@ class Run:
 
     def _fit(self) -> None:
         """Lower the batch until the predicted memory fits, and say so."""
-        job, config, free = self.job, self.job.train, free_memory(self.device)
+        job, config, team, free = self.job, self.job.train, self.team, free_memory(self.device)
+        if self.device.type == "cpu":
+            free //= team.size
         need_one_window(job.scene, job.model, config, self.parts.reached, free)
-        batch, warm_batch = fitting_batch(job.scene, job.model, config, self.parts.reached, free)
+        fitting = team.gather(fitting_batch(job.scene, job.model, team.part(config), self.parts.reached, free))
+        batch, warm_batch = (team.size * min(counts) for counts in zip(*fitting))
         if (batch, warm_batch) != (config.batch, config.warm_batch):
             found = f"{self._memory() / 2**30:.1f} GiB needed, {free / 2**30:.1f} GiB free on {self.device}"
             self._lower(found, batch, warm_batch)
 
     def _memory(self) -> int:
-        """Predict what a step takes [bytes]."""
-        frames = decoded_frames(self.config, self.config.batch)
+        """Predict what a step takes in this process [bytes]."""
+        own = self.team.part(self.config)
+        frames = decoded_frames(own, own.batch)
         return step_memory(self.job.scene, self.job.model, frames, self.parts.reached)
 
     def _lower(self, found: str, batch: int, warm_batch: int) -> None:
@@ -135,10 +142,12 @@ class Run:
         """Do `work`, with half the batch for as long as the device runs out of memory.
 
         Raises:
-            SsilkError: a batch of one does not fit.
+            SsilkError: a batch of one does not fit, or others have to go on with the batch that does not.
         """
         while not suffices(work):
             config, found = self.config, f"iteration {self.state.iteration}: {self.device} is out of memory"
+            need(self.team.size == 1, self.job.scene.garment.mesh.path, found, "a team keeps the batch it has",
+                 "train again with a smaller one (--set batch=...)")  # fmt: skip
             need(
                 (config.warm_batch if self.state.iteration < config.warm_iterations else config.batch) > 1,
                 self.job.scene.garment.mesh.path,
@@ -241,7 +250,17 @@ class Run:
     @property
     def save_due(self) -> bool:
         """Whether enough time has gone by to save again."""
-        return time.monotonic() - self._saved_at >= SAVE_EVERY
+        return self._agreed(time.monotonic() - self._saved_at >= SAVE_EVERY)
+
+    def stops(self, stop: threading.Event) -> bool:
+        """Return whether to stop here."""
+        return self._agreed(stop.is_set())
+
+    def _agreed(self, wish: bool) -> bool:
+        """Return whether to do what this process wishes; a team does, now and then, what any of it wishes."""
+        if self.team.size == 1:
+            return wish
+        return self.state.iteration % EVERY == 0 and self.team.any(wish)
 
     def _write_state(self) -> None:
         self.state.undone = int(self.stepper.faults.count)
@@ -279,18 +298,19 @@ def _not_finite(score: Score) -> list[str]:
     return [name for name, value in score.terms.items() if not isfinite(value)]
 
 
-def train(job: TrainJob, report: Reporter, stop: threading.Event | None = None) -> Trained:
+def train(job: TrainJob, report: Reporter, stop: threading.Event | None = None, team: Team = ALONE) -> Trained:
     """Train a model, keeping the best on disk and the run's state beside it.
 
     Args:
         job: what to train.
         report: takes the events.
         stop: set from outside to stop after the current step; the state is saved then.
+        team: the processes that train together, each of which calls this.
 
     Raises:
         SsilkError: the inputs or the memory do not suffice, or training diverged.
     """
-    run = Run(job, report)
+    run = Run(job, report, team)
     _loop(run, stop or threading.Event())
     run.save()
     if run.state.undone:
@@ -301,7 +321,7 @@ def train(job: TrainJob, report: Reporter, stop: threading.Event | None = None) 
 
 def _loop(run: Run, stop: threading.Event) -> None:
     began, steps, total = time.monotonic(), 0, run.job.train.iterations
-    while run.state.iteration < total and not stop.is_set():
+    while run.state.iteration < total and not run.stops(stop):
         run.step()
         steps += 1
         if run.state.iteration % EVERY == 0 or run.state.iteration == total or steps == 1:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -22,6 +22,8 @@ from ..files import replacing
 from .curve import Point
 from .step import Stepper
 from .validation import Score
+
+Tensors = dict[str, Tensor]
 
 SAMPLER = "sampler."  # begins the names of tensors that say where the windows stand; the others are what was learned
 
@@ -84,16 +86,18 @@ def state_path(model: str | Path) -> Path:
     return Path(model).with_suffix(".resume.safetensors")
 
 
-def save_state(path: Path, stepper: Stepper, state: RunState) -> None:
-    """Write everything that the next iteration depends on."""
+def save_state(path: Path, stepper: Stepper, samplers: Sequence[Tensors], state: RunState) -> None:
+    """Write everything that the next iteration depends on; `samplers` is where the windows stand in each process."""
     from safetensors.torch import save
 
-    tensors = learned(stepper) | {SAMPLER + name: _copied(value) for name, value in stepper.sampler.state().items()}
+    tensors = learned(stepper)
+    for rank, sampler in enumerate(samplers):
+        tensors |= {f"{SAMPLER}{rank}.{name}": value for name, value in sampler.items()}
     with replacing(path) as temporary:
         temporary.write_bytes(save(tensors, {"ssilk_state": json.dumps(asdict(state))}))
 
 
-def load_state(path: Path, asked: dict[str, Any]) -> tuple[RunState, dict[str, Tensor]]:
+def load_state(path: Path, asked: dict[str, Any]) -> tuple[RunState, Tensors]:
     """Return a state and its tensors.
 
     Raises:
@@ -116,31 +120,31 @@ def load_state(path: Path, asked: dict[str, Any]) -> tuple[RunState, dict[str, T
     return state, tensors
 
 
-def restore(path: Path, stepper: Stepper, tensors: dict[str, Tensor]) -> None:
-    """Put what `load_state` returned into a freshly built `stepper`.
+def restore(path: Path, stepper: Stepper, tensors: Tensors, rank: int = 0) -> None:
+    """Put what `load_state` returned into a freshly built `stepper`, that of the process `rank`.
 
     Raises:
         SsilkError: the tensors do not fit.
     """
     with _damage_named(path):
-        stepper.sampler.restore(_group(tensors, SAMPLER))
+        stepper.sampler.restore(_group(tensors, f"{SAMPLER}{rank}."))
         restore_learned(stepper, tensors)
 
 
-def learned(stepper: Stepper) -> dict[str, Tensor]:
+def learned(stepper: Stepper) -> Tensors:
     """Return copies on the CPU of all that training changes: parameters, their average, the optimiser's moments."""
     tensors = {f"model.{name}": value for name, value in stepper.model.state_dict().items()}
     tensors |= {f"averaged.{name}": value for name, value in stepper.averaged.state_dict().items()}
     for index, moments in stepper.optimiser.state_dict()["state"].items():
         tensors |= {f"adam.{index}.{name}": torch.as_tensor(value) for name, value in moments.items()}
-    return {name: _copied(value) for name, value in tensors.items()}
+    return copied(tensors)
 
 
-def restore_learned(stepper: Stepper, tensors: dict[str, Tensor]) -> None:
+def restore_learned(stepper: Stepper, tensors: Tensors) -> None:
     """Put what `learned` returned into a freshly built `stepper`, which may have another batch."""
     stepper.model.load_state_dict(_group(tensors, "model."))
     stepper.averaged.load_state_dict(_group(tensors, "averaged."))
-    moments: dict[int, dict[str, Tensor]] = {}
+    moments: dict[int, Tensors] = {}
     for name, value in _group(tensors, "adam.").items():
         index, _, key = name.partition(".")
         moments.setdefault(int(index), {})[key] = value
@@ -148,11 +152,12 @@ def restore_learned(stepper: Stepper, tensors: dict[str, Tensor]) -> None:
     stepper.optimiser.load_state_dict({"state": moments, "param_groups": document["param_groups"]})
 
 
-def _copied(value: Tensor) -> Tensor:
-    return value.detach().cpu().contiguous().clone()
+def copied(tensors: Tensors) -> Tensors:
+    """Return copies on the CPU."""
+    return {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
 
 
-def _group(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+def _group(tensors: Tensors, prefix: str) -> Tensors:
     return {name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)}
 
 
