@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Draw the learning curves of training runs, and compare what runs reach in equal time.
+
+    python benchmarks/curves.py plain=cape.safetensors warm=cape_warm.safetensors --hardware "NVIDIA H100 80GB HBM3"
+
+Each run is a model written by 'ssilk train', under a name of its own if one is given; the curve lies beside it, one
+point for each validation. Time is that of the training steps alone. A run counts as having reached a total from the
+first validation at or under it: the best model is the one that is kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from plots import COLOURS, Panel, canvas, save
+from reports import RESULTS, table, write_results
+
+from ssilk_core.energy import TERMS
+from ssilk_core.errors import need
+from ssilk_core.events import format_seconds
+from ssilk_core.training.curve import curve_path
+
+PANELS = ("total", *TERMS, "collisions")
+WIDTH, HEIGHT, MARGIN = 460, 190, 60  # of a panel and of what is around it [pixels]
+SHOWN = 0.9  # share of the values that a panel shows: the first ones would flatten all others
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """The validations of one training: iterations, seconds and values, shape (points,); plain skinning's total."""
+
+    name: str
+    iterations: np.ndarray
+    seconds: np.ndarray
+    values: dict[str, np.ndarray]
+    plain: float
+
+    @property
+    def best(self) -> np.ndarray:
+        """Return the lowest total so far [J], shape (points,)."""
+        return np.minimum.accumulate(self.values["total"])
+
+    def best_by(self, seconds: float) -> float | None:
+        """Return the lowest total that was seen within a time; None before the first validation."""
+        seen = self.best[self.seconds <= seconds]
+        return float(seen[-1]) if len(seen) else None
+
+    def reached(self, total: float) -> int | None:
+        """Return the first validation at or under a total."""
+        under = np.flatnonzero(self.values["total"] <= total)
+        return int(under[0]) if len(under) else None
+
+
+def read_run(text: str) -> Run:
+    """Read the run of "MODEL" or "NAME=MODEL".
+
+    Raises:
+        SsilkError: there is no curve beside the model, or it has no point yet.
+    """
+    name, _, model = text.rpartition("=")
+    path = curve_path(model)
+    need(
+        path.is_file(), str(path), "no such file", "'ssilk train' writes it beside the model", "name a trained model"
+    )
+    document = json.loads(path.read_text())
+    points = document["points"]
+    need(points, str(path), "the curve has no point yet", "one validation at least is needed", "train longer")
+    values = {key: np.array([point["validation"][key] for point in points]) for key in PANELS}
+    iterations, seconds = (np.array([point[key] for point in points]) for key in ("iteration", "seconds"))
+    return Run(name or Path(model).stem, iterations, seconds, values, document["plain"]["total"])
+
+
+def bounds(values: Iterable[np.ndarray]) -> tuple[float, float]:
+    """Return the range that a panel shows of several curves."""
+    every = np.concatenate(list(values))
+    return float(every.min()), float(np.quantile(every, SHOWN)) if len(every) > 1 else float(every.max() + 1)
+
+
+def draw(path: Path, runs: list[Run]) -> None:
+    """Draw each value of all runs, over iterations on the left and over minutes on the right, as a PNG."""
+    image, pen = canvas(2 * WIDTH, len(PANELS) * HEIGHT + 40)
+    for row, key in enumerate(PANELS):
+        span = bounds(run.values[key] for run in runs)
+        for column, unit in enumerate(("iterations", "minutes")):
+            places = [run.seconds / 60 if column else run.iterations for run in runs]
+            left, top = column * WIDTH + MARGIN, row * HEIGHT + 30
+            box = (left, top, left + WIDTH - MARGIN - 25, top + HEIGHT - MARGIN)
+            panel = Panel(pen, box, (0.0, max(float(place[-1]) for place in places)), span)
+            panel.title(f"{key}{'' if key == 'collisions' else ' [J]'} over {unit}")
+            panel.grid()
+            for run, place, colour in zip(runs, places, COLOURS):
+                panel.curve(zip(place, run.values[key]), colour)
+    for index, (run, colour) in enumerate(zip(runs, COLOURS)):
+        pen.text((MARGIN + 100 * index, len(PANELS) * HEIGHT + 15), run.name, fill=colour)
+    save(image, path)
+
+
+def compare(runs: list[Run], totals: list[float]) -> str:
+    """Return a table of what runs reach in equal time, and when they reach the totals [J]."""
+    shared = min(float(run.seconds[-1]) for run in runs)
+    times = [shared / 4, shared / 2, shared]
+    header = ["run", "iterations", "time", "best total [J]", "plain skinning [J]"]
+    header += [f"best within {format_seconds(time)}" for time in times]
+    header += [f"time (iterations) to {total:.4g} J" for total in totals]
+    return table(header, [_line(run, times, totals) for run in runs])
+
+
+def _line(run: Run, times: list[float], totals: list[float]) -> list[str]:
+    begun = [run.name, str(run.iterations[-1]), format_seconds(run.seconds[-1])]
+    best = [run.best_by(time) for time in times]
+    arrivals = [run.reached(total) for total in totals]
+    return [
+        *begun,
+        *(f"{value:.4g}" for value in (run.best[-1], run.plain)),
+        *("" if value is None else f"{value:.4g}" for value in best),
+        *("never" if at is None else f"{format_seconds(run.seconds[at])} ({run.iterations[at]})" for at in arrivals),
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="+", metavar="[NAME=]MODEL", help=f"up to {len(COLOURS)} trained models")
+    parser.add_argument("--hardware", required=True, help="what the runs were trained on, for the foot of the table")
+    parser.add_argument(
+        "--totals", type=float, nargs="+", metavar="JOULES", help="(default: the total all runs reach)"
+    )
+    parser.add_argument("--name", default="curves", help="of the result files (default curves)")
+    options = parser.parse_args()
+    need(
+        len(options.runs) <= len(COLOURS), "curves", f"{len(options.runs)} runs", f"{len(COLOURS)} can be told apart"
+    )
+    runs = [read_run(text) for text in options.runs]
+    totals = options.totals or [max(float(run.best[-1]) for run in runs)]
+    draw(RESULTS / f"{options.name}.png", runs)
+    figures = {
+        run.name: {
+            "iterations": run.iterations.tolist(),
+            "seconds": run.seconds.tolist(),
+            "plain skinning": run.plain,
+            **{key: values.tolist() for key, values in run.values.items()},
+        }
+        for run in runs
+    }
+    write_results(options, compare(runs, totals), figures)
+
+
+if __name__ == "__main__":
+    main()
