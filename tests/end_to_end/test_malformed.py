@@ -691,7 +691,7 @@ def check_sentence(err: str, *says: str) -> None:
 
 DISKS = [
     (RIG, 16, "new.usda"),
-    (TRAIN, 16, "new.safetensors"),
+    (TRAIN, 16, "new.resume.safetensors"),
     (BAKE, 16, "new.usdc"),
     (f"{INSPECT} --fix new.usda", 16, "new.usda"),
     (VIEW, 1, "new.png"),
