@@ -94,7 +94,8 @@ class Validator:
         return self._clip_terms(clip, model, self._states([clip], model)[0])
 
     def _states(self, clips: Sequence[range], model: GarmentModel | None) -> Sequence[Tensor | None]:
-        return [None] * len(clips) if model is None else roll_states(model, self.bank, clips, self.down)
+        """Return the states of each clip; of a team, one may have none to roll."""
+        return roll_states(model, self.bank, clips, self.down) if model and clips else [None] * len(clips)
 
     @torch.no_grad()
     def _clip_terms(self, clip: range, model: GarmentModel | None, states: Tensor | None) -> dict[str, Tensor]:
