@@ -7,7 +7,7 @@ import json
 import math
 import sys
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Protocol, TextIO
 
 
@@ -54,7 +54,18 @@ class Failed:
     error: str
 
 
-Event = Started | Progress | Message | Checkpoint | Result | Failed
+Said = Started | Progress | Message | Checkpoint | Result | Failed
+
+
+@dataclass(frozen=True)
+class Garment:
+    """What one of several trainings says."""
+
+    name: str
+    said: Said
+
+
+Event = Said | Garment
 
 
 class Reporter(Protocol):
@@ -74,8 +85,29 @@ class JsonReporter:
         self.stream = stream or sys.stdout
 
     def __call__(self, event: Event) -> None:
-        line = {"event": type(event).__name__.lower(), **_finite(asdict(event))}
-        print(json.dumps(line, allow_nan=False, default=str), file=self.stream, flush=True)
+        print(json.dumps(_document(event), allow_nan=False, default=str), file=self.stream, flush=True)
+
+
+def _document(event: Event) -> dict[str, Any]:
+    own = {"said": _document(event.said)} if isinstance(event, Garment) else {}
+    return {"event": type(event).__name__.lower(), **_finite(asdict(event)), **own}
+
+
+def read_event(line: str) -> Said:
+    """Return the event of a line that `JsonReporter` wrote, one training alone speaking.
+
+    Raises:
+        ValueError: it is no such line.
+    """
+    kinds = {kind.__name__.lower(): kind for kind in (Started, Progress, Message, Checkpoint, Result, Failed)}
+    try:
+        document = json.loads(line)
+        event = kinds[document.pop("event")](**document)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"no event: {line.strip()}") from error
+    if isinstance(event, Progress):
+        return replace(event, terms={name: math.nan if x is None else x for name, x in event.terms.items()})
+    return event
 
 
 def _finite(value: Any) -> Any:
@@ -110,9 +142,7 @@ class TextReporter:
         if now - self.last < (0.1 if self.live else 10.0) and event.done < event.total:
             return
         self.last = now
-        left = "" if event.seconds_left is None else f"  {format_seconds(event.seconds_left)} left"
-        terms = "  ".join(f"{name} {value:.4g}" for name, value in event.terms.items())
-        line = f"  {event.done}/{event.total}{left}  {terms}"
+        line = "  " + describe_progress(event)
         print(f"\r\x1b[K{line}" if self.live else line, end="" if self.live else "\n", file=self.stream, flush=True)
         self.open_line = self.live
 
@@ -120,6 +150,13 @@ class TextReporter:
         if self.open_line:
             print(file=self.stream)
             self.open_line = False
+
+
+def describe_progress(event: Progress) -> str:
+    """Return progress as one line: "40/500  3 min 05 s left  stretch 0.12"."""
+    left = "" if event.seconds_left is None else f"  {format_seconds(event.seconds_left)} left"
+    terms = "  ".join(f"{name} {value:.4g}" for name, value in event.terms.items())
+    return f"{event.done}/{event.total}{left}  {terms}"
 
 
 def describe(event: Event) -> str:
@@ -133,6 +170,8 @@ def describe(event: Event) -> str:
             return f"error: {event.error}"
         case Result():
             return "\n".join(f"  {name}: {value}" for name, value in event.detail.items())
+        case Garment():
+            return f"{event.name}: {describe(event.said)}"
     return ""
 
 

@@ -12,15 +12,16 @@ from ssilk_core import __version__
 from ssilk_core.errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, SsilkError, fail
 from ssilk_core.events import Failed, JsonReporter, Reporter, TextReporter
 
-from . import bake, demo, inspect, rig, simulate, train, verify, view
+from . import bake, demo, inspect, rig, simulate, train, verify, view, wardrobe
 
-VERBS = (inspect, rig, train, bake, simulate, verify, view, demo)
+VERBS = (inspect, rig, train, wardrobe, bake, simulate, verify, view, demo)
 
 # The extra of the distribution that brings all that a verb needs.
 EXTRAS = {
     "inspect": "train",
     "rig": "setup",
     "train": "train",
+    "wardrobe": "train",
     "bake": "bake",
     "simulate": "train",
     "verify": "bake",

@@ -22,7 +22,7 @@ LAYERS = (
     {"mesh", "kinematics", "kernels"},
     {"model", "energy"},
     {"checkpoint"},
-    {"demo", "view", "simulate", "training", "rollout", "preflight", "setup"},
+    {"demo", "view", "simulate", "training", "rollout", "preflight", "setup", "wardrobe"},
     {"cli"},
     {"__main__"},
 )

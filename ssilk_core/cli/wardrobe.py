@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Train a list of garments, each as 'ssilk train' does, one on each GPU at a time.
+
+LIST is a TOML file with a table for each garment, and [defaults] for all; its paths are relative to its folder:
+
+    [defaults]
+    stage = "hero.usda"
+    motions = ["walks/", "runs/"]
+    preset = "final"
+
+    [cape]
+    garment = "cape.usdc"
+    set = { iterations = 100000 }
+
+Other keys are valid, fabric, material and seed. FOLDER gets NAME.safetensors and NAME.log for each garment. The same
+command goes on where it stopped: what is finished is skipped unless something else is asked now, what was interrupted
+is resumed. Ctrl-C stops all gently, a second one at once. A garment that fails does not stop the others.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from ssilk_core.errors import SsilkError, need
+from ssilk_core.events import Failed, Garment, Message, Reporter, Result, Said, Started
+from ssilk_core.files import need_writable
+from ssilk_core.wardrobe.listing import Entry, read_list
+from ssilk_core.wardrobe.panel import Panel, table
+from ssilk_core.wardrobe.queue import End, Queue, Slot
+from ssilk_core.wardrobe.record import request_hash
+from ssilk_core.wardrobe.training import Training
+
+from . import options as shared
+from . import train
+
+
+def add_arguments(verb: argparse.ArgumentParser) -> None:
+    """Add the options of this verb."""
+    verb.add_argument("list", type=Path, metavar="LIST", help="TOML file with a table for each garment")
+    verb.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="FOLDER", help="folder for models, states and logs"
+    )
+    verb.add_argument("--jobs", type=int, help="trainings at a time (default: one for each GPU; one without GPUs)")
+    verb.add_argument(
+        "--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to train (default auto)"
+    )
+
+
+def run(options: argparse.Namespace, report: Reporter) -> int:
+    """Train all; return 0, 130 when interrupted, or the exit code of a garment that failed."""
+    need(options.jobs is None or options.jobs > 0, "--jobs", f"{options.jobs} trainings at a time", "1 is the least")
+    device, slots = _slots(options.device, options.jobs)
+    need_writable(options.output / "log")
+    entries = read_list(options.list)
+    trainings = [Training(entry, options.output, _request(entry, options.list)) for entry in entries]
+    options.output.mkdir(parents=True, exist_ok=True)
+    show = report if options.json else Panel([entry.name for entry in entries])
+    show(Started("wardrobe", len(trainings), {"device": device, "at a time": len(slots)}))
+    _train(trainings, options.list.absolute().parent, device, slots, show)
+    rows = [training.row() for training in trainings]
+    if options.json:
+        report(Result("wardrobe", {"garments": rows}))
+    else:
+        print(table(rows), *(f"{t.entry.name}: {t.error}" for t in trainings if t.state == "failed"), sep="\n")
+    return max(training.code for training in trainings)
+
+
+def _train(trainings: Sequence[Training], source: Path, device: str, slots: Sequence[Slot], show: Reporter) -> None:
+    """Train what waits, the paths of the list being relative to `source`."""
+    from ssilk_core.training.signals import interruptible
+
+    named = {training.entry.name: training for training in trainings}
+
+    def tell(name: str, event: Said) -> None:
+        if isinstance(event, Failed):
+            named[name].error = event.error
+        show(Garment(name, event))
+
+    def ended(name: str, end: End) -> None:
+        named[name].end(end)
+        if named[name].state != "failed":  # then there is an error to be seen
+            tell(name, Message(named[name].state))
+
+    for name, training in named.items():
+        if training.plan:
+            tell(name, Message(training.plan))
+    with interruptible() as stop:
+        waiting = (training for training in trainings if training.state == "waiting")
+        Queue(slots, tell, ended).run((training.begin(source, device) for training in waiting), stop)
+
+
+def _slots(device: str, jobs: int | None) -> tuple[str, list[Slot]]:
+    """Return the device that all train on, and the environment of each training at a time."""
+    gpus = [] if device == "cpu" else _visible_gpus()
+    need(gpus or device != "cuda", "--device cuda", "no GPU is visible", "'auto' and 'cpu' are allowed")
+    if gpus:
+        return "cuda", [{"CUDA_VISIBLE_DEVICES": gpus[index % len(gpus)]} for index in range(jobs or len(gpus))]
+    jobs = jobs or 1
+    threads = str(max(1, (os.cpu_count() or 1) // jobs))
+    return "cpu", [{"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", threads)}] * jobs
+
+
+def _visible_gpus() -> list[str]:
+    """Return the GPUs as CUDA_VISIBLE_DEVICES names them."""
+    import torch
+
+    count, visible = torch.cuda.device_count(), os.environ.get("CUDA_VISIBLE_DEVICES")
+    return [name.strip() for name in visible.split(",")][:count] if visible else [str(n) for n in range(count)]
+
+
+def _request(entry: Entry, path: Path) -> str:
+    """Return a hash of what is asked for a garment of the list at `path`.
+
+    Raises:
+        SsilkError: there is no such file, or 'ssilk train' would not take it.
+    """
+    from ssilk_core.cli import parser
+
+    where = f"{path}: table '{entry.name}'"
+    try:
+        options = parser().parse_args(["train", *entry.words, "-o", f"{entry.name}.safetensors"])
+        train.configured(options)
+        files = _inputs(options, path.parent)
+    except SsilkError as error:
+        raise SsilkError(f"{where}: {error}") from error
+    for file in files:
+        need(file.is_file(), where, f"there is no file {file}", "paths are relative to the folder of the list")
+    return request_hash(entry.words, files)
+
+
+def _inputs(options: argparse.Namespace, folder: Path) -> list[Path]:
+    """Return the files that a training reads."""
+    from ssilk_usd.read_motion import motion_files
+
+    motions = motion_files(folder / motion for motion in [*options.motions, *options.valid])
+    return [folder / options.stage, folder / shared.wardrobe(options)[0], *motions]

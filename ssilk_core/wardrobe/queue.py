@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trainings side by side, each a process of its own, one at a time in each slot."""
+
+from __future__ import annotations
+
+import os
+import queue
+import signal
+import subprocess
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ..events import Failed, Result, Said, read_event
+
+Slot = Mapping[str, str]  # environment variables that give a training its device
+LOOK = 0.2  # seconds between two looks at whether to stop
+
+
+@dataclass(frozen=True)
+class Task:
+    """A command that prints events as JSON lines, the folder to run it in, and the log that it is written to."""
+
+    name: str
+    command: Sequence[str]
+    folder: Path
+    log: Path
+
+
+@dataclass(frozen=True)
+class End:
+    """How a task ended: its exit code (negative for a signal), the time it took [s], and its last result."""
+
+    code: int
+    seconds: float
+    result: Result | None
+
+
+@dataclass
+class _Running:
+    task: Task
+    slot: Slot
+    process: subprocess.Popen[str]
+    began: float = field(default_factory=time.monotonic)
+    result: Result | None = None
+    explained: bool = False
+    stopping: bool = False
+
+    def hear(self, event: Said) -> None:
+        if isinstance(event, Result):
+            self.result = event
+        self.explained |= isinstance(event, Failed)
+
+    def stop(self) -> None:
+        if not self.stopping:
+            self.stopping = True
+            self.process.send_signal(signal.SIGINT)
+
+
+class Queue:
+    """Runs tasks in their order, as many at once as there are slots.
+
+    Args:
+        tell: given each event of a task after the task's name; one that dies without a word gets a `Failed`.
+        ended: given how each task ended.
+    """
+
+    def __init__(
+        self, slots: Sequence[Slot], tell: Callable[[str, Said], None], ended: Callable[[str, End], None]
+    ) -> None:
+        self._free, self.tell, self.ended = deque(slots), tell, ended
+        self._running: dict[str, _Running] = {}
+        self._heard: queue.Queue[tuple[str, Said | None]] = queue.Queue()
+
+    def run(self, tasks: Iterable[Task], stop: threading.Event) -> None:
+        """Run all tasks, each taken when a slot is free; once `stop` is set, ask those that run to stop, and end.
+
+        Whatever else ends this call, a second interrupt above all, ends them at once.
+        """
+        waiting = iter(tasks)
+        try:
+            while True:
+                while self._free and not stop.is_set() and (task := next(waiting, None)):
+                    self._start(task)
+                if not self._running:
+                    return
+                if stop.is_set():
+                    for running in self._running.values():
+                        running.stop()
+                self._listen()
+        finally:
+            for running in self._running.values():
+                running.process.kill()
+
+    def _start(self, task: Task) -> None:
+        slot = self._free.popleft()
+        with open(task.log, "a", encoding="utf-8") as log:
+            process = subprocess.Popen(
+                task.command,
+                cwd=task.folder,
+                env={**os.environ, **slot},
+                stdout=subprocess.PIPE,
+                stderr=log,
+                text=True,
+                encoding="utf-8",
+                start_new_session=True,  # a terminal interrupts this process alone, which passes it on
+            )
+        self._running[task.name] = _Running(task, slot, process)
+        threading.Thread(target=self._read, args=(task, process), daemon=True).start()
+
+    def _read(self, task: Task, process: subprocess.Popen[str]) -> None:
+        """Pass on what a process prints; in a thread of its own."""
+        assert process.stdout is not None
+        with open(task.log, "a", encoding="utf-8") as log:
+            for line in process.stdout:
+                log.write(line)
+                log.flush()
+                try:
+                    self._heard.put((task.name, read_event(line)))
+                except ValueError:
+                    continue  # a library's own words, for the log only
+        self._heard.put((task.name, None))
+
+    def _listen(self) -> None:
+        """Wait a moment for an event, and pass it on."""
+        try:
+            name, event = self._heard.get(timeout=LOOK)
+        except queue.Empty:
+            return
+        if event is None:
+            self._end(self._running.pop(name))
+        else:
+            self._running[name].hear(event)
+            self.tell(name, event)
+
+    def _end(self, running: _Running) -> None:
+        code, task = running.process.wait(), running.task
+        if code and not running.explained and not running.stopping:
+            how = f"signal {-code}" if code < 0 else f"exit code {code}"
+            self.tell(task.name, Failed(f"{task.log}: the training ended by {how}; its last lines say more."))
+        self._free.append(running.slot)
+        self.ended(task.name, End(code, time.monotonic() - running.began, running.result))

@@ -1,0 +1,352 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lists of garments: what they may say, how they are trained side by side; and one garment in two processes."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import shlex
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from ssilk_core.checkpoint import load_model
+from ssilk_core.cli import main
+from ssilk_core.errors import SsilkError
+from ssilk_core.events import Garment, JsonReporter, Message, Progress, Said, read_event
+from ssilk_core.wardrobe.listing import Entry, read_list
+from ssilk_core.wardrobe.panel import Panel, table
+from ssilk_core.wardrobe.queue import End, Queue, Task
+from ssilk_core.wardrobe.record import request_hash
+from ssilk_core.wardrobe.training import Training
+
+LIST = """
+[defaults]
+stage = "rigged.usda"
+motions = ["clip.usda"]
+preset = "draft"
+set = { latent = 8, widths = [16], shapes = 4, iterations = 240, warm = 0.5, batch = 2, warm_batch = 4, window = 4 }
+
+[skirt]
+seed = 3
+set = { valid_frames = 8 }
+
+[torn]
+motions = "torn.usda"
+"""
+
+
+# --- what a list says ---------------------------------------------------------------------------------------------
+
+
+def listed(folder: Path, text: str) -> list[Entry]:
+    (folder / "list.toml").write_text(text)
+    return read_list(folder / "list.toml")
+
+
+def test_a_garment_has_its_own_keys_and_the_defaults(tmp_path):
+    skirt, torn = listed(tmp_path, LIST + 'material = { drag = 0.2, damp = true }\nvalid = ["a", "b"]\n')
+    assert (skirt.name, torn.name) == ("skirt", "torn")
+    settings = "--set latent=8 --set widths=16 --set shapes=4 --set iterations=240 --set warm=0.5 --set batch=2 "
+    settings += "--set warm_batch=4 --set window=4"
+    assert shlex.join(skirt.words) == (
+        f"rigged.usda --motions clip.usda --preset draft {settings} --set valid_frames=8 --seed 3"
+    )
+    material = "--material drag=0.2 --material damp=true"
+    assert shlex.join(torn.words) == (
+        f"rigged.usda --motions torn.usda --valid a b --preset draft {material} {settings}"
+    )
+
+
+WRONG = {
+    "no TOML": ("[cape", "list.toml: not a TOML file"),
+    "nothing": ("", "list.toml: it names no garment"),
+    "loose key": ("seed = 1\n[cape]", "key 'seed': it stands in no table; each key belongs to"),
+    "name": ('["../cape"]', "table '../cape': its name would be the name of files; letters"),
+    "unknown": ("[cape]\nsteps = 3", "table 'cape', key 'steps': no such key; keys are stage, garment, motions"),
+    "default": ("[defaults]\nstage = 3\n[cape]", "table 'defaults', key 'stage': 3; the path of a stage is needed"),
+    "missing": ('[cape]\nstage = "a"', "table 'cape', key 'motions': missing; it stands here or in"),
+    "preset": ('[cape]\npreset = "fast"', "key 'preset': 'fast'; one of draft, preview, final is needed"),
+    "seed": ("[cape]\nseed = true", "key 'seed': True; a whole number is needed"),
+    "set": ('[cape]\nset = "batch=3"', "key 'set': 'batch=3'; a table of values, like { iterations = 20000 }, is"),
+    "motions": ("[cape]\nmotions = []", "key 'motions': []; a path or a list of paths is needed"),
+}
+
+
+@pytest.mark.parametrize(("text", "says"), WRONG.values(), ids=WRONG)
+def test_bad_entries_are_told_in_one_sentence(tmp_path, text, says):
+    with pytest.raises(SsilkError) as error:
+        listed(tmp_path, text)
+    assert says in str(error.value) and "\n" not in str(error.value)
+
+
+BAD = {
+    "setting": ("[cape]\nset = { speed = 3 }", "table 'cape': --set speed=3: no such setting; settings are latent"),
+    "value": ("[cape]\nset = { batch = 0 }", "table 'cape': setting 'batch': 0; it lies between 1 and"),
+    "file": ('[cape]\nmotions = "none.usda"', "there is no file"),
+    "garment": ('[cape]\ngarment = "none.usda:/Cape"', "there is no file"),
+}
+
+
+@pytest.mark.parametrize(("text", "says"), BAD.values(), ids=BAD)
+def test_nothing_is_trained_when_an_entry_cannot_be(toy, tmp_path, monkeypatch, capsys, text, says):
+    monkeypatch.chdir(toy.copy(tmp_path))
+    Path("list.toml").write_text('[defaults]\nstage = "rigged.usda"\nmotions = "clip.usda"\n' + text)
+    assert main(["wardrobe", "list.toml", "-o", "out", "--device", "cpu"]) == 2
+    assert says in capsys.readouterr().err and not Path("out").exists()
+
+
+# --- trainings side by side ---------------------------------------------------------------------------------------
+
+
+def task(folder: Path, name: str, code: str) -> Task:
+    """A process that costs little, in place of a training."""
+    told = "import json, os, signal, sys, time\ndef say(**event): print(json.dumps(event), flush=True)\n"
+    return Task(name, [sys.executable, "-S", "-c", told + code], folder, folder / f"{name}.log")
+
+
+class Heard:
+    """Runs tasks and keeps what they say."""
+
+    def __init__(self, slots: list[dict[str, str]]) -> None:
+        self.said: list[tuple[str, Said]] = []
+        self.ends: dict[str, End] = {}
+        self.stop = threading.Event()
+        self.queue = Queue(slots, self.tell, self.ends.__setitem__)
+
+    def tell(self, name: str, event: Said) -> None:
+        self.said.append((name, event))
+
+    def run(self, *tasks: Task) -> dict[str, End]:
+        self.queue.run(iter(tasks), self.stop)
+        return self.ends
+
+
+def test_each_slot_has_one_task_at_a_time_in_its_own_environment(tmp_path):
+    code = "say(event='message', text=os.environ['SLOT'])\ntime.sleep(0.2)\nsay(event='message', text='end')"
+    heard = Heard([{"SLOT": "a"}, {"SLOT": "b"}])
+    ends = heard.run(*(task(tmp_path, str(number), code) for number in range(4)))
+    assert {name: end.code for name, end in ends.items()} == dict.fromkeys("0123", 0)
+    first = {name: event.text for name, event in reversed(heard.said) if event.text != "end"}
+    assert sorted(first[name] for name in "01") == ["a", "b"]
+    for slot in "ab":  # begin and end alternate
+        texts = [event.text for name, event in heard.said if first[name] == slot]
+        assert texts == [slot, "end"] * (len(texts) // 2)
+
+
+def test_a_failure_stops_no_other_and_a_death_without_a_word_is_explained(tmp_path):
+    heard = Heard([{}])
+    ends = heard.run(
+        task(tmp_path, "bad", "say(event='failed', error='no cloth.')\nsys.exit(2)"),
+        task(tmp_path, "killed", "os.kill(os.getpid(), signal.SIGKILL)"),
+        task(tmp_path, "good", "print('noise')\nsay(event='result', task='train', detail={'iterations': 5})"),
+    )
+    assert [ends[name].code for name in ("bad", "killed", "good")] == [2, -9, 0]
+    assert ends["good"].result.detail == {"iterations": 5}
+    failures = [(name, event.error) for name, event in heard.said if type(event).__name__ == "Failed"]
+    assert failures[0] == ("bad", "no cloth.") and len(failures) == 2
+    assert failures[1][1].endswith("killed.log: the training ended by signal 9; its last lines say more.")
+    assert "noise" in (tmp_path / "good.log").read_text()
+
+
+GENTLE = """
+signal.signal(signal.SIGINT, lambda *_: (say(event='message', text='stopped'), sys.exit(130)))
+say(event='message', text='begun')
+time.sleep(60)
+"""
+
+
+def test_a_stop_asks_those_that_run_and_starts_no_more(tmp_path):
+    heard = Heard([{}, {}])
+    threading.Timer(1.0, heard.stop.set).start()
+    ends = heard.run(*(task(tmp_path, name, GENTLE) for name in "abc"))
+    assert {name: end.code for name, end in ends.items()} == {"a": 130, "b": 130}
+    assert sum(event == Message("stopped") for _, event in heard.said) == 2
+
+
+def test_a_second_interrupt_ends_all_at_once(tmp_path):
+    class Impatient(Heard):
+        def tell(self, name: str, event: Said) -> None:
+            raise KeyboardInterrupt
+
+    heard = Impatient([{}])
+    with pytest.raises(KeyboardInterrupt):
+        heard.run(task(tmp_path, "a", "say(event='message', text='begun')\ntime.sleep(60)"))
+    assert heard.queue._running["a"].process.wait(10) == -signal.SIGKILL
+
+
+# --- what is done again -------------------------------------------------------------------------------------------
+
+
+def test_what_is_finished_is_skipped_unless_something_else_is_asked(tmp_path):
+    entry, done = Entry("cape", ("stage.usda",)), {"iterations": 5, "higher by": "3.0%"}
+    first = Training(entry, tmp_path, "request")
+    assert (first.state, first.resumed, first.code) == ("waiting", False, 130)
+    begun = first.begin(tmp_path, "cpu")
+    assert "--resume" not in begun.command and begun.command[3:6] == ["train", "stage.usda", "-o"]
+    assert Training(entry, tmp_path, "request").plan == ""  # killed before it had a state
+    (tmp_path / "cape.resume.safetensors").touch()
+    again = Training(entry, tmp_path, "request")
+    assert again.resumed and again.begin(tmp_path, "cpu").command[-1] == "--resume"
+    again.end(End(130, 2.0, None))
+    assert (again.state, again.code) == ("stopped", 130)
+    (tmp_path / "cape.safetensors").touch()
+    last = Training(entry, tmp_path, "request")
+    last.end(End(0, 3.0, read_event(json.dumps({"event": "result", "task": "train", "detail": done}))))
+    kept = Training(entry, tmp_path, "request")
+    assert (kept.state, kept.code, kept.plan) == ("finished", 0, "finished before; skipped")
+    assert kept.row() == {
+        "garment": "cape", "iterations": 5, "total [J]": None, "lower by": "-3.0%", "collisions": None,
+        "time": 5.0, "state": "finished",
+    }  # fmt: skip
+    changed = Training(entry, tmp_path, "another request")
+    assert changed.state == "waiting" and not changed.resumed and "something else" in changed.plan
+    changed.begin(tmp_path, "cpu")
+    assert not (tmp_path / "cape.resume.safetensors").exists()  # it belongs to what was asked before
+    changed.end(End(-9, 1.0, None))
+    assert (changed.state, changed.code) == ("failed", 1)
+    (tmp_path / "cape.json").write_text("{")
+    with pytest.raises(SsilkError, match=r"cape.json: the record of a training is damaged .*delete it"):
+        Training(entry, tmp_path, "request")
+
+
+def test_a_request_changes_with_words_and_contents(tmp_path):
+    file = tmp_path / "a.usda"
+    file.write_text("one")
+    before = request_hash(["a"], [file])
+    assert request_hash(["b"], [file]) != before
+    moved = file.rename(tmp_path.joinpath("elsewhere").mkdir() or tmp_path / "elsewhere" / "a.usda")
+    assert request_hash(["a"], [moved]) == before
+    moved.write_text("two")
+    assert request_hash(["a"], [moved]) != before
+
+
+# --- what is shown ------------------------------------------------------------------------------------------------
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_terminal_has_a_line_for_each(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "30")
+    monkeypatch.setenv("LINES", "24")
+    panel = Panel(["cape", "skirt"], Terminal())
+    for done in (1, 2):  # the second comes too soon
+        panel(Garment("skirt", Progress(done, 9, 5.0, {"stretch": 0.5})))
+    panel(Garment("cape", Message("a warning that is longer than the line", "warning")))
+    first, second = panel.stream.getvalue().split("\x1b[2A")
+    assert first == "\r\x1b[Kcape   waiting\n\r\x1b[Kskirt  1/9  5 s left  stretch\n"
+    assert second == "\r\x1b[Kcape   warning: a warning tha\n\r\x1b[Kskirt  2/9  5 s left  stretch\n"
+
+
+def test_elsewhere_lines_say_whose_they_are():
+    stream = io.StringIO()
+    panel = Panel(["cape", "skirt"], stream)
+    for name in ("cape", "skirt", "cape"):
+        panel(Garment(name, Progress(1, 9, None, {"stretch": 0.5})))
+    panel(Garment("skirt", Message("half of it")))
+    assert stream.getvalue().splitlines() == [
+        "cape: 1/9  stretch 0.5",
+        "skirt: 1/9  stretch 0.5",
+        "skirt: half of it",
+    ]
+
+
+def test_the_table_is_aligned():
+    rows = [{"garment": "cape", "total": 0.25, "time": 65.0, "state": "finished"},
+            {"garment": "t", "total": None, "time": 5.0, "state": "failed"}]  # fmt: skip
+    assert table(rows).splitlines() == [
+        "garment  total        time  state",
+        "cape      0.25  1 min 05 s  finished",
+        "t                      5 s  failed",
+    ]
+
+
+def test_events_are_read_as_they_were_written():
+    stream = io.StringIO()
+    said = Progress(1, 2, None, {"stretch": float("nan"), "bending": 0.5})
+    JsonReporter(stream)(said)
+    JsonReporter(stream)(Garment("cape", Message("well")))
+    alone, named = stream.getvalue().splitlines()
+    assert repr(read_event(alone)) == repr(said)
+    inner = {"event": "message", "text": "well", "level": "info"}
+    assert json.loads(named) == {"event": "garment", "name": "cape", "said": inner}
+    for line in ("noise", "[1]", '{"event": "unknown"}', '{"event": "message"}', "{}", named):
+        with pytest.raises(ValueError):
+            read_event(line)
+
+
+# --- whole trainings ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def world(toy, tmp_path, monkeypatch) -> Path:
+    """A folder with the toy's files, a list, and a motion that is cut short, as the working folder."""
+    monkeypatch.chdir(toy.copy(tmp_path))
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    Path("list.toml").write_text(LIST)
+    Path("torn.usda").write_bytes(Path("clip.usda").read_bytes()[:300])
+    return tmp_path
+
+
+def interrupt_when(log: Path, word: str) -> threading.Thread:
+    """Interrupt this process as soon as a log has a word."""
+
+    def watch() -> None:
+        for _ in range(600):
+            if log.exists() and word in log.read_text():
+                os.kill(os.getpid(), signal.SIGINT)
+                return
+            time.sleep(0.05)
+
+    thread = threading.Thread(target=watch)
+    thread.start()
+    return thread
+
+
+def test_an_interrupted_list_goes_on_and_a_failure_is_told(world, capsys):
+    command = shlex.split("wardrobe list.toml -o out --device cpu --jobs 2 --json")
+    watching = interrupt_when(Path("out/skirt.log"), '"progress"')
+    assert main(command) == 130
+    watching.join()
+    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    states = {row["garment"]: row["state"] for row in events[-1]["detail"]["garments"]}
+    assert states["skirt"] == "stopped" and Path("out/skirt.resume.safetensors").exists()
+    assert main(command) == 2
+    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    skirt, torn = events[-1]["detail"]["garments"]
+    assert (skirt["state"], skirt["iterations"], torn["state"]) == ("finished", 240, "failed")
+    said = [event["said"] for event in events if event["event"] == "garment" and event["name"] == "torn"]
+    assert [event["event"] for event in said] == ["failed"] and "torn.usda" in said[0]["error"]
+    assert any("resumed at iteration" in line for line in Path("out/skirt.log").read_text().splitlines())
+    assert load_model("out/skirt.safetensors").provenance["train"]["seed"] == 3
+
+
+def test_two_processes_train_one_garment_and_one_of_them_speaks(world, toy):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    command = [sys.executable, "-m", "ssilk_core", "train", "rigged.usda", "--motions", "clip.usda", "--json"]
+    told = {**os.environ, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": "2"}
+    processes = [
+        subprocess.Popen(
+            [*command, "-o", "together.safetensors", *toy.training],
+            env={**told, "RANK": rank, "LOCAL_RANK": rank},
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        for rank in "01"
+    ]
+    first, second = (process.communicate()[0].splitlines() for process in processes)
+    assert [process.returncode for process in processes] == [0, 0]
+    assert json.loads(first[-1])["event"] == "result" and not second
+    assert load_model("together.safetensors").provenance["processes"] == 2
