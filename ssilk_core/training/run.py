@@ -29,10 +29,9 @@ from .parallel import ALONE, Team
 from .parts import build_parts
 from .state import Best, Lowered, RunState, learned, load_state, restore, restore_learned
 from .validation import Score
+from .verdict import not_finite, verdict
 from .watch import EVERY, SPAN, Watch
 
-# A rollout closer than this to the quasi-static state of each pose has learned no dynamics worth the name.
-NO_DYNAMICS = 2e-3  # [m]
 SAVE_EVERY = 60.0  # [s] that a killed process loses at most, a step and a validation aside
 SLOWER = 0.25  # factor on the step sizes once training has not stayed finite
 
@@ -194,10 +193,10 @@ class Run:
         state, batch = self.state, self._batch_terms()
         with self._untimed():
             score = self._score()
-            if broken := _not_finite(score):
+            if broken := not_finite(score):
                 self._recover("validation is not finite", broken)
                 return
-            self.report(_judgement(state.iteration, score, self.plain, self.job.scene.rig.proxy_count > 0))
+            self.report(verdict(state.iteration, score, self.plain, self.job.scene.rig.proxy_count > 0))
             finite = {name: value for name, value in batch.items() if isfinite(value)}
             state.curve = with_point(state.curve, Point(state.iteration, state.seconds, finite, score))
             better = state.best is None or score.total < state.best.score.total
@@ -219,8 +218,7 @@ class Run:
         Raises:
             SsilkError: it was tried before.
         """
-        found = f"{found} at iteration {self.state.iteration} ({' and '.join(broken)} not finite)"
-        self.keeper.save_fault(self.stepper, found)
+        found = self._studied(found, broken)
         config, lowered = self.config, self.state.lowered
         if lowered and lowered[-1].pace < 1:
             self._give_up(found)
@@ -231,6 +229,12 @@ class Run:
         self._rebuild_stepper(tensors)
         text = f"{found}; back to iteration {before.iteration} with steps of {SLOWER:.0%}, see {self.keeper.fault}"
         self.report(Message(text, "warning"))
+
+    def _studied(self, found: str, broken: list[str]) -> str:
+        """Keep the last window that was not finite; return what was found, where."""
+        found = f"{found} at iteration {self.state.iteration} ({' and '.join(broken)} not finite)"
+        self.keeper.save_fault(self.stepper, found)
+        return found
 
     def _give_up(self, found: str) -> NoReturn:
         fail(
@@ -288,14 +292,10 @@ class Run:
         if self.state.best:
             return self.state.best.score
         score = self._score()
-        if broken := _not_finite(score):
-            self._give_up(f"validation at iteration {self.state.iteration} ({' and '.join(broken)} not finite)")
+        if broken := not_finite(score):
+            self._give_up(self._studied("validation is not finite", broken))
         self._write_model(score)
         return score
-
-
-def _not_finite(score: Score) -> list[str]:
-    return [name for name, value in score.terms.items() if not isfinite(value)]
 
 
 def train(job: TrainJob, report: Reporter, stop: threading.Event | None = None, team: Team = ALONE) -> Trained:
@@ -330,16 +330,3 @@ def _loop(run: Run, stop: threading.Event) -> None:
             run.validate()
         elif run.save_due:
             run.save()
-
-
-def _judgement(iteration: int, score: Score, plain: Score, moves: bool) -> Message:
-    share = 1 - score.total / plain.total
-    terms = ", ".join(f"{name} {value:.4g}" for name, value in score.terms.items())
-    text = (
-        f"validation at {iteration}: total {score.total:.4g} J, "
-        f"{share:.1%} under plain skinning's {plain.total:.4g} J "
-        f"({terms}), collisions {score.collisions:.2%}, motion of its own {score.dynamics * 1000:.0f} mm"
-    )
-    if score.dynamics < NO_DYNAMICS and moves:
-        return Message(f"{text}; nothing dynamic is being learned: check that the motions move", "warning")
-    return Message(text)

@@ -384,6 +384,19 @@ def test_a_run_that_is_out_of_memory_with_a_batch_of_one_stops(job, monkeypatch,
         train(job(f"hopeless{windows}"), silent)
 
 
+def test_no_model_that_is_not_finite_is_written_where_a_run_is_interrupted(job, monkeypatch):
+    score = validation.Validator.score
+    monkeypatch.setattr(
+        validation.Validator,
+        "score",
+        lambda self, model: replace(score(self, model), terms={"bending": float("nan")}),
+    )
+    early = job("early")
+    with pytest.raises(SsilkError, match=r"not finite at iteration 2 \(bending not finite\); there is no model yet"):
+        train(early, silent, stop_after(monkeypatch, 2))
+    assert fault_path(early.output).exists() and state_path(early.output).exists() and not early.output.exists()
+
+
 @pytest.fixture
 def may_have(monkeypatch):
     """Sets how much memory of the GPU may be had, which no prediction knows of [bytes]."""

@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a validation means, in words."""
+
+from __future__ import annotations
+
+from math import isfinite
+
+from ..events import Message
+from .validation import Score
+
+# A rollout closer than this to the quasi-static state of each pose has learned no dynamics worth the name.
+NO_DYNAMICS = 2e-3  # [m]
+
+
+def not_finite(score: Score) -> list[str]:
+    """Return the names of the terms that are not finite."""
+    return [name for name, value in score.terms.items() if not isfinite(value)]
+
+
+def verdict(iteration: int, score: Score, plain: Score, moves: bool) -> Message:
+    """Return how a score compares with plain skinning's; a warning when a garment that `moves` has learned not to."""
+    share = 1 - score.total / plain.total
+    terms = ", ".join(f"{name} {value:.4g}" for name, value in score.terms.items())
+    text = (
+        f"validation at {iteration}: total {score.total:.4g} J, "
+        f"{share:.1%} under plain skinning's {plain.total:.4g} J "
+        f"({terms}), collisions {score.collisions:.2%}, motion of its own {score.dynamics * 1000:.0f} mm"
+    )
+    if score.dynamics < NO_DYNAMICS and moves:
+        return Message(f"{text}; nothing dynamic is being learned: check that the motions move", "warning")
+    return Message(text)
