@@ -2,10 +2,10 @@
 """Projected Newton with conjugate gradients, many frames at once.
 
 Each iteration solves with the positive Hessian to a tenth of the residual, then halves the step until the energy has
-fallen enough; the planes of the body hold still meanwhile. Then they are found anew. Where a vertex has hardly moved
-and its nearest point yet jumps towards it, the old plane then stays: the distance to the nearest point of a mesh is
-not continuous, and a vertex pushed to and fro over such a seam would never settle. Of all states on the way the one
-of lowest energy, with its own nearest points, is returned.
+fallen enough; the planes of the body hold still meanwhile, and are found anew before the next. The distance to the
+nearest point of a mesh is not continuous, and a vertex pushed to and fro over a seam would never settle: after some
+iterations, a vertex that the surface would jump towards stays before the seam, as if pinned, until the frame is
+solved. Of all states on the way the one of lowest energy is returned.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SUFFICIENT = 1e-4  # share of the slope that a step has to gain
 HALVINGS = 12
 REDUCTION = 0.1  # of the residual by each linear solution
 FALL = 1e-4  # [m]; states whose energies differ by less than such a fall of the garment count as equally low
-FREE = 12  # iterations in which all planes follow their vertices
+FREE = 20  # iterations in which every vertex may cross seams
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +56,7 @@ class Solution:
     Attributes:
         x: positions [m], shape (V, 3, N).
         energy: with the nearest body points of x [J], shape (N,).
-        imbalance: what `SolverOptions.tolerance` bounds, with the planes that the solver held, shape (N,).
+        imbalance: what `SolverOptions.tolerance` bounds, without the vertices that stay before a seam, shape (N,).
         iterations: of Newton's method, shape (N,).
         inner: iterations of conjugate gradients, each for all frames that were still at work.
     """
@@ -89,20 +89,24 @@ def minimise_from(potential: Potential, start: Tensor, setting: Setting, options
 class _Search:
     """Newton's method under way: the frames still at work, and the best state of every frame so far."""
 
+    energy: Tensor
+    gradient: Tensor
+    imbalance: Tensor
+
     def __init__(self, potential: Potential, start: Tensor, setting: Setting, options: SolverOptions) -> None:
         self.potential, self.options, self.setting = potential, options, setting
         self.x, self.planes, self.inner = start, potential.planes(start, setting), 0
-        energy = potential.energy(start, setting, self.planes)
-        bad = int((~energy.isfinite()).sum())
-        need(bad == 0, "simulation", f"the first state of {bad} of {len(energy)} frames has no finite energy",
+        self.held = torch.zeros_like(start[:, 0], dtype=torch.bool)
+        self._look()
+        bad = int((~self.energy.isfinite()).sum())
+        need(bad == 0, "simulation", f"the first state of {bad} of {len(self.energy)} frames has no finite energy",
              "positions, body and time step must be finite", "look for NaN in stage and motion")  # fmt: skip
-        self.at_work = torch.arange(len(energy), device=start.device)
-        self.moving = torch.ones_like(energy, dtype=torch.bool)
-        self.gradient = potential.gradient(start, setting, self.planes)
+        self.at_work = torch.arange(len(self.energy), device=start.device)
+        self.moving = torch.ones_like(self.energy, dtype=torch.bool)
         self.best = Solution(
-            start.clone(), energy, potential.imbalance(self.gradient), torch.zeros_like(self.at_work), 0
+            start.clone(), self.energy.clone(), self.imbalance.clone(), torch.zeros_like(self.at_work), 0
         )
-        self.imbalance, self.lowest = self.best.imbalance.clone(), energy.clone()
+        self.lowest = self.energy.clone()
         self.alike = float(potential.mass[potential.free].sum()) * GRAVITY * FALL
 
     def narrowed(self) -> bool:
@@ -111,24 +115,34 @@ class _Search:
         if 0 < len(kept) < len(self.at_work):
             self.x, self.gradient, self.at_work = self.x[..., kept], self.gradient[..., kept], self.at_work[kept]
             self.setting, self.planes = self.setting.picked(kept), self.planes and self.planes.picked(kept)
+            self.held = self.held[:, kept]
         return len(kept) > 0
 
     def advance(self, settle: bool) -> None:
-        """Make one step; with `settle`, hold planes that would jump towards a vertex."""
-        potential, setting = self.potential, self.setting
-        step, count = newton_step(potential, self.x, setting, self.planes, self.gradient, self.options.inner)
-        length = line_search(potential, self.x, setting, self.planes, self.gradient, step)
-        self.x = self.x + length * step
+        """Make one step; with `settle`, vertices over which the body's surface would jump stay where they are."""
+        potential, setting, x, planes = self.potential, self.setting, self.x, self.planes
+        step, count = newton_step(potential, x, setting, planes, self.gradient, ~self.held, self.options.inner)
+        length = line_search(potential, x, setting, planes, self.gradient, step)
         self.moving, self.inner = length > 0, self.inner + count
-        fresh = potential.planes(self.x, setting)
-        self.planes = self.planes.renewed(fresh) if self.planes and fresh and settle else fresh
-        self.gradient = potential.gradient(self.x, setting, self.planes)
-        self.imbalance = potential.imbalance(self.gradient)
-        self._remember(potential.energy(self.x, setting, fresh))
+        self.x = x + length * step
+        self.planes = potential.planes(self.x, setting)
+        if settle and planes and self.planes:
+            jumps = planes.jumps(self.planes, self.x, x)
+            self.x, self.planes = torch.where(jumps[:, None], x, self.x), planes.mixed(self.planes, jumps)
+            self.held |= jumps
+        self._look()
+        self._remember()
 
-    def _remember(self, energy: Tensor) -> None:
-        """Keep the latest of the states whose energy, with fresh planes, is as low as any."""
-        best, rows = self.best, self.at_work
+    def _look(self) -> None:
+        """Evaluate the states that the search stands at."""
+        state = self.x, self.setting, self.planes
+        self.energy = self.potential.energy(*state)
+        self.gradient = self.potential.gradient(*state).masked_fill(self.held[:, None], 0)
+        self.imbalance = self.potential.imbalance(self.gradient)
+
+    def _remember(self) -> None:
+        """Keep the latest of the states whose energy is as low as any."""
+        best, rows, energy = self.best, self.at_work, self.energy
         best.iterations[rows] += 1
         better = energy <= self.lowest[rows] + self.alike
         rows = rows[better]
@@ -142,13 +156,25 @@ class _Search:
 
 
 def newton_step(
-    potential: Potential, x: Tensor, setting: Setting, planes: Planes | None, gradient: Tensor, inner: int
+    potential: Potential,
+    x: Tensor,
+    setting: Setting,
+    planes: Planes | None,
+    gradient: Tensor,
+    moves: Tensor,
+    inner: int,
 ) -> tuple[Tensor, int]:
-    """Return a direction of descent (V, 3, N), zero in pinned vertices, and the iterations that it took."""
+    """Return a direction of descent (V, 3, N) and the iterations that it took.
+
+    It is zero in pinned vertices and wherever `moves` (V, N) is false.
+    """
     matrix = potential.hessian(x, setting, planes)
     inverse = inverse_blocks(matrix.diagonal)
-    right = -gradient[potential.free].permute(2, 0, 1).float().contiguous()
-    z, count = solve(matrix.__matmul__, lambda r: (inverse * r[..., None, :]).sum(-1), right, REDUCTION, inner)
+    mask = moves[potential.free].T[..., None].float()
+    right = -gradient[potential.free].permute(2, 0, 1).float() * mask
+    z, count = solve(
+        lambda v: (matrix @ v) * mask, lambda r: (inverse * r[..., None, :]).sum(-1), right, REDUCTION, inner
+    )
     step = torch.zeros_like(x)
     step[potential.free] = z.permute(1, 2, 0).to(x.dtype)
     return step, count

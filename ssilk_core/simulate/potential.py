@@ -28,7 +28,7 @@ from .hessian import Hessian
 from .hinges import Hinges
 from .membrane import Membrane
 
-JUMP = 1.0  # of the way that a vertex has moved: a surface that comes closer by more has jumped
+SEAM = 5e-4  # [m]; a jump of the surface by less does not keep a vertex from settling
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,16 +58,10 @@ class Setting:
 
 @dataclass(frozen=True, eq=False)
 class Planes:
-    """Planes through the body points b nearest to positions `at` (V, 3, N).
-
-    Attributes:
-        normal: unit normals n, shape (V, 3, N).
-        offset: n . b [m], shape (V, N).
-    """
+    """Planes through the body points b nearest to vertices: unit normals n (V, 3, N) and offsets n . b (V, N) [m]."""
 
     normal: Tensor
     offset: Tensor
-    at: Tensor
 
     def distance(self, x: Tensor) -> Tensor:
         """Return signed distances [m], shape (V, N)."""
@@ -75,16 +69,16 @@ class Planes:
 
     def picked(self, frames: Tensor) -> Planes:
         """Return the planes of some of the frames, indices (M,)."""
-        return Planes(self.normal[..., frames], self.offset[..., frames], self.at[..., frames])
+        return Planes(self.normal[..., frames], self.offset[..., frames])
 
-    def renewed(self, fresh: Planes) -> Planes:
-        """Return `fresh` planes, but the old ones where they would jump towards a vertex that has hardly moved."""
-        jump = self.distance(fresh.at) - fresh.distance(fresh.at) > JUMP * (fresh.at - self.at).norm(dim=1)
-        wide = jump[:, None]
+    def jumps(self, fresh: Planes, x: Tensor, before: Tensor) -> Tensor:
+        """Return where the `fresh` planes of x are nearer than these by more than vertices moved from `before`."""
+        return self.distance(x) - fresh.distance(x) > (x - before).norm(dim=1).clamp_min(SEAM)
+
+    def mixed(self, fresh: Planes, own: Tensor) -> Planes:
+        """Return these planes where `own` (V, N), else the fresh ones."""
         return Planes(
-            torch.where(wide, self.normal, fresh.normal),
-            torch.where(jump, self.offset, fresh.offset),
-            torch.where(wide, self.at, fresh.at),
+            torch.where(own[:, None], self.normal, fresh.normal), torch.where(own, self.offset, fresh.offset)
         )
 
 
@@ -121,7 +115,7 @@ class Potential:
         distance = signed_distance(at, setting.body)
         (normal,) = torch.autograd.grad(distance.sum(), at)
         offset = (normal * at.detach()).sum(1) - distance.detach()
-        return Planes(normal.to(x.dtype), offset.to(x.dtype), x)
+        return Planes(normal.to(x.dtype), offset.to(x.dtype))
 
     def energy(self, x: Tensor, setting: Setting, planes: Planes | None) -> Tensor:
         """Return the energy [J] of each frame, shape (N,)."""

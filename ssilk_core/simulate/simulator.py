@@ -150,6 +150,10 @@ class Simulator:
         predicted = predicted.to(local.dtype)
         setting = Setting(poses.body, self.gravity.expand(3, local.shape[-1]), predicted, local, self.dt)
         start = self._best([self._pinned(x, poses) for x in (predicted, local, follows)], setting)
+        return self.solve(start, setting)
+
+    def solve(self, start: Tensor, setting: Setting) -> Solution:
+        """Return the minima of one step (V, 3, N), sought from `start`."""
         return minimise_from(self.potential, start, setting, self.options.solver)
 
     def _pinned(self, x: Tensor, poses: Poses) -> Tensor:

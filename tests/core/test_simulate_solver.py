@@ -177,7 +177,7 @@ def test_a_line_search_accepts_no_worse_state(potential: Potential, scene: Scene
     x, setting = moving(scene, 3)
     planes = potential.planes(x, setting)
     gradient = potential.gradient(x, setting, planes)
-    step, _ = newton_step(potential, x, setting, planes, gradient, 50)
+    step, _ = newton_step(potential, x, setting, planes, gradient, torch.ones_like(x[:, 0]).bool(), 50)
     wild = step * torch.tensor([1.0, 300.0, -1.0], dtype=torch.float64)
     length = line_search(potential, x, setting, planes, gradient, wild)
     assert length[0] > 0 and 0 < length[1] < 1 and length[2] == 0  # uphill, no step is good enough

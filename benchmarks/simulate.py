@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Time the reference simulator, and hold its energies against L-BFGS on the very same frames.
+
+    python benchmarks/simulate.py cape.usdc --motions FOLDER --device cuda --batch 1 16 64
+
+Shots are stretches of the clips, side by side; the quasi-static start is not timed. L-BFGS (PyTorch's, strong Wolfe)
+minimises each compared frame of the first shot from the same start, in float64, in rounds between which the nearest
+body points are found anew; its table rows are budgets of iterations. Energies are means over the compared frames,
+with the nearest body points of the final states.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from reports import table, write_results
+from ssilk_usd.read_motion import read_motion
+from ssilk_usd.read_scene import read_scene
+from subjects import parsed
+from torch import Tensor
+
+from ssilk_core.assets import Motion, Scene
+from ssilk_core.devices import chosen_device
+from ssilk_core.events import TextReporter
+from ssilk_core.fabrics import Fabric
+from ssilk_core.setup.prepare import prepare_scene
+from ssilk_core.simulate import SimulationOptions, Simulator
+from ssilk_core.simulate.newton import Solution, SolverOptions
+from ssilk_core.simulate.potential import Potential, Setting
+
+HEADER = ("method", "shots at once", "ms per frame and shot", "iterations", "of conjugate gradients",
+          "out of balance, median [g]", "within the tolerance", "energy [J]")  # fmt: skip
+ROUND = 50  # iterations of L-BFGS between looks at the body
+
+
+class Watched(Simulator):
+    """A simulator that keeps every step's problem and solution of the first shot, and times the steps."""
+
+    def __init__(self, scene: Scene, options: SimulationOptions, device: torch.device) -> None:
+        super().__init__(scene, Fabric("default"), options, device=device)
+        self.seconds: list[float] = []
+        self.problems: list[tuple[Tensor, Setting]] = []
+        self.solutions: list[Solution] = []
+
+    def solve(self, start: Tensor, setting: Setting) -> Solution:
+        """Solve one step."""
+        first = torch.zeros(1, dtype=torch.int64, device=start.device)
+        begun = now(start.device)
+        solution = super().solve(start, setting)
+        self.seconds.append(now(start.device) - begun)
+        self.problems.append((start[..., :1], setting.picked(first)))
+        self.solutions.append(solution)
+        return solution
+
+
+def now(device: torch.device) -> float:
+    """Return the time once a device has done its work [s]."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
+def shots(motions: Sequence[Motion], count: int, frames: int, fps: float) -> list[Motion]:
+    """Return `count` stretches of so many frames, spread over the clips in turn."""
+    found: list[Motion] = []
+    step = 0
+    while len(found) < count:
+        for motion in motions:
+            length = round(frames * motion.fps / fps)
+            start = step * length
+            if start + length <= motion.frame_count:
+                found.append(motion.clip(start, start + length))
+        step = step + 1 if any((step + 2) * frames * m.fps / fps <= m.frame_count for m in motions) else 0
+    return found[:count]
+
+
+def newton(scene: Scene, motions: Sequence[Motion], count: int, options: argparse.Namespace) -> Watched:
+    """Simulate `count` shots at once."""
+    settings = SimulationOptions(
+        batch=count, precision=options.precision, solver=SolverOptions(tolerance=options.tolerance)
+    )
+    simulator = Watched(scene, settings, chosen_device(options.device))
+    for _ in simulator.frames(shots(motions, count, options.frames, settings.fps)):
+        pass
+    return simulator
+
+
+def newton_figures(simulator: Watched, count: int) -> dict[str, Any]:
+    """Return the figures of one run; energies are those of the first shot."""
+    imbalance = torch.cat([s.imbalance for s in simulator.solutions])
+    return {
+        "shots": count,
+        "seconds": sum(simulator.seconds) / len(simulator.seconds) / count,
+        "iterations": float(torch.cat([s.iterations for s in simulator.solutions]).double().mean()),
+        "inner": sum(s.inner for s in simulator.solutions) / len(simulator.solutions),
+        "imbalance": float(imbalance.median()),
+        "solved": float((imbalance <= simulator.options.solver.tolerance).double().mean()),
+        "energy": sum(float(s.energy[0]) for s in simulator.solutions) / len(simulator.solutions),
+    }
+
+
+def by_lbfgs(potential: Potential, start: Tensor, setting: Setting, iterations: int) -> Tensor:
+    """Return the lowest state that L-BFGS passes at the ends of its rounds, (V, 3, 1)."""
+    free, best, lowest = potential.free, start, torch.inf
+    moved = start[free].clone().requires_grad_(True)
+    for _ in range(max(1, iterations // ROUND)):
+        planes = potential.planes(start.index_copy(0, free, moved.detach()), setting)
+        search = torch.optim.LBFGS([moved], max_iter=min(ROUND, iterations), history_size=20, tolerance_grad=1e-9,
+                                   tolerance_change=1e-14, line_search_fn="strong_wolfe")  # fmt: skip
+
+        def evaluate(search: torch.optim.Optimizer = search, planes: Any = planes) -> Tensor:
+            search.zero_grad()
+            value = potential.energy(start.index_copy(0, free, moved), setting, planes).sum()
+            value.backward()
+            return value
+
+        search.step(evaluate)
+        x = start.index_copy(0, free, moved.detach())
+        energy = float(potential.energy(x, setting, potential.planes(x, setting)))
+        best, lowest = (x, energy) if energy < lowest else (best, lowest)
+    return best
+
+
+def lbfgs_figures(simulator: Watched, iterations: int, frames: int) -> dict[str, Any]:
+    """Return the figures of L-BFGS on the first frames of the first shot."""
+    potential, problems = simulator.potential, simulator.problems[:frames]
+    begun = now(potential.free.device)
+    states = [by_lbfgs(potential, start, setting, iterations) for start, setting in problems]
+    seconds = (now(potential.free.device) - begun) / len(problems)
+    energy, imbalance = [], []
+    for x, (_, setting) in zip(states, problems):
+        planes = potential.planes(x, setting)
+        energy.append(float(potential.energy(x, setting, planes)))
+        imbalance.append(float(potential.imbalance(potential.gradient(x, setting, planes))))
+    tolerance = simulator.options.solver.tolerance
+    return {
+        "shots": 1,
+        "seconds": seconds,
+        "iterations": iterations,
+        "imbalance": float(torch.tensor(imbalance).median()),
+        "solved": sum(value <= tolerance for value in imbalance) / len(imbalance),
+        "energy": sum(energy) / len(energy),
+    }
+
+
+def row(method: str, found: dict[str, Any]) -> list[str]:
+    """Return one line of the table."""
+    inner = f"{found['inner']:.0f}" if "inner" in found else ""
+    return [method, str(found["shots"]), f"{1000 * found['seconds']:.1f}", f"{found['iterations']:.1f}", inner,
+            f"{found['imbalance']:.1e}", f"{found['solved']:.0%}", f"{found['energy']:.6f}"]  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("stage", type=Path, help="USD file with character and garment")
+    parser.add_argument("--motions", type=Path, required=True, metavar="FOLDER", help="folder of motion files")
+    parser.add_argument("--clips", nargs="+", default=["02_04"], help="their names (default 02_04)")
+    parser.add_argument("--frames", type=int, default=30, help="of each shot (default 30)")
+    parser.add_argument("--batch", type=int, nargs="+", default=[1], help="shots at once (default 1)")
+    parser.add_argument("--lbfgs", type=int, nargs="*", default=[100, 1000], help="budgets (default 100 1000)")
+    parser.add_argument("--compared", type=int, default=10, help="frames that L-BFGS minimises too (default 10)")
+    parser.add_argument("--tolerance", type=float, default=1e-2, help="[g] (default 0.01)")
+    parser.add_argument("--precision", default="float64", help="float64 (default) or float32")
+    parser.add_argument("--device", default="cpu", help="where everything runs (default cpu)")
+    parser.add_argument("--threads", type=int, default=2, help="processor threads (default 2)")
+    parser.add_argument("--name", help="of the result files (default: the script's)")
+    options = parsed(parser)
+    scene = prepare_scene(*read_scene(options.stage), report=TextReporter())
+    motions = [read_motion(options.motions / f"{clip}.usdc", scene.character.skeleton) for clip in options.clips]
+    rows, measured = [], {}
+    for count in options.batch:
+        simulator = newton(scene, motions, count, options)
+        measured[f"newton {count}"] = found = newton_figures(simulator, count)
+        rows.append(row("Newton", found))
+        print(table(HEADER, rows), flush=True)
+    compared = simulator.solutions[: options.compared]
+    energy = sum(float(s.energy[0]) for s in compared) / len(compared)
+    measured["newton compared"] = found = {**measured[f"newton {count}"], "energy": energy}
+    rows.append(row("Newton, compared frames", found))
+    for budget in options.lbfgs:
+        measured[f"lbfgs {budget}"] = found = lbfgs_figures(simulator, budget, options.compared)
+        rows.append(row(f"L-BFGS, {budget} iterations", found))
+        print(table(HEADER, rows), flush=True)
+    write_results(options, table(HEADER, rows), measured)
+
+
+if __name__ == "__main__":
+    main()
