@@ -58,9 +58,14 @@ class Team:
         return replace(config, **{name: getattr(config, name) // self.size for name in SHARED})
 
     def average(self, tensors: list[Tensor]) -> None:
-        """Replace tensors by their means over all processes, in one exchange that a CUDA graph can hold."""
+        """Replace tensors by their means over all processes, in one exchange that a CUDA graph can hold.
+
+        Raises:
+            SsilkError: another process has ended.
+        """
         flat = torch.cat([tensor.reshape(-1) for tensor in tensors])
-        dist.all_reduce(flat)
+        with self._others_needed():
+            dist.all_reduce(flat)
         parts = flat.div_(self.size).split([tensor.numel() for tensor in tensors])
         torch._foreach_copy_(tensors, [part.view_as(tensor) for part, tensor in zip(parts, tensors)])
 
@@ -77,14 +82,20 @@ class Team:
         if self.size == 1:
             return [value]
         values = [value] * self.size
-        try:
+        with self._others_needed():
             dist.all_gather_object(values, value)
-        except RuntimeError as error:
-            raise SsilkError(
-                f"process {self.rank} of {self.size}: another process of this training has ended; see what it "
-                "said, then train again with --resume."
-            ) from error
         return values
+
+    @contextmanager
+    def _others_needed(self) -> Iterator[None]:
+        try:
+            yield
+        except RuntimeError as error:
+            reason = str(error).partition("\n")[0].partition(". ")[0]
+            raise SsilkError(
+                f"process {self.rank + 1} of {self.size}: the others cannot be reached ({reason}); see whether one "
+                "has said why it ended, then train again with --resume."
+            ) from error
 
 
 ALONE = Team()

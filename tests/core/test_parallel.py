@@ -209,6 +209,17 @@ def test_batches_are_divided_equally_or_refused():
         Team(0, 3).part(replace(SHORT, warm_batch=9))
 
 
+def test_that_another_process_has_ended_is_told(monkeypatch):
+    def broken(*given: object) -> None:
+        raise RuntimeError("[pair.cc:1] Connection closed by peer. This is\nnews")
+
+    for name in ("all_reduce", "all_gather_object"):
+        monkeypatch.setattr(torch.distributed, name, broken)
+    for exchange in (lambda: Team(1, 2).average([torch.zeros(1)]), lambda: Team(1, 2).any(True)):
+        with pytest.raises(SsilkError, match=r"^process 2 of 2: .*\(\[pair.cc:1\] Connection closed by peer\); see"):
+            exchange()
+
+
 def test_without_torchrun_a_process_is_alone(monkeypatch):
     for name in LAUNCHED:
         monkeypatch.delenv(name, raising=False)
