@@ -15,7 +15,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-FRAMES = 64  # frames that a program of `_pack` turns from last to first
+FRAMES = 32  # frames that a program of `_pack` turns from last to first
 CHUNK = 64  # groups whose boxes are compared with a block's at once
 RUN = 4  # blocks that a program of `_search` takes in turn, so that boxes stay in its cache
 # A gap is rounded no further than this share of itself, so no group is left out by rounding.
@@ -44,7 +44,7 @@ def by_frame(points: Tensor, table: Tensor) -> tuple[Tensor, Tensor]:
     packed = points.new_empty(frames, 3, rows * size)
     boxes = points.new_empty(frames, 6, rows)
     grid = (rows, triton.cdiv(frames, FRAMES))
-    _pack[grid](points.contiguous(), table, packed, boxes, frames, rows, size, FRAMES)
+    _pack[grid](points, table, packed, boxes, frames, rows, size, FRAMES, num_warps=1)
     return packed, boxes
 
 
