@@ -5,7 +5,8 @@ Each iteration solves with the positive Hessian to a tenth of the residual, then
 fallen enough; the planes of the body hold still meanwhile, and are found anew before the next. The distance to the
 nearest point of a mesh is not continuous, and a vertex pushed to and fro over a seam would never settle: after some
 iterations, a vertex that the surface would jump towards stays before the seam, as if pinned, until the frame is
-solved. Of all states on the way the one of lowest energy is returned.
+solved. Then all are released once more, for as long as that lowers the energy. Of all states on the way the one of
+lowest energy is returned.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ SUFFICIENT = 1e-4  # share of the slope that a step has to gain
 HALVINGS = 12
 REDUCTION = 0.1  # of the residual by each linear solution
 FALL = 1e-4  # [m]; states whose energies differ by less than such a fall of the garment count as equally low
-FREE = 20  # iterations in which every vertex may cross seams
+FREE = 12  # iterations in which every vertex may cross seams, at first and after each release
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,10 +80,10 @@ def minimise_from(potential: Potential, start: Tensor, setting: Setting, options
         SsilkError: the energy of the start is not finite.
     """
     search = _Search(potential, start, setting, options)
-    for done in range(options.iterations):
+    for _ in range(options.iterations):
         if not search.narrowed():
             break
-        search.advance(settle=done >= FREE)
+        search.advance()
     return search.solution()
 
 
@@ -107,29 +108,42 @@ class _Search:
             start.clone(), self.energy.clone(), self.imbalance.clone(), torch.zeros_like(self.at_work), 0
         )
         self.lowest = self.energy.clone()
+        self.since, self.mark = torch.zeros_like(self.at_work), torch.full_like(self.energy, torch.inf)
         self.alike = float(potential.mass[potential.free].sum()) * GRAVITY * FALL
 
     def narrowed(self) -> bool:
         """Leave out frames that are solved or cannot be improved; return whether any is left."""
-        kept = (self.moving & (self.imbalance > self.options.tolerance)).nonzero()[:, 0]
+        kept = ((self.moving & (self.imbalance > self.options.tolerance)) | self._released()).nonzero()[:, 0]
         if 0 < len(kept) < len(self.at_work):
             self.x, self.gradient, self.at_work = self.x[..., kept], self.gradient[..., kept], self.at_work[kept]
             self.setting, self.planes = self.setting.picked(kept), self.planes and self.planes.picked(kept)
-            self.held = self.held[:, kept]
+            self.held, self.since, self.mark = self.held[:, kept], self.since[kept], self.mark[kept]
         return len(kept) > 0
 
-    def advance(self, settle: bool) -> None:
-        """Make one step; with `settle`, vertices over which the body's surface would jump stay where they are."""
+    def _released(self) -> Tensor:
+        """Let go of held vertices in solved frames that the last such time has helped; return which, (N,)."""
+        solved = ~self.moving | (self.imbalance <= self.options.tolerance)
+        again = solved & self.held.any(0) & (self.energy < self.mark - self.alike)
+        if bool(again.any()):
+            self.held &= ~again
+            self.since.masked_fill_(again, 0)
+            self.mark = torch.where(again, self.energy, self.mark)
+            self._look()
+        return again
+
+    def advance(self) -> None:
+        """Make one step."""
         potential, setting, x, planes = self.potential, self.setting, self.x, self.planes
         step, count = newton_step(potential, x, setting, planes, self.gradient, ~self.held, self.options.inner)
         length = line_search(potential, x, setting, planes, self.gradient, step)
         self.moving, self.inner = length > 0, self.inner + count
         self.x = x + length * step
         self.planes = potential.planes(self.x, setting)
-        if settle and planes and self.planes:
-            jumps = planes.jumps(self.planes, self.x, x)
+        if planes and self.planes:
+            jumps = planes.jumps(self.planes, self.x, x) & (self.since >= FREE)
             self.x, self.planes = torch.where(jumps[:, None], x, self.x), planes.mixed(self.planes, jumps)
             self.held |= jumps
+        self.since += 1
         self._look()
         self._remember()
 
