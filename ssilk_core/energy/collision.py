@@ -68,12 +68,11 @@ def _by_kernels(x: Tensor, body: PosedBody, blocks: Tensor | None) -> tuple[Tens
     from ..kernels.nearest import nearest_kernel
     from ..kernels.surface import surface_kernel
 
-    x, points, normals = x.contiguous(), body.points.contiguous(), body.normals.contiguous()
     blocks = consecutive_blocks(len(x), BLOCK, x.device) if blocks is None else blocks
-    groups = consecutive_blocks(len(points), GROUP, x.device) if body.groups is None else body.groups
-    index = nearest_kernel(x, points, blocks, groups)
-    rings = index.new_zeros(len(points), 1) if body.rings is None else body.rings
-    return surface_kernel(x, index, points, normals, rings, FAR)
+    groups = consecutive_blocks(len(body.points), GROUP, x.device) if body.groups is None else body.groups
+    index = nearest_kernel(x, body.points, blocks, groups)
+    rings = index.new_zeros(len(body.points), 1) if body.rings is None else body.rings
+    return surface_kernel(x, index, body.points, body.normals, rings, FAR)
 
 
 def _on_triangles(

@@ -44,7 +44,7 @@ def by_frame(points: Tensor, table: Tensor) -> tuple[Tensor, Tensor]:
     packed = points.new_empty(frames, 3, rows * size)
     boxes = points.new_empty(frames, 6, rows)
     grid = (rows, triton.cdiv(frames, FRAMES))
-    _pack[grid](points, table, packed, boxes, frames, rows, size, FRAMES, num_warps=1)
+    _pack[grid](points.contiguous(), table, packed, boxes, frames, rows, size, FRAMES, num_warps=1)
     return packed, boxes
 
 

@@ -29,6 +29,7 @@ def surface_kernel(
         rings: neighbours around each vertex (`energy.surface_point.triangle_rings`), int32.
         far: further than this from its nearest vertex [m], a query keeps that as its nearest point.
     """
+    x, points, normals = x.contiguous(), points.contiguous(), normals.contiguous()
     vertices, _, frames = x.shape
     assert points.numel() < 1 << 31  # body vertices are addressed by 32 bits
     normal, offset = torch.empty_like(x), x.new_empty(vertices, frames)

@@ -344,7 +344,7 @@ def test_kernels_find_the_planes_that_their_twins_find(case, toy_grid):
     around = mesh.vertices + 0.003 * rng.normal(size=(3, *mesh.vertices.shape))
     points, normals = (torch.tensor(v, dtype=torch.float32) for v in (around.transpose(1, 2, 0), mesh.vertex_normals))
     rings = None if case == "vertices" else torch.as_tensor(triangle_rings(mesh.faces, len(points)))
-    body = PosedBody(points, normals[:, :, None].expand(-1, -1, 3).contiguous(), rings)
+    body = PosedBody(points, normals[:, :, None].expand(-1, -1, 3), rings)
     x = torch.tensor(mesh.sample(7, seed=1)[:, :, None] + 0.02 * rng.normal(size=(7, 3, 3)), dtype=torch.float32)
     x[-1, :, 1] -= 0.4  # nothing but the nearest vertex counts this far away
     expected = nearest_planes(x, body)
