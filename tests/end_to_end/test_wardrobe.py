@@ -164,8 +164,13 @@ time.sleep(60)
 
 
 def test_a_stop_asks_those_that_run_and_starts_no_more(tmp_path):
-    heard = Heard([{}, {}])
-    threading.Timer(1.0, heard.stop.set).start()
+    class Stopping(Heard):
+        def tell(self, name: str, event: Said) -> None:
+            super().tell(name, event)
+            if [said for _, said in self.said] == [Message("begun")] * 2:
+                self.stop.set()
+
+    heard = Stopping([{}, {}])
     ends = heard.run(*(task(tmp_path, name, GENTLE) for name in "abc"))
     assert {name: end.code for name, end in ends.items()} == {"a": 130, "b": 130}
     assert sum(event == Message("stopped") for _, event in heard.said) == 2
