@@ -1,4 +1,4 @@
-# `make demo` trains, bakes, verifies and films a cape; `make test` runs every check.
+# `make demo` films a cape that ships trained, then trains, bakes, verifies and films a draft; `make test` runs every check.
 # Both create the environment they need in .venv; only Python 3.11 (or later) and make must be there.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv

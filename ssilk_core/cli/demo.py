@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Dress the demo body, train a cape as a draft, bake it, verify it, and show it beside plain skinning.
+"""Film a garment that ships trained beside plain skinning, then train a draft of it and film that beside both.
 
-Everything the demo does is a command that can be typed: each is printed before it runs.
+Everything the demo does is a command that can be typed: each is printed before it runs. --pretrained leaves the
+training out.
 """
 
 from __future__ import annotations
@@ -9,17 +10,22 @@ from __future__ import annotations
 import argparse
 import shlex
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ssilk_core.errors import EXIT_OK
 from ssilk_core.events import Message, Reporter, Result
+
+if TYPE_CHECKING:
+    from ssilk_core.assets import Mesh
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
     verb.add_argument("--out", type=Path, default=Path("demo_out"), help="folder for all of it (default demo_out)")
     verb.add_argument(
-        "--garment", choices=("cape", "fringe_skirt", "hooded_dress"), default="cape", help="what to train"
+        "--garment", choices=("cape", "fringe_skirt", "hooded_dress"), default="cape", help="what to show"
     )
+    verb.add_argument("--pretrained", action="store_true", help="show the shipped model and train nothing")
     verb.add_argument("--preset", default="draft", help="schedule of the training (default draft)")
     verb.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", dest="settings", help="as in 'ssilk train'"
@@ -29,34 +35,63 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Make the inputs, then run the commands; the first that fails ends the demo with its exit code."""
     from ssilk_core.cli import main
+    from ssilk_core.demo.shipped import open_shipped, origin
 
-    _make_inputs(options.out, report)
-    for command in _commands(options):
+    wardrobe = _make_inputs(options.out, report)
+    shipped = open_shipped(options.garment, wardrobe[options.garment])
+    report(Message(f"shipped {options.garment}: {origin(shipped)}"))
+    commands = _shipped(options) + ([] if options.pretrained else _trained(options))
+    for command in commands:
         report(Message("\n$ ssilk " + shlex.join(command)))
         code = main([*command, "--json"] if options.json else command)
         if code != EXIT_OK:
             return code
-    report(Result("demo", {"film": str(options.out / "film.mp4"), "contact sheet": str(options.out / "sheet.png")}))
+    shown = ["shipped"] if options.pretrained else ["shipped", options.preset]
+    report(Result("demo", {f"{name} film": str(options.out / f"{name}.mp4") for name in shown}))
     return EXIT_OK
 
 
-def _commands(options: argparse.Namespace) -> list[list[str]]:
-    out, garment = options.out, options.garment
-    stage, model, motion = (
-        str(out / f"{garment}_stage.usdc"),
-        str(out / f"{garment}.safetensors"),
-        str(out / "shot.usdc"),
-    )
-    plain, baked = str(out / "plain.usdc"), str(out / f"{garment}_shot.usdc")
-    view = ["view", plain, baked, "--label", "plain skinning", "--label", "SSILK"]
+def _shipped(options: argparse.Namespace) -> list[list[str]]:
+    """Return the commands that bake and film the shipped model; its body is the character, its file the garment."""
+    from ssilk_core.demo.shipped import shipped_path
+
+    shots = _shots(options)
+    bake = ["bake", str(shipped_path(options.garment)), "--stage", str(_body())]
+    bake += ["--motion", str(options.out / "shot.usdc")]
+    return [
+        [*bake, "-o", shots["plain skinning"], "--plain"],
+        [*bake, "-o", shots["shipped"]],
+        *_views(options.out / "shipped", {name: shots[name] for name in ("plain skinning", "shipped")}),
+    ]
+
+
+def _trained(options: argparse.Namespace) -> list[list[str]]:
+    """Return the commands that rig the garment, train it, and film it between plain skinning and what ships."""
+    out, garment, preset, shots = options.out, options.garment, options.preset, _shots(options)
+    stage, model = str(out / f"{garment}_stage.usdc"), str(out / f"{garment}_{preset}.safetensors")
     settings = [word for setting in options.settings for word in ("--set", setting)]
     return [
         ["rig", str(_body()), "--garment", str(out / "wardrobe" / f"{garment}.usdc"), "-o", stage],
-        ["train", stage, "--motions", str(out / "motions"), "-o", model, "--preset", options.preset, *settings],
-        ["bake", model, "--stage", stage, "--motion", motion, "-o", baked],
-        ["bake", model, "--stage", stage, "--motion", motion, "-o", plain, "--plain"],
-        [*view, "-o", str(out / "sheet.png"), "--azimuth", "150", "--columns", "8"],
-        [*view, "-o", str(out / "film.mp4"), "--azimuth", "150", "--size", "400x480"],
+        ["train", stage, "--motions", str(out / "motions"), "-o", model, "--preset", preset, *settings],
+        ["bake", model, "--stage", stage, "--motion", str(out / "shot.usdc"), "-o", shots[preset]],
+        *_views(out / preset, shots),
+    ]
+
+
+def _shots(options: argparse.Namespace) -> dict[str, str]:
+    """Return the shots by what their panels are called, in the order of the film."""
+    files = {"plain skinning": "plain", options.preset: f"{options.garment}_{options.preset}"}
+    files["shipped"] = f"{options.garment}_shipped"
+    return {name: str(options.out / f"{file}.usdc") for name, file in files.items()}
+
+
+def _views(stem: Path, shots: dict[str, str]) -> list[list[str]]:
+    """Return the commands that draw shots as a sheet and as a film."""
+    labels = [word for name in shots for word in ("--label", name)]
+    view = ["view", *shots.values(), *labels, "--azimuth", "150"]
+    return [
+        [*view, "-o", f"{stem}.png", "--columns", "8"],
+        [*view, "-o", f"{stem}.mp4", "--size", "320x384"],
     ]
 
 
@@ -66,8 +101,8 @@ def _body() -> Path:
     return demo_body_path()
 
 
-def _make_inputs(out: Path, report: Reporter) -> None:
-    """Write the wardrobe, the motions to train on, and the shot to bake."""
+def _make_inputs(out: Path, report: Reporter) -> dict[str, Mesh]:
+    """Write the wardrobe, the motions to train on, and the shot to bake; return the wardrobe."""
     from ssilk_usd.read_character import read_character
     from ssilk_usd.write import write_garment, write_motion
 
@@ -75,8 +110,8 @@ def _make_inputs(out: Path, report: Reporter) -> None:
     from ssilk_core.demo.motions import demo_shot, training_motions
 
     character = read_character(_body())
-    for name in GARMENTS:
-        mesh = build_garment(name, character).mesh
+    wardrobe = {name: build_garment(name, character).mesh for name in GARMENTS}
+    for name, mesh in wardrobe.items():
         write_garment(out / "wardrobe" / f"{name}.usdc", mesh)
         report(Message(f"made {name}: {mesh.vertex_count} vertices"))
     motions = training_motions(character.skeleton)
@@ -85,3 +120,4 @@ def _make_inputs(out: Path, report: Reporter) -> None:
     write_motion(out / "shot.usdc", demo_shot(character.skeleton), character.skeleton)
     seconds = sum(motion.frame_count / motion.fps for motion in motions)
     report(Message(f"made {len(motions)} motions of {seconds:.0f} s to train on, and a shot to bake"))
+    return wardrobe

@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trained models of the wardrobe that ship with the package, on the demo's body."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ssilk_core.assets import Mesh
+from ssilk_core.checkpoint import ModelFile, load_model
+from ssilk_core.errors import need
+
+FOLDER = Path(__file__).with_name("models")
+TOLERANCE = 1e-4  # [m] between the garment that a model was trained on and the one that is built here
+
+
+def shipped_path(garment: str) -> Path:
+    """Return where the shipped model of a garment of the wardrobe lies."""
+    return FOLDER / f"{garment}.safetensors"
+
+
+def open_shipped(garment: str, mesh: Mesh) -> ModelFile:
+    """Load the shipped model of a garment.
+
+    Args:
+        garment: its name in the wardrobe.
+        mesh: the garment as it is built here.
+
+    Raises:
+        SsilkError: there is no such file, it cannot be read, or it was trained on another mesh.
+    """
+    path = shipped_path(garment)
+    need(path.is_file(), str(path), "the shipped model is missing", "it comes with the package",
+         "install the package again")  # fmt: skip
+    file = load_model(path)
+    need_trained_on(mesh, file, path)
+    return file
+
+
+def need_trained_on(mesh: Mesh, file: ModelFile, path: Path) -> None:
+    """Raise `SsilkError` unless a model's garment is `mesh`: the same faces, and points to within `TOLERANCE`."""
+    own, todo = file.scene.garment.mesh, "train it again on the garment as it is now"
+    need(np.array_equal(own.faces, mesh.faces), str(path),
+         f"trained on a garment of {own.vertex_count} vertices and {len(own.faces)} triangles",
+         f"{mesh.path} has {mesh.vertex_count} and {len(mesh.faces)}, connected as they are built here",
+         todo)  # fmt: skip
+    away = np.abs(own.points - mesh.points).max()
+    need(away < TOLERANCE, str(path), f"trained on a garment that is {away:.3g} m away from {mesh.path}",
+         f"at most {TOLERANCE:g} m is allowed", todo)  # fmt: skip
+
+
+def origin(file: ModelFile) -> str:
+    """Return in words how a shipped model came to be."""
+    made, shipped = file.provenance, file.provenance["shipped"]
+    return (
+        f"{made['iteration']:,} iterations on {len(made['motions'])} motions, seed {made['seed']}, {made['device']}, "
+        f"ssilk {made['ssilk']}, {shipped['date']}; on {shipped['held-out clips']} motions that it never saw "
+        f"{shipped['energy [J]']:.3g} J against plain skinning's {shipped['plain skinning [J]']:.3g} J, "
+        f"{shipped['inside the body']:.2%} of its vertices inside the body; stored to 16 bits, "
+        f"no vertex more than {1000 * shipped['largest error [m]']:.1g} mm off"
+    )

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The demo: models that ship fit what it builds, and all that it does is commands that a user can type."""
+
+from __future__ import annotations
+
+import shlex
+from argparse import Namespace
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ssilk_usd.read_character import read_character
+from ssilk_usd.stages import demo_body_path
+from ssilk_usd.write import write_garment
+
+from ssilk_core.assets import Garment, Motion, Scene, Skeleton
+from ssilk_core.checkpoint import ModelFile, load_model, save_model
+from ssilk_core.cli import demo, main, parser
+from ssilk_core.cli.options import load_scene
+from ssilk_core.demo import garments, motions, shipped
+from ssilk_core.events import silent
+
+SHORT = shlex.split(
+    "--set iterations=2 --set warm=0.5 --set validate_every=2 --set valid_frames=4 --set batch=1 --set warm_batch=4 "
+    "--set window=3"
+)
+
+
+@cache
+def wardrobe() -> dict[str, Garment]:
+    character = read_character(demo_body_path())
+    return {name: garments.build_garment(name, character) for name in garments.GARMENTS}
+
+
+@pytest.fixture
+def brief(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A wardrobe that is built once, a shot of six frames instead of 225, and two short motions instead of twenty."""
+    built, every, shot = wardrobe(), motions.training_motions, motions.demo_shot
+
+    def few(skeleton: Skeleton) -> list[Motion]:
+        return [motion.clip(0, 8) for motion in every(skeleton)[:2]]
+
+    monkeypatch.setattr(garments, "build_garment", lambda name, character: built[name])
+    monkeypatch.setattr(motions, "training_motions", few)
+    monkeypatch.setattr(motions, "demo_shot", lambda skeleton: shot(skeleton).clip(60, 66))
+
+
+def rigged(garment: str, folder: Path) -> Scene:
+    """Return the scene of the stage that the demo's own command rigs."""
+    write_garment(folder / "wardrobe" / f"{garment}.usdc", wardrobe()[garment].mesh)
+    chosen = Namespace(out=folder, garment=garment, preset="draft", settings=[])
+    rig = demo._trained(chosen)[0]
+    assert rig[0] == "rig" and main(rig) == 0
+    return load_scene(parser().parse_args(["rig", rig[-1], "-o", "unused"]), silent)
+
+
+@pytest.mark.parametrize("garment", garments.GARMENTS)
+def test_shipped_models_fit_what_the_demo_builds(garment, tmp_path):
+    """The garment, its classes, its weights and its rig, to the rounding of a stage."""
+    built, model = rigged(garment, tmp_path), load_model(shipped.shipped_path(garment))
+    mine, theirs = model.scene, replace(built, character=replace(built.character, bodies=()))
+    assert mine.joint_names == theirs.joint_names
+    for name in ("parents", "classes"):
+        np.testing.assert_array_equal(getattr(mine, name), getattr(theirs, name))
+    np.testing.assert_array_equal(mine.garment.mesh.faces, theirs.garment.mesh.faces)
+    np.testing.assert_allclose(mine.garment.mesh.points, theirs.garment.mesh.points, atol=1e-5)
+    np.testing.assert_allclose(mine.bind_transforms, theirs.bind_transforms, atol=1e-5)
+    count = len(mine.joint_names)
+    np.testing.assert_allclose(mine.plain_skin.dense(count), theirs.plain_skin.dense(count), atol=1e-4)
+    np.testing.assert_allclose(mine.rig.skin.dense(count), theirs.rig.skin.dense(count), atol=1e-4)
+
+
+def typed(said: str) -> list[list[str]]:
+    """Return the commands that the demo printed; each must be one that the command line takes."""
+    commands = [shlex.split(line)[2:] for line in said.splitlines() if line.startswith("$ ssilk ")]
+    for command in commands:
+        parser().parse_args(command)
+    return commands
+
+
+@pytest.mark.usefixtures("brief")
+def test_the_shipped_model_is_filmed_without_any_training(tmp_path, capsys):
+    assert main(["demo", "--pretrained", "--out", str(tmp_path)]) == 0
+    said = capsys.readouterr().err
+    assert [command[0] for command in typed(said)] == ["bake", "bake", "view", "view"]
+    made = load_model(shipped.shipped_path("cape")).provenance
+    assert f"shipped cape: {made['iteration']:,} iterations on {len(made['motions'])} motions, seed" in said
+    assert {path.name for path in tmp_path.iterdir()} == {
+        *("wardrobe", "motions", "shot.usdc", "plain.usdc", "cape_shipped.usdc", "shipped.png", "shipped.mp4")
+    }
+
+
+@pytest.mark.usefixtures("brief")
+def test_the_draft_is_trained_and_filmed_beside_what_ships(tmp_path, capsys):
+    assert main(["demo", "--out", str(tmp_path), *SHORT]) == 0
+    commands = typed(capsys.readouterr().err)
+    assert [command[0] for command in commands[4:]] == ["rig", "train", "bake", "view", "view"]
+    names = ("plain.usdc", "cape_draft.usdc", "cape_shipped.usdc")
+    assert commands[-1][1:4] == [str(tmp_path / name) for name in names]
+    for name in ("cape_draft.safetensors", "shipped.mp4", "draft.mp4", "draft.png"):
+        assert (tmp_path / name).stat().st_size > 1000
+
+
+def thinner(model: ModelFile) -> ModelFile:
+    mesh = model.scene.garment.mesh
+    bare = replace(mesh, faces=mesh.faces[1:], polygon_counts=None, polygon_indices=None, uvs=None)
+    return replace(model, scene=replace(model.scene, garment=replace(model.scene.garment, mesh=bare)))
+
+
+def longer(model: ModelFile) -> ModelFile:
+    mesh = model.scene.garment.mesh
+    moved = replace(mesh, points=mesh.points * 1.01)
+    return replace(model, scene=replace(model.scene, garment=replace(model.scene.garment, mesh=moved)))
+
+
+@pytest.mark.usefixtures("brief")
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (None, "the shipped model is missing"),
+        (thinner, "trained on a garment of 2718 vertices and 5225 triangles"),
+        (longer, "m away from /Cape"),
+    ],
+)
+def test_a_shipped_model_that_is_missing_or_of_another_garment_is_refused(
+    change: Callable[[ModelFile], ModelFile] | None, words, tmp_path, monkeypatch, capsys
+):
+    model = load_model(shipped.shipped_path("cape"))
+    monkeypatch.setattr(shipped, "FOLDER", tmp_path)
+    if change:
+        save_model(shipped.shipped_path("cape"), change(model))
+    assert main(["demo", "--pretrained", "--out", str(tmp_path / "out")]) == 2
+    error = next(line for line in capsys.readouterr().err.splitlines() if line.startswith("error: "))
+    assert words in error and str(tmp_path) in error and error.endswith(".")
+    assert not (tmp_path / "out" / "shipped.mp4").exists()
