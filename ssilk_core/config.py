@@ -41,7 +41,7 @@ class ModelConfig:
     shapes: int = 64
     scheme: str = "spring_verlet"
     bound: float = 4.0
-    push: float = 0.15
+    push: float = 0.3
     stiffness: float = 0.2
     fps: float = 30.0
 
@@ -67,7 +67,7 @@ class TrainConfig:
         iterations: optimiser steps, warm start included.
         warm: share of the iterations that train P and D alone on single poses (quasi-static warm start).
         warm_batch: poses for each step of the warm start.
-        batch, window: windows for each step, and poses in each window.
+        batch, window: windows for each step, and poses in each window, the two before the first new one included.
         carry: share of windows that continue from the state where the last window of their slot ended.
         rotated: share of windows that get a random rotation, uniform on SO(3); the others stay upright.
         resting: single poses that go on training the initialiser beside the windows.
@@ -88,9 +88,9 @@ class TrainConfig:
     iterations: int = 250_000
     warm: float = 0.1
     warm_batch: int = 1024
-    batch: int = 32
-    window: int = 32
-    carry: float = 0.7
+    batch: int = 256
+    window: int = 6
+    carry: float = 0.97
     rotated: float = 0.5
     resting: int = 64
     kick: float = 0.03
@@ -146,6 +146,8 @@ PRESETS = {
                 warm_rate=2e-3,
                 batch=4,
                 window=16,
+                carry=0.7,
+                resting=8,
                 rotated=0.3,
                 rate=6e-4,
                 final_rate=1e-4,
@@ -159,9 +161,9 @@ PRESETS = {
         Preset(
             name="preview",
             model=ModelConfig(),
-            train=TrainConfig(iterations=8_000, warm=0.3, warm_batch=1024, batch=32, window=32, validate_every=800),
+            train=TrainConfig(iterations=8_000, warm=0.3, validate_every=800),
         ),
-        Preset(name="final", model=ModelConfig(), train=TrainConfig()),
+        Preset(name="final", model=ModelConfig(), train=TrainConfig(average=0.9995)),
     )
 }
 

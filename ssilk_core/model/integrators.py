@@ -31,15 +31,21 @@ class Integrator(nn.Module, ABC):
     With `config.bound` each new state is limited, so that it can never leave the range where the decoder was
     trained, however long the rollout.
 
+    Args:
+        config: bounds and sizes.
+        rates: how many of the last entries of a dynamic descriptor are zero while the character holds still.
+
     Attributes:
         states: latent vectors that the stepper S sees beside the pose.
+        centred: whether only differences of what S gives are used, so that a bias of its last layer would do nothing.
     """
 
     states = 2
+    centred = False
 
-    def __init__(self, config: ModelConfig) -> None:
+    def __init__(self, config: ModelConfig, rates: int = 0) -> None:
         super().__init__()
-        self.config = config
+        self.config, self.rates = config, rates
 
     def forward(self, stepper: nn.Module, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor) -> Tensor:
         """Return z_t, shape (batch, latent).
@@ -66,8 +72,8 @@ class Verlet(Integrator):
     With `config.push` what S adds in a step, a latent acceleration, is limited: the state cannot be flung.
     """
 
-    def __init__(self, config: ModelConfig) -> None:
-        super().__init__(config)
+    def __init__(self, config: ModelConfig, rates: int = 0) -> None:
+        super().__init__(config, rates)
         self.alpha = nn.Parameter(torch.full((config.latent,), 1.0))
         # 1 would turn noise on the first two states into a steady drift; 0.9 lets it die within a second.
         self.beta = nn.Parameter(torch.full((config.latent,), 0.9))
@@ -81,33 +87,43 @@ class Verlet(Integrator):
 
 
 class SpringVerlet(Verlet):
-    """Eq. 3 with a spring: z_t = zbar + k (P(theta_t) - zbar) + s S([z_{t-1}, v, d, pose]).
+    """Eqs. 2 and 3 about the quasi-static state p = P(theta_t), with a spring towards it.
 
-    S sees the state, its velocity v = z_{t-1} - z_{t-2} and its distance d = P(theta_t) - zbar from rest, each
-    scaled to order one: given as states side by side, velocities would be small differences of large inputs, and
-    those are learnt last. `reach` s scales what S gives to what it has to give.
+        zbar = p + alpha (z_{t-1} - p) + beta v,    v = z_{t-1} - z_{t-2}
+        z_t = zbar + k (p - zbar) + s (S(z_{t-1}, v, p - zbar, pose) - S(p, 0, 0, pose held still))
 
-    Without S every dimension is a damped spring towards the quasi-static state, stable for any k in (0, 1]; S
-    learns what such a spring misses. Stiffnesses start spread from slow swings to quick following and stay under
-    `config.stiffness`; spring and S together are limited by `config.push`.
+    Without S every dimension is a damped spring, stable for any k in (0, 1]; S learns what such a spring misses.
+    What S would do to a garment at rest under a character that holds still is taken off, so that the garment rests
+    at p exactly: where gravity alone pulls, an error of a millimetre a frame is a tenth of gravity, and no loss
+    that also holds stretch and collisions can see it. Stiffnesses start spread from slow swings to quick following
+    and stay under `config.stiffness`; spring and S together are limited by `config.push`.
+
+    S sees velocities and distances themselves, scaled to order one: given as states side by side they would be
+    small differences of large inputs, and those are learnt last. `reach` s scales S to what it has to give.
     """
 
     states = 3
+    centred = True
     slowest = 0.01
+    most = 100.0  # of what S gives; far beyond what a push lets through, and finite
     velocity_scale, distance_scale, reach = 10.0, 3.0, 0.1
 
-    def __init__(self, config: ModelConfig) -> None:
-        super().__init__(config)
+    def __init__(self, config: ModelConfig, rates: int = 0) -> None:
+        super().__init__(config, rates)
         slowest = min(self.slowest, 0.05 * config.stiffness)
         start = torch.logspace(math.log10(slowest), math.log10(0.9 * config.stiffness), config.latent)
         self.share = nn.Parameter(torch.logit(start / config.stiffness))
 
     def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor) -> Tensor:
-        forward = self.extrapolated(before, now)
-        away = rest - forward
-        seen = [now, self.velocity_scale * (now - before), self.distance_scale * away, pose]
+        velocity = now - before
+        away = -self.alpha * (now - rest) - self.beta * velocity
+        seen = torch.cat([now, self.velocity_scale * velocity, self.distance_scale * away, pose], dim=1)
+        nothing = torch.zeros_like(rest)
+        still = torch.cat([pose[:, : pose.shape[1] - self.rates], pose.new_zeros(len(pose), self.rates)], dim=1)
+        calm = torch.cat([rest, nothing, nothing, still], dim=1)
+        moved, held = stepper(torch.cat([seen, calm])).clamp(-self.most, self.most).chunk(2)
         pull = self.config.stiffness * torch.sigmoid(self.share) * away
-        return forward + limited(pull + self.reach * stepper(torch.cat(seen, dim=1)), self.config.push)
+        return rest - away + limited(pull + self.reach * (moved - held), self.config.push)
 
 
 class Direct(Integrator):

@@ -17,17 +17,20 @@ from .descriptors import joints_in_view
 from .integrators import INTEGRATORS
 
 
-def mlp(inputs: int, widths: tuple[int, ...], outputs: int, generator: torch.Generator, last: float) -> nn.Sequential:
-    """Return a smooth multilayer perceptron; the last layer starts `last` times its usual size."""
+def mlp(
+    inputs: int, widths: tuple[int, ...], outputs: int, generator: torch.Generator, last: float, bias: bool = True
+) -> nn.Sequential:
+    """Return a smooth multilayer perceptron; its last layer starts `last` times its usual size, with a `bias` or not."""
     sizes = [inputs, *widths, outputs]
     layers: list[nn.Module] = []
     for index, (fan_in, fan_out) in enumerate(pairwise(sizes)):
-        linear = nn.Linear(fan_in, fan_out)
         final = index == len(sizes) - 2
+        linear = nn.Linear(fan_in, fan_out, bias=bias or not final)
         with torch.no_grad():
             scale = (last if final else 1.0) * (2 / fan_in) ** 0.5
             linear.weight.copy_(scale * torch.randn(fan_out, fan_in, generator=generator))
-            linear.bias.zero_()
+            if linear.bias is not None:
+                linear.bias.zero_()
         layers += [linear] if final else [linear, nn.SiLU()]
     return nn.Sequential(*layers)
 
@@ -51,8 +54,9 @@ class GarmentModel(nn.Module):
         z = config.latent
         self.initialiser = mlp(static, config.widths, z, generator, 1.0)
         # Zero: training starts as pure Verlet integration.
-        self.integrator = INTEGRATORS[config.scheme](config)
-        self.stepper = mlp(self.integrator.states * z + static + dynamic, config.widths, z, generator, 0.0)
+        self.integrator = INTEGRATORS[config.scheme](config, dynamic)
+        seen, bias = self.integrator.states * z + static + dynamic, not self.integrator.centred
+        self.stepper = mlp(seen, config.widths, z, generator, 0.0, bias)
         # Small: training starts as plain skinning.
         self.output = mlp(z, config.widths, self.decoder.output_count, generator, 0.01)
 

@@ -91,10 +91,11 @@ class Stepper:
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         gradients = [value.grad for value in self.model.parameters() if value.grad is not None]
+        judged = loss.detach().clone()
         if self.share is not None:
-            self.share(gradients)
+            self.share([*gradients, judged])  # the loss too: all processes must undo the same steps
         norm = nn.utils.get_total_norm(gradients, foreach=True)
-        bad = ~(norm.isfinite() & loss.isfinite())
+        bad = ~(norm.isfinite() & judged.isfinite())
         torch._foreach_mul_(gradients, (self.config.clip / (norm + 1e-12)).clamp_max(1.0))
         # The fused optimiser leaves parameters, moments and step counts as they are where this is one.
         self.optimiser.found_inf = bad.float()  # type: ignore[attr-defined]

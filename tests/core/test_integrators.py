@@ -43,17 +43,38 @@ def test_verlet_is_equations_2_and_3():
     np.testing.assert_allclose(says.seen, [[1.6, 0.2, 1.5, 1.0, 9.0]], rtol=1e-6)
 
 
+class Sums(nn.Module):
+    """Gives every dimension the weighted sum of what it sees, and remembers that."""
+
+    def forward(self, seen: torch.Tensor) -> torch.Tensor:
+        self.seen = seen
+        return (seen * torch.arange(1.0, seen.shape[1] + 1)).sum(1, keepdim=True).expand(-1, 2) / 10
+
+
 @torch.no_grad()
 def test_spring_verlet_pulls_towards_the_rest_state():
-    scheme, says = integrator("spring_verlet", stiffness=0.5, **FREE), Says(0.25)
-    scheme.alpha.fill_(1.0)
+    scheme, sums = integrator("spring_verlet", stiffness=0.5, **FREE), Sums()
+    scheme.alpha.copy_(torch.tensor([1.0, 0.8]))
     scheme.beta.fill_(0.5)
     scheme.share.copy_(torch.logit(torch.tensor([0.2, 0.4])))
-    # zbar = (1.75, 0.5) and k = (0.1, 0.2)
-    found = scheme(says, BEFORE, NOW, REST, POSE)
-    np.testing.assert_allclose(found, [[1.75 + 0.1 * 1.25 + 0.025, 0.5 + 0.2 * 3.5 + 0.025]], rtol=1e-6)
-    velocity, distance = [10 * 0.5, 10 * -1.0], [3 * 1.25, 3 * 3.5]
-    np.testing.assert_allclose(says.seen, [[*NOW[0], *velocity, *distance, 9.0]], rtol=1e-6)
+    # p = (3, 4), z = (1.5, 1), v = (0.5, -1): zbar = 3 - 1.5 + 0.25 and 4 - 0.8 * 3 - 0.5; k = (0.1, 0.2)
+    found = scheme(sums, BEFORE, NOW, REST, POSE)
+    zbar = np.array([1.75, 1.1])
+    seen = [1.5, 1.0, 10 * 0.5, 10 * -1.0, 3 * 1.25, 3 * 2.9, 9.0]
+    np.testing.assert_allclose(sums.seen, [seen, [3, 4, 0, 0, 0, 0, 9]], rtol=1e-6)
+    correction = 0.01 * np.sum((sums.seen[0] - sums.seen[1]).numpy() * np.arange(1, 8))
+    np.testing.assert_allclose(found, [zbar + [0.1 * 1.25, 0.2 * 2.9] + correction], rtol=1e-6)
+
+
+@torch.no_grad()
+def test_a_garment_at_rest_stays_there_whatever_the_stepper_says():
+    """Under a character that holds still, rates are zero and P is where the garment rests, alpha included."""
+    scheme = INTEGRATORS["spring_verlet"](ModelConfig(latent=2), 2)
+    scheme.alpha.copy_(torch.tensor([0.9, 1.1]))
+    still, moving = torch.tensor([[9.0, 0, 0]]), torch.tensor([[9.0, 1, 0]])
+    rest = torch.tensor([[0.5, -0.25]])
+    np.testing.assert_allclose(scheme(Sums(), rest, rest, rest, still), rest, atol=1e-7)
+    assert (scheme(Sums(), rest, rest, rest, moving) - rest).abs().min() > 0.05
 
 
 @torch.no_grad()
