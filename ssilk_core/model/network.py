@@ -20,7 +20,7 @@ from .integrators import INTEGRATORS
 def mlp(
     inputs: int, widths: tuple[int, ...], outputs: int, generator: torch.Generator, last: float, bias: bool = True
 ) -> nn.Sequential:
-    """Return a smooth multilayer perceptron; its last layer starts `last` times its usual size, with a `bias` or not."""
+    """Return a smooth multilayer perceptron; the last layer starts `last` times its usual size."""
     sizes = [inputs, *widths, outputs]
     layers: list[nn.Module] = []
     for index, (fan_in, fan_out) in enumerate(pairwise(sizes)):
