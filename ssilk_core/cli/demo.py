@@ -61,7 +61,12 @@ def _shipped(options: argparse.Namespace) -> list[list[str]]:
     return [
         [*bake, "-o", shots["plain skinning"], "--plain"],
         [*bake, "-o", shots["shipped"]],
-        *_views(options.out / "shipped", {name: shots[name] for name in ("plain skinning", "shipped")}),
+        # The film after the training has every frame of these two shots; until then half of them will do.
+        *_views(
+            options.out / "shipped",
+            {name: shots[name] for name in ("plain skinning", "shipped")},
+            fps=30 if options.pretrained else 15,
+        ),
     ]
 
 
@@ -74,7 +79,7 @@ def _trained(options: argparse.Namespace) -> list[list[str]]:
         ["rig", str(_body()), "--garment", str(out / "wardrobe" / f"{garment}.usdc"), "-o", stage],
         ["train", stage, "--motions", str(out / "motions"), "-o", model, "--preset", preset, *settings],
         ["bake", model, "--stage", stage, "--motion", str(out / "shot.usdc"), "-o", shots[preset]],
-        *_views(out / preset, shots),
+        *_views(out / preset, shots, fps=30),
     ]
 
 
@@ -85,13 +90,13 @@ def _shots(options: argparse.Namespace) -> dict[str, str]:
     return {name: str(options.out / f"{file}.usdc") for name, file in files.items()}
 
 
-def _views(stem: Path, shots: dict[str, str]) -> list[list[str]]:
+def _views(stem: Path, shots: dict[str, str], fps: int) -> list[list[str]]:
     """Return the commands that draw shots as a sheet and as a film."""
     labels = [word for name in shots for word in ("--label", name)]
     view = ["view", *shots.values(), *labels, "--azimuth", "150"]
     return [
         [*view, "-o", f"{stem}.png", "--columns", "8"],
-        [*view, "-o", f"{stem}.mp4", "--size", "320x384"],
+        [*view, "-o", f"{stem}.mp4", "--size", "320x384", "--fps", str(fps)],
     ]
 
 
