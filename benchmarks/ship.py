@@ -35,6 +35,7 @@ from subjects import Subject, arguments, open_subject, parsed
 from ssilk_core.assets import Motion, Scene
 from ssilk_core.checkpoint import ModelFile, save_model
 from ssilk_core.demo.garments import build_garment
+from ssilk_core.demo.motions import demo_shot
 from ssilk_core.demo.shipped import need_trained_on, shipped_path
 from ssilk_core.energy import TERMS
 from ssilk_core.errors import SsilkError, need
@@ -62,8 +63,11 @@ def ship(path: Path, options: Namespace) -> tuple[list[str], dict[str, Any]]:
 
 
 def record(subject: Subject, found: Loss, motions: list[Motion]) -> dict[str, Any]:
-    """Return what is known about a model that ships: the day, the loss, and its score on the held-out clips."""
-    plain = means(subject, motions, plain=True)
+    """Return what is known about a model that ships: the day, the loss, and its score on the held-out clips.
+
+    Its stretching on the demo's own shot tells later versions whether it still does what it did.
+    """
+    plain, shot = means(subject, motions, plain=True), demo_shot(subject.scene.character.skeleton)
     return {
         "date": datetime.now(UTC).date().isoformat(),
         "largest error [m]": found.largest,
@@ -71,6 +75,7 @@ def record(subject: Subject, found: Loss, motions: list[Motion]) -> dict[str, An
         "energy [J]": sum(found.energies.values()),
         "plain skinning [J]": sum(plain[name] for name in TERMS),
         "inside the body": found.inside,
+        "stretch on the demo's shot [J]": means(subject, [shot])["stretch"],
     }
 
 
