@@ -70,6 +70,7 @@ class TrainConfig:
         batch, window: windows for each step, and poses in each window, the two before the first new one included.
         carry: share of windows that continue from the state where the last window of their slot ended.
         rotated: share of windows that get a random rotation, uniform on SO(3); the others stay upright.
+        recombined: more motions made of each one, in which limbs move as in another.
         resting: single poses that go on training the initialiser beside the windows.
         kick: chance in each frame that a carried state is moved by noise; windows that begin anew always are.
         noise: standard deviation added to the first two latents of a window.
@@ -92,7 +93,8 @@ class TrainConfig:
     window: int = 6
     carry: float = 0.97
     rotated: float = 0.5
-    resting: int = 64
+    recombined: int = 3
+    resting: int = 256
     kick: float = 0.03
     noise: float = 0.1
     noise_correlation: float = 0.99
@@ -117,6 +119,7 @@ class TrainConfig:
         _need_between(self, 0, 1, "carry", "rotated", "noise_correlation", "kick")
         _need_between(self, 0, 0.99999, "warm", "average")
         _need_between(self, 0, MOST, "noise", "warm_rate", "rate", "final_rate", "rate_warmup", "skin_rate", "clip")
+        _need_between(self, 0, 1000, "recombined")
         _need_between(self, 0, 2**63 - 1, "seed")
 
     @property
@@ -148,6 +151,7 @@ PRESETS = {
                 window=16,
                 carry=0.7,
                 resting=8,
+                recombined=0,
                 rotated=0.3,
                 rate=6e-4,
                 final_rate=1e-4,

@@ -12,6 +12,7 @@ from ..assets import Motion, Scene
 from ..config import ModelConfig, TrainConfig
 from ..errors import need
 from ..fabrics import Fabric
+from .recombine import recombined
 from .state import canonical, scene_digest
 
 
@@ -36,6 +37,11 @@ class TrainJob:
     device: str = "auto"
     resume: bool = False
     inputs: dict[str, str] | None = None
+
+    def trained_motions(self) -> list[Motion]:
+        """Return the motions and what is recombined from them."""
+        skeleton = self.scene.character.skeleton
+        return [*self.motions, *recombined(self.motions, skeleton, self.train.recombined, self.train.seed)]
 
     def identity(self) -> dict[str, Any]:
         """Return what makes a run the run it is, as it comes back from JSON; a resumed run must be asked the same."""

@@ -57,7 +57,7 @@ class Keeper:
     def save_fault(self, stepper: Stepper, found: str) -> None:
         """Write what a step that was not finite was computed from."""
         if self.team.first:
-            save_fault(self.fault, stepper, self.job.motions, found)
+            save_fault(self.fault, stepper, self.job.trained_motions(), found)
 
     def provenance(self, state: RunState, score: Score) -> dict[str, Any]:
         """Return how the model came to be."""

@@ -44,23 +44,26 @@ class Objective:
         character = self.bank.character(frames)
         return self.potential(self.model.vertices(z, character), direction, character)
 
-    def window(self, sampler: WindowSampler, noise: Tensor) -> tuple[Terms, Terms, Tensor]:
+    def window(
+        self, sampler: WindowSampler, noise: Tensor, frames: Tensor, direction: Tensor
+    ) -> tuple[Terms, Terms, Tensor]:
         """Roll one window of every slot.
 
         Args:
             sampler: where the windows stand.
             noise: added to the two first latents, shape (2, batch, latent).
+            frames, direction: single poses for the initialiser (M,), and gravity's directions there (M, 3).
 
         Returns:
-            Terms of the frames from the third on, terms of the initialiser on `resting` of the frames, and the last
-            two latents (2, batch, latent) for the next window.
+            Terms of the frames from the third on, terms of the initialiser's states of the single
+            poses, and the last two latents (2, batch, latent) for the next window.
         """
         model, bank, length = self.model, self.bank, sampler.config.window
         batch = len(sampler.first)
-        frames = (sampler.first + torch.arange(length, device=sampler.first.device)[:, None]).reshape(-1)
-        direction = sampler.direction.repeat(length, 1)
-        static = bank.static_descriptor(frames, direction)
-        pose = torch.cat([static, bank.dynamic[frames]], dim=1).reshape(length, batch, -1)
+        times = (sampler.first + torch.arange(length, device=sampler.first.device)[:, None]).reshape(-1)
+        down = sampler.direction.repeat(length, 1)
+        static = bank.static_descriptor(times, down)
+        pose = torch.cat([static, bank.dynamic[times]], dim=1).reshape(length, batch, -1)
         with torch.no_grad():  # the initialiser learns rest states from their own energy, not what helps later frames
             target = model.initial(static).reshape(length, batch, -1)
             start = torch.where(sampler.carried[None, :, None], sampler.latents, target[:2])
@@ -73,21 +76,18 @@ class Objective:
             rolled = model.step(
                 states[: -2 * batch], states[batch:-batch], *(v[2:].flatten(0, 1) for v in (target, pose))
             )
-        resting_count = min(sampler.config.resting, len(frames))
-        quiet = model.initial(static[:resting_count])
+        quiet = model.initial(bank.static_descriptor(frames, direction))
         with torch.no_grad():
-            past = model.vertices(torch.cat(z[:2]), bank.character(frames[: 2 * batch]))
+            past = model.vertices(torch.cat(z[:2]), bank.character(times[: 2 * batch]))
         # The windows from the third frame on and the initialiser's own states share one decoding.
-        seen = torch.cat([frames[2 * batch :], frames[:resting_count]])
-        facing = torch.cat([direction[2 * batch :], direction[:resting_count]])
-        character = bank.character(seen)
+        character = bank.character(torch.cat([times[2 * batch :], frames]))
         x = model.vertices(torch.cat([rolled, quiet]), character)
-        terms = self.potential(x, facing, character)
+        terms = self.potential(x, torch.cat([down[2 * batch :], direction]), character)
         count = (length - 2) * batch
         dynamic = {name: value[:count] for name, value in terms.items()}
         resting = {name: value[count:] for name, value in terms.items()}
         path = torch.cat([past, x[..., : count - batch].detach()], dim=-1)
-        root = bank.root[frames].T
+        root = bank.root[times].T
         dynamic["inertia"], dynamic["drag"] = self.energy.kinetic(
             x, path[..., batch:], path[..., :-batch], root[:, 2 * batch :] - root[:, batch:-batch], self.dt
         )

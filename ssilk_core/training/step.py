@@ -14,7 +14,7 @@ from ..config import TrainConfig
 from ..model.network import GarmentModel
 from .faults import Faults
 from .objective import Objective, total
-from .windows import WindowSampler, random_directions
+from .windows import WindowSampler
 
 EAGER_STEPS = 3  # before a CUDA graph is captured: allocators, handles and kernels settle
 
@@ -68,18 +68,15 @@ class Stepper:
 
     def warm(self) -> None:
         """Train P and D on single random poses under static energies."""
-        sampler, config, bank = self.sampler, self.config, self.objective.bank
-        draw = torch.rand(config.warm_batch, generator=sampler.generator, device=self.device)
-        frames = (draw * bank.frame_count).long().clamp_max(bank.frame_count - 1)
-        direction = random_directions(config.warm_batch, config.rotated, sampler.generator, self.device)
+        frames, direction = self.sampler.poses(self.config.warm_batch)
         terms = self.objective.static(frames, direction)
         means = {name: value.mean() for name, value in terms.items()}
         self._descend(sum(means.values()), means, {"frames": frames, "directions": direction})  # type: ignore[arg-type]
 
     def windows(self) -> None:
-        """Train everything on one window of every slot."""
-        noise = self.sampler.noise()
-        dynamic, resting, latents = self.objective.window(self.sampler, noise)
+        """Train everything on one window of every slot, and P on single poses beside them."""
+        noise, poses = self.sampler.noise(), self.sampler.poses(self.config.resting)
+        dynamic, resting, latents = self.objective.window(self.sampler, noise, *poses)
         moving, still = (next(iter(terms.values())).shape[0] for terms in (dynamic, resting))
         # Every frame weighs the same, those that the initialiser answers for included.
         loss = (total(dynamic) * moving + total(resting) * still) / (moving + still)

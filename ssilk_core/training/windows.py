@@ -58,6 +58,13 @@ class WindowSampler:
         pick = torch.rand(self.config.batch, generator=self.generator, device=self.candidates.device)
         return self.candidates[(pick * len(self.candidates)).long().clamp_max(len(self.candidates) - 1)]
 
+    def poses(self, count: int) -> tuple[Tensor, Tensor]:
+        """Draw single poses from all frames: frames (count,) and gravity directions (count, 3)."""
+        bank, device = self.bank, self.candidates.device
+        draw = torch.rand(count, generator=self.generator, device=device)
+        frames = (draw * bank.frame_count).long().clamp_max(bank.frame_count - 1)
+        return frames, random_directions(count, self.config.rotated, self.generator, device)
+
     def noise(self) -> Tensor:
         """Return noise for the first two latents of each window, shape (2, batch, latent).
 
