@@ -79,7 +79,7 @@ class TrainConfig:
         warm_rate: Adam's step size in the warm start, decaying to a tenth.
         rate, final_rate: Adam's step size in training proper, after its warm-up and at the end (cosine in between).
         skin_rate: factor on the step size of skinning weights, alpha and beta.
-        clip: bound on the global gradient norm.
+        clip: bound on the norm of a gradient, as a multiple of what was typical lately.
         validate_every: iterations between validations; valid_frames: frames of each clip used for them.
         average: decay of the running average of the parameters, which is what is validated and kept; 0 for none.
         surface: nearest body point on "triangles", or at "vertices", which is faster and blunter.
@@ -104,7 +104,7 @@ class TrainConfig:
     final_rate: float = 2e-5
     rate_warmup: int = 500
     skin_rate: float = 0.1
-    clip: float = 1.0
+    clip: float = 2.0
     average: float = 0.998
     surface: str = "triangles"
     validate_every: int = 1000
@@ -118,7 +118,8 @@ class TrainConfig:
         _need_between(self, 3, MOST, "valid_frames")
         _need_between(self, 0, 1, "carry", "rotated", "noise_correlation", "kick")
         _need_between(self, 0, 0.99999, "warm", "average")
-        _need_between(self, 0, MOST, "noise", "warm_rate", "rate", "final_rate", "rate_warmup", "skin_rate", "clip")
+        _need_between(self, 0, MOST, "noise", "warm_rate", "rate", "final_rate", "rate_warmup", "skin_rate")
+        _need_between(self, 1, MOST, "clip")
         _need_between(self, 0, 1000, "recombined")
         _need_between(self, 0, 2**63 - 1, "seed")
 

@@ -16,6 +16,7 @@ from .faults import Faults
 from .objective import Objective, total
 from .windows import WindowSampler
 
+FORGET = 0.02  # of the typical gradient in each step
 EAGER_STEPS = 3  # before a CUDA graph is captured: allocators, handles and kernels settle
 
 
@@ -43,6 +44,7 @@ class Stepper:
     Attributes:
         terms: energies of the last step [J], updated in place so that reading them needs no new launch.
         averaged: running average of the model's parameters.
+        typical: running average of the gradient's norm, as it was bounded; zero before the first step.
         faults: steps that were undone because something was not finite.
     """
 
@@ -61,6 +63,7 @@ class Stepper:
         self.factors = [1.0, config.skin_rate]
         self.averaged = copy.deepcopy(model).requires_grad_(False)
         self.terms: dict[str, Tensor] = {}
+        self.typical = torch.zeros((), device=self.device)
         self.faults = Faults(self.device)
         self._iteration = torch.zeros((), dtype=torch.int64, device=self.device)
         self._graph: torch.cuda.CUDAGraph | None = None
@@ -93,7 +96,7 @@ class Stepper:
             self.share([*gradients, judged])  # the loss too: all processes must undo the same steps
         norm = nn.utils.get_total_norm(gradients, foreach=True)
         bad = ~(norm.isfinite() & judged.isfinite())
-        torch._foreach_mul_(gradients, (self.config.clip / (norm + 1e-12)).clamp_max(1.0))
+        torch._foreach_mul_(gradients, self._kept(norm, bad) / norm.clamp_min(1e-30))
         # The fused optimiser leaves parameters, moments and step counts as they are where this is one.
         self.optimiser.found_inf = bad.float()  # type: ignore[attr-defined]
         self.optimiser.step()
@@ -102,6 +105,18 @@ class Stepper:
         self.faults.record(bad, self._iteration, terms, window)
         for name, value in terms.items():
             self.terms.setdefault(name, torch.zeros((), device=self.device)).copy_(value)
+
+    def _kept(self, norm: Tensor, bad: Tensor) -> Tensor:
+        """Return the norm that a gradient may have, and take it into what is typical.
+
+        Adam divides by what gradients were lately: one a hundred times as large, of one torn garment, moves every
+        parameter by as much as all the others of the last iterations do, and a fixed bound is no measure of that.
+        """
+        begun = self.typical > 0
+        kept = torch.where(begun, torch.minimum(norm, self.config.clip * self.typical), norm)
+        latest = torch.where(begun, torch.lerp(self.typical, kept, FORGET), kept)
+        self.typical.copy_(torch.where(bad, self.typical, latest))
+        return kept
 
     def run(self, iteration: int) -> None:
         """Do the step of an iteration, in the phase that it belongs to."""

@@ -126,7 +126,7 @@ def test_the_initialiser_learns_from_rest_states_alone(objective, through_time):
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_every_scheme_trains_every_parameter(scene, toy_motion, toy_model, toy_objective, scheme):
-    objective = toy_objective(scene, toy_model(scene, scheme=scheme), toy_motion(scene, 40))
+    objective = toy_objective(scene, toy_model(scene, scheme=scheme), toy_motion(scene, 50))
     sampler = sampler_of(objective, CONFIG)
     dynamic, resting, _ = objective.window(sampler, sampler.noise(), *POSES)
     unused = {"integrator.alpha", "integrator.beta", "integrator.share"} if scheme.startswith("direct") else set()
@@ -162,3 +162,16 @@ def test_a_step_weighs_every_frame_the_same(objective):
         assert value.grad is not None
         np.testing.assert_allclose(value.grad, expected[name], atol=1e-5 * float(expected[name].abs().max()) + 1e-12)
     assert stepper.terms["inertia"].item() == pytest.approx(dynamic["inertia"].mean().item(), rel=1e-5)
+
+
+def test_a_gradient_is_bounded_by_what_was_typical(objective):
+    sampler = sampler_of(objective, replace(CONFIG, clip=2.0))
+    stepper = Stepper(objective.model, objective, sampler, sampler.config)
+    good = torch.tensor(False)
+    assert stepper._kept(torch.tensor(3.0), good).item() == 3 and stepper.typical.item() == 3
+    assert stepper._kept(torch.tensor(4.0), good).item() == 4  # under twice the typical one
+    assert stepper.typical.item() == pytest.approx(3.02)
+    assert stepper._kept(torch.tensor(600.0), good).item() == pytest.approx(6.04)
+    before = stepper.typical.clone()
+    stepper._kept(torch.tensor(float("nan")), ~good)
+    assert torch.equal(stepper.typical, before)

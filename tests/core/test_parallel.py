@@ -53,6 +53,12 @@ class Recorder:
 # --- in each of the processes -------------------------------------------------------------------------------------
 
 
+def poses(run: Run, first: int, count: int) -> None:
+    """Let a run look at certain single poses instead of drawing them."""
+    down = torch.tensor([0.0, -1.0, 0.0]).expand(count, 3)
+    run.stepper.sampler.poses = lambda _: (torch.arange(first, first + count), down)
+
+
 def shared_gradient(job: TrainJob, team: Team) -> dict[str, object]:
     """Where every process's windows stood after three steps, and the gradient of the fourth."""
     run = Run(replace(job, train=ONE_STEP), silent, team)
@@ -60,7 +66,8 @@ def shared_gradient(job: TrainJob, team: Team) -> dict[str, object]:
         run.stepper.run(iteration)
     before = team.gather({name: value.clone() for name, value in run.stepper.sampler.state().items()})
     parameters = [value.detach().clone() for value in run.stepper.model.parameters()]
-    recorder = Recorder(run)
+    recorder, half = Recorder(run), ONE_STEP.resting // team.size
+    poses(run, team.rank * half, half)
     run.stepper.run(3)
     return {"samplers": before, "parameters": parameters, "gradient": recorder.given[0]}
 
@@ -159,6 +166,7 @@ def test_two_halves_of_a_batch_give_the_gradient_of_the_whole(job, together):
         for value, trained in zip(alone.stepper.model.parameters(), ours["parameters"]):
             value.copy_(trained)
     recorder = Recorder(alone)
+    poses(alone, 0, ONE_STEP.resting)
     alone.stepper.run(3)
     assert len(recorder.given[0]) == len(ours["gradient"])
     for whole, mine, other in zip(recorder.given[0], ours["gradient"], theirs["gradient"]):
