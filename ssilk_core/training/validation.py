@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -14,7 +15,6 @@ from ..energy import TERMS, GarmentEnergy
 from ..energy.collision import PosedBody, signed_distance
 from ..model.body import CollisionBody
 from ..model.descriptors import GRAVITY
-from ..model.network import GarmentModel
 from ..model.skinning import Skinning
 from .bank import MotionBank
 from .parallel import ALONE, Team
@@ -40,6 +40,16 @@ class Score:
     def total(self) -> float:
         """Sum of all terms [J]."""
         return sum(self.terms.values())
+
+
+class Rolled(Protocol):
+    """What is scored: a `GarmentModel`, or what else has states of its own, shape (N, S), and these methods."""
+
+    def initial(self, static: Tensor) -> Tensor: ...
+
+    def roll(self, states: list[Tensor], rest: Tensor, pose: Tensor) -> list[Tensor]: ...
+
+    def vertices(self, z: Tensor, character: Tensor, /) -> Tensor: ...
 
 
 class Validator:
@@ -68,7 +78,7 @@ class Validator:
         """Return plain skinning's positions (V, 3, N) [m]."""
         return self.plain(self.rest, None, self.plain.weights, character)
 
-    def score(self, model: GarmentModel) -> Score:
+    def score(self, model: Rolled) -> Score:
         """Return the mean score of a model over all clips."""
         return self._mean(model)
 
@@ -76,7 +86,7 @@ class Validator:
         """Return the mean score of plain skinning over all clips."""
         return self._mean(None)
 
-    def _mean(self, model: GarmentModel | None) -> Score:
+    def _mean(self, model: Rolled | None) -> Score:
         """Return the mean over all clips, dealt out to the processes of the team; all get the same score."""
         clips = self.clips[self.team.rank :: self.team.size]
         states = self._states(clips, model)
@@ -86,19 +96,19 @@ class Validator:
         joined = {name: float(torch.cat([score[name] for score in scores]).mean()) for name in scores[0]}
         return Score({name: joined[name] for name in TERMS}, joined["collisions"], joined["dynamics"] ** 0.5)
 
-    def frame_terms(self, clip: range, model: GarmentModel | None) -> dict[str, Tensor]:
+    def frame_terms(self, clip: range, model: Rolled | None) -> dict[str, Tensor]:
         """Return what `Score` averages for each frame of a range of the bank, shape (N,).
 
         Without a model it is plain skinning that is scored. Distances to the quasi-static state come squared [m2].
         """
         return self._clip_terms(clip, model, self._states([clip], model)[0])
 
-    def _states(self, clips: Sequence[range], model: GarmentModel | None) -> Sequence[Tensor | None]:
+    def _states(self, clips: Sequence[range], model: Rolled | None) -> Sequence[Tensor | None]:
         """Return the states of each clip; of a team, one may have none to roll."""
         return roll_states(model, self.bank, clips, self.down) if model and clips else [None] * len(clips)
 
     @torch.no_grad()
-    def _clip_terms(self, clip: range, model: GarmentModel | None, states: Tensor | None) -> dict[str, Tensor]:
+    def _clip_terms(self, clip: range, model: Rolled | None, states: Tensor | None) -> dict[str, Tensor]:
         frames = torch.arange(clip.start, clip.stop, device=self.rest.device)
         parts, tail = [], None
         for start in range(0, len(frames), DECODED_AT_ONCE):
@@ -133,7 +143,7 @@ class Validator:
 
 
 @torch.no_grad()
-def roll_states(model: GarmentModel, bank: MotionBank, clips: Sequence[range], down: Tensor) -> list[Tensor]:
+def roll_states(model: Rolled, bank: MotionBank, clips: Sequence[range], down: Tensor) -> list[Tensor]:
     """Roll a model over ranges of a bank side by side, each from its quasi-static start.
 
     Returns:
