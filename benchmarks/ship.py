@@ -21,6 +21,7 @@ from precision import (
     LOSS_HEADER,
     MOST_CHANGED,
     MOST_MOVED,
+    MOST_RMS,
     Loss,
     held_out,
     loss,
@@ -54,8 +55,10 @@ def ship(path: Path, options: Namespace) -> tuple[list[str], dict[str, Any]]:
     found = loss(subject, packed_subject(subject, options), motions)
     most = max(map(abs, found.changes.values()))
     need(found.bearable, str(path),
-         f"packing moves a vertex by {1e3 * found.largest:.3g} mm and changes an energy by {most:.2%} of all",
-         f"at most {1e3 * MOST_MOVED:g} mm and {MOST_CHANGED:.1%} are allowed", "train it again")  # fmt: skip
+         f"packing moves a vertex by {1e3 * found.largest:.3g} mm, all by {1e3 * found.rms:.3g} mm RMS, and changes "
+         f"an energy by {most:.2%} of all",
+         f"at most {1e3 * MOST_MOVED:g} mm, {1e3 * MOST_RMS:g} mm and {MOST_CHANGED:.1%} are allowed",
+         "train it again")  # fmt: skip
     target = shipped_path(subject.name)
     save_model(target, published(subject.file, record(subject, found, motions)), pack=True)
     size = target.stat().st_size
