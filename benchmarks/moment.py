@@ -21,21 +21,25 @@ class Moment:
     def __init__(self, stepper: Stepper) -> None:
         self.stepper, self.model, self.sampler = stepper, stepper.model, stepper.sampler
         self.decoder, self.objective, self.bank = stepper.model.decoder, stepper.objective, stepper.objective.bank
-        self.batch, self.window = stepper.config.batch, stepper.config.window
+        self.batch, self.window, self.resting = stepper.config.batch, stepper.config.window, stepper.config.resting
         with torch.no_grad():
             self._seen()
             self._decoded()
             self._met()
 
     def _seen(self) -> None:
-        steps = torch.arange(self.window, device=self.sampler.first.device)[:, None]
-        self.frames = (self.sampler.first + steps).reshape(-1)
-        self.direction = self.sampler.direction.repeat(self.window, 1)
-        self.static, self.pose = self.descriptors()
+        steps, given = torch.arange(self.window, device=self.sampler.first.device)[:, None], 2 * self.batch
+        self.times = (self.sampler.first + steps).reshape(-1)
+        self.down = self.sampler.direction.repeat(self.window, 1)
+        self.single, self.single_down = self.sampler.poses(self.resting)
+        self.static, self.pose, self.quiet = self.descriptors()
+        self.frames = torch.cat([self.times[given:], self.single])
+        self.direction = torch.cat([self.down[given:], self.single_down])
         self.character = self.bank.character(self.frames)
 
     def _decoded(self) -> None:
-        self.z = self.model.initial(self.static)
+        self.target = self.targets()
+        self.z = torch.cat([self.target[2 * self.batch :], self.model.initial(self.quiet)])
         self.activation, self.turns = self.decoder._split(self.model.output(self.z))
         self.matrices = self.decoder._matrices(self.turns, self.character)
         self.offsets = self.blendshapes(self.activation)
@@ -50,26 +54,32 @@ class Moment:
 
     @property
     def count(self) -> int:
-        """Frames that are decoded."""
+        """Frames that are decoded for their energy."""
         return len(self.frames)
 
     def sample(self) -> Tensors:
-        self.sampler.advance(self.sampler.latents + self.sampler.noise())
-        return self.sampler.first, self.sampler.direction, self.sampler.latents
+        noise, poses = self.sampler.noise(), self.sampler.poses(self.resting)
+        self.sampler.advance(self.sampler.latents + noise)
+        return self.sampler.first, self.sampler.direction, self.sampler.latents, *poses
 
     def descriptors(self) -> Tensors:
-        static = self.bank.static_descriptor(self.frames, self.direction)
-        return static, torch.cat([static, self.bank.dynamic[self.frames]], dim=1)
+        static = self.bank.static_descriptor(self.times, self.down)
+        pose = torch.cat([static, self.bank.dynamic[self.times]], dim=1)
+        return static, pose, self.bank.static_descriptor(self.single, self.single_down)
+
+    @torch.no_grad()
+    def targets(self) -> Tensor:
+        return self.model.initial(self.static)
 
     @torch.no_grad()
     def rolled(self) -> Tensors:
-        rest, pose = (value.reshape(self.window, self.batch, -1) for value in (self.z, self.pose))
+        rest, pose = (value.reshape(self.window, self.batch, -1) for value in (self.target, self.pose))
         return tuple(self.model.roll([rest[0], rest[1]], rest[2:], pose[2:])[2:])
 
     @torch.no_grad()
     def decoded_first(self) -> Tensor:
         first = slice(0, 2 * self.batch)
-        return self.model.vertices(self.z[first], self.bank.character(self.frames[first]))
+        return self.model.vertices(self.target[first], self.bank.character(self.times[first]))
 
     def blendshapes(self, activation: Tensor) -> Tensor:
         offsets = self.decoder._offsets(activation)
@@ -80,7 +90,7 @@ class Moment:
         return self.decoder.skin(self.decoder.rest, offsets, self.decoder._influence_weights(), matrices)
 
     def path(self) -> Tensor:
-        return torch.cat([self.first, self.x[..., : -3 * self.batch]], dim=-1)
+        return torch.cat([self.first, self.x[..., : (self.window - 3) * self.batch]], dim=-1)
 
     def surface(self) -> Tensors:
         body = self.objective.body.posed(self.character)

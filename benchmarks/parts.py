@@ -41,37 +41,42 @@ def leaf(value: Tensor) -> Tensor:
 
 
 def input_parts(at: Moment) -> list[Part]:
-    turns = TURN * at.bank.down.shape[1] * at.count
+    static, turns = at.bank.static_descriptor, TURN * at.bank.down.shape[1]
+    made, moved = static(at.frames, at.direction), (at.sampler.latents, at.sampler.direction)
     return [
-        Part(name="sampling", run=at.sample, reads=(at.sampler.latents, at.sampler.direction)),
-        Part(name="descriptors", run=at.descriptors, reads=(at.static, at.pose), operations=turns),
+        Part(name="poses drawn", run=lambda: at.sampler.poses(at.count), reads=(), phases=(WARM,)),
+        Part(name="windows and poses drawn", run=at.sample, reads=moved, phases=(WINDOWS,)),
+        Part(name="descriptors of poses", run=lambda: static(at.frames, at.direction), reads=(made,),
+             operations=turns * at.count, phases=(WARM,)),
+        Part(name="descriptors of windows and poses", run=at.descriptors, reads=(at.static, at.pose, at.quiet),
+             operations=turns * (len(at.times) + len(at.single)), phases=(WINDOWS,)),
         Part(name="character matrices", run=lambda: at.bank.character(at.frames), reads=(at.character,)),
-    ]
+    ]  # fmt: skip
 
 
 def through(name: str, network: nn.Module, run: Callable[[], Tensor | Tensors], reads: Tensors,
-            leaves: Tensors = (), phases: tuple[str, ...] = (WARM, WINDOWS)) -> Part:  # fmt: skip
-    """Return a part that passes rows through a network: two operations for each row and weight."""
+            leaves: Tensors = (), phases: tuple[str, ...] = (WARM, WINDOWS), passes: int = 1) -> Part:  # fmt: skip
+    """Return a part that passes rows through a network: two operations for each row and weight, in each pass."""
     weights = tuple(network.parameters())
-    operations = 2 * len(reads[0]) * sum(weight.numel() for weight in weights)
+    operations = 2 * passes * len(reads[0]) * sum(weight.numel() for weight in weights)
     return Part(name=name, run=run, reads=(*weights, *reads), operations=operations, leaves=leaves, phases=phases)
 
 
 def network_parts(at: Moment) -> list[Part]:
-    model, batch, first = at.model, at.batch, 2 * at.batch
-    few, z = at.static[:first], leaf(at.z)
-    before, now, rest, pose = at.z[:-first], at.z[batch:-batch], at.z[first:], at.pose[first:]
+    model, batch, first, z = at.model, at.batch, 2 * at.batch, leaf(at.z)
+    before, now, rest = at.target[:-first], at.target[batch:-batch], at.target[first:]
+    poses, pose = at.bank.static_descriptor(at.frames, at.direction), at.pose[first:]
+    passes = 1 + model.integrator.centred  # what S would do at rest is taken off
     initial = tuple(model.initialiser.parameters())
     stepping = (*model.stepper.parameters(), *model.integrator.parameters())
     return [
-        through("initialiser P", model.initialiser, lambda: model.initial(at.static), (at.static,), initial, (WARM,)),
-        through("initialiser P of targets", model.initialiser, lambda: model.initial(at.static).detach(),
-                (at.static,), (), (WINDOWS,)),
-        through("initialiser P of two frames", model.initialiser, lambda: model.initial(few), (few,), initial,
-                (WINDOWS,)),
-        through("stepper S frame by frame", model.stepper, at.rolled, (rest, pose), (), (WINDOWS,)),
+        through("initialiser P", model.initialiser, lambda: model.initial(poses), (poses,), initial, (WARM,)),
+        through("initialiser P of targets", model.initialiser, at.targets, (at.static,), (), (WINDOWS,)),
+        through("initialiser P of single poses", model.initialiser, lambda: model.initial(at.quiet), (at.quiet,),
+                initial, (WINDOWS,)),
+        through("stepper S frame by frame", model.stepper, at.rolled, (rest, pose), (), (WINDOWS,), passes),
         through("stepper S on all frames", model.stepper, lambda: model.step(before, now, rest, pose),
-                (before, now, rest, pose), stepping, (WINDOWS,)),
+                (before, now, rest, pose), stepping, (WINDOWS,), passes),
         through("decoder D", model.output, lambda: model.output(z), (z,), (z, *model.output.parameters())),
     ]  # fmt: skip
 
@@ -80,7 +85,7 @@ def garment_parts(at: Moment) -> list[Part]:
     decoder, influences = at.decoder, at.model.scene.rig.skin.indices.shape[1]
     turns, activation = leaf(at.turns), leaf(at.activation)
     offsets, matrices = leaf(at.offsets), leaf(at.matrices)
-    first = (at.z[: 2 * at.batch], decoder.shapes)
+    first = (at.target[: 2 * at.batch], decoder.shapes)
     return [
         Part(name="proxies", run=lambda: decoder._matrices(turns, at.character), leaves=(turns,),
              reads=(turns, at.character), operations=COMPOSE * len(turns) * at.count),
@@ -101,10 +106,11 @@ def contact_parts(at: Moment) -> list[Part]:
     placing = (influences * BLEND + 2 * TRANSFORM + NORMALISE) * posed.points.shape[0] * at.count
     pairs = x.shape[0] * at.count
     search = BRUTE_FORCE * posed.points.shape[0] * pairs
+    triangles = float(posed.rings[:, 0].float().mean()) - 1  # a ring's first neighbour spans none
     return [
         Part(name="body posing", run=at.surface, reads=(at.character, body.points, body.normals), operations=placing),
         Part(name="nearest body point", run=at.planes, reads=(x, posed.points, posed.normals),
-             operations=search + TRIANGLE * posed.rings.shape[1] * pairs, captured=kernels.available(x.device)),
+             operations=search + TRIANGLE * triangles * pairs, captured=kernels.available(x.device)),
         Part(name="nearest body vertex alone", run=lambda: at.planes(surface=False), operations=search, phases=(),
              reads=(x, posed.points, posed.normals)),
     ]  # fmt: skip
@@ -112,7 +118,8 @@ def contact_parts(at: Moment) -> list[Part]:
 
 def energy_parts(at: Moment) -> list[Part]:
     energy, x, root, gravity = at.objective.energy, leaf(at.x), at.character[0, :, 3], GRAVITY * at.direction.T
-    moved, shift = x.shape[0] * at.count, root[:, : at.last.shape[-1]]
+    moving = at.last.shape[-1]
+    moved, shift = x.shape[0] * at.count, root[:, :moving]
     elastic = (STRETCH * len(energy.area) + BENDING * len(energy.rest_angle)) * at.count
     return [
         Part(name="stretch and bending", run=lambda: energy.elastic(x), reads=(x,), leaves=(x,), energy=True,
@@ -121,27 +128,27 @@ def energy_parts(at: Moment) -> list[Part]:
              reads=(x, at.normal, at.offset), leaves=(x,), energy=True, operations=2 * POINTWISE * moved),
         Part(name="positions before", run=at.path, reads=(at.first, at.last), phases=(WINDOWS,)),
         Part(name="inertia and drag", run=lambda: energy.kinetic(x, at.last, at.before, shift, at.objective.dt),
-             reads=(x, at.last, at.before), leaves=(x,), energy=True, operations=2 * POINTWISE * moved,
-             phases=(WINDOWS,)),
+             reads=(at.x[..., :moving], at.last, at.before), leaves=(x,), energy=True,
+             operations=2 * POINTWISE * x.shape[0] * moving, phases=(WINDOWS,)),
     ]  # fmt: skip
 
 
 def single_energy_parts(at: Moment) -> list[Part]:
     energy, x, dt, gravity = at.objective.energy, leaf(at.x), at.objective.dt, GRAVITY * at.direction.T
-    moved, moving, predicted = x.shape[0] * at.count, x[..., : at.last.shape[-1]], 2 * at.last - at.before
+    moving, predicted, cloth = leaf(at.x[..., : at.last.shape[-1]]), 2 * at.last - at.before, POINTWISE * x.shape[0]
 
-    def term(name: str, run: Callable[[], Tensor], operations: int, *reads: Tensor) -> Part:
-        return Part(name=f"{name} alone", run=run, reads=(x, *reads), leaves=(x,), energy=True, operations=operations,
-                    phases=())  # fmt: skip
+    def term(name: str, run: Callable[[], Tensor], operations: int, moved: Tensor, *reads: Tensor) -> Part:
+        return Part(name=f"{name} alone", run=run, reads=(moved, *reads), leaves=(moved,), energy=True,
+                    operations=operations * moved.shape[-1], phases=())  # fmt: skip
 
     return [
-        term("stretch", lambda: energy.stretch(x), STRETCH * len(energy.area) * at.count),
-        term("bending", lambda: energy.bending(x), BENDING * len(energy.rest_angle) * at.count),
-        term("gravity", lambda: energy.gravity(x, gravity), POINTWISE * moved),
-        term("collision", lambda: energy.collision_of((at.normal * x).sum(1) - at.offset), POINTWISE * moved,
-             at.normal, at.offset),
-        term("inertia", lambda: energy.inertia(moving, predicted, dt), POINTWISE * moved, predicted),
-        term("drag", lambda: energy.drag(moving, at.last, dt), POINTWISE * moved, at.last),
+        term("stretch", lambda: energy.stretch(x), STRETCH * len(energy.area), x),
+        term("bending", lambda: energy.bending(x), BENDING * len(energy.rest_angle), x),
+        term("gravity", lambda: energy.gravity(x, gravity), cloth, x),
+        term("collision", lambda: energy.collision_of((at.normal * x).sum(1) - at.offset), cloth, x, at.normal,
+             at.offset),
+        term("inertia", lambda: energy.inertia(moving, predicted, dt), cloth, moving, predicted),
+        term("drag", lambda: energy.drag(moving, at.last, dt), cloth, moving, at.last),
     ]  # fmt: skip
 
 

@@ -47,7 +47,7 @@ CLIPS, CLIP_FRAMES = 8, 300
 
 @dataclass(frozen=True, kw_only=True)
 class Size:
-    """How large a training step is: vertices, proxies P, blendshapes K, windows and poses in each."""
+    """How large a training step is: vertices, proxies P, blendshapes K, windows, poses in each, and single poses."""
 
     vertices: int
     body: int
@@ -55,6 +55,12 @@ class Size:
     shapes: int
     batch: int
     window: int
+    resting: int
+
+    @property
+    def decoded(self) -> int:
+        """Frames that are decoded for their energy: the two before a window's first new one are not."""
+        return self.batch * (self.window - 2) + self.resting
 
 
 def coil(path: str, count: int, top: float, bottom: float, radius: Callable[[Floats], Floats]) -> tuple[Mesh, Floats]:
@@ -146,9 +152,8 @@ def motion(skeleton: Skeleton, fps: float, seed: int) -> Motion:
 def stepper(size: Size, device: torch.device) -> Stepper:
     """Return what trains the default network at a size, as a training run puts it together."""
     whole, model = scene(size), ModelConfig(shapes=size.shapes)
-    # So that both phases decode as many frames: two of each window are left out, two of the initialiser come in.
-    frames, first = size.batch * size.window, 2 * size.batch
-    config = TrainConfig(batch=size.batch, window=size.window, warm_batch=frames, resting=first)
+    # Both phases decode as many frames, so that one measurement of a part serves both.
+    config = TrainConfig(batch=size.batch, window=size.window, resting=size.resting, warm_batch=size.decoded)
     skeleton, joints = whole.character.skeleton, np.arange(JOINTS)
     motions = [motion(skeleton, model.fps, seed) for seed in range(CLIPS)]
     bank = build_bank(motions, skeleton, joints, model.fps, device)

@@ -4,11 +4,11 @@
     python benchmarks/training.py --device cuda
 
 The scene is synthetic, so that every size is exact. The first of each list of sizes is the base case, around which
-one size at a time is changed. On a GPU each part is a CUDA graph of its own, timed with cold caches; the plain twin
-of the nearest body point, and with it the plain step, cannot be captured and are launched as they are. Each time is a
-median over repeats. A floor is the larger of bytes over the rate of a copy and operations over the rate of a float32
-matrix product, both measured in the same run (benchmarks/floors.py); that of the nearest body point counts brute
-force.
+one size at a time is changed; the batch that training has by default is a case of its own. On a GPU each part is a
+CUDA graph of its own, timed with cold caches; the plain twin of the nearest body point, and with it the plain step,
+cannot be captured and are launched as they are. Each time is a median over repeats. A floor is the larger of bytes
+over the rate of a copy and operations over the rate of a float32 matrix product, both measured in the same run
+(benchmarks/floors.py); that of the nearest body point counts brute force.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import argparse
 import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib.metadata import version
 from typing import Any
 from unittest import mock
@@ -33,6 +33,7 @@ from synthetic import Size, stepper
 from training_tables import tables
 
 from ssilk_core import kernels
+from ssilk_core.config import TrainConfig
 from ssilk_core.devices import chosen_device
 from ssilk_core.training.step import Stepper
 
@@ -43,6 +44,7 @@ SIZES = {
     "shapes": (64, 16, 256),
     "window": (32, 16, 64),
     "batch": (32, 16, 64),
+    "resting": (64,),
 }
 PLAIN, KERNELS = "plain", "kernels"
 
@@ -52,8 +54,11 @@ Figures = dict[str, Any]
 def cases(options: argparse.Namespace) -> dict[str, Size]:
     """Return the base case and those that differ from it in one size, by name."""
     base = Size(**{name: getattr(options, name)[0] for name in SIZES})
-    others = [(name, count) for name in SIZES for count in getattr(options, name)[1:]]
-    return {"base": base, **{f"{name} {count}": Size(**{**asdict(base), name: count}) for name, count in others}}
+    others = [{name: count} for name in SIZES for count in getattr(options, name)[1:]]
+    if options.default_batch:
+        others.append({name: getattr(TrainConfig(), name) for name in ("batch", "window", "resting")})
+    named = {", ".join(f"{name} {count}" for name, count in other.items()): other for other in others}
+    return {"base": base, **{name: replace(base, **other) for name, other in named.items()}}
 
 
 @contextmanager
@@ -127,6 +132,8 @@ def main() -> None:
     parser.add_argument("--name", default="training", help="of the result files (default training)")
     for name, counts in SIZES.items():
         parser.add_argument(f"--{name}", type=int, nargs="+", default=counts, help=f"(default {counts})")
+    parser.add_argument("--no-default-batch", dest="default_batch", action="store_false",
+                        help="leave out the batch that training has by default")  # fmt: skip
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     measured = measure_all(options)
