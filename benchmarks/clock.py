@@ -83,19 +83,23 @@ def _processor_time(work: Work) -> float:
     return 1000 * (time.perf_counter() - began)
 
 
+def side_stream(device: torch.device) -> torch.cuda.Stream | None:
+    """Return the one stream that everything is built, warmed up and captured on; none without a GPU.
+
+    Autograd runs a node on the stream where it was made, and what is left on the default one breaks any capture.
+    """
+    return torch.cuda.Stream(device) if device.type == "cuda" else None
+
+
 @contextmanager
 def _graph(work: Work, generator: torch.Generator | None) -> Iterator[Work]:
-    """Capture work as a CUDA graph and yield what replays it; its memory is given back in the end."""
-    side = torch.cuda.Stream()
-    side.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(side):
-        for _ in range(WARM_UP):
-            work()
-    torch.cuda.current_stream().wait_stream(side)
+    """Capture work as a CUDA graph, on `side_stream`, and yield what replays it; in the end its memory is free."""
+    for _ in range(WARM_UP):
+        work()
     graph = torch.cuda.CUDAGraph()
     if generator is not None:
         graph.register_generator_state(generator)
-    with torch.cuda.graph(graph):
+    with torch.cuda.graph(graph, stream=torch.cuda.current_stream()):
         work()
     yield graph.replay
     graph.reset()

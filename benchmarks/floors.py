@@ -62,7 +62,7 @@ class Part:
         return (outputs,) if isinstance(outputs, Tensor) else tuple(outputs)
 
     def with_backward(self) -> Callable[[], object]:
-        """Return what does the part and its backward pass."""
+        """Return what does the part and its backward pass, both, as a graph cannot go back through what it lacks."""
         gradients = [torch.full_like(output, 1 / output.shape[-1]) for output in self.made()]
         return lambda: torch.autograd.grad(self.made(), self.leaves, gradients)
 

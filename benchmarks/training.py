@@ -23,7 +23,7 @@ from typing import Any
 from unittest import mock
 
 import torch
-from clock import Clock, Rates, Span, Work
+from clock import Clock, Rates, Span, Work, side_stream
 from floors import WARM, WINDOWS, Floor
 from memory import Peak
 from moment import Moment
@@ -136,7 +136,8 @@ def main() -> None:
                         help="leave out the batch that training has by default")  # fmt: skip
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
-    measured = measure_all(options)
+    with torch.cuda.stream(side_stream(chosen_device(options.device))):
+        measured = measure_all(options)
     write_results(options, tables(measured), measured)
 
 
