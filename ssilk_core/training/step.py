@@ -100,7 +100,8 @@ class Stepper:
         # The fused optimiser leaves parameters, moments and step counts as they are where this is one.
         self.optimiser.found_inf = bad.float()  # type: ignore[attr-defined]
         self.optimiser.step()
-        torch._foreach_lerp_([*self.averaged.parameters()], [*self.model.parameters()], 1 - self.config.average)
+        with torch.no_grad():
+            torch._foreach_lerp_([*self.averaged.parameters()], [*self.model.parameters()], 1 - self.config.average)
         terms = {name: value.detach() for name, value in terms.items()}
         self.faults.record(bad, self._iteration, terms, window)
         for name, value in terms.items():

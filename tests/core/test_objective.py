@@ -162,6 +162,7 @@ def test_a_step_weighs_every_frame_the_same(objective):
         assert value.grad is not None
         np.testing.assert_allclose(value.grad, expected[name], atol=1e-5 * float(expected[name].abs().max()) + 1e-12)
     assert stepper.terms["inertia"].item() == pytest.approx(dynamic["inertia"].mean().item(), rel=1e-5)
+    assert all(value.is_leaf and not value.requires_grad for value in stepper.averaged.parameters())  # no history
 
 
 def test_a_gradient_is_bounded_by_what_was_typical(objective):
