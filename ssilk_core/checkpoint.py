@@ -9,7 +9,7 @@ matrices are 16-bit integers, "scale.model.*" beside them.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,6 +26,8 @@ from .packing import narrowest, packed, unpacked
 
 if TYPE_CHECKING:
     from .model.network import GarmentModel
+
+Shapes = dict[str, tuple[int, ...]]
 
 FORMAT = 2
 READABLE = (1, FORMAT)  # 1 knew nothing of packed matrices
@@ -119,8 +121,12 @@ def _packed(tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {**tensors, **weights, **steps, **{f"scale.{name}": pair[1] for name, pair in matrices.items()}}
 
 
-def load_model(path: str | Path) -> ModelFile:
+def load_model(path: str | Path, shapes: Callable[[ModelFile], Shapes] | None = None) -> ModelFile:
     """Read a model file.
+
+    Args:
+        path: the file, .safetensors.
+        shapes: says which shapes its parameters must have; those of a `GarmentModel` by default.
 
     Raises:
         SsilkError: there is no such file, it is truncated, foreign, of another format version, or its parameters
@@ -130,7 +136,7 @@ def load_model(path: str | Path) -> ModelFile:
     try:
         _need_header(document)
         model = _model_of(tensors, document)
-        _need_fit(model)
+        _need_fit(model, (shapes or _implied)(model))
         return model
     except SsilkError as error:
         raise SsilkError(f"{path}: the model cannot be used: {error}") from error
@@ -251,15 +257,19 @@ def _parameters(tensors: dict[str, np.ndarray], where: str) -> dict[str, np.ndar
     return {name[6:]: value for name, value in stored.items()}
 
 
-def _need_fit(model: ModelFile) -> None:
-    """Raise `SsilkError` unless the parameters have the shapes that the header implies, before memory is taken."""
+def _implied(model: ModelFile) -> Shapes:
+    """Return the shapes that the header implies, before memory is taken."""
     import torch
 
     from .model.network import GarmentModel
 
     with torch.device("meta"):
         empty = GarmentModel(model.scene, model.config, model.joints)
-    expected = {name: tuple(value.shape) for name, value in empty.state_dict().items()}
+    return {name: tuple(value.shape) for name, value in empty.state_dict().items()}
+
+
+def _need_fit(model: ModelFile, expected: Shapes) -> None:
+    """Raise `SsilkError` unless the parameters have the shapes that are expected."""
     found = {name: value.shape for name, value in model.parameters.items()}
     odd = next((name for name in {**expected, **found} if expected.get(name) != found.get(name)), "")
     need(

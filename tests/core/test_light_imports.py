@@ -23,6 +23,7 @@ LAYERS = (
     {"model", "energy"},
     {"checkpoint"},
     {"demo", "view", "simulate", "training", "rollout", "preflight", "setup", "wardrobe"},
+    {"baselines"},
     {"cli"},
     {"__main__"},
 )

@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The training run of a baseline, to a number of iterations or to a time, in the frame of `training.run`."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import torch
+
+from ..devices import chosen_device
+from ..errors import need
+from ..events import Checkpoint, Message, Progress, Reporter, Started
+from ..training.curve import Point, with_point
+from ..training.job import TrainJob
+from ..training.keeping import Keeper
+from ..training.parts import build_parts
+from ..training.state import Best, RunState, load_state, restore
+from ..training.validation import Score
+from ..training.verdict import not_finite, verdict
+from .descriptors import joint_bank
+from .files import save_baseline
+from .networks import BaselineConfig, baseline
+from .training import BaselineObjective, BaselineStepper
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaselineJob:
+    """Everything that the training of a baseline needs.
+
+    Attributes:
+        base: scene, motions, fabric and schedule. The batch is never lowered.
+        config: what is trained.
+        judged, mixed: as in `training.BaselineObjective`.
+        seconds: time that all steps together may take, validations left out [s]; the schedule then ends with it
+            rather than with the iterations.
+    """
+
+    base: TrainJob
+    config: BaselineConfig
+    judged: int = 2
+    mixed: float = 0.0
+    seconds: float = math.inf
+
+    def identity(self) -> dict[str, Any]:
+        """Return what makes a run the run it is; a resumed run must be asked the same."""
+        limit = self.seconds if math.isfinite(self.seconds) else None
+        own = {"baseline": asdict(self.config), "judged": self.judged, "mixed": self.mixed, "limit [s]": limit}
+        return {**self.base.identity(), **own}
+
+
+class BaselineRun:
+    """A run that has been set up, or taken up where it stopped.
+
+    Attributes:
+        state: what changes while the run goes on.
+        iterations: steps to do in all; with a limit in time it is an estimate that gets better.
+    """
+
+    def __init__(self, job: BaselineJob, report: Reporter) -> None:
+        self.job, self.report, base = job, report, job.base
+        device = chosen_device(base.device)
+        self.keeper = Keeper(base, device)
+        parts = build_parts(base, device)
+        joints = parts.model.joints
+        inner = torch.as_tensor(base.scene.character.skeleton.parents[joints] >= 0, device=device)
+        bank, held = (joint_bank(bank, inner, job.config.fps) for bank in (parts.bank, parts.validator.bank))
+        self.validator, parts.validator.bank = parts.validator, held
+        self.model = baseline(base.scene, job.config, joints, base.train.seed).to(device)
+        surface = base.train.surface == "triangles"
+        objective = BaselineObjective(
+            self.model, parts.energy, parts.body, bank, surface, judged=job.judged, mixed=job.mixed
+        )
+        self.stepper = BaselineStepper(objective, base.train, torch.Generator(device).manual_seed(base.train.seed))
+        self.iterations = base.train.iterations
+        self.state = RunState(job.identity())
+        if base.resume:
+            self._take_up()
+        report(Started(job.config.method, self.iterations, {**parts.detail(), "parameters": self._parameters()}))
+
+    @cached_property
+    def plain(self) -> Score:
+        """Score of plain skinning."""
+        return self.validator.plain_score()
+
+    def _parameters(self) -> int:
+        return sum(value.numel() for value in self.model.parameters())
+
+    def _take_up(self) -> None:
+        self.state, tensors = load_state(self.keeper.state, self.state.asked)
+        restore(self.keeper.state, self.stepper, tensors)
+        self.stepper.faults.count.fill_(self.state.undone)
+        self._plan(self.state.seconds / self.state.iteration)
+
+    def _plan(self, each: float) -> None:
+        """Let the schedule end with the time, when a step takes `each` [s]."""
+        if math.isfinite(self.job.seconds):
+            left = max(0.0, self.job.seconds - self.state.seconds)
+            self.iterations = self.state.iteration + int(left / each)
+            self.stepper.config = replace(self.stepper.config, iterations=max(1, self.iterations))
+
+    def advance(self) -> None:
+        """Do the steps up to the next validation."""
+        state, every = self.state, self.job.base.train.validate_every
+        began, first = time.monotonic(), state.iteration
+        state.iteration = min(self.iterations, (first // every + 1) * every)
+        for iteration in range(first, state.iteration):
+            self.stepper.run(iteration)
+        self.batch = {name: float(value) for name, value in self.stepper.terms.items()}  # waits for the device
+        taken = time.monotonic() - began
+        state.seconds += taken
+        self._plan(taken / (state.iteration - first))
+        left = (self.iterations - state.iteration) * taken / (state.iteration - first)
+        self.report(Progress(state.iteration, max(self.iterations, state.iteration), left, self.batch))
+
+    def validate(self) -> None:
+        """Score the averaged network on the held-out clips, and keep it when it is the best so far.
+
+        Raises:
+            SsilkError: the score is not finite.
+        """
+        state, base = self.state, self.job.base
+        score = self.validator.score(self.stepper.averaged)
+        broken = " and ".join(not_finite(score))
+        need(not broken, str(base.output), f"{broken} not finite at iteration {state.iteration}",
+             "the best model before it is kept", "train again with smaller steps (--set rate=...)")  # fmt: skip
+        self.report(verdict(state.iteration, score, self.plain, base.scene.rig.proxy_count > 0))
+        finite = {name: value for name, value in self.batch.items() if math.isfinite(value)}
+        state.curve = with_point(state.curve, Point(state.iteration, state.seconds, finite, score))
+        state.undone = int(self.stepper.faults.count)
+        if state.best is None or score.total < state.best.score.total:
+            state.best = Best(state.iteration, score)
+            save_baseline(base.output, self.stepper.averaged, base.fabric, self.keeper.provenance(state, score))
+            self.report(Checkpoint(str(base.output), state.iteration, True))
+        self.keeper.save_state(self.stepper, state)
+        self.keeper.save_curve(state, self.plain)
+
+
+def train_baseline(job: BaselineJob, report: Reporter) -> RunState:
+    """Train a baseline and keep the best of it on disk, its state and learning curve beside it; return the state.
+
+    Raises:
+        SsilkError: the inputs do not suffice, or training diverged.
+    """
+    run = BaselineRun(job, report)
+    while run.state.iteration < run.iterations:
+        run.advance()
+        run.validate()
+    if run.state.undone:
+        report(Message(f"{run.state.undone} steps in all were undone.", "warning"))
+    return run.state
