@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A dressed character as arrays, between Blender's data and the stage.
+
+Everything stands in Blender's world space: its units, z up, column vectors, the armature in its rest position.
+Joint indices run over the character's joints first, then over the garment's proxies.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Joints:
+    """Joints of an armature, parents before children, the proxies of the garment last.
+
+    Attributes:
+        names: of the bones, length J.
+        parents: index of each joint's parent, -1 for roots, shape (J,).
+        binds: joint to world at rest, rigid, shape (J, 4, 4).
+        proxy_count: how many of the last joints are proxies.
+    """
+
+    names: tuple[str, ...]
+    parents: np.ndarray
+    binds: np.ndarray
+    proxy_count: int = 0
+
+    @property
+    def character_count(self) -> int:
+        return len(self.names) - self.proxy_count
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """A mesh at rest.
+
+    Attributes:
+        name: of the object.
+        points: shape (V, 3).
+        counts, corners: corners of each polygon, and the points of all corners.
+        inside_out: whether the object's transform mirrors, so that its faces turn the other way.
+        uvs: (u, v) for each corner, shape (len(corners), 2), or None.
+        weights: over all joints, shape (V, J), or None where the mesh is not bound.
+    """
+
+    name: str
+    points: np.ndarray
+    counts: np.ndarray
+    corners: np.ndarray
+    inside_out: bool
+    uvs: np.ndarray | None
+    weights: np.ndarray | None
+
+
+@dataclass(frozen=True, eq=False)
+class Dressed:
+    """A character, the bodies that the garment collides with, and the garment.
+
+    Attributes:
+        meters_per_unit: length of one of Blender's units [m].
+        classes: of the garment's vertices, shape (V,), or None to have them found.
+        plain: the garment's weights before it was rigged, over the character's joints, or None.
+    """
+
+    meters_per_unit: float
+    joints: Joints
+    bodies: tuple[Shape, ...]
+    garment: Shape
+    classes: np.ndarray | None
+    plain: np.ndarray | None
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """What `ssilk rig` made of a garment.
+
+    Attributes:
+        classes: shape (V,).
+        names: of the proxies, length P.
+        parents: joint index of each proxy's parent, shape (P,).
+        binds: proxy to world at rest, rigid, shape (P, 4, 4).
+        weights: over the character's joints and the proxies, shape (V, J + P).
+        plain: weights over the character's joints alone, shape (V, J).
+    """
+
+    classes: np.ndarray
+    names: tuple[str, ...]
+    parents: np.ndarray
+    binds: np.ndarray
+    weights: np.ndarray
+    plain: np.ndarray
+
+
+def influences(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return joint indices and weights of each vertex, heaviest first, shape (V, I), of dense weights (V, J)."""
+    width = max(int((weights > 0).sum(axis=1).max(initial=0)), 1)
+    order = np.argsort(-weights, axis=1, kind="stable")[:, :width]
+    kept = np.take_along_axis(weights, order, axis=1)
+    return np.where(kept > 0, order, 0).astype(np.int32), kept.astype(np.float32)
+
+
+def dense(indices: np.ndarray, weights: np.ndarray, joint_count: int) -> np.ndarray:
+    """Return weights over all joints, shape (V, joint_count), of influences, shape (V, I) each."""
+    matrix = np.zeros((len(indices), joint_count), dtype=np.float32)
+    np.add.at(matrix, (np.arange(len(indices))[:, None], indices), weights)
+    return matrix

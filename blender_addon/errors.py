@@ -1,0 +1,14 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What an artist can mend: one sentence that names the object, what was found and what to do."""
+
+from __future__ import annotations
+
+
+class SetupError(Exception):
+    """A scene, a setting or a process is not as it must be; operators report it and change nothing."""
+
+
+def need(condition: object, sentence: str) -> None:
+    """Raise `SetupError` with `sentence` unless `condition` holds."""
+    if not condition:
+        raise SetupError(sentence)

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A piece of work outside Blender: commands one after another, their progress, and how they ended."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from .events import Event, parse
+from .process import Process
+
+Command = Sequence[str]
+
+
+class Work:
+    """Commands in a temporary folder of their own, which goes with `close`.
+
+    Attributes:
+        title: what is being done, for people.
+        folder: where the commands run.
+        text, fraction: the latest message, and the part that is done or None.
+        result: fields of the last `result` event.
+        error: one sentence when it failed, else empty.
+        cancelled: whether `cancel` was called.
+    """
+
+    def __init__(self, title: str, commands: Callable[[Path], Sequence[Command]], *, parent: str = "") -> None:
+        """Prepare the commands, given the temporary folder, and start the first one.
+
+        Args:
+            commands: writes what the commands read, and returns them; the folder goes if it raises.
+            parent: where the folder is made; the system's place for temporary files when empty.
+        """
+        self.title, self.text, self.error = title, "", ""
+        self.fraction: float | None = None
+        self.result: dict[str, Any] = {}
+        self.cancelled = False
+        self._temporary = tempfile.TemporaryDirectory(prefix="ssilk-", dir=parent or None)
+        self.folder = Path(self._temporary.name)
+        self._process: Process | None = None
+        try:
+            self._waiting = list(commands(self.folder))
+        except BaseException:
+            self.close()
+            raise
+        self._start_next()
+
+    def poll(self) -> bool:
+        """Take in what was said meanwhile; return whether everything has ended."""
+        if self._process is None:
+            return True
+        running = self._process.running
+        for line in self._process.lines():
+            self._hear(parse(line))
+        if running:
+            return False
+        self._end(self._process)
+        return self._process is None
+
+    def cancel(self) -> None:
+        """Ask the running command to stop; `poll` says when it has."""
+        self.cancelled = True
+        if self._process:
+            self._process.cancel()
+
+    def close(self) -> None:
+        """Stop what still runs and remove the folder."""
+        if self._process:
+            self._process.stop()
+            self._process = None
+        self._temporary.cleanup()
+
+    def _hear(self, event: Event) -> None:
+        self.text = event.text or self.text
+        self.fraction = event.fraction if event.fraction is not None else self.fraction
+        if event.kind == "result":
+            self.result = event.fields.get("detail", {})
+        elif event.kind == "failed":
+            self.error = event.text
+
+    def _end(self, process: Process) -> None:
+        self._process = None
+        if self.cancelled:
+            self.error = f"{self.title} was cancelled."
+        elif process.exit_code:
+            self.error = self.error or process.complaint or f"{self.title} ended with code {process.exit_code}."
+        elif self._waiting:
+            self._start_next()
+
+    def _start_next(self) -> None:
+        command = self._waiting.pop(0)
+        try:
+            self._process = Process(command, self.folder)
+        except OSError as error:
+            self.error = f"{command[0]} cannot be started ({error.strerror or error}); choose another Python."

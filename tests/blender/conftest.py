@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A pillar with three bones in a flared skirt, in Blender, and the Python that ssilk is installed in.
+
+What needs Blender is skipped without the bpy module, and what needs ssilk without a Python that has it:
+SSILK_PYTHON, else this one, else .venv of the repository.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[2]
+HEIGHTS = (0.8, 1.2, 1.5)  # of the bones [m]
+BONES = ("Hips", "Spine", "Head")
+
+
+@pytest.fixture(scope="session")
+def ssilk_python() -> str:
+    """The path of a Python that has ssilk installed, with what `ssilk rig` needs."""
+    try:
+        importlib.metadata.version("ssilk")
+        here = [sys.executable]
+    except importlib.metadata.PackageNotFoundError:
+        here = []
+    candidates = [os.environ.get("SSILK_PYTHON", ""), *here, str(ROOT / ".venv" / "bin" / "python")]
+    found = next((path for path in candidates if path and Path(path).exists()), None)
+    if found is None:
+        pytest.skip("no Python with ssilk: set SSILK_PYTHON, or run `make test` once")
+    return found
+
+
+@pytest.fixture
+def bpy() -> Iterator[ModuleType]:
+    """The bpy module with an empty scene and the extension enabled, as a plain add-on from its folder."""
+    bpy = pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
+    import addon_utils
+
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    assert addon_utils.enable("blender_addon", default_set=True)
+    yield bpy
+    addon_utils.disable("blender_addon", default_set=True)
+
+
+@pytest.fixture
+def ready(bpy: ModuleType, ssilk_python: str) -> ModuleType:
+    """Blender with a Python that was chosen and checked."""
+    bpy.context.preferences.addons["blender_addon"].preferences.python = ssilk_python
+    assert bpy.ops.ssilk.check_python() == {"FINISHED"}
+    return bpy
+
+
+@pytest.fixture
+def skirt(bpy: ModuleType) -> Any:
+    """A skirt without weights, active and selected, and a pillar bound to an armature of three bones."""
+    armature = add_armature(bpy)
+    pillar = add_mesh(bpy, "Pillar", *tube(16, 18, (0.0, 1.7), (0.15, 0.15)))
+    for name, low, high in zip(BONES, (0.0, *HEIGHTS[1:]), (*HEIGHTS[1:], 9.0)):
+        inside = [vertex.index for vertex in pillar.data.vertices if low <= vertex.co.z < high]
+        pillar.vertex_groups.new(name=name).add(inside, 1.0, "REPLACE")
+    pillar.modifiers.new("Armature", "ARMATURE").object = armature
+    garment = add_mesh(bpy, "Skirt", *tube(24, 13, (0.6, 1.0, 1.3), (0.5, 0.165, 0.165)))
+    activate(bpy, garment)
+    return garment
+
+
+def add_armature(bpy: ModuleType) -> Any:
+    armature = bpy.data.objects.new("Rig", bpy.data.armatures.new("Rig"))
+    bpy.context.collection.objects.link(armature)
+    activate(bpy, armature)
+    bpy.ops.object.mode_set(mode="EDIT")
+    above = None
+    for name, height in zip(BONES, HEIGHTS):
+        bone = armature.data.edit_bones.new(name)
+        bone.head, bone.tail, bone.parent = (0, 0, height), (0, 0, height + 0.2), above
+        above = bone
+    bpy.ops.object.mode_set(mode="OBJECT")
+    return armature
+
+
+def add_mesh(bpy: ModuleType, name: str, points: np.ndarray, faces: np.ndarray) -> Any:
+    mesh = bpy.data.meshes.new(name)
+    mesh.from_pydata(points.tolist(), [], faces.tolist())
+    thing = bpy.data.objects.new(name, mesh)
+    bpy.context.collection.objects.link(thing)
+    return thing
+
+
+def activate(bpy: ModuleType, thing: Any) -> None:
+    """Make an object the only selected one, and the active one."""
+    for other in bpy.context.view_layer.objects:
+        other.select_set(False)
+    thing.select_set(True)
+    bpy.context.view_layer.objects.active = thing
+
+
+def tube(columns: int, rows: int, heights: tuple[float, ...], radii: tuple[float, ...]) -> tuple[Any, Any]:
+    """Quads around the z axis, normals outward, with radii interpolated between heights [m]."""
+    angle, z = np.arange(columns) * 2 * np.pi / columns, np.linspace(heights[0], heights[-1], rows)
+    radius = np.interp(z, heights, radii)[:, None]
+    points = np.stack(np.broadcast_arrays(radius * np.cos(angle), radius * np.sin(angle), z[:, None]), -1)
+    row, column = (part.reshape(-1) for part in np.mgrid[0 : rows - 1, 0:columns])
+    a, b = row * columns + column, row * columns + (column + 1) % columns
+    return points.reshape(-1, 3), np.c_[a, b, b + columns, a + columns]
