@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Painting vertex classes with Blender's own brushes, and taking the painting up."""
+
+from __future__ import annotations
+
+import bpy
+from bpy.props import EnumProperty, FloatProperty
+
+from .. import classes as palette
+from ..errors import need
+from ..scene import attributes
+from ..scene.garment import unusable
+from ..scene.painting import choose_color, offer_palette
+from ..scene.symmetry import partners_across
+from .reporting import ReportingOperator
+
+CHOICES = [
+    ("PINNED", "Pinned", "Rigidly follows the skeleton, black: belts, collars, what is sewn on"),
+    ("TIGHT", "Tight", "Follows the body closely, red"),
+    ("LOOSE", "Loose", "Moves freely, green: moved by proxy joints and the network"),
+]
+VALUES = {name: value for value, (name, *_) in enumerate(CHOICES)}
+
+
+class ClassOperator(ReportingOperator):
+    """Base of operators on the garment's classes, outside edit mode."""
+
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        reason = unusable(context.object)
+        if not reason and context.mode not in {"OBJECT", "PAINT_VERTEX"}:
+            reason = "Go to Object Mode or Vertex Paint"
+        cls.poll_message_set(reason)
+        return not reason
+
+
+class PaintClasses(ClassOperator, bpy.types.Operator):
+    """Paint vertex classes with Blender's vertex-paint brushes: pinned black, tight red, loose green"""
+
+    bl_idname = "ssilk.paint_classes"
+    bl_label = "Paint Classes"
+
+    def apply(self, context: bpy.types.Context) -> str:
+        mesh = context.object.data
+        attributes.take_up_painting(mesh)
+        attributes.show_classes(mesh)
+        if context.mode != "PAINT_VERTEX":
+            bpy.ops.object.mode_set(mode="VERTEX_PAINT")
+        offer_palette(context)
+        return ""
+
+
+class TakeUpPainting(ClassOperator, bpy.types.Operator):
+    """Turn painted colours into classes, each into the nearest one, and make the colours pure again"""
+
+    bl_idname = "ssilk.take_up_painting"
+    bl_label = "Take Up Painting"
+
+    def apply(self, context: bpy.types.Context) -> str:
+        thing = context.object
+        painted = palette.COLOR_ATTRIBUTE in thing.data.attributes
+        need(painted, f"'{thing.name}' has no painted classes; choose Paint Classes first.")
+        return f"{attributes.take_up_painting(thing.data)} vertices of '{thing.name}' changed class."
+
+
+class ShowClasses(ClassOperator, bpy.types.Operator):
+    """Show classes as colours, made anew from the stored ones; in Solid shading, in this view"""
+
+    bl_idname = "ssilk.show_classes"
+    bl_label = "Show Classes"
+
+    def apply(self, context: bpy.types.Context) -> str:
+        attributes.show_classes(context.object.data)
+        if context.space_data and context.space_data.type == "VIEW_3D":
+            context.space_data.shading.color_type = "VERTEX"
+        return ""
+
+
+class BrushClass(ReportingOperator, bpy.types.Operator):
+    """Paint this class from now on"""
+
+    bl_idname = "ssilk.brush_class"
+    bl_label = "Paint This Class"
+
+    value: EnumProperty(name="Class", items=CHOICES)
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("Choose Paint Classes first")
+        return context.mode == "PAINT_VERTEX" and context.tool_settings.vertex_paint.brush is not None
+
+    def apply(self, context: bpy.types.Context) -> str:
+        choose_color(context, palette.COLORS[VALUES[self.value]])
+        return ""
+
+
+class MirrorClasses(ClassOperator, bpy.types.Operator):
+    """Give one side the classes of the other, by the places of vertices along the garment's own x axis"""
+
+    bl_idname = "ssilk.mirror_classes"
+    bl_label = "Mirror Classes"
+
+    source: EnumProperty(
+        name="From",
+        items=[("LEFT", "Left (+x)", "From the character's left"), ("RIGHT", "Right (-x)", "From its right")],
+    )
+    distance: FloatProperty(
+        name="Tolerance",
+        description="How far from the mirrored place a vertex may lie",
+        default=0.01,
+        min=0.0,
+        subtype="DISTANCE",
+    )
+
+    def apply(self, context: bpy.types.Context) -> str:
+        thing = context.object
+        values = attributes.current_classes(thing.data)
+        need(values is not None, f"'{thing.name}' has no classes; paint it first.")
+        points, partners = partners_across(thing.data, self.distance)
+        mirrored = palette.mirrored(values, points, partners, from_left=self.source == "LEFT")
+        attributes.write_classes(thing.data, mirrored)
+        alone = int((partners < 0).sum())
+        told = f"; {alone} have none across and stay as they are" if alone else ""
+        return f"{int((mirrored != values).sum())} vertices of '{thing.name}' changed class{told}."
+
+
+CLASSES = (PaintClasses, TakeUpPainting, ShowClasses, BrushClass, MirrorClasses)

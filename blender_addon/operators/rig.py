@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Automatic classes and proxy rigs, made outside by `ssilk rig`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+from bpy.props import BoolProperty, IntProperty
+
+from ..classes import LOOSE
+from ..errors import need
+from ..outside.work import Work
+from ..preferences import interpreter, preferences, unready
+from ..scene.apply import apply_classes, apply_rig
+from ..scene.armature import need_editable, proxy_names
+from ..scene.attributes import current_classes
+from ..scene.garment import armature_of, unusable
+from ..scene.gather import gather
+from ..scene.handover import Handover, hand_over, rig_command
+from . import tasks
+
+
+class RigOperator(tasks.OutsideOperator):
+    """Base of operators that hand the garment to `ssilk rig`."""
+
+    handover: Handover | None = None
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        reason = tasks.busy() or unusable(context.object) or unready(context)
+        reason = reason or ("" if context.mode == "OBJECT" else "Go to Object Mode")
+        cls.poll_message_set(reason)
+        return not reason
+
+    def begin(self, context: bpy.types.Context, title: str, *, classes: bool, options: tuple[str, ...]) -> Work:
+        """Write the garment without its proxies, and start `ssilk rig`."""
+        garment = context.object
+        dressed, armature = gather(garment, classes=classes, proxies=False), armature_of(garment)
+        python = interpreter(preferences(context))
+
+        def commands(folder: Path) -> list[list[str]]:
+            self.handover = hand_over(dressed, garment, armature, folder)
+            return [rig_command(python, folder, self.handover, options)]
+
+        return Work(title, commands, parent=bpy.app.tempdir)
+
+    def explain(self, work: Work) -> str:
+        return self.handover.in_blender_words(work.error, work.folder)
+
+
+class Classify(RigOperator, bpy.types.Operator):
+    """Find classes by the garment's distance to the body and by where limbs part; replaces what is painted"""
+
+    bl_idname = "ssilk.classify"
+    bl_label = "Classify Automatically"
+    undo = "Classify Automatically"
+
+    def prepare(self, context: bpy.types.Context) -> Work:
+        return self.begin(context, f"Classifying '{context.object.name}'", classes=False, options=("--proxies", "1"))
+
+    def finish(self, context: bpy.types.Context, work: Work) -> str:
+        garment, _ = self.handover.objects()
+        apply_classes(garment, self.handover.rig(work.folder))
+        return f"'{garment.name}' is classified."
+
+
+class GenerateRig(RigOperator, bpy.types.Operator):
+    """Make proxy bones for the loose part, and weights for the whole garment, from its classes"""
+
+    bl_idname = "ssilk.generate_rig"
+    bl_label = "Generate Proxy Rig"
+    undo = "Generate Proxy Rig"
+
+    proxies: IntProperty(name="Proxies", description="Proxy bones on the loose part", default=20, min=1, max=200)
+    replace: BoolProperty(
+        name="Replace Existing",
+        description="Remove the garment's proxies first, with what was edited on them by hand",
+    )
+
+    def invoke(self, context: bpy.types.Context, _: bpy.types.Event) -> set[str]:
+        """Ask for the options."""
+        return context.window_manager.invoke_props_dialog(self)
+
+    def prepare(self, context: bpy.types.Context) -> Work:
+        garment = context.object
+        armature, classes = armature_of(garment), current_classes(garment.data)
+        need_editable(armature)
+        old = len(proxy_names(armature, garment))
+        need(
+            self.replace or not old,
+            f"'{garment.name}' has {old} proxies already; they stay as they are unless Replace Existing is on.",
+        )
+        need(classes is not None, f"'{garment.name}' has no classes; classify or paint it first.")
+        need((classes == LOOSE).any(), f"Nothing of '{garment.name}' is loose, so it needs no proxies; paint some.")
+        options = ("--proxies", str(self.proxies))
+        return self.begin(context, f"Rigging '{garment.name}'", classes=True, options=options)
+
+    def finish(self, context: bpy.types.Context, work: Work) -> str:
+        garment, armature = self.handover.objects()
+        rig = self.handover.rig(work.folder)
+        apply_rig(garment, armature, self.handover.joints, rig)
+        return f"'{armature.name}' has {len(rig.names)} proxies for '{garment.name}'."
+
+
+CLASSES = (Classify, GenerateRig)

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Work outside Blender, watched by a timer, one at a time; every other event passes meanwhile."""
+
+from __future__ import annotations
+
+import time
+
+import bpy
+
+from ..errors import SetupError
+from ..outside.work import Work
+
+INTERVAL = 0.1  # seconds between two looks at a running work
+current: Work | None = None
+
+
+class OutsideOperator:
+    """Base of operators whose work runs outside.
+
+    Subclasses give `prepare`, which returns the work, and `finish`, which takes its result and returns a sentence.
+    Neither is undone by itself: what changes Blender's data names the step in `undo`.
+    """
+
+    undo = ""
+    work: Work | None = None
+    timer: bpy.types.Timer | None = None
+
+    def prepare(self, context: bpy.types.Context) -> Work:
+        """Check everything and start the work; raise `SetupError` if it cannot."""
+        raise NotImplementedError
+
+    def finish(self, context: bpy.types.Context, work: Work) -> str:
+        """Take the result; return what to tell."""
+        raise NotImplementedError
+
+    def explain(self, work: Work) -> str:
+        """Return why the work failed."""
+        return work.error
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Start, and watch by a timer; wait instead where there is no window to do so."""
+        if not self._begin(context):
+            return {"CANCELLED"}
+        if bpy.app.background:
+            while not self.work.poll():
+                time.sleep(INTERVAL / 10)
+            return self._end(context)
+        self.timer = context.window_manager.event_timer_add(INTERVAL, window=context.window)
+        context.window_manager.modal_handler_add(self)
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Look at the work now and then."""
+        if event.type != "TIMER":
+            return {"PASS_THROUGH"}
+        redraw(context)
+        if self.work is not current:  # stopped by `stop`
+            self._leave(context)
+            return {"CANCELLED"}
+        if not self.work.poll():
+            return {"PASS_THROUGH"}
+        if self.undo and context.mode != "OBJECT" and not self.work.error:
+            self.work.text = "Done; it is applied as soon as you are in Object Mode"
+            return {"PASS_THROUGH"}
+        return self._end(context)
+
+    def cancel(self, context: bpy.types.Context) -> None:
+        """Stop, as Blender asks when it closes the file."""
+        self._leave(context)
+
+    def _begin(self, context: bpy.types.Context) -> bool:
+        global current
+        try:
+            self.work = self.prepare(context)
+        except SetupError as error:
+            self.report({"ERROR"}, str(error))
+            return False
+        current = self.work
+        return True
+
+    def _end(self, context: bpy.types.Context) -> set[str]:
+        """Report how the work ended, with what it made."""
+        work = self.work
+        try:
+            if work.error:
+                raise SetupError(self.explain(work))
+            self.report({"INFO"}, self.finish(context, work))
+        except SetupError as error:
+            self.report({"WARNING" if work.cancelled else "ERROR"}, str(error))
+            return {"CANCELLED"}
+        finally:
+            self._leave(context)
+        if self.undo:
+            bpy.ops.ed.undo_push(message=self.undo)
+        return {"FINISHED"}
+
+    def _leave(self, context: bpy.types.Context) -> None:
+        global current
+        if self.timer:
+            context.window_manager.event_timer_remove(self.timer)
+            self.timer = None
+        self.work.close()
+        if current is self.work:
+            current = None
+        redraw(context)
+
+
+def busy() -> str:
+    """Return what is running already; empty if nothing is."""
+    return f"{current.title} still runs" if current else ""
+
+
+def stop() -> None:
+    """Stop what runs, for good."""
+    global current
+    if current:
+        current.close()
+        current = None
+
+
+def redraw(context: bpy.types.Context) -> None:
+    """Draw again what shows progress."""
+    for window in context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type in {"VIEW_3D", "PREFERENCES"}:
+                area.tag_redraw()
+
+
+class CancelWork(bpy.types.Operator):
+    """Stop what runs outside Blender"""
+
+    bl_idname = "ssilk.cancel"
+    bl_label = "Cancel"
+
+    @classmethod
+    def poll(cls, _: bpy.types.Context) -> bool:
+        cls.poll_message_set("Nothing runs")
+        return current is not None
+
+    def execute(self, _: bpy.types.Context) -> set[str]:
+        current.cancel()
+        return {"FINISHED"}
+
+
+CLASSES = (CancelWork,)

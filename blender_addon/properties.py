@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a garment object remembers."""
+
+from __future__ import annotations
+
+import bpy
+from bpy.props import PointerProperty
+
+
+def _is_armature(_: object, thing: bpy.types.Object) -> bool:
+    return thing.type == "ARMATURE"
+
+
+class GarmentSettings(bpy.types.PropertyGroup):
+    """Choices for one garment; where one is empty, what is meant is found (see `scene.garment`)."""
+
+    armature: PointerProperty(
+        type=bpy.types.Object,
+        poll=_is_armature,
+        name="Armature",
+        description="Armature of the character that wears the garment; found by its Armature modifier when empty",
+    )
+    bodies: PointerProperty(
+        type=bpy.types.Collection,
+        name="Bodies",
+        description="Meshes that the garment collides with; all others bound to the armature when empty",
+    )
+
+
+CLASSES = (GarmentSettings,)
+
+
+def attach() -> None:
+    """Give every object the settings."""
+    bpy.types.Object.ssilk = PointerProperty(type=GarmentSettings)
+
+
+def detach() -> None:
+    """Take them away; what was chosen stays in the file."""
+    del bpy.types.Object.ssilk

@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Every class and property that Blender hears of, and their removal."""
+
+from __future__ import annotations
+
+import bpy
+
+from . import panels, preferences, properties
+from .operators import classes, environment, fill, rig, tasks
+
+CLASSES = (
+    *properties.CLASSES,
+    *preferences.CLASSES,
+    *tasks.CLASSES,
+    *environment.CLASSES,
+    *classes.CLASSES,
+    *fill.CLASSES,
+    *rig.CLASSES,
+    *panels.CLASSES,
+)
+
+
+def register() -> None:
+    """Register all classes, then the properties that use them."""
+    for kind in CLASSES:
+        bpy.utils.register_class(kind)
+    properties.attach()
+
+
+def unregister() -> None:
+    """Stop what runs outside, then remove properties and classes in reverse."""
+    tasks.stop()
+    properties.detach()
+    for kind in reversed(CLASSES):
+        bpy.utils.unregister_class(kind)

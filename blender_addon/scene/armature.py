@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Bones as joints, and proxies as bones in a collection of their own.
+
+The collection names its garment by a custom property, so that both may be renamed. A bone is a proxy of the garment
+if it is in the collection or descends from one that is; artists add, move, reparent and delete them like any other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from ..contract.arrays import Joints, Rig
+from ..errors import need
+
+OWNER = "ssilk_garment"  # custom property of a bone collection: the garment object
+PALETTE = "THEME04"
+ALONE = 0.05  # how long proxies are drawn that have none above
+UNEQUAL = 1e-3  # relative difference of scales that still counts as uniform
+
+
+def read_joints(armature: bpy.types.Object, garment: bpy.types.Object) -> Joints:
+    """Return the deforming bones at rest: the character's, then the garment's proxies; other garments' are left out.
+
+    Raises:
+        SetupError: no bone deforms, or the armature is scaled unequally or mirrored.
+    """
+    owners = _owners(armature.data)
+    bones = [bone for bone in armature.data.bones if bone.use_deform]  # Blender keeps parents before children
+    own = [bone for bone in bones if bone.name not in owners]
+    proxies = [bone for bone in bones if owners.get(bone.name) == garment]
+    need(own, f"No bone of '{armature.name}' deforms; switch on Deform for the bones that move the character.")
+    ordered = [*own, *proxies]
+    index = {bone.name: joint for joint, bone in enumerate(ordered)}
+    return Joints(
+        names=tuple(index),
+        parents=np.array([_parent(bone, index) for bone in ordered], dtype=np.int64),
+        binds=np.array([_rigid(armature) @ bone.matrix_local @ _shrunk(armature) for bone in ordered]),
+        proxy_count=len(proxies),
+    )
+
+
+def proxy_names(armature: bpy.types.Object, garment: bpy.types.Object) -> list[str]:
+    """Return the names of a garment's proxies."""
+    return [name for name, owner in _owners(armature.data).items() if owner == garment]
+
+
+def need_editable(armature: bpy.types.Object) -> None:
+    """Check that bones can be added.
+
+    Raises:
+        SetupError: the armature is linked, overridden or cannot be reached in this view layer.
+    """
+    linked = armature.library or armature.data.library or armature.override_library or armature.data.override_library
+    need(not linked, f"'{armature.name}' is linked from another file; proxies need an armature of this file.")
+    visible = armature.name in bpy.context.view_layer.objects and armature.visible_get()
+    need(visible, f"'{armature.name}' is hidden or excluded from the view layer; show it, so that it can be edited.")
+
+
+def replace_proxies(armature: bpy.types.Object, garment: bpy.types.Object, joints: Joints, rig: Rig) -> list[str]:
+    """Put a rig's proxies in place of the garment's older ones; return the names that Blender gave them.
+
+    Args:
+        joints: the character's joints that the rig's parents count from.
+    """
+    old, to_armature = proxy_names(armature, garment), armature.matrix_world.inverted()
+    names: list[str] = []
+    with _editing(armature):
+        bones = armature.data.edit_bones
+        for name in old:
+            bones.remove(bones[name])
+        collection = _collection(armature.data, garment)
+        length = _length(rig)
+        for name, parent, bind in zip(rig.names, rig.parents, rig.binds):
+            bone = bones.new(name)
+            bone.tail = (0.0, length, 0.0)  # a bone without length takes no matrix
+            bone.parent = bones[[*joints.names, *names][parent]]
+            bone.matrix = _unscaled(to_armature @ Matrix(bind))
+            bone.length = length / armature.matrix_world.median_scale
+            bone.color.palette = PALETTE
+            collection.assign(bone)
+            names.append(bone.name)
+    return names
+
+
+def _owners(armature: bpy.types.Armature) -> dict[str, object]:
+    """Return the garment of each proxy by the bone's name, parents first; None where the garment is gone."""
+    listed = {
+        bone.name: collection.get(OWNER)
+        for collection in armature.collections_all
+        if OWNER in collection.keys()  # noqa: SIM118 (no dictionary)
+        for bone in collection.bones
+    }
+    owners: dict[str, object] = {}
+    for bone in armature.bones:
+        if bone.name in listed:
+            owners[bone.name] = listed[bone.name]
+        elif bone.parent and bone.parent.name in owners:
+            owners[bone.name] = owners[bone.parent.name]
+    return owners
+
+
+def _parent(bone: bpy.types.Bone, index: dict[str, int]) -> int:
+    """Return the joint that is a bone's nearest ancestor; -1 without."""
+    return next((index[above.name] for above in bone.parent_recursive if above.name in index), -1)
+
+
+def _rigid(armature: bpy.types.Object) -> Matrix:
+    """Return the armature's placement; its scale must be uniform."""
+    scale, placement = armature.matrix_world.to_scale(), armature.matrix_world
+    uniform = max(scale) - min(scale) <= UNEQUAL * abs(max(scale)) and placement.determinant() > 0
+    need(uniform, f"'{armature.name}' is scaled unequally or mirrored; apply its scale (Ctrl A).")
+    return placement
+
+
+def _shrunk(armature: bpy.types.Object) -> Matrix:
+    return Matrix.Scale(1 / armature.matrix_world.median_scale, 4)
+
+
+def _unscaled(matrix: Matrix) -> Matrix:
+    place, turn, _ = matrix.decompose()
+    return Matrix.LocRotScale(place, turn, None)
+
+
+def _length(rig: Rig) -> float:
+    """Return how long proxies are drawn, in world units: half the mean way to the next one."""
+    places, above = rig.binds[:, :3, 3], rig.parents - (rig.weights.shape[1] - len(rig.binds))
+    chained = above >= 0
+    steps = np.linalg.norm(places[chained] - places[above[chained]], axis=1)
+    return float(steps.mean() / 2) if len(steps) else ALONE
+
+
+def _collection(armature: bpy.types.Armature, garment: bpy.types.Object) -> bpy.types.BoneCollection:
+    """Return the bone collection of a garment's proxies, made if there is none."""
+    for collection in armature.collections_all:
+        if collection.get(OWNER) == garment:
+            return collection
+    collection = armature.collections.new(f"{garment.name} proxies")
+    collection[OWNER] = garment
+    return collection
+
+
+@contextmanager
+def _editing(armature: bpy.types.Object) -> Iterator[None]:
+    """Be in edit mode of an armature, from object mode, and put the active object back afterwards."""
+    layer = bpy.context.view_layer
+    before, selected = layer.objects.active, armature.select_get()
+    layer.objects.active = armature
+    bpy.ops.object.mode_set(mode="EDIT")
+    try:
+        yield
+    finally:
+        bpy.ops.object.mode_set(mode="OBJECT")
+        armature.select_set(selected)
+        layer.objects.active = before

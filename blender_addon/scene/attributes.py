@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The class attribute of a mesh, and the colours that artists paint.
+
+The truth is an integer for each point. It is not of 8 bits: Blender's USD importer makes 32, and edit mode reads
+no others from Python. Colours are made from it and taken up into it; nothing does so behind the artist's back.
+"""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+
+from .. import classes as palette
+from ..errors import need
+
+
+def read_classes(mesh: bpy.types.Mesh) -> np.ndarray | None:
+    """Return the class of each vertex, shape (V,); None where the mesh has none. Not in edit mode.
+
+    Raises:
+        SetupError: the attribute is no integer for each point, or holds other values.
+    """
+    attribute = mesh.attributes.get(palette.ATTRIBUTE)
+    if attribute is None:
+        return None
+    need(
+        attribute.domain == "POINT" and attribute.data_type in {"INT", "INT8"},
+        f"The attribute '{palette.ATTRIBUTE}' of '{mesh.name}' is {attribute.data_type} on {attribute.domain}; "
+        "integers on points are needed: remove it and paint again.",
+    )
+    values = np.empty(len(mesh.vertices), dtype=np.int32)
+    attribute.data.foreach_get("value", values)
+    need(
+        palette.in_range(values),
+        f"The attribute '{palette.ATTRIBUTE}' of '{mesh.name}' holds values besides 0, 1 and 2; paint these again.",
+    )
+    return values
+
+
+def write_classes(mesh: bpy.types.Mesh, values: np.ndarray) -> None:
+    """Set the class of each vertex, shape (V,), and the colours with them where there are any. Not in edit mode."""
+    attribute = mesh.attributes.get(palette.ATTRIBUTE)
+    if attribute and (attribute.domain, attribute.data_type) != ("POINT", "INT"):
+        mesh.attributes.remove(attribute)
+        attribute = None
+    attribute = attribute or mesh.attributes.new(palette.ATTRIBUTE, "INT", "POINT")
+    attribute.data.foreach_set("value", np.ascontiguousarray(values, dtype=np.int32))
+    if palette.COLOR_ATTRIBUTE in mesh.attributes:
+        show_classes(mesh)
+    mesh.update()
+
+
+def show_classes(mesh: bpy.types.Mesh) -> None:
+    """Make the active colours of a mesh those of its classes; all is tight where there are none yet."""
+    values = read_classes(mesh)
+    if values is None:
+        values = np.full(len(mesh.vertices), palette.TIGHT, dtype=np.int32)
+        write_classes(mesh, values)
+    layer = mesh.color_attributes.get(palette.COLOR_ATTRIBUTE)
+    if layer and layer.domain != "POINT":
+        mesh.color_attributes.remove(layer)
+        layer = None
+    layer = layer or mesh.color_attributes.new(palette.COLOR_ATTRIBUTE, "BYTE_COLOR", "POINT")
+    layer.data.foreach_set("color_srgb", palette.colors_of(values).astype(np.float32).reshape(-1))
+    mesh.color_attributes.active_color = mesh.color_attributes[palette.COLOR_ATTRIBUTE]
+    mesh.update()
+
+
+def painted_classes(mesh: bpy.types.Mesh) -> np.ndarray | None:
+    """Return the class whose colour each vertex is nearest to, shape (V,); None without colours. Not in edit mode."""
+    layer = mesh.color_attributes.get(palette.COLOR_ATTRIBUTE)
+    if layer is None:
+        return None
+    colors = np.empty(len(layer.data) * 4, dtype=np.float32)
+    layer.data.foreach_get("color_srgb", colors)
+    colors = colors.reshape(-1, 4)
+    if layer.domain == "CORNER":  # another tool converted it
+        points = np.empty(len(mesh.loops), dtype=np.int32)
+        mesh.loops.foreach_get("vertex_index", points)
+        colors = palette.point_colors(colors, points, len(mesh.vertices))
+    return palette.nearest(colors)
+
+
+def take_up_painting(mesh: bpy.types.Mesh) -> int:
+    """Make classes of the colours, and the colours pure again; return how many vertices changed class."""
+    painted, before = painted_classes(mesh), read_classes(mesh)
+    if painted is None:
+        return 0
+    write_classes(mesh, painted)
+    return len(painted) if before is None else int(np.count_nonzero(painted != before))
+
+
+def current_classes(mesh: bpy.types.Mesh) -> np.ndarray | None:
+    """Return the classes as the artist sees them: as painted where there are colours, else the attribute."""
+    painted = painted_classes(mesh)
+    return read_classes(mesh) if painted is None else painted

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Which object is the garment, and which armature and bodies go with it."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..classes import ATTRIBUTE
+from ..errors import SetupError, need
+
+# Modifiers that leave points where they are, and those that may come after the armature's.
+HARMLESS = {
+    "DATA_TRANSFER", "NORMAL_EDIT", "UV_PROJECT", "UV_WARP", "VERTEX_WEIGHT_EDIT", "VERTEX_WEIGHT_MIX",
+    "VERTEX_WEIGHT_PROXIMITY", "WEIGHTED_NORMAL",
+}  # fmt: skip
+AFTERWARDS = {"SUBSURF", "SOLIDIFY"}
+
+
+def unusable(thing: bpy.types.Object | None) -> str:
+    """Return why an object cannot be a garment; empty if it can."""
+    if thing is None or thing.type != "MESH":
+        return "Select the garment, a mesh, first"
+    if thing.library or thing.data.library:
+        return f"'{thing.name}' is linked from another file; make it local or open that file"
+    if not len(thing.data.polygons):
+        return f"'{thing.name}' has no faces"
+    return ""
+
+
+def is_garment(thing: bpy.types.Object) -> bool:
+    """Return whether an object has vertex classes, or an armature chosen for it."""
+    return thing.type == "MESH" and (ATTRIBUTE in thing.data.attributes or thing.ssilk.armature is not None)
+
+
+def armature_of(garment: bpy.types.Object) -> bpy.types.Object:
+    """Return the armature that a garment was given, else that of its modifier, else its parent, else the only one.
+
+    Raises:
+        SetupError: there is none, or there are several.
+    """
+    bound = _modifier_armature(garment)
+    above = garment.parent if garment.parent and garment.parent.type == "ARMATURE" else None
+    chosen = garment.ssilk.armature or bound or above
+    if chosen:
+        return chosen
+    found = [thing for thing in bpy.context.scene.objects if thing.type == "ARMATURE"]
+    names = ", ".join(f"'{thing.name}'" for thing in found)
+    need(found, f"There is no armature for '{garment.name}'; a garment needs a character with bones.")
+    need(len(found) == 1, f"'{garment.name}' could belong to {names}; choose its armature in the Garment panel.")
+    return found[0]
+
+
+def bodies_of(garment: bpy.types.Object, armature: bpy.types.Object) -> list[bpy.types.Object]:
+    """Return the meshes that a garment collides with: those chosen, else all others bound to its armature.
+
+    Raises:
+        SetupError: there is none, or one that was chosen is not bound to the armature.
+    """
+    chosen = garment.ssilk.bodies
+    things = chosen.all_objects if chosen else bpy.context.scene.objects
+    meshes = [thing for thing in things if thing.type == "MESH" and thing != garment]
+    bound = [thing for thing in meshes if _modifier_armature(thing) == armature]
+    if not chosen:
+        bound = [thing for thing in bound if not is_garment(thing)]
+    loose = [thing.name for thing in meshes if thing not in bound] if chosen else []
+    if loose:
+        raise SetupError(f"'{loose[0]}' is not bound to '{armature.name}'; bind it, or take it from '{chosen.name}'.")
+    need(bound, f"No body is bound to '{armature.name}'; give the character's mesh an Armature modifier.")
+    return bound
+
+
+def shaping_modifiers(thing: bpy.types.Object) -> list[bpy.types.Modifier]:
+    """Return the modifiers that shape a mesh before its armature deforms it."""
+    kinds = [modifier.type for modifier in thing.modifiers]
+    bound = "ARMATURE" in kinds
+    before = thing.modifiers[: kinds.index("ARMATURE")] if bound else thing.modifiers[:]
+    passed = HARMLESS if bound else HARMLESS | AFTERWARDS
+    return [modifier for modifier in before if modifier.show_viewport and modifier.type not in passed]
+
+
+def need_plain_shape(garment: bpy.types.Object) -> None:
+    """Check that a garment's own vertices are those that its armature moves.
+
+    Raises:
+        SetupError: a modifier shapes it first.
+    """
+    for modifier in shaping_modifiers(garment):
+        raise SetupError(
+            f"'{garment.name}' is shaped by its modifier '{modifier.name}' before bones move it; apply the modifier."
+        )
+
+
+def _modifier_armature(thing: bpy.types.Object) -> bpy.types.Object | None:
+    return next((modifier.object for modifier in thing.modifiers if modifier.type == "ARMATURE"), None)

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A garment out to `ssilk rig`, and its answer back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import bpy
+
+from ..contract.arrays import Dressed, Joints, Rig
+from ..errors import need
+
+STAGE, RIGGED = "dressed.usdc", "rigged.usdc"
+
+
+@dataclass(frozen=True)
+class Handover:
+    """What was given away: whose it was, and what its prims are called.
+
+    Attributes:
+        garment, armature: session_uid of the objects; they may be deleted or renamed meanwhile.
+        joints: the character's joints as they were written.
+        prims: path of each mesh in the stage by the name of its object.
+    """
+
+    garment: int
+    armature: int
+    name: str
+    joints: Joints
+    prims: dict[str, str]
+
+    def objects(self) -> tuple[bpy.types.Object, bpy.types.Object]:
+        """Return the garment and the armature.
+
+        Raises:
+            SetupError: one was deleted.
+        """
+        found = {thing.session_uid: thing for thing in bpy.context.scene.objects}
+        gone = [uid for uid in (self.garment, self.armature) if uid not in found]
+        need(not gone, f"'{self.name}' or its armature was deleted meanwhile; nothing was changed.")
+        return found[self.garment], found[self.armature]
+
+    def rig(self, folder: Path) -> Rig:
+        """Return what was made of it."""
+        from ..contract.read import read_rig
+
+        return read_rig(folder / RIGGED, self.prims[self.name], self.joints)
+
+    def in_blender_words(self, sentence: str, folder: Path) -> str:
+        """Return a sentence with names of objects in place of files and prims."""
+        for name, prim in sorted(self.prims.items(), key=lambda pair: -len(pair[1])):
+            sentence = sentence.replace(f"{folder / STAGE}:{prim}", f"'{name}'")
+        return sentence.replace(f"{folder / STAGE}:", "").replace(str(folder / STAGE), "the character")
+
+
+def hand_over(dressed: Dressed, garment: bpy.types.Object, armature: bpy.types.Object, folder: Path) -> Handover:
+    """Write a dressed character into a folder."""
+    expose_usd()
+    from ..contract.write import write_stage
+
+    prims = write_stage(dressed, folder / STAGE)
+    return Handover(garment.session_uid, armature.session_uid, garment.name, dressed.joints, prims)
+
+
+def rig_command(python: str, folder: Path, handover: Handover, options: Sequence[str]) -> list[str]:
+    """Return the command that rigs what was handed over."""
+    stage, rigged = str(folder / STAGE), str(folder / RIGGED)
+    prim = handover.prims[handover.name]
+    return [python, "-m", "ssilk_core", "rig", stage, "--garment", prim, "-o", rigged, "--json", *options]
+
+
+def expose_usd() -> None:
+    """Make Blender's own `pxr` importable; the bpy module hides it, Blender does not."""
+    expose = getattr(bpy.utils, "expose_bundled_modules", None)
+    if expose:
+        expose()

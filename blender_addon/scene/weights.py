@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Vertex groups and weights that are kept beside them, as dense arrays over joints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import bpy
+import numpy as np
+
+from ..contract.arrays import influences
+
+PLAIN = "ssilk:plain:"  # begins the attributes that keep a garment's own weights, one for each bone
+
+
+def read_groups(thing: bpy.types.Object, mesh: bpy.types.Mesh, names: Sequence[str]) -> np.ndarray:
+    """Return the weights of vertex groups named like joints, shape (V, len(names)).
+
+    Args:
+        mesh: the object's, or its evaluated one.
+    """
+    joints = {name: joint for joint, name in enumerate(names)}
+    of_group = np.array([joints.get(group.name, -1) for group in thing.vertex_groups] or [-1])
+    found = [(vertex.index, element.group, element.weight) for vertex in mesh.vertices for element in vertex.groups]
+    rows, groups, weights = np.array(found).reshape(-1, 3).T
+    columns = of_group[groups.astype(int)]
+    matrix = np.zeros((len(mesh.vertices), len(names)), dtype=np.float32)
+    used = columns >= 0
+    matrix[rows.astype(int)[used], columns[used]] = weights[used]
+    return matrix
+
+
+def write_groups(thing: bpy.types.Object, weights: np.ndarray, names: Sequence[str], gone: Sequence[str]) -> None:
+    """Replace the weights of vertex groups named like joints.
+
+    Args:
+        weights: shape (V, len(names)).
+        names: of the joints; those without weight get no group.
+        gone: names of joints whose groups go.
+    """
+    for name in (*names, *gone):
+        group = thing.vertex_groups.get(name)
+        if group:
+            thing.vertex_groups.remove(group)
+    indices, values = influences(weights)
+    groups = {int(joint): thing.vertex_groups.new(name=names[joint]) for joint in np.unique(indices[values > 0])}
+    for vertex, (row, shares) in enumerate(zip(indices.tolist(), values.tolist())):
+        for joint, share in zip(row, shares):
+            if share > 0:
+                groups[joint].add((vertex,), share, "REPLACE")
+
+
+def read_plain(mesh: bpy.types.Mesh, names: Sequence[str]) -> np.ndarray | None:
+    """Return the weights that were kept, shape (V, len(names)); None where there are none."""
+    matrix = np.zeros((len(mesh.vertices), len(names)), dtype=np.float32)
+    kept = [attribute for attribute in mesh.attributes if attribute.name.startswith(PLAIN)]
+    joints = {name: joint for joint, name in enumerate(names)}
+    for attribute in kept:
+        joint = joints.get(attribute.name.removeprefix(PLAIN))
+        if joint is not None:
+            column = np.empty(len(matrix), dtype=np.float32)
+            attribute.data.foreach_get("value", column)
+            matrix[:, joint] = column
+    return matrix if kept else None
+
+
+def keep_plain(mesh: bpy.types.Mesh, weights: np.ndarray, names: Sequence[str]) -> None:
+    """Keep weights, shape (V, len(names)), as attributes: they then survive edits of the mesh."""
+    for joint in np.flatnonzero(weights.any(axis=0)):
+        attribute = mesh.attributes.new(f"{PLAIN}{names[joint]}", "FLOAT", "POINT")
+        attribute.data.foreach_set("value", np.ascontiguousarray(weights[:, joint]))
