@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from ssilk_core.config import overridden
 from ssilk_core.errors import need
 from ssilk_core.events import Reporter
+from ssilk_core.fabrics import FABRICS, Fabric, fabric_named
 from ssilk_core.files import need_writable
 from ssilk_core.setup.classes import ClassOptions
 from ssilk_core.setup.rig import RigOptions
@@ -52,6 +53,23 @@ def add_setup(verb: argparse.ArgumentParser) -> None:
             metavar="NAME=VALUE",
             help=f"change a threshold (repeatable): {names}",
         )
+
+
+def add_fabric(verb: argparse.ArgumentParser) -> None:
+    """Add the options that say what a garment is made of."""
+    verb.add_argument("--fabric", choices=FABRICS, default="default", help="material (default: that of the paper)")
+    verb.add_argument(
+        "--material",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help=f"change a property of the fabric (repeatable): {', '.join(Fabric.__dataclass_fields__)}",
+    )
+
+
+def fabric(options: argparse.Namespace) -> Fabric:
+    """Return the fabric that the options ask for; raise `SsilkError` for a property that it does not have."""
+    return overridden(fabric_named(options.fabric), options.material)
 
 
 def wardrobe(options: argparse.Namespace) -> tuple[Path, str | None]:

@@ -15,10 +15,9 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ssilk_core.config import overridden
 from ssilk_core.errors import EXIT_OK, need
 from ssilk_core.events import Progress, Reporter, Result, Started
-from ssilk_core.fabrics import FABRICS, Fabric, fabric_named
+from ssilk_core.fabrics import Fabric
 
 from . import options as shared
 
@@ -40,14 +39,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         "-o", "--output", type=Path, required=True,
         help="shot to write (.usdc, .usd or .usda), or a folder where there are several motions",
     )  # fmt: skip
-    verb.add_argument("--fabric", choices=FABRICS, default="default", help="material (default: that of the paper)")
-    verb.add_argument(
-        "--material",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help=f"change a property of the fabric (repeatable): {', '.join(Fabric.__dataclass_fields__)}",
-    )
+    shared.add_fabric(verb)
     verb.add_argument("--fps", type=float, default=30.0, help="frames per second (default 30, as models are trained)")
     verb.add_argument("--substeps", type=int, default=1, help="steps in each frame (default 1)")
     verb.add_argument("--tolerance", type=float, default=1e-2, metavar="G",
@@ -81,7 +73,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         solver=SolverOptions(tolerance=options.tolerance),
         rest=SolverOptions(tolerance=options.tolerance, iterations=150),
     )
-    fabric = overridden(fabric_named(options.fabric), options.material)
+    fabric = shared.fabric(options)
     found = _written(options, outputs, scene, fabric, motions, settings, device, report)
     report(Result("simulate", {"shots": ", ".join(map(str, outputs)), **found}))
     return EXIT_OK

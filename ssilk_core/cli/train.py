@@ -13,7 +13,7 @@ from pathlib import Path
 from ssilk_core.config import PRESETS, ModelConfig, TrainConfig, overridden, preset_named
 from ssilk_core.errors import EXIT_INTERRUPTED, EXIT_OK, need
 from ssilk_core.events import Message, Reporter, Result, silent
-from ssilk_core.fabrics import FABRICS, Fabric, fabric_named
+from ssilk_core.fabrics import Fabric
 
 from . import options as shared
 
@@ -39,14 +39,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--preset", choices=PRESETS, default="preview", help="schedule and size of the network (default preview)"
     )
-    verb.add_argument("--fabric", choices=FABRICS, default="default", help="material (default: that of the paper)")
-    verb.add_argument(
-        "--material",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help=f"change a property of the fabric (repeatable): {', '.join(Fabric.__dataclass_fields__)}",
-    )
+    shared.add_fabric(verb)
     verb.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1, ... (default auto)")
     verb.add_argument("--resume", action="store_true", help="go on from the state beside the model")
     verb.add_argument("--seed", type=int, default=0, help="of everything random (default 0)")
@@ -134,7 +127,7 @@ def configured(options: argparse.Namespace) -> tuple[ModelConfig, TrainConfig, F
     """
     preset = preset_named(options.preset)
     model, train = _settings(options.settings, preset.model, preset.train, options.seed)
-    return model, train, overridden(fabric_named(options.fabric), options.material)
+    return model, train, shared.fabric(options)
 
 
 def _settings(
