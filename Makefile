@@ -1,11 +1,16 @@
 # `make demo` films a cape that ships trained, then trains, bakes, verifies and films a draft; `make test` runs every check.
 # Both create the environment they need in .venv; only Python 3.11 (or later) and make must be there.
+# `make extension` packs the Blender extension into dist/, checked by Blender's own tool; `make test-blender` tests it
+# in Blender's Python module. Both need Python 3.11 and download some 370 MB into .venv-blender.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+BLENDER_VENV := .venv-blender
+BLENDER_STAMP := $(BLENDER_VENV)/.installed
+BLENDER_TOOL = $(wildcard $(BLENDER_VENV)/lib/python3.11/site-packages/bpy/*/scripts/addons_core/bl_pkg/cli/blender_ext.py)
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint extension test-blender clean
 
 demo: $(STAMP)
 	$(BIN)/ssilk demo --out demo_out
@@ -17,6 +22,13 @@ lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
+extension: $(BLENDER_STAMP)
+	mkdir -p dist
+	$(BLENDER_VENV)/bin/python $(BLENDER_TOOL) build --source-dir blender_addon --output-dir dist
+
+test-blender: $(STAMP) $(BLENDER_STAMP)
+	$(BLENDER_VENV)/bin/python -m pytest tests/blender
+
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
@@ -24,5 +36,10 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet -e '.[dev]' -c constraints.txt
 	touch $(STAMP)
 
+$(BLENDER_STAMP): constraints.txt
+	python3.11 -m venv $(BLENDER_VENV)
+	$(BLENDER_VENV)/bin/python -m pip install --quiet bpy==5.0.1 pytest -c constraints.txt
+	touch $(BLENDER_STAMP)
+
 clean:
-	rm -rf $(VENV) demo_out build ssilk.egg-info
+	rm -rf $(VENV) $(BLENDER_VENV) demo_out build ssilk.egg-info

@@ -85,7 +85,8 @@ class Work:
         if self.cancelled:
             self.error = f"{self.title} was cancelled."
         elif process.exit_code:
-            self.error = self.error or process.complaint or f"{self.title} ended with code {process.exit_code}."
+            reason = process.complaint or f"the command ended with code {process.exit_code}"
+            self.error = self.error or f"{self.title} failed: {reason}"
         elif self._waiting:
             self._start_next()
 

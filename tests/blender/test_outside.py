@@ -57,9 +57,9 @@ def test_work_hears_events_and_ends_with_a_result():
 
 def test_a_failed_command_ends_the_work_with_its_last_word():
     failed = wait(work("import sys; print('no room', file=sys.stderr); sys.exit(3)", "print('never')"))
-    assert (failed.error, failed.text) == ("no room", "")
+    assert (failed.error, failed.text) == ("Testing failed: no room", "")
     silent = wait(work("import sys; sys.exit(3)"))
-    assert silent.error == "Testing ended with code 3."
+    assert silent.error == "Testing failed: the command ended with code 3"
     for ended in (failed, silent):
         ended.close()
 

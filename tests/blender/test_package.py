@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The built zip: valid by Blender's own rules, installed in a private profile, enabled, disabled, enabled again."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from .conftest import ROOT
+from .test_outside import write_wheel
+
+pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
+
+ADDON = ROOT / "blender_addon"
+INSTALL = """
+import sys, bpy
+package = "bl_ext.user_default.ssilk"
+bpy.ops.extensions.package_install_files(filepath=sys.argv[1], repo="user_default", enable_on_install=True)
+for _ in range(2):
+    assert package in bpy.context.preferences.addons
+    assert "paint_classes" in dir(bpy.ops.ssilk) and hasattr(bpy.types.Object, "ssilk")
+    bpy.ops.preferences.addon_disable(module=package)
+    assert not dir(bpy.ops.ssilk) and not hasattr(bpy.types.Object, "ssilk")
+    bpy.ops.preferences.addon_enable(module=package)
+settings = bpy.context.preferences.addons[package].preferences
+settings.source = sys.argv[2]
+assert not bpy.ops.ssilk.create_environment.poll()
+bpy.context.preferences.system.use_online_access = True
+try:
+    bpy.ops.ssilk.create_environment()
+except RuntimeError as error:
+    print("TOLD", str(error).strip())
+print("PYTHON", settings.python)
+"""
+
+
+def command_line(*arguments: str) -> str:
+    """Run the tool that Blender has for extensions."""
+    import addon_utils
+
+    tool = Path(addon_utils.__file__).parents[1] / "addons_core" / "bl_pkg" / "cli" / "blender_ext.py"
+    done = subprocess.run([sys.executable, str(tool), *arguments], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("package") / "ssilk.zip"
+    command_line("build", "--source-dir", str(ADDON), "--output-filepath", str(path))
+    return path
+
+
+def test_the_zip_is_valid_and_holds_what_it_needs(package):
+    assert "Success" in command_line("validate", str(package))
+    with zipfile.ZipFile(package) as files:
+        names = set(files.namelist())
+    sources = {str(path.relative_to(ADDON)) for path in ADDON.rglob("*.py")}
+    assert names == {*sources, "LICENSE", "blender_manifest.toml"}
+
+
+def test_the_manifest_says_what_the_code_says():
+    manifest = tomllib.loads((ADDON / "blender_manifest.toml").read_text())
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert manifest["version"] == project["version"]
+    assert manifest["license"] == ["SPDX:GPL-3.0-or-later"]
+    assert manifest["blender_version_min"] == "4.2.0"
+    for path in ADDON.rglob("*.py"):
+        assert path.read_text().startswith("# SPDX-License-Identifier: GPL-3.0-or-later\n"), path
+
+
+def test_the_zip_is_installed_and_makes_an_environment(package, tmp_path):
+    """In a profile of its own; the environment comes from a wheel without dependencies, so nothing is downloaded."""
+    program = tmp_path / "install.py"
+    program.write_text(INSTALL)
+    wheel = write_wheel(tmp_path)
+    profile = {**os.environ, "BLENDER_USER_RESOURCES": str(tmp_path / "profile")}
+    command = [sys.executable, str(program), str(package), str(wheel)]
+    done = subprocess.run(command, capture_output=True, text=True, env=profile, cwd=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    lines = dict(line.split(" ", 1) for line in done.stdout.splitlines() if line.startswith(("TOLD ", "PYTHON ")))
+    assert "has ssilk but not usd-core" in lines["TOLD"]
+    assert Path(lines["PYTHON"]).is_relative_to(tmp_path / "profile")
