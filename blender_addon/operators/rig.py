@@ -8,7 +8,6 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, IntProperty
 
-from ..classes import LOOSE
 from ..errors import need
 from ..outside.work import Work
 from ..preferences import interpreter, preferences, unready
@@ -66,7 +65,7 @@ class Classify(RigOperator, bpy.types.Operator):
 
 
 class GenerateRig(RigOperator, bpy.types.Operator):
-    """Make proxy bones for the loose part, and weights for the whole garment, from its classes"""
+    """Make proxy bones for the loose part, if there is one, and weights for the whole garment, from its classes"""
 
     bl_idname = "ssilk.generate_rig"
     bl_label = "Generate Proxy Rig"
@@ -92,7 +91,6 @@ class GenerateRig(RigOperator, bpy.types.Operator):
             f"'{garment.name}' has {old} proxies already; they stay as they are unless Replace Existing is on.",
         )
         need(classes is not None, f"'{garment.name}' has no classes; classify or paint it first.")
-        need((classes == LOOSE).any(), f"Nothing of '{garment.name}' is loose, so it needs no proxies; paint some.")
         options = ("--proxies", str(self.proxies))
         return self.begin(context, f"Rigging '{garment.name}'", classes=True, options=options)
 
@@ -100,6 +98,8 @@ class GenerateRig(RigOperator, bpy.types.Operator):
         garment, armature = self.handover.objects()
         rig = self.handover.rig(work.folder)
         apply_rig(garment, armature, self.handover.joints, rig)
+        if not rig.names:
+            return f"Nothing of '{garment.name}' is loose; it follows '{armature.name}' without proxies."
         return f"'{armature.name}' has {len(rig.names)} proxies for '{garment.name}'."
 
 

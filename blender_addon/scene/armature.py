@@ -73,7 +73,6 @@ def replace_proxies(armature: bpy.types.Object, garment: bpy.types.Object, joint
         bones = armature.data.edit_bones
         for name in old:
             bones.remove(bones[name])
-        collection = _collection(armature.data, garment)
         length = _length(rig)
         for name, parent, bind in zip(rig.names, rig.parents, rig.binds):
             bone = bones.new(name)
@@ -82,7 +81,7 @@ def replace_proxies(armature: bpy.types.Object, garment: bpy.types.Object, joint
             bone.matrix = _unscaled(to_armature @ Matrix(bind))
             bone.length = length / armature.matrix_world.median_scale
             bone.color.palette = PALETTE
-            collection.assign(bone)
+            _collection(armature.data, garment).assign(bone)
             names.append(bone.name)
     return names
 

@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
-import addon_utils
+import sys
+
 import pytest
 
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
+
+import addon_utils
 
 
 def footprint(bpy) -> set[str]:
@@ -34,8 +37,6 @@ def test_nothing_is_left_after_disabling(bpy):
 
 
 def test_disabling_stops_what_runs_outside(bpy, tmp_path):
-    import sys
-
     from blender_addon.operators import tasks
     from blender_addon.outside.work import Work
 

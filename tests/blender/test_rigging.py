@@ -187,6 +187,25 @@ def test_a_second_rig_needs_leave_and_replaces_the_first(ready, rigged):
     assert len(ready.data.objects["Rig"].data.collections_all) == 1
 
 
+def test_a_garment_with_nothing_loose_follows_the_body(ready, skirt):
+    skirt.data.attributes.new("ssilk:class", "INT", "POINT").data.foreach_set("value", [1] * len(skirt.data.vertices))
+    assert ready.ops.ssilk.generate_rig() == {"FINISHED"}
+    assert (proxies_of(ready), len(ready.data.armatures["Rig"].collections_all)) == ([], 0)
+    assert set(skirt.vertex_groups.keys()) <= set(BONES)
+    np.testing.assert_allclose(weights_of(skirt).sum(axis=1), 1, atol=1e-6)
+    assert skirt.modifiers[0].object.name == "Rig"
+
+
+def test_classes_and_rigs_are_undone(ready, rigged):
+    ready.ops.ed.undo_push(message="before")
+    ready.ops.ssilk.generate_rig(proxies=4, replace=True)
+    assert len(proxies_of(ready)) == 4
+    ready.ops.ed.undo()
+    assert len(proxies_of(ready)) == 6
+    thing = ready.data.objects["Skirt"]
+    np.testing.assert_allclose(weights_of(thing).sum(axis=1), 1, atol=1e-6)
+
+
 def test_an_artists_weights_are_kept_beside_the_rig(ready, classified, ssilk_python, tmp_path):
     skirt = classified
     heights = np.array([vertex.co.z for vertex in skirt.data.vertices])

@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What panels draw, on a layout that only takes notes: no window is needed to see a wrong name."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
+
+from .conftest import activate
+
+
+class Layout:
+    """A layout that notes labels, operators and properties, and refuses those that do not exist."""
+
+    def __init__(self, notes: list[str] | None = None):
+        self.notes: list[str] = [] if notes is None else notes
+
+    def row(self, align: bool = False) -> Layout:
+        return Layout(self.notes)
+
+    column = row
+
+    def label(self, text: str, icon: str = "NONE") -> None:
+        self.notes.append(text)
+
+    def prop(self, data: object, name: str) -> None:
+        assert hasattr(data, name), name
+        self.notes.append(name)
+
+    def operator(self, name: str, text: str = "", icon: str = "NONE") -> SimpleNamespace:
+        module, _, function = name.partition(".")
+        import bpy
+
+        assert function in dir(getattr(bpy.ops, module)), name
+        self.notes.append(name)
+        return SimpleNamespace()
+
+    def progress(self, factor: float, text: str) -> None:
+        self.notes.append(f"{text} {factor:.0%}")
+
+
+def drawn(kind, context, **fields) -> list[str]:
+    layout = Layout()
+    kind.draw(SimpleNamespace(layout=layout, **fields), context)
+    return layout.notes
+
+
+def test_without_a_python_the_way_to_one_is_shown(bpy, skirt):
+    from blender_addon.panels import GarmentPanel
+
+    notes = drawn(GarmentPanel, bpy.context)
+    assert {"armature", "bodies", "ssilk.find_python"} <= set(notes)
+    assert "No Python with ssilk is chosen; find one in the extension's preferences" in notes
+
+
+def test_classes_are_counted_and_buttons_follow_the_mode(bpy, skirt):
+    from blender_addon.panels import ClassesPanel
+
+    bpy.ops.ssilk.paint_classes()
+    notes = drawn(ClassesPanel, bpy.context)
+    assert [note for note in notes if note.isdigit()] == ["0", "312", "0"]
+    assert notes.count("ssilk.brush_class") == 3
+    bpy.ops.object.mode_set(mode="EDIT")
+    assert drawn(ClassesPanel, bpy.context).count("ssilk.fill_class") == 3
+
+
+def test_broken_classes_are_told_and_drawn_around(bpy, skirt):
+    from blender_addon.panels import ClassesPanel
+
+    skirt.data.attributes.new("ssilk:class", "FLOAT", "POINT")
+    notes = drawn(ClassesPanel, bpy.context)
+    assert any("is FLOAT on POINT" in note for note in notes)
+    assert "ssilk.paint_classes" in notes
+
+
+def test_the_rig_is_told_or_why_there_is_none(bpy, skirt):
+    from blender_addon.panels import RigPanel
+
+    assert drawn(RigPanel, bpy.context)[0] == "No proxies yet on 'Rig'"
+    bpy.data.objects.remove(bpy.data.objects["Rig"])
+    assert drawn(RigPanel, bpy.context)[0].startswith("There is no armature for 'Skirt'")
+
+
+def test_panels_show_only_what_can_be_a_garment(bpy, skirt):
+    from blender_addon.panels import ClassesPanel, GarmentPanel, RigPanel
+
+    assert ClassesPanel.poll(bpy.context)
+    activate(bpy, bpy.data.objects["Rig"])
+    assert not ClassesPanel.poll(bpy.context)
+    assert not RigPanel.poll(bpy.context)
+    assert drawn(GarmentPanel, bpy.context)[0] == "Select the garment, a mesh, first"
+
+
+def test_work_shows_its_progress_and_a_way_out(bpy, skirt, monkeypatch):
+    from blender_addon.operators import tasks
+    from blender_addon.panels import GarmentPanel
+
+    monkeypatch.setattr(tasks, "current", SimpleNamespace(title="Rigging", fraction=0.25, text="half way", close=int))
+    assert drawn(GarmentPanel, bpy.context)[-3:] == ["Rigging 25%", "ssilk.cancel", "half way"]
+
+
+def test_preferences_show_the_python(bpy):
+    from blender_addon.preferences import Preferences
+
+    notes = drawn(Preferences, bpy.context, python="", source="", handshake="")
+    assert notes == [
+        "python", "ssilk.find_python", "ssilk.check_python", "No Python with ssilk is chosen", "source",
+        "ssilk.create_environment",
+    ]  # fmt: skip
