@@ -15,9 +15,9 @@ from ssilk_core.kinematics import quaternion_from_matrix
 from .finding import Finding, Findings, joint_leaves, listing
 
 # Seconds that one vertex in one frame takes, in a whole optimiser step of a garment of 2,700 vertices. Measured:
-# "draft", 64 frames, 0.2 s on two CPU threads; "preview", 1,024 frames, 17 ms on one H100. Devices that nobody has
+# "draft", 64 frames, 0.2 s on two CPU threads; "preview", 1,280 frames, 3.7 ms on one H100. Devices that nobody has
 # measured are not listed.
-SECONDS_PER_VERTEX = {"cpu": 0.2 / (2700 * 64), "cuda": 0.017 / (2700 * 1024)}
+SECONDS_PER_VERTEX = {"cpu": 0.2 / (2700 * 64), "cuda": 0.0037 / (2700 * 1280)}
 
 
 def training_cost(scene: Scene, motions: Sequence[Motion], preset: Preset) -> Findings:
@@ -67,7 +67,10 @@ def training_seconds(vertices: int, train: TrainConfig, device: str) -> float | 
     """Return how long a training takes [s], by measured speed; None for a device that was not measured."""
     if device not in SECONDS_PER_VERTEX:
         return None
-    proper = (train.iterations - train.warm_iterations) * train.batch * train.window
+    trained = (
+        train.batch * (train.window - 2) + train.resting
+    )  # frames of a step, those that windows begin at left out
+    proper = (train.iterations - train.warm_iterations) * trained
     return SECONDS_PER_VERTEX[device] * vertices * (train.warm_iterations * train.warm_batch + proper)
 
 

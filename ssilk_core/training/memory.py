@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import ceil
 from pathlib import Path
 
 import torch
@@ -63,7 +64,12 @@ def step_memory(scene: Scene, config: ModelConfig, frames: int, body_vertices: i
 
 def decoded_frames(config: TrainConfig, batch: int) -> int:
     """Return the frames that the larger phase decodes at once."""
-    return max(batch * config.window, config.warm_batch if config.warm else 0)
+    return max(ceil(batch * _frames_of_a_window(config)), config.warm_batch if config.warm else 0)
+
+
+def _frames_of_a_window(config: TrainConfig) -> float:
+    """Return the frames of a window, with its share of the single poses beside all of them."""
+    return config.window + config.resting / config.batch
 
 
 def fitting_batch(
@@ -72,14 +78,16 @@ def fitting_batch(
     """Return the largest batch and warm batch, up to the configured ones, whose steps fit into `available` bytes."""
     per_frame = step_memory(scene, model, 1, body_vertices) - step_memory(scene, model, 0, body_vertices)
     frames = int(max(1, (SHARE * available - step_memory(scene, model, 0, body_vertices)) // per_frame))
-    return max(1, min(config.batch, frames // config.window)), max(1, min(config.warm_batch, frames))
+    return max(1, min(config.batch, int(frames / _frames_of_a_window(config)))), max(
+        1, min(config.warm_batch, frames)
+    )
 
 
 def need_one_window(
     scene: Scene, model: ModelConfig, config: TrainConfig, body_vertices: int, available: int
 ) -> None:
     """Raise `SsilkError` unless a step on a single window fits into `available` bytes."""
-    needed = step_memory(scene, model, config.window, body_vertices)
+    needed = step_memory(scene, model, ceil(_frames_of_a_window(config)), body_vertices)
     need(
         needed <= available,
         scene.garment.mesh.path,

@@ -70,10 +70,11 @@ def build_parts(job: TrainJob, device: torch.device, team: Team = ALONE) -> Part
         SsilkError: the motions are too short.
     """
     scene, skeleton, fps = job.scene, job.scene.character.skeleton, job.model.fps
-    reach = reachable_body(scene, [*job.motions, *job.held_out])
+    motions = job.trained_motions()
+    reach = reachable_body(scene, [*motions, *job.held_out])
     joints = model_joints(scene, reach.joints)
     model = GarmentModel(scene, job.model, joints, job.train.seed).to(device)
-    bank = build_bank(job.trained_motions(), skeleton, joints, fps, device, most_turn=MOST_TURN)
+    bank = build_bank(motions, skeleton, joints, fps, device, most_turn=MOST_TURN)
     held = build_bank(job.held_out, skeleton, joints, fps, device)
     energy = GarmentEnergy(scene.garment.mesh, job.fabric, device=device)
     body, count = scene.character.merged_body(), skeleton.joint_count

@@ -19,7 +19,7 @@ SHARE = 0.4  # of the limbs of a clip that another one moves
 
 
 def recombined(motions: Sequence[Motion], skeleton: Skeleton, copies: int, seed: int) -> list[Motion]:
-    """Return `copies` more of each motion, in each of which some limbs move as in another motion."""
+    """Return up to `copies` more of each motion, in each of which some limbs move as in another motion."""
     limbs, generator, more = limb_joints(skeleton), np.random.default_rng(seed), []
     for base in [*motions] * copies:
         chosen = [limb for limb in limbs if generator.random() < SHARE]

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import isfinite
+from math import inf, isfinite
 from typing import NoReturn
 
 import torch
@@ -21,6 +21,7 @@ from ..devices import chosen_device
 from ..errors import fail, need
 from ..events import Checkpoint, Message, Progress, Reporter, Started
 from ..kinematics import split_at_cuts
+from .bank import MOST_TURN
 from .curve import Point, with_point
 from .job import TrainJob
 from .keeping import Keeper
@@ -65,13 +66,13 @@ class Run:
             self._fit()
         self._build_stepper()
         self._announce()
-        self._since = self._saved_at = time.monotonic()
         self.keeper.tidy()
         if tensors is None:
             self._write_state()
         else:
             self._take_up(tensors)
         self.keeper.save_curve(self.state, self.plain)
+        self._since = self._saved_at = time.monotonic()
 
     @cached_property
     def plain(self) -> Score:
@@ -154,13 +155,16 @@ class Run:
                 "a step needs more than is free",
                 "take another device, or shorter windows (--set window=...)",
             )
+            self.state.undone = int(self.stepper.faults.count)
             self._lower(found, max(1, config.batch // 2), max(1, config.warm_batch // 2))
             self._rebuild_stepper(learned(self.stepper))
 
     def _announce(self) -> None:
-        for motion in (*self.job.motions, *self.job.held_out):
-            if jumps := len(split_at_cuts(motion)) - 1:
-                self.report(Message(f"{motion.path}: the root jumps {jumps} times; each span is used by itself."))
+        for motions, most_turn in ((self.job.motions, MOST_TURN), (self.job.held_out, inf)):
+            for motion in motions:
+                if cuts := len(split_at_cuts(motion, most_turn=most_turn)) - 1:
+                    found = "root or a joint jumps" if most_turn < inf else "root jumps"
+                    self.report(Message(f"{motion.path}: the {found} {cuts} times; each span is used by itself."))
         detail = {**self.parts.detail(), "memory predicted [MiB]": self._memory() >> 20}
         self.report(Started("train", self.job.train.iterations, detail))
 

@@ -42,7 +42,7 @@ class Lowered:
 
     Attributes:
         iteration: steps done until then.
-        batch, warm_batch: what fits into memory.
+        batch, warm_batch: what fits into memory; single poses beside the windows are lowered with them.
         pace: factor on every step size, below one after steps that were not finite.
     """
 
@@ -54,7 +54,8 @@ class Lowered:
     def applied(self, config: TrainConfig) -> TrainConfig:
         """Return the schedule with this instead of what was asked for."""
         rates = {name: getattr(config, name) * self.pace for name in ("warm_rate", "rate", "final_rate")}
-        return replace(config, batch=self.batch, warm_batch=self.warm_batch, **rates)
+        resting = max(1, config.resting * self.batch // config.batch)
+        return replace(config, batch=self.batch, warm_batch=self.warm_batch, resting=resting, **rates)
 
 
 @dataclass

@@ -84,10 +84,19 @@ class Stepper:
         # Every frame weighs the same, those that the initialiser answers for included.
         loss = (total(dynamic) * moving + total(resting) * still) / (moving + still)
         means = {name: value.mean() for name, value in dynamic.items()}
-        self._descend(loss, means, {**self.sampler.window(), "noise": noise})
+        beside = {f"resting {name}": value.mean() for name, value in resting.items()}
+        drawn = {"noise": noise, "resting frames": poses[0], "resting directions": poses[1]}
+        self._descend(loss, means, {**self.sampler.window(), **drawn}, beside)
         self.sampler.advance(latents)
 
-    def _descend(self, loss: Tensor, terms: dict[str, Tensor], window: dict[str, Tensor]) -> None:
+    def _descend(
+        self,
+        loss: Tensor,
+        terms: dict[str, Tensor],
+        window: dict[str, Tensor],
+        beside: dict[str, Tensor] | None = None,
+    ) -> None:
+        """Move the parameters down the gradient of a loss, whose means of energies are `terms` and what is `beside`."""
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         gradients = [value.grad for value in self.model.parameters() if value.grad is not None]
@@ -103,7 +112,7 @@ class Stepper:
         with torch.no_grad():
             torch._foreach_lerp_([*self.averaged.parameters()], [*self.model.parameters()], 1 - self.config.average)
         terms = {name: value.detach() for name, value in terms.items()}
-        self.faults.record(bad, self._iteration, terms, window)
+        self.faults.record(bad, self._iteration, terms | (beside or {}), window)
         for name, value in terms.items():
             self.terms.setdefault(name, torch.zeros((), device=self.device)).copy_(value)
 

@@ -19,10 +19,10 @@ CORE, USD = ROOT / "ssilk_core", ROOT / "usd" / "ssilk_usd"
 LAYERS = (
     {"errors"},
     {"assets", "config", "devices", "fabrics", "events", "files", "packing"},
-    {"mesh", "kinematics", "kernels"},
+    {"mesh", "kinematics", "kernels", "descriptors", "parameters"},
     {"model", "energy"},
     {"checkpoint"},
-    {"demo", "view", "simulate", "training", "rollout", "preflight", "setup", "wardrobe"},
+    {"demo", "view", "simulate", "training", "rollout", "preflight", "setup", "wardrobe", "runtime"},
     {"baselines"},
     {"cli"},
     {"__main__"},

@@ -21,7 +21,7 @@ from ssilk_core.training.memory import (
     suffices,
 )
 
-MODEL, CONFIG = ModelConfig(), TrainConfig(batch=32, window=16, warm_batch=700)
+MODEL, CONFIG = ModelConfig(), TrainConfig(batch=32, window=16, resting=32, warm_batch=700)
 
 
 def test_more_of_anything_needs_more(scene):
@@ -38,8 +38,8 @@ def test_frames_cost_the_same_each(scene):
 
 def test_the_larger_phase_counts():
     assert decoded_frames(CONFIG, 32) == 700
-    assert decoded_frames(CONFIG, 64) == 1024
-    assert decoded_frames(replace(CONFIG, warm=0.0), 32) == 512
+    assert decoded_frames(CONFIG, 64) == 64 * 17  # a window of 16 poses, and one of the single poses
+    assert decoded_frames(replace(CONFIG, warm=0.0), 32) == 32 * 17
 
 
 def test_what_fits_is_left_as_it_is(scene):
@@ -49,11 +49,11 @@ def test_what_fits_is_left_as_it_is(scene):
 @pytest.mark.parametrize("megabytes", [150, 200, 300])
 def test_a_lowered_batch_fits_and_one_more_would_not(scene, megabytes):
     available = megabytes << 20
-    config = replace(CONFIG, batch=10_000, warm_batch=100_000)
+    config = replace(CONFIG, batch=10_000, warm_batch=100_000, resting=10_000)
     batch, warm = fitting_batch(scene, MODEL, config, 1000, available)
     assert 1 < batch < 10_000 and 1 < warm < 100_000
-    assert step_memory(scene, MODEL, max(batch * 16, warm), 1000) <= SHARE * available
-    assert step_memory(scene, MODEL, (batch + 1) * 16, 1000) > SHARE * available
+    assert step_memory(scene, MODEL, max(batch * 17, warm), 1000) <= SHARE * available
+    assert step_memory(scene, MODEL, (batch + 1) * 17, 1000) > SHARE * available
     assert step_memory(scene, MODEL, warm + 1, 1000) > SHARE * available
 
 
@@ -62,9 +62,9 @@ def test_at_least_one_window_is_trained_on(scene):
 
 
 def test_one_window_must_fit(scene):
-    needed = step_memory(scene, MODEL, CONFIG.window, 1000)
+    needed = step_memory(scene, MODEL, CONFIG.window + 1, 1000)
     need_one_window(scene, MODEL, CONFIG, 1000, needed)
-    with pytest.raises(SsilkError, match=r"one window of 16 poses needs 0\.042 GiB; 0\.042 GiB are free; .*window="):
+    with pytest.raises(SsilkError, match=r"one window of 16 poses needs 0\.043 GiB; 0\.043 GiB are free; .*window="):
         need_one_window(scene, MODEL, CONFIG, 1000, needed - 1)
 
 

@@ -247,7 +247,10 @@ def poison(monkeypatch: pytest.MonkeyPatch, bad: Callable[[Stepper, int], bool],
 
     def spoiled(self: Objective, sampler: WindowSampler, *drawn: torch.Tensor):
         dynamic, resting, latents = window(self, sampler, *drawn)
-        return (dynamic | {name: dynamic[name] * float("nan")}) if poisoned[0] else dynamic, resting, latents
+        if poisoned[0]:
+            kind = resting if name.startswith("resting ") else dynamic
+            kind[name.removeprefix("resting ")] = kind[name.removeprefix("resting ")] * float("nan")
+        return dynamic, resting, latents
 
     monkeypatch.setattr(Stepper, "run", watched)
     monkeypatch.setattr(Objective, "window", spoiled)
@@ -259,10 +262,13 @@ def test_an_undone_step_is_told_of_by_term_and_iteration_and_counted_across_resu
         poison(patch, lambda stepper, iteration: iteration == 7)
         train(spoiled, silent, stop_after(patch, 9))
     events: list[Event] = []
-    poison(monkeypatch, lambda stepper, iteration: iteration in (11, 12), "stretch")
+    poison(monkeypatch, lambda stepper, iteration: iteration in (11, 12), "resting stretch")
     train(replace(spoiled, resume=True), events.append)
     told = [event.text for event in events if isinstance(event, Message) and "undone" in event.text]
-    assert told == ["2 steps up to iteration 13 were undone: stretch not finite.", "3 steps in all were undone."]
+    assert told == [
+        "2 steps up to iteration 13 were undone: resting stretch not finite.",
+        "3 steps in all were undone.",
+    ]
     assert load_state(state_path(spoiled.output), spoiled.identity())[0].undone == 3
 
 

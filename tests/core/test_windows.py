@@ -142,3 +142,25 @@ def test_a_restored_sampler_goes_on_exactly(bank):
 def test_a_window_longer_than_every_clip_is_refused(bank):
     with pytest.raises(SsilkError, match=r"longest clip has 23 frames.*window of 24 poses must fit.*window=N"):
         WindowSampler(bank, replace(CONFIG, window=24), 3, generator())
+
+
+def test_a_carried_window_is_displaced_now_and_then_and_a_new_one_always(bank):
+    config = replace(CONFIG, batch=4000, kick=0.1, noise=1.0)
+    sampler = WindowSampler(bank, config, 3, generator())
+    sampler.carried[:] = torch.arange(4000) < 3000
+    moved = (sampler.noise() != 0).all(dim=2).all(dim=0)
+    assert moved[3000:].all()
+    assert moved[:3000].double().mean().item() == pytest.approx(1 - 0.9**3, abs=0.03)  # three new frames
+
+
+def test_motions_are_cut_where_a_joint_flips(scene, toy_motion):
+    smooth = toy_motion(scene, 40)
+    rotations = smooth.rotations.copy()
+    rotations[25:, 2] = rotations[25:, 2] @ np.diag([1.0, 1, 1, 1])[[1, 0, 3, 2]]  # half a turn between two frames
+    flipped = replace(smooth, rotations=rotations)
+    cut = build_bank([flipped], scene.character.skeleton, JOINTS, 30.0, CPU, most_turn=40.0)
+    assert cut.stops.tolist() == [25, 40]
+    for motion, turn in ((flipped, np.inf), (smooth, 40.0)):
+        assert build_bank([motion], scene.character.skeleton, JOINTS, 30.0, CPU, most_turn=turn).stops.tolist() == [
+            40
+        ]
