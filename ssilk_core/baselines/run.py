@@ -57,6 +57,7 @@ class BaselineRun:
 
     Attributes:
         state: what changes while the run goes on.
+        batch: energies of the last batch before a validation [J].
         iterations: steps to do in all; with a limit in time it is an estimate that gets better.
     """
 
@@ -64,6 +65,7 @@ class BaselineRun:
         self.job, self.report, base = job, report, job.base
         device = chosen_device(base.device)
         self.keeper = Keeper(base, device)
+        self.keeper.tidy()
         parts = build_parts(base, device)
         joints = parts.model.joints
         inner = torch.as_tensor(base.scene.character.skeleton.parents[joints] >= 0, device=device)
@@ -76,18 +78,17 @@ class BaselineRun:
         )
         self.stepper = BaselineStepper(objective, base.train, torch.Generator(device).manual_seed(base.train.seed))
         self.iterations = base.train.iterations
-        self.state = RunState(job.identity())
+        self.state, self.batch = RunState(job.identity()), dict[str, float]()
         if base.resume:
             self._take_up()
-        report(Started(job.config.method, self.iterations, {**parts.detail(), "parameters": self._parameters()}))
+        parameters = sum(value.numel() for value in self.model.parameters())
+        shared = {name: value for name, value in parts.detail().items() if name not in ("proxies", "blendshapes")}
+        report(Started(job.config.method, self.iterations, {**shared, "parameters": parameters}))
 
     @cached_property
     def plain(self) -> Score:
         """Score of plain skinning."""
         return self.validator.plain_score()
-
-    def _parameters(self) -> int:
-        return sum(value.numel() for value in self.model.parameters())
 
     def _take_up(self) -> None:
         self.state, tensors = load_state(self.keeper.state, self.state.asked)
@@ -112,7 +113,8 @@ class BaselineRun:
         self.batch = {name: float(value) for name, value in self.stepper.terms.items()}  # waits for the device
         taken = time.monotonic() - began
         state.seconds += taken
-        self._plan(taken / (state.iteration - first))
+        if state.iteration < self.iterations:  # or a few more steps would follow the end of the schedule
+            self._plan(taken / (state.iteration - first))
         left = (self.iterations - state.iteration) * taken / (state.iteration - first)
         self.report(Progress(state.iteration, max(self.iterations, state.iteration), left, self.batch))
 
