@@ -23,11 +23,10 @@ from .errors import SsilkError, need
 from .fabrics import Fabric
 from .files import replacing
 from .packing import narrowest, packed, unpacked
+from .parameters import Shapes, parameter_shapes
 
 if TYPE_CHECKING:
     from .model.network import GarmentModel
-
-Shapes = dict[str, tuple[int, ...]]
 
 FORMAT = 2
 READABLE = (1, FORMAT)  # 1 knew nothing of packed matrices
@@ -140,7 +139,7 @@ def load_model(path: str | Path, shapes: Callable[[ModelFile], Shapes] | None = 
         return model
     except SsilkError as error:
         raise SsilkError(f"{path}: the model cannot be used: {error}") from error
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:  # the last for sizes beyond all memory
+    except (KeyError, TypeError, ValueError) as error:
         first = str(error).partition("\n")[0]
         raise SsilkError(
             f"{path}: the model file is incomplete or inconsistent ({type(error).__name__}: {first}); "
@@ -258,18 +257,11 @@ def _parameters(tensors: dict[str, np.ndarray], where: str) -> dict[str, np.ndar
 
 
 def _implied(model: ModelFile) -> Shapes:
-    """Return the shapes that the header implies, before memory is taken."""
-    import torch
-
-    from .model.network import GarmentModel
-
-    with torch.device("meta"):
-        empty = GarmentModel(model.scene, model.config, model.joints)
-    return {name: tuple(value.shape) for name, value in empty.state_dict().items()}
+    return parameter_shapes(model.scene, model.config, model.joints)
 
 
 def _need_fit(model: ModelFile, expected: Shapes) -> None:
-    """Raise `SsilkError` unless the parameters have the shapes that are expected."""
+    """Raise `SsilkError` unless the parameters have the shapes that the header implies."""
     found = {name: value.shape for name, value in model.parameters.items()}
     odd = next((name for name in {**expected, **found} if expected.get(name) != found.get(name)), "")
     need(

@@ -96,7 +96,7 @@ class Stepper:
         window: dict[str, Tensor],
         beside: dict[str, Tensor] | None = None,
     ) -> None:
-        """Move the parameters down the gradient of a loss, whose means of energies are `terms` and what is `beside`."""
+        """Move the parameters down the gradient of a loss; `terms` and what is `beside` are what it is made of."""
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         gradients = [value.grad for value in self.model.parameters() if value.grad is not None]

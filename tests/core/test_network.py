@@ -10,6 +10,7 @@ import torch
 from ssilk_core.assets import GarmentPose, SkinWeights
 from ssilk_core.config import SCHEMES, ModelConfig
 from ssilk_core.model.network import GarmentModel, mlp, model_joints
+from ssilk_core.parameters import parameter_shapes
 
 
 def fresh(scene, **options) -> GarmentModel:
@@ -93,3 +94,10 @@ def test_the_network_sees_joints_that_carry_cloth_proxies_or_body_in_reach(toy_s
     proxied = SkinWeights("/toy", np.full((60, 1), 3), np.ones((60, 1)))
     hung = replace(hung, garment=replace(hung.garment, skin=hips), rig=replace(hung.rig, skin=proxied))
     assert model_joints(hung, nothing).tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_the_parameters_are_known_from_sizes_alone(scene, toy_model, scheme):
+    model = toy_model(scene, scheme=scheme)
+    found = {name: tuple(value.shape) for name, value in model.state_dict().items()}
+    assert parameter_shapes(scene, model.config, model.joints) == found

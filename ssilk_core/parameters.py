@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which parameters a network has, from its sizes alone, so that a file can be checked without building one."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+from .assets import PINNED, Ints, Scene
+from .config import ModelConfig
+
+Shapes = dict[str, tuple[int, ...]]
+# Of each scheme: latents that the stepper sees, parameters of its own, whether the stepper ends in a bias.
+SCHEMES: dict[str, tuple[int, tuple[str, ...], bool]] = {
+    "spring_verlet": (3, ("alpha", "beta", "share"), False),
+    "verlet": (2, ("alpha", "beta"), True),
+    "direct": (2, (), True),
+    "direct_residual": (2, (), True),
+}
+
+
+def parameter_shapes(scene: Scene, config: ModelConfig, joints: Ints) -> Shapes:
+    """Return the shape of each parameter of `model.network.GarmentModel` by name."""
+    free, proxies = int((scene.classes != PINNED).sum()), scene.rig.proxy_count
+    static, dynamic = descriptor_sizes(scene, joints)
+    seen, own, bias = SCHEMES[config.scheme]
+    z, widths = config.latent, config.widths
+    return {
+        "decoder.skin_offset": (free, scene.rig.skin.indices.shape[1]),
+        "decoder.shapes": (free, 3, config.shapes),
+        **{f"integrator.{name}": (z,) for name in own},
+        **_layers("initialiser", (static, *widths, z)),
+        **_layers("stepper", (seen * z + static + dynamic, *widths, z), bias),
+        **_layers("output", (z, *widths, config.shapes + 6 * proxies)),
+    }
+
+
+def descriptor_sizes(scene: Scene, joints: Ints) -> tuple[int, int]:
+    """Return how many numbers static descriptors have, gravity included, and how many dynamic ones add to them."""
+    inner = int((scene.character.skeleton.parents[joints] >= 0).sum())
+    return 6 * inner + 3 * len(joints), 12 * inner + 12 + 3 * len(joints)
+
+
+def _layers(name: str, sizes: tuple[int, ...], bias: bool = True) -> Shapes:
+    """Return the shapes of a perceptron's parameters; every second index is an activation, which has none."""
+    shapes: Shapes = {}
+    for index, (inputs, outputs) in enumerate(pairwise(sizes)):
+        shapes[f"{name}.{2 * index}.weight"] = (outputs, inputs)
+        if bias or index < len(sizes) - 2:
+            shapes[f"{name}.{2 * index}.bias"] = (outputs,)
+    return shapes
