@@ -1,0 +1,14 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Play a trained garment with numpy alone: the fastest way on a processor, without PyTorch.
+
+    from ssilk_core.runtime import Player
+    playback = Player.load("cape.safetensors").play(motion)
+    playback.vertices(12)   # (V, 3) [m], any frame in any order
+
+What depends on the character's poses alone is computed for a whole motion at once, the latents frame by frame, and
+what is decoded from them in blocks of frames.
+"""
+
+from .playback import Playback, Player
+
+__all__ = ["Playback", "Player"]

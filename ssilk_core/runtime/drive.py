@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a character's motion alone says: descriptors for the network, and skinning matrices about the root."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..assets import Floats, Motion, Skeleton
+from ..descriptors import pose_features
+from ..kinematics import motion_transforms, skinning_matrices
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """The character's share of a motion of F frames.
+
+    Attributes:
+        static: static descriptors, gravity included, shape (F, S), float32.
+        rates: what dynamic descriptors add to them, zero where the character holds still, shape (F, R), float32.
+        matrices: bind pose to posed world, about the root, shape (J, 3, 4, F), float32.
+        origins: places of the root [m], shape (F, 3).
+    """
+
+    static: NDArray
+    rates: NDArray
+    matrices: NDArray
+    origins: Floats
+
+
+def drive(motion: Motion, skeleton: Skeleton, joints: NDArray) -> Drive:
+    """Return what a motion at the model's rate says about every frame, gravity pointing down."""
+    features = pose_features(motion, skeleton, joints)
+    down = -features.down[..., 1].reshape(motion.frame_count, -1)
+    matrices, origins = character_matrices(motion, skeleton)
+    static = np.concatenate([features.static, down], axis=1, dtype=np.float32)
+    return Drive(static, features.dynamic.astype(np.float32), matrices, origins)
+
+
+def character_matrices(motion: Motion, skeleton: Skeleton) -> tuple[NDArray, Floats]:
+    """Return skinning matrices about the root (J, 3, 4, F), float32, and where the root is (F, 3) [m].
+
+    About the root, single precision is as good a kilometre from the origin as beside it.
+    """
+    world = motion_transforms(motion, skeleton.parents)
+    origins = world[:, 0, :3, 3].copy()
+    world[..., :3, 3] -= origins[:, None]
+    matrices = skinning_matrices(world, skeleton.bind_transforms)[:, :, :3]
+    return np.ascontiguousarray(matrices.transpose(1, 2, 3, 0), dtype=np.float32), origins

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Proxy rotations and skinning matrices of many frames at once, frames last, as `model.decoder` defines them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..assets import ProxyRig
+
+
+def rotation_from_six_d(values: NDArray) -> NDArray:
+    """Orthonormalise 6D rotations (P, 6, F) by Gram-Schmidt; returns (P, 3, 3, F) [ZBL*19]."""
+    x = _unit(values[:, :3])
+    b = values[:, 3:]
+    y = _unit(b - (x * b).sum(1, keepdims=True) * x)
+    z = x[:, [1, 2, 0]] * y[:, [2, 0, 1]] - x[:, [2, 0, 1]] * y[:, [1, 2, 0]]
+    return np.stack([x, y, z], axis=2)
+
+
+def _unit(vectors: NDArray) -> NDArray:
+    length = np.sqrt((vectors * vectors).sum(1, keepdims=True))
+    return vectors / np.maximum(length, np.float32(1e-8))
+
+
+class ProxyKinematics:
+    """Forward kinematics of a rig's proxies, one generation after another, all proxies of one at once.
+
+    Args:
+        rig: the proxies; joints: how many the character has.
+    """
+
+    def __init__(self, rig: ProxyRig, joints: int) -> None:
+        self.joints, self.count = joints, rig.proxy_count
+        self.pivots = rig.bind_transforms[:, :3, 3].astype(np.float32)
+        depth = np.zeros(joints + self.count, dtype=int)
+        for proxy, parent in enumerate(rig.parents):
+            depth[joints + proxy] = depth[parent] + 1
+        own = depth[joints:]
+        self.generations = [
+            (proxies, rig.parents[proxies])
+            for proxies in (np.flatnonzero(own == level) for level in range(1, own.max(initial=0) + 1))
+        ]
+
+    def matrices(self, rotations: NDArray, character: NDArray) -> NDArray:
+        """Return skinning matrices of all joints (J + P, 3, 4, F).
+
+        Args:
+            rotations: of the proxies in the axes of the bind pose (P, 3, 3, F).
+            character: skinning matrices of the character's joints (J, 3, 4, F).
+        """
+        moved = self.pivots[:, :, None] - sum(
+            rotations[:, :, axis] * self.pivots[:, None, axis, None] for axis in range(3)
+        )
+        whole = np.empty((self.joints + self.count, *character.shape[1:]), dtype=np.float32)
+        whole[: self.joints] = character
+        for proxies, parents in self.generations:
+            above, turn, place = whole[parents], rotations[proxies], moved[proxies]
+            own = np.concatenate([turn, place[:, :, None]], axis=2)
+            product = sum(above[:, :, axis, None] * own[:, None, axis] for axis in range(3))
+            product[:, :, 3] += above[:, :, 3]
+            whole[self.joints + proxies] = product
+        return whole

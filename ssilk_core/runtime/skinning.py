@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Blendshapes and linear blend skinning, a few vertices and frames at a time so that all stays in the cache.
+
+Each tile of consecutive vertices blends only the joints that move one of them: sparse where a mesh is large, and a
+plain matrix product within.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..assets import PINNED, Floats, Scene
+from .networks import Parameters
+
+TILE = 512  # vertices
+
+
+@dataclass(frozen=True, eq=False)
+class Tile:
+    """Consecutive vertices: `vertices` of the mesh, T of them.
+
+    Attributes:
+        shapes: blendshapes, then the rest shape [m], shape (K + 1, 3 T).
+        joints: which of all joints move them, shape (U,).
+        weights: those of these joints, shape (U, T).
+    """
+
+    vertices: slice
+    shapes: NDArray
+    joints: NDArray
+    weights: NDArray
+
+    def posed(self, activations: NDArray, matrices: NDArray) -> NDArray:
+        """Return positions (F, 3, T) of activations (F, K + 1), the last one 1, and matrices (J + P, 3, 4, F)."""
+        frames, count = len(activations), self.weights.shape[1]
+        points = (activations @ self.shapes).reshape(frames, 1, 3, count)
+        chosen = matrices[self.joints].transpose(3, 1, 2, 0).reshape(frames * 12, -1)
+        blended = (chosen @ self.weights).reshape(frames, 3, 4, count)
+        blended[:, :, :3] *= points
+        return blended.sum(axis=2)
+
+
+def posed(garment: list[Tile], activations: NDArray, matrices: NDArray, origins: Floats) -> Floats:
+    """Return vertices in world space [m], shape (F, V, 3).
+
+    Args:
+        garment: all its tiles.
+        activations: of the blendshapes, shape (K, F); matrices: of all joints about the root, (J + P, 3, 4, F).
+        origins: places of the root [m], shape (F, 3).
+    """
+    frames = len(origins)
+    activations = np.vstack([activations, np.ones((1, frames), np.float32)]).T
+    points = np.empty((frames, sum(tile.weights.shape[1] for tile in garment), 3))
+    for tile in garment:
+        local = tile.posed(activations, matrices)
+        for axis in range(3):  # one after the other is five times as fast as transposing while adding
+            np.add(local[:, axis], origins[:, axis, None], out=points[:, tile.vertices, axis])
+    return points
+
+
+def tiles(scene: Scene, parameters: Parameters) -> list[Tile]:
+    """Return a garment's vertices with the trained blendshapes and weights."""
+    count = scene.garment.mesh.vertex_count
+    free = scene.classes != PINNED
+    trained = parameters["decoder.shapes"]
+    shapes = np.zeros((trained.shape[2] + 1, 3, count), dtype=np.float32)
+    shapes[:-1, :, free] = trained.transpose(2, 1, 0)
+    shapes[-1] = scene.garment.mesh.points.T
+    indices, weights = scene.rig.skin.indices, trained_weights(scene, parameters)
+    return [
+        _tile(slice(start, start + TILE), shapes, indices[start : start + TILE], weights[start : start + TILE])
+        for start in range(0, count, TILE)
+    ]
+
+
+def trained_weights(scene: Scene, parameters: Parameters) -> NDArray:
+    """Return the weights of each influence (V, I): a softmax over each vertex's support, pinned rows as they were."""
+    factor = np.ones(scene.rig.skin.weights.shape)
+    offset = parameters["decoder.skin_offset"].astype(np.float64)
+    factor[scene.classes != PINNED] = np.exp(offset - offset.max(axis=1, keepdims=True))
+    weights = scene.rig.skin.weights * factor
+    return weights / weights.sum(axis=1, keepdims=True)
+
+
+def _tile(vertices: slice, shapes: NDArray, indices: NDArray, weights: NDArray) -> Tile:
+    joints = np.unique(indices[weights > 0])
+    dense = np.zeros((len(joints), len(indices)), dtype=np.float32)
+    row, influence = np.nonzero(weights)
+    np.add.at(dense, (np.searchsorted(joints, indices[row, influence]), row), weights[row, influence])
+    own = np.ascontiguousarray(shapes[:, :, vertices]).reshape(len(shapes), -1)
+    return Tile(vertices, own, joints, dense)

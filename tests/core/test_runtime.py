@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Playing without PyTorch: what comes out is what the network in PyTorch gives, in whatever order it is asked for."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ssilk_core.checkpoint import model_file, save_model
+from ssilk_core.descriptors import pose_features
+from ssilk_core.errors import SsilkError
+from ssilk_core.fabrics import FABRICS
+from ssilk_core.kinematics import deform
+from ssilk_core.model import descriptors
+from ssilk_core.model.network import GarmentModel
+from ssilk_core.parameters import SCHEMES, parameter_shapes
+from ssilk_core.rollout import decode, garment_poses, roll
+from ssilk_core.runtime import Player
+from ssilk_core.runtime.stepper import Limit
+
+FRAMES = 150  # more than two blocks of decoded frames, the last one short
+
+
+def player_of(model: GarmentModel) -> Player:
+    return Player(model_file(model, FABRICS["silk"], {}))
+
+
+def expected_vertices(model: GarmentModel, motion) -> np.ndarray:
+    return np.concatenate([decode(model, motion, pose) for pose in garment_poses(model, motion, motion.fps)])
+
+
+def all_vertices(playback) -> np.ndarray:
+    return np.stack([playback.vertices(frame) for frame in range(playback.frame_count)])
+
+
+@pytest.fixture(scope="module")
+def model(scene, toy_model) -> GarmentModel:
+    # Weak enough not to be chaotic, so that rounding in another order stays rounding.
+    return toy_model(scene, scale=0.1).eval()
+
+
+@pytest.fixture(scope="module")
+def motion(scene, toy_motion):
+    return toy_motion(scene, FRAMES)
+
+
+@pytest.fixture(scope="module")
+def playback(model, motion):
+    return player_of(model).play(motion)
+
+
+@pytest.mark.parametrize("options", [{}, {"widths": (16, 24, 12)}, {"bound": 0.0, "push": 0.0}, {"shapes": 0}])
+@pytest.mark.parametrize("proxies, shuffled", [(2, False), (2, True), (0, False)])
+def test_vertices_are_those_of_the_network(toy_scene, toy_model, toy_motion, options, proxies, shuffled):
+    scene = toy_scene(proxies=proxies, shuffled=shuffled)
+    model, motion = toy_model(scene, scale=0.1, **options).eval(), toy_motion(scene, 20)
+    np.testing.assert_allclose(
+        all_vertices(player_of(model).play(motion)), expected_vertices(model, motion), rtol=0, atol=1e-5
+    )
+
+
+def test_limits_are_reached_and_kept_as_in_the_network(scene, toy_model, motion):
+    model = toy_model(scene, scale=0.1, bound=0.2, push=0.02).eval()
+    free = toy_model(scene, scale=0.1, bound=0.0, push=0.0).eval()
+    states = player_of(model).play(motion).states
+    assert 0.1 < np.abs(states).max() < 0.2001 < np.abs(player_of(free).play(motion).states).max()
+    found, theirs = player_of(model).play(motion).poses(), garment_poses(model, motion, motion.fps)
+    np.testing.assert_allclose(next(found).weights[-1], next(theirs).weights[63], atol=1e-5)
+
+
+@pytest.mark.parametrize("bound", [0.0, 0.3, 4.0])
+def test_a_limit_is_that_of_the_integrators(bound):
+    from ssilk_core.model.integrators import limited
+
+    for reach in (0.1, 1.0, 30.0):
+        values = np.linspace(-reach, reach, 101, dtype=np.float32)
+        expected = limited(torch.from_numpy(values.copy()), bound)
+        Limit(bound, values.shape)(values)
+        np.testing.assert_allclose(values, expected, rtol=1e-6, atol=1e-7)
+
+
+def test_poses_are_what_a_file_stores(model, motion, playback):
+    mine, theirs = list(playback.poses()), list(garment_poses(model, motion, motion.fps))
+    assert [pose.start for pose in mine] == [0, 64, 128] and sum(pose.frame_count for pose in mine) == FRAMES
+    for name in ("rotations", "weights"):
+        found, expected = (np.concatenate([getattr(pose, name) for pose in poses]) for poses in (mine, theirs))
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+        assert np.ptp(found, axis=0).max() > 0.01  # it moves
+
+
+def test_a_reader_of_the_file_deforms_to_the_same_vertices(model, motion, playback):
+    frames = np.concatenate([deform(model.deformer(), motion, pose) for pose in playback.poses()])
+    np.testing.assert_allclose(all_vertices(playback), frames, atol=1e-5)
+
+
+def test_matrices_are_those_of_forward_kinematics(model, motion, playback):
+    character = torch.from_numpy(playback.driven.matrices)
+    step = next(roll(model, motion, FRAMES))
+    expected = model.decoder.proxy_matrices(step.rotations, character).detach().numpy()
+    for frame in (0, 63, 64, FRAMES - 1):
+        matrices, origin = playback.matrices(frame)
+        np.testing.assert_allclose(matrices, expected[..., frame], atol=1e-5)
+        np.testing.assert_array_equal(origin, motion.translations[frame, 0])
+
+
+def test_any_order_gives_the_same_bits(model, motion, playback):
+    order = np.random.default_rng(0).permutation(FRAMES)
+    other = player_of(model).play(motion)
+    shuffled = {int(frame): (other.vertices(int(frame)), *other.matrices(int(frame))) for frame in order}
+    for frame in range(FRAMES):
+        for mine, theirs in zip(shuffled[frame], (playback.vertices(frame), *playback.matrices(frame))):
+            np.testing.assert_array_equal(mine, theirs)
+
+
+def test_negative_frames_count_from_the_end_and_others_are_refused(playback):
+    np.testing.assert_array_equal(playback.vertices(-1), playback.vertices(FRAMES - 1))
+    for frame in (FRAMES, -FRAMES - 1):
+        with pytest.raises(IndexError):
+            playback.vertices(frame)
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3])
+def test_the_shortest_motions_play(model, scene, toy_motion, frames):
+    motion = toy_motion(scene, frames)
+    np.testing.assert_allclose(
+        all_vertices(player_of(model).play(motion)), expected_vertices(model, motion), atol=1e-5
+    )
+
+
+def test_far_from_the_origin_nothing_is_lost(model, motion, playback):
+    far = motion.translations.copy()
+    far[:, 0] += [3000.0, 40, -7000]
+    found = player_of(model).play(replace(motion, translations=far)).vertices(5)
+    np.testing.assert_allclose(found - [3000, 40, -7000], playback.vertices(5), atol=1e-5)
+
+
+def test_a_motion_of_another_rate_or_character_is_refused(model, scene, toy_motion):
+    player, motion = player_of(model), toy_motion(scene, 5)
+    with pytest.raises(SsilkError, match="24 frames per second; the model steps at 30"):
+        player.play(replace(motion, fps=24.0))
+    with pytest.raises(SsilkError, match="2 joints; the model's character has 3"):
+        player.play(replace(motion, rotations=motion.rotations[:, :2], translations=motion.translations[:, :2]))
+
+
+def test_other_schemes_are_refused(scene, toy_model):
+    with pytest.raises(SsilkError, match="scheme is 'direct'"):
+        player_of(toy_model(scene, scheme="direct"))
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("widths", [(16,), (8, 24, 12)])
+def test_parameter_shapes_are_those_of_the_network(scene, toy_model, scheme, widths):
+    model = toy_model(scene, scheme=scheme, widths=widths)
+    found = parameter_shapes(scene, model.config, model.joints)
+    assert found == {name: tuple(value.shape) for name, value in model.state_dict().items()}
+
+
+def test_descriptors_are_those_that_training_sees(scene, motion):
+    joints = np.arange(3)
+    mine = pose_features(motion, scene.character.skeleton, joints)
+    theirs = descriptors.pose_features(motion, scene.character.skeleton, joints)
+    for name in ("static", "dynamic", "down"):
+        np.testing.assert_array_equal(getattr(mine, name), getattr(theirs, name))
+
+
+def test_loading_and_playing_load_no_torch(model, motion, tmp_path: Path):
+    save_model(tmp_path / "model.safetensors", model_file(model, FABRICS["silk"], {}))
+    np.savez(tmp_path / "motion.npz", rotations=motion.rotations, translations=motion.translations)
+    code = (
+        "import sys, numpy as np\n"
+        "from ssilk_core.assets import Motion\n"
+        "from ssilk_core.runtime import Player\n"
+        "assert 'torch' not in sys.modules\n"
+        "motion = Motion('/m', 30.0, **np.load('motion.npz'))\n"
+        "playback = Player.load('model.safetensors').play(motion)\n"
+        "np.save('points.npy', playback.vertices(70))\n"
+        "list(playback.poses())\n"
+        "assert not {'torch', 'scipy', 'pxr'} & sys.modules.keys()\n"
+    )
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True)
+    expected = expected_vertices(model, motion)[70]
+    np.testing.assert_allclose(np.load(tmp_path / "points.npy"), expected, rtol=0, atol=1e-5)
