@@ -109,7 +109,7 @@ class SpringStepper:
         return Course(history, driven, held)
 
     def rolled(self, course: Course) -> NDArray:
-        """Return the latents of all frames (F, latent), which are written into `course`; the first two are at rest."""
+        """Return the latents of all frames (F, latent), written into `course`; the first two are at rest."""
         with np.errstate(over="ignore"):  # an activation of minus infinity is zero
             self._advance(course.history, course.driven, course.held)
         return course.history[2:, 1]
