@@ -37,7 +37,7 @@ class Preferences(bpy.types.AddonPreferences):
 
     def draw(self, _: bpy.types.Context) -> None:
         """Draw the settings."""
-        from .panels import draw_work
+        from .panels.base import draw_work
 
         row = self.layout.row(align=True)
         row.prop(self, "python")
