@@ -28,8 +28,8 @@ from .parameters import Shapes, parameter_shapes
 if TYPE_CHECKING:
     from .model.network import GarmentModel
 
-FORMAT = 2
-READABLE = (1, FORMAT)  # 1 knew nothing of packed matrices
+FORMAT = 3
+READABLE = (1, 2, FORMAT)  # 1 knew nothing of packed matrices, 2 nothing of reduced models
 # Parts of the header that are no plain values, as tuples (JSON: lists) and dicts.
 HEADER: dict[str, Any] = {
     "joint_names": (), "proxy_names": (), "paths": {}, "config": {}, "fabric": {}, "provenance": {},
@@ -173,7 +173,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     except (ValueError, RecursionError) as error:
         raise SsilkError(f"{path}: the model's header is damaged ({error}); train again.") from error
     found = document.get("format") if isinstance(document, dict) else None
-    allowed = f"this version reads formats {' and '.join(map(str, READABLE))}"
+    allowed = f"this version reads formats {', '.join(map(str, READABLE))}"
     need(found in READABLE, str(path), f"model format {found}", allowed, "train it again")
     return tensors, document
 

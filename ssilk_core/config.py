@@ -28,6 +28,7 @@ class ModelConfig:
         latent: dimensions of the latent state z.
         widths: hidden layers of the initialiser P, the stepper S and the decoder D.
         shapes: blendshapes K; zero leaves proxies alone to deform the garment.
+        activations: what D gives for them, where it is more than K ("ssilk reduce"); zero for K itself.
         scheme: how z is integrated: "verlet" (Eq. 3), "direct" (Eq. 11), "direct_residual" (Eq. 12), or
             "spring_verlet", Eq. 3 with a spring to the quasi-static state.
         bound: soft bound on each latent dimension; zero leaves the latents free, as the paper does.
@@ -39,6 +40,7 @@ class ModelConfig:
     latent: int = 128
     widths: tuple[int, ...] = (256, 512, 512)
     shapes: int = 64
+    activations: int = 0
     scheme: str = "spring_verlet"
     bound: float = 4.0
     push: float = 0.3
@@ -55,8 +57,13 @@ class ModelConfig:
         )
         need(min(self.widths) > 0, "model", f"widths = {self.widths}", "each is at least 1")
         _need_between(self, 1, MOST, "latent", "fps")
-        _need_between(self, 0, MOST, "shapes", "bound", "push")
+        _need_between(self, 0, MOST, "shapes", "activations", "bound", "push")
         _need_between(self, 1e-6, 1, "stiffness")
+
+    @property
+    def given(self) -> int:
+        """How many activations D gives."""
+        return self.activations or self.shapes
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -42,6 +42,9 @@ class Decoder(nn.Module):
         scene: garment, rig and character.
         shapes: blendshapes K.
         generator: source of the initial blendshapes.
+        activations: what the network gives for them, where it is more than K. Fixed linear combinations of these,
+            `readout` (K, activations) with rows whose absolute values sum to one, then activate the blendshapes
+            about the mean displacement `offset` (V', 3) [m] of the vertices that are not pinned.
     """
 
     rest: Tensor
@@ -50,11 +53,14 @@ class Decoder(nn.Module):
     free: Tensor
     logits: Tensor
     identity: Tensor
+    readout: Tensor
+    offset: Tensor
 
-    def __init__(self, scene: Scene, shapes: int, generator: torch.Generator) -> None:
+    def __init__(self, scene: Scene, shapes: int, generator: torch.Generator, activations: int = 0) -> None:
         super().__init__()
         rig = scene.rig
-        self.proxy_count, self.shape_count = rig.proxy_count, shapes
+        self.proxy_count, self.shape_count, self.given = rig.proxy_count, shapes, activations or shapes
+        self.is_reduced = activations > 0
         self.above = tuple(rig.parents.tolist())  # as numbers too, which need not be fetched from a GPU
         self.skin = Skinning(rig.skin, range(scene.character.skeleton.joint_count, len(scene.joint_names)))
         free = np.flatnonzero(scene.classes != PINNED)
@@ -68,6 +74,8 @@ class Decoder(nn.Module):
         self._constant("identity", np.array([1.0, 0, 0, 0, 1, 0]))
         self.skin_offset = nn.Parameter(torch.zeros(len(free), weights.shape[1]))
         self.shapes = nn.Parameter(1e-3 * torch.randn(len(free), 3, shapes, generator=generator))
+        self.register_buffer("readout", torch.eye(shapes, self.given), persistent=self.is_reduced)
+        self.register_buffer("offset", torch.zeros(len(free), 3), persistent=self.is_reduced)
 
     def _constant(self, name: str, values: np.ndarray) -> None:
         """Register a constant that is rebuilt from the scene, hence not saved; floats become float32."""
@@ -81,8 +89,13 @@ class Decoder(nn.Module):
 
     @property
     def output_count(self) -> int:
-        """Numbers the network must give for each frame: K blendshape activations and 6 P for the proxies."""
-        return self.shape_count + 6 * self.proxy_count
+        """Numbers the network must give for each frame: blendshape activations and 6 P for the proxies."""
+        return self.given + 6 * self.proxy_count
+
+    @property
+    def has_constant(self) -> bool:
+        """Whether a file needs one more shape, of constant weight."""
+        return self.given > 0
 
     def activations(self, output: Tensor) -> tuple[Tensor, Tensor]:
         """Split network output (N, K + 6 P) into activations (K, N) in [-1, 1] and rotations (P, 3, 3, N)."""
@@ -90,8 +103,9 @@ class Decoder(nn.Module):
         return activation, rotation_from_six_d(six_d)
 
     def _split(self, output: Tensor) -> tuple[Tensor, Tensor]:
-        delta = output[:, self.shape_count :].T.reshape(self.proxy_count, 6, len(output))
-        return torch.tanh(output[:, : self.shape_count].T), self.identity[:, None] + delta
+        delta = output[:, self.given :].T.reshape(self.proxy_count, 6, len(output))
+        activation = torch.tanh(output[:, : self.given].T)
+        return self.readout @ activation if self.is_reduced else activation, self.identity[:, None] + delta
 
     def _influence_weights(self) -> Tensor:
         """Return weights (V, I): a softmax over each vertex's support, pinned rows frozen."""
@@ -132,7 +146,8 @@ class Decoder(nn.Module):
         return (shapes.flatten(0, 1) @ activation).reshape(len(self.rest), 3, activation.shape[1])
 
     def _skinned(self, activation: Tensor, matrices: Tensor) -> Tensor:
-        return self.skin(self.rest, self._offsets(activation), self._influence_weights(), matrices)
+        rest = self.rest.index_add(0, self.free, self.offset) if self.is_reduced else self.rest
+        return self.skin(rest, self._offsets(activation), self._influence_weights(), matrices)
 
     def vertices(self, output: Tensor, character: Tensor) -> Tensor:
         """Return vertices (V, 3, N) [m] from network output (N, K + 6 P) and character (J, 3, 4, N)."""

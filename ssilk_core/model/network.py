@@ -49,7 +49,7 @@ class GarmentModel(nn.Module):
         super().__init__()
         self.scene, self.config, self.joints = scene, config, np.asarray(joints, dtype=np.int64)
         generator = torch.Generator().manual_seed(seed)
-        self.decoder = Decoder(scene, config.shapes, generator)
+        self.decoder = Decoder(scene, config.shapes, generator, config.activations)
         static, dynamic = self._descriptor_sizes()
         z = config.latent
         self.initialiser = mlp(static, config.widths, z, generator, 1.0)
@@ -98,7 +98,7 @@ class GarmentModel(nn.Module):
         """Return the trained garment for files: shapes for weights in [0, 1], with W^g and W^p made sparse.
 
         An activation a in [-1, 1] is the weight w = (a + 1) / 2 of the shape 2 B_k. The last shape, -sum_k B_k at a
-        constant weight of one, puts the middle of the range back to the rest shape.
+        constant weight of one, puts the middle of the range back to the rest shape, or where a reduced model's is.
         """
         scene, decoder = self.scene, self.decoder
         dense = np.zeros((scene.garment.mesh.vertex_count, len(scene.joint_names)))
@@ -107,8 +107,10 @@ class GarmentModel(nn.Module):
         free = decoder.shapes.double().permute(2, 0, 1).cpu().numpy()
         shapes = np.zeros((decoder.shape_count, scene.garment.mesh.vertex_count, 3))
         shapes[:, decoder.free.cpu().numpy()] = 2 * free
-        if decoder.shape_count:
-            shapes = np.concatenate([shapes, -shapes.sum(0, keepdims=True) / 2])
+        if decoder.has_constant:
+            constant = -shapes.sum(0, keepdims=True) / 2
+            constant[0, decoder.free.cpu().numpy()] += decoder.offset.cpu().numpy()
+            shapes = np.concatenate([shapes, constant])
         return Deformer(scene, skin, shapes)
 
     @torch.no_grad()
@@ -121,7 +123,7 @@ class GarmentModel(nn.Module):
         turned = rotations.double().permute(3, 0, 1, 2).cpu().numpy()
         local = quaternion_from_matrix(above @ turned @ bind[joints:])
         weights = (activation.double().T.cpu().numpy() + 1) / 2
-        if self.decoder.shape_count:
+        if self.decoder.has_constant:
             weights = np.concatenate([weights, np.ones((len(weights), 1))], axis=1)
         return local, weights.clip(0, 1)
 

@@ -61,7 +61,7 @@ class Player:
         static, _ = descriptor_sizes(scene, file.joints)
         self.initialiser = layers(file.parameters, "initialiser")
         self.stepper = SpringStepper(config, file.parameters, static)
-        self.decoder = Decoder(scene, file.parameters, config.shapes)
+        self.decoder = Decoder(scene, file.parameters, config)
         self.kinematics = ProxyKinematics(scene.rig, self.skeleton.joint_count)
         self.tiles = tiles(scene, file.parameters)
 

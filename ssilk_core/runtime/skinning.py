@@ -69,6 +69,8 @@ def tiles(scene: Scene, parameters: Parameters) -> list[Tile]:
     shapes = np.zeros((trained.shape[2] + 1, 3, count), dtype=np.float32)
     shapes[:-1, :, free] = trained.transpose(2, 1, 0)
     shapes[-1] = scene.garment.mesh.points.T
+    if "decoder.offset" in parameters:
+        shapes[-1][:, free] += parameters["decoder.offset"].T
     indices, weights = scene.rig.skin.indices, trained_weights(scene, parameters)
     return [
         _tile(slice(start, start + TILE), shapes, indices[start : start + TILE], weights[start : start + TILE])

@@ -239,7 +239,7 @@ def configure(**changes: object) -> Callable[[dict, dict], None]:
 
 
 DAMAGE = {
-    "another format": (set_header("format", 99), "model format 99; this version reads formats 1 and 2"),
+    "another format": (set_header("format", 99), "model format 99; this version reads formats 1, 2, 3"),
     "header is a list": (lambda tensors, document: document.clear(), "model format None"),
     "integers without their scale": (
         set_tensor("model.output.0.weight", np.ones((16, 8), np.int16)),
