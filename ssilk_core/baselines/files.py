@@ -9,10 +9,11 @@ from typing import Any
 
 import torch
 
-from ..checkpoint import ModelFile, load_model, save_model
+from ..checkpoint import ModelFile, load_model, network, save_model
 from ..config import ModelConfig
-from ..errors import need
 from ..fabrics import Fabric
+from ..model.network import GarmentModel
+from ..parameters import Shapes, parameter_shapes
 from .networks import Baseline, BaselineConfig, baseline
 
 KEY = "baseline"  # of the provenance
@@ -27,24 +28,26 @@ def save_baseline(path: str | Path, model: Baseline, fabric: Fabric, provenance:
     )
 
 
-def load_baseline(path: str | Path) -> tuple[ModelFile, Baseline]:
-    """Read what `save_baseline` wrote: the file and its network, on the CPU.
+def load_network(path: str | Path) -> tuple[ModelFile, Baseline | GarmentModel]:
+    """Read a trained baseline or a model of 'ssilk train', whichever the file holds: the file and its network.
 
     Raises:
-        SsilkError: as `load_model` does, or it is no baseline.
+        SsilkError: as `load_model` does.
     """
     file = load_model(path, _shapes)
-    model = _network(file)
+    if KEY not in file.provenance:
+        return file, network(file)
+    model = _untrained(file)
     model.load_state_dict({name: torch.from_numpy(value.copy()) for name, value in file.parameters.items()})
     return file, model.eval()
 
 
-def _shapes(file: ModelFile) -> dict[str, tuple[int, ...]]:
+def _shapes(file: ModelFile) -> Shapes:
+    if KEY not in file.provenance:
+        return parameter_shapes(file.scene, file.config, file.joints)
     with torch.device("meta"):
-        return {name: tuple(value.shape) for name, value in _network(file).state_dict().items()}
+        return {name: tuple(value.shape) for name, value in _untrained(file).state_dict().items()}
 
 
-def _network(file: ModelFile) -> Baseline:
-    where = file.scene.garment.mesh.path
-    need(KEY in file.provenance, where, "this is no baseline", "the provenance of one says which it is")
+def _untrained(file: ModelFile) -> Baseline:
     return baseline(file.scene, BaselineConfig(**file.provenance[KEY]), file.joints)

@@ -122,24 +122,33 @@ class Validator:
                 quiet = model.initial(self.bank.static_descriptor(frames[window], direction))
                 still = model.vertices(quiet, character)
             joined = x if tail is None else torch.cat([tail, x], dim=-1)
-            parts.append(self._terms(x, plain, still, self.body.posed(character), joined))
+            posed = self.body.posed(character)
+            terms = energies(self.energy, x, plain, posed, joined, self.fps, self.down)
+            parts.append({**terms, "dynamics": ((x - still) ** 2).sum(1).mean(0)})
             tail = joined[..., -2:]
         return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
-    def _terms(self, x: Tensor, plain: Tensor, still: Tensor, body: PosedBody, joined: Tensor) -> dict[str, Tensor]:
-        energy = self.energy
-        distance = signed_distance(x, body)
-        moving = joined[..., 2:]
-        inertia = energy.inertia(moving, 2 * joined[..., 1:-1] - joined[..., :-2], 1 / self.fps)
-        return {
-            "stretch": energy.stretch(x),
-            "bending": energy.bending(x),
-            "gravity": energy.gravity(x - plain, GRAVITY * self.down[:, None]),
-            "inertia": torch.cat([inertia.new_zeros(x.shape[-1] - len(inertia)), inertia]),
-            "collision": energy.collision_of(distance),
-            "collisions": (distance < 0).double().mean(0),
-            "dynamics": ((x - still) ** 2).sum(1).mean(0),
-        }
+
+def energies(
+    energy: GarmentEnergy, x: Tensor, plain: Tensor, body: PosedBody, joined: Tensor, fps: float, down: Tensor
+) -> dict[str, Tensor]:
+    """Return each of `TERMS` [J], and the share of vertices inside the body as "collisions", shape (N,).
+
+    Args:
+        x, plain: positions (V, 3, N); gravity is that of `x` less that of `plain`.
+        joined: `x` after up to two frames before it. Where two are lacking there is no inertia.
+        down: direction of gravity, shape (3,).
+    """
+    distance = signed_distance(x, body)
+    inertia = energy.inertia(joined[..., 2:], 2 * joined[..., 1:-1] - joined[..., :-2], 1 / fps)
+    return {
+        "stretch": energy.stretch(x),
+        "bending": energy.bending(x),
+        "gravity": energy.gravity(x - plain, GRAVITY * down[:, None]),
+        "inertia": torch.cat([inertia.new_zeros(x.shape[-1] - len(inertia)), inertia]),
+        "collision": energy.collision_of(distance),
+        "collisions": (distance < 0).double().mean(0),
+    }
 
 
 @torch.no_grad()

@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from ssilk_core.assets import PINNED, Motion, Scene
 from ssilk_core.baselines.descriptors import JointBank, joint_bank
-from ssilk_core.baselines.files import load_baseline, save_baseline
+from ssilk_core.baselines.files import load_network, save_baseline
 from ssilk_core.baselines.networks import METHODS, Baseline, BaselineConfig, baseline
 from ssilk_core.baselines.run import BaselineJob, BaselineRun, train_baseline
 from ssilk_core.baselines.training import BaselineObjective, BaselineStepper
-from ssilk_core.checkpoint import load_model
+from ssilk_core.checkpoint import load_model, model_file, save_model
 from ssilk_core.config import ModelConfig, TrainConfig
 from ssilk_core.energy import GarmentEnergy
 from ssilk_core.errors import SsilkError
@@ -23,6 +23,7 @@ from ssilk_core.fabrics import Fabric
 from ssilk_core.kinematics import matrix_from_quaternion, motion_transforms, quaternion_from_matrix
 from ssilk_core.model.body import CollisionBody
 from ssilk_core.model.descriptors import GRAVITY, RATE_TIME
+from ssilk_core.model.network import GarmentModel
 from ssilk_core.training.bank import build_bank
 from ssilk_core.training.curve import curve_path
 from ssilk_core.training.job import TrainJob
@@ -285,7 +286,7 @@ def test_a_run_writes_its_best_model_with_where_it_comes_from(scene, job, method
     asked = job(method)
     state = train_baseline(asked, silent)
     assert [point.iteration for point in state.curve] == [3, 6, 8] and curve_path(asked.base.output).is_file()
-    file, model = load_baseline(asked.base.output)
+    file, model = load_network(asked.base.output)
     told = file.provenance
     assert told["baseline"] == {"method": method, "fps": 30.0} and told["train"]["window"] == 8
     assert (told["iteration"], told["validation"]["total"]) == (state.best.iteration, state.best.score.total)
@@ -316,7 +317,7 @@ def test_a_run_ends_with_its_time(job, monkeypatch):
 def test_files_are_written_and_read_whole(scene, tmp_path):
     path, model = tmp_path / "ncs.safetensors", network(scene, "ncs")
     save_baseline(path, model, FABRIC, {"seed": 1})
-    file, loaded = load_baseline(path)
+    file, loaded = load_network(path)
     assert file.provenance == {"seed": 1, "baseline": {"method": "ncs", "fps": 30.0}}
     assert loaded.state_dict().keys() == model.state_dict().keys()
     assert all(torch.equal(value, loaded.state_dict()[name]) for name, value in model.state_dict().items())
@@ -324,10 +325,9 @@ def test_files_are_written_and_read_whole(scene, tmp_path):
         load_model(path)
 
 
-def test_models_are_no_baselines(scene, toy_model, tmp_path):
-    from ssilk_core.checkpoint import model_file, save_model
-
-    path = tmp_path / "model.safetensors"
-    save_model(path, model_file(toy_model(scene), FABRIC, {}))
-    with pytest.raises(SsilkError, match=r"model.safetensors: .*this is no baseline"):
-        load_baseline(path)
+def test_models_open_as_what_they_are(scene, toy_model, tmp_path):
+    path, model = tmp_path / "model.safetensors", toy_model(scene)
+    save_model(path, model_file(model, FABRIC, {}))
+    file, loaded = load_network(path)
+    assert isinstance(loaded, GarmentModel) and file.config == model.config
+    assert all(torch.equal(value, loaded.state_dict()[name]) for name, value in model.state_dict().items())

@@ -24,6 +24,7 @@ LAYERS = (
     {"checkpoint"},
     {"demo", "view", "simulate", "training", "rollout", "preflight", "setup", "wardrobe", "runtime"},
     {"baselines"},
+    {"evaluation"},
     {"cli"},
     {"__main__"},
 )

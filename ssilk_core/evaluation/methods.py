@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Everything that dresses a character, behind one call: networks, plain skinning, and point caches."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..assets import PINNED, Floats, Scene
+from ..baselines.descriptors import joint_bank
+from ..baselines.networks import Baseline
+from ..energy import GarmentEnergy
+from ..errors import need
+from ..fabrics import Fabric
+from ..model.body import CollisionBody
+from ..model.skinning import Skinning
+from ..training.bank import MotionBank, build_bank
+from ..training.validation import Rolled, roll_states
+from .takes import Take
+
+SAME = 0.02  # [m] that pinned vertices of a point cache may be away from the skeleton of the motion
+
+Reader = Callable[[str, range], Floats]
+"""Returns the points of frames of a clip in the world [m], shape (frames, V, 3)."""
+
+
+class Method(Protocol):
+    """A garment over takes. Positions are about the root of each take's first frame, as those of a bank are."""
+
+    name: str
+
+    def vertices(self, take: int, frames: range) -> Tensor:
+        """Return positions [m] of consecutive frames of a take, shape (V, 3, N)."""
+        ...
+
+    def still(self, take: int, frames: range) -> Tensor | None:
+        """Return the method's own quasi-static states of these poses [m], (V, 3, N); None where it has none."""
+        ...
+
+
+class Dressed:
+    """A garment on its whole character, and what measures it.
+
+    Args:
+        scene: with every body mesh, reachable or not.
+        fps: of every method.
+
+    Attributes:
+        height: of the garment at rest [m].
+    """
+
+    def __init__(self, scene: Scene, fabric: Fabric, fps: float, device: torch.device) -> None:
+        mesh = scene.garment.mesh
+        self.scene, self.fabric, self.fps, self.device = scene, fabric, fps, device
+        self.energy = GarmentEnergy(mesh, fabric, device=device)
+        skeleton = scene.character.skeleton
+        self.body = CollisionBody(scene.character.merged_body(), skeleton.joint_count, device=device)
+        self.skin = Skinning(scene.plain_skin).to(device)
+        self.rest = torch.tensor(mesh.points, dtype=torch.float32, device=device)
+        self.height = float(np.ptp(mesh.points[:, 1]))
+
+    @property
+    def name(self) -> str:
+        """Name of the garment's prim."""
+        return self.scene.garment.mesh.path.rpartition("/")[2]
+
+    def plain(self, character: Tensor) -> Tensor:
+        """Return plain skinning's positions (V, 3, N) [m] of skinning matrices (J, 3, 4, N)."""
+        return self.skin(self.rest, None, self.skin.weights, character)
+
+
+@dataclass(frozen=True, eq=False)
+class Reel:
+    """Takes of one garment's character on a device; clip `i` of the bank is take `i`."""
+
+    takes: tuple[Take, ...]
+    bank: MotionBank
+
+    def frames(self, take: int, frames: range) -> Tensor:
+        """Return indices into the bank of frames of a take, shape (N,)."""
+        first = int(self.bank.starts[take])
+        return torch.arange(first + frames.start, first + frames.stop, device=self.bank.root.device)
+
+    def character(self, take: int, frames: range) -> Tensor:
+        """Return skinning matrices (J, 3, 4, N) of frames of a take."""
+        return self.bank.character(self.frames(take, frames))
+
+
+def reel_of(takes: Sequence[Take], dressed: Dressed, joints: np.ndarray) -> Reel:
+    """Return takes with what networks that have these joints in view see of them.
+
+    Raises:
+        SsilkError: there is no take.
+    """
+    need(takes, "clips", "none of four frames or more", "one at least is needed", "name longer ones")
+    skeleton = dressed.scene.character.skeleton
+    bank = build_bank([take.motion for take in takes], skeleton, joints, dressed.fps, dressed.device)
+    assert len(bank.starts) == len(takes)
+    return Reel(tuple(takes), bank)
+
+
+class Network:
+    """A trained model or a baseline, rolled over all takes side by side, each from its quasi-static start."""
+
+    def __init__(self, name: str, model: Rolled, reel: Reel) -> None:
+        self.name, self.model, self.reel = name, model, _seen_by(model, reel)
+        bank = self.reel.bank
+        self.down = torch.tensor([0.0, -1.0, 0.0], device=bank.root.device)
+        clips = [range(int(start), int(stop)) for start, stop in zip(bank.starts, bank.stops)]
+        self.states = roll_states(model, bank, clips, self.down)
+
+    @torch.no_grad()
+    def vertices(self, take: int, frames: range) -> Tensor:
+        states = self.states[take][frames.start : frames.stop]
+        return self.model.vertices(states, self.reel.character(take, frames))
+
+    @torch.no_grad()
+    def still(self, take: int, frames: range) -> Tensor:
+        bank, index = self.reel.bank, self.reel.frames(take, frames)
+        quiet = self.model.initial(bank.static_descriptor(index, self.down.expand(len(index), 3)))
+        return self.model.vertices(quiet, self.reel.character(take, frames))
+
+
+def _seen_by(model: Rolled, reel: Reel) -> Reel:
+    """Return a reel with the descriptors of a network."""
+    if not isinstance(model, Baseline):
+        return reel
+    parents = model.scene.character.skeleton.parents[model.joints]
+    inner = torch.as_tensor(parents >= 0, device=reel.bank.root.device)
+    return replace(reel, bank=joint_bank(reel.bank, inner, model.config.fps))
+
+
+class Plain:
+    """Plain skinning."""
+
+    name = "plain"
+
+    def __init__(self, dressed: Dressed, reel: Reel) -> None:
+        self.dressed, self.reel = dressed, reel
+
+    def vertices(self, take: int, frames: range) -> Tensor:
+        return self.dressed.plain(self.reel.character(take, frames))
+
+    def still(self, take: int, frames: range) -> None:
+        return None
+
+
+class Cache:
+    """Points that were written frame by frame, by a simulator or by anything else.
+
+    Args:
+        read: gives the points of a clip at the rate of the takes.
+    """
+
+    def __init__(self, name: str, read: Reader, dressed: Dressed, reel: Reel) -> None:
+        self.name, self.read, self.dressed, self.reel = name, read, dressed, reel
+        self.pinned = torch.as_tensor((dressed.scene.classes == PINNED).nonzero()[0], device=dressed.device)
+
+    def vertices(self, take: int, frames: range) -> Tensor:
+        """Return positions as above.
+
+        Raises:
+            SsilkError: pinned vertices are not where the skeleton has them: it is another motion.
+        """
+        played = self.reel.takes[take]
+        points = self.read(played.clip, range(played.first + frames.start, played.first + frames.stop))
+        local = points - played.motion.translations[0, 0]
+        x = torch.as_tensor(local.transpose(1, 2, 0).copy(), dtype=torch.float32, device=self.dressed.device)
+        self._check(x, take, frames)
+        return x
+
+    def _check(self, x: Tensor, take: int, frames: range) -> None:
+        plain = self.dressed.plain(self.reel.character(take, frames))
+        away = (x - plain)[self.pinned].norm(dim=1)
+        far = float(away.max()) if away.numel() else 0.0
+        need(far < SAME, self.reel.takes[take].clip,
+             f"in the point cache, pinned vertices are {far:.3g} m from where this motion has them",
+             f"{SAME:g} m are allowed", "simulate this motion on this character")  # fmt: skip
+
+    def still(self, take: int, frames: range) -> None:
+        return None

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is played: stretches of clips without cuts at a model's rate, and clips that loop or come to a stop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..assets import Floats, Motion
+from ..kinematics import sample_motion
+from ..simulate.actors import spans_of
+
+EASE = 0.25  # [s] to start or to stop
+SHORTEST = 4  # frames; a third difference needs as many
+
+
+@dataclass(frozen=True, eq=False)
+class Take:
+    """A stretch of a clip without cuts.
+
+    Attributes:
+        clip: its name.
+        first: frame of the clip that it begins with, at the rate of `motion`.
+        motion: the character's poses at the model's rate.
+    """
+
+    clip: str
+    first: int
+    motion: Motion
+
+    @property
+    def frame_count(self) -> int:
+        return self.motion.frame_count
+
+
+def takes_of(clip: str, motion: Motion, fps: float, longest: int | None = None) -> list[Take]:
+    """Return a clip at `fps` as takes of at most `longest` frames; those of under four frames are left out.
+
+    Frames are those of `ssilk simulate` at the same rate, so that a point cache of the clip lines up.
+    """
+    found = []
+    for span in spans_of(motion, 0, fps, 1):
+        step = longest or span.frame_count
+        for start in range(0, span.frame_count, step):
+            part = span.motion.clip(start, start + step)
+            found.append(Take(clip, span.first + start, part))
+    return [take for take in found if take.frame_count >= SHORTEST]
+
+
+def _played(motion: Motion, fps: float, seconds: Floats) -> Motion:
+    position = np.clip(seconds * motion.fps, 0, motion.frame_count - 1)
+    return Motion(motion.path, fps, *sample_motion(motion, position))
+
+
+def back_and_forth(motion: Motion, fps: float, frames: int) -> tuple[Motion, int]:
+    """Loop a clip forward and backward and return at least `frames` frames, with the length of a loop.
+
+    Speed falls to zero and rises again within `EASE` at either end, so that positions and velocities are continuous
+    and each loop is exactly the one before it.
+    """
+    duration = (motion.frame_count - 1) / motion.fps
+    half = round((duration + EASE) * fps)
+    time = np.linspace(0, duration + EASE, half + 1)
+    first = np.minimum(time, EASE) ** 2 / (2 * EASE) + np.maximum(time - EASE, 0)
+    late = np.maximum(time - duration, 0)  # the mirror image of the start
+    there = first - late**2 / (2 * EASE)
+    loop = np.concatenate([there, there[-2:0:-1]])
+    return _played(motion, fps, np.tile(loop, -(-frames // len(loop)))), len(loop)
+
+
+def stopped(motion: Motion, fps: float, stop: float, hold: float) -> tuple[Motion, int]:
+    """Play a clip until `stop` [s], come to rest within `EASE`, and hold that pose for `hold` seconds.
+
+    Returns:
+        The motion, and its first frame at rest.
+    """
+    time = np.arange(round((stop + EASE + hold) * fps) + 1) / fps
+    late = np.clip(time - stop, 0, EASE)
+    return _played(motion, fps, np.minimum(time, stop) + late - late**2 / (2 * EASE)), int(
+        np.ceil((stop + EASE) * fps)
+    )
