@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import bpy
-from bpy.props import PointerProperty
+from bpy.props import PointerProperty, StringProperty
 
 
 def _is_armature(_: object, thing: bpy.types.Object) -> bool:
@@ -24,6 +24,16 @@ class GarmentSettings(bpy.types.PropertyGroup):
         type=bpy.types.Collection,
         name="Bodies",
         description="Meshes that the garment collides with; all others bound to the armature when empty",
+    )
+    model: StringProperty(
+        name="Model",
+        subtype="FILE_PATH",
+        description="Trained model of the garment; that of its own training when empty",
+    )
+    job: StringProperty(
+        name="Training",
+        subtype="DIR_PATH",
+        description="Folder of the garment's training, relative to the blend file",
     )
 
 

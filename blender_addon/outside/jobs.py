@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Trainings that outlive Blender: a folder each, and what their runner says of them in it."""
+
+from __future__ import annotations
+
+import getpass
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ..errors import SetupError, need
+from .process import environment
+from .runner import BEAT, CANCEL, ORDER, STATE
+
+MODEL = "model.safetensors"
+CURVE = "model.curve.json"  # what validations found, as `ssilk train` writes it beside the model
+RUNNER = Path(__file__).with_name("runner.py")
+SILENCE = 10 * BEAT  # seconds without a beat after which a runner is no more
+
+# How a process goes on when Blender and its terminal end.
+if sys.platform == "win32":
+    DETACHED: dict[str, Any] = {
+        "creationflags": subprocess.DETACHED_PROCESS | subprocess.CREATE_NEW_PROCESS_GROUP  # type: ignore[attr-defined]
+    }
+else:
+    DETACHED = {"start_new_session": True}
+
+
+@dataclass(frozen=True)
+class JobState:
+    """What a runner said of its training.
+
+    Attributes:
+        state: waiting, running, done, stopped or failed; lost where a runner ended without a word.
+        done, total: iterations.
+        seconds_left: None until it can be estimated.
+        terms: energies of the last batch [J] by name; None where one is not finite.
+        curve: [iteration, terms] now and then.
+        checkpoint: iteration of the model on disk; None before there is one.
+        text: the last message.
+        error: why it failed.
+    """
+
+    state: str
+    done: int = 0
+    total: int = 0
+    seconds_left: float | None = None
+    terms: dict[str, float | None] = field(default_factory=dict)
+    curve: list[tuple[int, dict[str, float | None]]] = field(default_factory=list)
+    checkpoint: int | None = None
+    text: str = ""
+    error: str = ""
+    beat: float = 0.0
+
+    @property
+    def fraction(self) -> float:
+        """The part that is done, in [0, 1]."""
+        return self.done / self.total if self.total else 0.0
+
+    @property
+    def alive(self) -> bool:
+        """Whether somebody works on it, or waits to."""
+        return self.state in ("waiting", "running")
+
+
+def create(parent: Path, name: str) -> Path:
+    """Make a new folder for a job; return it.
+
+    Args:
+        name: begins the folder's name; a number follows.
+
+    Raises:
+        SetupError: it cannot be made.
+    """
+    number = 1
+    while (folder := parent / f"{name}-{number:03d}").exists():
+        number += 1
+    try:
+        folder.mkdir(parents=True)
+    except OSError as error:
+        raise SetupError(
+            f"{folder} cannot be made ({error.strerror or error}); save the blend file elsewhere."
+        ) from error
+    return folder
+
+
+def begin(python: str, folder: Path, command: Sequence[str]) -> None:
+    """Let a job begin when its turn comes.
+
+    Args:
+        python: the Python that has ssilk.
+        command: arguments of that Python, run in the job's folder.
+
+    Raises:
+        SetupError: the Python cannot be started.
+    """
+    _write(folder / ORDER, {"command": list(command)})
+    _launch(python, folder)
+
+
+def resume(python: str, folder: Path) -> None:
+    """Let a job go on where it ended.
+
+    Raises:
+        SetupError: it works already, its files are gone, or the Python cannot be started.
+    """
+    state, order = read_state(folder), _read(folder / ORDER)
+    need(order, f"There is no training in {folder} any more; train again.")
+    need(not (state and state.alive), "The training is under way already.")
+    _write(folder / ORDER, {"command": [*(word for word in order["command"] if word != "--resume"), "--resume"]})
+    _launch(python, folder)
+
+
+def _launch(python: str, folder: Path) -> None:
+    """Start a runner, which goes on without us."""
+    (folder / CANCEL).unlink(missing_ok=True)
+    _write(folder / STATE, {**_read(folder / STATE), "state": "waiting", "beat": time.time(), "error": ""})
+    try:
+        subprocess.Popen(
+            [python, str(RUNNER), str(folder), str(queue_folder())], cwd=folder, env=environment(),
+            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, **DETACHED,
+        )  # fmt: skip
+    except OSError as error:
+        raise SetupError(f"{python} cannot be started ({error.strerror or error}); choose another Python.") from error
+
+
+def cancel(folder: Path) -> None:
+    """Ask a job to end; the best model and the state are kept."""
+    (folder / CANCEL).touch()
+
+
+def queue_folder() -> Path:
+    """Return where the runners of this user line up."""
+    return Path(tempfile.gettempdir()) / f"ssilk-queue-{getpass.getuser()}"
+
+
+def read_state(folder: Path) -> JobState | None:
+    """Return the state of a job; None where there is none."""
+    fields = _read(folder / STATE)
+    known = {name: fields[name] for name in JobState.__dataclass_fields__ if name in fields}
+    if "state" not in known:
+        return None
+    state = JobState(**known)
+    if state.alive and time.time() - state.beat > SILENCE:
+        return JobState(**{**known, "state": "lost"})
+    return state
+
+
+def read_curve(folder: Path) -> dict[str, Any]:
+    """Return the learning curve beside a job's model, {"plain": score, "points": [...]}; empty before there is one."""
+    return _read(folder / CURVE)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):  # not there yet, or not any more
+        return {}
+    return document if isinstance(document, dict) else {}
+
+
+def _write(path: Path, document: dict[str, Any]) -> None:
+    temporary = path.with_suffix(".partial")
+    temporary.write_text(json.dumps(document), encoding="utf-8")
+    os.replace(temporary, path)

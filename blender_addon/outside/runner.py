@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Runs one training that outlives Blender, when its turn comes, and keeps its state in a small file.
+
+Run by the Python that has ssilk, from its standard library alone: `python runner.py JOB QUEUE`. JOB is a folder with
+`job.json`; `state.json` is written in it, and a file named `cancel` in it asks for an end. QUEUE is a folder in which
+all runners of a user line up: one of them trains at a time.
+"""
+
+import contextlib
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+ORDER, STATE, CANCEL, LOG = "job.json", "state.json", "cancel", "log.txt"
+LOOK = 0.25  # seconds between two looks at the queue, the training and the wish to cancel
+BEAT = 2.0  # seconds after which the state is written though nothing was heard: Blender sees that somebody is there
+MOST_POINTS = 300  # of the curve
+UNLOCKED = 5.0  # seconds that a new place in the queue may be unlocked before it counts as left behind
+INTERRUPTED = 130  # exit code of ssilk
+
+# On Windows an interrupt reaches a whole group, so that the training needs one of its own.
+WINDOWS = sys.platform == "win32"
+NEW_GROUP = subprocess.CREATE_NEW_PROCESS_GROUP if WINDOWS else 0
+INTERRUPT = signal.CTRL_BREAK_EVENT if WINDOWS else signal.SIGINT
+
+
+class Record:
+    """The state of a job: what its training said last, written whole."""
+
+    def __init__(self, folder):
+        """Take up the curve of an earlier run."""
+        self.path = folder / STATE
+        self.fields = {"curve": read(self.path).get("curve", [])}
+        self.written = 0.0
+
+    def hear(self, event):
+        """Take in one event of ssilk, a dictionary."""
+        kind = event.pop("event", "")
+        if kind == "started":
+            self.fields["total"] = event["total"]
+        elif kind == "progress":
+            self.fields.update(event)
+            self._add_point(event["done"], event["terms"])
+        elif kind == "message":
+            self.fields["text"] = event["text"]
+        elif kind == "checkpoint":
+            self.fields["checkpoint"] = event["done"]
+        elif kind == "failed":
+            self.fields["error"] = event["error"]
+
+    def _add_point(self, done, terms):
+        curve = [point for point in self.fields["curve"] if point[0] < done]
+        curve.append([done, terms])
+        self.fields["curve"] = curve if len(curve) <= MOST_POINTS else curve[::2]
+
+    def write(self, **fields):
+        """Write the state with these fields changed."""
+        self.fields.update(fields, beat=time.time())
+        temporary = self.path.with_suffix(".partial")
+        temporary.write_text(json.dumps(self.fields), encoding="utf-8")
+        with contextlib.suppress(PermissionError):  # somebody reads it, on Windows; the next one comes soon
+            temporary.replace(self.path)
+        self.written = time.monotonic()
+
+
+def read(path):
+    """Return what a file of JSON holds; nothing where there is none."""
+    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+
+
+@contextlib.contextmanager
+def place_in(folder):
+    """Yield a function that says whether it is our turn: whether all who came earlier have left the queue."""
+    folder.mkdir(parents=True, exist_ok=True)
+    own = folder / f"{time.time_ns():020d}-{os.getpid()}"
+    with own.open("w") as stream:
+        if not locks(stream):
+            raise OSError(f"{own} cannot be locked")
+        try:
+            yield lambda: not any(waits(other) for other in sorted(folder.iterdir()) if other.name < own.name)
+        finally:
+            if not WINDOWS:
+                own.unlink(missing_ok=True)
+    own.unlink(missing_ok=True)
+
+
+def waits(place):
+    """Return whether somebody holds a place in the queue; one that was left behind is removed."""
+    try:
+        with place.open("r+") as stream:
+            if not locks(stream) or time.time() - place.stat().st_mtime < UNLOCKED:
+                return True
+        place.unlink(missing_ok=True)
+    except FileNotFoundError:
+        pass
+    return False
+
+
+def locks(stream):
+    """Return whether an open file could be locked; the lock ends with the process at the latest."""
+    try:
+        if WINDOWS:
+            import msvcrt
+
+            msvcrt.locking(stream.fileno(), msvcrt.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
+
+
+def wait(folder, record, our_turn):
+    """Wait for our turn; return whether to begin."""
+    while not (folder / CANCEL).exists():
+        if our_turn():
+            return True
+        if time.monotonic() - record.written > BEAT:
+            record.write()
+        time.sleep(LOOK)
+    return False
+
+
+def train(folder, record, command):
+    """Run the training; return its exit code."""
+    with (folder / LOG).open("w", encoding="utf-8") as log:
+        process = subprocess.Popen(
+            [sys.executable, *command], cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log,
+            encoding="utf-8", errors="replace", creationflags=NEW_GROUP,
+        )  # fmt: skip
+    said = queue.SimpleQueue()
+    reader = threading.Thread(target=lambda: [said.put(line) for line in process.stdout], daemon=True)
+    reader.start()
+    asked = False
+    while process.poll() is None or reader.is_alive() or not said.empty():
+        if not asked and (folder / CANCEL).exists() and process.poll() is None:
+            process.send_signal(INTERRUPT)
+            asked = True
+        if listen(said, record) or time.monotonic() - record.written > BEAT:
+            record.write()
+        time.sleep(LOOK)
+    return process.returncode
+
+
+def listen(said, record):
+    """Take in the lines of a training; return whether there were any."""
+    heard = False
+    while not said.empty():
+        with contextlib.suppress(ValueError):  # a library printed something
+            record.hear(json.loads(said.get()))
+        heard = True
+    return heard
+
+
+def last_words(folder):
+    """Return the last line that a training wrote to standard error."""
+    lines = (folder / LOG).read_text(encoding="utf-8", errors="replace").split("\n")
+    return next((line for line in reversed(lines) if line.strip()), "it ended without a word")
+
+
+def main(folder, queue_folder):
+    """Wait and train; the state says how it ended."""
+    record = Record(folder)
+    record.write(state="waiting")
+    with place_in(queue_folder) as our_turn:
+        if not wait(folder, record, our_turn):
+            record.write(state="stopped")
+            return
+        record.write(state="running")
+        code = train(folder, record, read(folder / ORDER)["command"])
+    if code in (0, INTERRUPTED):
+        record.write(state="stopped" if code else "done", seconds_left=None)
+    else:
+        record.write(state="failed", error=record.fields.get("error") or last_words(folder))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]))

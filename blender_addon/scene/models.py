@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Where a garment's training and its model lie; what is stored is relative to the blend file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+
+from ..errors import need
+from ..outside.jobs import MODEL
+
+
+def job_of(garment: bpy.types.Object) -> Path | None:
+    """Return the folder of a garment's training; None where it has none."""
+    return Path(bpy.path.abspath(garment.ssilk.job)) if garment.ssilk.job else None
+
+
+def model_of(garment: bpy.types.Object) -> Path:
+    """Return the model that was chosen for a garment, else the one that its training has reached.
+
+    Raises:
+        SetupError: there is none.
+    """
+    job, chosen = job_of(garment), garment.ssilk.model
+    need(chosen or job, f"'{garment.name}' has no trained model; train it, or choose a model in the Training panel.")
+    path = Path(bpy.path.abspath(chosen)) if chosen else job / MODEL
+    todo = "choose another" if chosen else "wait for the training's first validation, or resume it"
+    need(path.is_file(), f"'{garment.name}' has no model at {path}; {todo}.")
+    return path
