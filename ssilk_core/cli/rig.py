@@ -11,7 +11,7 @@ import argparse
 from pathlib import Path
 
 from ssilk_core.errors import EXIT_OK
-from ssilk_core.events import Reporter, Result
+from ssilk_core.events import Reporter, Result, Started
 
 from . import options as shared
 
@@ -32,6 +32,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     from ssilk_core.assets import CLASS_NAMES
 
     shared.check_output(options.output, options.stage, shared.wardrobe(options)[0])
+    report(Started("rig", options.proxies))
     scene = shared.load_scene(options, report, anew=options.anew)
     write_rigged_stage(options.stage, scene, options.output)
     counts = np.bincount(scene.classes, minlength=3)

@@ -7,6 +7,8 @@ here run along the cloth, and are infinite between islands.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,6 +35,19 @@ def distances(points: Floats, faces: Ints, sources: Ints) -> Floats:
     return _along_edges(result, points, edges(faces))
 
 
+def within(points: Floats, faces: Ints, sources: Ints, reach: float) -> NDArray[np.bool_]:
+    """Return which vertices lie within `reach` [m] of `sources` along the cloth, shape (V,).
+
+    No path along the cloth is shorter than the straight one: only faces near the sources are looked at.
+    """
+    from scipy.spatial import cKDTree
+
+    corners = points[faces]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(initial=0)
+    straight, _ = cKDTree(points[sources]).query(points, distance_upper_bound=reach + longest)
+    return distances(points, faces[np.isfinite(straight)[faces].all(axis=1)], sources) <= reach
+
+
 def nearest_sources(points: Floats, faces: Ints, sources: Ints) -> tuple[Floats, NDArray[np.int64]]:
     """Return the distance to the nearest of `sources` [m], and that source (-1 where unreached), both (V,).
 
@@ -55,8 +70,13 @@ def nearest_sources(points: Floats, faces: Ints, sources: Ints) -> tuple[Floats,
     return distance, np.where(np.isfinite(distance), nearest, -1)
 
 
-def farthest_points(points: Floats, faces: Ints, start: int, count: int) -> tuple[NDArray[np.int64], Floats]:
+def farthest_points(
+    points: Floats, faces: Ints, start: int, count: int, *, sampled: Callable[[], object] = lambda: None
+) -> tuple[NDArray[np.int64], Floats]:
     """Sample vertices so that each lies as far as possible from those before it, beginning with `start`.
+
+    Args:
+        sampled: called after each of them.
 
     Returns:
         Up to `count` vertices of the island of `start`, shape (S,), fewer when all of its points are taken, and
@@ -64,6 +84,7 @@ def farthest_points(points: Floats, faces: Ints, start: int, count: int) -> tupl
     """
     samples, rows = [start], [distances(points, faces, np.array([start]))]
     nearest = rows[0].copy()
+    sampled()
     while len(samples) < count:
         reached = np.where(np.isfinite(nearest), nearest, 0)
         farthest = int(reached.argmax())
@@ -72,6 +93,7 @@ def farthest_points(points: Floats, faces: Ints, start: int, count: int) -> tupl
         samples.append(farthest)
         rows.append(distances(points, faces, np.array([farthest])))
         nearest = np.minimum(nearest, rows[-1])
+        sampled()
     return np.array(samples), np.array(rows)
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ssilk_core.assets import LOOSE, PINNED, TIGHT, UP, Character, Floats, Ints, Mesh, SkinWeights
 from ssilk_core.errors import fail, need
-from ssilk_core.mesh.geodesic import distances
+from ssilk_core.mesh.geodesic import distances, within
 from ssilk_core.mesh.topology import components, edge_use, edges, islands, smooth, vertex_areas
 from ssilk_core.setup.surface import SurfacePoints, closest_on_surface
 
@@ -118,7 +118,7 @@ def _strips(mesh: Mesh, width: float) -> Mask:
 
 def _band(mesh: Mesh, seeds: Mask, width: float) -> Mask:
     """Return the vertices within `width` [m] of `seeds` (V,) along the cloth, shape (V,)."""
-    return distances(mesh.points, mesh.faces, np.flatnonzero(seeds)) <= width
+    return within(mesh.points, mesh.faces, np.flatnonzero(seeds), width)
 
 
 def _tear_rate(mesh: Mesh, weights: Floats, pairs: Ints) -> Floats:

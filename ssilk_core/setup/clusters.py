@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,7 +85,15 @@ def share_out(areas: Floats, sizes: Ints, count: int) -> Ints:
 
 
 def build_cluster(
-    mesh: Mesh, vertices: Ints, seam: Seam, body_weights: Floats, parents: Ints, *, proxies: int, roots: int
+    mesh: Mesh,
+    vertices: Ints,
+    seam: Seam,
+    body_weights: Floats,
+    parents: Ints,
+    *,
+    proxies: int,
+    roots: int,
+    placed: Callable[[], object] = lambda: None,
 ) -> Cluster:
     """Sample `proxies` vertices of a loose piece and hang them on the body.
 
@@ -95,6 +104,7 @@ def build_cluster(
         vertices: the piece, ascending, shape (M,).
         body_weights: plain weights of all garment vertices, shape (V, J).
         parents: parents of the character's joints, shape (J,).
+        placed: called after each proxy.
     """
     inside = np.zeros(mesh.vertex_count, dtype=bool)
     inside[vertices] = True
@@ -103,7 +113,7 @@ def build_cluster(
     points = mesh.points[vertices]
     off_middle = np.linalg.norm(points - points[beside].mean(axis=0), axis=1)
     start = int(np.where(beside, off_middle, np.inf).argmin())
-    samples, spread = farthest_points(points, faces, start, proxies)
+    samples, spread = farthest_points(points, faces, start, proxies, sampled=placed)
     order, above = hierarchy(spread, samples, seam.distance[vertices], beside, edges(faces), roots)
     joint = carrying_joint(body_weights[seam.nearest[vertices[beside]]].sum(axis=0), parents)
     return Cluster(vertices, beside, vertices[samples[order]], spread[order], above, joint)

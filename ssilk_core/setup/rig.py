@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+import itertools
 import re
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,7 +65,7 @@ def build_rig(
 
     Args:
         garment: with weights and classes.
-        report: told when the number of proxies is not what was asked for.
+        report: told of each proxy that is placed, and when there are not as many as were asked for.
 
     Raises:
         SsilkError: the garment has no weights or classes, or an island has only loose vertices.
@@ -105,11 +108,23 @@ def _clusters(
         np.array([areas[piece].sum() for piece in pieces]), np.array([len(piece) for piece in pieces]), count
     )
     parents, roots = character.skeleton.parents, options.roots_per_cluster
+    placed = _counting(int(shares.sum()), report)
     return [
-        build_cluster(mesh, piece, seam, body_weights, parents, proxies=int(share), roots=roots)
+        build_cluster(mesh, piece, seam, body_weights, parents, proxies=int(share), roots=roots, placed=placed)
         for piece, share in zip(pieces, shares)
         if share
     ]
+
+
+def _counting(total: int, report: events.Reporter) -> Callable[[], None]:
+    """Return what to call after each of `total` proxies; it tells how many there are, and the time left."""
+    start, done = time.monotonic(), itertools.count(1)
+
+    def placed() -> None:
+        count = next(done)
+        report(events.Progress(count, total, (time.monotonic() - start) / count * (total - count)))
+
+    return placed
 
 
 def _affordable(piece_count: int, options: RigOptions, path: str, report: events.Reporter) -> int:

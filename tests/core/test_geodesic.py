@@ -49,6 +49,17 @@ def test_several_sources_give_the_nearest_and_name_it():
     np.testing.assert_array_equal(nearest[clear], sources[each.argmin(axis=0)][clear])
 
 
+@pytest.mark.parametrize("reach", [0.0, 0.1, 0.25, 0.6])
+@pytest.mark.parametrize("sources", [[], [112], [0, 5, 200]])
+def test_what_lies_within_reach_is_what_the_distances_say(reach, sources):
+    flat, faces = grid(15, 15)
+    points = rolled(flat, 0.3) + np.random.default_rng(0).normal(0, 0.01, flat.shape)
+    away = geodesic.distances(points, faces, np.array(sources, dtype=int))
+    found = geodesic.within(points, faces, np.array(sources, dtype=int), reach)
+    np.testing.assert_array_equal(found, away <= reach)
+    assert found.any() == bool(sources)
+
+
 def test_islands_and_lone_vertices_are_infinitely_far():
     points, faces = grid(4, 4)
     both = np.concatenate([points, points + [0, 0, 0.01], [[9.0, 9, 9]]])
