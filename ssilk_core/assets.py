@@ -35,11 +35,11 @@ def _set(instance: object, **values: object) -> None:
 
 
 def _need_finite(array: NDArray, where: str, what: str) -> None:
-    bad = int(np.count_nonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1))) if array.size else 0
+    bad = np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1)) if array.size else ()
     need(
-        bad == 0,
+        len(bad) == 0,
         where,
-        f"{bad} of {len(array)} {what} hold NaN or infinity",
+        f"{len(bad)} of {len(array)} {what} hold NaN or infinity, first number {bad[0] if len(bad) else 0}",
         "all must be finite",
         "repair or re-export the source",
     )

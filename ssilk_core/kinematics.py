@@ -136,19 +136,30 @@ def resample(motion: Motion, fps: float, *, cover: bool = False) -> Motion:
     return Motion(motion.path, fps, rotations, translations)
 
 
-CUT_SPEED = 25.0  # [m/s]; a root faster than this has been moved, not animated
+CUT_SPEED = 25.0  # [m/s]; a root that is so much faster than before and after has been moved, not animated
+AROUND = 5  # frames to either side that say how fast a root moves anyway, be it in a car
 
 
 def split_at_cuts(motion: Motion, *, most_turn: float = np.inf) -> list[Motion]:
     """Return the spans of a motion between jumps of its root (a teleport, an edit), in order; mostly just one.
 
-    With `most_turn` [rad/s] it is also cut where any joint turns faster than that, as captured joints do that flip.
+    A jump is a step that the median of the steps around it does not explain. With `most_turn` [rad/s] it is also cut
+    where any joint turns faster than that, as captured joints do that flip.
     """
-    step = np.linalg.norm(np.diff(motion.translations[:, 0], axis=0), axis=1) * motion.fps
+    step = _unexplained(np.diff(motion.translations[:, 0], axis=0)) * motion.fps
     cosine = np.abs((motion.rotations[1:] * motion.rotations[:-1]).sum(-1)).clip(max=1.0)
     turn = 2 * np.arccos(cosine).max(axis=1) * motion.fps
     ends = [*(np.flatnonzero((step > CUT_SPEED) | (turn > most_turn)) + 1), motion.frame_count]
     return [motion.clip(start, stop) for start, stop in zip([0, *ends[:-1]], ends)]
+
+
+def _unexplained(steps: Floats) -> Floats:
+    """Return how far each step (N, 3) is from the median of those around it [m], shape (N,)."""
+    if not len(steps):
+        return np.zeros(0)
+    padded = np.pad(steps, ((AROUND, AROUND), (0, 0)), mode="reflect")
+    around = np.lib.stride_tricks.sliding_window_view(padded, 2 * AROUND + 1, axis=0)
+    return np.linalg.norm(steps - np.median(around, axis=-1), axis=1)
 
 
 def sample_motion(motion: Motion, position: Floats) -> tuple[Floats, Floats]:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,67 +19,157 @@ from .model.network import GarmentModel
 CHUNK = 256  # frames decoded at once
 HISTORY = 2  # frames before a chunk that its descriptors look back on
 DOWN = (0.0, -1.0, 0.0)
+LOST = 1e3  # of a latent: trained ones stay below ten, and no decoder knows what this means
+RECOVERY = 15  # frames at rest after a lost state, half a second of the usual rate
+
+OnRecovery = Callable[[range], None]
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """Consecutive frames of a rollout at the model's rate; tensors as `GarmentModel.pose` returns them."""
+    """Consecutive frames of a rollout at the model's rate; tensors as `GarmentModel.pose` returns them.
+
+    `recovered` (N,) flags frames whose state was lost: the garment hangs at rest there, or as its rig skins it.
+    """
 
     start: int
     activation: Tensor
     rotations: Tensor
+    recovered: Tensor
 
 
-@torch.no_grad()
 def roll(model: GarmentModel, span: Motion, chunk: int = CHUNK) -> Iterator[Step]:
     """Yield the garment's pose over a motion without cuts, at the model's rate, some frames at a time.
 
     Raises:
         SsilkError: the motion is not at the model's rate.
     """
-    fps = model.config.fps
-    need(abs(span.fps - fps) < 1e-6, span.path, f"{span.fps:g} frames per second", f"the model steps at {fps:g}")
+    starts = range(0, span.frame_count, chunk)
+    return roll_blocks(model, (span.clip(start, start + chunk) for start in starts))
+
+
+@torch.no_grad()
+def roll_blocks(model: GarmentModel, blocks: Iterable[Motion]) -> Iterator[Step]:
+    """Yield the garment's pose over each of consecutive blocks of a motion without cuts, at the model's rate.
+
+    A motion of any length takes the memory of one block. A state that is not finite, or that leaves all bounds, is
+    replaced by the quasi-static one for `RECOVERY` frames, from which the rollout goes on.
+
+    Raises:
+        SsilkError: a block is not at the model's rate.
+    """
+    fps, start = model.config.fps, 0
+    past: Motion | None = None
     state: list[Tensor] = []
-    for start in range(0, span.frame_count, chunk):
-        stop = min(start + chunk, span.frame_count)
-        states = _advance(model, span, start, stop, state)
-        state = states[-2:]
-        yield Step(start, *model.pose(torch.cat(states[-(stop - start) :])))
+    for block in blocks:
+        need(abs(block.fps - fps) < 1e-6, block.path, f"{block.fps:g} frames per second",
+             f"the model steps at {fps:g}")  # fmt: skip
+        seen = block if past is None else _following(past, block)
+        states, lost = _advance(model, seen, block.frame_count, start, state)
+        yield Step(start, *_decoded(model, torch.cat(states[-block.frame_count :]), lost))
+        past, state = seen.clip(max(0, seen.frame_count - HISTORY), seen.frame_count), states[-HISTORY:]
+        start += block.frame_count
 
 
-def _advance(model: GarmentModel, span: Motion, start: int, stop: int, state: list[Tensor]) -> list[Tensor]:
-    """Return the states up to frame `stop`, each (1, latent), after those in `state`."""
-    before = min(start, HISTORY)
-    device = next(model.parameters()).device
-    features = pose_features(span.clip(start - before, stop), model.scene.character.skeleton, model.joints)
+def _following(past: Motion, block: Motion) -> Motion:
+    rotations, translations = (
+        np.concatenate([getattr(part, name) for part in (past, block)]) for name in ("rotations", "translations")
+    )
+    return replace(block, rotations=rotations, translations=translations)
+
+
+def _advance(
+    model: GarmentModel, seen: Motion, count: int, start: int, state: list[Tensor]
+) -> tuple[list[Tensor], Tensor]:
+    """Return the states after those in `state`, each (1, latent), and which of the last `count` were lost.
+
+    The last `count` frames of `seen` are new, those before them are what descriptors look back on.
+    """
+    parameter = next(model.parameters())
+    features = pose_features(seen, model.scene.character.skeleton, model.joints)
 
     def tensor(values: Floats) -> Tensor:
-        return torch.as_tensor(values[before:], dtype=torch.float32, device=device)
+        return torch.as_tensor(values[-count:], dtype=parameter.dtype, device=parameter.device)
 
-    down = torch.tensor(DOWN, device=device).expand(stop - start, 3)
+    down = torch.tensor(DOWN, dtype=parameter.dtype, device=parameter.device).expand(count, 3)
     static = torch.cat([tensor(features.static), gravity_features(tensor(features.down), down)], dim=1)
     dynamic = torch.cat([static, tensor(features.dynamic)], dim=1)
-    rest, pose = model.initial(static).unsqueeze(1), dynamic.unsqueeze(1)
-    resting = max(0, HISTORY - start)
-    return model.roll([*state, *rest[:resting]], rest[resting:], pose[resting:])
+    rest, lost = _kept(model.initial(static))
+    rest, pose = rest.unsqueeze(1), dynamic.unsqueeze(1)
+    resting = min(max(0, HISTORY - start), count)
+    return _rolled(model, [*state, *rest[:resting]], rest[resting:], pose[resting:], lost)
 
 
-def garment_poses(model: GarmentModel, motion: Motion, fps: float, chunk: int = CHUNK) -> Iterator[GarmentPose]:
+def _kept(states: Tensor) -> tuple[Tensor, Tensor]:
+    """Return states (N, latent) with zeros for those that are lost, and which ones are."""
+    lost = ~(states.abs().amax(dim=1) < LOST)  # NaN is not less than anything
+    return torch.where(lost[:, None], torch.zeros_like(states), states), lost
+
+
+def _rolled(
+    model: GarmentModel, states: list[Tensor], rest: Tensor, pose: Tensor, lost: Tensor
+) -> tuple[list[Tensor], Tensor]:
+    """Roll over the frames of `rest` and `pose`; after a lost state the garment rests, then goes on."""
+    done = 0
+    while done < len(rest):
+        rolled = model.roll(states, rest[done:], pose[done:])[len(states) :]
+        bad = _kept(torch.cat(rolled))[1].nonzero()
+        good = int(bad[0]) if len(bad) else len(rolled)
+        first, done = done + good, min(done + good + RECOVERY, len(rest))
+        states = [*states, *rolled[:good], *rest[first:done]]
+        lost[len(lost) - len(rest) + first : len(lost) - len(rest) + done] = True
+    return states, lost
+
+
+def _decoded(model: GarmentModel, z: Tensor, lost: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return activations, rotations and which frames were lost; a pose that is not finite becomes the rig's own."""
+    activation, rotations = model.pose(z)
+    bad = ~(activation.isfinite().all(dim=0) & rotations.isfinite().flatten(0, 2).all(dim=0))
+    if bad.any():
+        unturned = torch.eye(3, dtype=z.dtype, device=z.device)[:, :, None]
+        activation = torch.where(bad, torch.zeros_like(activation), activation)
+        rotations = torch.where(bad, unturned, rotations)
+    return activation, rotations, lost | bad
+
+
+def ignored(frames: range) -> None:
+    """Take frames that were recovered and do nothing."""
+
+
+def garment_poses(
+    model: GarmentModel, motion: Motion, fps: float, chunk: int = CHUNK, on_recovery: OnRecovery = ignored
+) -> Iterator[GarmentPose]:
     """Yield what a shot stores, at `fps`, over a motion of any rate: the frames of `resample(motion, fps)`.
 
     The model rolls at its own rate; where the shot's differs, rotations are interpolated by slerp and weights by
     lines between the two nearest steps. After a cut of the motion (a root that jumps) the garment starts anew from
-    the initialiser, and nothing is interpolated across it.
+    the initialiser, and nothing is interpolated across it. `on_recovery` is told the shot's frames of which
+    `roll_blocks` had to take the rest state.
     """
     first = source_frame = 0
     for span in split_at_cuts(motion):
         stop = frames_at(source_frame + span.frame_count, motion.fps, fps)
-        steps = roll(model, resample(span, model.config.fps, cover=True), chunk)
-        poses = (GarmentPose(step.start, *model.file_pose(step.activation, step.rotations)) for step in steps)
         shift = (first / fps - source_frame / motion.fps) * model.config.fps
+        steps = roll(model, resample(span, model.config.fps, cover=True), chunk)
+        poses = _stored(model, steps, fps / model.config.fps, shift, range(first, stop), on_recovery)
         for pose in resample_poses(poses, model.config.fps, fps, shift=shift, count=stop - first):
             yield replace(pose, start=first + pose.start)
         first, source_frame = stop, source_frame + span.frame_count
+
+
+def _stored(
+    model: GarmentModel, steps: Iterable[Step], rate: float, shift: float, shot: range, on_recovery: OnRecovery
+) -> Iterator[GarmentPose]:
+    """Yield what files store of steps, and tell which of the `shot` frames, at `rate` times theirs, are recovered."""
+    for step in steps:
+        flags = step.recovered.cpu().numpy().astype(int)
+        edges = np.flatnonzero(np.diff(flags, prepend=0, append=0)) + step.start
+        for start, stop in zip(edges[::2], edges[1::2]):  # all that is interpolated from a recovered frame
+            low = int(np.floor((start - 1 - shift) * rate + 1e-6)) + 1
+            high = int(np.ceil((stop - shift) * rate - 1e-6))
+            if seen := shot[max(low, 0) : max(high, 0)]:
+                on_recovery(seen)
+        yield GarmentPose(step.start, *model.file_pose(step.activation, step.rotations))
 
 
 def resample_poses(
@@ -118,15 +208,16 @@ def _sampled(pose: GarmentPose, position: Floats, start: int) -> GarmentPose:
 def decode(model: GarmentModel, motion: Motion, pose: GarmentPose) -> Floats:
     """Return the decoder's own vertices [m], shape (F, V, 3), of poses as a shot stores them.
 
-    `motion` is at the shot's rate. The decoder runs in float32 about the frame's root, so that a character far
-    from the origin loses no precision; the root's position is added back in float64.
+    `motion` is at the shot's rate. The decoder runs in the model's precision about the frame's root, so that a
+    character far from the origin loses none; the root's position is added back in float64.
     """
     skeleton = model.scene.character.skeleton
     world = motion_transforms(motion.clip(pose.start, pose.start + pose.frame_count), skeleton.parents)
     origin = world[:, :1, :3, 3].copy()
     world[..., :3, 3] -= origin
-    device = next(model.parameters()).device
+    parameter = next(model.parameters())
     matrices = skinning_matrices(world, skeleton.bind_transforms)[:, :, :3]
-    character = torch.as_tensor(matrices.transpose(1, 2, 3, 0), dtype=torch.float32, device=device)
-    x = model.decoder(*model.network_pose(pose), character)
+    character = torch.as_tensor(matrices.transpose(1, 2, 3, 0)).to(parameter)
+    activation, rotations = (values.to(parameter) for values in model.network_pose(pose))
+    x = model.decoder(activation, rotations, character)
     return x.permute(2, 0, 1).double().cpu().numpy() + origin

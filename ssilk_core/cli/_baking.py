@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,7 +38,10 @@ class BakeRequest:
 
 @dataclass(frozen=True, eq=False)
 class Bake:
-    """A garment over a motion at the shot's rate; `model` is None under plain skinning."""
+    """A garment over a motion at the shot's rate; `model` is None under plain skinning.
+
+    `recovered` says, once `poses` are through, at which frames the rollout was lost and the garment was put to rest.
+    """
 
     request: BakeRequest
     model: GarmentModel | None
@@ -47,6 +50,7 @@ class Bake:
     source: Motion
     units: StageUnits
     provenance: dict[str, Any]
+    recovered: list[str] = field(default_factory=list)
 
     def poses(self) -> Iterator[GarmentPose]:
         """Yield the shot's poses, some frames at a time."""
@@ -58,7 +62,11 @@ class Bake:
             return
         from ssilk_core.rollout import garment_poses
 
-        yield from garment_poses(self.model, self.source, self.motion.fps, CHUNK)
+        self.recovered.clear()
+        yield from garment_poses(self.model, self.source, self.motion.fps, CHUNK, self._note)
+
+    def _note(self, frames: range) -> None:
+        self.recovered.append(f"{frames[0]} to {frames[-1]}")
 
     def vertices(self, report: Reporter) -> Iterator[Floats]:
         """Yield the decoder's own garment points (V, 3) [m] of each frame."""

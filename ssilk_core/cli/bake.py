@@ -77,8 +77,10 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
             units=bake.units,
             start=bake.motion.start,
             include_body=not options.no_body,
-            provenance={**bake.provenance, "beside": _beside(options)},
+            provenance={**bake.provenance, "beside": _beside(options), "recovered": bake.recovered},
         )
+        for frames in bake.recovered:
+            report(Message(f"frames {frames}: the rollout was lost, and the garment is put to rest", "warning"))
         if options.no_verify:
             report(Message("not verified, as asked", "warning"))
         proof = {} if options.no_verify else bake.verify(unproven, report)
@@ -90,6 +92,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         "proxies": summary.proxy_count,
         "blendshapes": summary.shape_count,
         "bytes": options.output.stat().st_size,
+        **({"put to rest": bake.recovered} if bake.recovered else {}),
         **proof,
     }
     report(Result("bake", detail))

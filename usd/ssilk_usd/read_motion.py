@@ -195,9 +195,10 @@ def _sampled(animation: Usd.Prim, name: str, codes: Floats, shape: tuple[int, in
         found = f"{name} for {len(odd)} joints" if odd.ndim else f"no {name}"
         fail(where, f"the animation has {found}", f"{shape[0]} are needed, one for each joint", "export it again")
     result = np.array(values, dtype=np.float64)
-    need(
-        np.isfinite(result).all(), where, f"{name} hold NaN or infinity", "all must be finite", "repair the animation"
-    )
+    bad = np.flatnonzero(~np.isfinite(result).all(axis=(1, 2)))
+    if len(bad):
+        found = f"{name} hold NaN or infinity in {len(bad)} frames, first at time code {codes[bad[0]]:g}"
+        fail(where, found, "all must be finite", "repair the animation")
     return result
 
 
