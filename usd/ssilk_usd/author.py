@@ -15,6 +15,7 @@ from ssilk_core.assets import Body, Deformer, Floats, Ints, Mesh, Scene, SkinWei
 from ssilk_core.errors import need
 from ssilk_core.kinematics import local_transforms, world_transforms
 
+from .garment_api import GarmentRecord, apply_garment_api
 from .read_mesh import CLASS, PROXIES
 from .units import StageUnits
 
@@ -36,8 +37,20 @@ class Asset:
     shapes: Ints
 
 
-def define_asset(stage: Usd.Stage, deformer: Deformer, bodies: tuple[Body, ...], units: StageUnits) -> Asset:
+def define_asset(
+    stage: Usd.Stage,
+    deformer: Deformer,
+    bodies: tuple[Body, ...],
+    units: StageUnits,
+    *,
+    name: str | None = None,
+    record: GarmentRecord | None = None,
+) -> Asset:
     """Define SkelRoot, Skeleton, SkelAnimation, the garment's mesh with its blendshapes, and body meshes.
+
+    Args:
+        name: of the SkelRoot (default: the character's).
+        record: how the garment was made, kept on its mesh.
 
     Raises:
         SsilkError: the joint paths spell another hierarchy than the parents.
@@ -45,7 +58,7 @@ def define_asset(stage: Usd.Stage, deformer: Deformer, bodies: tuple[Body, ...],
     scene = deformer.scene
     meshes = [scene.garment.mesh.path, *(body.mesh.path for body in bodies)]
     names = prim_names(["Skeleton", "Animation", *meshes])
-    root = UsdSkel.Root.Define(stage, "/" + prim_names([scene.character.path])[0])
+    root = UsdSkel.Root.Define(stage, "/" + (name or prim_names([scene.character.path])[0]))
     paths = [root.GetPath().AppendChild(name) for name in names]
     skeleton = _define_skeleton(stage, paths[0], scene, units)
     shapes = np.flatnonzero(deformer.shapes.any(axis=(1, 2)))
@@ -54,6 +67,7 @@ def define_asset(stage: Usd.Stage, deformer: Deformer, bodies: tuple[Body, ...],
     _bind_root(root, skeleton, paths[1])
     garment = define_mesh(stage, paths[2], scene.garment.mesh, units)
     _mark_garment(garment, scene)
+    apply_garment_api(garment.GetPrim(), record)
     bind_skin(garment, deformer.skin, skeleton)
     _define_blendshapes(garment, shape_names, deformer.shapes[shapes], units)
     for path, body in zip(paths[3:], bodies):

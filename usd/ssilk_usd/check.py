@@ -155,21 +155,27 @@ def allowed_error(points: Floats, tolerance: float = TOLERANCE) -> float:
     return tolerance + 4 * EPSILON * float(np.abs(points[np.isfinite(points)]).max(initial=0.0))
 
 
-def compare_points(shot: Shot, expected: Iterable[Floats], *, tolerance: float = TOLERANCE) -> Comparison:
+def compare_points(
+    shot: Shot, expected: Iterable[Floats], *, tolerance: float = TOLERANCE, samples_per_frame: int = 1
+) -> Comparison:
     """Compare the garment of a shot, re-skinned by UsdSkel, with the decoder's vertices.
 
     Args:
-        expected: for each frame of the shot in order, garment points in world space [m], y up, shape (V, 3).
+        expected: for each sample of the shot in order, garment points in world space [m], y up, shape (V, 3).
         tolerance: largest distance [m] allowed, besides the rounding of float32 (see `allowed_error`).
+        samples_per_frame: as the shot was written.
 
     Raises:
         VerificationError: frames or vertices are not as many as in the shot.
     """
-    return max(_compare_frames(shot, expected, tolerance), key=lambda found: found.worst / found.bound)
+    times = frame_times(shot.stage, samples_per_frame)
+    return max(_compare_frames(shot, times, expected, tolerance), key=lambda found: found.worst / found.bound)
 
 
-def _compare_frames(shot: Shot, expected: Iterable[Floats], tolerance: float) -> Iterator[Comparison]:
-    for time, points in zip_longest(shot.frame_times, expected):
+def _compare_frames(
+    shot: Shot, times: Iterable[float], expected: Iterable[Floats], tolerance: float
+) -> Iterator[Comparison]:
+    for time, points in zip_longest(times, expected):
         if time is None or points is None:
             raise VerificationError(f"{shot.name}: the shot has another number of frames than what was computed.")
         yield _compare_frame(shot, time, points, tolerance)

@@ -142,10 +142,10 @@ def _describe(prim: Usd.Prim) -> ShotMesh:
     return ShotMesh(prim.GetName(), str(prim.GetPath()), read_mesh(prim, np.eye(4)).faces, is_garment(prim))
 
 
-def frame_times(stage: Usd.Stage) -> tuple[float, ...]:
-    """Return the time code of each frame of a stage, one apart."""
+def frame_times(stage: Usd.Stage, per_frame: int = 1) -> tuple[float, ...]:
+    """Return the time codes of a stage's frames, one apart, or of so many samples in each frame."""
     start, end = _time_range(stage)
-    return tuple(start + frame for frame in range(int(np.floor(end - start + 1e-6)) + 1))
+    return tuple(start + index / per_frame for index in range(int(np.floor((end - start) * per_frame + 1e-6)) + 1))
 
 
 def _time_range(stage: Usd.Stage) -> tuple[float, float]:

@@ -18,6 +18,7 @@ from .read_stage import (
     EARLIEST,
     PRIMS,
     StageLike,
+    has_value,
     listed,
     location,
     named,
@@ -106,11 +107,11 @@ def garment_to_core(prim: Usd.Prim, skel: SkelSource | None) -> Floats:
 
 def plain_skin(prim: Usd.Prim, joints: tuple[str, ...], skeleton: Skeleton) -> SkinWeights | None:
     """Return a garment's weights onto the character's joints alone, or None; those kept beside a rig go first."""
-    if prim.HasAttribute(PLAIN[0]):
+    if has_value(prim, PLAIN[0]):
         influences = read_influences(prim, joints, PLAIN)
         assert influences is not None
         return SkinWeights(influences.path, *influences.onto(skeleton.joint_names))
-    return None if prim.HasAttribute(PROXIES) else read_skin(prim, joints, skeleton.joint_names)
+    return None if has_value(prim, PROXIES) else read_skin(prim, joints, skeleton.joint_names)
 
 
 def _classes(prim: Usd.Prim) -> Ints | None:

@@ -10,7 +10,7 @@ from ssilk_core.assets import Floats, Ints, Mesh
 from ssilk_core.errors import need
 
 from .read_polygons import triangulate
-from .read_stage import EARLIEST, apply, location, value
+from .read_stage import EARLIEST, apply, has_value, location, value
 
 CLASS = "primvars:ssilk:class"
 GARMENT = "ssilk:garment"
@@ -19,7 +19,7 @@ PROXIES = "ssilk:proxyJoints"
 
 def is_garment(prim: Usd.Prim) -> bool:
     """Return whether a mesh carries vertex classes, a proxy rig, or `ssilk:garment = true`."""
-    return prim.HasAttribute(CLASS) or prim.HasAttribute(PROXIES) or value(prim, GARMENT) is True
+    return has_value(prim, CLASS) or has_value(prim, PROXIES) or value(prim, GARMENT) is True
 
 
 def is_drawn(prim: Usd.Prim) -> bool:

@@ -15,6 +15,7 @@ from .read_spaces import SkelSource, joints_to_core, need_similarity
 from .read_stage import (
     PRIMS,
     column_matrix,
+    has_value,
     inherited_target,
     location,
     named,
@@ -163,7 +164,7 @@ def _owners(root: Usd.Prim, joints: tuple[str, ...], parents: Ints) -> tuple[str
     """Return for each joint the garment that it is a proxy of: by list, or because it descends from a proxy."""
     listed_by: dict[int, str] = {}
     for prim in Usd.PrimRange(root, PRIMS):
-        names = tuple(value(prim, PROXIES) or ()) if prim.HasAttribute(PROXIES) else ()
+        names = tuple(value(prim, PROXIES) or ()) if has_value(prim, PROXIES) else ()
         listed_by.update({index: str(prim.GetPath()) for index in match_joints(names, joints) if index >= 0})
     owners: list[str] = []
     for index, parent in enumerate(parents):

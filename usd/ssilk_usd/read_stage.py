@@ -14,6 +14,8 @@ from pxr import Pcp, Tf, Usd, UsdGeom, UsdUtils
 from ssilk_core.assets import Floats
 from ssilk_core.errors import fail, need
 
+from .garment_api import register_schema
+
 Reader = TypeVar("Reader", bound=Callable[..., Any])
 StageLike: TypeAlias = str | Path | Usd.Stage
 LAYER_SUFFIXES = (".usdc", ".usd", ".usda")
@@ -21,6 +23,7 @@ USD_SUFFIXES = (*LAYER_SUFFIXES, ".usdz")
 EARLIEST = Usd.TimeCode.EarliestTime()
 # Instance proxies are read too: a referenced character may be instanceable.
 PRIMS = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
+register_schema()  # before the first stage is opened: USD lists its schemas once
 _MISSING = (Pcp.ErrorInvalidAssetPath, Pcp.ErrorInvalidSublayerPath, Pcp.ErrorUnresolvedPrimPath)
 
 
@@ -119,6 +122,11 @@ def value(prim: Usd.Prim, name: str) -> Any:
     """Return an attribute's value at its earliest time, or None."""
     attribute = prim.GetAttribute(name)
     return attribute.Get(EARLIEST) if attribute else None
+
+
+def has_value(prim: Usd.Prim, name: str) -> bool:
+    """Return whether an attribute has an authored value; schemas declare some that no file holds."""
+    return bool(prim.GetAttribute(name).HasAuthoredValue())
 
 
 def column_matrix(matrix: object) -> Floats:

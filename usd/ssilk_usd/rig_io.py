@@ -20,6 +20,7 @@ from ssilk_core.events import Message, Reporter, silent
 
 from .author import bind_skin, define_mesh, matrix_array, prim_names, sorted_influences
 from .export import export, need_layer_suffix
+from .garment_api import apply_garment_api
 from .read_garment import find_garment, fitted_skeleton, garment_to_core, plain_skin
 from .read_mesh import CLASS, PROXIES, is_garment
 from .read_skeleton import find_skeleton
@@ -29,6 +30,7 @@ from .read_stage import (
     PRIMS,
     StageLike,
     apply,
+    has_value,
     inherited,
     location,
     needs_whole_files,
@@ -61,7 +63,7 @@ def read_proxy_rig(
     """
     stage = open_stage(source)
     prim = find_garment(stage, garment)
-    if not prim.HasAttribute(PROXIES):
+    if not has_value(prim, PROXIES):
         return None
     where, skel = location(prim), fitted_skeleton(prim, root)
     if skel is None:
@@ -288,6 +290,7 @@ def _bind_garment(
     for name in (CLASS, *SKEL, *PLAIN):
         prim.RemoveProperty(name)
         prim.RemoveProperty(f"{name}:indices")  # of an indexed primvar
+    apply_garment_api(prim)
     bind_skin(mesh, scene.rig.skin, UsdSkel.Skeleton(skel.prim))
     binding = UsdSkel.BindingAPI(prim)
     binding.CreateGeomBindTransformAttr(Gf.Matrix4d(to_bind.T.tolist()))

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The time samples of a shot: joints, blendshape weights, the extent of the SkelRoot."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+from pxr import Gf, Sdf, Tf, UsdSkel, Vt
+
+from ssilk_core.assets import Deformer, Floats, GarmentPose, Ints, Motion, SkinWeights
+from ssilk_core.errors import fail
+from ssilk_core.kinematics import (
+    combined_transforms,
+    local_transforms,
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    skinning_matrices,
+)
+
+from .author import Asset, extent_array, matrix_array, sorted_influences
+from .read_stage import usd_reason
+from .units import StageUnits
+
+PATH_OP = "xformOp:translate:path"  # of the SkelRoot: where the character's root joint is
+AT_REST = 1e-7  # largest entry of a joint's transform by which it may be away from rest and still be left out
+
+
+class Samples:
+    """The samples of a shot under way.
+
+    Args:
+        layer: where they go; it holds specs of the SkelRoot and the SkelAnimation.
+        start: time code of the first frame.
+        step: time codes from one frame to the next.
+        lean: leave joints that stay at rest out, and move the SkelRoot with the first root joint, as it leaves its rest.
+    """
+
+    def __init__(
+        self,
+        layer: Sdf.Layer,
+        asset: Asset,
+        deformer: Deformer,
+        motion: Motion,
+        units: StageUnits,
+        *,
+        start: float,
+        step: float = 1.0,
+        lean: bool = False,
+    ) -> None:
+        self.layer, self.asset, self.deformer, self.motion = layer, asset, deformer, motion
+        self.units, self.start, self.step, self.lean, self.unsaved_count = units, start, step, lean, 0
+        self.surfaces = [_Surface(deformer.skin), *(_Surface(body.skin) for body in asset.bodies)]
+        self.kept = _moving_joints(deformer, motion) if lean else np.arange(len(deformer.scene.joint_names))
+        self.moves = bool(np.ptp(_stored_translations(deformer, motion, lean), axis=0).any())
+        self.last_rotations: Floats | None = None
+
+    def append(self, pose: GarmentPose) -> None:
+        """Write the frames of `pose`."""
+        times = self.start + self.step * (pose.start + np.arange(pose.frame_count))
+        world = combined_transforms(self.deformer, self.motion, pose)
+        if self.lean:
+            origins = world[:, 0, :3, 3] - _root_at_rest(self.deformer)
+            world[..., :3, 3] -= origins[:, None]
+            self._write(self.asset.root, PATH_OP, times, _vectors(self.units.points_from_core(origins)))
+        self._write_joints(times, world)
+        if len(self.asset.shapes):
+            weights = np.ascontiguousarray(pose.weights[:, self.asset.shapes])
+            self._write(self.asset.animation, "blendShapeWeights", times, map(Vt.FloatArray.FromNumpy, weights))
+        self._write(self.asset.root, "extent", times, self._extents(pose, world))
+        self.unsaved_count += pose.frame_count
+
+    def _write(self, prim: Sdf.Path, name: str, times: Floats, values: Iterable[object]) -> None:
+        path = prim.AppendProperty(name)
+        for time, value in zip(times, values):
+            self.layer.SetTimeSample(path, float(time), value)
+
+    def _write_joints(self, times: Floats, world: Floats) -> None:
+        animation, parents = self.asset.animation, self.deformer.scene.parents
+        local = local_transforms(self.units.transforms_from_core(world), parents)[:, self.kept]
+        rotations = self._continuous(quaternion_from_matrix(local[..., :3, :3]))[..., [1, 2, 3, 0]]
+        self._write(animation, "rotations", times, map(Vt.QuatfArray.FromNumpy, rotations.astype(np.float32)))
+        translations = local[..., :3, 3].astype(np.float32)
+        if self.moves:
+            self._write(animation, "translations", times, map(Vt.Vec3fArray.FromNumpy, translations))
+        else:
+            attribute = self.layer.GetAttributeAtPath(animation.AppendProperty("translations"))
+            attribute.default = Vt.Vec3fArray.FromNumpy(translations[0])
+
+    def _continuous(self, rotations: Floats) -> Floats:
+        """Choose the signs of quaternions (F, J, 4) so that none flips between frames: some importers mix them
+        componentwise."""
+        before = rotations[:1] if self.last_rotations is None else self.last_rotations
+        steps = np.sum(np.concatenate([before, rotations[:-1]]) * rotations, axis=-1)
+        result = rotations * np.cumprod(np.where(steps < 0, -1.0, 1.0), axis=0)[..., None]
+        self.last_rotations = result[-1:]
+        return result
+
+    def _extents(self, pose: GarmentPose, world: Floats) -> Iterator[Vt.Vec3fArray]:
+        """Yield, for each frame, the bounds of everything skinned."""
+        scene = self.deformer.scene
+        matrices = skinning_matrices(world, scene.bind_transforms)
+        bodies = [body.mesh.points for body in self.asset.bodies]
+        for weights, joints in zip(pose.weights, matrices):
+            garment = scene.garment.mesh.points + np.tensordot(weights, self.deformer.shapes, 1)
+            rest = [garment, *bodies]
+            posed = np.concatenate([surface.skin(points, joints) for surface, points in zip(self.surfaces, rest)])
+            posed = self.units.points_from_core(posed)
+            yield extent_array(posed.min(axis=0), posed.max(axis=0))
+
+    def save(self, name: str | Path) -> None:
+        """Write what is pending to the file; `name` is what messages call it."""
+        try:
+            self.layer.Save()
+        except Tf.ErrorException as error:
+            fail(str(name), f"writing failed ({usd_reason(error)})", "free some space or choose another output")
+        self.unsaved_count = 0
+
+
+def _vectors(points: Floats) -> Iterator[Gf.Vec3d]:
+    return (Gf.Vec3d(*point) for point in points.tolist())
+
+
+def _stored_translations(deformer: Deformer, motion: Motion, lean: bool) -> Floats:
+    """Return the character's local translations [m], shape (F, J, 3), without the path of its root where `lean`."""
+    translations = np.array(motion.translations)
+    if lean:
+        roots = np.flatnonzero(deformer.scene.character.skeleton.parents < 0)
+        translations[:, roots] -= motion.translations[:, :1]
+    return translations
+
+
+def _root_at_rest(deformer: Deformer) -> Floats:
+    """Return where the first root joint rests [m], shape (3,)."""
+    return deformer.scene.character.skeleton.rest_transforms[0, :3, 3]
+
+
+def _moving_joints(deformer: Deformer, motion: Motion) -> Ints:
+    """Return the combined joints that leave their rest transforms, with every root and every proxy."""
+    skeleton, scene = deformer.scene.character.skeleton, deformer.scene
+    turned = np.abs(matrix_from_quaternion(motion.rotations) - skeleton.rest_transforms[:, :3, :3])
+    moved = np.abs(motion.translations - skeleton.rest_transforms[:, :3, 3])
+    away = np.maximum(turned.max(axis=(0, 2, 3)), moved.max(axis=(0, 2)))
+    kept = (away > AT_REST) | (skeleton.parents < 0)
+    return np.flatnonzero(np.concatenate([kept, np.ones(scene.rig.proxy_count, dtype=bool)]))
+
+
+class _Surface:
+    """Skinning weights as UsdSkel's compiled skinning takes them."""
+
+    def __init__(self, skin: SkinWeights) -> None:
+        indices, weights = sorted_influences(skin)
+        self.width = indices.shape[1]
+        self.indices = Vt.IntArray.FromNumpy(indices.reshape(-1))
+        self.weights = Vt.FloatArray.FromNumpy(weights.reshape(-1))
+
+    def skin(self, points: Floats, matrices: Floats) -> Floats:
+        """Return rest points (V, 3) posed by bind-to-posed transforms (J, 4, 4)."""
+        posed = Vt.Vec3fArray.FromNumpy(np.asarray(points, dtype=np.float32))
+        UsdSkel.SkinPointsLBS(Gf.Matrix4d(1), matrix_array(matrices), self.indices, self.weights, self.width, posed)
+        return np.array(posed)
