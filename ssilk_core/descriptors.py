@@ -48,9 +48,14 @@ def joints_in_view(skeleton: Skeleton, used: Floats) -> np.ndarray:
     return np.flatnonzero(keep)
 
 
-def pose_features(motion: Motion, skeleton: Skeleton, joints: np.ndarray) -> PoseFeatures:
-    """Return the descriptors of every frame of a motion; the first frame also stands for what was before it."""
-    world = motion_transforms(motion, skeleton.parents)[:, joints]
+def pose_features(
+    motion: Motion, skeleton: Skeleton, joints: np.ndarray, world: Floats | None = None
+) -> PoseFeatures:
+    """Return the descriptors of every frame of a motion; the first frame also stands for what was before it.
+
+    `world` is `motion_transforms` of the motion where it is known already.
+    """
+    world = (motion_transforms(motion, skeleton.parents) if world is None else world)[:, joints]
     local = matrix_from_quaternion(motion.rotations[:, joints])
     inner = [i for i, joint in enumerate(joints) if skeleton.parents[joint] >= 0]
     static = six_d(local[:, inner]).reshape(len(local), -1)

@@ -9,6 +9,7 @@ What depends on the character's poses alone is computed for a whole motion at on
 what is decoded from them in blocks of frames.
 """
 
-from .playback import Playback, Player
+from .playback import Playback
+from .player import Player
 
 __all__ = ["Playback", "Player"]

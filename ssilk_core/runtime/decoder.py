@@ -6,9 +6,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..assets import Floats, Scene
+from ..assets import Floats, GarmentPose, Scene
 from ..config import ModelConfig
-from ..kinematics import quaternion_from_matrix
+from ..kinematics import matrix_from_quaternion, quaternion_from_matrix
 from .kinematics import rotation_from_six_d
 from .networks import Parameters, evaluated, layers
 
@@ -23,7 +23,8 @@ class Decoder:
     """
 
     def __init__(self, scene: Scene, parameters: Parameters, config: ModelConfig) -> None:
-        self.layers, self.given, self.proxies = layers(parameters, "output"), config.given, scene.rig.proxy_count
+        self.layers, self.given, self.shapes = layers(parameters, "output"), config.given, config.shapes
+        self.proxies = scene.rig.proxy_count
         self.readout = parameters.get("decoder.readout")
         joints, binds = scene.character.skeleton.joint_count, scene.bind_transforms[:, :3, :3]
         self.above, self.binds = binds[scene.rig.parents].swapaxes(-1, -2), binds[joints:]
@@ -44,3 +45,10 @@ class Decoder:
         if self.given:
             weights = np.concatenate([weights, np.ones((len(weights), 1))], axis=1)
         return quaternion_from_matrix(self.above @ turned @ self.binds), weights.clip(0, 1)
+
+    def taken(self, pose: GarmentPose) -> tuple[NDArray, NDArray]:
+        """Invert `stored`, as `GarmentModel.network_pose`: activations (K, F) and rotations (P, 3, 3, F)."""
+        turned = self.above.swapaxes(-1, -2) @ matrix_from_quaternion(pose.rotations) @ self.binds.swapaxes(-1, -2)
+        activations = 2 * pose.weights[:, : self.shapes].T - 1
+        rotations = turned.transpose(1, 2, 3, 0)
+        return activations.astype(np.float32), np.ascontiguousarray(rotations, dtype=np.float32)

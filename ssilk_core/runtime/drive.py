@@ -30,22 +30,28 @@ class Drive:
     origins: Floats
 
 
-def drive(motion: Motion, skeleton: Skeleton, joints: NDArray) -> Drive:
-    """Return what a motion at the model's rate says about every frame, gravity pointing down."""
-    features = pose_features(motion, skeleton, joints)
+def drive(motion: Motion, skeleton: Skeleton, joints: NDArray, seen: int = 0) -> Drive:
+    """Return what a motion at the model's rate says about its frames, gravity pointing down.
+
+    The first `seen` frames are only what descriptors look back on.
+    """
+    world = motion_transforms(motion, skeleton.parents)
+    features = pose_features(motion, skeleton, joints, world)
     down = -features.down[..., 1].reshape(motion.frame_count, -1)
-    matrices, origins = character_matrices(motion, skeleton)
     static = np.concatenate([features.static, down], axis=1, dtype=np.float32)
-    return Drive(static, features.dynamic.astype(np.float32), matrices, origins)
+    matrices, origins = _about_root(world[seen:], skeleton)
+    return Drive(static[seen:], features.dynamic[seen:].astype(np.float32), matrices, origins)
 
 
 def character_matrices(motion: Motion, skeleton: Skeleton) -> tuple[NDArray, Floats]:
-    """Return skinning matrices about the root (J, 3, 4, F), float32, and where the root is (F, 3) [m].
+    """Return skinning matrices about the root (J, 3, 4, F), float32, and where the root is (F, 3) [m]."""
+    return _about_root(motion_transforms(motion, skeleton.parents), skeleton)
 
-    About the root, single precision is as good a kilometre from the origin as beside it.
-    """
-    world = motion_transforms(motion, skeleton.parents)
+
+def _about_root(world: Floats, skeleton: Skeleton) -> tuple[NDArray, Floats]:
+    """Take joints to world (F, J, 4, 4); about the root, single precision is as good far away as at the origin."""
     origins = world[:, 0, :3, 3].copy()
+    world = world.copy()
     world[..., :3, 3] -= origins[:, None]
     matrices = skinning_matrices(world, skeleton.bind_transforms)[:, :, :3]
     return np.ascontiguousarray(matrices.transpose(1, 2, 3, 0), dtype=np.float32), origins

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The recurrence of `model.integrators.SpringVerlet`, frame after frame, in as few calls as numpy allows.
 
-With p the quasi-static state, u = z_{t-1} - p and v = z_{t-1} - z_{t-2}, the first layer of S is linear in u and v
+With p the quasi-static state, w = z_{t-1} - p and v = z_{t-1} - z_{t-2}, the first layer of S is linear in w and v
 plus a part that the pose alone decides, as it decides all of what S gives to a garment at rest:
 
-    z_t = p + f + limited(s (S(u, v, pose) - S(0, 0, pose held still)) - k f),    f = alpha u + beta v
+    z_t = p + f + limited(s (S(w, v, pose) - S(0, 0, pose held still)) - k f),    f = alpha w + beta v
 """
 
 from __future__ import annotations
@@ -15,53 +15,53 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..config import ModelConfig
-from .networks import Layer, Parameters, continued, layers
+from .networks import Parameters, continued, layers
 
 VELOCITY, DISTANCE, REACH, MOST = 10.0, 3.0, 0.1, 100.0  # the constants of SpringVerlet
+SAFE = (REACH * MOST) ** 2  # no entry of a vector with a smaller square passes REACH * MOST
+
+
+LOST, RECOVERY = 1e3, 15  # those of `rollout`: a latent beyond is lost, and this many frames rest after it
+
+
+def lost(states: NDArray) -> NDArray:
+    """Return which states (F, latent) are not finite or leave all bounds, shape (F,)."""
+    return ~(np.abs(states).max(axis=1) < LOST)  # NaN is not less than anything
 
 
 class Limit:
     """`model.integrators.limited`: the identity up to half a bound, a smooth bend beyond; its own room to work in."""
 
     def __init__(self, bound: float, shape: tuple[int, ...]) -> None:
-        self.unlimited = not bound
-        self.high = np.full(shape, bound / 2, dtype=np.float32)
-        self.low, self.inner, self.over = -self.high, np.empty_like(self.high), np.empty_like(self.high)
+        self.half = bound / 2 or np.inf
+        self.size = np.empty(shape, dtype=np.float32)
 
     def __call__(self, values: NDArray) -> None:
         """Limit values in place."""
-        if self.unlimited:
-            return
-        inner, over = self.inner, self.over
-        np.maximum(values, self.low, inner)
-        np.minimum(inner, self.high, inner)
-        if inner.tobytes() == values.tobytes():  # nothing to bend, as in most frames: comparing costs least
-            return
-        np.subtract(values, inner, over)
-        np.divide(over, self.high, over)
-        np.tanh(over, over)
-        np.multiply(over, self.high, over)
-        np.add(inner, over, values)
+        largest = np.abs(values, self.size).argmax()  # four times as fast as their maximum
+        if self.size.item(largest) > self.half:
+            inner = np.clip(values, -self.half, self.half)
+            values[...] = inner + self.half * np.tanh((values - inner) / self.half)
 
 
 class Room:
-    """A hidden or last layer as one frame goes through it, with the memory that it writes to."""
+    """A hidden layer as one frame goes through it, with the memory that it writes to."""
 
-    def __init__(self, layer: Layer) -> None:
-        self.dot, self.bias = layer.weights.dot, layer.bias
+    def __init__(self, rows: NDArray) -> None:
+        """Take weights (inputs, hidden), with biases as a row more where no other ones are added."""
+        self.rows, hidden = rows, rows.shape[1]
         # Apart: numpy takes neighbours in memory for overlapping, and its exponential then takes 20 times as long.
-        self.sums, self.scale = np.empty_like(layer.bias), np.empty_like(layer.bias)
-        self.one = np.ones_like(self.bias)  # an array: numpy takes longer over a number than over 512 of them
+        self.active, self.scale = np.ones(hidden + 1, np.float32), np.empty(hidden, np.float32)
+        self.sums = self.active[:-1]  # the last one meets the next layer's biases
+        self.one = np.ones_like(self.scale)  # an array: numpy takes longer over a number than over 512 of them
 
-    def activated(self, seen: NDArray, bias: NDArray) -> NDArray:
-        """Return `networks.activate` of the sums."""
+    def activate(self) -> NDArray:
+        """Turn the sums into activations; return these and a one."""
         sums, scale = self.sums, self.scale
-        self.dot(seen, sums)
-        np.add(sums, bias, sums)
         np.exp(sums, scale)
         np.add(scale, self.one, scale)
         np.divide(sums, scale, sums)
-        return sums
+        return self.active
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,14 +69,16 @@ class Course:
     """F frames of a motion as the stepper takes them.
 
     Attributes:
-        history: p of frame t and z_{t-2} in row t, so that one subtraction gives u and v, shape (F + 2, 2, latent).
+        history: p of frame t and z_{t-2} in row t, so that one subtraction gives w and v, shape (F + 2, 2, latent).
         driven: what the pose adds to the sums of S's first layer, shape (F, hidden).
         held: s S(0, 0, pose held still), shape (F, latent).
+        first: frame that the stepper begins with; those before it are at rest.
     """
 
     history: NDArray
     driven: NDArray
     held: NDArray
+    first: int
 
 
 class SpringStepper:
@@ -93,49 +95,75 @@ class SpringStepper:
         blocks = np.cumsum([config.latent] * 3 + [static])
         of_now, of_speed, of_away, of_static, self.of_rates = np.split(first.weights, blocks, axis=1)
         speed, away = VELOCITY * of_speed, DISTANCE * of_away
-        self.first = Layer(np.hstack([of_now - away * alpha, speed - away * beta], dtype=np.float32), first.bias)
-        self.of_still = np.hstack([of_now, of_static])
-        stiffness = config.stiffness / (1 + np.exp(-share))
-        self.inertia = np.array([[alpha, beta], [stiffness * alpha, stiffness * beta]], dtype=np.float32)
+        self.bias, self.of_still = first.bias, np.hstack([of_now, of_static])
+        self.first = _transposed(np.hstack([of_now - away * alpha, speed - away * beta]))
+        self.hidden = [_transposed(np.hstack([layer.weights, layer.bias[:, None]])) for layer in self.later[:-1]]
+        self.last = _transposed(REACH * np.pad(self.later[-1].weights, [(0, 0), (0, 1)]))
+        self.inertia = np.hstack([alpha, beta]).astype(np.float32)
+        self.stiffness = (config.stiffness / (1 + np.exp(-share))).astype(np.float32)
         self.config = config
 
-    def prepared(self, rest: NDArray, static: NDArray, rates: NDArray) -> Course:
-        """Return what poses decide, from quasi-static latents (F, latent) and descriptors (F, S) and (F, R)."""
-        still = self.of_still @ np.hstack([rest, static]).T + self.first.bias[:, None]
+    def prepared(self, rest: NDArray, static: NDArray, rates: NDArray, before: NDArray | None) -> Course:
+        """Return what poses decide.
+
+        Args:
+            rest: quasi-static latents (F, latent); static, rates: descriptors (F, S) and (F, R).
+            before: the two latents before the first frame (2, latent); None where a motion begins, at rest.
+        """
+        still = self.of_still @ np.hstack([rest, static]).T + self.bias[:, None]
         driven = np.ascontiguousarray((still + self.of_rates @ rates.T).T)
         held = REACH * np.ascontiguousarray(continued(self.later, still).T.clip(-MOST, MOST))
         history = np.empty((len(rest) + 2, 2, rest.shape[1]), dtype=np.float32)
-        history[:-2, 0], history[2:4, 1] = rest, rest[:2]
-        return Course(history, driven, held)
+        history[:-2, 0] = rest
+        if before is None:
+            history[2:4, 1] = rest[:2]
+            return Course(history, driven, held, 2)
+        history[:2, 1] = before
+        return Course(history, driven, held, 0)
 
     def rolled(self, course: Course) -> NDArray:
-        """Return the latents of all frames (F, latent), written into `course`; the first two are at rest."""
-        with np.errstate(over="ignore"):  # an activation of minus infinity is zero
-            self._advance(course.history, course.driven, course.held)
-        return course.history[2:, 1]
+        """Return the latents of all frames (F, latent), written into `course`."""
+        z, rest, start = course.history[2:, 1], course.history[:-2, 0], course.first
+        while start < len(z):
+            self._advance(course.history[start:], course.driven[start:], course.held[start:])
+            bad = lost(z[start:])
+            if not bad.any():
+                break
+            first = start + int(bad.argmax())
+            start = first + RECOVERY
+            z[first:start] = rest[first:start]
+        return z
 
     def _advance(self, history: NDArray, driven: NDArray, held: NDArray) -> None:
-        z = history.shape[2]
-        differences, forces, parts, given = (np.empty(shape, np.float32) for shape in ((2, z), (2, z), (2, 2, z), z))
-        most = np.full(z, REACH * MOST, dtype=np.float32)
-        least, state, (along, pull), (of_u, of_v) = -most, differences.reshape(-1), forces, parts.swapaxes(0, 1)
+        z = self.config.latent
+        rooms = [Room(rows) for rows in (self.first, *self.hidden)]
+        differences, terms = np.empty((2, z), np.float32), np.empty(2 * z, np.float32)
+        along, pull, own = (np.empty(z, np.float32) for _ in range(3))
+        state, of_w, of_v, sums = differences.reshape(-1), terms[:z], terms[z:], rooms[0].sums
         push, bound = Limit(self.config.push, (z,)), Limit(self.config.bound, (z,))
-        first, hidden, last = Room(self.first), [Room(layer) for layer in self.later[:-1]], self.later[-1].weights
-        last_dot = (np.float32(REACH) * last).dot
-        frames = zip(history[2:-2], history[2:-2, 0], history[3:-1, 1], history[4:, 1], driven[2:], held[2:])
-        for past, rest, now, new, drive, calm in frames:
-            np.subtract(now, past, differences)
-            seen = first.activated(state, drive)
-            for layer in hidden:
-                seen = layer.activated(seen, layer.bias)
-            last_dot(seen, given)
-            np.maximum(given, least, given)
-            np.minimum(given, most, given)
-            np.multiply(self.inertia, differences, parts)
-            np.add(of_u, of_v, forces)
-            np.subtract(given, calm, given)
-            np.subtract(given, pull, given)
-            push(given)
-            np.add(given, along, given)
-            np.add(given, rest, new)
-            bound(new)
+        frames = zip(history[:-2], history[:-2, 0], history[1:-1, 1], history[2:, 1], driven, held)
+        with np.errstate(over="ignore"):  # an activation of minus infinity is zero
+            for past, rest, now, new, drive, calm in frames:
+                np.subtract(now, past, differences)
+                np.dot(state, self.first, sums)
+                np.add(sums, drive, sums)
+                seen = rooms[0].activate()
+                for room in rooms[1:]:
+                    np.dot(seen, room.rows, room.sums)
+                    seen = room.activate()
+                np.dot(seen, self.last, own)
+                if not own.dot(own) < SAFE:
+                    np.clip(own, -REACH * MOST, REACH * MOST, own)
+                np.multiply(self.inertia, state, terms)
+                np.add(of_w, of_v, along)
+                np.multiply(self.stiffness, along, pull)
+                np.subtract(own, calm, own)
+                np.subtract(own, pull, own)
+                push(own)
+                np.add(own, along, own)
+                np.add(own, rest, new)
+                bound(new)
+
+
+def _transposed(weights: NDArray) -> NDArray:
+    return np.ascontiguousarray(weights.T, dtype=np.float32)

@@ -16,12 +16,13 @@ from ssilk_core.checkpoint import model_file, save_model
 from ssilk_core.descriptors import pose_features
 from ssilk_core.errors import SsilkError
 from ssilk_core.fabrics import FABRICS
-from ssilk_core.kinematics import deform
+from ssilk_core.kinematics import deform, resample
 from ssilk_core.model import descriptors
 from ssilk_core.model.network import GarmentModel
 from ssilk_core.parameters import SCHEMES, parameter_shapes
 from ssilk_core.rollout import decode, garment_poses, roll
 from ssilk_core.runtime import Player
+from ssilk_core.runtime.drive import character_matrices
 from ssilk_core.runtime.stepper import Limit
 
 FRAMES = 150  # more than two blocks of decoded frames, the last one short
@@ -33,6 +34,10 @@ def player_of(model: GarmentModel) -> Player:
 
 def expected_vertices(model: GarmentModel, motion) -> np.ndarray:
     return np.concatenate([decode(model, motion, pose) for pose in garment_poses(model, motion, motion.fps)])
+
+
+def states_of(model: GarmentModel, motion) -> np.ndarray:
+    return player_of(model).play(motion).takes[0].states(motion.frame_count)
 
 
 def all_vertices(playback) -> np.ndarray:
@@ -68,8 +73,8 @@ def test_vertices_are_those_of_the_network(toy_scene, toy_model, toy_motion, opt
 def test_limits_are_reached_and_kept_as_in_the_network(scene, toy_model, motion):
     model = toy_model(scene, scale=0.1, bound=0.2, push=0.02).eval()
     free = toy_model(scene, scale=0.1, bound=0.0, push=0.0).eval()
-    states = player_of(model).play(motion).states
-    assert 0.1 < np.abs(states).max() < 0.2001 < np.abs(player_of(free).play(motion).states).max()
+    states = states_of(model, motion)
+    assert 0.1 < np.abs(states).max() < 0.2001 < np.abs(states_of(free, motion)).max()
     found, theirs = player_of(model).play(motion).poses(), garment_poses(model, motion, motion.fps)
     np.testing.assert_allclose(next(found).weights[-1], next(theirs).weights[63], atol=1e-5)
 
@@ -90,7 +95,7 @@ def test_poses_are_what_a_file_stores(model, motion, playback):
     assert [pose.start for pose in mine] == [0, 64, 128] and sum(pose.frame_count for pose in mine) == FRAMES
     for name in ("rotations", "weights"):
         found, expected = (np.concatenate([getattr(pose, name) for pose in poses]) for poses in (mine, theirs))
-        np.testing.assert_allclose(found, expected, atol=1e-5)
+        np.testing.assert_allclose(found, expected, atol=5e-5)
         assert np.ptp(found, axis=0).max() > 0.01  # it moves
 
 
@@ -100,7 +105,7 @@ def test_a_reader_of_the_file_deforms_to_the_same_vertices(model, motion, playba
 
 
 def test_matrices_are_those_of_forward_kinematics(model, motion, playback):
-    character = torch.from_numpy(playback.driven.matrices)
+    character = torch.from_numpy(character_matrices(motion, model.scene.character.skeleton)[0])
     step = next(roll(model, motion, FRAMES))
     expected = model.decoder.proxy_matrices(step.rotations, character).detach().numpy()
     for frame in (0, 63, 64, FRAMES - 1):
@@ -140,10 +145,64 @@ def test_far_from_the_origin_nothing_is_lost(model, motion, playback):
     np.testing.assert_allclose(found - [3000, 40, -7000], playback.vertices(5), atol=1e-5)
 
 
-def test_a_motion_of_another_rate_or_character_is_refused(model, scene, toy_motion):
+@pytest.mark.parametrize("fps", [24.0, 29.97, 60.0])
+def test_motions_of_other_rates_are_interpolated_as_in_a_bake(model, motion, fps):
+    shot = resample(motion.clip(0, 90), fps)
+    playback = player_of(model).play(shot, block=16)
+    mine, theirs = list(playback.poses()), list(garment_poses(model, shot, fps))
+    found, expected = (np.concatenate([pose.weights for pose in poses]) for poses in (mine, theirs))
+    np.testing.assert_allclose(found, expected, atol=5e-5)
+    found, expected = (np.concatenate([pose.rotations for pose in poses]) for poses in (mine, theirs))
+    np.testing.assert_allclose(np.abs((found * expected).sum(-1)), 1, atol=1e-8)  # q and -q are the same rotation
+    np.testing.assert_allclose(all_vertices(playback), expected_vertices(model, shot), atol=2e-5)
+
+
+@pytest.mark.parametrize("fps", [24.0, 30.0])
+def test_a_garment_starts_anew_where_the_motion_is_cut(model, motion, fps):
+    shot = resample(motion.clip(0, 80), fps)
+    far = shot.translations.copy()
+    far[37:, 0] += [9.0, 0, 4]
+    shot = replace(shot, translations=far)
+    playback = player_of(model).play(shot, block=16)
+    assert playback.firsts == [0, 37]
+    np.testing.assert_allclose(all_vertices(playback), expected_vertices(model, shot), atol=2e-5)
+    assert [pose.start for pose in playback.poses()] == [0, 16, 32, 37, 53, *([69] if fps == 30 else [])]
+    np.testing.assert_array_equal(playback.pose(40).weights, list(playback.poses())[3].weights[3:4])
+
+
+@pytest.mark.parametrize("fps", [24.0, 30.0])
+def test_what_changes_later_leaves_the_frames_before_as_they_are(model, motion, fps):
+    """Bit by bit what a new playback gives, with the frames before taken over rather than rolled again."""
+    shot = resample(motion.clip(0, 90), fps)
+    edited = shot.rotations.copy()
+    edited[50:] = edited[50:, ::-1]
+    edited = replace(shot, rotations=edited)
+    player = player_of(model)
+    before = player.play(shot, block=8)
+    before.vertices(70)
+    after, anew = before.changed(edited, 50), player.play(edited, block=8)
+    assert 32 <= after.takes[0].rolled <= 64 and anew.takes[0].rolled == 0
+    for frame in (69, 10, 50, 49):
+        np.testing.assert_array_equal(after.vertices(frame), anew.vertices(frame))
+    assert not np.array_equal(after.vertices(69), before.vertices(69))
+    assert before.changed(edited, 0).takes[0].rolled == 0
+
+
+def test_lost_states_rest_for_a_while_as_in_a_bake(scene, toy_model, motion):
+    model = toy_model(scene, scale=0.1, bound=0.0, push=0.0).eval()
+    with torch.no_grad():
+        model.integrator.alpha.fill_(1.6)  # flies off
+    mine, theirs = (
+        states_of(model, motion),
+        np.concatenate([pose.weights for pose in garment_poses(model, motion, 30.0)]),
+    )
+    assert np.isfinite(mine).all() and 100 < np.abs(mine).max() < 1000
+    found = np.concatenate([pose.weights for pose in player_of(model).play(motion, block=256).poses()])
+    np.testing.assert_allclose(found, theirs, atol=1e-3)
+
+
+def test_a_motion_of_another_character_is_refused(model, scene, toy_motion):
     player, motion = player_of(model), toy_motion(scene, 5)
-    with pytest.raises(SsilkError, match="24 frames per second; the model steps at 30"):
-        player.play(replace(motion, fps=24.0))
     with pytest.raises(SsilkError, match="2 joints; the model's character has 3"):
         player.play(replace(motion, rotations=motion.rotations[:, :2], translations=motion.translations[:, :2]))
 

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A trained garment, ready to play."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..assets import Motion
+from ..checkpoint import ModelFile, load_model
+from ..errors import need
+from ..parameters import descriptor_sizes
+from .decoder import Decoder
+from .kinematics import ProxyKinematics
+from .networks import evaluated, layers
+from .playback import BLOCK, Playback
+from .skinning import tiles
+from .stepper import Limit, SpringStepper, lost
+
+
+class Player:
+    """A trained garment, ready to play motions.
+
+    Raises:
+        SsilkError: the model's integration scheme is none that is played here.
+    """
+
+    def __init__(self, file: ModelFile) -> None:
+        scene, config = file.scene, file.config
+        need(
+            config.scheme == "spring_verlet",
+            scene.garment.mesh.path,
+            f"the model's scheme is '{config.scheme}'",
+            "the runtime plays 'spring_verlet'",
+            "use 'ssilk bake'",
+        )
+        self.file, self.skeleton = file, scene.character.skeleton
+        static, _ = descriptor_sizes(scene, file.joints)
+        self.initialiser = layers(file.parameters, "initialiser")
+        self.stepper = SpringStepper(config, file.parameters, static)
+        self.decoder = Decoder(scene, file.parameters, config)
+        self.kinematics = ProxyKinematics(scene.rig, self.skeleton.joint_count)
+        self.tiles = tiles(scene, file.parameters)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Player:
+        """Read a model file; raise `SsilkError` as `checkpoint.load_model` does."""
+        return cls(load_model(path))
+
+    def play(self, motion: Motion, *, block: int = BLOCK) -> Playback:
+        """Return the garment over a motion of any rate, with cuts or without, rolled when somebody looks.
+
+        Args:
+            motion: of the model's skeleton, at the shot's rate.
+            block: frames that are computed together; fewer take longer each, and the first one comes sooner.
+
+        Raises:
+            SsilkError: the motion is of another skeleton.
+        """
+        joints = self.skeleton.joint_count
+        need(motion.rotations.shape[1] == joints, motion.path, f"a motion of {motion.rotations.shape[1]} joints",
+             f"the model's character has {joints}")  # fmt: skip
+        return Playback(self, motion, block)
+
+    def at_rest(self, static: NDArray) -> NDArray:
+        """Return the quasi-static latents (F, latent) of static descriptors (F, S) (Eq. 1)."""
+        rest = np.ascontiguousarray(evaluated(self.initialiser, static.T).T)
+        Limit(self.file.config.bound, rest.shape)(rest)
+        rest[lost(rest)] = 0
+        return rest

@@ -1,0 +1,22 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Garment poses between frames."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .assets import Floats, GarmentPose
+from .kinematics import slerp
+
+
+def sample_pose(pose: GarmentPose, position: Floats, start: int = 0) -> GarmentPose:
+    """Return poses at fractional frames `position` (N,), counted from the first one given.
+
+    Rotations are interpolated by slerp and weights by lines; `start` is where the result stands in its shot.
+    """
+    low = np.minimum(position.astype(int), pose.frame_count - 1)
+    high = np.minimum(low + 1, pose.frame_count - 1)
+    t = position - low
+    rotations = slerp(pose.rotations[low], pose.rotations[high], t[:, None])
+    weights = pose.weights[low] * (1 - t[:, None]) + pose.weights[high] * t[:, None]
+    return GarmentPose(start, rotations, weights.clip(0, 1))
