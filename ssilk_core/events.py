@@ -90,7 +90,7 @@ class JsonReporter:
 
 def _document(event: Event) -> dict[str, Any]:
     own = {"said": _document(event.said)} if isinstance(event, Garment) else {}
-    return {"event": type(event).__name__.lower(), **_finite(asdict(event)), **own}
+    return {"event": type(event).__name__.lower(), **finite(asdict(event)), **own}
 
 
 def read_event(line: str) -> Said:
@@ -110,12 +110,12 @@ def read_event(line: str) -> Said:
     return event
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
     """Return a value with None for NaN and infinity, which JSON lacks."""
     if isinstance(value, dict):
-        return {name: _finite(item) for name, item in value.items()}
+        return {name: finite(item) for name, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
+        return [finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

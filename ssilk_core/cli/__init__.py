@@ -12,9 +12,9 @@ from ssilk_core import __version__
 from ssilk_core.errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, SsilkError, fail
 from ssilk_core.events import Failed, JsonReporter, Reporter, TextReporter
 
-from . import bake, demo, inspect, rig, simulate, train, verify, view, wardrobe
+from . import bake, demo, evaluate, inspect, rig, simulate, train, verify, view, wardrobe
 
-VERBS = (inspect, rig, train, wardrobe, bake, simulate, verify, view, demo)
+VERBS = (inspect, rig, train, wardrobe, bake, simulate, evaluate, verify, view, demo)
 
 # The extra of the distribution that brings all that a verb needs.
 EXTRAS = {
@@ -24,6 +24,7 @@ EXTRAS = {
     "wardrobe": "train",
     "bake": "bake",
     "simulate": "train",
+    "evaluate": "train",
     "verify": "bake",
     "view": "view",
     "demo": "all",

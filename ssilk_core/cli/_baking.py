@@ -129,7 +129,7 @@ def open_bake(request: BakeRequest) -> Bake:
     stage = open_stage(request.stage)
     character = read_character(stage, root=request.root, garment=None)
     skeleton = file.scene.character.skeleton
-    _need_same_skeleton(character.skeleton, skeleton)
+    need_same_skeleton(character.skeleton, skeleton)
     scene = replace(file.scene, character=replace(character, skeleton=skeleton))
     source = read_motion(request.motion, skeleton)
     motion = source if request.fps is None else _at_rate(source, request.fps)
@@ -144,7 +144,7 @@ def open_bake(request: BakeRequest) -> Bake:
     return Bake(request, model, deformer, motion, source, StageUnits.of(stage), provenance)
 
 
-def _need_same_skeleton(found: Skeleton, trained: Skeleton) -> None:
+def need_same_skeleton(found: Skeleton, trained: Skeleton) -> None:
     """Raise `SsilkError` unless a skeleton has the joints of the model, with its bind transforms."""
     allowed, todo = "a model bakes on the character it was trained with", "train on this character"
     missing = sorted(set(trained.joint_names) - set(found.joint_names))

@@ -15,9 +15,11 @@ from ..assets import PINNED, Floats, Scene
 from ..baselines.descriptors import joint_bank
 from ..baselines.networks import Baseline
 from ..energy import GarmentEnergy
+from ..energy.stretch import deformation_gradient_operator
 from ..errors import need
 from ..fabrics import Fabric
 from ..model.body import CollisionBody
+from ..model.descriptors import GRAVITY
 from ..model.skinning import Skinning
 from ..training.bank import MotionBank, build_bank
 from ..training.validation import Rolled, roll_states
@@ -51,18 +53,20 @@ class Dressed:
         fps: of every method.
 
     Attributes:
-        height: of the garment at rest [m].
+        columns: from positions to both columns of all deformation gradients.
+        weight: m g L, the garment's weight times its height at rest [J].
     """
 
     def __init__(self, scene: Scene, fabric: Fabric, fps: float, device: torch.device) -> None:
         mesh = scene.garment.mesh
         self.scene, self.fabric, self.fps, self.device = scene, fabric, fps, device
         self.energy = GarmentEnergy(mesh, fabric, device=device)
+        self.columns = deformation_gradient_operator(mesh, device, torch.float32)
         skeleton = scene.character.skeleton
         self.body = CollisionBody(scene.character.merged_body(), skeleton.joint_count, device=device)
         self.skin = Skinning(scene.plain_skin).to(device)
         self.rest = torch.tensor(mesh.points, dtype=torch.float32, device=device)
-        self.height = float(np.ptp(mesh.points[:, 1]))
+        self.weight = float(self.energy.mass.sum()) * GRAVITY * float(np.ptp(mesh.points[:, 1]))
 
     @property
     def name(self) -> str:

@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Point caches of clips, as the reference that garments are compared with."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ssilk_core.assets import Floats
+from ssilk_core.errors import need
+
+if TYPE_CHECKING:
+    from ssilk_usd.play import Shot
+
+OPEN = 4  # shots at once; clips are read one after the other
+
+
+class References:
+    """Shots of one garment in a folder, or in its subfolder of the garment's name, called as the clips are.
+
+    Attributes:
+        clips: names of the clips that there are shots of.
+    """
+
+    def __init__(self, folder: Path, garment: str, vertex_count: int, fps: float) -> None:
+        """Find the shots.
+
+        Raises:
+            SsilkError: there is no such folder.
+        """
+        from ssilk_usd.read_stage import LAYER_SUFFIXES
+
+        need(folder.is_dir(), str(folder), "there is no such folder", "one with shots of 'ssilk simulate' is needed")
+        within = folder / garment if (folder / garment).is_dir() else folder
+        self._paths = {path.stem: path for path in sorted(within.iterdir()) if path.suffix in LAYER_SUFFIXES}
+        self.vertex_count, self.fps = vertex_count, fps
+        self._shot = lru_cache(OPEN)(self._opened)
+
+    @property
+    def clips(self) -> frozenset[str]:
+        return frozenset(self._paths)
+
+    def read(self, clip: str, frames: range) -> Floats:
+        """Return the points of some frames of a clip in the world [m], shape (frames, V, 3).
+
+        Raises:
+            SsilkError: the shot is of another garment, at another rate, or shorter than the clip.
+        """
+        shot, path = self._shot(clip), str(self._paths[clip])
+        count = len(shot.frame_times)
+        need(
+            frames.stop <= count, path, f"{count} frames", f"the clip has {frames.stop} or more", "simulate it again"
+        )
+        points = np.stack([shot.garment_points(shot.frame_times[frame]) for frame in frames])
+        need(points.shape[1] == self.vertex_count, path, f"a garment of {points.shape[1]} vertices",
+             f"the model's has {self.vertex_count}", "simulate the model's garment")  # fmt: skip
+        return points
+
+    def _opened(self, clip: str) -> Shot:
+        from ssilk_usd.play import Shot
+
+        path = self._paths[clip]
+        shot = Shot(path)
+        need(abs(shot.fps - self.fps) < 1e-6, str(path), f"{shot.fps:g} frames per second",
+             f"the model steps at {self.fps:g}", f"simulate with --fps {self.fps:g}")  # fmt: skip
+        return shot

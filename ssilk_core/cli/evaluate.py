@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measure trained garments on whole clips: energies, against the simulator, and what energies hide.
+
+Models of 'ssilk train' and baselines are measured side by side, with plain skinning, on the character that they
+were trained with. Gravity is relative to plain skinning. --reference compares with what the reference simulator makes
+of the same clips: a folder of shots written by 'ssilk simulate', named after the clips, or one such folder for each
+garment, under its name. Beside the clips, poses are held after stops, and the clips' first seconds are looped: a
+garment should come to rest where its own quasi-static state P is, and repeat itself.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ssilk_core.errors import EXIT_OK, need
+from ssilk_core.events import Reporter, Result, Started, finite
+from ssilk_core.files import replacing
+
+from . import options as shared
+
+if TYPE_CHECKING:
+    import torch
+
+    from ssilk_core.baselines.networks import Baseline
+    from ssilk_core.checkpoint import ModelFile
+    from ssilk_core.evaluation.methods import Dressed
+    from ssilk_core.evaluation.run import Playlist, Row, Subject
+    from ssilk_core.model.network import GarmentModel
+
+
+def add_arguments(verb: argparse.ArgumentParser) -> None:
+    """Add the options of this verb."""
+    verb.add_argument("models", type=Path, nargs="+", metavar="MODEL", help="models of 'ssilk train', or baselines")
+    verb.add_argument("--stage", type=Path, required=True, help="USD file with the character")
+    verb.add_argument("--root", metavar="PRIM", help="SkelRoot of the character, where the stage has several")
+    verb.add_argument("--motions", type=Path, required=True, metavar="FOLDER", help="folder of motion files")
+    verb.add_argument("--index", type=Path, metavar="JSON",
+                      help='list of {"clip", "split", "tags"} (default: all clips in one split)')  # fmt: skip
+    verb.add_argument("--clips", nargs="+", default=[], metavar="NAME", help="only these clips")
+    verb.add_argument("--reference", type=Path, metavar="FOLDER", help="shots of 'ssilk simulate' to compare with")
+    verb.add_argument("--trained-on", type=Path, nargs="+", default=[], metavar="PATH",
+                      help="motion files or folders of the training, to tell how unfamiliar poses are")  # fmt: skip
+    verb.add_argument("--sequence", type=int, metavar="FRAMES", help="start clips anew after so many (paper: 512)")
+    verb.add_argument("--stops", type=int, default=2, help="stops in each clip to hold poses after (default 2)")
+    verb.add_argument("--hold", type=float, default=3.0, metavar="S", help="how long poses are held (default 3)")
+    verb.add_argument("--loop", type=int, default=2000, metavar="FRAMES",
+                      help="length of loops, none for 0 (default 2000)")  # fmt: skip
+    verb.add_argument("-o", "--output", type=Path, help="figures to write (.json), in SI units")
+    verb.add_argument("--device", default="cpu", help="where it runs (default cpu)")
+
+
+def run(options: argparse.Namespace, report: Reporter) -> int:
+    """Evaluate; return 0."""
+    from ssilk_core.baselines.files import load_network
+    from ssilk_core.devices import chosen_device
+    from ssilk_core.evaluation.run import EvaluationOptions, evaluate
+    from ssilk_core.evaluation.tables import tables
+
+    if options.output:
+        need(options.output.suffix == ".json", str(options.output), "not a name for figures", "it ends in .json")
+        shared.check_output(options.output, *options.models, options.index)
+    asked = EvaluationOptions(sequence=options.sequence, stops=options.stops, hold=options.hold, loop=options.loop)
+    device = chosen_device(options.device)
+    opened = [Opened(path, *load_network(path)) for path in options.models]
+    rows: list[Row] = []
+    for models in _by_garment(opened):
+        dressed = _dressed(models[0].file, options, device)
+        playlist = _playlist(options, dressed)
+        report(Started("evaluate", 0, {"garment": dressed.name, "clips": list(playlist.clips)}))
+        rows += evaluate(dressed, _subjects(models, device), playlist, asked, report)
+    found = [asdict(row) for row in rows]
+    if options.output:
+        _write(options, found, opened, device)
+    if not options.json:
+        print(tables(rows))
+    report(Result("evaluate", {"figures": found} if options.json else {}))
+    return EXIT_OK
+
+
+@dataclass(frozen=True, eq=False)
+class Opened:
+    """A model's file and its network."""
+
+    path: Path
+    file: ModelFile
+    model: GarmentModel | Baseline
+
+    @property
+    def method(self) -> str:
+        """What the network is: "ssilk", "snug", "ncs", or "ncs*" where it was trained with rotations."""
+        from ssilk_core.baselines.files import KEY
+
+        told = self.file.provenance
+        if KEY not in told:
+            return "ssilk"
+        rotated = told.get("train", {}).get("rotated", 0) > 0
+        return told[KEY]["method"] + "*" * rotated
+
+    @property
+    def garment(self) -> tuple[object, ...]:
+        """What models must share to be measured side by side: mesh, fabric and rate."""
+        mesh = self.file.scene.garment.mesh
+        return mesh.path.rpartition("/")[2], mesh.points.tobytes(), self.file.fabric, self.model.config.fps
+
+
+def _by_garment(opened: Iterable[Opened]) -> list[list[Opened]]:
+    """Return the models of each garment, in the order of the first of each."""
+    groups: dict[tuple[object, ...], list[Opened]] = {}
+    for one in opened:
+        groups.setdefault(one.garment, []).append(one)
+    return list(groups.values())
+
+
+def _subjects(models: list[Opened], device: torch.device) -> list[Subject]:
+    """Return the networks of one garment, called after their files where several are of one method."""
+    from ssilk_core.evaluation.run import Subject
+
+    methods = [one.method for one in models]
+    names = [
+        method if methods.count(method) == 1 else f"{method} ({one.path.stem})"
+        for method, one in zip(methods, models)
+    ]
+    return [Subject(name, one.model.to(device), one.file.joints) for name, one in zip(names, models)]
+
+
+def _dressed(file: ModelFile, options: argparse.Namespace, device: torch.device) -> Dressed:
+    """Put the garment of a model on the character of the stage."""
+    from ssilk_usd.read_character import read_character
+    from ssilk_usd.read_stage import open_stage
+
+    from ssilk_core.evaluation.methods import Dressed
+
+    from ._baking import need_same_skeleton
+
+    skeleton = file.scene.character.skeleton
+    character = read_character(open_stage(options.stage), root=options.root, garment=None)
+    need_same_skeleton(character.skeleton, skeleton)
+    scene = replace(file.scene, character=replace(character, skeleton=skeleton))
+    return Dressed(scene, file.fabric, file.config.fps, device)
+
+
+def _playlist(options: argparse.Namespace, dressed: Dressed) -> Playlist:
+    """Read the clips that are asked for, and what there is to compare with."""
+    from ssilk_usd.read_motion import read_motion, read_motions
+
+    from ssilk_core.evaluation.run import Playlist
+
+    from ._reference import References
+
+    skeleton = dressed.scene.character.skeleton
+    splits, files = _splits(options)
+    names = dict.fromkeys(name for split in splits.values() for name in split)
+    reference = None
+    if options.reference:
+        vertices = dressed.scene.garment.mesh.vertex_count
+        reference = References(options.reference, dressed.name, vertices, dressed.fps)
+    return Playlist(
+        clips={name: read_motion(files[name], skeleton) for name in names},
+        splits=splits,
+        simulated=reference.clips & names.keys() if reference else frozenset(),
+        read=reference.read if reference else None,
+        seen=read_motions(options.trained_on, skeleton),
+    )
+
+
+def _splits(options: argparse.Namespace) -> tuple[dict[str, list[str]], dict[str, Path]]:
+    """Return the names of clips by split, and their files."""
+    from ssilk_usd.read_motion import motion_files
+
+    from ssilk_core.evaluation.splits import read_index, splits_of
+
+    folder: Path = options.motions
+    need(folder.is_dir(), str(folder), "there is no such folder", "one of motion files is needed")
+    files = {path.stem: path for path in motion_files([folder])}
+    if options.index:
+        splits = splits_of(read_index(options.index), options.clips)
+        need(splits, str(options.index), "no clip of valid, inertia or flips is chosen", "one at least is needed")
+    else:
+        splits = {"all": options.clips or list(files)}
+    missing = sorted({name for names in splits.values() for name in names} - files.keys())
+    need(not missing, str(folder), f"{len(missing)} clips are missing ({', '.join(missing[:3])})",
+         f"it holds {', '.join(list(files)[:3])} and so on")  # fmt: skip
+    return splits, files
+
+
+def _write(
+    options: argparse.Namespace, rows: list[dict[str, Any]], opened: list[Opened], device: torch.device
+) -> None:
+    """Write the figures with where they come from."""
+    import torch
+
+    from ssilk_core import __version__
+    from ssilk_core.devices import device_name
+    from ssilk_core.files import sha256
+
+    asked = {name: getattr(options, name) for name in ("clips", "sequence", "stops", "hold", "loop")}
+    document = {
+        "units": "SI",
+        "models": {str(one.path): sha256(one.path) for one in opened},
+        "stage": {str(options.stage): sha256(options.stage)},
+        "options": {**asked, "reference": options.reference and str(options.reference)},
+        "hardware": device_name(device),
+        "versions": {"ssilk": __version__, "torch": torch.__version__},
+        "figures": rows,
+    }
+    with replacing(options.output) as temporary:
+        temporary.write_text(json.dumps(finite(document), indent=1, allow_nan=False) + "\n")

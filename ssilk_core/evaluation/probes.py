@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What energies of moving clips hide: whether a garment comes to rest, and whether it drifts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from .figures import Holds, Loops
+from .methods import Dressed, Method, Reel
+from .metrics import kinetic_energy, mean_square, settling_time
+from .record import frame_energies
+from .takes import EASE, Take, back_and_forth, stopped
+
+CALM = 0.01  # [m/s], RMS over the mass
+RUN_UP = 4.0  # [s] that are played before a stop, and of a clip that loops
+LOOPS = 3
+STATIC = ("stretch", "bending", "gravity", "collision")
+
+
+def stops(takes: Sequence[Take], fps: float, count: int, hold: float) -> tuple[list[Take], list[int]]:
+    """Return takes that stop `count` times in each given one, spread evenly, and their first frames at rest."""
+    found, first = [], []
+    for take in takes:
+        length = (take.frame_count - 1) / fps
+        for number in range(1, count + 1):
+            stop = length * number / (count + 1)
+            before = max(0, int((stop - RUN_UP) * fps))
+            motion, at_rest = stopped(take.motion.clip(before, take.frame_count), fps, stop - before / fps, hold)
+            found.append(Take(take.clip, 0, motion))
+            first.append(at_rest)
+    return found, first
+
+
+@torch.no_grad()
+def held(dressed: Dressed, reel: Reel, method: Method, first: Sequence[int]) -> list[Holds]:
+    """Return what happens after each stop; a take of the reel is at rest from its frame `first` on."""
+    return [_held(dressed, reel, method, take, at_rest) for take, at_rest in enumerate(first)]
+
+
+def _held(dressed: Dressed, reel: Reel, method: Method, take: int, first: int) -> Holds:
+    count, mass, fps = reel.takes[take].frame_count, dressed.energy.mass, dressed.fps
+    path = method.vertices(take, range(first - 1, count))
+    kinetic = kinetic_energy(path, mass, fps)
+    calm = float(settling_time((2 * kinetic / mass.sum()).sqrt(), CALM, fps))
+    last = range(count - 1, count)
+    x, still = path[..., -1:], method.still(take, last)
+    assert still is not None
+    ours, theirs = (frame_energies(dressed, reel, take, last, at) for at in (x, still))
+    distance = float(mean_square(x - still, mass)) ** 0.5
+    return Holds(
+        stops=1,
+        begun=float(kinetic[0]),
+        kinetic=float(kinetic[-1]),
+        settled=float(calm < torch.inf),
+        settling=calm,
+        distance=distance,
+        furthest=distance,
+        above=sum(float(ours[name] - theirs[name]) for name in STATIC),
+        floats=float(ours["gravity"] - theirs["gravity"]) / dressed.weight,
+    )
+
+
+def joined_holds(single: Sequence[Holds]) -> Holds | None:
+    """Return the figures of several stops; None of none."""
+    if not single:
+        return None
+    table = {name: torch.tensor([getattr(hold, name) for hold in single]).double() for name in vars(single[0])}
+    means = {name: float(values.mean()) for name, values in table.items()}
+    middle = table["settling"].sort().values[(len(single) - 1) // 2]
+    distances = table["distance"]
+    return Holds(
+        **{
+            **means,
+            "stops": len(single),
+            "settling": float(middle),
+            "distance": float(distances.square().mean()) ** 0.5,
+            "furthest": float(distances.max()),
+        }
+    )
+
+
+def looped(takes: Sequence[Take], fps: float, frames: int) -> tuple[list[Take], list[int]]:
+    """Return takes whose first seconds loop for at least so many frames and three loops, and the loops' lengths."""
+    least = max(frames, LOOPS * round(2 * (RUN_UP + EASE) * fps))
+    pairs = [back_and_forth(take.motion.clip(0, round(RUN_UP * fps)), fps, least) for take in takes]
+    return [Take(take.clip, 0, motion) for take, (motion, _) in zip(takes, pairs)], [length for _, length in pairs]
+
+
+@torch.no_grad()
+def drifted(dressed: Dressed, reel: Reel, method: Method, lengths: Sequence[int]) -> list[Loops]:
+    """Return how the last loop of each take differs from its second."""
+    return [_drifted(dressed, reel, method, take, length) for take, length in enumerate(lengths)]
+
+
+def _drifted(dressed: Dressed, reel: Reel, method: Method, take: int, length: int) -> Loops:
+    count = reel.takes[take].frame_count
+    second, last = range(length, 2 * length), range(count - length, count)
+    paths = [method.vertices(take, range(loop.start - 2, loop.stop)) for loop in (second, last)]
+    totals = [_total(dressed, reel, take, loop, path) for loop, path in zip((second, last), paths)]
+    drift, apart = totals[1] - totals[0], mean_square(paths[1] - paths[0], dressed.energy.mass)
+    return Loops(
+        clips=1,
+        frames=count,
+        second=totals[0],
+        last=totals[1],
+        drift=drift,
+        most=drift,
+        apart=float(apart.mean()) ** 0.5,
+    )
+
+
+def _total(dressed: Dressed, reel: Reel, take: int, frames: range, path: Tensor) -> float:
+    terms = frame_energies(dressed, reel, take, frames, path)
+    return sum(float(values.mean()) for name, values in terms.items() if name != "collisions")
+
+
+def joined_loops(single: Sequence[Loops]) -> Loops | None:
+    """Return the figures of several clips; None of none."""
+    if not single:
+        return None
+    table = {name: torch.tensor([getattr(loop, name) for loop in single]).double() for name in vars(single[0])}
+    means = {name: float(values.mean()) for name, values in table.items()}
+    drifts = table["drift"]
+    return Loops(
+        **{
+            **means,
+            "clips": len(single),
+            "frames": int(table["frames"].min()),
+            "most": float(drifts[drifts.abs().argmax()]),
+            "apart": float(table["apart"].square().mean()) ** 0.5,
+        }
+    )

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is measured of every frame of a take, in blocks, so that takes may be of any length."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ..training.validation import DECODED_AT_ONCE, energies
+from .methods import Dressed, Method, Reel
+from .metrics import BINS, derivative, kinetic_energy, mean_square, principal_stretches, stretch_histogram
+
+PAST = 3  # frames that a third difference looks back on
+TRUTH = ("position", "velocity", "acceleration")  # differences from another method, by order of the derivative
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """One method over one take.
+
+    Attributes:
+        values: for each frame, float64 on the CPU, shape (N,): the energies of `training.validation.energies`,
+            "kinetic" energy [J], "jerk" squared, "stretch" at most, "motion" squared [m2] away from the method's own
+            quasi-static state, and squared errors of `TRUTH`. NaN where the take has no past to tell it from.
+        stretches: histogram of the larger principal stretch of all triangles.
+    """
+
+    values: dict[str, Tensor]
+    stretches: Tensor
+
+
+@torch.no_grad()
+def recorded(dressed: Dressed, reel: Reel, method: Method, take: int, truth: Method | None = None) -> Record:
+    """Measure a method over a take, beside `truth` where there is one."""
+    parts, stretches = [], torch.zeros(BINS, dtype=torch.float64)
+    ours, theirs = _Past(method, take), _Past(truth, take) if truth else None
+    count = reel.takes[take].frame_count
+    for start in range(0, count, DECODED_AT_ONCE):
+        frames = range(start, min(start + DECODED_AT_ONCE, count))
+        path, still = ours.joined(frames), method.still(take, frames)
+        x = path[..., -len(frames) :]
+        stretch = principal_stretches(dressed.columns(x))[0]
+        stretches += stretch_histogram(stretch)
+        values = {
+            **frame_energies(dressed, reel, take, frames, path),
+            **_moving(dressed, path, len(frames)),
+            "largest stretch": stretch.amax(0),
+            **({} if still is None else {"motion": mean_square(x - still, dressed.energy.mass)}),
+            **({} if theirs is None else _errors(dressed, path - theirs.joined(frames), len(frames))),
+        }
+        parts.append({name: value.double().cpu() for name, value in values.items()})
+    return Record({name: torch.cat([part[name] for part in parts]) for name in parts[0]}, stretches)
+
+
+def frame_energies(dressed: Dressed, reel: Reel, take: int, frames: range, path: Tensor) -> dict[str, Tensor]:
+    """Return `training.validation.energies` of the last frames of a path (V, 3, past + N), shape (N,)."""
+    x, character = path[..., -len(frames) :], reel.character(take, frames)
+    down = x.new_tensor([0.0, -1.0, 0.0])
+    joined = path[..., -len(frames) - 2 :]
+    return energies(
+        dressed.energy, x, dressed.plain(character), dressed.body.posed(character), joined, dressed.fps, down
+    )
+
+
+class _Past:
+    """A method's positions block by block, each with the last frames of the one before."""
+
+    def __init__(self, method: Method, take: int) -> None:
+        self.method, self.take, self.tail = method, take, torch.zeros(0)
+
+    def joined(self, frames: range) -> Tensor:
+        x = self.method.vertices(self.take, frames)
+        path = torch.cat([self.tail, x], dim=-1) if len(self.tail) else x
+        self.tail = path[..., -PAST:].clone()
+        return path
+
+
+def _moving(dressed: Dressed, path: Tensor, count: int) -> dict[str, Tensor]:
+    mass, fps = dressed.energy.mass, dressed.fps
+    return {
+        "kinetic": _last(kinetic_energy(path, mass, fps), count),
+        "jerk": _last(mean_square(derivative(path, 3, fps), mass), count),
+    }
+
+
+def _errors(dressed: Dressed, away: Tensor, count: int) -> dict[str, Tensor]:
+    mass, fps = dressed.energy.mass, dressed.fps
+    orders = {name: derivative(away, order, fps) for order, name in enumerate(TRUTH)}
+    return {name: _last(mean_square(vectors, mass), count) for name, vectors in orders.items()}
+
+
+def _last(values: Tensor, count: int) -> Tensor:
+    """Return the last `count` values, NaN before the first."""
+    missing = max(0, count - len(values))
+    return torch.cat([values.new_full((missing,), torch.nan), values[len(values) - count + missing :]])

@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The evaluation of one garment: all methods on all clips, by split."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..assets import Motion
+from ..errors import need
+from ..events import Progress, Reporter, silent
+from ..training.bank import MotionBank, build_bank
+from ..training.validation import Rolled
+from .figures import Figures, Holds, Loops
+from .methods import Cache, Dressed, Method, Network, Plain, Reader, Reel, reel_of
+from .metrics import pose_distance
+from .probes import drifted, held, joined_holds, joined_loops, looped, stops
+from .record import recorded
+from .takes import takes_of
+from .tally import Tally, against, figures, poses, takes_in
+
+SIMULATOR = "simulator"
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationOptions:
+    """What is measured beside the energies.
+
+    Attributes:
+        sequence: frames after which a clip starts anew, as in the paper (512); None for whole clips.
+        stops: stops in each clip after which poses are held; none for zero.
+        hold: how long they are held [s].
+        loop: frames that the first seconds of each clip loop for, at least; none for zero.
+    """
+
+    sequence: int | None = None
+    stops: int = 2
+    hold: float = 3.0
+    loop: int = 2000
+
+    def __post_init__(self) -> None:
+        need(self.sequence is None or self.sequence >= 4, "evaluation", f"sequences of {self.sequence} frames",
+             "four at least are needed")  # fmt: skip
+        need(0 <= self.stops <= 100, "evaluation", f"{self.stops} stops in each clip", "0 to 100 are allowed")
+        need(0 < self.hold <= 600, "evaluation", f"a hold of {self.hold:g} s", "it lies between 0 and 600 s")
+        need(0 <= self.loop <= 1_000_000, "evaluation", f"loops of {self.loop} frames", "0 to 1,000,000 are allowed")
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """A network under a name, and the character's joints that it has in view."""
+
+    name: str
+    model: Rolled
+    joints: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Playlist:
+    """What is played.
+
+    Attributes:
+        clips: motions by name.
+        splits: names of clips by split; a clip may be in several.
+        simulated: clips that the reference simulator has played, with `read` to get its points at the models' rate.
+        seen: motions that networks were trained on; none where that is not known.
+    """
+
+    clips: Mapping[str, Motion]
+    splits: Mapping[str, Sequence[str]]
+    simulated: frozenset[str] = frozenset()
+    read: Reader | None = None
+    seen: Sequence[Motion] = ()
+
+
+@dataclass(frozen=True)
+class Row:
+    """Figures of one method on one split."""
+
+    garment: str
+    method: str
+    split: str
+    figures: Figures
+
+
+def evaluate(
+    dressed: Dressed,
+    subjects: Sequence[Subject],
+    playlist: Playlist,
+    options: EvaluationOptions | None = None,
+    report: Reporter = silent,
+) -> Iterator[Row]:
+    """Yield the figures of plain skinning, of the simulator where it has played, and of each network, by split.
+
+    Raises:
+        SsilkError: no clip has four frames, or a point cache is not of its clip.
+    """
+    run = _Run(dressed, subjects, playlist, options or EvaluationOptions(), report)
+    yield from run.rows(run.plain, "plain")
+    yield from run.rows(run.truth, SIMULATOR)
+    for subject in subjects:
+        yield from run.network_rows(subject)
+
+
+class _Run:
+    """Takes of all clips, with the records of plain skinning and of the simulator on them."""
+
+    def __init__(
+        self,
+        dressed: Dressed,
+        subjects: Sequence[Subject],
+        playlist: Playlist,
+        options: EvaluationOptions,
+        report: Reporter,
+    ) -> None:
+        self.dressed, self.playlist, self.options, self.report = dressed, playlist, options, report
+        cut = [takes_of(name, motion, dressed.fps, options.sequence) for name, motion in playlist.clips.items()]
+        self.takes = [take for takes in cut for take in takes]
+        self.clips = {number: take.clip for number, take in enumerate(self.takes)}
+        self.simulated = takes_in(self.clips, playlist.simulated)
+        self.done, self.total = 0, len(self.takes) * (len(subjects) + 1) + len(self.simulated)
+        reel = reel_of(self.takes, dressed, subjects[0].joints)
+        read = playlist.read
+        self.cache = Cache(SIMULATOR, read, dressed, reel) if read else None
+        self.truth = self._tally(reel, self.cache, self.simulated) if self.cache else Tally({}, self.clips)
+        self.plain = self._tally(reel, Plain(dressed, reel), list(self.clips))
+
+    def _tally(self, reel: Reel, method: Method, takes: Sequence[int]) -> Tally:
+        """Measure a method over takes, beside the simulator where that has played."""
+        records = {}
+        for take in takes:
+            truth = self.cache if take in self.simulated and method is not self.cache else None
+            records[take] = recorded(self.dressed, reel, method, take, truth)
+            self.done += 1
+            self.report(Progress(self.done, self.total))
+        return Tally(records, self.clips)
+
+    def rows(self, tally: Tally, method: str) -> Iterator[Row]:
+        """Yield the figures of a method that has no state of its own."""
+        for split, names in self.playlist.splits.items():
+            own = tally.only(takes_in(self.clips, names))
+            if own.records:
+                yield Row(self.dressed.name, method, split, self._figures(own))
+
+    def _figures(self, tally: Tally) -> Figures:
+        takes, weight = list(tally.records), self.dressed.weight
+        found = figures(tally, self.plain.only(takes), weight)
+        return replace(found, truth=against(tally, self.truth.only(takes), weight))
+
+    def network_rows(self, subject: Subject) -> Iterator[Row]:
+        """Yield the figures of a network."""
+        reel = reel_of(self.takes, self.dressed, subject.joints)
+        tally = self._tally(reel, Network(subject.name, subject.model, reel), list(self.clips))
+        far, holds, loops = self._distances(reel, subject), self._holds(subject), self._loops(subject)
+        for row in self.rows(tally, subject.name):
+            names = self.playlist.splits[row.split]
+            takes = takes_in(self.clips, names)
+            yield replace(
+                row,
+                figures=replace(
+                    row.figures,
+                    poses=poses(tally.only(takes), far) if far else None,
+                    holds=joined_holds([hold for clip, hold in holds if clip in names]),
+                    loops=joined_loops([loop for clip, loop in loops if clip in names]),
+                ),
+            )
+
+    def _distances(self, reel: Reel, subject: Subject) -> dict[int, Tensor]:
+        """Return how far the poses of each take are from those seen in training [rad], (N,); empty if not known."""
+        if not self.playlist.seen:
+            return {}
+        skeleton, device = self.dressed.scene.character.skeleton, self.dressed.device
+        seen = build_bank(self.playlist.seen, skeleton, subject.joints, self.dressed.fps, device)
+        far = pose_distance(_upright(reel.bank), _upright(seen), len(subject.joints))
+        return dict(enumerate(far.split((reel.bank.stops - reel.bank.starts).tolist())))
+
+    def _holds(self, subject: Subject) -> list[tuple[str, Holds]]:
+        """Return what happens after stops, with the clip of each."""
+        options, fps = self.options, self.dressed.fps
+        if not options.stops:
+            return []
+        takes, first = stops(self.takes, fps, options.stops, options.hold)
+        reel = reel_of(takes, self.dressed, subject.joints)
+        found = held(self.dressed, reel, Network(subject.name, subject.model, reel), first)
+        return [(take.clip, hold) for take, hold in zip(takes, found)]
+
+    def _loops(self, subject: Subject) -> list[tuple[str, Loops]]:
+        """Return how looped takes drift, with the clip of each."""
+        if not self.options.loop:
+            return []
+        takes, lengths = looped(self.takes, self.dressed.fps, self.options.loop)
+        reel = reel_of(takes, self.dressed, subject.joints)
+        found = drifted(self.dressed, reel, Network(subject.name, subject.model, reel), lengths)
+        return [(take.clip, loop) for take, loop in zip(takes, found)]
+
+
+def _upright(bank: MotionBank) -> Tensor:
+    """Return the static descriptors of all frames of a bank, gravity being where it was."""
+    frames = torch.arange(bank.frame_count, device=bank.root.device)
+    return bank.static_descriptor(frames, bank.root.new_tensor([0.0, -1.0, 0.0]).expand(len(frames), 3))
