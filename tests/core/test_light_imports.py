@@ -19,7 +19,7 @@ CORE, USD = ROOT / "ssilk_core", ROOT / "usd" / "ssilk_usd"
 LAYERS = (
     {"errors"},
     {"assets", "config", "devices", "fabrics", "events", "files", "packing"},
-    {"mesh", "kinematics", "kernels", "descriptors", "parameters"},
+    {"mesh", "kinematics", "kernels", "descriptors", "parameters", "sampling"},
     {"model", "energy"},
     {"checkpoint"},
     {"demo", "view", "simulate", "training", "rollout", "preflight", "setup", "wardrobe", "runtime"},
