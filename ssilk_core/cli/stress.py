@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Put a trained garment under extreme motions, rates, sizes, fabrics, meshes and precisions, and tabulate it.
+
+Each case says whether all stays bounded, how far it goes, how its energy grows, what it is off by, and what becomes
+of it: it works, falls back to rest, or is refused with a sentence. Where anything else happens the exit code is 3.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ssilk_core.errors import EXIT_OK, EXIT_VERIFICATION, need
+from ssilk_core.events import Message, Progress, Reporter, Result, Started
+
+from .options import check_output
+
+if TYPE_CHECKING:
+    from ssilk_core.stress.outcome import Outcome
+    from ssilk_core.stress.subject import Subject
+
+
+def add_arguments(verb: argparse.ArgumentParser) -> None:
+    """Add the options of this verb."""
+    verb.add_argument("model", type=Path, help="model written by 'ssilk train'")
+    verb.add_argument("--stage", type=Path, required=True, help="USD file with the character")
+    verb.add_argument("--root", metavar="PRIM", help="SkelRoot of the character, where the stage has several")
+    verb.add_argument(
+        "--motion",
+        type=Path,
+        metavar="SHOT[:/PRIM]",
+        help="USD file with the motion to begin from (default: joints that turn to and fro)",
+    )
+    verb.add_argument(
+        "--quick", action="store_true", help="a tenth of the frames, small trials: minutes, not an hour"
+    )
+    verb.add_argument(
+        "--only", nargs="+", default=[], metavar="WORD", help="cases whose name contains a word, such as 'rate:'"
+    )
+    verb.add_argument("-o", "--output", type=Path, help="JSON file for the figures")
+
+
+def run(options: argparse.Namespace, report: Reporter) -> int:
+    """Run the cases and tabulate them."""
+    from ssilk_core.stress.cases import CASES
+    from ssilk_core.stress.outcome import markdown
+
+    if options.output:
+        check_output(options.output, options.model, options.stage)
+    subject, cases = _subject(options), [case for case in CASES if case.matches(options.only)]
+    need(cases, "--only", f"no case contains {' or '.join(options.only)}", "'ssilk stress --help' names the option",
+         f"groups are {', '.join(dict.fromkeys(case.group for case in CASES))}")  # fmt: skip
+    report(Started("stress", len(cases)))
+    found, faults = [], []
+    for number, case in enumerate(cases):
+        outcome = case.run(subject)
+        found.append(outcome)
+        if outcome.verdict not in case.allowed:
+            faults.append(f"{case.group}: {case.name}")
+            report(Message(f"{faults[-1]} {outcome.verdict}: {outcome.said}", "warning"))
+        report(Progress(number + 1, len(cases)))
+    report(Message(markdown(found)))
+    if options.output:
+        _write(options, found)
+    report(Result("stress", {"cases": len(found), "faults": ", ".join(faults) or "none"}))
+    return EXIT_VERIFICATION if faults else EXIT_OK
+
+
+def _subject(options: argparse.Namespace) -> Subject:
+    """Load the model, its character and the motion."""
+    from ssilk_usd.read_character import read_character
+    from ssilk_usd.read_motion import read_motion
+    from ssilk_usd.read_stage import open_stage
+
+    from ssilk_core.checkpoint import load_model
+    from ssilk_core.stress.subject import FULL, QUICK, Subject
+
+    from ._baking import need_same_skeleton
+
+    file = load_model(options.model)
+    skeleton = file.scene.character.skeleton
+    character = read_character(open_stage(str(options.stage)), root=options.root, garment=None)
+    need_same_skeleton(character.skeleton, skeleton)
+    scene = replace(file.scene, character=replace(character, skeleton=skeleton))
+    clip = read_motion(str(options.motion), skeleton) if options.motion else None
+    return Subject(file, scene, clip, QUICK if options.quick else FULL)
+
+
+def _write(options: argparse.Namespace, outcomes: list[Outcome]) -> None:
+    from ssilk_core import __version__
+    from ssilk_core.devices import chosen_device, device_name
+    from ssilk_core.events import finite
+    from ssilk_core.files import replacing, sha256
+
+    document: dict[str, Any] = {
+        "ssilk": __version__,
+        "model": options.model.name,
+        "model_sha256": sha256(options.model),
+        "hardware": device_name(chosen_device("cpu")),
+        "quick": options.quick,
+        "outcomes": [asdict(outcome) for outcome in outcomes],
+    }
+    with replacing(options.output) as temporary:
+        temporary.write_text(json.dumps(finite(document), indent=1, allow_nan=False) + "\n")

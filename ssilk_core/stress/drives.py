@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Motions as functions of time, so that any number of frames takes the memory of one block; and what is done to them.
+
+A drive is sampled when it is played. What changes one (a spin, a teleport) wraps it and returns another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..assets import Floats, Motion, Skeleton
+from ..kinematics import local_transforms, multiply_quaternions, quaternion_from_matrix, sample_motion, slerp
+
+BLOCK = 256  # frames
+
+Sampled = tuple[Floats, Floats]  # rotations (N, J, 4) and translations (N, J, 3) [m]
+Turn = Callable[[Floats], Floats]  # times [s] (N,) to quaternions (N, 4)
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """A motion of `frames` frames at `fps`, given by joint rotations and translations at any times [s] (N,).
+
+    `loop` is the time after which it repeats [s]; zero where it does not.
+    """
+
+    fps: float
+    frames: int
+    at: Callable[[Floats], Sampled]
+    loop: float = 0.0
+
+    def motion(self, start: int = 0, stop: int | None = None) -> Motion:
+        """Return some frames, all by default.
+
+        Raises:
+            SsilkError: a frame holds NaN.
+        """
+        stop = self.frames if stop is None else min(stop, self.frames)
+        return Motion("stress", self.fps, *self.at(np.arange(start, stop) / self.fps), start)
+
+    def blocks(self, size: int = BLOCK) -> Iterator[Motion]:
+        """Yield all frames, `size` at a time."""
+        for start in range(0, self.frames, size):
+            yield self.motion(start, start + size)
+
+    def lasting(self, seconds: float, fps: float | None = None) -> Drive:
+        """Return the drive for so many seconds, at another rate."""
+        fps = fps or self.fps
+        return replace(self, fps=fps, frames=round(seconds * fps) + 1)
+
+    def then(self, change: Callable[[Floats, Floats, Floats], Sampled]) -> Drive:
+        """Return the drive with rotations and translations changed by a function of (times, both)."""
+        return replace(self, at=lambda times: change(times, *self.at(times)))
+
+
+def sway(skeleton: Skeleton, fps: float) -> Drive:
+    """Return a drive for want of a motion: every joint turns by sines of its own about the bind pose, in a loop."""
+    random, loop = np.random.default_rng(0), 4.0
+    local = local_transforms(skeleton.bind_transforms, skeleton.parents)
+    rest, places = quaternion_from_matrix(local[:, :3, :3]), local[:, :3, 3]
+    turns = random.integers(1, 4, (skeleton.joint_count, 3)) * 2 * np.pi / loop  # [rad/s]
+    phase, size = random.uniform(0, 6, turns.shape), random.uniform(0.05, 0.25, turns.shape)
+
+    def at(times: Floats) -> Sampled:
+        half = size * np.sin(times[:, None, None] * turns + phase)
+        turn = np.concatenate([np.ones((*half.shape[:2], 1)), half], axis=-1)
+        moved = np.tile(places, (len(times), 1, 1))
+        moved[:, 0, 0] += 0.3 * np.sin(times * 2 * np.pi / loop)
+        return multiply_quaternions(rest, turn / np.linalg.norm(turn, axis=-1, keepdims=True)), moved
+
+    return Drive(fps, 1, at, loop)
+
+
+def looped(motion: Motion, fps: float) -> Drive:
+    """Return a clip played forward and backward without end."""
+    last = max(motion.frame_count - 1, 1)
+
+    def at(times: Floats) -> Sampled:
+        phase = times * motion.fps % (2 * last)
+        return sample_motion(motion, np.minimum(last - np.abs(last - phase), motion.frame_count - 1))
+
+    return Drive(fps, 1, at, 2 * last / motion.fps)
+
+
+def turned(drive: Drive, skeleton: Skeleton, turn: Turn) -> Drive:
+    """Return the drive with the whole character turned about its first joint, by a function of time."""
+    roots = np.flatnonzero(skeleton.parents < 0)
+
+    def change(times: Floats, rotations: Floats, translations: Floats) -> Sampled:
+        rotations, translations = rotations.copy(), translations.copy()
+        q, centre = turn(times)[:, None], translations[:, :1]
+        rotations[:, roots] = multiply_quaternions(q, rotations[:, roots])
+        translations[:, roots] = centre + rotated(q, translations[:, roots] - centre)
+        return rotations, translations
+
+    return drive.then(change)
+
+
+def rotated(quaternions: Floats, vectors: Floats) -> Floats:
+    """Return vectors (..., 3) turned by unit quaternions (..., 4)."""
+    pure = np.concatenate([np.zeros_like(vectors[..., :1]), vectors], axis=-1)
+    inverse = quaternions * [1, -1, -1, -1]
+    return multiply_quaternions(multiply_quaternions(quaternions, pure), inverse)[..., 1:]
+
+
+def about(axis: tuple[float, float, float], speed: float = 0.0, angle: float = 0.0) -> Turn:
+    """Return a turn about a unit axis by an angle [rad] that grows with a speed [rad/s]."""
+
+    def turn(times: Floats) -> Floats:
+        half = (angle + speed * times)[:, None] / 2
+        return np.concatenate([np.cos(half), np.sin(half) * axis], axis=1)
+
+    return turn
+
+
+def carried(drive: Drive, path: Callable[[Floats], Floats], skeleton: Skeleton) -> Drive:
+    """Return the drive with the character moved by a path: times [s] (N,) to offsets [m] (N, 3)."""
+    roots = np.flatnonzero(skeleton.parents < 0)
+
+    def change(times: Floats, rotations: Floats, translations: Floats) -> Sampled:
+        translations = translations.copy()
+        translations[:, roots] += path(times)[:, None]
+        return rotations, translations
+
+    return drive.then(change)
+
+
+def stopping(drive: Drive, time: float) -> Drive:
+    """Return the drive with its pose at a time [s] held from then on, at once."""
+    return replace(drive, at=lambda times: drive.at(np.minimum(times, time)))
+
+
+def contorted(drive: Drive, skeleton: Skeleton, every: float) -> Drive:
+    """Return a drive in which each joint but the roots turns at will: uniform on SO(3), anew `every` so often [s]."""
+    random, inner = np.random.default_rng(1), skeleton.parents >= 0
+    keys = random.normal(size=(64, skeleton.joint_count, 4))
+    keys /= np.linalg.norm(keys, axis=-1, keepdims=True)
+
+    def change(times: Floats, rotations: Floats, translations: Floats) -> Sampled:
+        step, part = np.divmod(times / every, 1)
+        low = step.astype(int) % len(keys)
+        mixed = slerp(keys[low], keys[(low + 1) % len(keys)], part[:, None])
+        return np.where(inner[:, None], mixed, rotations), translations
+
+    return drive.then(change)
+
+
+def broken(drive: Drive, frame: int) -> Drive:
+    """Return the drive with NaN for all rotations of one frame."""
+
+    def change(times: Floats, rotations: Floats, translations: Floats) -> Sampled:
+        hit = np.isclose(times * drive.fps, frame)[:, None, None]
+        return np.where(hit, np.nan, rotations), translations
+
+    return drive.then(change)
+
+
+def enlarged(drive: Drive, scale: float) -> Drive:
+    """Return the drive of a character that is so many times as large."""
+    return drive.then(lambda times, rotations, translations: (rotations, scale * translations))

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What came of one extreme, and tables of many."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from .meter import Extent
+
+Verdict = Literal["works", "falls back", "refuses", "breaks"]
+HEADER = ("extreme", "what happens", "frames", "bounded", "speed [m/s]", "off plain skinning [m]", "latent",
+          "energy growth", "error", "s")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a case found: an extent where there was a rollout, an error and its unit, and words to add."""
+
+    extent: Extent | None = None
+    error: float | None = None
+    unit: str = ""
+    note: str = ""
+
+    @property
+    def verdict(self) -> Verdict:
+        if self.extent is None:
+            return "works"
+        if not self.extent.bounded:
+            return "breaks"
+        return "falls back" if self.extent.recovered else "works"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One line of the table.
+
+    Attributes:
+        name, group: of the case.
+        verdict: what the product does; "breaks" is a fault.
+        said: the sentence of a refusal, or what there is to add.
+        measured: figures; empty for a refusal.
+        seconds: that the case took.
+    """
+
+    name: str
+    group: str
+    verdict: Verdict
+    said: str
+    measured: Measured
+    seconds: float
+
+    def row(self) -> list[str]:
+        """Return the line as words."""
+        found, error = self.measured.extent, self.measured.error
+        figures = ["", "", "", "", "", ""]
+        if found:
+            figures = [
+                f"{found.frames:,}", "yes" if found.bounded else "no", f"{found.speed:.3g}", f"{found.distance:.3g}",
+                f"{found.latent:.3g}", f"{found.growth:.3g}",
+            ]  # fmt: skip
+        off = "" if error is None else f"{error:.2g} {self.measured.unit}".strip()
+        words = f"{self.verdict}: {self.said}" if self.said else self.verdict
+        return [f"{self.group}: {self.name}", words, *figures, off, f"{self.seconds:.0f}"]
+
+
+def markdown(outcomes: Sequence[Outcome]) -> str:
+    """Return outcomes as a Markdown table."""
+    lines = [HEADER, ["---"] * 2 + ["---:"] * (len(HEADER) - 2), *(outcome.row() for outcome in outcomes)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"

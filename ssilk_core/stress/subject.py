@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is put under stress: a trained garment on its character, a motion to begin from, and how much to try."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+
+from ..assets import Motion, Scene
+from ..checkpoint import ModelFile, network
+from ..fabrics import Fabric
+from ..model.network import GarmentModel
+from .drives import Drive, looped, sway
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effort:
+    """How much is tried.
+
+    Attributes:
+        seconds: of motion in most cases.
+        frames: of the long cases, as a share of what they are called.
+        steps: of trial trainings; simulated: frames of trial simulations.
+        vertices: most that a trial garment may have.
+    """
+
+    seconds: float = 10.0
+    frames: float = 1.0
+    steps: int = 20
+    simulated: int = 10
+    vertices: int = 200_000
+
+
+FULL = Effort()
+QUICK = Effort(seconds=3.0, frames=0.1, steps=6, simulated=3, vertices=20_000)
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """A model file, its scene with the bodies of the character, and a clip; none for a made-up motion."""
+
+    file: ModelFile
+    scene: Scene
+    clip: Motion | None
+    effort: Effort
+
+    @property
+    def fabric(self) -> Fabric:
+        return self.file.fabric
+
+    @property
+    def fps(self) -> float:
+        return self.file.config.fps
+
+    @cached_property
+    def base(self) -> Drive:
+        """The motion that every case begins from."""
+        skeleton = self.scene.character.skeleton
+        endless = looped(self.clip, self.fps) if self.clip else sway(skeleton, self.fps)
+        return endless.lasting(self.effort.seconds)
+
+    @cached_property
+    def model(self) -> GarmentModel:
+        return self.in_precision(torch.float32)
+
+    def in_precision(self, dtype: torch.dtype) -> GarmentModel:
+        """Return the network with all its numbers in a precision."""
+        return network(self.file, self.scene).to(dtype)
