@@ -23,8 +23,9 @@ LAYERS = (
     {"model", "energy"},
     {"checkpoint"},
     {"demo", "view", "simulate", "training", "rollout", "preflight", "setup", "wardrobe", "runtime"},
-    {"baselines"},
-    {"evaluation"},
+    {"baselines", "reduction"},
+    {"evaluation", "quality"},
+    {"trade"},
     {"cli"},
     {"__main__"},
 )

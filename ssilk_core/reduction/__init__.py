@@ -1,0 +1,7 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Smaller models of a trained one, without training."""
+
+from .reducer import Reduced, Reducer
+from .size import Size
+
+__all__ = ["Reduced", "Reducer", "Size"]

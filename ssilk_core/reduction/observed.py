@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What motions ask of a trained garment: frames to judge by what a smaller model loses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..assets import Floats, Motion, Skeleton
+from ..errors import need
+from ..runtime import Player
+from ..runtime.drive import character_matrices
+from ..runtime.skinning import posed
+
+POSED = 16  # frames whose vertices are in memory at once
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """Frames of motions, F of them, as every model that was cut from one whole sees them.
+
+    Attributes:
+        states: latents, shape (F, latent).
+        character: skinning matrices of the character's joints about the root, shape (J, 3, 4, F).
+    """
+
+    states: NDArray
+    character: NDArray
+
+    def decoded(self, player: Player) -> tuple[NDArray, NDArray]:
+        """Return a model's activations (K, F) and skinning matrices of all its joints (J + P, 3, 4, F)."""
+        activations, rotations = player.decoder.decoded(self.states)
+        return activations, player.kinematics.matrices(rotations, self.character)
+
+    def vertices(self, player: Player) -> Iterator[Floats]:
+        """Yield a model's vertices about the root [m], some frames at a time, shape (F', V, 3)."""
+        activations, matrices = self.decoded(player)
+        for start in range(0, len(self.states), POSED):
+            chosen = slice(start, start + POSED)
+            count = len(self.states[chosen])
+            yield posed(player.tiles, activations[:, chosen], matrices[..., chosen], np.zeros((count, 3)))
+
+
+def observe(player: Player, motions: Sequence[Motion], frames: int) -> Observed:
+    """Play motions and return about `frames` frames of them, evenly spread.
+
+    Raises:
+        SsilkError: there is no motion, or it is of another character.
+    """
+    need(motions, "motions", "none given", "at least one is needed", "name motion files with --motions")
+    takes = [take for motion in motions for take in player.play(motion).takes]
+    every = max(1, sum(take.motion.frame_count for take in takes) // frames)
+    return Observed(
+        np.concatenate([take.states(take.motion.frame_count)[::every] for take in takes]),
+        np.concatenate([_character(take.motion, every, player.skeleton) for take in takes], axis=-1),
+    )
+
+
+def _character(motion: Motion, every: int, skeleton: Skeleton) -> NDArray:
+    """Return the character's skinning matrices about its root (J, 3, 4, F) of every so many frames."""
+    some = replace(motion, rotations=motion.rotations[::every], translations=motion.translations[::every])
+    return character_matrices(some, skeleton)[0]

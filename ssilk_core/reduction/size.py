@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How much of a garment a smaller model keeps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ..errors import need
+
+
+@dataclass(frozen=True, kw_only=True)
+class Size:
+    """What is kept of a garment.
+
+    Attributes:
+        shapes: blendshapes; joints: proxy joints; influences: joints that move one vertex.
+    """
+
+    shapes: int
+    joints: int
+    influences: int
+
+    def __post_init__(self) -> None:
+        for name, least in (("shapes", 0), ("joints", 0), ("influences", 1)):
+            value = getattr(self, name)
+            need(value >= least, f"{name} = {value}", "too few to be kept", f"it is at least {least}")
+
+    def within(self, other: Size) -> Size:
+        """Return what both have."""
+        return Size(**{name: min(most, vars(other)[name]) for name, most in vars(self).items()})
