@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Many shots of one garment at once, one frame of all in one call: on a GPU, a CUDA graph that Python only starts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..assets import Motion
+from ..errors import need
+from ..kinematics import motion_transforms, skinning_matrices
+from .descriptors import gravity_features, pose_features
+from .network import GarmentModel
+
+DOWN = (0.0, -1.0, 0.0)
+RESTING = 2  # frames at rest that a shot begins with
+WARM_UP = 3  # calls before a graph is captured, in which libraries settle what they will do
+
+
+@dataclass(frozen=True, eq=False)
+class Driven:
+    """What N motions of F frames say.
+
+    Attributes:
+        rest: quasi-static latents, shape (F, N, latent); pose: dynamic descriptors, shape (F, N, D).
+        character: skinning matrices about each root, shape (F, J, 3, 4, N).
+        origins: where each root is [m], shape (F, 3, N), float64.
+    """
+
+    rest: Tensor
+    pose: Tensor
+    character: Tensor
+    origins: Tensor
+
+
+@torch.no_grad()
+def driven(model: GarmentModel, motions: Sequence[Motion]) -> Driven:
+    """Return what motions without cuts say, on the model's device; the shorter ones hold their last pose.
+
+    Raises:
+        SsilkError: a motion is not at the model's rate.
+    """
+    fps, frames = model.config.fps, max(motion.frame_count for motion in motions)
+    for motion in motions:
+        need(abs(motion.fps - fps) < 1e-6, motion.path, f"{motion.fps:g} frames per second",
+             f"the model steps at {fps:g}")  # fmt: skip
+    parts = [_driven(model, motion) for motion in motions]
+    rest, pose, character, origins = (
+        torch.stack([part[[*range(len(part)), *[-1] * (frames - len(part))]] for part in group], dim=axis)
+        for group, axis in zip(zip(*parts), (1, 1, -1, -1))
+    )
+    return Driven(rest, pose, character, origins)
+
+
+def _driven(model: GarmentModel, motion: Motion) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return quasi-static latents, descriptors, matrices and origins of one motion, frames first."""
+    skeleton, parameter = model.scene.character.skeleton, next(model.parameters())
+    world = motion_transforms(motion, skeleton.parents)
+    features = pose_features(motion, skeleton, model.joints, world)
+    origins = world[:, 0, :3, 3].copy()
+    world[..., :3, 3] -= origins[:, None]
+
+    def tensor(values: np.ndarray) -> Tensor:
+        return torch.as_tensor(values).to(parameter)
+
+    gravity = gravity_features(tensor(features.down), tensor(np.array(DOWN)).expand(motion.frame_count, 3))
+    static = torch.cat([tensor(features.static), gravity], dim=1)
+    matrices = tensor(skinning_matrices(world, skeleton.bind_transforms)[:, :, :3])
+    pose = torch.cat([static, tensor(features.dynamic)], dim=1)
+    return model.initial(static), pose, matrices, torch.as_tensor(origins).to(parameter.device)
+
+
+class BatchPlayer:
+    """Advances one garment in N shots, all of them by a frame in each call.
+
+    Args:
+        model: on the device where everything is to run.
+        like: motions of N shots, for their shapes.
+        vertices: whether to decode to vertices; without, a step gives what the decoder's network does.
+    """
+
+    def __init__(self, model: GarmentModel, like: Driven, *, vertices: bool = True) -> None:
+        self.model, self.vertices = model, vertices
+        self.rest, self.pose, self.character = like.rest[0].clone(), like.pose[0].clone(), like.character[0].clone()
+        self.before, self.now = self.rest.clone(), self.rest.clone()
+        self.begins = torch.ones((), dtype=torch.bool, device=self.rest.device)
+        self.network = torch.compile(self._network, dynamic=False) if self.rest.is_cuda else self._network
+        self.advance = self._captured() if self.rest.is_cuda else self._advance
+
+    def play(self, shots: Driven) -> Iterator[Tensor]:
+        """Yield vertices about each root (V, 3, N) [m], or network output (N, K + 6 P), of frame after frame.
+
+        On a GPU each result is overwritten by the next one.
+        """
+        for frame in range(len(shots.rest)):
+            yield self.step(shots, frame)
+
+    @torch.no_grad()
+    def step(self, shots: Driven, frame: int) -> Tensor:
+        """Return what `play` yields of a frame, the one after the last that was asked for, or the first."""
+        self.begins.fill_(frame < RESTING)
+        for own, given in zip((self.rest, self.pose, self.character), (shots.rest, shots.pose, shots.character)):
+            own.copy_(given[frame])
+        return self.advance()
+
+    def _network(self) -> tuple[Tensor, Tensor]:
+        z = self.model.step(self.before, self.now, self.rest, self.pose)
+        z = torch.where(self.begins, self.rest, z)
+        return z, self.model.output(z)
+
+    def _advance(self) -> Tensor:
+        z, output = self.network()
+        self.before.copy_(self.now)
+        self.now.copy_(z)
+        return self.model.decoder.vertices(output, self.character) if self.vertices else output
+
+    @torch.no_grad()
+    def _captured(self) -> Callable[[], Tensor]:
+        """Record a step as a graph; return what runs it again."""
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            for _ in range(WARM_UP):
+                self._advance()
+        torch.cuda.current_stream().wait_stream(stream)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            result = self._advance()
+
+        def replayed() -> Tensor:
+            graph.replay()
+            return result
+
+        return replayed
