@@ -42,7 +42,7 @@ def held(dressed: Dressed, reel: Reel, method: Method, first: Sequence[int]) -> 
 
 def _held(dressed: Dressed, reel: Reel, method: Method, take: int, first: int) -> Holds:
     count, mass, fps = reel.takes[take].frame_count, dressed.energy.mass, dressed.fps
-    path = method.vertices(take, range(first - 1, count))
+    path = method.vertices(take, range(first, count))
     kinetic = kinetic_energy(path, mass, fps)
     calm = float(settling_time((2 * kinetic / mass.sum()).sqrt(), CALM, fps))
     last = range(count - 1, count)
@@ -67,7 +67,9 @@ def joined_holds(single: Sequence[Holds]) -> Holds | None:
     """Return the figures of several stops; None of none."""
     if not single:
         return None
-    table = {name: torch.tensor([getattr(hold, name) for hold in single]).double() for name in vars(single[0])}
+    table = {
+        name: torch.tensor([getattr(hold, name) for hold in single], dtype=torch.float64) for name in vars(single[0])
+    }
     means = {name: float(values.mean()) for name, values in table.items()}
     middle = table["settling"].sort().values[(len(single) - 1) // 2]
     distances = table["distance"]
@@ -121,7 +123,9 @@ def joined_loops(single: Sequence[Loops]) -> Loops | None:
     """Return the figures of several clips; None of none."""
     if not single:
         return None
-    table = {name: torch.tensor([getattr(loop, name) for loop in single]).double() for name in vars(single[0])}
+    table = {
+        name: torch.tensor([getattr(loop, name) for loop in single], dtype=torch.float64) for name in vars(single[0])
+    }
     means = {name: float(values.mean()) for name, values in table.items()}
     drifts = table["drift"]
     return Loops(

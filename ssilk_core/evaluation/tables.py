@@ -27,8 +27,10 @@ def aligned(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def tables(rows: Sequence[Row]) -> str:
-    """Return one table for each kind of figures that any row has."""
-    return "\n".join(text for text in (_table(rows, *kind) for kind in KINDS) if text)
+    """Return one table for each kind of figures that any row has, the methods of a split together."""
+    places = {(row.garment, row.split): place for place, row in reversed(list(enumerate(rows)))}
+    together = sorted(rows, key=lambda row: places[row.garment, row.split])
+    return "\n".join(text for text in (_table(together, *kind) for kind in KINDS) if text)
 
 
 def _table(

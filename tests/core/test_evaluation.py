@@ -1,0 +1,340 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The evaluation of a toy garment: takes, methods, records, held poses, loops, and what splits come to."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from ssilk_core.assets import Motion
+from ssilk_core.baselines.networks import METHODS, BaselineConfig, baseline
+from ssilk_core.energy import TERMS
+from ssilk_core.errors import SsilkError
+from ssilk_core.evaluation.methods import Cache, Dressed, Network, Plain, Reel, reel_of
+from ssilk_core.evaluation.probes import CALM, drifted, held, joined_holds, joined_loops, looped, stops
+from ssilk_core.evaluation.record import recorded
+from ssilk_core.evaluation.run import SIMULATOR, EvaluationOptions, Playlist, Subject, evaluate
+from ssilk_core.evaluation.splits import chosen, read_index, splits_of
+from ssilk_core.evaluation.tables import aligned, tables
+from ssilk_core.evaluation.takes import Take, back_and_forth, stopped, takes_of
+from ssilk_core.evaluation.tally import Tally, against, figures
+from ssilk_core.fabrics import Fabric
+from ssilk_core.kinematics import motion_transforms, skin_points, skinning_matrices
+from ssilk_core.model.descriptors import GRAVITY
+from ssilk_core.training.bank import build_bank
+from ssilk_core.training.holding import rest_distance, spread_poses
+from ssilk_core.training.validation import Validator, roll_states
+
+FPS, JOINTS, CPU = 30.0, np.arange(3), torch.device("cpu")
+
+
+@pytest.fixture
+def dressed(scene) -> Dressed:
+    return Dressed(scene, Fabric("toy", bending=1e-4, margin=0.02), FPS, CPU)
+
+
+@pytest.fixture
+def motion(scene, toy_motion) -> Motion:
+    return toy_motion(scene, 40)
+
+
+@pytest.fixture
+def reel(dressed, motion) -> Reel:
+    return reel_of(takes_of("sway", motion, FPS), dressed, JOINTS)
+
+
+class Still:
+    """Cloth that moves by given offsets (N, 3) away from plain skinning, whose quasi-static state that is."""
+
+    name = "still"
+
+    def __init__(self, dressed: Dressed, reel: Reel, offsets: Tensor) -> None:
+        self.plain, self.offsets = Plain(dressed, reel), offsets
+
+    def vertices(self, take: int, frames: range) -> Tensor:
+        return self.plain.vertices(take, frames) + self.offsets[frames.start : frames.stop].T
+
+    def still(self, take: int, frames: range) -> Tensor:
+        return self.plain.vertices(take, frames)
+
+
+def test_takes_are_the_frames_of_a_simulated_shot(scene, toy_motion):
+    """Cut where the root jumps, at the frames that a simulator would write."""
+    fast = toy_motion(scene, 101, fps=50.0)
+    places = fast.translations.copy()
+    places[60:, 0] += 3.0
+    takes = takes_of("clip", replace(fast, translations=places), FPS)
+    assert [(take.first, take.frame_count) for take in takes] == [(0, 36), (36, 25)]
+    np.testing.assert_allclose(takes[1].motion.translations[-1, 0], places[100, 0], atol=1e-9)
+    parts = takes_of("clip", fast, FPS, longest=25)
+    assert [(take.first, take.frame_count) for take in parts] == [(0, 25), (25, 25), (50, 11)]
+    assert [take.frame_count for take in takes_of("clip", fast.clip(0, 101), FPS, longest=58)] == [58]  # 3 are few
+
+
+def test_a_motion_stops_and_loops_without_a_jolt(motion):
+    still, first = stopped(motion, FPS, 0.5, 1.0)
+    assert still.frame_count == first + 30 or still.frame_count == first + 31
+    assert np.ptp(still.translations[first:], axis=0).max() == 0 and np.ptp(still.translations[:first, 0, 0]) > 0.01
+    loop, length = back_and_forth(motion, FPS, 200)
+    assert loop.frame_count >= 200 and loop.frame_count % length == 0
+    np.testing.assert_array_equal(loop.translations[:length], loop.translations[length : 2 * length])
+    speed = np.abs(np.diff(loop.translations[:, 0], axis=0)).max(axis=1) * FPS
+    assert speed[length - 1] < 0.1 * speed.max()
+
+
+@pytest.mark.parametrize("kind", ["ssilk", *METHODS])
+def test_energies_are_those_of_the_validation(scene, dressed, toy_motion, toy_model, kind, monkeypatch):
+    """Of models and baselines, also over several blocks."""
+    model = toy_model(scene) if kind == "ssilk" else baseline(scene, BaselineConfig(method=kind), JOINTS)
+    clip = toy_motion(scene, 23)
+    reel = reel_of(takes_of("clip", clip, FPS), dressed, JOINTS)
+    network = Network(kind, model, reel)
+    validator = Validator(
+        network.reel.bank, dressed.energy, dressed.body, scene.plain_skin, dressed.rest, FPS, clip.frame_count
+    )
+    expected = validator.frame_terms(range(23), model)
+    monkeypatch.setattr("ssilk_core.evaluation.record.DECODED_AT_ONCE", 9)
+    found = recorded(dressed, reel, network, 0).values
+    for name in (*TERMS, "collisions"):
+        np.testing.assert_allclose(found[name], expected[name].double(), rtol=1e-4, atol=1e-7)
+    plain = recorded(dressed, reel, Plain(dressed, reel), 0).values
+    np.testing.assert_allclose(plain["stretch"], validator.frame_terms(range(23), None)["stretch"], rtol=1e-4)
+    assert plain["gravity"].abs().max() == 0 and "motion" not in plain
+
+
+def test_a_record_in_blocks_is_that_of_the_whole(dressed, reel, monkeypatch):
+    offsets = 0.01 * torch.randn(40, 3, generator=torch.Generator().manual_seed(1))
+    method, truth = Still(dressed, reel, offsets), Plain(dressed, reel)
+    whole = recorded(dressed, reel, method, 0, truth)
+    monkeypatch.setattr("ssilk_core.evaluation.record.DECODED_AT_ONCE", 2)
+    parts = recorded(dressed, reel, method, 0, truth)
+    assert whole.values.keys() == parts.values.keys() and torch.equal(whole.stretches, parts.stretches)
+    for name, values in whole.values.items():
+        np.testing.assert_allclose(parts.values[name], values, rtol=1e-3, atol=1e-9, err_msg=name)
+    missing = {name: int(values.isnan().sum()) for name, values in whole.values.items()}
+    assert {name: count for name, count in missing.items() if count} == {
+        "kinetic": 1, "jerk": 3, "velocity": 1, "acceleration": 2,
+    }  # fmt: skip
+
+
+def test_errors_against_a_reference_are_those_of_the_offset(dressed, reel):
+    """Cloth that is carried along a wave beside the reference, as a whole."""
+    rate, amplitude = 6.0, 0.02
+    path = torch.zeros(40, 3)
+    path[:, 1] = amplitude * torch.sin(rate * torch.arange(40) / FPS)
+    truth = Tally({0: recorded(dressed, reel, Plain(dressed, reel), 0)}, {0: "sway"})
+    tally = Tally({0: recorded(dressed, reel, Still(dressed, reel, path), 0, Plain(dressed, reel))}, {0: "sway"})
+    found = against(tally, truth, dressed.weight)
+    exact = [path, path.diff(dim=0) * FPS, path.diff(n=2, dim=0) * FPS**2]
+    expected = [float(values[:, 1].square().mean()) ** 0.5 for values in exact]
+    np.testing.assert_allclose([found.position, found.velocity, found.acceleration], expected, rtol=2e-3)
+    mass = float(dressed.energy.mass.sum())
+    assert found.floats == pytest.approx(mass * GRAVITY * float(path[:, 1].mean()) / dressed.weight, rel=1e-3)
+    own = figures(tally, truth, dressed.weight)
+    assert found.excess == pytest.approx(own.total - found.total) and found.frames == 40
+    assert own.motion == pytest.approx(expected[0], rel=1e-3) and own.lift == pytest.approx(found.floats, rel=1e-3)
+    assert own.jitter_of_plain == pytest.approx(found.jitter)
+
+
+def test_the_weight_is_that_of_the_cloth_at_its_height(dressed):
+    """A strip of 0.2 m by 0.55 m, of 0.15 kg/m2."""
+    assert dressed.weight == pytest.approx(0.2 * 0.55 * 0.15 * 9.81 * 0.55)
+
+
+def test_a_point_cache_is_measured_as_the_cloth_that_was_written(scene, dressed, reel, motion):
+    matrices = skinning_matrices(
+        motion_transforms(motion, scene.character.skeleton.parents), scene.character.skeleton.bind_transforms
+    )
+    points = skin_points(scene.garment.mesh.points, scene.plain_skin, matrices)
+    cache = Cache("cache", lambda clip, frames: points[frames.start : frames.stop], dressed, reel)
+    plain = Plain(dressed, reel)
+    ours, theirs = (recorded(dressed, reel, method, 0, plain) for method in (cache, plain))
+    for name in (*TERMS, "kinetic"):
+        np.testing.assert_allclose(ours.values[name], theirs.values[name], rtol=1e-3, atol=2e-6, err_msg=name)
+    assert ours.values["position"].max() < 1e-10
+    elsewhere = Cache("cache", lambda clip, frames: points[frames.start : frames.stop] + 0.1, dressed, reel)
+    with pytest.raises(SsilkError, match=r"sway: in the point cache, pinned vertices are 0.173 m from"):
+        elsewhere.vertices(0, range(5))
+
+
+def test_a_swing_that_dies_away_settles(dressed, motion):
+    """An offset that decays while the pose is held: energy, settling time and distance from rest follow from it."""
+    takes, first = stops(takes_of("sway", motion, FPS), FPS, 2, 2.0)
+    assert [take.clip for take in takes] == ["sway"] * 2 and first[1] > first[0]
+    reel, tau, begun = reel_of(takes, dressed, JOINTS), 0.3, 0.1
+    count = max(take.frame_count for take in takes)
+    offsets = torch.zeros(count, 3)
+    offsets[:, 1] = begun * torch.exp(-(torch.arange(count) - first[0]) / FPS / tau)
+    found = held(dressed, reel, Still(dressed, reel, offsets), first)[0]
+    decay = 1 - math.exp(-1 / FPS / tau)  # the first two frames at rest are apart by begun * decay
+    speed, mass = begun * FPS * decay, float(dressed.energy.mass.sum())
+    assert found.begun == pytest.approx(mass * speed**2 / 2, rel=1e-3)
+    settled = tau * math.log(speed / CALM)
+    assert settled <= found.settling < settled + 1 / FPS
+    last = begun * math.exp(-(takes[0].frame_count - 1 - first[0]) / FPS / tau)
+    assert found.distance == pytest.approx(last, rel=1e-3)
+    assert found.floats == pytest.approx(mass * GRAVITY * last / dressed.weight, rel=1e-3)
+
+
+def test_cloth_that_is_held_up_is_found_out(dressed, motion):
+    """Ten centimetres above its quasi-static state for ever: it settles, and floats."""
+    takes, first = stops(takes_of("sway", motion, FPS), FPS, 1, 1.0)
+    reel = reel_of(takes, dressed, JOINTS)
+    lifted = torch.tensor([0.0, 0.1, 0.0]).expand(takes[0].frame_count, 3)
+    found = joined_holds(held(dressed, reel, Still(dressed, reel, lifted), first))
+    assert (found.stops, found.settled) == (1, 1.0) and found.kinetic < 1e-9
+    assert found.distance == found.furthest == pytest.approx(0.1, rel=1e-4)
+    assert found.floats == pytest.approx(0.1 / 0.55, rel=1e-3)
+    assert joined_holds([]) is None and joined_loops([]) is None
+
+
+def test_holds_come_together(dressed, motion):
+    takes, first = stops(takes_of("sway", motion, FPS), FPS, 3, 1.0)
+    reel = reel_of(takes, dressed, JOINTS)
+    single = held(dressed, reel, Still(dressed, reel, torch.zeros(100, 3)), first)
+    never = replace(single[0], settled=0.0, settling=math.inf, distance=0.3, furthest=0.3)
+    assert joined_holds([never, never, single[1]]).settling == math.inf
+    found = joined_holds([never, single[1], single[2]])
+    assert found.settled == pytest.approx(2 / 3) and found.settling < math.inf and found.stops == 3
+    assert found.distance == pytest.approx(0.3 / 3**0.5, rel=1e-3) and found.furthest == 0.3
+
+
+def test_drift_is_what_changes_from_loop_to_loop(dressed, motion):
+    takes, lengths = looped(takes_of("sway", motion, FPS), FPS, 400)
+    reel = reel_of(takes, dressed, JOINTS)
+    frames, length = takes[0].frame_count, lengths[0]
+    same = drifted(dressed, reel, Still(dressed, reel, torch.zeros(frames, 3)), lengths)[0]
+    assert frames >= 400 and abs(same.drift) < 1e-6 and same.apart < 1e-6
+    rising = torch.zeros(frames, 3)
+    rising[:, 1] = 0.05 * torch.arange(frames) / frames
+    found = drifted(dressed, reel, Still(dressed, reel, rising), lengths)[0]
+    assert found.apart == pytest.approx(0.05 * (frames - 2 * length) / frames, rel=1e-3)
+    joined = joined_loops([found, replace(found, drift=-1.0, most=-1.0)])
+    assert joined.most == -1.0 and joined.drift == pytest.approx((found.drift - 1) / 2)
+
+
+def playlist(dressed: Dressed, motion: Motion, slow: Motion, **options: object) -> Playlist:
+    return Playlist(
+        clips={"sway": motion, "slow": slow}, splits={"valid": ["sway", "slow"], "flips": ["slow"]}, **options
+    )
+
+
+def test_every_method_gets_its_row_in_every_split(scene, dressed, motion, toy_motion, toy_model):
+    slow = toy_motion(scene, 30, speed=0.3)
+    subjects = [
+        Subject("ssilk", toy_model(scene), JOINTS),
+        Subject("ncs", baseline(scene, BaselineConfig(method="ncs"), JOINTS), JOINTS),
+    ]
+    cache = {}
+
+    def read(clip: str, frames: range) -> np.ndarray:
+        if not cache:
+            reel = reel_of(takes_of("slow", slow, FPS), dressed, JOINTS)
+            cache["slow"] = Plain(dressed, reel).vertices(0, range(30)).permute(2, 0, 1) + slow.translations[0, 0]
+        return cache[clip][frames.start : frames.stop].numpy()
+
+    played = playlist(dressed, motion, slow, simulated=frozenset({"slow"}), read=read, seen=[motion])
+    rows = list(evaluate(dressed, subjects, played, EvaluationOptions(stops=1, hold=0.5, loop=1)))
+    names = [(row.method, row.split) for row in rows]
+    methods = ("plain", SIMULATOR, "ssilk", "ncs")
+    assert names == [(method, split) for method in methods for split in ("valid", "flips")]
+    by_name = {name: row.figures for name, row in zip(names, rows)}
+    model, simulated = by_name["ssilk", "valid"], by_name[SIMULATOR, "valid"]
+    assert (model.frames, model.truth.frames, simulated.frames, simulated.clips) == (70, 30, 30, 1)
+    assert by_name["plain", "valid"].truth.position < 1e-6 < model.truth.position  # plain is what was written
+    assert (model.holds.stops, model.loops.clips) == (2, 2) and by_name["plain", "valid"].holds is None
+    # The training saw 'sway' and not 'slow', which is why the whole is nearer than the part.
+    assert model.poses.mean < by_name["ssilk", "flips"].poses.mean
+    assert model.clip_totals[0] <= model.total <= model.clip_totals[2]
+    text = tables(rows)
+    first = [line.split("|")[2].strip() for line in text.split("\n\n")[0].splitlines()[2:]]
+    assert first == ["valid"] * 4 + ["flips"] * 4  # the methods of a split stand together
+    assert text.count("| garment") == 6 and len({len(line) for line in text.split("\n\n")[0].splitlines()}) == 1
+
+
+def test_nothing_is_asked_for_nothing_is_computed(scene, dressed, motion, toy_model):
+    played = Playlist(clips={"sway": motion}, splits={"all": ["sway"]})
+    rows = list(
+        evaluate(dressed, [Subject("ssilk", toy_model(scene), JOINTS)], played, EvaluationOptions(stops=0, loop=0))
+    )
+    assert [row.method for row in rows] == ["plain", "ssilk"]
+    found = rows[1].figures
+    assert (found.truth, found.poses, found.holds, found.loops) == (None, None, None, None)
+
+
+def test_held_poses_come_to_rest_where_the_initialiser_is(scene, toy_motion, toy_model):
+    """A damped spring without a stepper, wherever it starts; and without a spring nothing comes back."""
+    model, clips = toy_model(scene, bound=0.0), [toy_motion(scene, 30), toy_motion(scene, 20, speed=2.0)]
+    bank = build_bank(clips, scene.character.skeleton, JOINTS, FPS, CPU)
+    with torch.no_grad():
+        model.stepper[-1].weight.zero_()
+        model.integrator.alpha.fill_(1.0)
+        model.integrator.beta.fill_(0.5)
+        model.integrator.share.fill_(3.0)
+    spans = [range(30), range(30, 50)]
+    states = roll_states(model, bank, spans, torch.tensor([0.0, -1, 0]))
+    frames, (before, now) = spread_poses(spans, states, 3)
+    assert frames.tolist() == [1, 15, 29, 31, 40, 49]
+    assert torch.equal(before[1], states[0][14]) and torch.equal(now[-1], states[1][19])
+    short, long = (rest_distance(model, bank, frames, (before, now + 0.5), seconds=s) for s in (0.1, 5.0))
+    assert short.shape == (6,) and (long < 1e-4).all() and (short > 10 * long).all()
+    with torch.no_grad():
+        model.integrator.share.fill_(-30.0)  # no spring: what is moved stays moved
+    assert (rest_distance(model, bank, frames, (now + 0.5, now + 0.5)) > 1e-3).all()
+
+
+def test_an_index_says_which_clips_are_in_which_split(tmp_path):
+    path = tmp_path / "index.json"
+    path.write_text(json.dumps([
+        {"clip": "a", "split": "train", "tags": ["inertia"]}, {"clip": "b", "split": "valid", "tags": ["inertia"]},
+        {"clip": "c", "split": "valid", "tags": []}, {"clip": "d", "split": "flips"},
+    ]))  # fmt: skip
+    index = read_index(path)
+    assert chosen(index, "train") == ["a"] and chosen(index, "inertia") == ["b"]
+    assert splits_of(index) == {"valid": ["b", "c"], "inertia": ["b"], "flips": ["d"]}
+    assert splits_of(index, ["c", "d"]) == {"valid": ["c"], "flips": ["d"]}
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{}", '[{"clip": 1, "split": "valid"}]', '[{"split": "valid"}]', '["a"]', "[3]"]
+)
+def test_a_malformed_index_is_refused(tmp_path, text):
+    (tmp_path / "index.json").write_text(text)
+    if text == "{}":
+        assert read_index(tmp_path / "index.json") == []
+        return
+    with pytest.raises(SsilkError, match=r"index.json: no index of clips .*an index is a JSON list"):
+        read_index(tmp_path / "index.json")
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        ({"sequence": 3}, "sequences of 3 frames"),
+        ({"stops": -1}, "-1 stops"),
+        ({"hold": 0.0}, "a hold of 0 s"),
+        ({"hold": math.nan}, "a hold of nan s"),
+        ({"loop": -5}, "loops of -5 frames"),
+    ],
+)
+def test_options_out_of_range_are_refused(options, complaint):
+    with pytest.raises(SsilkError, match=complaint):
+        EvaluationOptions(**options)
+
+
+def test_no_take_is_refused(dressed, motion):
+    nothing: Sequence[Take] = takes_of("short", motion.clip(0, 3), FPS)
+    with pytest.raises(SsilkError, match="none of four frames"):
+        reel_of(nothing, dressed, JOINTS)
+
+
+def test_tables_are_aligned():
+    text = aligned(["name", "value"], [["a", "1.5"], ["longer", "-20"]])
+    assert text == "| name   | value |\n| ------ | ----: |\n| a      |   1.5 |\n| longer |   -20 |\n"

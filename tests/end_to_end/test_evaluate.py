@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ssilk evaluate` on the toy world: its tables, its file, the simulator's shots beside it, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import shlex
+
+import pytest
+from pxr import Usd
+
+from ssilk_core.cli import main
+from ssilk_core.files import sha256
+
+QUICK = "--stage rigged.usda --motions clips --stops 1 --hold 0.3 --loop 1"
+INDEX = [{"clip": "brief", "split": "valid", "tags": ["inertia"]}, {"clip": "turn", "split": "flips", "tags": []}]
+
+
+@pytest.fixture
+def world(toy, tmp_path, monkeypatch):
+    toy.copy(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "clips").mkdir()
+    toy.write_clip(tmp_path / "clips" / "brief.usda", frames=12)
+    toy.write_clip(tmp_path / "clips" / "turn.usda", frames=20, fps=60.0)
+    (tmp_path / "index.json").write_text(json.dumps(INDEX))
+    return tmp_path
+
+
+def evaluated(words: str) -> int:
+    return main(["evaluate", "model.safetensors", *shlex.split(words)])
+
+
+def test_figures_by_split_are_shown_and_written(world, capsys):
+    assert evaluated(f"{QUICK} --index index.json --trained-on clip.usda -o out/figures.json") == 0
+    shown = capsys.readouterr()
+    assert shown.out.count("| garment") == 5 and shown.out.count("| ssilk ") == 15  # no simulator was named
+    document = json.loads((world / "out" / "figures.json").read_text())
+    assert document["models"] == {"model.safetensors": sha256("model.safetensors")} and document["units"] == "SI"
+    rows = {(row["method"], row["split"]): row["figures"] for row in document["figures"]}
+    assert rows.keys() == {(m, s) for m in ("plain", "ssilk") for s in ("valid", "inertia", "flips")}
+    assert rows["ssilk", "valid"] == rows["ssilk", "inertia"] and rows["ssilk", "flips"]["frames"] == 10
+    found = rows["ssilk", "valid"]
+    assert found["total"] == pytest.approx(sum(found["terms"].values())) and found["poses"]["mean"] < 0.1
+    assert {row["garment"] for row in document["figures"]} == {"Skirt"} and found["holds"]["stops"] == 1
+
+
+def test_the_simulators_shots_are_the_reference(world, capsys):
+    assert (
+        main(["simulate", "rigged.usda", "--motion", "clips/brief.usda", "--no-body", "-o", "ref/Skirt/brief.usdc"])
+        == 0
+    )
+    assert evaluated(f"{QUICK} --reference ref --json") == 0
+    event = json.loads(capsys.readouterr().out.splitlines()[-1])
+    rows = {row["method"]: row["figures"] for row in event["detail"]["figures"]}
+    assert (rows["simulator"]["frames"], rows["plain"]["frames"], rows["plain"]["truth"]["frames"]) == (12, 22, 12)
+    # The simulator minimises what is measured: it is lower than cloth that does nothing, and moves elsewhere.
+    assert rows["plain"]["truth"]["excess"] > 0 and rows["plain"]["truth"]["position"] > 0.001
+    assert rows["simulator"]["total"] == pytest.approx(rows["plain"]["truth"]["total"])
+    assert rows["simulator"]["truth"] is None
+
+
+def test_several_models_of_a_garment_share_its_table(world, capsys):
+    (world / "again.safetensors").write_bytes((world / "model.safetensors").read_bytes())
+    assert evaluated(f"again.safetensors {QUICK} --clips brief --stops 0 --loop 0") == 0
+    lines = [line.split("|")[3].strip() for line in capsys.readouterr().out.split("\n\n")[0].splitlines()[2:]]
+    assert lines == ["plain", "ssilk (model)", "ssilk (again)"]
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        ("--stage rigged.usda --motions nowhere", "nowhere: there is no such folder"),
+        (f"{QUICK} --clips brief walk", "1 clips are missing (walk)"),
+        (f"{QUICK} --index index.json --clips walk", "no clip of valid, inertia or flips is chosen"),
+        (f"{QUICK} --index model.safetensors", "no index of clips"),
+        (f"{QUICK} --reference nowhere", "nowhere: there is no such folder"),
+        (f"{QUICK} --reference wrong", "brief.usda: 60 frames per second; the model steps at 30"),
+        (f"{QUICK} --sequence 2", "sequences of 2 frames"),
+        (f"{QUICK} -o figures.txt", "not a name for figures"),
+        (f"{QUICK} -o index.json --index index.json", "output is also an input"),
+        ("--stage clip.usda --motions clips", "there is no SkelRoot"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_in_one_sentence(world, capsys, words, complaint):
+    (world / "wrong").mkdir()
+    shot = Usd.Stage.Open("shot.usda")
+    shot.SetTimeCodesPerSecond(60.0)
+    shot.Export("wrong/brief.usda")
+    assert evaluated(words) == 2
+    assert complaint in capsys.readouterr().err
