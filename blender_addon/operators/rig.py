@@ -8,14 +8,16 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, IntProperty
 
-from ..errors import need
+from ..errors import SetupError, need
 from ..outside.work import Work
 from ..preferences import interpreter, preferences, unready
 from ..scene.apply import apply_classes, apply_rig
 from ..scene.armature import need_editable, proxy_names
 from ..scene.attributes import current_classes
+from ..scene.follower import is_linked, make_follower
 from ..scene.garment import armature_of, unusable
 from ..scene.gather import gather
+from ..scene.handmade import find_edits
 from ..scene.handover import Handover, hand_over, rig_command
 from . import tasks
 
@@ -72,35 +74,61 @@ class GenerateRig(RigOperator, bpy.types.Operator):
     undo = "Generate Proxy Rig"
 
     proxies: IntProperty(name="Proxies", description="Proxy bones on the loose part", default=20, min=1, max=200)
-    replace: BoolProperty(
-        name="Replace Existing",
-        description="Remove the garment's proxies first, with what was edited on them by hand",
+    roots: IntProperty(
+        name="Roots per Cluster",
+        description="How many proxies of each connected loose part hang from the character's bones directly",
+        default=4,
+        min=1,
+        max=50,
+    )
+    keep_edits: BoolProperty(
+        name="Keep Edits by Hand",
+        description="Keep proxies that were moved, reparented or added, leave out those that were deleted, and keep "
+        "the weights of repainted vertices",
+        default=True,
     )
 
     def invoke(self, context: bpy.types.Context, _: bpy.types.Event) -> set[str]:
         """Ask for the options."""
         return context.window_manager.invoke_props_dialog(self)
 
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the options, with what there is to keep."""
+        layout = self.layout
+        for name in ("proxies", "roots", "keep_edits"):
+            layout.prop(self, name)
+        layout.label(text=edits_line(context.object))
+
     def prepare(self, context: bpy.types.Context) -> Work:
         garment = context.object
         armature, classes = armature_of(garment), current_classes(garment.data)
-        need_editable(armature)
-        old = len(proxy_names(armature, garment))
-        need(
-            self.replace or not old,
-            f"'{garment.name}' has {old} proxies already; they stay as they are unless Replace Existing is on.",
-        )
+        if not is_linked(armature):
+            need_editable(armature)
         need(classes is not None, f"'{garment.name}' has no classes; classify or paint it first.")
-        options = ("--proxies", str(self.proxies))
+        options = ("--proxies", str(self.proxies), "--rig", f"roots_per_cluster={self.roots}")
         return self.begin(context, f"Rigging '{garment.name}'", classes=True, options=options)
 
     def finish(self, context: bpy.types.Context, work: Work) -> str:
         garment, armature = self.handover.objects()
         rig = self.handover.rig(work.folder)
-        apply_rig(garment, armature, self.handover.joints, rig)
+        if is_linked(armature) and rig.names:
+            armature = make_follower(garment, armature)
+        edits = apply_rig(garment, armature, self.handover.joints, rig, keep_edits=self.keep_edits)
         if not rig.names:
             return f"Nothing of '{garment.name}' is loose; it follows '{armature.name}' without proxies."
-        return f"'{armature.name}' has {len(rig.names)} proxies for '{garment.name}'."
+        kept = f"; kept by hand: {edits.summary}" if edits.summary else ""
+        return f"'{armature.name}' has {len(proxy_names(armature, garment))} proxies for '{garment.name}'{kept}."
+
+
+def edits_line(garment: bpy.types.Object) -> str:
+    """Return one line about what was changed by hand on a garment's rig, or why it has none."""
+    try:
+        armature = armature_of(garment)
+    except SetupError as error:
+        return str(error)
+    if not proxy_names(armature, garment):
+        return f"No proxies yet on '{armature.name}'"
+    return f"By hand: {find_edits(armature, garment).summary or 'nothing'}"
 
 
 CLASSES = (Classify, GenerateRig)

@@ -4,13 +4,17 @@
 from __future__ import annotations
 
 import bpy
+import numpy as np
 
 from ..contract.arrays import Joints, Rig
+from ..contract.edits import Edits
 from ..errors import need
-from .armature import need_editable, proxy_names, replace_proxies
+from .armature import need_editable, proxy_names
 from .attributes import write_classes
 from .gather import own_weights
-from .weights import keep_plain, read_plain, write_groups
+from .handmade import MADE, find_edits, generated, remember_weights
+from .proxies import replace_proxies
+from .weights import keep_plain, read_groups, read_plain, write_groups
 
 
 def apply_classes(garment: bpy.types.Object, rig: Rig) -> None:
@@ -23,17 +27,19 @@ def apply_classes(garment: bpy.types.Object, rig: Rig) -> None:
     write_classes(garment.data, rig.classes)
 
 
-def apply_rig(garment: bpy.types.Object, armature: bpy.types.Object, joints: Joints, rig: Rig) -> None:
-    """Give a garment the proxies, weights and classes of a rig. In object mode.
+def apply_rig(
+    garment: bpy.types.Object, armature: bpy.types.Object, joints: Joints, rig: Rig, *, keep_edits: bool = True
+) -> Edits:
+    """Give a garment the proxies, weights and classes of a rig; return what was kept of the artist's. In object mode.
 
     Args:
         joints: the character's joints that the rig was made for.
+        keep_edits: whether bones and weights stay that were changed by hand.
 
     Raises:
         SetupError: the garment or the armature was edited meanwhile, or the armature cannot be edited.
     """
     _need_same(garment, rig)
-    need_editable(armature)
     lost = [name for name in joints.names if name not in armature.data.bones]
     need(not lost, f"'{armature.name}' lost {lost[:1]} while the rig was made; make it again.")
     old, names = proxy_names(armature, garment), joints.names
@@ -41,10 +47,36 @@ def apply_rig(garment: bpy.types.Object, armature: bpy.types.Object, joints: Joi
         own = own_weights(garment, joints)
         if own is not None:
             keep_plain(garment.data, own, names)
-    proxies = replace_proxies(armature, garment, joints, rig)
-    write_groups(garment, rig.weights, [*names, *proxies], old)
+    old += generated(armature, garment)  # groups stay behind where their bones were deleted
+    edits = find_edits(armature, garment) if keep_edits else Edits.none(len(rig.classes))
+    carriers = list(names)
+    if old or rig.names:
+        need_editable(armature)
+        carriers = replace_proxies(armature, garment, joints, rig, edits)
+    _give_weights(garment, armature, rig, carriers, edits.repainted, old)
     write_classes(garment.data, rig.classes)
     _bind(garment, armature)
+    return edits
+
+
+def _give_weights(
+    garment: bpy.types.Object,
+    armature: bpy.types.Object,
+    rig: Rig,
+    carriers: list[str],
+    repainted: np.ndarray,
+    old: list[str],
+) -> None:
+    """Write a rig's weights to the bones that carry them, but for vertices that were repainted."""
+    names = list(dict.fromkeys([*carriers, *proxy_names(armature, garment)]))
+    made = np.zeros((len(rig.weights), len(names)), dtype=np.float32)
+    np.add.at(made.T, [names.index(name) for name in carriers], rig.weights.T)
+    painted = read_groups(garment, garment.data, names)
+    total = painted.sum(axis=1, keepdims=True)
+    painted = np.divide(painted, total, out=made.copy(), where=total > 0)
+    write_groups(garment, np.where(repainted[:, None], painted, made), names, old)
+    bones = armature.data.bones
+    remember_weights(garment.data, made, [bones[name].get(MADE, name) for name in names])
 
 
 def _need_same(garment: bpy.types.Object, rig: Rig) -> None:

@@ -14,12 +14,10 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ..contract.arrays import Joints, Rig
+from ..contract.arrays import Joints
 from ..errors import need
 
 OWNER = "ssilk_garment"  # custom property of a bone collection: the garment object
-PALETTE = "THEME04"
-ALONE = 0.05  # how long proxies are drawn that have none above
 UNEQUAL = 1e-3  # relative difference of scales that still counts as uniform
 
 
@@ -29,7 +27,7 @@ def read_joints(armature: bpy.types.Object, garment: bpy.types.Object) -> Joints
     Raises:
         SetupError: no bone deforms, or the armature is scaled unequally or mirrored.
     """
-    owners = _owners(armature.data)
+    owners = owners_of(armature.data)
     bones = [bone for bone in armature.data.bones if bone.use_deform]  # Blender keeps parents before children
     own = [bone for bone in bones if bone.name not in owners]
     proxies = [bone for bone in bones if owners.get(bone.name) == garment]
@@ -46,47 +44,20 @@ def read_joints(armature: bpy.types.Object, garment: bpy.types.Object) -> Joints
 
 def proxy_names(armature: bpy.types.Object, garment: bpy.types.Object) -> list[str]:
     """Return the names of a garment's proxies."""
-    return [name for name, owner in _owners(armature.data).items() if owner == garment]
+    return [name for name, owner in owners_of(armature.data).items() if owner == garment]
 
 
 def need_editable(armature: bpy.types.Object) -> None:
     """Check that bones can be added.
 
     Raises:
-        SetupError: the armature is linked, overridden or cannot be reached in this view layer.
+        SetupError: the armature cannot be reached in this view layer.
     """
-    linked = armature.library or armature.data.library or armature.override_library or armature.data.override_library
-    need(not linked, f"'{armature.name}' is linked from another file; proxies need an armature of this file.")
     visible = armature.name in bpy.context.view_layer.objects and armature.visible_get()
     need(visible, f"'{armature.name}' is hidden or excluded from the view layer; show it, so that it can be edited.")
 
 
-def replace_proxies(armature: bpy.types.Object, garment: bpy.types.Object, joints: Joints, rig: Rig) -> list[str]:
-    """Put a rig's proxies in place of the garment's older ones; return the names that Blender gave them.
-
-    Args:
-        joints: the character's joints that the rig's parents count from.
-    """
-    old, to_armature = proxy_names(armature, garment), armature.matrix_world.inverted()
-    names: list[str] = []
-    with _editing(armature):
-        bones = armature.data.edit_bones
-        for name in old:
-            bones.remove(bones[name])
-        length = _length(rig)
-        for name, parent, bind in zip(rig.names, rig.parents, rig.binds):
-            bone = bones.new(name)
-            bone.tail = (0.0, length, 0.0)  # a bone without length takes no matrix
-            bone.parent = bones[[*joints.names, *names][parent]]
-            bone.matrix = _unscaled(to_armature @ Matrix(bind))
-            bone.length = length / armature.matrix_world.median_scale
-            bone.color.palette = PALETTE
-            _collection(armature.data, garment).assign(bone)
-            names.append(bone.name)
-    return names
-
-
-def _owners(armature: bpy.types.Armature) -> dict[str, object]:
+def owners_of(armature: bpy.types.Armature) -> dict[str, object]:
     """Return the garment of each proxy by the bone's name, parents first; None where the garment is gone."""
     listed = {
         bone.name: collection.get(OWNER)
@@ -101,6 +72,20 @@ def _owners(armature: bpy.types.Armature) -> dict[str, object]:
         elif bone.parent and bone.parent.name in owners:
             owners[bone.name] = owners[bone.parent.name]
     return owners
+
+
+def collection_of(armature: bpy.types.Armature, garment: bpy.types.Object) -> bpy.types.BoneCollection | None:
+    """Return the bone collection of a garment's proxies; None where it has none."""
+    return next((group for group in armature.collections_all if group.get(OWNER) == garment), None)
+
+
+def made_collection(armature: bpy.types.Armature, garment: bpy.types.Object) -> bpy.types.BoneCollection:
+    """Return the bone collection of a garment's proxies, made if there is none."""
+    collection = collection_of(armature, garment)
+    if collection is None:
+        collection = armature.collections.new(f"{garment.name} proxies")
+        collection[OWNER] = garment
+    return collection
 
 
 def _parent(bone: bpy.types.Bone, index: dict[str, int]) -> int:
@@ -120,31 +105,8 @@ def _shrunk(armature: bpy.types.Object) -> Matrix:
     return Matrix.Scale(1 / armature.matrix_world.median_scale, 4)
 
 
-def _unscaled(matrix: Matrix) -> Matrix:
-    place, turn, _ = matrix.decompose()
-    return Matrix.LocRotScale(place, turn, None)
-
-
-def _length(rig: Rig) -> float:
-    """Return how long proxies are drawn, in world units: half the mean way to the next one."""
-    places, above = rig.binds[:, :3, 3], rig.parents - (rig.weights.shape[1] - len(rig.binds))
-    chained = above >= 0
-    steps = np.linalg.norm(places[chained] - places[above[chained]], axis=1)
-    return float(steps.mean() / 2) if len(steps) else ALONE
-
-
-def _collection(armature: bpy.types.Armature, garment: bpy.types.Object) -> bpy.types.BoneCollection:
-    """Return the bone collection of a garment's proxies, made if there is none."""
-    for collection in armature.collections_all:
-        if collection.get(OWNER) == garment:
-            return collection
-    collection = armature.collections.new(f"{garment.name} proxies")
-    collection[OWNER] = garment
-    return collection
-
-
 @contextmanager
-def _editing(armature: bpy.types.Object) -> Iterator[None]:
+def editing(armature: bpy.types.Object) -> Iterator[None]:
     """Be in edit mode of an armature, from object mode, and put the active object back afterwards."""
     layer = bpy.context.view_layer
     before, selected = layer.objects.active, armature.select_get()

@@ -7,6 +7,7 @@ import bpy
 
 from ..classes import ATTRIBUTE
 from ..errors import SetupError, need
+from .follower import leader_of
 
 # Modifiers that leave points where they are, and those that may come after the armature's.
 HARMLESS = {
@@ -43,7 +44,7 @@ def armature_of(garment: bpy.types.Object) -> bpy.types.Object:
     chosen = garment.ssilk.armature or bound or above
     if chosen:
         return chosen
-    found = [thing for thing in bpy.context.scene.objects if thing.type == "ARMATURE"]
+    found = [thing for thing in bpy.context.scene.objects if thing.type == "ARMATURE" and leader_of(thing) == thing]
     names = ", ".join(f"'{thing.name}'" for thing in found)
     need(found, f"There is no armature for '{garment.name}'; a garment needs a character with bones.")
     need(len(found) == 1, f"'{garment.name}' could belong to {names}; choose its armature in the Garment panel.")
@@ -59,7 +60,8 @@ def bodies_of(garment: bpy.types.Object, armature: bpy.types.Object) -> list[bpy
     chosen = garment.ssilk.bodies
     things = chosen.all_objects if chosen else bpy.context.scene.objects
     meshes = [thing for thing in things if thing.type == "MESH" and thing != garment]
-    bound = [thing for thing in meshes if _modifier_armature(thing) == armature]
+    wearers = (armature, leader_of(armature))
+    bound = [thing for thing in meshes if _modifier_armature(thing) in wearers]
     if not chosen:
         bound = [thing for thing in bound if not is_garment(thing)]
     loose = [thing.name for thing in meshes if thing not in bound] if chosen else []

@@ -106,7 +106,7 @@ def select(bpy, thing, vertices) -> None:
 def test_filling_from_the_selection(bpy, quad):
     select(bpy, quad, [1, 2])
     assert bpy.ops.ssilk.fill_class(value="LOOSE") == {"FINISHED"}
-    from blender_addon.panels import class_counts
+    from blender_addon.panels.classes import class_counts
 
     assert class_counts(quad) == (0, 2, 2)
     bpy.ops.object.mode_set(mode="OBJECT")

@@ -177,14 +177,12 @@ def test_an_armature_that_is_placed_and_scaled_makes_no_difference(ready, classi
     assert ((proxies[:, 1] > 0.5) & (proxies[:, 1] < 1.4)).all()
 
 
-def test_a_second_rig_needs_leave_and_replaces_the_first(ready, rigged):
-    with pytest.raises(RuntimeError, match="'Skirt' has 6 proxies already"):
-        ready.ops.ssilk.generate_rig(proxies=4)
-    assert len(proxies_of(ready)) == 6
-    ready.ops.ssilk.generate_rig(proxies=4, replace=True)
-    assert len(proxies_of(ready)) == 4
-    assert set(rigged.vertex_groups.keys()) <= {*BONES, *proxies_of(ready)}
-    assert len(ready.data.objects["Rig"].data.collections_all) == 1
+def test_a_second_rig_replaces_the_first(ready, rigged):
+    for keep in (True, False):
+        ready.ops.ssilk.generate_rig(proxies=4, keep_edits=keep)
+        assert len(proxies_of(ready)) == 4
+        assert set(rigged.vertex_groups.keys()) <= {*BONES, *proxies_of(ready)}
+        assert len(ready.data.objects["Rig"].data.collections_all) == 1
 
 
 def test_a_garment_with_nothing_loose_follows_the_body(ready, skirt):
@@ -198,7 +196,7 @@ def test_a_garment_with_nothing_loose_follows_the_body(ready, skirt):
 
 def test_classes_and_rigs_are_undone(ready, rigged):
     ready.ops.ed.undo_push(message="before")
-    ready.ops.ssilk.generate_rig(proxies=4, replace=True)
+    ready.ops.ssilk.generate_rig(proxies=4, keep_edits=False)
     assert len(proxies_of(ready)) == 4
     ready.ops.ed.undo()
     assert len(proxies_of(ready)) == 6
@@ -211,9 +209,9 @@ def test_an_artists_weights_are_kept_beside_the_rig(ready, classified, ssilk_pyt
     heights = np.array([vertex.co.z for vertex in skirt.data.vertices])
     for name, inside in (("Hips", heights < 1.1), ("Spine", heights >= 1.1)):
         skirt.vertex_groups.new(name=name).add(np.flatnonzero(inside).tolist(), 1.0, "REPLACE")
-    for replace in (False, True):
-        ready.ops.ssilk.generate_rig(proxies=4, replace=replace)
-        plain = np.array(contract_of(skirt, ssilk_python, tmp_path / f"{replace}.usdc")["plain"])
+    for keep in (False, True):
+        ready.ops.ssilk.generate_rig(proxies=4, keep_edits=keep)
+        plain = np.array(contract_of(skirt, ssilk_python, tmp_path / f"{keep}.usdc")["plain"])
         np.testing.assert_allclose(plain, np.stack([heights < 1.1, heights >= 1.1, 0 * heights], axis=1), atol=1e-6)
 
 
@@ -222,7 +220,8 @@ def test_a_rig_survives_saving_and_renaming(ready, rigged, tmp_path):
     path = str(tmp_path / "a b.blend")
     ready.ops.wm.save_as_mainfile(filepath=path)
     ready.ops.wm.open_mainfile(filepath=path)
-    from blender_addon.panels import class_counts, rig_line
+    from blender_addon.panels.classes import class_counts
+    from blender_addon.panels.rig import rig_line
 
     thing = ready.data.objects["Röckchen"]
     assert rig_line(thing) == "6 proxies on 'Rig'"

@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Proxies that an artist moved, added, deleted, reparented and repainted outlive a rig that is generated anew."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
+
+from .conftest import BONES, activate
+from .test_rigging import classified, files, proxies_of, rigged, weights_of  # noqa: F401
+
+
+@pytest.fixture
+def edit(ready, rigged):  # noqa: F811
+    """A function that changes edit bones by hand, and leaves the garment active."""
+
+    def run(change):
+        armature = ready.data.objects["Rig"]
+        activate(ready, armature)
+        ready.ops.object.mode_set(mode="EDIT")
+        change(armature.data.edit_bones)
+        ready.ops.object.mode_set(mode="OBJECT")
+        activate(ready, rigged)
+
+    return run
+
+
+def edits_of(bpy, thing):
+    from blender_addon.scene.handmade import find_edits
+
+    return find_edits(bpy.data.objects["Rig"], thing)
+
+
+def heads(bpy) -> dict[str, tuple[float, ...]]:
+    return {bone.name: tuple(bone.head_local) for bone in bpy.data.objects["Rig"].data.bones}
+
+
+def parents(bpy) -> dict[str, str]:
+    return {bone.name: bone.parent.name for bone in bpy.data.objects["Rig"].data.bones if bone.parent}
+
+
+def test_a_fresh_rig_has_no_edits(ready, rigged):  # noqa: F811
+    assert edits_of(ready, rigged).summary == ""
+
+
+def test_the_same_again_is_the_same(ready, rigged):  # noqa: F811
+    places, weights = heads(ready), weights_of(rigged)
+    ready.ops.ssilk.generate_rig(proxies=6)
+    assert (heads(ready), edits_of(ready, rigged).summary) == (places, "")
+    np.testing.assert_array_equal(weights_of(rigged), weights)
+
+
+def test_what_was_moved_stays_where_it_is(ready, rigged, edit):  # noqa: F811
+    name = proxies_of(ready)[2]
+    weights = weights_of(rigged)
+
+    def move(bones):
+        for end in ("head", "tail"):
+            getattr(bones[name], end).x += 0.02
+
+    edit(move)
+    assert edits_of(ready, rigged).summary == "1 moved"
+    moved = heads(ready)
+    for _ in range(2):
+        ready.ops.ssilk.generate_rig(proxies=6)
+        assert (heads(ready), edits_of(ready, rigged).summary) == (moved, "1 moved")
+        np.testing.assert_allclose(weights_of(rigged), weights, atol=1e-6)
+    ready.ops.ssilk.generate_rig(proxies=6, keep_edits=False)
+    assert heads(ready) != moved
+
+
+def test_renaming_is_no_edit_but_stays_with_what_was_moved(ready, rigged, edit):  # noqa: F811
+    first, second = proxies_of(ready)[:2]
+
+    def rename(bones):
+        bones[first].name = "Train.L"
+        bones[second].name = "Train.R"
+        bones["Train.R"].tail.x += 0.05
+
+    edit(rename)
+    assert edits_of(ready, rigged).summary == "1 moved"
+    ready.ops.ssilk.generate_rig(proxies=6)
+    assert "Train.R" in proxies_of(ready)
+    assert "Train.R" in rigged.vertex_groups
+    assert len(proxies_of(ready)) == 6
+
+
+def test_what_was_added_stays(ready, rigged, edit):  # noqa: F811
+    above = proxies_of(ready)[1]
+
+    def add(bones):
+        bone = bones.new("Ribbon")
+        bone.head, bone.tail, bone.parent = (0.4, 0, 0.7), (0.4, 0, 0.6), bones[above]
+
+    edit(add)
+    rigged.vertex_groups.new(name="Ribbon").add([0, 1], 1.0, "ADD")
+    found = edits_of(ready, rigged)
+    assert (found.summary, found.added) == ("1 added, 2 vertices repainted", ("Ribbon",))
+    ready.ops.ssilk.generate_rig(proxies=6)
+    assert parents(ready)["Ribbon"] == above
+    assert len(proxies_of(ready)) == 7
+    painted = weights_of(rigged)[:, rigged.vertex_groups["Ribbon"].index]
+    assert (painted[:2] > 0.2).all()
+    assert not painted[2:].any()
+    assert edits_of(ready, rigged).summary == "1 added, 2 vertices repainted"
+
+
+def test_what_was_deleted_is_not_made_again(ready, rigged, edit):  # noqa: F811
+    leaf = next(name for name in proxies_of(ready) if name not in parents(ready).values())
+    edit(lambda bones: bones.remove(bones[leaf]))
+    assert edits_of(ready, rigged).summary == "1 deleted"
+    for _ in range(2):
+        ready.ops.ssilk.generate_rig(proxies=6)
+        assert leaf not in proxies_of(ready)
+        assert leaf not in rigged.vertex_groups
+        assert edits_of(ready, rigged).summary == "1 deleted"
+        np.testing.assert_allclose(weights_of(rigged).sum(axis=1), 1, atol=1e-6)
+
+
+def test_deleting_a_root_changes_nothing_on_those_below(ready, rigged, edit):  # noqa: F811
+    root = next(name for name in proxies_of(ready) if parents(ready)[name] in BONES)
+    below = [name for name, above in parents(ready).items() if above == root]
+    edit(lambda bones: bones.remove(bones[root]))
+    assert edits_of(ready, rigged).summary == "1 deleted"
+    ready.ops.ssilk.generate_rig(proxies=6)
+    assert all(parents(ready)[name] in BONES for name in below)
+
+
+def test_what_was_reparented_stays_so(ready, rigged, edit):  # noqa: F811
+    second = proxies_of(ready)[1]
+
+    def reparent(bones):
+        bones[second].parent = bones["Spine"]
+
+    edit(reparent)
+    assert edits_of(ready, rigged).summary == "1 moved"
+    ready.ops.ssilk.generate_rig(proxies=6)
+    assert parents(ready)[second] == "Spine"
+    assert len(proxies_of(ready)) == 6
+
+
+def test_a_copy_of_a_proxy_is_an_addition(ready, rigged, edit):  # noqa: F811
+    name = proxies_of(ready)[0]
+
+    def copy(bones):
+        source, bone = bones[name], bones.new("Copy")
+        bone.head, bone.tail, bone.parent = (0.4, 0, 0.7), (0.4, 0, 0.6), source
+        bone["ssilk_made"] = source["ssilk_made"]
+
+    edit(copy)
+    assert edits_of(ready, rigged).added == ("Copy",)
+
+
+def test_repainted_weights_stay(ready, rigged):  # noqa: F811
+    name = next(name for name in proxies_of(ready) if name in rigged.vertex_groups)
+    for group in rigged.vertex_groups:
+        group.remove([5, 6])
+    rigged.vertex_groups[name].add([5, 6], 1.0, "REPLACE")
+    assert edits_of(ready, rigged).summary == "2 vertices repainted"
+    before = weights_of(rigged)
+    ready.ops.ssilk.generate_rig(proxies=6)
+    column = rigged.vertex_groups[name].index
+    np.testing.assert_allclose(weights_of(rigged)[[5, 6], column], 1, atol=1e-6)
+    np.testing.assert_allclose(np.sort(weights_of(rigged)[7:]), np.sort(before[7:]), atol=1e-6)
+    assert edits_of(ready, rigged).summary == "2 vertices repainted"
+
+
+def test_subdividing_is_no_repainting(ready, rigged):  # noqa: F811
+    ready.ops.object.mode_set(mode="EDIT")
+    ready.ops.mesh.select_all(action="SELECT")
+    ready.ops.mesh.subdivide(number_cuts=1)
+    ready.ops.object.mode_set(mode="OBJECT")
+    assert len(rigged.data.vertices) > 1000
+    assert edits_of(ready, rigged).summary == ""
+
+
+def test_fewer_proxies_leave_an_edited_one_its_own(ready, rigged, edit):  # noqa: F811
+    """Where no new proxy is near, a moved one stays beside the new ones, as if it had been added."""
+    name = proxies_of(ready)[-1]
+
+    def move(bones):
+        bones[name].tail.z -= 0.03
+
+    edit(move)
+    ready.ops.ssilk.generate_rig(proxies=3)
+    assert name in proxies_of(ready)
+    assert len(proxies_of(ready)) in {3, 4}
+    np.testing.assert_allclose(weights_of(rigged).sum(axis=1), 1, atol=1e-6)
