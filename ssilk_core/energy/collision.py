@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from .. import kernels
+from .closest import closest_on_faces
 from .nearest import BLOCK, GROUP, consecutive_blocks, nearest_vertex
 from .surface_point import nearest_on_rings
 
@@ -25,12 +26,20 @@ class PosedBody:
             the nearest vertex.
         groups: the vertices in compact groups (`nearest.compact_blocks` of `nearest.GROUP`), int32; they make the
             search on a GPU fast, and change no result but which of several equally near vertices is meant.
+        faces: triangles (F, 3); with them the nearest body point is that of the whole surface (`closest`), for
+            simulating and measuring. It differs from what training sees where a triangle away from the nearest
+            vertex is nearer than those around it.
     """
 
     points: Tensor
     normals: Tensor
     rings: Tensor | None = None
     groups: Tensor | None = None
+    faces: Tensor | None = None
+
+    def picked(self, frames: Tensor) -> PosedBody:
+        """Return the body in some of the frames, indices (M,)."""
+        return replace(self, points=self.points[..., frames], normals=self.normals[..., frames])
 
 
 def gather_frames(values: Tensor, index: Tensor) -> Tensor:
@@ -54,37 +63,53 @@ def nearest_planes(x: Tensor, body: PosedBody, blocks: Tensor | None = None) -> 
         blocks: garment vertices in compact blocks (`nearest.compact_blocks` of `nearest.BLOCK`), int32; they make
             the search on a GPU fast, and change no result.
     """
-    if x.dtype == torch.float32 and kernels.available(x.device):
+    if body.faces is None and x.dtype == torch.float32 and kernels.available(x.device):
         return _by_kernels(x, body, blocks)
-    index = nearest_vertex(x, body.points)
+    index = _nearest_vertex(x, body, blocks).long()
     normal, point = gather_frames(body.normals, index), gather_frames(body.points, index)
     offset = (normal * point).sum(1)
-    if body.rings is None:
+    if body.faces is None and body.rings is None:
         return normal, offset
-    return _on_triangles(x, index, normal, offset, ((x - point) ** 2).sum(1) < FAR**2, body)
+    square = ((x - point) ** 2).sum(1)
+    if body.faces is not None:
+        found = closest_on_faces(x, square.sqrt().where(square < FAR**2, -1), body.points, body.faces)
+        return _on_triangles(normal, offset, body, *found)
+    return _on_triangles(normal, offset, body, *_around(x, index, square < FAR**2, body))
 
 
-def _by_kernels(x: Tensor, body: PosedBody, blocks: Tensor | None) -> tuple[Tensor, Tensor]:
+def _nearest_vertex(x: Tensor, body: PosedBody, blocks: Tensor | None) -> Tensor:
+    """Return the index of the nearest body vertex (V, N), int32 from the kernel and int64 elsewhere."""
+    if x.dtype != torch.float32 or not kernels.available(x.device):
+        return nearest_vertex(x, body.points)
     from ..kernels.nearest import nearest_kernel
-    from ..kernels.surface import surface_kernel
 
     blocks = consecutive_blocks(len(x), BLOCK, x.device) if blocks is None else blocks
     groups = consecutive_blocks(len(body.points), GROUP, x.device) if body.groups is None else body.groups
-    index = nearest_kernel(x, body.points, blocks, groups)
+    return nearest_kernel(x, body.points, blocks, groups)
+
+
+def _by_kernels(x: Tensor, body: PosedBody, blocks: Tensor | None) -> tuple[Tensor, Tensor]:
+    from ..kernels.surface import surface_kernel
+
+    index = _nearest_vertex(x, body, blocks)
     rings = index.new_zeros(len(body.points), 1) if body.rings is None else body.rings
     return surface_kernel(x, index, body.points, body.normals, rings, FAR)
 
 
-def _on_triangles(
-    x: Tensor, index: Tensor, normal: Tensor, offset: Tensor, near: Tensor, body: PosedBody
-) -> tuple[Tensor, Tensor]:
-    """Replace normals (V, 3, N) and offsets (V, N) by those of the nearest surface point where `near` (V, N)."""
+def _around(x: Tensor, index: Tensor, near: Tensor, body: PosedBody) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return what `closest_on_faces` does, where `near` (V, N) and of the triangles around the nearest vertex."""
     assert body.rings is not None
     row, frame = near.nonzero(as_tuple=True)
+    points = body.points.transpose(0, 1).contiguous()
+    queries = x.transpose(0, 1)[:, row, frame]
+    return row, frame, *nearest_on_rings(queries, index[row, frame], frame, points, body.rings)
+
+
+def _on_triangles(
+    normal: Tensor, offset: Tensor, body: PosedBody, row: Tensor, frame: Tensor, corners: Tensor, weights: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Replace normals (V, 3, N) and offsets (V, N) by those of points on triangles, as `closest_on_faces` gives."""
     points, normals = body.points.transpose(0, 1).contiguous(), body.normals.transpose(0, 1).contiguous()
-    corners, weights = nearest_on_rings(
-        x.transpose(0, 1)[:, row, frame], index[row, frame], frame, points, body.rings
-    )
     point = (points[:, corners, frame] * weights).sum(1)
     found = (normals[:, corners, frame] * weights).sum(1)
     found = found / found.norm(dim=0).clamp_min(1e-8)

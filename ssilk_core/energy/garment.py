@@ -12,10 +12,11 @@ from ..assets import Floats, Ints, Mesh
 from ..fabrics import Fabric
 from ..kernels.corners import elastic_tables
 from ..mesh import topology
+from ..mesh.topology import SLIVER
 from .bending import bending_energy, dihedral_angles
 from .collision import PosedBody, collision_energy, signed_distance
 from .operators import difference_operator
-from .stretch import column_weights, deformation_gradient_operator, rest_frames, stretch_density
+from .stretch import column_weights, deformation_gradient_operator, stretch_density, stretched_areas
 
 TERMS = ("stretch", "bending", "gravity", "inertia", "collision")
 """The paper's terms; drag is trained with, but not counted, so that totals compare with its."""
@@ -36,7 +37,7 @@ class GarmentEnergy:
         def tensor(values: np.ndarray) -> Tensor:
             return torch.tensor(values, dtype=dtype, device=device)
 
-        _, areas = rest_frames(mesh)
+        areas = stretched_areas(mesh)
         hinges = topology.hinges(mesh.faces) if fabric.bending else np.zeros((0, 4), dtype=np.int64)
         self.fabric = fabric
         self.area = tensor(areas)[:, None]
@@ -126,7 +127,11 @@ class GarmentEnergy:
 
 
 def _hinge_shapes(mesh: Mesh, hinges: Ints) -> Floats:
-    """Return l^2 / (8 (A_1 + A_2)) of each hinge at rest, with its edge's length and the areas beside it, (H,)."""
+    """Return l^2 / (8 (A_1 + A_2)) of each hinge at rest, with its edge's length and the areas beside it, (H,).
+
+    Faces count as high as a `SLIVER`th of the edge at least.
+    """
     x0, x1, left, right = (mesh.points[hinges[:, i]] for i in range(4))
-    areas = sum(np.linalg.norm(np.cross(x1 - x0, tip - x0), axis=1) / 2 for tip in (left, right))
-    return np.sum((x1 - x0) ** 2, axis=1) / (8 * areas)
+    squared = np.sum((x1 - x0) ** 2, axis=1)
+    doubled = [np.linalg.norm(np.cross(x1 - x0, tip - x0), axis=1) for tip in (left, right)]
+    return squared / (4 * sum(np.maximum(each, squared / SLIVER) for each in doubled))

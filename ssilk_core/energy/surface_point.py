@@ -61,7 +61,7 @@ def nearest_on_rings(
     for neighbour in rings[:, 1:].long().unbind(1):
         second, third, e1 = third, neighbour[vertex], e2
         e2 = points[:, third, frame] - origin
-        s, t, value = _closest_in_triangle(p, e1, e2)
+        s, t, value = closest_in_triangle(p, e1, e2)
         closer = value < best
         best = torch.where(closer, value, best)
         s_best, t_best = torch.where(closer, s, s_best), torch.where(closer, t, t_best)
@@ -70,7 +70,7 @@ def nearest_on_rings(
     return corners, torch.stack([1 - s_best - t_best, s_best, t_best])
 
 
-def _closest_in_triangle(p: Tensor, e1: Tensor, e2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def closest_in_triangle(p: Tensor, e1: Tensor, e2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Minimise |p - s e1 - t e2|^2 over s, t >= 0, s + t <= 1; return s, t and the minimum less |p|^2.
 
     The least of the inside, where the plane's foot lies there, and of the three edges.

@@ -29,7 +29,9 @@ class CollisionBody:
         place = np.full(body.mesh.vertex_count, -1)
         place[chosen] = np.arange(len(chosen))
         faces = place[body.mesh.faces]
-        rings = triangle_rings(faces[(faces >= 0).all(axis=1)], len(chosen))
+        faces = faces[(faces >= 0).all(axis=1)]
+        rings = triangle_rings(faces, len(chosen))
+        self.faces = torch.as_tensor(faces, device=device)
         self.rings = torch.as_tensor(rings, device=device)
         self.groups = torch.as_tensor(compact_blocks(body.mesh.points[chosen], GROUP), device=device)
         skin = SkinWeights(body.skin.path, body.skin.indices[chosen], body.skin.weights[chosen])
@@ -38,10 +40,11 @@ class CollisionBody:
         self.normals = tensor(normals)[:, :, None]
 
     @torch.no_grad()
-    def posed(self, character: Tensor, *, surface: bool = True) -> PosedBody:
+    def posed(self, character: Tensor, *, surface: bool = True, exact: bool = False) -> PosedBody:
         """Pose by skinning matrices (J, 3, 4, N); normals turn with the blended matrices.
 
-        Without `surface` only vertices are collided with.
+        Without `surface` only vertices are collided with; `exact` finds the nearest point of the whole surface.
         """
         points, normals = self.skin.surface(self.points[:, :, 0], self.normals[:, :, 0], character)
-        return PosedBody(points, normals, self.rings if surface else None, self.groups)
+        rings, faces = self.rings if surface else None, self.faces if exact else None
+        return PosedBody(points, normals, rings, self.groups, faces)

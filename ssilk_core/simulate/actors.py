@@ -109,5 +109,7 @@ class Actors:
         character = torch.as_tensor(matrices.copy(), dtype=self.dtype, device=self.rest.device)
         plain = transformed(blended(self.weights, character), self.rest)
         return Poses(
-            torch.as_tensor(root.T.copy(), device=self.rest.device), self.body.posed(character.float()), plain
+            torch.as_tensor(root.T.copy(), device=self.rest.device),
+            self.body.posed(character.float(), exact=True),
+            plain,
         )

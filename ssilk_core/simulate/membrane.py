@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ..assets import Mesh
-from ..energy.stretch import deformation_gradient_operator, rest_frames, stretch_density
+from ..energy.stretch import deformation_gradient_operator, stretch_density, stretched_areas
 from ..fabrics import Fabric
 from .blocks import adjoint
 
@@ -30,7 +30,7 @@ class Membrane:
     def __init__(self, mesh: Mesh, fabric: Fabric, device: torch.device, dtype: torch.dtype) -> None:
         self.fabric = fabric
         self.operator = deformation_gradient_operator(mesh, device, dtype)
-        self.area = torch.as_tensor(rest_frames(mesh)[1], dtype=dtype, device=device)[:, None]
+        self.area = torch.as_tensor(stretched_areas(mesh), dtype=dtype, device=device)[:, None]
 
     def energy(self, x: Tensor) -> Tensor:
         """Return the energy [J], shape (N,)."""

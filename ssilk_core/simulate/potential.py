@@ -19,7 +19,7 @@ from torch import Tensor
 
 from ..assets import PINNED, Scene
 from ..energy import GarmentEnergy
-from ..energy.collision import PosedBody, signed_distance
+from ..energy.collision import PosedBody, nearest_planes
 from ..fabrics import Fabric
 from ..mesh import topology
 from ..model.descriptors import GRAVITY
@@ -51,7 +51,7 @@ class Setting:
 
     def picked(self, frames: Tensor) -> Setting:
         """Return the setting of some of the frames, indices (M,)."""
-        body = self.body and PosedBody(self.body.points[..., frames], self.body.normals[..., frames], self.body.rings)
+        body = self.body and self.body.picked(frames)
         predicted, carried = (v if v is None else v[..., frames] for v in (self.predicted, self.carried))
         return Setting(body, self.gravity[..., frames], predicted, carried, self.dt)
 
@@ -106,15 +106,11 @@ class Potential:
         self.free = torch.as_tensor(free, device=device)
         self._hessian = Hessian(self.membrane, self.hinges, hinges, free, mesh.vertex_count)
 
-    @torch.enable_grad()
     def planes(self, x: Tensor, setting: Setting) -> Planes | None:
         """Return the planes through the body points nearest to x."""
         if setting.body is None:
             return None
-        at = x.detach().float().requires_grad_(True)
-        distance = signed_distance(at, setting.body)
-        (normal,) = torch.autograd.grad(distance.sum(), at)
-        offset = (normal * at.detach()).sum(1) - distance.detach()
+        normal, offset = nearest_planes(x.float(), setting.body)
         return Planes(normal.to(x.dtype), offset.to(x.dtype))
 
     def energy(self, x: Tensor, setting: Setting, planes: Planes | None) -> Tensor:

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The nearest point of a whole surface against trimesh's, and against the search that training uses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from ssilk_core.energy import closest
+from ssilk_core.energy.closest import closest_on_faces
+from ssilk_core.energy.collision import PosedBody, nearest_planes
+from ssilk_core.energy.surface_point import triangle_rings
+
+DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def slab(width: float = 1.0) -> trimesh.Trimesh:
+    """A flat box whose large triangles have their corners far from most of their points."""
+    return trimesh.creation.box((width, 0.1, 0.3)).subdivide()
+
+
+def body_of(*meshes: trimesh.Trimesh) -> PosedBody:
+    """The same triangles in several frames, one mesh for each, as simulating sees them."""
+    points = np.stack([mesh.vertices for mesh in meshes], axis=-1)
+    normals = np.stack([mesh.vertex_normals for mesh in meshes], axis=-1)
+    rings, faces = triangle_rings(meshes[0].faces, len(points)), np.array(meshes[0].faces)
+    tensors = [torch.as_tensor(values, dtype=torch.float32, device=DEVICE) for values in (points, normals)]
+    tables = [torch.as_tensor(values, device=DEVICE) for values in (rings, faces)]
+    return PosedBody(*tensors, rings=tables[0], faces=tables[1])
+
+
+def scattered(count: int, frames: int) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(3)
+    return (torch.rand(count, 3, frames, generator=generator) - 0.5) * torch.tensor([1.2, 0.4, 0.5])[:, None]
+
+
+@pytest.mark.parametrize("scores", [1 << 25, 1])  # all frames at once, and one after another
+def test_the_nearest_point_is_that_of_the_whole_surface(monkeypatch, scores) -> None:
+    monkeypatch.setattr(closest, "SCORES", scores)
+    meshes, x = (slab(), slab(1.1), slab(0.9)), scattered(150, 3)
+    body = body_of(*meshes)
+    reach = torch.full_like(x[:, 0], 2.0)
+    row, frame, corners, weights = closest_on_faces(x.to(DEVICE), reach.to(DEVICE), body.points, body.faces)
+    assert len(row) == 450  # each query once
+    points = (body.points[corners, :, frame] * weights[..., None]).sum(0)
+    distance = (x.to(DEVICE)[row, :, frame] - points).norm(dim=1).cpu()
+    for n, mesh in enumerate(meshes):
+        _, expected, _ = trimesh.proximity.closest_point(mesh, x[:, :, n].double().numpy())
+        own = (frame == n).cpu()
+        np.testing.assert_allclose(distance[own][row[own].cpu().argsort()], expected, atol=1e-6)
+
+
+def test_only_what_is_asked_for_is_sought() -> None:
+    x, body = scattered(40, 1).to(DEVICE), body_of(slab())
+    reach = torch.full_like(x[:, 0], 2.0)
+    reach[10:] = -1
+    row, *_ = closest_on_faces(x, reach, body.points, body.faces)
+    assert sorted(row.tolist()) == list(range(10))
+
+
+def distances(x: torch.Tensor, body: PosedBody) -> torch.Tensor:
+    normal, offset = nearest_planes(x, body)
+    return (normal * x).sum(1) - offset
+
+
+def test_it_is_the_distance_of_training_where_the_triangle_touches_the_nearest_vertex() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.2)
+    body = body_of(ball)
+    x = (scattered(400, 1) * torch.tensor([0.4, 1.2, 1.0])[:, None]).to(DEVICE)
+    torch.testing.assert_close(distances(x, body), distances(x, replace(body, faces=None)), rtol=0, atol=2e-6)
+
+
+def test_the_distance_has_no_seams() -> None:
+    # Two blades 3 cm apart with corners at different places: towards the coarse one's middle, the nearest vertex is
+    # one of the other's.
+    fine = trimesh.creation.box((0.2, 0.01, 0.2)).subdivide().subdivide().apply_translation([0, 0.03, 0])
+    coarse = trimesh.creation.box((0.2, 0.01, 0.2)).apply_translation([0, -0.005, 0])
+    body = body_of(trimesh.util.concatenate([fine, coarse]))
+    along = torch.linspace(-0.09, 0.09, 400)
+    x = torch.stack([along, torch.full_like(along, 0.005), 0.3 * along], dim=1)[..., None].to(DEVICE)
+    found, trained = distances(x, body)[:, 0], distances(x, replace(body, faces=None))[:, 0]
+    assert found.diff().abs().max() < 1e-4 < 1e-3 < trained.diff().abs().max()
