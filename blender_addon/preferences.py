@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 
 import bpy
-from bpy.props import StringProperty
+from bpy.props import BoolProperty, StringProperty
 
 from .outside.python import Handshake
 
@@ -33,6 +33,10 @@ class Preferences(bpy.types.AddonPreferences):
         description="A wheel of ssilk, or the folder of its project; an environment is made from it",
         subtype="FILE_PATH",
     )
+    stop_trainings: BoolProperty(
+        name="Stop Trainings with Blender",
+        description="End trainings when Blender closes; otherwise they go on. The best model is kept either way",
+    )
     handshake: StringProperty(description="What the Python said of itself (JSON)", options={"HIDDEN"})
 
     def draw(self, _: bpy.types.Context) -> None:
@@ -48,6 +52,7 @@ class Preferences(bpy.types.AddonPreferences):
         row = self.layout.row(align=True)
         row.prop(self, "source")
         row.operator("ssilk.create_environment", text="Create", icon="ADD")
+        self.layout.prop(self, "stop_trainings")
         draw_work(self.layout)
 
 

@@ -6,6 +6,9 @@ from __future__ import annotations
 import bpy
 from bpy.props import PointerProperty, StringProperty
 
+from . import training_properties
+from .training_properties import RELATIVE, TrainingSettings
+
 
 def _is_armature(_: object, thing: bpy.types.Object) -> bool:
     return thing.type == "ARMATURE"
@@ -28,16 +31,13 @@ class GarmentSettings(bpy.types.PropertyGroup):
     model: StringProperty(
         name="Model",
         subtype="FILE_PATH",
+        options=RELATIVE,
         description="Trained model of the garment; that of its own training when empty",
     )
-    job: StringProperty(
-        name="Training",
-        subtype="DIR_PATH",
-        description="Folder of the garment's training, relative to the blend file",
-    )
+    training: PointerProperty(type=TrainingSettings, name="Training", description="How the garment is trained")
 
 
-CLASSES = (GarmentSettings,)
+CLASSES = (*training_properties.CLASSES, GarmentSettings)
 
 
 def attach() -> None:

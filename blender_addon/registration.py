@@ -6,7 +6,8 @@ from __future__ import annotations
 import bpy
 
 from . import panels, preferences, properties
-from .operators import classes, environment, fill, rig, tasks
+from .operators import baking, classes, environment, fill, rig, tasks, training
+from .panels import plot
 
 CLASSES = (
     *properties.CLASSES,
@@ -16,6 +17,8 @@ CLASSES = (
     *classes.CLASSES,
     *fill.CLASSES,
     *rig.CLASSES,
+    *training.CLASSES,
+    *baking.CLASSES,
     *panels.CLASSES,
 )
 
@@ -25,11 +28,14 @@ def register() -> None:
     for kind in CLASSES:
         bpy.utils.register_class(kind)
     properties.attach()
+    training.start_watching()
 
 
 def unregister() -> None:
     """Stop what runs outside, then remove properties and classes in reverse."""
     tasks.stop()
+    training.stop_watching(bpy.context)
+    plot.forget()
     properties.detach()
     for kind in reversed(CLASSES):
         bpy.utils.unregister_class(kind)

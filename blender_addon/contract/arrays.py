@@ -94,6 +94,48 @@ class Rig:
     plain: np.ndarray
 
 
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """What the character's joints do, frame by frame.
+
+    Attributes:
+        worlds: joint to world, rigid, shape (F, J, 4, 4).
+        start: the first frame.
+        fps: frames per second [1/s].
+        meters_per_unit: length of one of Blender's units [m].
+    """
+
+    worlds: np.ndarray
+    start: int
+    fps: float
+    meters_per_unit: float
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """What `ssilk bake` made of a garment over a motion, F frames of it; in the joint order of an armature.
+
+    Attributes:
+        start: the first frame.
+        binds: joint to world at rest, rigid, shape (J, 4, 4).
+        rotations: each proxy to its parent, unit quaternions (w, x, y, z), shape (F, P, 4).
+        points: of the garment at rest, shape (V, 3).
+        weights: over all joints, as trained, shape (V, J).
+        shapes: names of the blendshapes, length K.
+        offsets: of each blendshape, shape (K, V, 3).
+        activations: weights of the blendshapes, shape (F, K).
+    """
+
+    start: int
+    binds: np.ndarray
+    rotations: np.ndarray
+    points: np.ndarray
+    weights: np.ndarray
+    shapes: tuple[str, ...]
+    offsets: np.ndarray
+    activations: np.ndarray
+
+
 def influences(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return joint indices and weights of each vertex, heaviest first, shape (V, I), of dense weights (V, J)."""
     width = max(int((weights > 0).sum(axis=1).max(initial=0)), 1)
@@ -107,3 +149,9 @@ def dense(indices: np.ndarray, weights: np.ndarray, joint_count: int) -> np.ndar
     matrix = np.zeros((len(indices), joint_count), dtype=np.float32)
     np.add.at(matrix, (np.arange(len(indices))[:, None], indices), weights)
     return matrix
+
+
+def to_parents(worlds: np.ndarray, parents: np.ndarray) -> np.ndarray:
+    """Return joint to parent, world for roots, of joint to world, both shape (..., J, 4, 4)."""
+    above = np.where((parents >= 0)[:, None, None], worlds[..., parents, :, :], np.eye(4))
+    return np.linalg.inv(above) @ worlds

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
-from .arrays import Dressed, Joints, Shape, influences
+from .arrays import Dressed, Joints, Shape, influences, to_parents
 from .names import identifiers, joint_paths
 
 ROOT = Sdf.Path("/Character")
@@ -47,14 +47,13 @@ def write_stage(dressed: Dressed, path: Path) -> dict[str, str]:
 
 def _define_skeleton(stage: Usd.Stage, joints: Joints) -> UsdSkel.Skeleton:
     skeleton = UsdSkel.Skeleton.Define(stage, ROOT.AppendChild("Skeleton"))
-    above = np.where((joints.parents >= 0)[:, None, None], joints.binds[joints.parents], np.eye(4))
     skeleton.CreateJointsAttr(Vt.TokenArray(joint_paths(joints.names, joints.parents)))
-    skeleton.CreateBindTransformsAttr(_matrices(joints.binds))
-    skeleton.CreateRestTransformsAttr(_matrices(np.linalg.inv(above) @ joints.binds))
+    skeleton.CreateBindTransformsAttr(matrices(joints.binds))
+    skeleton.CreateRestTransformsAttr(matrices(to_parents(joints.binds, joints.parents)))
     return skeleton
 
 
-def _matrices(transforms: np.ndarray) -> Vt.Matrix4dArray:
+def matrices(transforms: np.ndarray) -> Vt.Matrix4dArray:
     """Return column-vector transforms as USD holds them, for row vectors."""
     return Vt.Matrix4dArray.FromNumpy(np.ascontiguousarray(transforms.swapaxes(-1, -2), dtype=np.float64))
 

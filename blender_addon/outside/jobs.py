@@ -24,13 +24,11 @@ CURVE = "model.curve.json"  # what validations found, as `ssilk train` writes it
 RUNNER = Path(__file__).with_name("runner.py")
 SILENCE = 10 * BEAT  # seconds without a beat after which a runner is no more
 
-# How a process goes on when Blender and its terminal end.
+# How a process goes on when Blender and its terminal end; elsewhere a session of its own does that.
 if sys.platform == "win32":
-    DETACHED: dict[str, Any] = {
-        "creationflags": subprocess.DETACHED_PROCESS | subprocess.CREATE_NEW_PROCESS_GROUP  # type: ignore[attr-defined]
-    }
+    DETACHED = subprocess.DETACHED_PROCESS | subprocess.CREATE_NEW_PROCESS_GROUP
 else:
-    DETACHED = {"start_new_session": True}
+    DETACHED = 0
 
 
 @dataclass(frozen=True)
@@ -125,7 +123,8 @@ def _launch(python: str, folder: Path) -> None:
     try:
         subprocess.Popen(
             [python, str(RUNNER), str(folder), str(queue_folder())], cwd=folder, env=environment(),
-            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, **DETACHED,
+            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+            creationflags=DETACHED,
         )  # fmt: skip
     except OSError as error:
         raise SetupError(f"{python} cannot be started ({error.strerror or error}); choose another Python.") from error
@@ -153,8 +152,14 @@ def read_state(folder: Path) -> JobState | None:
     return state
 
 
+def stamp(folder: Path) -> float:
+    """Return when a job's state was written last; zero where there is none."""
+    path = folder / STATE
+    return path.stat().st_mtime if path.exists() else 0.0
+
+
 def read_curve(folder: Path) -> dict[str, Any]:
-    """Return the learning curve beside a job's model, {"plain": score, "points": [...]}; empty before there is one."""
+    """Return the curve beside a job's model, {"plain": score, "points": [...]}; empty before there is one."""
     return _read(folder / CURVE)
 
 

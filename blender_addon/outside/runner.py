@@ -25,9 +25,10 @@ UNLOCKED = 5.0  # seconds that a new place in the queue may be unlocked before i
 INTERRUPTED = 130  # exit code of ssilk
 
 # On Windows an interrupt reaches a whole group, so that the training needs one of its own.
-WINDOWS = sys.platform == "win32"
-NEW_GROUP = subprocess.CREATE_NEW_PROCESS_GROUP if WINDOWS else 0
-INTERRUPT = signal.CTRL_BREAK_EVENT if WINDOWS else signal.SIGINT
+if sys.platform == "win32":
+    NEW_GROUP, INTERRUPT = subprocess.CREATE_NEW_PROCESS_GROUP, signal.CTRL_BREAK_EVENT
+else:
+    NEW_GROUP, INTERRUPT = 0, signal.SIGINT
 
 
 class Record:
@@ -85,7 +86,7 @@ def place_in(folder):
         try:
             yield lambda: not any(waits(other) for other in sorted(folder.iterdir()) if other.name < own.name)
         finally:
-            if not WINDOWS:
+            if os.name != "nt":  # where an open file cannot be removed
                 own.unlink(missing_ok=True)
     own.unlink(missing_ok=True)
 
@@ -105,7 +106,7 @@ def waits(place):
 def locks(stream):
     """Return whether an open file could be locked; the lock ends with the process at the latest."""
     try:
-        if WINDOWS:
+        if sys.platform == "win32":
             import msvcrt
 
             msvcrt.locking(stream.fileno(), msvcrt.LK_NBLCK, 1)
@@ -136,8 +137,8 @@ def train(folder, record, command):
             [sys.executable, *command], cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log,
             encoding="utf-8", errors="replace", creationflags=NEW_GROUP,
         )  # fmt: skip
-    said = queue.SimpleQueue()
-    reader = threading.Thread(target=lambda: [said.put(line) for line in process.stdout], daemon=True)
+    said: queue.SimpleQueue[str] = queue.SimpleQueue()
+    reader = threading.Thread(target=pass_on, args=(process.stdout, said.put), daemon=True)
     reader.start()
     asked = False
     while process.poll() is None or reader.is_alive() or not said.empty():
@@ -148,6 +149,12 @@ def train(folder, record, command):
             record.write()
         time.sleep(LOOK)
     return process.returncode
+
+
+def pass_on(stream, take):
+    """Give every line of a stream away, until it ends."""
+    for line in stream:
+        take(line)
 
 
 def listen(said, record):

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A piece of work outside Blender: commands one after another, their progress, and how they ended."""
+"""A piece of work: steps in Blender, then commands outside it one after another; progress, and how it ended."""
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..errors import SetupError, need
 from .events import Event, parse
 from .process import Process
 
@@ -15,7 +16,7 @@ Command = Sequence[str]
 
 
 class Work:
-    """Commands in a temporary folder of their own, which goes with `close`.
+    """Steps, then commands in a temporary folder of their own, which goes with `close`.
 
     Attributes:
         title: what is being done, for people.
@@ -26,12 +27,20 @@ class Work:
         cancelled: whether `cancel` was called.
     """
 
-    def __init__(self, title: str, commands: Callable[[Path], Sequence[Command]], *, parent: str = "") -> None:
-        """Prepare the commands, given the temporary folder, and start the first one.
+    def __init__(
+        self,
+        title: str,
+        commands: Callable[[Path], Sequence[Command]],
+        *,
+        parent: str = "",
+        steps: Iterator[float] | None = None,
+    ) -> None:
+        """Prepare the steps; without any prepare the commands, given the temporary folder, and start the first one.
 
         Args:
             commands: writes what the commands read, and returns them; the folder goes if it raises.
             parent: where the folder is made; the system's place for temporary files when empty.
+            steps: are done in this process first, one in each `poll`; they yield the part that is done.
         """
         self.title, self.text, self.error = title, "", ""
         self.fraction: float | None = None
@@ -40,17 +49,21 @@ class Work:
         self._temporary = tempfile.TemporaryDirectory(prefix="ssilk-", dir=parent or None)
         self.folder = Path(self._temporary.name)
         self._process: Process | None = None
+        self._commands, self._waiting = commands, list[Command]()
+        self._steps = steps
         try:
-            self._waiting = list(commands(self.folder))
+            if steps is None:
+                self._begin()
         except BaseException:
             self.close()
             raise
-        self._start_next()
 
     def poll(self) -> bool:
-        """Take in what was said meanwhile; return whether everything has ended."""
+        """Do the next step, or take in what was said meanwhile; return whether everything has ended."""
+        if self._steps is not None:
+            self._step(self._steps)
         if self._process is None:
-            return True
+            return self._steps is None
         running = self._process.running
         for line in self._process.lines():
             self._hear(parse(line))
@@ -71,6 +84,22 @@ class Work:
             self._process.stop()
             self._process = None
         self._temporary.cleanup()
+
+    def _step(self, steps: Iterator[float]) -> None:
+        """Do the next step; after the last one start the commands."""
+        try:
+            need(not self.cancelled, f"{self.title} was cancelled.")
+            self.fraction = next(steps, None)
+            if self.fraction is None:
+                self._steps = None
+                self._begin()
+        except SetupError as error:
+            self._steps, self.error = None, str(error)
+
+    def _begin(self) -> None:
+        self._waiting = list(self._commands(self.folder))
+        if self._waiting:
+            self._start_next()
 
     def _hear(self, event: Event) -> None:
         self.text = event.text or self.text

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+from .baking import BakingPanel
 from .classes import ClassesPanel
 from .garment import GarmentPanel
 from .rig import RigPanel
+from .training import TrainingPanel
 
-CLASSES = (GarmentPanel, ClassesPanel, RigPanel)  # in the order of the sidebar
+CLASSES = (GarmentPanel, ClassesPanel, RigPanel, TrainingPanel, BakingPanel)  # in the order of the sidebar

@@ -13,7 +13,8 @@ from ..outside.jobs import MODEL
 
 def job_of(garment: bpy.types.Object) -> Path | None:
     """Return the folder of a garment's training; None where it has none."""
-    return Path(bpy.path.abspath(garment.ssilk.job)) if garment.ssilk.job else None
+    folder = garment.ssilk.training.folder
+    return Path(bpy.path.abspath(folder)) if folder else None
 
 
 def model_of(garment: bpy.types.Object) -> Path:
@@ -28,3 +29,8 @@ def model_of(garment: bpy.types.Object) -> Path:
     todo = "choose another" if chosen else "wait for the training's first validation, or resume it"
     need(path.is_file(), f"'{garment.name}' has no model at {path}; {todo}.")
     return path
+
+
+def relative(path: Path) -> str:
+    """Return a path as the blend file should remember it: relative to itself where it has a place."""
+    return bpy.path.relpath(str(path)) if bpy.data.filepath else str(path)

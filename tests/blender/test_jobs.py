@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
+
 from blender_addon.errors import SetupError
 from blender_addon.outside import jobs
 

@@ -105,8 +105,8 @@ def test_work_shows_its_progress_and_a_way_out(bpy, skirt, monkeypatch):
 def test_preferences_show_the_python(bpy):
     from blender_addon.preferences import Preferences
 
-    notes = drawn(Preferences, bpy.context, python="", source="", handshake="")
+    notes = drawn(Preferences, bpy.context, python="", source="", handshake="", stop_trainings=False)
     assert notes == [
         "python", "ssilk.find_python", "ssilk.check_python", "No Python with ssilk is chosen", "source",
-        "ssilk.create_environment",
+        "ssilk.create_environment", "stop_trainings",
     ]  # fmt: skip

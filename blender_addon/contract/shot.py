@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The shot that `ssilk bake` wrote: bones and shapes of a garment, frame by frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from pxr import Usd, UsdGeom, UsdSkel
+
+from ..errors import need
+from .arrays import Joints, Shot, dense
+from .names import joint_paths
+from .write import CLASS
+
+
+def read_shot(path: Path, joints: Joints) -> Shot:
+    """Read a baked garment.
+
+    Args:
+        path: what was baked from a stage of `write_stage`.
+        joints: of the armature now, proxies included.
+
+    Raises:
+        SetupError: the armature has other joints than the shot.
+    """
+    stage = Usd.Stage.Open(str(path))
+    mesh = next(prim for prim in stage.Traverse() if prim.HasAttribute(CLASS))
+    skeleton, skinning = _queries(mesh)
+    order = [str(name) for name in skeleton.GetJointOrder()]
+    _need_same_joints(order, joints)
+    joint = [order.index(name) for name in joint_paths(joints.names, joints.parents)]
+    times = np.arange(stage.GetStartTimeCode(), stage.GetEndTimeCode() + 1)
+    shapes = tuple(str(name) for name in UsdSkel.BindingAPI(mesh).GetBlendShapesAttr().Get() or ())
+    points = np.array(UsdGeom.Mesh(mesh).GetPointsAttr().Get())
+    return Shot(
+        start=int(times[0]),
+        binds=np.array(skeleton.GetJointWorldBindTransforms()).swapaxes(-1, -2)[joint],
+        rotations=_rotations(skeleton.GetAnimQuery(), order, times)[:, joint[joints.character_count :]],
+        points=points,
+        weights=_weights(skinning, order)[:, joint],
+        shapes=shapes,
+        offsets=_offsets(mesh, len(shapes), len(points)),
+        activations=_activations(skeleton.GetAnimQuery(), shapes, times),
+    )
+
+
+def _queries(mesh: Usd.Prim) -> tuple[UsdSkel.SkeletonQuery, UsdSkel.SkinningQuery]:
+    cache, root = UsdSkel.Cache(), UsdSkel.Root.Find(mesh)
+    cache.Populate(root, Usd.PrimDefaultPredicate)
+    skeleton = UsdSkel.BindingAPI(mesh).GetInheritedSkeleton()
+    return cache.GetSkelQuery(skeleton), cache.GetSkinningQuery(mesh)
+
+
+def _need_same_joints(order: list[str], joints: Joints) -> None:
+    own = joint_paths(joints.names, joints.parents)
+    odd = [name for name in (*order, *own) if (name in order) != (name in own)]
+    need(
+        not odd,
+        f"the bones are not those that it was trained with ('{odd[0].rpartition('/')[2] if odd else ''}' was added, "
+        "removed, renamed or has another parent); undo that, or train again.",
+    )
+
+
+def _rotations(animation: UsdSkel.AnimQuery, order: list[str], times: np.ndarray) -> np.ndarray:
+    """Return the rotations of all joints to their parents, shape (F, J, 4), as (w, x, y, z)."""
+    animated = [str(name) for name in animation.GetJointOrder()]
+    columns = [animated.index(name) for name in order]
+    turns = [np.array(animation.ComputeJointLocalTransformComponents(time)[1])[columns] for time in times]
+    return np.roll(np.array(turns, dtype=np.float64), 1, axis=-1)  # pxr gives (x, y, z, w)
+
+
+def _weights(skinning: UsdSkel.SkinningQuery, order: list[str]) -> np.ndarray:
+    """Return dense weights over the skeleton's joints."""
+    own = skinning.GetJointOrder() or order
+    to_skeleton = np.array([order.index(str(name)) for name in own])
+    width = skinning.GetNumInfluencesPerComponent()
+    indices, weights = (np.array(values).reshape(-1, width) for values in skinning.ComputeJointInfluences())
+    return dense(to_skeleton[indices], weights, len(order))
+
+
+def _offsets(mesh: Usd.Prim, shape_count: int, point_count: int) -> np.ndarray:
+    offsets = np.zeros((shape_count, point_count, 3))
+    for row, path in zip(offsets, UsdSkel.BindingAPI(mesh).GetBlendShapeTargetsRel().GetTargets()):
+        shape = UsdSkel.BlendShape(mesh.GetStage().GetPrimAtPath(path))
+        moved = shape.GetPointIndicesAttr().Get()
+        row[np.array(moved) if moved else slice(None)] = np.array(shape.GetOffsetsAttr().Get())
+    return offsets
+
+
+def _activations(animation: UsdSkel.AnimQuery, shapes: tuple[str, ...], times: np.ndarray) -> np.ndarray:
+    if not shapes:
+        return np.zeros((len(times), 0))
+    animated = [str(name) for name in animation.GetBlendShapeOrder()]
+    columns = [animated.index(name) for name in shapes]
+    return np.array([animation.ComputeBlendShapeWeights(time) for time in times])[:, columns]

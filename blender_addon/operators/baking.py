@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Baking a trained garment onto the timeline, to USD, or both."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import bpy
+from bpy.props import BoolProperty, FloatProperty, StringProperty
+
+from ..contract.arrays import Dressed
+from ..errors import SetupError, need
+from ..outside.work import Work
+from ..preferences import interpreter, preferences, unready
+from ..scene.armature import read_joints
+from ..scene.baked import apply_shot, has_bake, need_bakeable, remove_bake
+from ..scene.garment import armature_of, unusable
+from ..scene.gather import character_joints, gather
+from ..scene.handover import STAGE, hand_over
+from ..scene.models import model_of
+from ..scene.motions import TIMELINE, Source
+from ..scene.objects import found_again
+from ..scene.sampling import Take, prepare_takes, sample
+from . import tasks
+from .reporting import ReportingOperator
+
+INPUTS, MOTION, SHOT = "bake", "motion.usdc", "shot.usdc"  # folder of a bake's inputs beside the model; files
+
+
+class Bake(tasks.OutsideOperator, bpy.types.Operator):
+    """Bake the trained garment over the scene's frames, as bones and shape keys; what was baked before is replaced"""
+
+    bl_idname = "ssilk.bake"
+    bl_label = "Bake"
+    undo = "Bake"
+
+    to_timeline: BoolProperty(
+        name="To Timeline", description="Put keys on the proxies and on shape keys of the garment", default=True
+    )
+    to_usd: BoolProperty(name="To USD", description="Write a UsdSkel shot, with the body")
+    filepath: StringProperty(
+        name="USD File", description="Shot to write; named like the garment, beside the blend file, when empty",
+        subtype="FILE_PATH",
+    )  # fmt: skip
+    pre_roll: FloatProperty(
+        name="Pre-Roll",
+        description="How long the garment settles in the first pose before the first frame",
+        default=1.0,
+        min=0.0,
+        max=60.0,
+        subtype="TIME_ABSOLUTE",
+        unit="TIME_ABSOLUTE",
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        reason = tasks.busy() or unusable(context.object) or unready(context)
+        reason = reason or ("" if context.mode == "OBJECT" else "Go to Object Mode")
+        cls.poll_message_set(reason)
+        return not reason
+
+    def invoke(self, context: bpy.types.Context, _: bpy.types.Event) -> set[str]:
+        """Ask for the options."""
+        return context.window_manager.invoke_props_dialog(self)
+
+    def prepare(self, context: bpy.types.Context) -> Work:
+        garment = context.object
+        need(self.to_timeline or self.to_usd, "Choose where to bake to: the timeline, USD, or both.")
+        self.model, armature = model_of(garment), armature_of(garment)
+        self.dressed = gather(garment)
+        need_bakeable(garment, armature, self.dressed.joints)
+        (self.take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
+        self.uids = (garment.session_uid, armature.session_uid)
+        self.shot = usd_path(garment, self.filepath) if self.to_usd else None
+        self.python = interpreter(preferences(context))
+        joints = character_joints(self.dressed.joints)
+        return Work(f"Baking '{garment.name}'", self.commands, parent=bpy.app.tempdir,
+                    steps=sample(armature, joints, [self.take]))  # fmt: skip
+
+    def commands(self, folder: Path) -> list[list[str]]:
+        """Write what is baked from; return the command."""
+        inputs = write_inputs(self.model.parent / INPUTS, self.dressed, self.take, self.things())
+        self.shot = self.shot or folder / SHOT
+        options = ("--pre-roll", f"{self.pre_roll:g}") if self.pre_roll else ()
+        return [
+            [
+                self.python, "-m", "ssilk_core", "bake", str(self.model), "--stage", str(inputs / STAGE),
+                "--motion", str(inputs / MOTION), "-o", str(self.shot), "--json", *options,
+            ]
+        ]  # fmt: skip
+
+    def things(self) -> tuple[bpy.types.Object, bpy.types.Object]:
+        """Return the garment and its armature; raise `SetupError` if one was deleted."""
+        garment, armature = (found_again(uid, self.dressed.garment.name) for uid in self.uids)
+        return garment, armature
+
+    def finish(self, context: bpy.types.Context, work: Work) -> str:
+        if self.to_timeline:
+            from ..contract.shot import read_shot
+
+            garment, armature = self.things()
+            joints = read_joints(armature, garment)
+            need_bakeable(garment, armature, joints)
+            apply_shot(garment, armature, joints, read_shot(self.shot, joints))
+        where = [f"frames {self.take.frames[0]} to {self.take.frames[-1]}"] if self.to_timeline else []
+        where += [str(self.shot)] if self.to_usd else []
+        return f"'{self.dressed.garment.name}' is baked: {' and '.join(where)}."
+
+
+class RemoveBake(ReportingOperator, bpy.types.Operator):
+    """Remove the keys and shape keys that were baked; the weights stay as trained"""
+
+    bl_idname = "ssilk.remove_bake"
+    bl_label = "Remove Bake"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        reason = unusable(context.object) or ("" if context.mode == "OBJECT" else "Go to Object Mode")
+        if not reason and not has_bake(context.object):
+            reason = f"Nothing was baked for '{context.object.name}'"
+        cls.poll_message_set(reason)
+        return not reason
+
+    def apply(self, context: bpy.types.Context) -> str:
+        garment = context.object
+        remove_bake(garment, armature_of(garment))
+        return f"What was baked for '{garment.name}' is gone."
+
+
+def usd_path(garment: bpy.types.Object, chosen: str) -> Path:
+    """Return where a shot goes.
+
+    Raises:
+        SetupError: nothing was chosen, and the blend file has no place yet.
+    """
+    need(chosen or bpy.data.filepath, "Save the file first, or choose a USD file.")
+    path = Path(bpy.path.abspath(chosen or f"//{bpy.path.clean_name(garment.name)}.usdc"))
+    allowed = path.suffix in (".usd", ".usda", ".usdc")
+    need(allowed, f"'{path.name}' is no name for a shot; it ends in .usdc, .usd or .usda.")
+    return path
+
+
+def write_inputs(
+    folder: Path, dressed: Dressed, take: Take, things: tuple[bpy.types.Object, bpy.types.Object]
+) -> Path:
+    """Write the character and its motion beside the model, from where shots say they were baked; return the folder.
+
+    Raises:
+        SetupError: nothing can be written there.
+    """
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise SetupError(f"{folder} cannot be made ({error.strerror or error}); move the model.") from error
+    need(os.access(folder, os.W_OK), f"Nothing can be written into {folder}; move the model.")
+    hand_over(dressed, *things, folder)
+    from ..contract.motion import write_motion
+
+    write_motion(folder / MOTION, character_joints(dressed.joints), take.motion())
+    return folder
+
+
+CLASSES = (Bake, RemoveBake)

@@ -1,0 +1,291 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Training a garment: choosing motions, starting, cancelling, going on."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import bpy
+from bpy.props import CollectionProperty, IntProperty, StringProperty
+
+from ..classes import LOOSE
+from ..contract.arrays import Dressed
+from ..contract.names import identifiers
+from ..errors import need
+from ..outside import jobs
+from ..outside.work import Work
+from ..preferences import interpreter, preferences, unready
+from ..scene.baked import need_bakeable
+from ..scene.garment import armature_of, unusable
+from ..scene.gather import character_joints, gather
+from ..scene.handover import STAGE, expose_usd, hand_over
+from ..scene.models import job_of, relative
+from ..scene.motions import FILE, Source, sources
+from ..scene.objects import found_again
+from ..scene.sampling import Take, prepare_takes, sample
+from . import tasks
+from .reporting import ReportingOperator
+
+MOTIONS = "motions"  # folder of the sampled motions, in that of the job
+LOOK = 1.0  # seconds between two looks at trainings
+begun: set[Path] = set()  # folders of trainings that this session of Blender began
+
+
+class MotionOperator(ReportingOperator):
+    """Base of operators on the list of motions."""
+
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        reason = unusable(context.object)
+        cls.poll_message_set(reason)
+        return not reason
+
+
+class FindMotions(MotionOperator, bpy.types.Operator):
+    """List what the armature plays: the timeline, its actions, its NLA strips; what was chosen stays chosen"""
+
+    bl_idname = "ssilk.find_motions"
+    bl_label = "Find Motions"
+
+    def apply(self, context: bpy.types.Context) -> str:
+        garment = context.object
+        found = sources(armature_of(garment))
+        motions = garment.ssilk.training.motions
+        used = {(item.kind, item.name, item.track): item.use for item in motions}
+        files = [item.name for item in motions if item.kind == FILE]
+        motions.clear()
+        for source in (*found, *(Source(FILE, path) for path in files)):
+            key = (source.kind, source.name, source.track)
+            add_motion(garment, source).use = used.get(key, source.kind != "TIMELINE" or len(found) == 1)
+        return f"'{armature_of(garment).name}' has {len(found) - 1} motions besides the timeline."
+
+
+class AddMotionFiles(MotionOperator, bpy.types.Operator):
+    """Train on animations of this skeleton in USD files, too"""
+
+    bl_idname = "ssilk.add_motion_files"
+    bl_label = "Add Motion Files"
+
+    directory: StringProperty(subtype="DIR_PATH", description="Folder of the files")
+    files: CollectionProperty(type=bpy.types.OperatorFileListElement, description="The files' names")
+    filter_glob: StringProperty(default="*.usd;*.usda;*.usdc", options={"HIDDEN"}, description="What is listed")
+
+    def invoke(self, context: bpy.types.Context, _: bpy.types.Event) -> set[str]:
+        """Ask for the files."""
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def apply(self, context: bpy.types.Context) -> str:
+        garment = context.object
+        listed = {item.name for item in garment.ssilk.training.motions if item.kind == FILE}
+        for file in self.files:
+            path = relative(Path(self.directory, file.name))
+            need(Path(bpy.path.abspath(path)).is_file(), f"There is no file {path}; choose a USD file.")
+            if path not in listed:
+                add_motion(garment, Source(FILE, path))
+        return ""
+
+
+class RemoveMotion(MotionOperator, bpy.types.Operator):
+    """Take this motion off the list"""
+
+    bl_idname = "ssilk.remove_motion"
+    bl_label = "Remove Motion"
+
+    index: IntProperty(description="Place in the list", min=0)
+
+    def apply(self, context: bpy.types.Context) -> str:
+        motions = context.object.ssilk.training.motions
+        need(self.index < len(motions), f"There are only {len(motions)} motions.")
+        motions.remove(self.index)
+        return ""
+
+
+class Train(tasks.OutsideOperator, bpy.types.Operator):
+    """Train the garment on the chosen motions, outside Blender: it goes on when Blender closes"""
+
+    bl_idname = "ssilk.train"
+    bl_label = "Train"
+    undo = "Train"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        reason = tasks.busy() or unusable(context.object) or unready(context)
+        if not reason and context.mode != "OBJECT":
+            reason = "Go to Object Mode"
+        if not reason and not bpy.data.filepath:
+            reason = "Save the file first; the training lies beside it"
+        cls.poll_message_set(reason)
+        return not reason
+
+    def prepare(self, context: bpy.types.Context) -> Work:
+        garment = context.object
+        armature, settings, folder = armature_of(garment), garment.ssilk.training, job_of(garment)
+        running = folder and jobs.read_state(folder)
+        need(not (running and running.alive), f"'{garment.name}' is being trained already; cancel that first.")
+        chosen = [item for item in settings.motions if item.use]
+        need(chosen, f"No motion is chosen for '{garment.name}'; find motions, or add files of motions.")
+        self.dressed = gather(garment)
+        need_trainable(garment, armature, self.dressed)
+        self.takes = prepare_takes(armature, [source_of(item) for item in chosen if item.kind != FILE])
+        self.files = [Path(bpy.path.abspath(item.name)) for item in chosen if item.kind == FILE]
+        self.uids = (garment.session_uid, armature.session_uid)
+        joints = character_joints(self.dressed.joints)
+        return Work(f"Sampling motions for '{garment.name}'", lambda _: (), parent=bpy.app.tempdir,
+                    steps=sample(armature, joints, self.takes))  # fmt: skip
+
+    def finish(self, context: bpy.types.Context, _: Work) -> str:
+        name = self.dressed.garment.name
+        garment, armature = (found_again(uid, name) for uid in self.uids)
+        folder = jobs.create(Path(bpy.data.filepath).parent / "ssilk", identifiers([name])[0])
+        prim = hand_over(self.dressed, garment, armature, folder).prims[name]
+        write_takes(folder / MOTIONS, self.dressed, self.takes)
+        command = train_command(garment, prim, self.takes, [beside(path, folder) for path in self.files])
+        jobs.begin(interpreter(preferences(context)), folder, command)
+        begun.add(folder)
+        garment.ssilk.training.folder = relative(folder)
+        return f"The training of '{name}' began; it lies in {folder}."
+
+
+class JobOperator(ReportingOperator):
+    """Base of operators on the garment's training."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        reason = unusable(context.object)
+        if not reason:
+            folder = job_of(context.object)
+            state = folder and jobs.read_state(folder)
+            reason = cls.refusal(context, state) if state else f"'{context.object.name}' is not being trained"
+        cls.poll_message_set(reason)
+        return not reason
+
+    @classmethod
+    def refusal(cls, context: bpy.types.Context, state: jobs.JobState) -> str:
+        """Return why nothing can be done with a training in this state; empty if something can."""
+        raise NotImplementedError
+
+
+class CancelTraining(JobOperator, bpy.types.Operator):
+    """End the training; its best model is kept, and it can go on from where it is"""
+
+    bl_idname = "ssilk.cancel_training"
+    bl_label = "Cancel Training"
+
+    @classmethod
+    def refusal(cls, context: bpy.types.Context, state: jobs.JobState) -> str:
+        return "" if state.alive else f"The training of '{context.object.name}' has ended"
+
+    def apply(self, context: bpy.types.Context) -> str:
+        jobs.cancel(job_of(context.object))
+        return f"The training of '{context.object.name}' ends after its current step."
+
+
+class ResumeTraining(JobOperator, bpy.types.Operator):
+    """Let the training go on from where it ended"""
+
+    bl_idname = "ssilk.resume_training"
+    bl_label = "Resume Training"
+
+    @classmethod
+    def refusal(cls, context: bpy.types.Context, state: jobs.JobState) -> str:
+        if state.alive or state.state == "done":
+            return f"The training of '{context.object.name}' {'still runs' if state.alive else 'is complete'}"
+        return unready(context)
+
+    def apply(self, context: bpy.types.Context) -> str:
+        folder = job_of(context.object)
+        jobs.resume(interpreter(preferences(context)), folder)
+        begun.add(folder)
+        return f"The training of '{context.object.name}' goes on."
+
+
+def add_motion(garment: bpy.types.Object, source: Source) -> bpy.types.PropertyGroup:
+    """Put a motion at the end of a garment's list; return it."""
+    item = garment.ssilk.training.motions.add()
+    item.kind, item.name, item.track = source.kind, source.name, source.track
+    return item
+
+
+def source_of(item: bpy.types.PropertyGroup) -> Source:
+    """Return what an item of the list of motions stands for."""
+    return Source(item.kind, item.name, item.track)
+
+
+def need_trainable(garment: bpy.types.Object, armature: bpy.types.Object, dressed: Dressed) -> None:
+    """Check that a garment is complete, and that Blender will show what is trained.
+
+    Raises:
+        SetupError: it is not; the sentence says what is missing.
+    """
+    need(dressed.classes is not None, f"'{garment.name}' has no classes; classify or paint it first.")
+    rigged = dressed.joints.proxy_count or not (dressed.classes == LOOSE).any()
+    need(rigged, f"'{garment.name}' is loose but has no proxies; generate its rig first.")
+    need_bakeable(garment, armature, dressed.joints)
+
+
+def write_takes(folder: Path, dressed: Dressed, takes: Sequence[Take]) -> None:
+    """Write sampled motions into a new folder, a file each."""
+    expose_usd()
+    from ..contract.motion import write_motion
+
+    folder.mkdir()
+    for name, take in zip(file_names(takes), takes):
+        write_motion(folder / name, character_joints(dressed.joints), take.motion())
+
+
+def file_names(takes: Sequence[Take]) -> list[str]:
+    """Return a name for the file of each take."""
+    return [f"{name}.usdc" for name in identifiers(take.source.name for take in takes)]
+
+
+def train_command(garment: bpy.types.Object, prim: str, takes: Sequence[Take], files: Sequence[str]) -> list[str]:
+    """Return the arguments of the Python that has ssilk, for its folder of the job."""
+    settings = garment.ssilk.training
+    motions = [*(f"{MOTIONS}/{name}" for name in file_names(takes)), *files]
+    budget = ["--set", f"iterations={settings.iterations}"] if settings.iterations else []
+    return [
+        "-m", "ssilk_core", "train", STAGE, "--garment", prim, "--motions", *motions, "-o", jobs.MODEL,
+        "--preset", settings.preset, *budget, "--json",
+    ]  # fmt: skip
+
+
+def beside(path: Path, folder: Path) -> str:
+    """Return a path as seen from a folder, so that both may be moved together; as it is from another drive."""
+    try:
+        return os.path.relpath(path, folder)
+    except ValueError:
+        return str(path)
+
+
+def watch() -> float:
+    """Draw panels again where a training went on; return when to look next [s]."""
+    from ..panels.training import changed
+
+    garments = [thing for thing in bpy.data.objects if thing.type == "MESH" and thing.ssilk.training.folder]
+    if sum(changed(garment) for garment in garments):
+        tasks.redraw(bpy.context)
+    return LOOK
+
+
+def start_watching() -> None:
+    """Look at trainings from now on, whatever file is open."""
+    bpy.app.timers.register(watch, first_interval=LOOK, persistent=True)
+
+
+def stop_watching(context: bpy.types.Context) -> None:
+    """Look no more; end what this session began, if the preferences ask for it."""
+    if bpy.app.timers.is_registered(watch):
+        bpy.app.timers.unregister(watch)
+    if preferences(context).stop_trainings:
+        for folder in begun:
+            if folder.exists():
+                jobs.cancel(folder)
+    begun.clear()
+
+
+CLASSES = (FindMotions, AddMotionFiles, RemoveMotion, Train, CancelTraining, ResumeTraining)

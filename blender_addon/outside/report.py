@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a training's state and learning curve mean, in lines for people; the standard library alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from .jobs import JobState
+
+NO_DYNAMICS = 2e-3  # [m]; a garment that moves less of its own has learned no dynamics, as ssilk has it
+
+ENDED = {
+    "done": "Trained for {total} iterations",
+    "stopped": "Stopped at {done} of {total}; it can be resumed",
+    "lost": "Ended without a word at {done} of {total}, perhaps with the machine; resume it",
+    "waiting": "Waits until the trainings before it have ended",
+}
+
+
+def progress(state: JobState) -> str:
+    """Return how far a training is."""
+    if state.state == "failed":
+        return state.error
+    if state.state in ENDED:
+        return ENDED[state.state].format(done=state.done, total=state.total)
+    if not state.total:
+        return "Prepares the training"
+    left = "" if state.seconds_left is None else f", {duration(state.seconds_left)} left"
+    return f"{state.done} of {state.total}{left}"
+
+
+def findings(state: JobState, curve: Mapping[str, Any], *, moves: bool) -> list[tuple[str, bool]]:
+    """Return what validations found so far, each line with whether it is a warning.
+
+    Args:
+        curve: what `read_curve` returns.
+        moves: whether the garment has proxies, and so should learn to move by itself.
+    """
+    if not curve.get("points"):
+        return [("No validation yet: too early to say what is being learned", False)] if state.alive else []
+    score, plain = curve["points"][-1]["validation"], curve["plain"]
+    share = 1 - score["total"] / plain["total"]
+    found = [
+        (f"{abs(share):.0%} {'less' if share >= 0 else 'more'} energy than plain skinning", share < 0),
+        (f"{score['collisions']:.2%} of the vertices inside the body", False),
+    ]
+    if moves:
+        found.append(dynamics(score["dynamics"]))
+    if state.checkpoint is not None:
+        found.append((f"Best model: from iteration {state.checkpoint}; bake to see it on your shot", False))
+    return found
+
+
+def dynamics(moved: float) -> tuple[str, bool]:
+    """Return whether dynamics are being learned.
+
+    Args:
+        moved: how far the garment is from hanging still, in the mean [m].
+    """
+    if moved < NO_DYNAMICS:
+        return ("Nothing dynamic is being learned: check that the motions move", True)
+    return (f"Dynamics are being learned: {moved * 1000:.0f} mm of motion of its own", False)
+
+
+def duration(seconds: float) -> str:
+    """Return a duration as people say it: "42 s", "3 min 05 s", "2 h 10 min"."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"

@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Baking: the model, and putting it on the timeline."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..errors import SetupError
+from ..scene.garment import unusable
+from ..scene.models import model_of
+from .base import Panel
+
+
+def model_line(garment: bpy.types.Object) -> str:
+    """Return which model is baked, or why there is none."""
+    try:
+        return f"Bakes {bpy.path.relpath(str(model_of(garment)))}"
+    except SetupError as error:
+        return str(error)
+
+
+class BakingPanel(Panel, bpy.types.Panel):
+    bl_idname = "SSILK_PT_baking"
+    bl_label = "Baking"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return not unusable(context.object)
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.prop(context.object.ssilk, "model")
+        layout.label(text=model_line(context.object))
+        layout.operator("ssilk.bake", icon="REC")
+        layout.operator("ssilk.remove_bake", icon="TRASH")

@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A baked shot becomes weights, shape keys and keys on a garment and its proxies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from ..contract.arrays import Joints, Shot, to_parents
+from ..errors import need
+from .armature import proxy_names
+from .keys import Channel, bake_keys, is_baked, need_tracks, remove_keys
+from .shapes import need_relative, remove_shapes, rest_points, write_shapes
+from .weights import write_groups
+
+MOVED = 1e-4  # how far rest points may be from those that were trained on, as a share of the garment's size
+TURNED = 1e-3  # how far the axes and places of bones may be
+
+
+def need_bakeable(garment: bpy.types.Object, armature: bpy.types.Object, joints: Joints) -> None:
+    """Check that Blender will deform a garment as ssilk does.
+
+    Raises:
+        SetupError: an option of the modifier, of a bone, of shape keys or of NLA tracks is in the way.
+    """
+    need_relative(garment)
+    need_tracks(animated(garment, armature))
+    _need_linear(garment, armature)
+    names = joints.names
+    for name, parent in list(zip(names, joints.parents))[joints.character_count :]:
+        bone = armature.data.bones[name]
+        above = bone.parent.name if bone.parent else ""
+        need(
+            parent >= 0 and above == names[parent],
+            f"The proxy '{name}' hangs on '{above}', which does not deform; give it a parent that does.",
+        )
+        need(bone.use_inherit_rotation, f"The proxy '{name}' does not inherit rotation; switch that on.")
+    bent = next((name for name in names if armature.data.bones[name].bbone_segments > 1), None)
+    need(not bent, f"The bone '{bent}' bends (B-Bone segments); a garment follows stiff bones only.")
+
+
+def animated(garment: bpy.types.Object, armature: bpy.types.Object) -> list[object]:
+    """Return what a bake animates: the armature, and the garment's shape keys where it has any."""
+    keys = garment.data.shape_keys
+    return [armature, keys] if keys else [armature]
+
+
+def apply_shot(garment: bpy.types.Object, armature: bpy.types.Object, joints: Joints, shot: Shot) -> None:
+    """Put a shot in place of what was baked for a garment before. In object mode.
+
+    Args:
+        joints: of the armature, as `read_joints` returns them.
+
+    Raises:
+        SetupError: garment or bones are not those that it was trained with.
+    """
+    _need_same_binds(armature, joints, shot)
+    _need_same_points(garment, shot)
+    own = np.linalg.inv(np.array(garment.matrix_world)[:3, :3])
+    shapes = write_shapes(garment, shot.offsets @ own.T, shot.shapes)
+    write_groups(garment, shot.weights, joints.names, ())
+    proxies = joints.names[joints.character_count :]
+    _free(armature, proxies)
+    keys = garment.data.shape_keys
+    moved = [(armature, _turns(joints, shot)), (keys, _activations(shapes, shot))]
+    bake_keys(garment, shot.start, [(thing, channels) for thing, channels in moved if channels])
+
+
+def has_bake(garment: bpy.types.Object) -> bool:
+    """Return whether anything was baked for a garment."""
+    return any(is_baked(action, garment) for action in bpy.data.actions)
+
+
+def remove_bake(garment: bpy.types.Object, armature: bpy.types.Object) -> None:
+    """Remove what was baked for a garment; weights stay as trained."""
+    remove_keys(garment, animated(garment, armature))
+    remove_shapes(garment)
+    _free(armature, proxy_names(armature, garment))
+
+
+def _need_linear(garment: bpy.types.Object, armature: bpy.types.Object) -> None:
+    for modifier in garment.modifiers:
+        if modifier.type != "ARMATURE" or modifier.object != armature:
+            continue
+        options = {
+            "Preserve Volume": modifier.use_deform_preserve_volume,
+            "Bone Envelopes": modifier.use_bone_envelopes,
+            "a vertex group": bool(modifier.vertex_group),
+            "Multi Modifier": modifier.use_multi_modifier,
+        }
+        for label, on in options.items():
+            need(not on, f"The modifier '{modifier.name}' of '{garment.name}' uses {label}; switch that off.")
+        need(modifier.use_vertex_groups, f"The modifier '{modifier.name}' of '{garment.name}' ignores vertex groups.")
+        return
+    need(False, f"'{garment.name}' has no Armature modifier for '{armature.name}'; generate its rig.")
+
+
+def _need_same_binds(armature: bpy.types.Object, joints: Joints, shot: Shot) -> None:
+    size = max(float(np.ptp(shot.points, axis=0).max()), 1e-9)
+    away = np.abs(joints.binds - shot.binds)
+    away[:, :3, 3] /= size
+    worst = int(away.max(axis=(1, 2)).argmax())
+    need(
+        away[worst].max() <= TURNED,
+        f"The bone '{joints.names[worst]}' of '{armature.name}' was moved since the garment was trained; undo that, "
+        "or train again.",
+    )
+
+
+def _need_same_points(garment: bpy.types.Object, shot: Shot) -> None:
+    count = len(garment.data.vertices)
+    need(
+        count == len(shot.points),
+        f"'{garment.name}' had {len(shot.points)} vertices when it was trained and has {count} now; train it again.",
+    )
+    world = np.array(garment.matrix_world)
+    away = np.abs(rest_points(garment) @ world[:3, :3].T + world[:3, 3] - shot.points).max()
+    need(
+        away <= MOVED * np.ptp(shot.points, axis=0).max(),
+        f"'{garment.name}' has another shape at rest than when it was trained; undo that, or train it again.",
+    )
+
+
+def _free(armature: bpy.types.Object, proxies: Sequence[str]) -> None:
+    """Put proxies at rest where no key says otherwise, to be turned by quaternions."""
+    for name in proxies:
+        bone = armature.pose.bones[name]
+        bone.rotation_mode = "QUATERNION"
+        bone.location, bone.scale, bone.rotation_quaternion = (0, 0, 0), (1, 1, 1), (1, 0, 0, 0)
+
+
+def _turns(joints: Joints, shot: Shot) -> list[Channel]:
+    """Return the proxies' turns from their rest rotations, which is what pose bones hold."""
+    first = joints.character_count
+    rest = _quaternions(to_parents(joints.binds, joints.parents)[first:, :3, :3])
+    turns = _product(rest * [1, -1, -1, -1], shot.rotations)
+    return [
+        Channel(f'pose.bones["{bpy.utils.escape_identifier(name)}"].rotation_quaternion', index, name, values)
+        for name, turn in zip(joints.names[first:], turns.swapaxes(0, 1))
+        for index, values in enumerate(turn.T)
+    ]
+
+
+def _activations(names: Sequence[str], shot: Shot) -> list[Channel]:
+    return [
+        Channel(f'key_blocks["{bpy.utils.escape_identifier(name)}"].value', 0, "SSILK", values)
+        for name, values in zip(names, shot.activations.T)
+    ]
+
+
+def _quaternions(axes: np.ndarray) -> np.ndarray:
+    """Return unit quaternions (w, x, y, z), shape (N, 4), of rotation matrices (N, 3, 3)."""
+    return np.array([Matrix(matrix).to_quaternion() for matrix in axes]).reshape(-1, 4)
+
+
+def _product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return quaternion products (first after second), shape (..., 4)."""
+    w, v, x, u = first[..., :1], first[..., 1:], second[..., :1], second[..., 1:]
+    scalar = w * x - (v * u).sum(axis=-1, keepdims=True)
+    return np.concatenate([scalar, w * u + x * v + np.cross(v, u)], axis=-1)

@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Keys written in bulk: an action with a slot for each thing that it animates, on tracks beneath the artist's own.
+
+Before Blender 4.4 an action animates one kind of thing; each then gets an action of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ..errors import need
+
+OWNER = "ssilk_garment"  # custom property of an action that was baked: the garment object
+SLOTS = hasattr(bpy.types, "ActionSlot")  # since Blender 4.4
+LINEAR = bpy.types.Keyframe.bl_rna.properties["interpolation"].enum_items["LINEAR"].value
+
+
+@dataclass(frozen=True, eq=False)
+class Channel:
+    """Values of one property, one for each frame.
+
+    Attributes:
+        path, index: the property, as F-curves name it.
+        group: that the curve is listed under.
+        values: shape (F,).
+    """
+
+    path: str
+    index: int
+    group: str
+    values: np.ndarray
+
+
+def is_baked(action: bpy.types.Action, garment: bpy.types.Object | None = None) -> bool:
+    """Return whether an action was baked, for this garment if one is given."""
+    baked = OWNER in action.keys()  # noqa: SIM118 (no dictionary)
+    return baked and (garment is None or action[OWNER] == garment)
+
+
+def curves_of(action: bpy.types.Action) -> Iterator[bpy.types.FCurve]:
+    """Yield the F-curves of all slots."""
+    if not SLOTS:
+        yield from action.fcurves
+        return
+    for layer in action.layers:
+        for strip in layer.strips:
+            for bag in strip.channelbags:
+                yield from bag.fcurves
+
+
+def need_tracks(things: Sequence[Any]) -> None:
+    """Check that tracks can be added to the animation of objects and shape keys.
+
+    Raises:
+        SetupError: one is in tweak mode, or its tracks are switched off.
+    """
+    for thing in things:
+        animation = thing.animation_data
+        if animation:
+            name = f"'{thing.name}'"
+            need(not animation.use_tweak_mode, f"A strip of {name} is being tweaked; leave tweak mode (Tab) first.")
+            off = len(animation.nla_tracks) and not animation.use_nla
+            need(not off, f"The NLA tracks of {name} are switched off; switch them on in the NLA editor.")
+
+
+def bake_keys(garment: bpy.types.Object, start: int, moved: Sequence[tuple[Any, Sequence[Channel]]]) -> None:
+    """Put keys in place of those that were baked for a garment before.
+
+    They lie on tracks of their own, beneath the action in which the artist animates; older ones keep their place.
+
+    Args:
+        start: the first frame.
+        moved: objects or shape keys, each with what moves on it.
+    """
+    tracks = [_cleared_track(thing, garment) for thing, _ in moved]
+    _remove_actions(garment)
+    action = None
+    for track, (thing, channels) in zip(tracks, moved):
+        if action is None or not SLOTS:
+            action = bpy.data.actions.new(f"SSILK {garment.name}")
+            action[OWNER] = garment
+        bag = _Bag(action, thing)
+        for channel in channels:
+            _write(bag.new_curve(channel), start, channel.values)
+        bag.play_on(track, start, start + len(channels[0].values) - 1)
+
+
+def remove_keys(garment: bpy.types.Object, things: Sequence[Any]) -> None:
+    """Remove what was baked for a garment from the animation of objects and shape keys."""
+    for thing in things:
+        for track in _tracks(thing, garment):
+            thing.animation_data.nla_tracks.remove(track)
+    _remove_actions(garment)
+
+
+def _tracks(thing: Any, garment: bpy.types.Object) -> list[bpy.types.NlaTrack]:
+    """Return the tracks on which something plays that was baked for a garment."""
+    tracks = thing.animation_data.nla_tracks if thing.animation_data else ()
+    return [t for t in tracks if any(strip.action and is_baked(strip.action, garment) for strip in t.strips)]
+
+
+def _cleared_track(thing: Any, garment: bpy.types.Object) -> bpy.types.NlaTrack:
+    """Return the garment's track of a thing, made if there is none, without what was baked."""
+    found = _tracks(thing, garment)
+    if not found:
+        track = thing.animation_data_create().nla_tracks.new()
+        track.name = f"SSILK {garment.name}"
+        return track
+    for strip in list(found[0].strips):
+        if strip.action and is_baked(strip.action, garment):
+            found[0].strips.remove(strip)
+    return found[0]
+
+
+def _remove_actions(garment: bpy.types.Object) -> None:
+    for action in [action for action in bpy.data.actions if is_baked(action, garment)]:
+        bpy.data.actions.remove(action)
+
+
+class _Bag:
+    """The curves of one thing in an action."""
+
+    def __init__(self, action: bpy.types.Action, thing: Any) -> None:
+        self.action = action
+        if SLOTS:
+            self.slot = action.slots.new(id_type=thing.id_type, name=thing.name)
+            layer = action.layers[0] if action.layers else action.layers.new("Baked")
+            strip = layer.strips[0] if layer.strips else layer.strips.new(type="KEYFRAME")
+            self.bag = strip.channelbag(self.slot, ensure=True)
+
+    def new_curve(self, channel: Channel) -> bpy.types.FCurve:
+        if not SLOTS:
+            return self.action.fcurves.new(channel.path, index=channel.index, action_group=channel.group)
+        curve = self.bag.fcurves.new(channel.path, index=channel.index)
+        curve.group = self.bag.groups.get(channel.group) or self.bag.groups.new(channel.group)
+        return curve
+
+    def play_on(self, track: bpy.types.NlaTrack, start: int, end: int) -> None:
+        """Play the curves on a track, frame by frame where their keys are."""
+        strip = track.strips.new(self.action.name, start, self.action)
+        strip.action_frame_start, strip.action_frame_end = start, end
+        strip.frame_start, strip.frame_end = start, max(end, start + 1)
+        if SLOTS:
+            strip.action_slot = self.slot
+
+
+def _write(curve: bpy.types.FCurve, start: int, values: np.ndarray) -> None:
+    points = np.stack([start + np.arange(len(values)), values], axis=1).astype(np.float32)
+    curve.keyframe_points.add(len(values))
+    curve.keyframe_points.foreach_set("co", points.reshape(-1))
+    curve.keyframe_points.foreach_set("interpolation", np.full(len(values), LINEAR, dtype=np.int32))
+    curve.update()

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What an armature does, frame by frame, as Blender evaluates it with constraints and drivers, a little at a time.
+
+A scene of its own, which holds nothing else, is made for each slice of time and removed at its end: nothing of the
+artist's scene is evaluated or moved, and nothing is left behind if the artist saves or undoes in between.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import bpy
+import numpy as np
+
+from ..contract.arrays import Joints, Motion
+from ..errors import SetupError, need
+from .motions import Source, frames_of, playing
+from .objects import found_again
+
+SLICE = 0.04  # seconds that Blender waits for us at a time
+UNEVEN = 1e-3  # how far a bone's axes may be from unit length and right angles, as ssilk has it
+
+
+@dataclass(eq=False)
+class Take:
+    """A motion that is being sampled.
+
+    Attributes:
+        worlds: joint to world of the frames that were sampled yet, rigid, shape (J, 4, 4) each.
+    """
+
+    source: Source
+    frames: range
+    worlds: list[np.ndarray] = field(default_factory=list)
+
+    @property
+    def complete(self) -> bool:
+        return len(self.worlds) == len(self.frames)
+
+    def motion(self) -> Motion:
+        """Return what was sampled, at the scene's rate and in its units."""
+        scene = bpy.context.scene
+        fps = scene.render.fps / scene.render.fps_base
+        return Motion(np.array(self.worlds), self.frames.start, fps, scene.unit_settings.scale_length)
+
+
+def prepare_takes(armature: bpy.types.Object, chosen: Sequence[Source]) -> list[Take]:
+    """Return takes to sample.
+
+    Raises:
+        SetupError: a motion is gone, or the armature cannot be evaluated.
+    """
+    posed = armature.data.pose_position == "POSE"
+    need(posed, f"'{armature.name}' shows its rest position; switch to Pose Position in its data properties.")
+    need(not armature.hide_viewport, f"'{armature.name}' is disabled in viewports; enable it in the outliner.")
+    return [Take(source, frames_of(armature, source)) for source in chosen]
+
+
+def sample(armature: bpy.types.Object, joints: Joints, takes: Sequence[Take]) -> Iterator[float]:
+    """Fill takes, yielding the part that is done after each slice of time.
+
+    Args:
+        joints: of the character.
+
+    Raises:
+        SetupError: the armature or a bone was deleted meanwhile, or a bone is scaled.
+    """
+    uid, name, total = armature.session_uid, armature.name, sum(len(take.frames) for take in takes)
+    for take in takes:
+        while not take.complete:
+            _sample_slice(found_again(uid, name), joints, take)
+            yield sum(len(take.worlds) for take in takes) / total
+
+
+def _sample_slice(armature: bpy.types.Object, joints: Joints, take: Take) -> None:
+    lost = [name for name in joints.names if name not in armature.pose.bones]
+    need(not lost, f"'{armature.name}' lost the bone '{lost[0] if lost else ''}' meanwhile; begin again.")
+    columns = [armature.pose.bones.find(name) for name in joints.names]
+    until = time.monotonic() + SLICE
+    with playing(armature, take.source), _alone(armature) as scene:
+        while not take.complete and time.monotonic() < until:
+            frame = take.frames[len(take.worlds)]
+            scene.frame_set(frame)
+            evaluated = armature.evaluated_get(scene.view_layers[0].depsgraph)
+            take.worlds.append(_rigid(_worlds(evaluated)[columns], joints, take.source.name, frame))
+
+
+@contextmanager
+def _alone(armature: bpy.types.Object) -> Iterator[bpy.types.Scene]:
+    scene = bpy.data.scenes.new("SSILK")
+    try:
+        scene.collection.objects.link(armature)
+        yield scene
+    finally:
+        bpy.data.scenes.remove(scene)
+
+
+def _worlds(armature: bpy.types.Object) -> np.ndarray:
+    """Return bone to world of all bones, without the armature's scale in their axes, shape (bones, 4, 4)."""
+    poses = np.empty(len(armature.pose.bones) * 16, dtype=np.float32)
+    armature.pose.bones.foreach_get("matrix", poses)
+    placement = np.array(armature.matrix_world)
+    worlds = placement @ poses.reshape(-1, 4, 4).swapaxes(-1, -2)
+    worlds[:, :3, :3] /= armature.matrix_world.median_scale
+    return worlds
+
+
+def _rigid(worlds: np.ndarray, joints: Joints, motion: str, frame: int) -> np.ndarray:
+    axes = worlds[:, :3, :3]
+    error = np.abs(axes.swapaxes(-1, -2) @ axes - np.eye(3)).max(axis=(1, 2))
+    worst = int(error.argmax())
+    if not error[worst] <= UNEVEN:
+        raise SetupError(
+            f"The bone '{joints.names[worst]}' is scaled at frame {frame} of '{motion}'; it may turn and move only."
+        )
+    return worlds

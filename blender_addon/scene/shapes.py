@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Blendshapes as relative shape keys, beside the artist's own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import bpy
+import numpy as np
+
+from ..errors import need
+
+PREFIX = "SSILK "  # begins the names of shape keys that were baked
+
+
+def need_relative(garment: bpy.types.Object) -> None:
+    """Check that shape keys add up.
+
+    Raises:
+        SetupError: those that are there are absolute.
+    """
+    keys = garment.data.shape_keys
+    need(not keys or keys.use_relative, f"The shape keys of '{garment.name}' are absolute; make them Relative.")
+
+
+def rest_points(garment: bpy.types.Object) -> np.ndarray:
+    """Return the points without any shape key, in the object's own space, shape (V, 3)."""
+    keys = garment.data.shape_keys
+    points = np.empty(len(garment.data.vertices) * 3, dtype=np.float32)
+    (keys.reference_key.points if keys else garment.data.vertices).foreach_get("co", points)
+    return points.reshape(-1, 3)
+
+
+def write_shapes(garment: bpy.types.Object, offsets: np.ndarray, names: Sequence[str]) -> list[str]:
+    """Put shape keys in place of those that were baked before; return their names. In object mode.
+
+    Args:
+        offsets: from the reference key, in the object's own space, shape (K, V, 3).
+    """
+    names = [PREFIX + name for name in names]
+    _remove(garment, keep=names)
+    if not names:
+        return names
+    if not garment.data.shape_keys:
+        garment.shape_key_add(name="Basis", from_mix=False)
+    blocks = garment.data.shape_keys.key_blocks
+    for name in names:
+        if name not in blocks:
+            garment.shape_key_add(name=name, from_mix=False)
+    reference, rest = garment.data.shape_keys.reference_key, rest_points(garment)
+    for name, offset in zip(names, offsets):
+        block = blocks[name]
+        block.relative_key, block.slider_min, block.slider_max, block.mute = reference, 0.0, 1.0, False
+        block.points.foreach_set("co", (rest + offset).astype(np.float32).reshape(-1))
+    return names
+
+
+def remove_shapes(garment: bpy.types.Object) -> None:
+    """Remove the shape keys that were baked, and the basis with them if nothing else is left."""
+    _remove(garment, keep=())
+    keys = garment.data.shape_keys
+    if keys and len(keys.key_blocks) == 1:
+        garment.shape_key_clear()
+
+
+def _remove(garment: bpy.types.Object, *, keep: Sequence[str]) -> None:
+    keys = garment.data.shape_keys
+    for block in list(keys.key_blocks) if keys else ():
+        if block.name.startswith(PREFIX) and block.name not in keep:
+            garment.shape_key_remove(block)

@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a garment remembers of its training."""
+
+from __future__ import annotations
+
+import bpy
+from bpy.props import BoolProperty, CollectionProperty, EnumProperty, IntProperty, StringProperty
+
+from .scene.motions import KINDS
+
+# Paths may begin with "//", the folder of the blend file; Blender wants to be told since 4.5.
+RELATIVE = {"ANIMATABLE", "PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) else {"ANIMATABLE"}
+
+PRESETS = [
+    ("draft", "Draft", "A first look, after minutes on any machine"),
+    ("preview", "Preview", "Nearly the final quality, after minutes on a GPU"),
+    ("final", "Final", "The paper's schedule, after about an hour on a GPU"),
+]
+
+
+class MotionChoice(bpy.types.PropertyGroup):
+    """A motion that can be trained on; its name is that of the action, the strip, or the path of the file."""
+
+    kind: EnumProperty(name="Kind", items=KINDS)
+    track: StringProperty(name="Track", description="NLA track of the strip")
+    use: BoolProperty(name="Use", description="Train on this motion", default=True)
+
+
+class TrainingSettings(bpy.types.PropertyGroup):
+    """Choices for the training of one garment."""
+
+    motions: CollectionProperty(type=MotionChoice, name="Motions", description="What can be trained on")
+    preset: EnumProperty(name="Preset", items=PRESETS, default="preview")
+    iterations: IntProperty(
+        name="Iterations",
+        description="Optimiser steps; zero for as many as the preset has",
+        default=0,
+        min=0,
+        max=10_000_000,
+    )
+    folder: StringProperty(
+        name="Folder",
+        subtype="DIR_PATH",
+        description="Folder of the garment's training, relative to the blend file",
+        options=RELATIVE,
+    )
+
+
+CLASSES = (MotionChoice, TrainingSettings)
