@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import filecmp
 import glob
 import hashlib
 import os
@@ -18,8 +19,10 @@ UNFINISHED = ".{}.partial-"  # how temporary names begin, the stem of the target
 
 
 @contextmanager
-def replacing(target: str | Path) -> Iterator[Path]:
+def replacing(target: str | Path, *, keep_same: bool = False) -> Iterator[Path]:
     """Yield a temporary path beside `target`; rename it onto `target` on success, remove it on failure.
+
+    With `keep_same` a target that holds the same bytes already is left alone, its time of change included.
 
     The temporary name keeps the suffix of `target`, because USD chooses the file format by it. Errors raised
     meanwhile that name the temporary file name `target` instead: nobody knows the other.
@@ -43,7 +46,8 @@ def replacing(target: str | Path) -> Iterator[Path]:
         temporary.chmod(0o666 & ~umask)
         with temporary.open("rb+") as stream:
             os.fsync(stream.fileno())  # or a loss of power could leave an empty file under the target's name
-        temporary.replace(target)
+        if not (keep_same and target.is_file() and filecmp.cmp(temporary, target, shallow=False)):
+            temporary.replace(target)
     except SsilkError as error:
         raise type(error)(str(error).replace(str(temporary), str(target))) from error
     except OSError as error:

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,13 +14,21 @@ import numpy as np
 from ssilk_core.assets import Deformer, Floats, GarmentPose, Motion, ProxyRig, Scene, Skeleton
 from ssilk_core.errors import VerificationError, need
 from ssilk_core.events import Message, Progress, Reporter
+from ssilk_core.targets import TARGETS, Target, fitted
+
+from .options import INPUTS
 
 if TYPE_CHECKING:
+    from pxr import Usd
+    from ssilk_usd.garment_api import GarmentRecord
     from ssilk_usd.units import StageUnits
 
+    from ssilk_core.checkpoint import ModelFile
+    from ssilk_core.farm.tasks import Task
     from ssilk_core.model.network import GarmentModel
 
 CHUNK = 256  # frames in memory at once
+MOST_SAMPLES = 64  # in each frame
 BIND_TOLERANCE = 1e-3  # [m] between positions, and between the entries of rotation matrices
 
 
@@ -34,13 +43,21 @@ class BakeRequest:
     root: str | None = None
     plain: bool = False
     device: str = "cpu"
+    target: str = "usd"
+    samples: int = 1  # in each frame
+
+    @classmethod
+    def of(cls, task: Task) -> BakeRequest:
+        """Return what a task asks for."""
+        return cls(**{item.name: getattr(task, item.name) for item in fields(cls)})
 
 
 @dataclass(frozen=True, eq=False)
 class Bake:
-    """A garment over a motion at the shot's rate; `model` is None under plain skinning.
+    """A garment over a motion at the rate of the shot's samples; `model` is None under plain skinning.
 
-    `recovered` says, once `poses` are through, at which frames the rollout was lost and the garment was put to rest.
+    `deformer` is as the target takes it; `hidden` as `ssilk_usd.read_visibility` says it. `recovered` says, once
+    `poses` are through, at which frames the rollout was lost and the garment was put to rest.
     """
 
     request: BakeRequest
@@ -48,9 +65,30 @@ class Bake:
     deformer: Deformer
     motion: Motion
     source: Motion
+    hidden: list[tuple[int, bool]]
     units: StageUnits
     provenance: dict[str, Any]
+    record: GarmentRecord
     recovered: list[str] = field(default_factory=list)
+
+    @property
+    def start(self) -> float:
+        """Return the time code of the first frame."""
+        return self.motion.start / self.request.samples
+
+    @property
+    def target(self) -> Target:
+        return TARGETS[self.request.target]
+
+    def carried(self, output: Path) -> dict[str, Any]:
+        """Return what a file says of its origin; `recovered` fills as the poses go through."""
+        return {**self.provenance, "beside": _beside(self.request, output), "recovered": self.recovered}
+
+    def warn(self, report: Reporter) -> dict[str, object]:
+        """Say at which frames the rollout was lost; return that as figures."""
+        for frames in self.recovered:
+            report(Message(f"frames {frames}: the rollout was lost, and the garment is put to rest", "warning"))
+        return {"put to rest": self.recovered} if self.recovered else {}
 
     def poses(self) -> Iterator[GarmentPose]:
         """Yield the shot's poses, some frames at a time."""
@@ -69,19 +107,38 @@ class Bake:
         self.recovered.append(f"{frames[0]} to {frames[-1]}")
 
     def vertices(self, report: Reporter) -> Iterator[Floats]:
-        """Yield the decoder's own garment points (V, 3) [m] of each frame."""
+        """Yield the garment's points (V, 3) [m] at each sample: the decoder's own, or as the target takes them."""
         for pose in self.poses():
-            yield from self._decoded(pose)
+            yield from self._fitted(pose) if self._departs else self._decoded(pose)
             report(Progress(pose.start + pose.frame_count, self.motion.frame_count))
 
     def _decoded(self, pose: GarmentPose) -> Floats:
         if self.model is None:
-            from ssilk_core.kinematics import deform
-
-            return deform(self.deformer, self.motion, pose)
+            return self._fitted(pose)
         from ssilk_core.rollout import decode
 
         return decode(self.model, self.motion, pose)
+
+    def _fitted(self, pose: GarmentPose) -> Floats:
+        from ssilk_core.kinematics import deform
+
+        return deform(self.deformer, self.motion, pose)
+
+    @property
+    def _departs(self) -> bool:
+        """Return whether the target takes something else than what the decoder computes."""
+        return self.model is not None and self.target.influences is not None
+
+    def departure(self) -> dict[str, object]:
+        """Return how far the target's garment is from the decoder's own, where it takes another."""
+        if not self._departs:
+            return {}
+        away = [np.linalg.norm(self._fitted(pose) - self._decoded(pose), axis=-1) for pose in self.poses()]
+        errors = np.concatenate(away)
+        return {
+            f"largest error of {self.request.target} [m]": f"{errors.max():.3g}",
+            f"mean error of {self.request.target} [m]": f"{errors.mean():.3g}",
+        }
 
     def verify(self, path: Path, report: Reporter) -> dict[str, object]:
         """Check a written shot and compare it, re-skinned by UsdSkel, with the decoder; return figures.
@@ -100,13 +157,65 @@ class Bake:
             raise VerificationError(
                 f"{path}: {len(errors)} checks failed, first at {errors[0].prim}: {errors[0].text}."
             )
-        found = compare_points(Shot(path), self.vertices(report))
+        found = compare_points(Shot(path), self.vertices(report), samples_per_frame=self.request.samples)
         if not found.passed:
             raise VerificationError(
                 f"{path}: vertex {found.vertex} at time code {found.time:g} is {found.worst:.3g} m from where the "
                 f"decoder has it; at most {found.bound:.3g} m is allowed."
             )
-        return {"largest error [m]": f"{found.worst:.3g}", "allowed [m]": f"{found.bound:.3g}"}
+        proof = {"largest error [m]": f"{found.worst:.3g}", "allowed [m]": f"{found.bound:.3g}"}
+        return {**proof, **self.departure()}
+
+
+@dataclass(frozen=True, eq=False)
+class Dressed:
+    """A garment on its character, ready for any motion; `model` is None under plain skinning."""
+
+    request: BakeRequest
+    file: ModelFile
+    model: GarmentModel | None
+    deformer: Deformer
+    units: StageUnits
+    provenance: dict[str, Any]
+
+    def over(self, motion: str) -> Bake:
+        """Return the garment over a motion, "file[:/Prim/Path]".
+
+        Raises:
+            SsilkError: the file is missing or does not fit.
+        """
+        from ssilk_usd.read_motion import read_motion
+        from ssilk_usd.read_stage import split_location
+        from ssilk_usd.read_visibility import read_hidden
+
+        from ssilk_core.files import sha256
+
+        request = replace(self.request, motion=motion)
+        source = read_motion(motion, self.file.scene.character.skeleton, root=request.root)
+        at_rate = source if request.fps is None else _at_rate(source, request.fps)
+        sampled = at_rate if request.samples == 1 else _at_rate(source, at_rate.fps * request.samples)
+        carried = {key: value for key, value in vars(request).items() if value != getattr(BakeRequest, key, None)}
+        provenance = {
+            **self.provenance,
+            "request": carried,
+            "motion_sha256": sha256(split_location(motion)[0]),
+        }
+        return Bake(
+            request=request,
+            model=self.model,
+            deformer=self.deformer,
+            motion=sampled,
+            source=source,
+            hidden=read_hidden(motion, sampled, root=request.root),
+            units=self.units,
+            provenance=provenance,
+            record=self.record,
+        )
+
+    @property
+    def record(self) -> GarmentRecord:
+        """Return how the garment's model was made."""
+        return _record(self.file, self.provenance["model_sha256"])
 
 
 def open_bake(request: BakeRequest) -> Bake:
@@ -115,33 +224,66 @@ def open_bake(request: BakeRequest) -> Bake:
     Raises:
         SsilkError: a file is missing or does not fit the others.
     """
+    return dressed(request).over(request.motion)
+
+
+def dressed(request: BakeRequest) -> Dressed:
+    """Load what a request names, its motion apart.
+
+    Raises:
+        SsilkError: a file is missing or does not fit the others, or there is no such target or number of samples.
+    """
     from ssilk_usd.read_character import read_character
-    from ssilk_usd.read_motion import read_motion
-    from ssilk_usd.read_stage import open_stage, split_location
-    from ssilk_usd.units import StageUnits
+    from ssilk_usd.read_stage import open_stage
 
     from ssilk_core.checkpoint import load_model, network
     from ssilk_core.devices import chosen_device
     from ssilk_core.files import sha256
 
-    device = chosen_device(request.device)
+    need(request.target in TARGETS, "--target", f"'{request.target}'", f"it is one of {', '.join(TARGETS)}")
+    need(1 <= request.samples <= MOST_SAMPLES, "--samples-per-frame", f"{request.samples} samples in each frame",
+         f"1 to {MOST_SAMPLES} are allowed")  # fmt: skip
+    device, target = chosen_device(request.device), TARGETS[request.target]
     file = load_model(request.model)
     stage = open_stage(request.stage)
     character = read_character(stage, root=request.root, garment=None)
     skeleton = file.scene.character.skeleton
     need_same_skeleton(character.skeleton, skeleton)
     scene = replace(file.scene, character=replace(character, skeleton=skeleton))
-    source = read_motion(request.motion, skeleton)
-    motion = source if request.fps is None else _at_rate(source, request.fps)
     model = None if request.plain else network(file, scene).to(device)
     deformer = _plain(scene) if model is None else model.deformer()
-    provenance = {
-        "request": {key: value for key, value in vars(request).items() if value is not None},
-        "model_sha256": sha256(request.model),
-        "motion_sha256": sha256(split_location(request.motion)[0]),
-        "training": file.provenance.get("ssilk", ""),
-    }
-    return Bake(request, model, deformer, motion, source, StageUnits.of(stage), provenance)
+    provenance = {"model_sha256": sha256(request.model), "training": file.provenance.get("ssilk", "")}
+    return Dressed(request, file, model, fitted(deformer, target), _units(stage, target), provenance)
+
+
+def _units(stage: Usd.Stage, target: Target) -> StageUnits:
+    """Return a target's units and axis, or those of the character's stage where it takes any."""
+    from ssilk_usd.units import StageUnits
+
+    own = StageUnits.of(stage)
+    return StageUnits(target.meters_per_unit or own.meters_per_unit, target.up_axis or own.up_axis)
+
+
+def _record(file: ModelFile, model_hash: str) -> GarmentRecord:
+    from ssilk_usd.garment_api import GarmentRecord
+
+    numbers = {name: float(value) for name, value in asdict(file.fabric).items() if isinstance(value, int | float)}
+    return GarmentRecord(
+        model_hash=model_hash,
+        version=str(file.provenance.get("ssilk", "")),
+        seed=int(file.provenance.get("seed", 0)),
+        fabric=file.fabric.name,
+        parameters=numbers,
+    )
+
+
+def _beside(request: BakeRequest, output: Path) -> dict[str, str]:
+    """Return the inputs' paths as seen from the output's folder: they hold when everything moves together."""
+    folder = output.absolute().parent
+    try:
+        return {name: os.path.relpath(getattr(request, name), folder) for name in INPUTS}
+    except ValueError:  # on another drive
+        return {}
 
 
 def need_same_skeleton(found: Skeleton, trained: Skeleton) -> None:

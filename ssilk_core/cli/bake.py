@@ -1,89 +1,87 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bake a trained garment over a motion as one UsdSkel shot, and prove it by re-skinning the file.
+"""Bake trained garments over motions as UsdSkel, and prove it by re-skinning the files.
 
-The shot holds joints, blendshapes and their animation, no vertex caches. --plain bakes the same garment under
-plain skinning, to compare with. A shot that fails the proof (exit code 3) is not kept, and an older file of its name
-stays as it was.
+One garment over one motion goes into one file: joints, blendshapes and their animation, no vertex caches. A folder
+takes any number of both, as layers: an asset for each garment, a small layer for each garment in each shot, and a
+stage for each shot. What is there already and would come out the same is left alone.
+
+A file that fails the proof (exit code 3) is not kept, and an older one of its name stays as it was. --plain bakes
+the same garments under plain skinning, to compare with.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
 from pathlib import Path
 
-from ssilk_core.errors import EXIT_OK
+from ssilk_core.errors import EXIT_OK, need
 from ssilk_core.events import Message, Reporter, Result, Started
 from ssilk_core.files import replacing
+from ssilk_core.targets import TARGETS
 
-from .options import INPUTS, check_output
+from .options import add_bake, check_output, is_folder, tasks_of
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
-    verb.add_argument("model", type=Path, help="model written by 'ssilk train'")
-    verb.add_argument("--stage", type=Path, required=True, help="USD file with the character")
-    verb.add_argument(
-        "--motion",
-        type=Path,
-        required=True,
-        metavar="SHOT[:/PRIM]",
-        help="USD file with the motion; PRIM is the SkelAnimation, where there are several",
-    )
-    verb.add_argument("-o", "--output", type=Path, required=True, help="shot to write (.usdc, .usd or .usda)")
-    verb.add_argument("--fps", type=float, help="frames per second of the shot (default: the motion's)")
-    verb.add_argument("--root", metavar="PRIM", help="SkelRoot of the character, where the stage has several")
-    verb.add_argument("--plain", action="store_true", help="bake plain skinning instead of the network")
-    verb.add_argument("--no-body", action="store_true", help="leave the body meshes out")
-    verb.add_argument("--no-verify", action="store_true", help="do not re-skin the written file")
-    verb.add_argument("--device", default="cpu", help="where the network runs (default cpu)")
-
-
-def _beside(options: argparse.Namespace) -> dict[str, str]:
-    """Return the inputs' paths as seen from the shot's folder: they hold when everything moves together."""
-    folder = options.output.absolute().parent
-    try:
-        return {name: os.path.relpath(getattr(options, name), folder) for name in INPUTS}
-    except ValueError:  # on another drive
-        return {}
+    add_bake(verb)
+    verb.add_argument("-o", "--output", type=Path, required=True,
+                      help="shot to write (.usdc, .usd, .usda or .usdz), or a folder of layers")  # fmt: skip
+    verb.add_argument("--again", action="store_true", help="bake what is there and current, too (folders)")
 
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Bake and verify."""
+    if is_folder(options.output):
+        return _bake_layers(options, report)
+    return _bake_file(options, report)
+
+
+def _bake_layers(options: argparse.Namespace, report: Reporter) -> int:
+    from ._layers import Wardrobe, bake_task, write_stages
+
+    tasks, wardrobe = tasks_of(options), Wardrobe()
+    report(Started("bake", len(tasks), {"output": str(options.output)}))
+    for task in tasks:
+        report(Result("bake", bake_task(task, options.output, wardrobe, report, again=options.again)))
+    write_stages(tasks, options.output, report)
+    return EXIT_OK
+
+
+def _bake_file(options: argparse.Namespace, report: Reporter) -> int:
+    from ssilk_usd.export import packaged
     from ssilk_usd.read_stage import split_location
     from ssilk_usd.shot import write_shot
 
     from ._baking import BakeRequest, open_bake
 
-    check_output(options.output, options.model, options.stage, split_location(str(options.motion))[0])
-    bake = open_bake(
-        BakeRequest(
-            model=str(options.model),
-            stage=str(options.stage),
-            motion=str(options.motion),
-            fps=options.fps,
-            root=options.root,
-            plain=options.plain,
-            device=options.device,
-        )
-    )
+    tasks, suffixes = tasks_of(options), TARGETS[options.target].suffixes
+    need(len(tasks) == 1 and not options.points, str(options.output), "one file", "it holds one garment in one shot "
+         "and no point cache", "name a folder")  # fmt: skip
+    need(options.output.suffix in suffixes, str(options.output), f"the suffix is '{options.output.suffix}'",
+         f"{options.target} takes {', '.join(suffixes)}")  # fmt: skip
+    (task,) = tasks
+    check_output(options.output, task.model, task.stage, split_location(task.motion)[0])
+    bake = open_bake(BakeRequest.of(task))
     report(Started("bake", bake.motion.frame_count, {"output": str(options.output)}))
     with replacing(options.output) as unproven:
-        summary = write_shot(
-            unproven,
-            bake.deformer,
-            bake.motion,
-            bake.poses(),
-            units=bake.units,
-            start=bake.motion.start,
-            include_body=not options.no_body,
-            provenance={**bake.provenance, "beside": _beside(options), "recovered": bake.recovered},
-        )
-        for frames in bake.recovered:
-            report(Message(f"frames {frames}: the rollout was lost, and the garment is put to rest", "warning"))
-        if options.no_verify:
+        with packaged(unproven) as layer:
+            summary = write_shot(
+                layer,
+                bake.deformer,
+                bake.motion,
+                bake.poses(),
+                units=bake.units,
+                start=bake.start,
+                samples_per_frame=task.samples,
+                include_body=task.body,
+                hidden=bake.hidden,
+                provenance=bake.carried(options.output),
+                record=bake.record,
+            )
+        if not task.verify:
             report(Message("not verified, as asked", "warning"))
-        proof = {} if options.no_verify else bake.verify(unproven, report)
+        proof = bake.verify(unproven, report) if task.verify else {}
     detail: dict[str, object] = {
         "shot": str(options.output),
         "frames": summary.frame_count,
@@ -92,8 +90,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         "proxies": summary.proxy_count,
         "blendshapes": summary.shape_count,
         "bytes": options.output.stat().st_size,
-        **({"put to rest": bake.recovered} if bake.recovered else {}),
         **proof,
+        **bake.warn(report),
     }
     report(Result("bake", detail))
     return EXIT_OK

@@ -12,9 +12,11 @@ from ssilk_core.config import overridden
 from ssilk_core.errors import need
 from ssilk_core.events import Reporter
 from ssilk_core.fabrics import FABRICS, Fabric, fabric_named
+from ssilk_core.farm.tasks import Task, plan
 from ssilk_core.files import need_writable
 from ssilk_core.setup.classes import ClassOptions
 from ssilk_core.setup.rig import RigOptions
+from ssilk_core.targets import TARGETS
 
 INPUTS = ("model", "stage", "motion")  # what a shot is baked from
 
@@ -70,6 +72,52 @@ def add_fabric(verb: argparse.ArgumentParser) -> None:
 def fabric(options: argparse.Namespace) -> Fabric:
     """Return the fabric that the options ask for; raise `SsilkError` for a property that it does not have."""
     return overridden(fabric_named(options.fabric), options.material)
+
+
+def add_bake(verb: argparse.ArgumentParser) -> None:
+    """Add the options that say what is baked, over what, and for whom."""
+    verb.add_argument("model", nargs="+", metavar="MODEL[:/ROOT]",
+                      help="models written by 'ssilk train'; ROOT is the SkelRoot that wears it, where the stage has "
+                           "several")  # fmt: skip
+    verb.add_argument("--stage", type=Path, required=True, help="USD file with the characters")
+    verb.add_argument("--motion", nargs="+", required=True, metavar="SHOT[:/PRIM]",
+                      help="USD files with motions; PRIM is the SkelAnimation, where there are several")  # fmt: skip
+    about = "; ".join(f"{name}: {target.about}" for name, target in TARGETS.items())
+    verb.add_argument("--target", choices=TARGETS, default="usd", help=f"who receives it (default usd). {about}")
+    verb.add_argument("--fps", type=float, help="frames per second of the shot (default: the motion's)")
+    verb.add_argument("--samples-per-frame", type=int, default=1, metavar="N",
+                      help="samples in each frame, for motion blur (default 1)")  # fmt: skip
+    verb.add_argument("--root", metavar="PRIM", help="SkelRoot of the models that name none")
+    verb.add_argument("--plain", action="store_true", help="bake plain skinning instead of the network")
+    verb.add_argument("--points", action="store_true", help="write point caches as well (folders)")
+    verb.add_argument("--no-body", action="store_true", help="leave the body meshes out")
+    verb.add_argument("--no-verify", action="store_true", help="do not re-skin the written files")
+    verb.add_argument("--device", default="cpu", help="where the network runs (default cpu)")
+
+
+def tasks_of(options: argparse.Namespace) -> list[Task]:
+    """Return the tasks that the options of `add_bake` ask for."""
+    from ssilk_usd.read_stage import split_location
+
+    named = [split_location(model) for model in options.model]
+    like = Task(
+        garment="", shot="", model="", motion="",
+        stage=str(options.stage),
+        fps=options.fps,
+        samples=options.samples_per_frame,
+        target=options.target,
+        plain=options.plain,
+        body=not options.no_body,
+        points=options.points,
+        verify=not options.no_verify,
+        device=options.device,
+    )  # fmt: skip
+    return plan([(model, root or options.root) for model, root in named], options.motion, like)
+
+
+def is_folder(output: Path) -> bool:
+    """Return whether an output is a folder, there already or by its name."""
+    return output.is_dir() or not output.suffix
 
 
 def wardrobe(options: argparse.Namespace) -> tuple[Path, str | None]:

@@ -19,10 +19,10 @@ CORE, USD = ROOT / "ssilk_core", ROOT / "usd" / "ssilk_usd"
 LAYERS = (
     {"errors"},
     {"assets", "config", "devices", "fabrics", "events", "files", "packing"},
-    {"mesh", "kinematics", "kernels", "descriptors", "parameters", "sampling"},
+    {"mesh", "kinematics", "kernels", "descriptors", "parameters", "sampling", "targets"},
     {"model", "energy"},
     {"checkpoint"},
-    {"demo", "view", "simulate", "training", "rollout", "preflight", "setup", "wardrobe", "runtime"},
+    {"demo", "view", "simulate", "training", "rollout", "preflight", "setup", "wardrobe", "runtime", "farm"},
     {"baselines", "reduction"},
     {"evaluation", "quality"},
     {"trade"},

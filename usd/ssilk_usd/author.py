@@ -26,12 +26,14 @@ class Asset:
 
     Attributes:
         root: the SkelRoot.
+        garment: the garment's mesh.
         animation: the SkelAnimation; what moves (rotations, translations, blendShapeWeights) has no value yet.
         bodies: the bodies whose meshes were written.
         shapes: the blendshapes that were written, as indices into the deformer's; others move nothing.
     """
 
     root: Sdf.Path
+    garment: Sdf.Path
     animation: Sdf.Path
     bodies: tuple[Body, ...]
     shapes: Ints
@@ -72,7 +74,7 @@ def define_asset(
     _define_blendshapes(garment, shape_names, deformer.shapes[shapes], units)
     for path, body in zip(paths[3:], bodies):
         bind_skin(define_mesh(stage, path, body.mesh, units), body.skin, skeleton)
-    return Asset(root.GetPath(), paths[1], bodies, shapes)
+    return Asset(root.GetPath(), paths[2], paths[1], bodies, shapes)
 
 
 def prim_names(paths: Sequence[str]) -> list[str]:

@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from pxr import Sdf, Tf
+from pxr import Sdf, Tf, UsdUtils
 
 from ssilk_core.errors import fail, need
 from ssilk_core.files import replacing
@@ -31,3 +33,20 @@ def export(layer: Sdf.Layer, out: str | Path) -> None:
             layer.Export(str(temporary))
         except Tf.ErrorException as error:
             fail(str(out), f"writing failed ({usd_reason(error)})", "free some space or choose another output")
+
+
+@contextmanager
+def packaged(out: str | Path) -> Iterator[Path]:
+    """Yield a layer to write: `out` itself, or one beside it that is then packed into it where it ends in .usdz.
+
+    Raises:
+        SsilkError: the package cannot be written.
+    """
+    out = Path(out)
+    if out.suffix != ".usdz":
+        yield out
+        return
+    with replacing(out.with_suffix(".usdc")) as layer:
+        yield layer
+        packed = UsdUtils.CreateNewUsdzPackage(str(layer), str(out), "shot.usdc")
+        need(packed, str(out), "the package cannot be written", "free some space or choose another output")

@@ -71,7 +71,7 @@ def read_motion(source: StageLike, skeleton: Skeleton, *, prim: str | None = Non
         source: a file with a SkelAnimation, as "file[:/Prim/Path]", or a stage with an animated character.
         skeleton: whose joints the motion is for.
         prim: the SkelAnimation, by path or name, where there are several.
-        root: the character, where several are animated.
+        root: the character, by path or name, where several are animated.
 
     Raises:
         SsilkError: no or several animations, an animation of another skeleton, scales, or malformed data.
@@ -80,7 +80,7 @@ def read_motion(source: StageLike, skeleton: Skeleton, *, prim: str | None = Non
         source, asked = split_location(str(source))
         prim = prim or asked
     stage = open_stage(source)
-    animation, placed = _find_animation(stage, prim, root)
+    animation, placed = find_animation(stage, prim, root)
     where = location(animation)
     joints = tuple(str(name) for name in UsdSkel.Animation(animation).GetJointsAttr().Get() or ())
     match = _matched(joints, skeleton, where)
@@ -101,14 +101,17 @@ def read_motion(source: StageLike, skeleton: Skeleton, *, prim: str | None = Non
     return Motion(where, fps, quaternion_from_matrix(local[..., :3, :3]), local[..., :3, 3], start)
 
 
-def _find_animation(stage: Usd.Stage, prim: str | None, root: str | None) -> tuple[Usd.Prim, Usd.Prim | None]:
+def find_animation(stage: Usd.Stage, prim: str | None, root: str | None) -> tuple[Usd.Prim, Usd.Prim | None]:
     """Return the SkelAnimation and the Skeleton that it animates, None for an animation by itself."""
     where = stage.GetRootLayer().identifier
-    bound = {}
+    bound, own = {}, {}
     for top, skeleton in skeletons(stage):
         animation = inherited_target(skeleton, "skel:animationSource")
-        if animation and (root is None or named([top, skeleton], root)):
+        if animation:
             bound[animation] = skeleton
+        if animation and root and named([top, skeleton], root):
+            own[animation] = skeleton
+    bound = own or bound
     every = [other for other in Usd.PrimRange.Stage(stage, PRIMS) if other.IsA(UsdSkel.Animation)]
     found = named(every, prim) if prim else list(bound) or every
     need(

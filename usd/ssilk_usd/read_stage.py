@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
@@ -13,6 +14,7 @@ from pxr import Pcp, Tf, Usd, UsdGeom, UsdUtils
 
 from ssilk_core.assets import Floats
 from ssilk_core.errors import fail, need
+from ssilk_core.files import sha256
 
 from .garment_api import register_schema
 
@@ -71,6 +73,17 @@ def open_stage(source: StageLike) -> Usd.Stage:
     ]
     need(not missing, str(source), " and ".join(missing[:2]), "every layer must be found", "restore it or its path")
     return stage
+
+
+def content_hash(source: str | Path) -> str:
+    """Return a SHA-256 of what a stage is made of, wherever its files lie: its root layer and all that it uses.
+
+    Raises:
+        SsilkError: as `open_stage`.
+    """
+    stage = open_stage(source)
+    paths = {layer.realPath for layer in stage.GetUsedLayers() if layer.realPath}
+    return hashlib.sha256("".join(sorted(map(sha256, paths))).encode()).hexdigest()
 
 
 def location(prim: Usd.Prim) -> str:

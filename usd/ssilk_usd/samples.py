@@ -10,7 +10,7 @@ import numpy as np
 from pxr import Gf, Sdf, Tf, UsdSkel, Vt
 
 from ssilk_core.assets import Deformer, Floats, GarmentPose, Ints, Motion, SkinWeights
-from ssilk_core.errors import fail
+from ssilk_core.errors import fail, need
 from ssilk_core.kinematics import (
     combined_transforms,
     local_transforms,
@@ -24,7 +24,7 @@ from .read_stage import usd_reason
 from .units import StageUnits
 
 PATH_OP = "xformOp:translate:path"  # of the SkelRoot: where the character's root joint is
-AT_REST = 1e-7  # largest entry of a joint's transform by which it may be away from rest and still be left out
+AT_REST = 1e-7  # by which entries of a joint's transform may differ and still count as the same; [m] for positions
 
 
 class Samples:
@@ -34,7 +34,7 @@ class Samples:
         layer: where they go; it holds specs of the SkelRoot and the SkelAnimation.
         start: time code of the first frame.
         step: time codes from one frame to the next.
-        lean: leave joints that stay at rest out, and move the SkelRoot with the first root joint, as it leaves its rest.
+        lean: leave joints that stay at rest out; the SkelRoot moves as far as its first root joint leaves its rest.
     """
 
     def __init__(
@@ -52,8 +52,9 @@ class Samples:
         self.layer, self.asset, self.deformer, self.motion = layer, asset, deformer, motion
         self.units, self.start, self.step, self.lean, self.unsaved_count = units, start, step, lean, 0
         self.surfaces = [_Surface(deformer.skin), *(_Surface(body.skin) for body in asset.bodies)]
-        self.kept = _moving_joints(deformer, motion) if lean else np.arange(len(deformer.scene.joint_names))
-        self.moves = bool(np.ptp(_stored_translations(deformer, motion, lean), axis=0).any())
+        self.kept = kept_joints(deformer, motion, lean)
+        self.path = root_path(deformer, motion)
+        self.moves = bool((np.ptp(_stored_translations(deformer, motion, lean), axis=0) > AT_REST).any())
         self.last_rotations: Floats | None = None
 
     def append(self, pose: GarmentPose) -> None:
@@ -61,7 +62,7 @@ class Samples:
         times = self.start + self.step * (pose.start + np.arange(pose.frame_count))
         world = combined_transforms(self.deformer, self.motion, pose)
         if self.lean:
-            origins = world[:, 0, :3, 3] - _root_at_rest(self.deformer)
+            origins = self.path[pose.start : pose.start + pose.frame_count]
             world[..., :3, 3] -= origins[:, None]
             self._write(self.asset.root, PATH_OP, times, _vectors(self.units.points_from_core(origins)))
         self._write_joints(times, world)
@@ -111,11 +112,16 @@ class Samples:
 
     def save(self, name: str | Path) -> None:
         """Write what is pending to the file; `name` is what messages call it."""
-        try:
-            self.layer.Save()
-        except Tf.ErrorException as error:
-            fail(str(name), f"writing failed ({usd_reason(error)})", "free some space or choose another output")
+        save(self.layer, name)
         self.unsaved_count = 0
+
+
+def save(layer: Sdf.Layer, name: str | Path) -> None:
+    """Write what is pending in a layer to its file; `name` is what messages call it."""
+    try:
+        layer.Save()
+    except Tf.ErrorException as error:
+        fail(str(name), f"writing failed ({usd_reason(error)})", "free some space or choose another output")
 
 
 def _vectors(points: Floats) -> Iterator[Gf.Vec3d]:
@@ -127,22 +133,32 @@ def _stored_translations(deformer: Deformer, motion: Motion, lean: bool) -> Floa
     translations = np.array(motion.translations)
     if lean:
         roots = np.flatnonzero(deformer.scene.character.skeleton.parents < 0)
-        translations[:, roots] -= motion.translations[:, :1]
+        translations[:, roots] -= root_path(deformer, motion)[:, None]
     return translations
 
 
-def _root_at_rest(deformer: Deformer) -> Floats:
-    """Return where the first root joint rests [m], shape (3,)."""
-    return deformer.scene.character.skeleton.rest_transforms[0, :3, 3]
+def root_path(deformer: Deformer, motion: Motion) -> Floats:
+    """Return how far the first root joint is from its rest [m] at each frame, shape (F, 3)."""
+    return motion.translations[:, 0] - deformer.scene.character.skeleton.rest_transforms[0, :3, 3]
 
 
-def _moving_joints(deformer: Deformer, motion: Motion) -> Ints:
-    """Return the combined joints that leave their rest transforms, with every root and every proxy."""
+def kept_joints(deformer: Deformer, motion: Motion, lean: bool) -> Ints:
+    """Return the combined joints that are animated: all; where `lean`, roots, proxies, and those that leave rest.
+
+    Raises:
+        SsilkError: the motion is of another skeleton.
+    """
     skeleton, scene = deformer.scene.character.skeleton, deformer.scene
+    need(
+        motion.rotations.shape[1] == skeleton.joint_count,
+        motion.path,
+        f"{motion.rotations.shape[1]} animated joints, where {skeleton.path} has {skeleton.joint_count}",
+        "the motion must be one of this skeleton",
+    )
     turned = np.abs(matrix_from_quaternion(motion.rotations) - skeleton.rest_transforms[:, :3, :3])
     moved = np.abs(motion.translations - skeleton.rest_transforms[:, :3, 3])
     away = np.maximum(turned.max(axis=(0, 2, 3)), moved.max(axis=(0, 2)))
-    kept = (away > AT_REST) | (skeleton.parents < 0)
+    kept = (away > AT_REST) | (skeleton.parents < 0) | (not lean)
     return np.flatnonzero(np.concatenate([kept, np.ones(scene.rig.proxy_count, dtype=bool)]))
 
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -50,6 +50,7 @@ def write_shot(
     start: float = 0.0,
     samples_per_frame: int = 1,
     include_body: bool = True,
+    hidden: Sequence[tuple[int, bool]] = (),
     provenance: Mapping[str, object] | None = None,
     record: GarmentRecord | None = None,
 ) -> ShotSummary:
@@ -63,6 +64,7 @@ def write_shot(
         start: time code of the first frame; each next frame is one time code later.
         samples_per_frame: how many of the motion's frames make one of the shot's, for motion blur.
         include_body: write the character's body meshes as well.
+        hidden: from which frames of the motion on the garment is hidden (True) or seen (False).
         provenance: where the shot came from, kept as the layer's `customLayerData["ssilk"]`; looked at once the
             poses are written, so that it may say what came of them.
 
@@ -77,20 +79,28 @@ def write_shot(
         stage = Usd.Stage.Open(layer)
         asset = define_asset(stage, deformer, bodies, units, record=record)
         span = TimeSpan.of(motion, start, samples_per_frame)
-        set_metadata(stage, span, units, provenance or {})
+        set_metadata(stage, span, units)
+        set_visibility(stage, asset.root, span, hidden)
         del stage  # nobody has to hear of each sample
         samples = Samples(layer, asset, deformer, motion, units, start=start, step=span.step)
-        write_samples(samples, poses, path)
+        write_samples(samples, poses, path, provenance)
         del samples, layer  # the file is closed before it is renamed
     return summary(path, deformer, motion, span, len(asset.shapes))
 
 
-def write_samples(samples: Samples, poses: Iterable[GarmentPose], path: str | Path) -> None:
-    """Write the frames of a shot, checked, saving now and then; `path` is what messages call the file."""
+def write_samples(
+    samples: Samples,
+    poses: Iterable[GarmentPose],
+    path: str | Path,
+    provenance: Mapping[str, object] | None = None,
+) -> None:
+    """Write the frames of a shot, checked, saving now and then, and last, what may have grown meanwhile, where it
+    came from; `path` is what messages call the file."""
     for pose in _checked(poses, samples.deformer, samples.motion):
         samples.append(pose)
         if samples.unsaved_count >= FRAMES_PER_SAVE:
             samples.save(path)
+    samples.layer.customLayerData = {"ssilk": _metadata(provenance or {})}
     samples.save(path)
 
 
@@ -124,15 +134,24 @@ def summary(path: str | Path, deformer: Deformer, motion: Motion, span: TimeSpan
     )
 
 
-def set_metadata(stage: Usd.Stage, span: TimeSpan, units: StageUnits, provenance: Mapping[str, object]) -> None:
-    """Author units, axis, rate, range and provenance of a stage."""
+def set_metadata(stage: Usd.Stage, span: TimeSpan, units: StageUnits) -> None:
+    """Author units, axis, rate and range of a stage."""
     UsdGeom.SetStageMetersPerUnit(stage, units.meters_per_unit)
     UsdGeom.SetStageUpAxis(stage, units.up_axis)
     stage.SetTimeCodesPerSecond(span.fps)
     stage.SetFramesPerSecond(span.fps)
     stage.SetStartTimeCode(span.start)
     stage.SetEndTimeCode(span.end)
-    stage.GetRootLayer().customLayerData = {"ssilk": _metadata(provenance)}
+
+
+def set_visibility(stage: Usd.Stage, root: Sdf.Path, span: TimeSpan, hidden: Sequence[tuple[int, bool]]) -> None:
+    """Author from which frames on a prim is hidden or seen; nothing where it is seen throughout."""
+    if not hidden:
+        return
+    visibility = UsdGeom.Imageable(stage.GetPrimAtPath(root)).CreateVisibilityAttr()
+    for frame, gone in hidden:
+        token = UsdGeom.Tokens.invisible if gone else UsdGeom.Tokens.inherited
+        visibility.Set(token, span.start + span.step * frame)
 
 
 def _metadata(value: object) -> object:
@@ -146,14 +165,7 @@ def _metadata(value: object) -> object:
 
 def _checked(poses: Iterable[GarmentPose], deformer: Deformer, motion: Motion) -> Iterator[GarmentPose]:
     """Yield the chunks; raise unless they are of this garment and cover the motion in order."""
-    scene, where, count = deformer.scene, deformer.scene.garment.mesh.path, 0
-    need(
-        motion.rotations.shape[1] == scene.character.skeleton.joint_count,
-        motion.path,
-        f"{motion.rotations.shape[1]} animated joints, where {scene.character.skeleton.path} has "
-        f"{scene.character.skeleton.joint_count}",
-        "the motion must be one of this skeleton",
-    )
+    where, count = deformer.scene.garment.mesh.path, 0
     for pose in poses:
         need(pose.start == count, where, f"a chunk that starts at frame {pose.start}", f"frame {count} comes next")
         _check_pose(pose, deformer)

@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What 'bake' and 'task' share: one garment in one shot as layers, done once."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ssilk_core.errors import need
+from ssilk_core.events import Message, Reporter, silent
+from ssilk_core.farm.record import NAME, Record, is_current, read_record, task_key, write_record
+from ssilk_core.farm.tasks import Task
+from ssilk_core.files import remove_unfinished, replacing, sha256
+
+from ._baking import Bake, BakeRequest, Dressed, dressed
+
+if TYPE_CHECKING:
+    from ssilk_usd.author import Asset
+    from ssilk_usd.layers import Layout
+
+
+class Wardrobe:
+    """Garments on their characters, the last one kept: tasks of one model that follow each other load it once."""
+
+    def __init__(self) -> None:
+        self.open = lru_cache(maxsize=1)(dressed)
+
+    def dressed(self, task: Task) -> Dressed:
+        """Return the garment of a task, ready for any motion."""
+        return self.open(replace(BakeRequest.of(task), motion=""))
+
+
+def layout_of(task: Task, folder: Path) -> Layout:
+    """Return where the files of a task lie."""
+    from ssilk_usd.layers import Layout
+
+    return Layout(folder, task.garment, task.shot)
+
+
+def key_of(task: Task) -> str:
+    """Return the key of a task, from what its inputs hold now.
+
+    Raises:
+        SsilkError: an input is missing or cannot be read.
+    """
+    from ssilk_usd.read_stage import content_hash, split_location
+
+    need(Path(task.model).is_file(), task.model, "there is no such model file", "a file of 'ssilk train' is needed")
+    contents = {
+        "model": sha256(task.model),
+        "stage": content_hash(task.stage),
+        "motion": content_hash(split_location(task.motion)[0]),
+    }
+    return task_key(task, contents)
+
+
+def bake_task(
+    task: Task, folder: Path, wardrobe: Wardrobe, report: Reporter, *, again: bool = False
+) -> dict[str, object]:
+    """Bake one garment in one shot, unless that is done already; return figures for people.
+
+    Raises:
+        SsilkError: an input is missing or bad, or a file cannot be written.
+        VerificationError: the written layer is not what was computed; it is not kept.
+    """
+    layout, key = layout_of(task, folder), key_of(task)
+    home = layout.animation.parent
+    if not again and is_current(home, key):
+        return {"layer": str(layout.animation), "current": True}
+    for path in (layout.animation, layout.points, home / NAME):
+        remove_unfinished(path)
+    bake = wardrobe.dressed(task).over(task.motion)
+    asset = write_asset(layout, bake, task, report)
+    detail = _write_animation(layout, asset, bake, task, report)
+    files = [layout.animation, layout.asset, layout.geometry, *([layout.points] if task.points else [])]
+    written = {os.path.relpath(path, home): sha256(path) for path in files}
+    write_record(home, Record(key=key, files=written, detail=detail))
+    return {"layer": str(layout.animation), **detail}
+
+
+def write_asset(layout: Layout, bake: Bake | Dressed, task: Task, report: Reporter) -> Asset:
+    """Write the asset of a task where it is not there already; warn of what layers above relied on."""
+    from ssilk_usd import layers
+
+    written = layers.write_asset(layout, bake.deformer, bake.units, include_body=task.body, record=bake.record)
+    for change in written.changes:
+        report(Message(f"{layout.asset}: {change}; check the layers that override it", "warning"))
+    return written.asset
+
+
+def _write_animation(layout: Layout, asset: Asset, bake: Bake, task: Task, report: Reporter) -> dict[str, object]:
+    """Write and prove what moves; return figures."""
+    from ssilk_usd import layers
+
+    with replacing(layout.animation) as unproven:
+        summary = layers.write_animation(
+            layout,
+            asset,
+            bake.deformer,
+            bake.motion,
+            bake.poses(),
+            units=bake.units,
+            start=bake.start,
+            samples_per_frame=task.samples,
+            lean=bake.target.lean,
+            hidden=bake.hidden,
+            provenance=bake.carried(layout.animation),
+            path=unproven,
+            points=task.points,
+        )
+        proof = bake.verify(unproven, report) if task.verify else {}
+    if task.points:
+        layers.write_points(
+            layout,
+            asset,
+            bake.vertices(silent),
+            bake.deformer,
+            bake.motion,
+            units=bake.units,
+            start=bake.start,
+            samples_per_frame=task.samples,
+            lean=bake.target.lean,
+        )
+    return {
+        "frames": summary.frame_count,
+        "fps": summary.fps,
+        "bytes": layout.animation.stat().st_size,
+        **proof,
+        **bake.warn(report),
+    }
+
+
+def write_stages(tasks: Sequence[Task], folder: Path, report: Reporter) -> None:
+    """Write the stage of each shot, of those of its garments that are baked; name shots that an asset outgrew."""
+    from ssilk_usd.layers import write_stage
+
+    layouts = [layout_of(task, folder) for task in tasks]
+    for shot in dict.fromkeys(layout.shot for layout in layouts):
+        found = [layout for layout in layouts if layout.shot == shot and layout.animation.is_file()]
+        if found:
+            write_stage(found)
+    for layout in {layout.garment: layout for layout in layouts}.values():
+        outgrown = list(_outgrown(layout))
+        if outgrown:
+            report(Message(
+                f"{layout.asset}: {len(outgrown)} shots were baked with the asset as it was before "
+                f"({', '.join(outgrown[:3])}); bake them again", "warning"))  # fmt: skip
+
+
+def _outgrown(layout: Layout) -> Iterator[str]:
+    """Yield the shots whose record has another asset of this garment than is there now."""
+    for path in sorted(layout.folder.glob(f"shots/*/{layout.garment}/{NAME}")):
+        record, name = read_record(path.parent), os.path.relpath(layout.geometry, path.parent)
+        if record and layout.geometry.is_file() and record.files.get(name) != sha256(layout.geometry):
+            yield path.parent.parent.name

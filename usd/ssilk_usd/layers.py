@@ -1,0 +1,273 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bake as layers: an asset that stays, and for each shot one small layer that a new bake replaces.
+
+    FOLDER/assets/cape/asset.usda        component; payload and variants
+    FOLDER/assets/cape/geometry.usdc     the payload: meshes, skeleton, blendshapes
+    FOLDER/shots/walk/cape/anim.usdc     what moves; opens by itself
+    FOLDER/shots/walk/cape/points.usdc   a point cache, where one is asked for
+    FOLDER/shots/walk/shot.usda          every garment of the shot
+
+Artists put layers of their own above these: nothing here is edited in place, and what has not changed is not touched.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
+
+from ssilk_core.assets import Deformer, Floats, GarmentPose, Motion
+from ssilk_core.files import replacing
+
+from .author import Asset, define_asset, extent_array
+from .garment_api import GarmentRecord
+from .layers_facts import asset_facts
+from .samples import PATH_OP, Samples, kept_joints, root_path, save
+from .shot import ShotSummary, TimeSpan, set_metadata, set_visibility, summary, write_samples
+from .units import StageUnits
+
+DEFORMATION, QUALITY = "deformation", "quality"
+FRAMES_PER_SAVE = 128  # of points: 5 MB in memory for a garment of 3,000 vertices
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the files of one garment in one shot lie; `garment` is the name of its prim as well."""
+
+    folder: Path
+    garment: str
+    shot: str
+
+    @property
+    def asset(self) -> Path:
+        return self.folder / "assets" / self.garment / "asset.usda"
+
+    @property
+    def geometry(self) -> Path:
+        return self.asset.with_name("geometry.usdc")
+
+    @property
+    def animation(self) -> Path:
+        return self.folder / "shots" / self.shot / self.garment / "anim.usdc"
+
+    @property
+    def points(self) -> Path:
+        return self.animation.with_name("points.usdc")
+
+    @property
+    def stage(self) -> Path:
+        return self.folder / "shots" / self.shot / "shot.usda"
+
+
+@dataclass(frozen=True)
+class WrittenAsset:
+    """An asset on disk: where its prims stand, and what layers above may have relied on and is no longer so."""
+
+    asset: Asset
+    changes: tuple[str, ...]
+
+
+def write_asset(
+    layout: Layout,
+    deformer: Deformer,
+    units: StageUnits,
+    *,
+    include_body: bool = True,
+    record: GarmentRecord | None = None,
+) -> WrittenAsset:
+    """Write a garment's asset; files that hold the same already are left alone.
+
+    Raises:
+        SsilkError: as `author.define_asset` does, or a file cannot be written.
+    """
+    before = asset_facts(layout.asset) if layout.asset.is_file() and layout.geometry.is_file() else None
+    bodies = deformer.scene.character.bodies if include_body else ()
+    with replacing(layout.geometry, keep_same=True) as temporary:
+        stage = _new_stage(temporary, units)
+        asset = define_asset(stage, deformer, bodies, units, name=layout.garment, record=record)
+        stage.Save()
+        box = _extent(stage, asset)
+        del stage
+    with replacing(layout.asset, keep_same=True) as temporary:
+        stage = _new_stage(temporary, units)
+        _define_component(stage, asset, layout, box)
+        stage.Save()
+        del stage
+    return WrittenAsset(asset, () if before is None else asset_facts(layout.asset).changes_since(before))
+
+
+def _new_stage(path: Path, units: StageUnits) -> Usd.Stage:
+    stage = Usd.Stage.Open(Sdf.Layer.CreateNew(str(path)))
+    UsdGeom.SetStageMetersPerUnit(stage, units.meters_per_unit)
+    UsdGeom.SetStageUpAxis(stage, units.up_axis)
+    return stage
+
+
+def _extent(stage: Usd.Stage, asset: Asset) -> Vt.Vec3fArray:
+    """Return the bounds of every mesh at its bind pose."""
+    meshes = [prim for prim in stage.GetPrimAtPath(asset.root).GetChildren() if prim.IsA(UsdGeom.Mesh)]
+    corners = np.stack([np.array(UsdGeom.Mesh(prim).GetExtentAttr().Get()) for prim in meshes])
+    return extent_array(corners[:, 0].min(axis=0), corners[:, 1].max(axis=0))
+
+
+def _define_component(stage: Usd.Stage, asset: Asset, layout: Layout, box: Vt.Vec3fArray) -> None:
+    """Define the SkelRoot over its payload, with bounds that need no payload, and the variants."""
+    root = UsdSkel.Root.Define(stage, asset.root).GetPrim()
+    stage.SetDefaultPrim(root)
+    model = Usd.ModelAPI(root)
+    model.SetKind(Kind.Tokens.component)
+    model.SetAssetName(layout.garment)
+    UsdGeom.Boundable(root).CreateExtentAttr(box)
+    root.GetPayloads().AddPayload(f"./{layout.geometry.name}", asset.root)
+    with _variant(root, DEFORMATION, "rest"):
+        UsdSkel.BindingAPI(root).CreateAnimationSourceRel().SetTargets([])
+    with _variant(root, QUALITY, "skin"):
+        binding = UsdSkel.BindingAPI(stage.OverridePrim(asset.garment))
+        binding.CreateBlendShapesAttr().Block()
+        binding.CreateBlendShapeTargetsRel().SetTargets([])
+    _variant(root, DEFORMATION, "skel")
+    _variant(root, QUALITY, "full")
+
+
+def _variant(prim: Usd.Prim, name: str, choice: str) -> Usd.EditContext:
+    """Add a variant and select it; return the context that authors in it."""
+    variants = prim.GetVariantSets().AddVariantSet(name)
+    variants.AddVariant(choice)
+    variants.SetVariantSelection(choice)
+    return Usd.EditContext(prim.GetStage(), variants.GetVariantEditTarget())
+
+
+def write_animation(
+    layout: Layout,
+    asset: Asset,
+    deformer: Deformer,
+    motion: Motion,
+    poses: Iterable[GarmentPose],
+    *,
+    units: StageUnits,
+    start: float = 0.0,
+    samples_per_frame: int = 1,
+    lean: bool = True,
+    hidden: Sequence[tuple[int, bool]] = (),
+    points: bool = False,
+    provenance: Mapping[str, object] | None = None,
+    path: Path | None = None,
+) -> ShotSummary:
+    """Write what moves in one shot as a layer that references its asset.
+
+    Args:
+        motion, poses, start, samples_per_frame, hidden: as `shot.write_shot` takes them.
+        lean: see `samples.Samples`.
+        points: offer the point cache that `write_points` writes as a variant.
+        path: the file to write, where it is not yet that of `layout`, which must be in the same folder.
+
+    Raises:
+        SsilkError: as `shot.write_shot` does.
+    """
+    span = TimeSpan.of(motion, start, samples_per_frame)
+    with replacing(path or layout.animation) as temporary:
+        layer = Sdf.Layer.CreateNew(str(temporary))
+        stage = Usd.Stage.Open(layer)
+        _define_animation(stage, asset, layout, kept_names(deformer, motion, lean))
+        set_metadata(stage, span, units)
+        if lean:
+            UsdGeom.Xformable(stage.GetPrimAtPath(asset.root)).AddTranslateOp(opSuffix=PATH_OP.rpartition(":")[2])
+        set_visibility(stage, asset.root, span, hidden)
+        if points:
+            _define_points(stage, asset, layout)
+        del stage  # nobody has to hear of each sample
+        samples = Samples(layer, asset, deformer, motion, units, start=start, step=span.step, lean=lean)
+        write_samples(samples, poses, layout.animation, provenance)
+        del samples, layer  # the file is closed before it is renamed
+    return summary(layout.animation, deformer, motion, span, len(asset.shapes))
+
+
+def kept_names(deformer: Deformer, motion: Motion, lean: bool) -> list[str]:
+    """Return the joints that a shot animates."""
+    return [deformer.scene.joint_names[joint] for joint in kept_joints(deformer, motion, lean)]
+
+
+def _define_animation(stage: Usd.Stage, asset: Asset, layout: Layout, joints: list[str]) -> None:
+    """Reference the asset, and override its SkelAnimation with the joints that this shot moves."""
+    root = stage.DefinePrim(asset.root)
+    stage.SetDefaultPrim(root)
+    root.GetReferences().AddReference(os.path.relpath(layout.asset, layout.animation.parent))
+    animation = UsdSkel.Animation(stage.OverridePrim(asset.animation))
+    animation.CreateJointsAttr(Vt.TokenArray(joints))
+    animation.CreateRotationsAttr()
+    animation.CreateTranslationsAttr()
+    animation.CreateScalesAttr(Vt.Vec3hArray(len(joints), Gf.Vec3h(1)))
+    if len(asset.shapes):
+        animation.CreateBlendShapeWeightsAttr()
+    UsdGeom.Boundable(root).CreateExtentAttr()
+
+
+def _define_points(stage: Usd.Stage, asset: Asset, layout: Layout) -> None:
+    """Add a variant of the shot in which the garment is bound to nothing and has its points from a file."""
+    root = stage.GetPrimAtPath(asset.root)
+    with _variant(root, DEFORMATION, "points"):
+        root.GetPayloads().AddPayload(f"./{layout.points.name}", asset.root)
+        mesh = stage.OverridePrim(asset.garment)
+        mesh.RemoveAppliedSchema("SkelBindingAPI")
+        UsdSkel.BindingAPI(mesh).CreateSkeletonRel().SetTargets([])
+    root.GetVariantSet(DEFORMATION).SetVariantSelection("skel")
+
+
+def write_points(
+    layout: Layout,
+    asset: Asset,
+    vertices: Iterable[Floats],
+    deformer: Deformer,
+    motion: Motion,
+    *,
+    units: StageUnits,
+    start: float = 0.0,
+    samples_per_frame: int = 1,
+    lean: bool = True,
+) -> None:
+    """Write the garment's points at each sample of a shot, [m] in world space, shape (V, 3), as a point cache."""
+    span = TimeSpan.of(motion, start, samples_per_frame)
+    paths = root_path(deformer, motion) if lean else np.zeros((motion.frame_count, 3))
+    with replacing(layout.points) as temporary:
+        layer = Sdf.Layer.CreateNew(str(temporary))
+        stage = Usd.Stage.Open(layer)
+        mesh = UsdGeom.Mesh(stage.OverridePrim(asset.garment))
+        attributes = [mesh.CreatePointsAttr().GetPath(), mesh.CreateExtentAttr().GetPath()]
+        set_metadata(stage, span, units)
+        del stage
+        for frame, (points, path) in enumerate(zip(vertices, paths, strict=True)):
+            placed = np.ascontiguousarray(units.points_from_core(points - path), dtype=np.float32)
+            values = Vt.Vec3fArray.FromNumpy(placed), extent_array(placed.min(axis=0), placed.max(axis=0))
+            for attribute, value in zip(attributes, values):
+                layer.SetTimeSample(attribute, start + span.step * frame, value)
+            if frame % FRAMES_PER_SAVE == FRAMES_PER_SAVE - 1:
+                save(layer, layout.points)
+        save(layer, layout.points)
+        del layer  # the file is closed before it is renamed
+
+
+def write_stage(garments: Sequence[Layout]) -> None:
+    """Write the stage of a shot, each garment by reference, over all frames of theirs; same bytes are left alone."""
+    layout = garments[0]
+    layers = [Sdf.Layer.FindOrOpen(str(garment.animation)) for garment in garments]
+    for layer in layers:
+        layer.Reload()
+    first = layers[0].pseudoRoot
+    with replacing(layout.stage, keep_same=True) as temporary:
+        stage = Usd.Stage.Open(Sdf.Layer.CreateNew(str(temporary)))
+        shot = UsdGeom.Xform.Define(stage, "/Shot").GetPrim()
+        stage.SetDefaultPrim(shot)
+        Usd.ModelAPI(shot).SetKind(Kind.Tokens.assembly)
+        for name in ("metersPerUnit", "upAxis", "timeCodesPerSecond", "framesPerSecond"):
+            stage.SetMetadata(name, first.GetInfo(name))
+        stage.SetStartTimeCode(min(layer.startTimeCode for layer in layers))
+        stage.SetEndTimeCode(max(layer.endTimeCode for layer in layers))
+        for garment in garments:
+            prim = stage.DefinePrim(shot.GetPath().AppendChild(garment.garment))
+            prim.GetReferences().AddReference(os.path.relpath(garment.animation, layout.stage.parent))
+        stage.Save()
+        del stage, shot
