@@ -136,6 +136,25 @@ def resample(motion: Motion, fps: float, *, cover: bool = False) -> Motion:
     return Motion(motion.path, fps, rotations, translations)
 
 
+EASE = 0.25  # [s] in which a run-up comes from rest to the motion's own pace
+
+
+def run_up(motion: Motion, seconds: float) -> Motion:
+    """Return frames before a motion: its first pose, held, then eased into the pace of its first step.
+
+    Args:
+        seconds: how long they take, to the nearest frame and at least one [s].
+    """
+    count = max(round(seconds * motion.fps), 1)
+    easing = min(count, EASE * motion.fps)
+    away = np.arange(count, 0, -1.0).clip(max=easing)
+    away -= away**2 / (2 * easing)  # steps before the first frame; their pace falls from one to zero
+    first, second = (motion.clip(frame, frame + 1) for frame in (0, min(1, motion.frame_count - 1)))
+    rotations = slerp(first.rotations, second.rotations, -away[:, None])
+    translations = first.translations - away[:, None, None] * (second.translations - first.translations)
+    return Motion(motion.path, motion.fps, rotations, translations)
+
+
 CUT_SPEED = 25.0  # [m/s]; a root that is so much faster than before and after has been moved, not animated
 AROUND = 5  # frames to either side that say how fast a root moves anyway, be it in a car
 

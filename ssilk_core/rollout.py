@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import chain, islice
 
 import numpy as np
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from .assets import Floats, GarmentPose, Motion
 from .errors import need
-from .kinematics import frames_at, motion_transforms, resample, skinning_matrices, slerp, split_at_cuts
+from .kinematics import frames_at, motion_transforms, resample, run_up, skinning_matrices, slerp, split_at_cuts
 from .model.descriptors import gravity_features, pose_features
 from .model.network import GarmentModel
 
@@ -38,14 +39,21 @@ class Step:
     recovered: Tensor
 
 
-def roll(model: GarmentModel, span: Motion, chunk: int = CHUNK) -> Iterator[Step]:
+def roll(model: GarmentModel, span: Motion, chunk: int = CHUNK, *, pre_roll: float = 0.0) -> Iterator[Step]:
     """Yield the garment's pose over a motion without cuts, at the model's rate, some frames at a time.
+
+    The garment starts at rest in the first pose; with `pre_roll` [s] it has come there by `run_up`.
 
     Raises:
         SsilkError: the motion is not at the model's rate.
     """
     starts = range(0, span.frame_count, chunk)
-    return roll_blocks(model, (span.clip(start, start + chunk) for start in starts))
+    blocks = (span.clip(start, start + chunk) for start in starts)
+    if not pre_roll:
+        return roll_blocks(model, blocks)
+    before = run_up(span, pre_roll)
+    steps = islice(roll_blocks(model, chain([before], blocks)), 1, None)
+    return (replace(step, start=step.start - before.frame_count) for step in steps)
 
 
 @torch.no_grad()
@@ -137,20 +145,26 @@ def ignored(frames: range) -> None:
 
 
 def garment_poses(
-    model: GarmentModel, motion: Motion, fps: float, chunk: int = CHUNK, on_recovery: OnRecovery = ignored
+    model: GarmentModel,
+    motion: Motion,
+    fps: float,
+    chunk: int = CHUNK,
+    on_recovery: OnRecovery = ignored,
+    *,
+    pre_roll: float = 0.0,
 ) -> Iterator[GarmentPose]:
     """Yield what a shot stores, at `fps`, over a motion of any rate: the frames of `resample(motion, fps)`.
 
     The model rolls at its own rate; where the shot's differs, rotations are interpolated by slerp and weights by
     lines between the two nearest steps. After a cut of the motion (a root that jumps) the garment starts anew from
-    the initialiser, and nothing is interpolated across it. `on_recovery` is told the shot's frames of which
-    `roll_blocks` had to take the rest state.
+    the initialiser, `pre_roll` seconds before (see `roll`), and nothing is interpolated across it. `on_recovery` is
+    told the shot's frames of which `roll_blocks` had to take the rest state.
     """
     first = source_frame = 0
     for span in split_at_cuts(motion):
         stop = frames_at(source_frame + span.frame_count, motion.fps, fps)
         shift = (first / fps - source_frame / motion.fps) * model.config.fps
-        steps = roll(model, resample(span, model.config.fps, cover=True), chunk)
+        steps = roll(model, resample(span, model.config.fps, cover=True), chunk, pre_roll=pre_roll)
         poses = _stored(model, steps, fps / model.config.fps, shift, range(first, stop), on_recovery)
         for pose in resample_poses(poses, model.config.fps, fps, shift=shift, count=stop - first):
             yield replace(pose, start=first + pose.start)

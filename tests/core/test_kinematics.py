@@ -86,3 +86,24 @@ def test_resample_keeps_duration_and_hits_a_steady_turn(source, target):
     np.testing.assert_allclose(
         2 * np.arctan2(motion.rotations[:, 0, 2], motion.rotations[:, 0, 0]), 3 * time, atol=1e-9
     )
+
+
+def test_a_run_up_comes_from_rest_to_the_pace_of_a_steady_turn():
+    fps, pace = 40.0, 0.1  # easing takes 10 frames, in which the joint turns by as much as in 5 at full pace
+    turns = Rotation.from_rotvec(np.arange(5)[:, None] * [0, 0, pace]).as_quat()[:, [3, 0, 1, 2]]
+    places = np.arange(5)[:, None, None] * [[1.0, 0, 0]]
+    before = kinematics.run_up(Motion("turn", fps, turns[:, None], places), 1.0)
+    angles = as_scipy(before.rotations[:, 0]).as_rotvec()[:, 2] / pace
+    np.testing.assert_allclose(angles, before.translations[:, 0, 0], atol=1e-9)
+    steps = np.diff(np.append(angles, 0.0))
+    np.testing.assert_allclose(angles[:31], -5.0, atol=1e-9)
+    np.testing.assert_allclose(steps[30:], np.arange(0.05, 1.0, 0.1), atol=1e-9)
+    assert before.frame_count == 40
+
+
+def test_a_run_up_to_a_single_pose_holds_it():
+    motion = Motion("pose", 30.0, np.array([[[0.6, 0.8, 0, 0]]]), np.ones((1, 1, 3)))
+    before = kinematics.run_up(motion, 0.5)
+    assert before.frame_count == 15
+    np.testing.assert_allclose(before.rotations, np.broadcast_to(motion.rotations, (15, 1, 4)), atol=1e-12)
+    np.testing.assert_allclose(before.translations, 1.0)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ssilk_core.assets import GarmentPose, Motion
 from ssilk_core.errors import SsilkError
-from ssilk_core.kinematics import deform, resample
+from ssilk_core.kinematics import deform, resample, run_up
 from ssilk_core.model.descriptors import gravity_features, pose_features
 from ssilk_core.rollout import decode, garment_poses, resample_poses, roll
 
@@ -59,6 +59,21 @@ def test_a_rollout_is_the_plain_recurrence(model, scene, toy_motion):
     for mine, theirs in zip(joined(roll(model, motion)), expected):
         np.testing.assert_allclose(mine, theirs.detach(), atol=1e-4)  # rounding, which velocities amplify
     assert expected[0].diff(dim=1).abs().max() > 0.01  # it moves
+
+
+@pytest.mark.parametrize(("seconds", "count"), [(1.0, 30), (0.01, 1)])
+def test_a_pre_roll_is_a_rollout_that_began_earlier(model, scene, toy_motion, seconds, count):
+    motion = toy_motion(scene, 50)
+    before = run_up(motion, seconds)
+    rotations, translations = (
+        np.concatenate([getattr(part, name) for part in (before, motion)]) for name in ("rotations", "translations")
+    )
+    longer = Motion(motion.path, motion.fps, rotations, translations)
+    assert before.frame_count == count
+    for mine, whole in zip(joined(roll(model, motion, 16, pre_roll=seconds)), joined(roll(model, longer))):
+        np.testing.assert_allclose(mine, whole[..., count:], atol=1e-4)
+    stored = gathered(garment_poses(model, motion, 24.0, pre_roll=seconds))
+    assert stored.frame_count == gathered(garment_poses(model, motion, 24.0)).frame_count
 
 
 @pytest.mark.parametrize("chunk", [1, 2, 3, 7, 49, 50, 1000])
