@@ -12,9 +12,9 @@ from ssilk_core import __version__
 from ssilk_core.errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, SsilkError, fail
 from ssilk_core.events import Failed, JsonReporter, Reporter, TextReporter
 
-from . import bake, demo, evaluate, inspect, rig, simulate, stress, train, verify, view, wardrobe
+from . import bake, demo, evaluate, inspect, reduce, rig, simulate, stress, train, verify, view, wardrobe
 
-VERBS = (inspect, rig, train, wardrobe, bake, simulate, evaluate, stress, verify, view, demo)
+VERBS = (inspect, rig, train, wardrobe, reduce, bake, simulate, evaluate, stress, verify, view, demo)
 
 # The extra of the distribution that brings all that a verb needs.
 EXTRAS = {
@@ -22,6 +22,7 @@ EXTRAS = {
     "rig": "setup",
     "train": "train",
     "wardrobe": "train",
+    "reduce": "usd",
     "bake": "bake",
     "simulate": "train",
     "evaluate": "train",

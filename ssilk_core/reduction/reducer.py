@@ -92,6 +92,18 @@ class Reducer:
             file, predicted = with_basis(file, basis(found, kept.shapes, readout)), found.lost(kept.shapes)
         return Reduced(file, kept, *self._difference(file), predicted)
 
+    def predicted(self, size: Size) -> float:
+        """Return about what a model of this size loses [m], RMS weighted by mass, without making it."""
+        kept = size.within(self.whole)
+        if kept == self.whole:
+            return 0.0
+        skin = (kept.joints, kept.influences)
+        lost = self.mass * self.influences.lost(self._skinned(*skin))
+        if not self.file.config.given:
+            return float(np.sqrt(lost.sum()))
+        pinned = np.delete(lost, self.free).sum()  # shapes can make up for what the others lose
+        return float(np.hypot(self._followed(*skin).lost(kept.shapes), np.sqrt(pinned)))
+
     @cached_property
     def displacements(self) -> NDArray:
         """By how much blendshapes move the vertices that are not pinned, shape (V', 3, F) [m]."""

@@ -44,7 +44,7 @@ def modes(displacements: NDArray, activations: NDArray, mass: Floats) -> Modes:
 
     Args:
         displacements: of the vertices in F frames, shape (V, 3, F) [m].
-        activations: shape (K, F); mass: of the vertices, adding up to one, shape (V,).
+        activations: shape (K, F); mass: of the vertices as shares of the whole garment's, shape (V,).
     """
     frames = activations.shape[1]
     mean, middle = displacements.mean(axis=2, dtype=np.float64), activations.mean(axis=1, dtype=np.float64)

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cut a trained model down to fewer blendshapes, proxy joints and influences, without training it again.
+
+Each is the best of its number for the motions given (default: those it was trained with, where they still lie):
+blendshapes by reduced-rank regression weighted by mass, influences by least squares, proxies by what is missed least.
+--quality takes a level's numbers; --budget picks the model that loses least of those that are fast or small enough:
+0.3ms for each frame played on this processor, or 6MB for the file. What is cut feeds nothing back: what it loses does
+not add up over time.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ssilk_core.errors import EXIT_OK, need
+from ssilk_core.events import Reporter, Result
+
+from . import options as shared
+from ._quality import NUMBERS, add_level, level_size, spent
+
+if TYPE_CHECKING:
+    from ssilk_core.assets import Motion
+    from ssilk_core.checkpoint import ModelFile
+    from ssilk_core.reduction import Reduced, Reducer
+
+
+def add_arguments(verb: argparse.ArgumentParser) -> None:
+    """Add the options of this verb."""
+    verb.add_argument("model", type=Path, help="model written by 'ssilk train'")
+    verb.add_argument("-o", "--output", type=Path, required=True, help="model to write (.safetensors)")
+    for name, what in zip(NUMBERS, ("blendshapes", "proxy joints", "joints that move one vertex")):
+        verb.add_argument(f"--{name}", type=int, metavar="N", help=f"{what} to keep (default: all)")
+    add_level(verb, "6MB for the file")
+    verb.add_argument("--motions", type=Path, nargs="+", default=[], metavar="PATH",
+                      help="motion files or folders to do well (default: the training's)")  # fmt: skip
+    verb.add_argument("--precision", choices=("int16", "float32"), default="int16",
+                      help="of matrices in the file (default int16, which halves it)")  # fmt: skip
+
+
+def run(options: argparse.Namespace, report: Reporter) -> int:
+    """Reduce and write."""
+    from ssilk_usd.read_motion import motion_files
+
+    from ssilk_core.checkpoint import load_model, save_model
+    from ssilk_core.reduction import Reducer
+
+    need(options.output.suffix == ".safetensors", str(options.output), "not a name for a model",
+         "it ends in .safetensors")  # fmt: skip
+    shared.check_output(options.output, options.model, *motion_files(options.motions))
+    file = load_model(options.model)
+    motions = _motions(file, options)
+    reducer = Reducer(file, motions)
+    found = _chosen(options, reducer, motions, report)
+    told = {"model": str(options.model), "motions": [motion.path for motion in motions], **_figures(reducer, found)}
+    provenance = {**file.provenance, "reduced": told}
+    save_model(options.output, replace(found.file, provenance=provenance), pack=options.precision == "int16")
+    detail = {"model": str(options.output), **_figures(reducer, found), "bytes": options.output.stat().st_size}
+    report(Result("reduce", detail))
+    return EXIT_OK
+
+
+def _motions(file: ModelFile, options: argparse.Namespace) -> list[Motion]:
+    """Read the motions that were named, or those of the training where they still lie."""
+    from ssilk_usd.read_motion import read_motions
+    from ssilk_usd.read_stage import split_location
+
+    known = file.provenance.get("motions", {})
+    there = [path for path in known if Path(split_location(path)[0]).is_file()]
+    need(options.motions or there, str(options.model), "the motions of its training are not where they were",
+         "some are needed to tell what is missed least", "name motion files or folders with --motions")  # fmt: skip
+    return read_motions(options.motions or there, file.scene.character.skeleton)
+
+
+def _chosen(options: argparse.Namespace, reducer: Reducer, motions: list[Motion], report: Reporter) -> Reduced:
+    """Return the model that the options ask for."""
+    from ssilk_core.cost import model_bytes
+
+    named = {name: value for name in NUMBERS if (value := getattr(options, name)) is not None}
+    size = replace(level_size(options.quality, reducer.whole), **named)
+    if not options.budget:
+        return reducer.reduced(size)
+    pack = options.precision == "int16"
+    return spent(options.budget, reducer, size, motions[0], lambda file: model_bytes(file, pack=pack), report)
+
+
+def _figures(reducer: Reducer, found: Reduced) -> dict[str, Any]:
+    """Return what was kept, and what that loses."""
+    kept, whole = vars(found.size), vars(reducer.whole)
+    names = dict(zip(NUMBERS, ("blendshapes", "proxies", "influences")))
+    return {
+        **{names[name]: f"{kept[name]} of {whole[name]}" for name in NUMBERS},
+        "loses [mm RMS]": round(1000 * found.rms, 3),
+        "loses at most [mm]": round(1000 * found.largest, 2),
+    }

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Smaller models and levels of quality, as users ask for them."""
+
+from __future__ import annotations
+
+import json
+import shlex
+
+import pytest
+
+from ssilk_core.checkpoint import load_model
+from ssilk_core.cli import main
+
+
+def run(command: str) -> int:
+    return main(shlex.split(command))
+
+
+def last_result(capsys: pytest.CaptureFixture) -> dict:
+    return json.loads(capsys.readouterr().out.splitlines()[-1])["detail"]
+
+
+@pytest.fixture
+def world(toy, tmp_path, monkeypatch):
+    """A folder of its own with the toy's files, as the working folder."""
+    monkeypatch.chdir(toy.copy(tmp_path))
+    return tmp_path
+
+
+def test_a_smaller_model_bakes_verifies_and_says_what_it_lost(world, capsys):
+    whole = load_model("model.safetensors")
+    assert run("reduce model.safetensors -o small.safetensors --shapes 2 --joints 1 --influences 2 --json") == 0
+    told = last_result(capsys)
+    small = load_model("small.safetensors")
+    assert small.config.shapes == 2 and small.scene.rig.proxy_count == 1
+    assert small.scene.rig.skin.indices.shape[1] == 2
+    lost = small.provenance["reduced"]
+    assert small.provenance["seed"] == whole.provenance["seed"] and lost["model"] == "model.safetensors"
+    assert lost["blendshapes"] == told["blendshapes"] == "2 of 4" and lost["proxies"] == "1 of 4"
+    assert 0 < lost["loses [mm RMS]"] < lost["loses at most [mm]"] and len(lost["motions"]) == 1
+    assert told["bytes"] == (world / "small.safetensors").stat().st_size
+    assert run("bake small.safetensors --stage rigged.usda --motion clip.usda -o small.usdc --json") == 0
+    told = last_result(capsys)
+    assert told["blendshapes"] == 3 and told["proxies"] == 1 and float(told["largest error [m]"]) < 1e-5
+
+
+def test_levels_and_numbers_may_be_mixed(world, capsys):
+    assert run("reduce model.safetensors -o small.safetensors --quality crowd --shapes 1 --json") == 0
+    told = last_result(capsys)
+    assert (told["blendshapes"], told["proxies"]) == ("1 of 4", "4 of 4")
+
+
+def test_a_budget_is_kept_and_what_it_bought_is_said(world, capsys):
+    assert run("reduce model.safetensors -o whole.safetensors --json") == 0
+    whole = last_result(capsys)["bytes"]
+    budget = (whole - 3000) / 1000
+    assert run(f"reduce model.safetensors -o small.safetensors --motions clip.usda --budget {budget}kB") == 0
+    assert "blendshapes" in capsys.readouterr().err
+    assert (world / "small.safetensors").stat().st_size < 1000 * budget + 2000  # what it says of itself comes on top
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("--budget 1kB", "--budget: nothing fits 1 kB; the smallest that this model can be cut to takes"),
+        ("--budget much", "not a budget"),
+        ("--influences 0", "influences = 0"),
+        ("--quality best", "invalid choice: 'best'"),
+        ("--motions nowhere.usda", "nowhere.usda"),
+        ("-o small.usdc", "it ends in .safetensors"),
+        ("-o model.safetensors", "the output is also an input"),
+    ],
+)
+def test_what_cannot_be_is_said_in_one_sentence(world, capsys, options, message):
+    assert run(f"reduce model.safetensors -o small.safetensors {options}") == 2
+    error = capsys.readouterr().err
+    assert message in error and "Traceback" not in error and not (world / "small.safetensors").exists()
+
+
+def test_motions_that_are_gone_must_be_named(world, capsys):
+    (world / "clip.usda").rename("moved.usda")
+    assert run("reduce model.safetensors -o small.safetensors --shapes 2") == 2
+    assert "name motion files or folders with --motions" in capsys.readouterr().err
+    assert run("reduce model.safetensors -o small.safetensors --shapes 2 --motions moved.usda") == 0
