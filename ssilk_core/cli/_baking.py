@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 CHUNK = 256  # frames in memory at once
 MOST_SAMPLES = 64  # in each frame
+MOST_PRE_ROLL = 600.0  # [s]
 BIND_TOLERANCE = 1e-3  # [m] between positions, and between the entries of rotation matrices
 
 
@@ -45,6 +46,7 @@ class BakeRequest:
     device: str = "cpu"
     target: str = "usd"
     samples: int = 1  # in each frame
+    pre_roll: float = 0.0  # [s]
 
     @classmethod
     def of(cls, task: Task) -> BakeRequest:
@@ -101,7 +103,8 @@ class Bake:
         from ssilk_core.rollout import garment_poses
 
         self.recovered.clear()
-        yield from garment_poses(self.model, self.source, self.motion.fps, CHUNK, self._note)
+        rate, pre_roll = self.motion.fps, self.request.pre_roll
+        yield from garment_poses(self.model, self.source, rate, CHUNK, self._note, pre_roll=pre_roll)
 
     def _note(self, frames: range) -> None:
         self.recovered.append(f"{frames[0]} to {frames[-1]}")
@@ -231,7 +234,7 @@ def dressed(request: BakeRequest) -> Dressed:
     """Load what a request names, its motion apart.
 
     Raises:
-        SsilkError: a file is missing or does not fit the others, or there is no such target or number of samples.
+        SsilkError: a file is missing or does not fit the others, or an option has a value that is not allowed.
     """
     from ssilk_usd.read_character import read_character
     from ssilk_usd.read_stage import open_stage
@@ -243,6 +246,8 @@ def dressed(request: BakeRequest) -> Dressed:
     need(request.target in TARGETS, "--target", f"'{request.target}'", f"it is one of {', '.join(TARGETS)}")
     need(1 <= request.samples <= MOST_SAMPLES, "--samples-per-frame", f"{request.samples} samples in each frame",
          f"1 to {MOST_SAMPLES} are allowed")  # fmt: skip
+    need(0 <= request.pre_roll <= MOST_PRE_ROLL, "--pre-roll", f"{request.pre_roll:g} seconds",
+         f"0 to {MOST_PRE_ROLL:g} are allowed")  # fmt: skip
     device, target = chosen_device(request.device), TARGETS[request.target]
     file = load_model(request.model)
     stage = open_stage(request.stage)

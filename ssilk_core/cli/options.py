@@ -87,6 +87,13 @@ def add_bake(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--fps", type=float, help="frames per second of the shot (default: the motion's)")
     verb.add_argument("--samples-per-frame", type=int, default=1, metavar="N",
                       help="samples in each frame, for motion blur (default 1)")  # fmt: skip
+    verb.add_argument(
+        "--pre-roll",
+        type=float,
+        default=0.0,
+        metavar="SECONDS",
+        help="run-up to the first pose and after each cut, so that the garment has settled (default 0)",
+    )
     verb.add_argument("--root", metavar="PRIM", help="SkelRoot of the models that name none")
     verb.add_argument("--plain", action="store_true", help="bake plain skinning instead of the network")
     verb.add_argument("--points", action="store_true", help="write point caches as well (folders)")
@@ -105,6 +112,7 @@ def tasks_of(options: argparse.Namespace) -> list[Task]:
         stage=str(options.stage),
         fps=options.fps,
         samples=options.samples_per_frame,
+        pre_roll=options.pre_roll,
         target=options.target,
         plain=options.plain,
         body=not options.no_body,

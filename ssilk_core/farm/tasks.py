@@ -23,6 +23,7 @@ class Task:
         root: SkelRoot of the character, where the stage has several.
         fps: frames per second, or None for the motion's.
         samples: in each frame.
+        pre_roll: how long the garment settles before the first frame [s].
         target: who receives it (see `ssilk_core.targets`).
         plain: plain skinning instead of the network.
         body: write the character's body meshes as well.
@@ -39,6 +40,7 @@ class Task:
     root: str | None = None
     fps: float | None = None
     samples: int = 1
+    pre_roll: float = 0.0
     target: str = "usd"
     plain: bool = False
     body: bool = True

@@ -124,6 +124,24 @@ def test_the_same_bake_gives_the_same_bytes(world):
     assert Path("shot.usdc").read_bytes() == first
 
 
+def test_a_pre_roll_changes_poses_and_no_times(world):
+    assert run(f"{SHOT} -o shot.usdc --no-verify") == 0
+    assert run(f"{SHOT} -o settled.usdc --pre-roll 0.5") == 0
+    plain, settled = Usd.Stage.Open("shot.usdc"), Usd.Stage.Open("settled.usdc")
+    for read in (Usd.Stage.GetStartTimeCode, Usd.Stage.GetEndTimeCode):
+        assert read(plain) == read(settled)
+    first = [np.array(animation(shot).GetRotationsAttr().Get(shot.GetStartTimeCode())) for shot in (plain, settled)]
+    np.testing.assert_array_equal(first[0][:3], first[1][:3])
+    assert np.abs(first[0][3:] - first[1][3:]).max() > 1e-4
+    assert run("verify settled.usdc") == 0
+
+
+@pytest.mark.parametrize("seconds", ["-1", "nan", "601"])
+def test_a_pre_roll_out_of_range_is_refused(world, capsys, seconds):
+    assert run(f"{SHOT} -o shot.usdc --pre-roll={seconds}") == 2
+    assert "0 to 600 are allowed" in capsys.readouterr().err
+
+
 def test_plain_skinning_moves_with_the_body_alone(world):
     assert run(f"{SHOT} -o plain.usdc --plain") == 0
     stage = Usd.Stage.Open("plain.usdc")
