@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ways of playing a garment over a motion, each with the time that its parts take."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ssilk_core.assets import Motion
+from ssilk_core.baselines.descriptors import joint_bank
+from ssilk_core.baselines.networks import Baseline, BaselineConfig, baseline
+from ssilk_core.checkpoint import ModelFile, network
+from ssilk_core.model.batch import DOWN, driven
+from ssilk_core.model.network import GarmentModel
+from ssilk_core.runtime.drive import drive
+from ssilk_core.runtime.playback import BLOCK, POSED
+from ssilk_core.runtime.player import Player
+from ssilk_core.runtime.skinning import posed
+from ssilk_core.training.bank import build_bank
+
+DESCRIPTORS, REST, LATENTS, DECODER, KINEMATICS, SKINNING = PARTS = (
+    "descriptors and character", "networks of the poses alone", "latents", "decoder", "proxy kinematics",
+    "blendshapes and skinning",
+)  # fmt: skip
+TOTALS = {
+    "model": (LATENTS, DECODER),
+    "+ kinematics": (LATENTS, DECODER, KINEMATICS),
+    "+ blendshapes and skinning": (LATENTS, DECODER, KINEMATICS, SKINNING),
+    "full, poses included": PARTS,
+}
+Laps = dict[str, float]
+Way = Callable[[Motion], Laps]
+Times = dict[str, dict[str, list[float]]]  # median and 95th percentile [us] by way, then by part or total
+
+
+class Stopwatch:
+    """Adds up processor time since the last lap under the name of a part [s]: other work cannot lengthen it."""
+
+    def __init__(self) -> None:
+        self.laps: Laps = defaultdict(float)
+        self.last = time.process_time()
+
+    def lap(self, part: str) -> None:
+        now = time.process_time()
+        self.laps[part] += now - self.last
+        self.last = now
+
+
+def spans(count: int, size: int) -> Iterator[slice]:
+    return (slice(start, min(start + size, count)) for start in range(0, count, size))
+
+
+def with_numpy(player: Player, motion: Motion) -> Laps:
+    """Play a motion at the model's rate as `runtime.Playback` does; return the time of each part [s]."""
+    watch, before = Stopwatch(), None
+    for frames in spans(motion.frame_count, BLOCK):
+        seen = min(frames.start, 2)
+        given = drive(motion.clip(frames.start - seen, frames.stop), player.skeleton, player.file.joints, seen)
+        watch.lap(DESCRIPTORS)
+        course = player.stepper.prepared(player.at_rest(given.static), given.static, given.rates, before)
+        watch.lap(REST)
+        states = player.stepper.rolled(course)
+        before = states[-2:]
+        watch.lap(LATENTS)
+        activations, rotations = player.decoder.decoded(states)
+        watch.lap(DECODER)
+        matrices = player.kinematics.matrices(rotations, given.matrices)
+        watch.lap(KINEMATICS)
+        for part in spans(len(states), POSED):
+            posed(player.tiles, activations[:, part], matrices[..., part], given.origins[part])
+        watch.lap(SKINNING)
+    return watch.laps
+
+
+@torch.no_grad()
+def with_torch(model: GarmentModel, motion: Motion, chunk: int) -> Laps:
+    """Play a motion with the network itself, `chunk` frames at a time; return the time of each part [s].
+
+    Latents advance frame by frame in any case. The stepper sees each pose moved and held still in one call.
+    """
+    watch = Stopwatch()
+    given = driven(model, [motion])
+    watch.lap(DESCRIPTORS)  # with the quasi-static latents, which PyTorch computes at once
+    states: list[Tensor] = []
+    for frames in spans(motion.frame_count, chunk):
+        rest, pose = given.rest[frames], given.pose[frames]
+        resting = max(0, min(2 - frames.start, len(rest)))
+        states = model.roll([*states[-2:], *rest[:resting]], rest[resting:], pose[resting:])
+        watch.lap(LATENTS)
+        activations, rotations = model.pose(torch.cat(states[-len(rest) :]))
+        watch.lap(DECODER)
+        character = given.character[frames, ..., 0].permute(1, 2, 3, 0)
+        matrices = model.decoder.proxy_matrices(rotations, character)
+        watch.lap(KINEMATICS)
+        for part in spans(len(rest), POSED):
+            model.decoder._skinned(activations[:, part], matrices[..., part])
+        watch.lap(SKINNING)
+    return watch.laps
+
+
+@torch.no_grad()
+def with_baseline(model: Baseline, motion: Motion, chunk: int) -> Laps:
+    """Play a motion with a baseline, `chunk` frames at a time; return the time of each part [s]."""
+    watch, skeleton = Stopwatch(), model.scene.character.skeleton
+    bank = build_bank([motion], skeleton, model.joints, model.config.fps, torch.device("cpu"))
+    inner = torch.as_tensor(skeleton.parents[model.joints] >= 0)
+    seen = joint_bank(bank, inner, model.config.fps)
+    down = torch.tensor(DOWN).expand(bank.frame_count, 3)
+    every = torch.arange(bank.frame_count)
+    static, pose = seen.static_descriptor(every, down), seen.dynamic_descriptor(every, down)[:, None]
+    watch.lap(DESCRIPTORS)
+    states = [model.initial(static[:1])]
+    watch.lap(REST)
+    for frames in spans(bank.frame_count, chunk):
+        states = model.roll(states[-1:], states[-1][None], pose[frames])[1:]
+        watch.lap(LATENTS)
+        codes = model.code(torch.cat(states))
+        watch.lap(DECODER)
+        model.skinned(codes, bank.character(every[frames]))
+        watch.lap(SKINNING)
+    return watch.laps
+
+
+def ways(file: ModelFile, chunks: dict[str, int]) -> dict[str, Way]:
+    """Return the ways of playing a garment by name: numpy, then PyTorch and NCS in chunks of frames by name.
+
+    NCS is untrained, which takes as long.
+    """
+    player, model = Player(file), network(file)
+    ncs = baseline(file.scene, BaselineConfig(method="ncs", fps=file.config.fps), file.joints).eval()
+    found: dict[str, Way] = {"numpy": lambda motion: with_numpy(player, motion)}
+    for name, chunk in chunks.items():
+        found[f"PyTorch, {name}"] = lambda motion, chunk=chunk: with_torch(model, motion, chunk)  # type: ignore[misc]
+        found[f"NCS, {name}"] = lambda motion, chunk=chunk: with_baseline(ncs, motion, chunk)  # type: ignore[misc]
+    return found
+
+
+def measured(players: dict[str, Way], motion: Motion, repeats: int) -> Times:
+    """Return median and 95th percentile [us] per frame by way, then by part or total; the ways take turns."""
+    laps: dict[str, list[Laps]] = {name: [] for name in players}
+    for repeat in range(repeats + 1):
+        for name, play in players.items():
+            taken = play(motion)
+            if repeat:  # the first one warms caches
+                laps[name].append(taken)
+    sums = {**{part: (part,) for part in PARTS}, **TOTALS}
+    return {
+        name: {row: spread([sum(lap.get(part, 0.0) for part in parts) / motion.frame_count for lap in taken])
+               for row, parts in sums.items()}
+        for name, taken in laps.items()
+    }  # fmt: skip
+
+
+def spread(seconds: list[float]) -> list[float]:
+    """Return median and 95th percentile [us]."""
+    return (1e6 * np.percentile(seconds, (50, 95))).tolist()
