@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 
 from ssilk_core.assets import Floats, Ints
 
+NO_AREA = 1e-7  # twice the area of a triangle to the square of its longest edge; single precision sees no less
+SLIVER = 50.0  # longest edge of a triangle to its height; clean cloth stays below 15
+
 
 def edges(faces: Ints) -> NDArray[np.int64]:
     """Return each undirected edge once, as (low, high) in ascending order, shape (E, 2)."""

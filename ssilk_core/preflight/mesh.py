@@ -6,13 +6,11 @@ from __future__ import annotations
 import numpy as np
 
 from ssilk_core.assets import Floats, Ints, Mesh
-from ssilk_core.mesh.topology import edge_use, face_areas
+from ssilk_core.mesh.topology import NO_AREA, SLIVER, edge_use, face_areas
 
 from .finding import Finding, Findings, amount, listing
 
 SAME_PLACE = 1e-6  # [m]; vertices closer than this share their place
-NO_AREA = 1e-9  # of the square of the longest edge: what the membrane energy refuses
-SLIVER = 50.0  # longest edge to height of a triangle; clean cloth stays below 15
 
 
 def isolated_vertices(mesh: Mesh) -> Findings:
@@ -120,7 +118,7 @@ def degenerate_faces(mesh: Mesh, collapsing: int) -> Findings:
             prim=mesh.path,
             count=int(sliver.sum()),
             found=f"more than {SLIVER:.0f} times as long as high",
-            why="the cloth is stiff there and training slows down",
+            why="the cloth is wrong there: slivers resist less than they should, so as not to outweigh all else",
             fix="collapse their short edges or remesh",
             elements="faces",
             indices=listing(np.flatnonzero(sliver)),

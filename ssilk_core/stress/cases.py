@@ -81,7 +81,7 @@ def at_rate(fps: int) -> Callable[[Subject], Measured]:
 
     def measure(subject: Subject) -> Measured:
         base, own = subject.base, round(subject.fps)
-        drive = base.lasting(subject.effort.seconds, fps)
+        drive = base.lasting((base.frames - 1) / base.fps, fps)
         shared = gcd(fps, own)
         found, expected = (positions(subject.model, each) for each in (drive, base))
         found, expected = found[:: fps // shared], expected[:: own // shared]

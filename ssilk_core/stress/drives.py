@@ -15,6 +15,7 @@ from ..assets import Floats, Motion, Skeleton
 from ..kinematics import local_transforms, multiply_quaternions, quaternion_from_matrix, sample_motion, slerp
 
 BLOCK = 256  # frames
+SWAY = 4.0  # [s]
 
 Sampled = tuple[Floats, Floats]  # rotations (N, J, 4) and translations (N, J, 3) [m]
 Turn = Callable[[Floats], Floats]  # times [s] (N,) to quaternions (N, 4)
@@ -51,6 +52,11 @@ class Drive:
         fps = fps or self.fps
         return replace(self, fps=fps, frames=round(seconds * fps) + 1)
 
+    def looping(self, seconds: float) -> Drive:
+        """Return the drive for at least so many seconds and three of its loops, ended by a whole one."""
+        loops = max(3, int(np.ceil(seconds / self.loop)))
+        return self.lasting(loops * self.loop)
+
     def then(self, change: Callable[[Floats, Floats, Floats], Sampled]) -> Drive:
         """Return the drive with rotations and translations changed by a function of (times, both)."""
         return replace(self, at=lambda times: change(times, *self.at(times)))
@@ -58,7 +64,7 @@ class Drive:
 
 def sway(skeleton: Skeleton, fps: float) -> Drive:
     """Return a drive for want of a motion: every joint turns by sines of its own about the bind pose, in a loop."""
-    random, loop = np.random.default_rng(0), 4.0
+    random, loop = np.random.default_rng(0), SWAY
     local = local_transforms(skeleton.bind_transforms, skeleton.parents)
     rest, places = quaternion_from_matrix(local[:, :3, :3]), local[:, :3, 3]
     turns = random.integers(1, 4, (skeleton.joint_count, 3)) * 2 * np.pi / loop  # [rad/s]
@@ -75,14 +81,14 @@ def sway(skeleton: Skeleton, fps: float) -> Drive:
 
 
 def looped(motion: Motion, fps: float) -> Drive:
-    """Return a clip played forward and backward without end."""
-    last = max(motion.frame_count - 1, 1)
+    """Return a clip played forward and backward without end, slowing at both ends; a loop has whole frames at `fps`."""
+    last = motion.frame_count - 1
+    loop = max(1, round(np.pi * last / motion.fps * fps)) / fps  # at the clip's own speed in its middle
 
     def at(times: Floats) -> Sampled:
-        phase = times * motion.fps % (2 * last)
-        return sample_motion(motion, np.minimum(last - np.abs(last - phase), motion.frame_count - 1))
+        return sample_motion(motion, last * (1 - np.cos(2 * np.pi * times / loop)) / 2)
 
-    return Drive(fps, 1, at, 2 * last / motion.fps)
+    return Drive(fps, 1, at, loop)
 
 
 def turned(drive: Drive, skeleton: Skeleton, turn: Turn) -> Drive:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,9 +18,9 @@ from ..model.network import GarmentModel
 from ..model.skinning import Skinning
 from ..rollout import decode, garment_poses, roll_blocks
 from .drives import Drive
+from .worlds import garment_size
 
-ENERGY_EVERY = 8  # frames: energies take ten times as long as all else
-SHARE = 5  # the first and the last of so many parts are compared for growth
+ENERGY_EVERY = 4  # frames: energies take ten times as long as all else
 FAR = 2.0  # times the garment's own size from plain skinning: cloth that hangs the other way is no further off
 LONG = 4096  # frames; more are streamed, and only so many of them decoded
 
@@ -36,7 +36,8 @@ class Extent:
         distance: largest of any vertex from plain skinning [m].
         size: of the garment at rest: the diagonal of its box [m].
         latent: largest entry of any latent.
-        growth: elastic and kinetic energy in the last fifth of the frames over that in the first.
+        growth: mean elastic and kinetic energy in the last loop of the motion over that in the second, the first one
+            being the transient's; 1 where there are not three.
         recovered: frames at which the rollout was lost.
     """
 
@@ -69,27 +70,31 @@ class Latents:
 
 
 class Meter:
-    """Takes blocks of frames of one garment and keeps what an `Extent` needs."""
+    """Takes blocks of frames of one garment and keeps what an `Extent` needs; energies in `spans` of frames alone."""
 
-    def __init__(self, scene: Scene, fabric: Fabric, fps: float) -> None:
-        self.scene, self.fps = scene, fps
+    def __init__(self, scene: Scene, fabric: Fabric, fps: float, spans: Sequence[range] = ()) -> None:
+        self.scene, self.fps, self.spans = scene, fps, [span[::ENERGY_EVERY] for span in spans]
         self.energy = GarmentEnergy(scene.garment.mesh, fabric, dtype=torch.float64)
         self.skin = Skinning(scene.plain_skin).double()
         self.rest = torch.tensor(scene.garment.mesh.points)
         self.speed, self.distance, self.finite = 0.0, 0.0, True
-        self.energies: list[float] = []
+        self.energies: list[list[float]] = [[] for _ in spans]
 
     def add(self, motion: Motion, points: Floats) -> None:
-        """Take the frames of a block and the garment's points (F, V, 3) [m] there."""
+        """Take a block, whose first frame is number `motion.start`, and the garment's points there (F, V, 3) [m]."""
         self.finite &= bool(np.isfinite(points).all())
         matrices, origin = matrices_about_root(motion, self.scene)
         x = torch.as_tensor((points - origin).transpose(1, 2, 0))
         plain = self.skin(self.rest, None, self.skin.weights, matrices)
         self.distance = max(self.distance, float((x - plain).norm(dim=1).max()))
         velocity = x.diff(dim=2) * self.fps
-        if velocity.shape[2]:
-            self.speed = max(self.speed, float(velocity.norm(dim=1).max()))
-            self.energies += self._energies(x[..., 1::ENERGY_EVERY], velocity[..., ::ENERGY_EVERY])
+        if not velocity.shape[2]:
+            return
+        self.speed = max(self.speed, float(velocity.norm(dim=1).max()))
+        for span, energies in zip(self.spans, self.energies):
+            frames = [frame for frame in range(1, x.shape[2]) if motion.start + frame in span]
+            if frames:
+                energies += self._energies(x[..., frames], velocity[..., [frame - 1 for frame in frames]])
 
     def _energies(self, x: Tensor, velocity: Tensor) -> list[float]:
         kinetic = self.energy.mass @ (velocity**2).sum(1) / 2
@@ -97,12 +102,17 @@ class Meter:
 
     @property
     def growth(self) -> float:
-        """Energy in the last part of the frames over that in the first; 1 for one frame."""
-        part = max(1, len(self.energies) // SHARE)
-        first, last = (
-            float(np.mean(values)) for values in (self.energies[:part] or [1], self.energies[-part:] or [1])
-        )
-        return last / first if first else float(last == 0) or float("inf")
+        """Mean energy in the last span over that in the first; 1 where there are none."""
+        if not self.energies or not all(self.energies):
+            return 1.0
+        return float(np.mean(self.energies[-1]) / np.mean(self.energies[0]))
+
+
+def compared_loops(drive: Drive) -> tuple[range, ...]:
+    """Return the frames of a drive's second loop and of its last; nothing where there are not three."""
+    length = round(drive.loop * drive.fps)
+    loops = drive.frames // length if length else 0
+    return tuple(range(loop * length, (loop + 1) * length) for loop in (1, loops - 1)) if loops >= 3 else ()
 
 
 def matrices_about_root(motion: Motion, scene: Scene) -> tuple[Tensor, Floats]:
@@ -124,7 +134,8 @@ class Course:
     recovered: list[range] = field(default_factory=list)
 
     def __iter__(self) -> Iterator[tuple[Motion, GarmentPose]]:
-        return self._streamed() if self.drive.frames > LONG else self._baked()
+        steady = self.drive.fps == self.model.config.fps
+        return self._streamed() if steady and self.drive.frames > LONG else self._baked()
 
     def _baked(self) -> Iterator[tuple[Motion, GarmentPose]]:
         """Yield what a bake of the whole motion writes."""
@@ -141,23 +152,25 @@ class Course:
 
 
 def extent(model: GarmentModel, fabric: Fabric, drive: Drive) -> Extent:
-    """Roll a model over a drive and measure it; of more than `LONG` frames some blocks are decoded, evenly spread.
+    """Roll a model over a drive and measure it; of more than `LONG` frames some blocks are decoded, evenly spread,
+    and those of the compared loops.
 
     Raises:
         SsilkError: the motion cannot be played.
     """
     course, latents = Course(model, drive), Latents()
-    meter = Meter(model.scene, fabric, drive.fps)
+    spans = compared_loops(drive)
+    meter = Meter(model.scene, fabric, drive.fps, spans)
     skipped = -(-drive.frames // LONG)
     handle = latents.watched(model)
     try:
         for number, (motion, pose) in enumerate(course):
-            if number % skipped == 0:
+            own = range(int(motion.start), int(motion.start) + motion.frame_count)
+            if number % skipped == 0 or any(own.start < span.stop and span.start < own.stop for span in spans):
                 meter.add(motion, decode(model, motion, pose))
     finally:
         handle.remove()
-    points = model.scene.garment.mesh.points
-    size = float(np.linalg.norm(np.ptp(points, axis=0)))
+    size = garment_size(model.scene)
     lost = sum(map(len, course.recovered))
     return Extent(drive.frames, meter.finite, meter.speed, meter.distance, size, latents.largest, meter.growth, lost)
 

@@ -26,15 +26,15 @@ class Effort:
         vertices: most that a trial garment may have.
     """
 
-    seconds: float = 10.0
+    seconds: float = 20.0
     frames: float = 1.0
-    steps: int = 20
+    steps: int = 60
     simulated: int = 10
     vertices: int = 200_000
 
 
 FULL = Effort()
-QUICK = Effort(seconds=3.0, frames=0.1, steps=6, simulated=3, vertices=20_000)
+QUICK = Effort(seconds=3.0, frames=0.1, steps=12, simulated=3, vertices=20_000)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ class Subject:
         """The motion that every case begins from."""
         skeleton = self.scene.character.skeleton
         endless = looped(self.clip, self.fps) if self.clip else sway(skeleton, self.fps)
-        return endless.lasting(self.effort.seconds)
+        return endless.looping(self.effort.seconds)
 
     @cached_property
     def model(self) -> GarmentModel:

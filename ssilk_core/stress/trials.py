@@ -23,6 +23,7 @@ from ..training.job import TrainJob
 from ..training.parts import build_parts
 from .drives import Drive
 from .meter import Extent, Meter, extent, matrices_about_root
+from .worlds import garment_size
 
 SMALL = ModelConfig(latent=16, widths=(32, 32), shapes=8)
 WIGGLE = 1e-3  # of the garment's size: by how much points are moved off plain skinning to have energies compared
@@ -68,8 +69,7 @@ def simulated(scene: Scene, fabric: Fabric, motion: Motion, gravity: Sequence[fl
     meter = Meter(scene, fabric, motion.fps)
     points = np.stack([frame.points for frame in Simulator(scene, fabric, options).frames([motion])])
     meter.add(motion, points)
-    size = float(np.linalg.norm(np.ptp(scene.garment.mesh.points, axis=0)))
-    return Extent(len(points), meter.finite, meter.speed, meter.distance, size, 0.0, meter.growth, 0)
+    return Extent(len(points), meter.finite, meter.speed, meter.distance, garment_size(scene), 0.0, meter.growth, 0)
 
 
 def gradient_error(scene: Scene, fabric: Fabric, motion: Motion) -> float:

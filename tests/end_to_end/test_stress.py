@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ssilk stress, from a model and a stage to a table and a file of figures."""
+
+import json
+
+import pytest
+
+from ssilk_core.cli import main
+
+
+def stress(toy, *words: str) -> int:
+    files = [str(toy.folder / "model.safetensors"), "--stage", str(toy.folder / "rigged.usda")]
+    return main(["stress", *files, "--quick", *words])
+
+
+@pytest.mark.parametrize("motion", [(), ("--motion", "clip.usda")])
+def test_figures_of_every_case_that_was_asked_for(toy, tmp_path, capsys, motion):
+    given = [str(toy.folder / word) if word.endswith("usda") else word for word in motion]
+    assert stress(toy, *given, "--only", "motion:", "precision: float16", "-o", str(tmp_path / "out.json")) == 0
+    document = json.loads((tmp_path / "out.json").read_text())
+    found = {outcome["name"]: outcome for outcome in document["outcomes"]}
+    assert len(found) == 11 and document["quick"] and len(document["model_sha256"]) == 64
+    assert found["NaN in frame 7"]["verdict"] == "refuses"
+    assert found["upside down"]["measured"]["extent"]["finite"]
+    assert 0 < found["float16"]["measured"]["error"] < 0.2
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("| motion: ")]
+    assert len(lines) == 10
+
+
+def test_what_does_not_fit_is_refused_in_one_sentence(toy, tmp_path, capsys):
+    assert stress(toy, "--only", "weather") == 2
+    assert "no case contains weather" in capsys.readouterr().err
+    assert stress(toy, "-o", str(toy.folder / "model.safetensors")) == 2
+    assert "the output is also an input" in capsys.readouterr().err
+    assert main(["stress", str(tmp_path / "none.safetensors"), "--stage", str(toy.folder / "rigged.usda")]) == 2
+    assert "there is no such model file" in capsys.readouterr().err
