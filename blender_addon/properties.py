@@ -6,7 +6,8 @@ from __future__ import annotations
 import bpy
 from bpy.props import PointerProperty, StringProperty
 
-from . import training_properties
+from . import fabric_properties, training_properties
+from .fabric_properties import FabricSettings
 from .training_properties import RELATIVE, TrainingSettings
 
 
@@ -28,6 +29,7 @@ class GarmentSettings(bpy.types.PropertyGroup):
         name="Bodies",
         description="Meshes that the garment collides with; all others bound to the armature when empty",
     )
+    fabric: PointerProperty(type=FabricSettings, name="Fabric", description="What the garment is made of")
     model: StringProperty(
         name="Model",
         subtype="FILE_PATH",
@@ -37,7 +39,7 @@ class GarmentSettings(bpy.types.PropertyGroup):
     training: PointerProperty(type=TrainingSettings, name="Training", description="How the garment is trained")
 
 
-CLASSES = (*training_properties.CLASSES, GarmentSettings)
+CLASSES = (*training_properties.CLASSES, *fabric_properties.CLASSES, GarmentSettings)
 
 
 def attach() -> None:

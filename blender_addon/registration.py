@@ -5,18 +5,20 @@ from __future__ import annotations
 
 import bpy
 
-from . import panels, preferences, properties
-from .operators import baking, classes, environment, fill, rig, tasks, training
+from . import panels, preferences, preflight_properties, properties
+from .operators import baking, classes, environment, fill, preflight, rig, tasks, training
 from .panels import plot
 
 CLASSES = (
     *properties.CLASSES,
+    *preflight_properties.CLASSES,
     *preferences.CLASSES,
     *tasks.CLASSES,
     *environment.CLASSES,
     *classes.CLASSES,
     *fill.CLASSES,
     *rig.CLASSES,
+    *preflight.CLASSES,
     *training.CLASSES,
     *baking.CLASSES,
     *panels.CLASSES,
@@ -28,6 +30,7 @@ def register() -> None:
     for kind in CLASSES:
         bpy.utils.register_class(kind)
     properties.attach()
+    preflight_properties.attach()
     training.start_watching()
 
 
@@ -36,6 +39,7 @@ def unregister() -> None:
     tasks.stop()
     training.stop_watching(bpy.context)
     plot.forget()
+    preflight_properties.detach()
     properties.detach()
     for kind in reversed(CLASSES):
         bpy.utils.unregister_class(kind)

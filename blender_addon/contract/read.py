@@ -35,6 +35,12 @@ def read_rig(path: Path, garment: str, joints: Joints) -> Rig:
     )
 
 
+def read_points(path: Path, mesh: str) -> np.ndarray:
+    """Read the points of the mesh at a prim path of a stage of `write_stage`, shape (V, 3)."""
+    stage = Usd.Stage.Open(str(path))
+    return np.array(UsdGeom.Mesh.Get(stage, mesh).GetPointsAttr().Get())
+
+
 def _value(prim: Usd.Prim, name: str) -> Any:
     return prim.GetAttribute(name).Get()
 

@@ -34,7 +34,7 @@ class OutsideOperator:
         raise NotImplementedError
 
     def explain(self, work: Work) -> str:
-        """Return why the work failed."""
+        """Return why the work failed; empty if it did what was wanted all the same."""
         return work.error
 
     def execute(self, context: bpy.types.Context) -> set[str]:
@@ -82,8 +82,9 @@ class OutsideOperator:
         """Report how the work ended, with what it made."""
         work = self.work
         try:
-            if work.error:
-                raise SetupError(self.explain(work))
+            reason = work.error and self.explain(work)
+            if reason:
+                raise SetupError(reason)
             self.report({"INFO"}, self.finish(context, work))
         except SetupError as error:
             self.report({"WARNING" if work.cancelled else "ERROR"}, str(error))

@@ -14,10 +14,12 @@ from ..classes import LOOSE
 from ..contract.arrays import Dressed
 from ..contract.names import identifiers
 from ..errors import need
+from ..fabric_properties import fabric_options
 from ..outside import jobs
 from ..outside.work import Work
 from ..preferences import interpreter, preferences, unready
 from ..scene.baked import need_bakeable
+from ..scene.follower import leader_of
 from ..scene.garment import armature_of, unusable
 from ..scene.gather import character_joints, gather
 from ..scene.handover import STAGE, expose_usd, hand_over
@@ -53,7 +55,8 @@ class FindMotions(MotionOperator, bpy.types.Operator):
 
     def apply(self, context: bpy.types.Context) -> str:
         garment = context.object
-        found = sources(armature_of(garment))
+        armature = leader_of(armature_of(garment))
+        found = sources(armature)
         motions = garment.ssilk.training.motions
         used = {(item.kind, item.name, item.track): item.use for item in motions}
         files = [item.name for item in motions if item.kind == FILE]
@@ -61,7 +64,7 @@ class FindMotions(MotionOperator, bpy.types.Operator):
         for source in (*found, *(Source(FILE, path) for path in files)):
             key = (source.kind, source.name, source.track)
             add_motion(garment, source).use = used.get(key, source.kind != "TIMELINE" or len(found) == 1)
-        return f"'{armature_of(garment).name}' has {len(found) - 1} motions besides the timeline."
+        return f"'{armature.name}' has {len(found) - 1} motions besides the timeline."
 
 
 class AddMotionFiles(MotionOperator, bpy.types.Operator):
@@ -250,7 +253,7 @@ def train_command(garment: bpy.types.Object, prim: str, takes: Sequence[Take], f
     budget = ["--set", f"iterations={settings.iterations}"] if settings.iterations else []
     return [
         "-m", "ssilk_core", "train", STAGE, "--garment", prim, "--motions", *motions, "-o", jobs.MODEL,
-        "--preset", settings.preset, *budget, "--json",
+        "--preset", settings.preset, *budget, *fabric_options(garment.ssilk.fabric), "--json",
     ]  # fmt: skip
 
 

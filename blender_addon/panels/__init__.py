@@ -5,8 +5,19 @@ from __future__ import annotations
 
 from .baking import BakingPanel
 from .classes import ClassesPanel
+from .fabric import FabricPanel
 from .garment import GarmentPanel
+from .preflight import FindingList, PreflightPanel
 from .rig import RigPanel
 from .training import TrainingPanel
 
-CLASSES = (GarmentPanel, ClassesPanel, RigPanel, TrainingPanel, BakingPanel)  # in the order of the sidebar
+CLASSES = (
+    FindingList,
+    GarmentPanel,
+    FabricPanel,
+    PreflightPanel,
+    ClassesPanel,
+    RigPanel,
+    TrainingPanel,
+    BakingPanel,
+)  # in the order of the sidebar

@@ -93,12 +93,17 @@ def _parent(bone: bpy.types.Bone, index: dict[str, int]) -> int:
     return next((index[above.name] for above in bone.parent_recursive if above.name in index), -1)
 
 
+def is_evenly_scaled(armature: bpy.types.Object) -> bool:
+    """Return whether an armature is scaled alike in all directions, and not mirrored."""
+    scale = armature.matrix_world.to_scale()
+    return max(scale) - min(scale) <= UNEQUAL * abs(max(scale)) and armature.matrix_world.determinant() > 0
+
+
 def _rigid(armature: bpy.types.Object) -> Matrix:
     """Return the armature's placement; its scale must be uniform."""
-    scale, placement = armature.matrix_world.to_scale(), armature.matrix_world
-    uniform = max(scale) - min(scale) <= UNEQUAL * abs(max(scale)) and placement.determinant() > 0
-    need(uniform, f"'{armature.name}' is scaled unequally or mirrored; apply its scale (Ctrl A).")
-    return placement
+    uneven = f"'{armature.name}' is scaled unequally or mirrored; apply its scale (Ctrl A)."
+    need(is_evenly_scaled(armature), uneven)
+    return armature.matrix_world
 
 
 def _shrunk(armature: bpy.types.Object) -> Matrix:

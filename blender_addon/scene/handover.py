@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ import bpy
 from ..contract.arrays import Dressed, Joints, Rig
 from ..errors import need
 
-STAGE, RIGGED = "dressed.usdc", "rigged.usdc"
+STAGE, RIGGED, REPAIRED = "dressed.usdc", "rigged.usdc", "repaired.usdc"
 
 
 @dataclass(frozen=True)
@@ -71,8 +72,21 @@ def rig_command(python: str, folder: Path, handover: Handover, options: Sequence
     return [python, "-m", "ssilk_core", "rig", stage, "--garment", prim, "-o", rigged, "--json", *options]
 
 
+def inspect_command(python: str, folder: Path, handover: Handover, *, repaired: bool) -> list[str]:
+    """Return the command that inspects what was handed over, and writes a repaired copy where that is asked for."""
+    fix = ["--fix", str(folder / REPAIRED)] if repaired else []
+    prim = handover.prims[handover.name]
+    return [python, "-m", "ssilk_core", "inspect", str(folder / STAGE), "--garment", prim, "--json", *fix]
+
+
 def expose_usd() -> None:
-    """Make Blender's own `pxr` importable; the bpy module hides it, Blender does not."""
+    """Make Blender's own `pxr` importable; the bpy module hides it, Blender does not.
+
+    Raises:
+        SetupError: this Blender was built without USD, as those of some Linux distributions are.
+    """
     expose = getattr(bpy.utils, "expose_bundled_modules", None)
     if expose:
         expose()
+    built = importlib.util.find_spec("pxr")
+    need(built, "This Blender was built without USD; take one from blender.org.")

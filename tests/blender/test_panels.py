@@ -23,8 +23,16 @@ class Layout:
 
     column = row
 
-    def label(self, text: str, icon: str = "NONE") -> None:
+    def label(self, text: str, icon: str = "NONE", translate: bool = True) -> None:
         self.notes.append(text)
+
+    def template_list(
+        self, kind: str, _: str, data: object, name: str, active: object, index: str, rows: int
+    ) -> None:
+        import bpy
+
+        assert hasattr(bpy.types, kind) and hasattr(data, name) and hasattr(active, index)
+        self.notes.append(name)
 
     def prop(self, data: object, name: str) -> None:
         assert hasattr(data, name), name

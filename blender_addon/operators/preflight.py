@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The preflight: what `ssilk inspect` finds, selected and repaired in Blender."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+
+from ..contract.findings import read_findings
+from ..errors import SetupError, need
+from ..outside.work import Work
+from ..preferences import interpreter, preferences
+from ..preflight_properties import FindingItem, keep_findings, shown_finding, size_of
+from ..scene.armature import read_joints
+from ..scene.checks import SCALE, scene_findings
+from ..scene.garment import armature_of
+from ..scene.gather import gather
+from ..scene.handover import REPAIRED, hand_over, inspect_command
+from ..scene.repairs import REPAIRS, apply_scale, push_points, repair_mesh
+from ..scene.selecting import select_bones, select_elements
+from .reporting import ReportingOperator
+from .rig import RigOperator
+
+PUSHED = ("penetration", "inside-margin")
+
+
+class InspectOperator(RigOperator):
+    """Base of operators that hand the garment to `ssilk inspect`."""
+
+    repaired = False
+
+    def prepare(self, context: bpy.types.Context) -> Work:
+        garment = context.object
+        self.dressed, armature = gather(garment), armature_of(garment)
+        python = interpreter(preferences(context))
+
+        def commands(folder: Path) -> list[list[str]]:
+            self.handover = hand_over(self.dressed, garment, armature, folder)
+            return [inspect_command(python, folder, self.handover, repaired=self.repaired)]
+
+        return Work(f"Inspecting '{garment.name}'", commands, parent=bpy.app.tempdir)
+
+    def explain(self, work: Work) -> str:
+        return "" if "findings" in work.result else super().explain(work)
+
+
+class Inspect(InspectOperator, bpy.types.Operator):
+    """Look for what would spoil the training: on the mesh, on how the garment fits the body, and on its classes"""
+
+    bl_idname = "ssilk.inspect"
+    bl_label = "Inspect"
+
+    def prepare(self, context: bpy.types.Context) -> Work:
+        garment = context.object
+        findings = scene_findings(garment)
+        keep_findings(context, garment.name, findings)
+        for finding in findings:
+            raise SetupError(f"'{finding.target}': {finding.found}; {finding.fix}.")
+        return super().prepare(context)
+
+    def finish(self, context: bpy.types.Context, work: Work) -> str:
+        findings = read_findings(work.result["findings"], self.dressed, self.handover.prims)
+        keep_findings(context, self.handover.name, findings)
+        bad = sum(finding.severity != "info" for finding in findings)
+        return (
+            f"{bad} findings on '{self.handover.name}'." if bad else f"Nothing is wrong with '{self.handover.name}'."
+        )
+
+
+class SelectFinding(ReportingOperator, bpy.types.Operator):
+    """Select what the finding is about"""
+
+    bl_idname = "ssilk.select_finding"
+    bl_label = "Select"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        item = shown_finding(context)
+        cls.poll_message_set("This finding is about nothing that can be selected")
+        return bool(item and item.indices and item.elements in {"vertices", "polygons", "joints"})
+
+    def apply(self, context: bpy.types.Context) -> str:
+        item = shown_finding(context)
+        if item.elements == "joints":
+            garment = find_target(context.window_manager.ssilk_preflight.garment)
+            armature = armature_of(garment)
+            names = read_joints(armature, garment).names
+            select_bones(armature, [names[joint] for joint in item.indices])
+        else:
+            select_elements(unchanged(item), item.elements, item.indices)
+        return ""
+
+
+class FixFinding(ReportingOperator, bpy.types.Operator):
+    """Repair what was found, where that needs no decision; look again afterwards"""
+
+    bl_idname = "ssilk.fix_finding"
+    bl_label = "Fix"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        item = shown_finding(context)
+        cls.poll_message_set("This finding needs your decision")
+        return bool(item and fixer(item) == cls.bl_idname)
+
+    def apply(self, context: bpy.types.Context) -> str:
+        item = shown_finding(context)
+        thing = find_target(item.target) if item.code == SCALE else unchanged(item)
+        if context.mode != "OBJECT":
+            bpy.ops.object.mode_set(mode="OBJECT")
+        if item.code == SCALE:
+            apply_scale(thing)
+        else:
+            repair_mesh(thing, item.code, item.indices)
+        told = f"'{thing.name}' is repaired; inspect it again."
+        forget(context)
+        return told
+
+
+class PushOut(InspectOperator, bpy.types.Operator):
+    """Push shallow patches out of the body to where collisions begin, with all shape keys"""
+
+    bl_idname = "ssilk.push_out"
+    bl_label = "Push Out"
+    undo = "Push Out of Body"
+    repaired = True
+
+    def finish(self, context: bpy.types.Context, work: Work) -> str:
+        from ..contract.read import read_points
+
+        garment, _ = self.handover.objects()
+        points = read_points(work.folder / REPAIRED, self.handover.prims[self.handover.name])
+        fits = len(points) == len(garment.data.vertices)
+        need(fits, f"'{garment.name}' has other findings to fix first: vertices would be merged or removed.")
+        moved = push_points(garment, points)
+        forget(context)
+        return f"{moved} vertices of '{garment.name}' were pushed out; inspect it again."
+
+
+def fixer(item: FindingItem) -> str:
+    """Return the operator that repairs a finding; empty where none does."""
+    if item.code in PUSHED:
+        return PushOut.bl_idname if item.fixable else ""
+    safe = item.fixable or item.code == "body-inside-out"
+    return FixFinding.bl_idname if safe and (item.code in REPAIRS or item.code == SCALE) else ""
+
+
+def find_target(name: str) -> bpy.types.Object:
+    """Return an object by name.
+
+    Raises:
+        SetupError: it was deleted or renamed.
+    """
+    thing = bpy.data.objects.get(name)
+    need(thing, f"'{name}' was deleted or renamed; inspect the garment again.")
+    return thing
+
+
+def unchanged(item: FindingItem) -> bpy.types.Object:
+    """Return the mesh that a finding is about.
+
+    Raises:
+        SetupError: it has other vertices by now.
+    """
+    thing = find_target(item.target)
+    need(size_of(item.target) == item.size, f"'{thing.name}' has changed since it was inspected; inspect it again.")
+    return thing
+
+
+def forget(context: bpy.types.Context) -> None:
+    """Take the shown finding from the list."""
+    preflight = context.window_manager.ssilk_preflight
+    preflight.findings.remove(preflight.active)
+    preflight.active = max(0, preflight.active - 1)
+
+
+CLASSES = (Inspect, SelectFinding, FixFinding, PushOut)

@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What the garment is made of."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..scene.garment import unusable
+from .base import Panel
+
+MEMBRANE = {"stvk": ("lame_mu", "lame_lambda"), "baraff_witkin": ("stretch", "shear")}  # values of each model
+
+
+class FabricPanel(Panel, bpy.types.Panel):
+    bl_idname = "SSILK_PT_fabric"
+    bl_label = "Fabric"
+    bl_parent_id = "SSILK_PT_garment"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return not unusable(context.object)
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, fabric = self.layout, context.object.ssilk.fabric
+        layout.use_property_split = True
+        for name in ("preset", "density", "stretch_model", *MEMBRANE[fabric.stretch_model]):
+            layout.prop(fabric, name)
+        for name in ("bending", "drag", "collision", "margin"):
+            layout.prop(fabric, name)

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The preflight: findings as a list, with buttons that select and repair."""
+
+from __future__ import annotations
+
+import textwrap
+
+import bpy
+
+from ..operators.preflight import fixer
+from ..preflight_properties import shown_finding
+from ..scene.garment import unusable
+from .base import Panel
+
+ICONS = {"error": "CANCEL", "warning": "ERROR", "info": "INFO"}
+CHARACTER = 7  # points that a letter takes on average, at a scale of one
+
+
+class FindingList(bpy.types.UIList):
+    bl_idname = "SSILK_UL_findings"
+
+    def draw_item(self, _context, layout, _data, item, _icon, _active, _property) -> None:  # type: ignore[no-untyped-def]
+        layout.label(text=line(item), icon=ICONS.get(item.severity, "INFO"), translate=False)
+
+
+class PreflightPanel(Panel, bpy.types.Panel):
+    bl_idname = "SSILK_PT_preflight"
+    bl_label = "Preflight"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return not unusable(context.object)
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, preflight = self.layout, context.window_manager.ssilk_preflight
+        layout.operator("ssilk.inspect", icon="VIEWZOOM")
+        item = shown_finding(context)
+        if item is None:
+            return
+        layout.template_list(FindingList.bl_idname, "", preflight, "findings", preflight, "active", rows=4)
+        for text in wrapped(context, item.target, item.found, item.why, item.fix):
+            layout.label(text=text, translate=False)
+        row = layout.row(align=True)
+        row.operator("ssilk.select_finding")
+        row.operator(fixer(item) or "ssilk.fix_finding")
+
+
+def line(item: bpy.types.PropertyGroup) -> str:
+    """Return a finding in a few words."""
+    words = item.code.replace("-", " ")
+    return f"{len(item.indices)} {words}" if item.indices else words
+
+
+def wrapped(context: bpy.types.Context, *texts: str) -> list[str]:
+    """Return texts in lines as wide as the region."""
+    scale = context.preferences.system.ui_scale or 1.0  # zero where there is no display
+    width = context.region.width / scale if context.region else 300
+    columns = max(20, int(width / CHARACTER))
+    return [text for given in texts for text in textwrap.wrap(given, columns)]

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Repairs of a mesh that need no decision by an artist, and of an armature's scale."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+import bmesh
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from ..errors import need
+
+SAME_PLACE = 2e-6  # [m]; what ssilk takes to be one place
+Repair = Callable[[bmesh.types.BMesh, Sequence[int], float], None]
+
+
+def repair_mesh(thing: bpy.types.Object, code: str, indices: Sequence[int]) -> None:
+    """Repair a finding of a kind in `REPAIRS` on the vertices or polygons of a mesh. In object mode.
+
+    Raises:
+        SetupError: the mesh is linked.
+    """
+    need(not thing.data.library, f"'{thing.name}' is linked from another file; repair it there.")
+    scale = bpy.context.scene.unit_settings.scale_length * max(map(abs, thing.matrix_world.to_scale()))
+    with _edited(thing.data) as mesh:
+        REPAIRS[code](mesh, indices, SAME_PLACE / scale)
+
+
+def apply_scale(armature: bpy.types.Object) -> None:
+    """Give the bones of an armature that is scaled unequally its scale, and leave all that hangs from it in place.
+
+    Raises:
+        SetupError: it is linked, mirrored, animated, or shares its bones.
+    """
+    name, data = armature.name, armature.data
+    need(not (armature.library or data.library), f"'{name}' is linked from another file; apply its scale there.")
+    need(min(armature.scale) > 0, f"'{name}' is mirrored; apply its scale by hand and look at its bones.")
+    need(
+        not armature.animation_data, f"'{name}' is animated; its keys hold for bones of this scale: apply it by hand."
+    )
+    need(data.users == 1, f"'{name}' shares its bones with other objects; make them single-user first.")
+    children = {child: child.matrix_world.copy() for child in armature.children}
+    data.transform(Matrix.Diagonal(armature.scale).to_4x4())
+    armature.scale = (1.0, 1.0, 1.0)
+    bpy.context.view_layer.update()
+    for child, place in children.items():
+        child.matrix_world = place
+
+
+def push_points(thing: bpy.types.Object, points: np.ndarray) -> int:
+    """Move the vertices of a mesh to places in the world, shape (V, 3), its shape keys with them; return how many.
+
+    Vertices that would not move stay exactly as they are.
+    """
+    mesh, inverse = thing.data, np.array(thing.matrix_world.inverted())
+    target = points @ inverse[:3, :3].T + inverse[:3, 3]
+    old = _coordinates(mesh.vertices)
+    offset = np.where(np.abs(target - old).max(axis=1, keepdims=True) > 1e-6, target - old, 0.0)
+    for items in [mesh.vertices, *(block.data for block in (mesh.shape_keys.key_blocks if mesh.shape_keys else ()))]:
+        items.foreach_set("co", (_coordinates(items) + offset).astype(np.float32).reshape(-1))
+    mesh.update()
+    return int(offset.any(axis=1).sum())
+
+
+def _coordinates(items: bpy.types.bpy_prop_collection) -> np.ndarray:
+    points = np.empty(len(items) * 3, dtype=np.float32)
+    items.foreach_get("co", points)
+    return points.reshape(-1, 3)
+
+
+@contextmanager
+def _edited(mesh: bpy.types.Mesh) -> Iterator[bmesh.types.BMesh]:
+    edited = bmesh.new()
+    try:
+        edited.from_mesh(mesh)
+        for sequence in (edited.verts, edited.faces):
+            sequence.ensure_lookup_table()
+        yield edited
+        edited.to_mesh(mesh)
+    finally:
+        edited.free()
+    mesh.update()
+
+
+def _delete_vertices(mesh: bmesh.types.BMesh, indices: Sequence[int], _: float) -> None:
+    bmesh.ops.delete(mesh, geom=[mesh.verts[index] for index in indices], context="VERTS")
+
+
+def _delete_faces(mesh: bmesh.types.BMesh, indices: Sequence[int], _: float) -> None:
+    bmesh.ops.delete(mesh, geom=[mesh.faces[index] for index in indices], context="FACES_ONLY")
+
+
+def _merge(mesh: bmesh.types.BMesh, indices: Sequence[int], distance: float) -> None:
+    bmesh.ops.remove_doubles(mesh, verts=[mesh.verts[index] for index in indices], dist=distance)
+
+
+def _dissolve(mesh: bmesh.types.BMesh, indices: Sequence[int], distance: float) -> None:
+    around = {edge for index in indices for edge in mesh.faces[index].edges}
+    bmesh.ops.dissolve_degenerate(mesh, dist=distance, edges=list(around))
+
+
+def _flip(mesh: bmesh.types.BMesh, indices: Sequence[int], _: float) -> None:
+    bmesh.ops.reverse_faces(mesh, faces=[mesh.faces[index] for index in indices])
+
+
+REPAIRS: dict[str, Repair] = {
+    "isolated-vertices": _delete_vertices,
+    "duplicate-vertices": _merge,
+    "duplicate-faces": _delete_faces,
+    "degenerate-faces": _dissolve,
+    "inconsistent-winding": _flip,
+    "inside-out": _flip,
+    "body-inside-out": _flip,
+}

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Selecting what a finding is about, in the mode in which it can be seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import bpy
+import numpy as np
+
+
+def select_elements(thing: bpy.types.Object, elements: str, indices: Sequence[int]) -> None:
+    """Be in edit mode of a mesh with these of its "vertices" or "polygons" selected, and nothing else."""
+    _only(thing)
+    mesh, vertices = thing.data, elements == "vertices"
+    for items in (mesh.vertices, mesh.edges, mesh.polygons):
+        items.foreach_set("select", np.zeros(len(items), dtype=bool))
+    chosen = np.zeros(len(mesh.vertices if vertices else mesh.polygons), dtype=bool)
+    chosen[list(indices)] = True
+    (mesh.vertices if vertices else mesh.polygons).foreach_set("select", chosen)
+    bpy.context.tool_settings.mesh_select_mode = (vertices, False, not vertices)
+    bpy.ops.object.mode_set(mode="EDIT")
+
+
+def select_bones(armature: bpy.types.Object, names: Sequence[str]) -> None:
+    """Be in pose mode of an armature with these bones selected, and no other."""
+    _only(armature)
+    bpy.ops.object.mode_set(mode="POSE")
+    for bone in armature.pose.bones:
+        # Since Blender 5 pose bones are selected, before it was their bones.
+        (bone if "select" in bone.bl_rna.properties else bone.bone).select = bone.name in names
+
+
+def _only(thing: bpy.types.Object) -> None:
+    """Make an object the active and only selected one, in object mode."""
+    if bpy.context.mode != "OBJECT":
+        bpy.ops.object.mode_set(mode="OBJECT")
+    for other in bpy.context.selected_objects:
+        other.select_set(False)
+    thing.select_set(True)
+    bpy.context.view_layer.objects.active = thing

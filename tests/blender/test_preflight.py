@@ -1,0 +1,288 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The preflight in Blender: every finding is selected and, where that is safe, repaired."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from blender_addon.contract.arrays import Dressed, Joints, Shape
+from blender_addon.contract.findings import polygons_of, read_findings
+
+pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
+
+from .conftest import activate, add_mesh
+from .test_panels import drawn
+
+
+def shape(name: str, counts: list[int], points: int) -> Shape:
+    return Shape(name, np.zeros((points, 3)), np.array(counts), np.zeros(sum(counts), int), False, None, None)
+
+
+def test_triangles_are_named_by_their_polygons():
+    counts = np.array([3, 4, 5])
+    assert polygons_of(counts, [0, 1, 2]) == (0, 1)
+    assert polygons_of(counts, [1]) == ()
+    assert polygons_of(counts, [3, 4, 5]) == (2,)
+
+
+def test_findings_on_several_bodies_come_apart():
+    joints = Joints(("Root",), np.array([-1]), np.eye(4)[None])
+    bodies = (shape("Torso", [4], 4), shape("Hand", [3, 3], 5))
+    dressed = Dressed(1.0, joints, bodies, shape("Shirt", [4], 4), None, None)
+    prims = {"Shirt": "/Character/Shirt", "Torso": "/Character/Torso", "Hand": "/Character/Hand"}
+    document = {"severity": "warning", "code": "holes", "found": "", "why": "", "fix": "", "fixable": False}
+    whole = {**document, "prim": "a.usdc:/Character"}
+    rim, faces = (
+        {**whole, "elements": "vertices", "indices": [1, 4, 8]}, {**whole, "elements": "faces", "indices": [3]},
+    )  # fmt: skip
+    own = {**document, "prim": "a.usdc:/Character/Shirt", "elements": "joints", "indices": [0]}
+    said = read_findings([rim, faces, own], dressed, prims)
+    found = [(finding.target, finding.elements, finding.indices) for finding in said]
+    assert found == [
+        ("Torso", "vertices", (1,)),
+        ("Hand", "vertices", (0, 4)),
+        ("Hand", "polygons", (1,)),
+        ("Shirt", "joints", (0,)),
+    ]
+
+
+def findings(bpy) -> dict[str, object]:
+    return {item.code: item for item in bpy.context.window_manager.ssilk_preflight.findings}
+
+
+def show(bpy, code: str):
+    """Show a finding in the list, as a click does."""
+    preflight = bpy.context.window_manager.ssilk_preflight
+    preflight.active = [item.code for item in preflight.findings].index(code)
+    return preflight.findings[preflight.active]
+
+
+def spoil(bpy, thing, change) -> None:
+    import bmesh
+
+    mesh = bmesh.new()
+    mesh.from_mesh(thing.data)
+    mesh.verts.ensure_lookup_table()
+    mesh.faces.ensure_lookup_table()
+    change(mesh)
+    mesh.to_mesh(thing.data)
+    mesh.free()
+    thing.data.update()
+
+
+def loose_vertex(mesh):
+    mesh.verts.new((0.3, 0, 1))
+
+
+def flipped_faces(mesh):
+    for face in list(mesh.faces)[30:34]:
+        face.normal_flip()
+
+
+def turned_inside_out(mesh):
+    for face in mesh.faces:
+        face.normal_flip()
+
+
+def cut_open(mesh):
+    import bmesh
+
+    bmesh.ops.split_edges(mesh, edges=[edge for edge in mesh.edges if 0.9 < edge.verts[0].co.z < 1.0][:6])
+
+
+SPOILED = {
+    loose_vertex: "isolated-vertices",
+    flipped_faces: "inconsistent-winding",
+    turned_inside_out: "inside-out",
+    cut_open: "duplicate-vertices",
+}
+
+
+@pytest.mark.parametrize("change, code", SPOILED.items(), ids=lambda item: getattr(item, "__name__", item))
+def test_what_is_found_is_selected_and_fixed(ready, skirt, change, code):
+    size = len(skirt.data.vertices)
+    spoil(ready, skirt, change)
+    assert ready.ops.ssilk.inspect() == {"FINISHED"}
+    item = show(ready, code)
+    count, elements = len(item.indices), item.elements
+    assert count
+    assert ready.ops.ssilk.select_finding() == {"FINISHED"}
+    assert (ready.context.mode, ready.context.object) == ("EDIT_MESH", skirt)
+    selected = skirt.data.total_vert_sel if elements == "vertices" else skirt.data.total_face_sel
+    assert selected == count
+    assert ready.ops.ssilk.fix_finding() == {"FINISHED"}
+    assert ready.context.mode == "OBJECT"
+    assert len(skirt.data.vertices) == size
+    activate(ready, skirt)
+    ready.ops.ssilk.inspect()
+    assert code not in findings(ready)
+
+
+def test_a_sound_garment_has_nothing_wrong(ready, skirt):
+    assert ready.ops.ssilk.inspect() == {"FINISHED"}
+    assert {item.severity for item in findings(ready).values()} <= {"info", "warning"}
+    assert not {"error"} & {item.severity for item in findings(ready).values()}
+
+
+def test_fixes_keep_classes_weights_and_shape_keys(ready, skirt):
+    skirt.data.attributes.new("ssilk:class", "INT", "POINT").data.foreach_set("value", [1] * 312)
+    skirt.vertex_groups.new(name="Hips").add(list(range(312)), 1.0, "REPLACE")
+    skirt.shape_key_add(name="Basis")
+    skirt.shape_key_add(name="Wide").data[7].co.x += 0.1
+    spoil(ready, skirt, flipped_faces)
+    ready.ops.ssilk.inspect()
+    show(ready, "inconsistent-winding")
+    ready.ops.ssilk.fix_finding()
+    wide = skirt.data.shape_keys.key_blocks["Wide"]
+    assert np.isclose(wide.data[7].co.x - skirt.data.vertices[7].co.x, 0.1)
+    assert skirt.data.attributes["ssilk:class"].data[100].value == 1
+    assert skirt.vertex_groups["Hips"].weight(100) == 1
+
+
+def test_cloth_in_the_body_is_pushed_out_with_its_shape_keys(ready, skirt):
+    skirt.shape_key_add(name="Basis")
+    skirt.shape_key_add(name="Wide").data[7].co.x += 0.1
+    waist = [vertex.index for vertex in skirt.data.vertices if vertex.co.z > 1.0]
+    for block in (skirt.data.vertices, *(block.data for block in skirt.data.shape_keys.key_blocks)):
+        for index in waist:
+            block[index].co.x *= 0.148 / 0.165
+            block[index].co.y *= 0.148 / 0.165
+    ready.ops.ssilk.inspect()
+    item = show(ready, "penetration")
+    assert set(item.indices) <= set(waist)
+    before = [vertex.co.copy() for vertex in skirt.data.vertices]
+    from blender_addon.operators.preflight import fixer
+
+    assert fixer(item) == "ssilk.push_out"
+    assert ready.ops.ssilk.push_out() == {"FINISHED"}
+    radius = [np.hypot(*skirt.data.vertices[index].co.xy) for index in waist]
+    assert min(radius) > 0.15
+    wide = skirt.data.shape_keys.key_blocks["Wide"]
+    assert np.isclose(wide.data[7].co.x - skirt.data.vertices[7].co.x, 0.1)
+    untouched = [vertex.index for vertex in skirt.data.vertices if vertex.co.z < 0.8]
+    assert all(skirt.data.vertices[index].co == before[index] for index in untouched)
+
+
+def test_an_unequal_scale_is_found_and_applied(ready, skirt):
+    armature, pillar = ready.data.objects["Rig"], ready.data.objects["Pillar"]
+    pillar.parent = armature
+    armature.scale = (1, 1, 2)
+    ready.context.view_layer.update()
+    with pytest.raises(RuntimeError, match="'Rig': its bones are scaled unequally"):
+        ready.ops.ssilk.inspect()
+    place = pillar.matrix_world.copy()
+    tail = armature.matrix_world @ armature.data.bones["Head"].tail_local
+    assert show(ready, "unequal-scale").target == "Rig"
+    assert ready.ops.ssilk.fix_finding() == {"FINISHED"}
+    ready.context.view_layer.update()
+    assert tuple(armature.scale) == (1, 1, 1)
+    np.testing.assert_allclose(armature.matrix_world @ armature.data.bones["Head"].tail_local, tail, atol=1e-6)
+    np.testing.assert_allclose(np.array(pillar.matrix_world), np.array(place), atol=1e-6)
+
+
+def test_an_animated_armatures_scale_is_left_alone(ready, skirt):
+    armature = ready.data.objects["Rig"]
+    armature.scale = (1, 1, 2)
+    armature.keyframe_insert("location")
+    ready.context.view_layer.update()
+    with pytest.raises(RuntimeError, match="scaled unequally"):
+        ready.ops.ssilk.inspect()
+    with pytest.raises(RuntimeError, match="'Rig' is animated"):
+        ready.ops.ssilk.fix_finding()
+    assert tuple(armature.scale) == (1, 1, 2)
+
+
+def test_a_modifier_before_the_armature_is_listed(ready, skirt):
+    skirt.modifiers.new("Mirror", "MIRROR")
+    with pytest.raises(RuntimeError, match="its modifier 'Mirror' shapes it"):
+        ready.ops.ssilk.inspect()
+    assert list(findings(ready)) == ["shaping-modifier"]
+    with pytest.raises(RuntimeError, match="needs your decision"):
+        ready.ops.ssilk.fix_finding()
+
+
+def test_joints_are_selected_as_bones(ready, skirt):
+    from blender_addon.contract.findings import Finding
+    from blender_addon.preflight_properties import keep_findings
+
+    keep_findings(ready.context, "Skirt", [Finding("info", "still", "", "", elements="joints", indices=(1,))])
+    assert ready.ops.ssilk.select_finding() == {"FINISHED"}
+    armature = ready.data.objects["Rig"]
+    assert ready.context.mode == "POSE"
+    chosen = [bone.name for bone in armature.pose.bones if (bone if hasattr(bone, "select") else bone.bone).select]
+    assert chosen == ["Spine"]
+
+
+def test_a_mesh_that_changed_since_is_not_touched(ready, skirt):
+    spoil(ready, skirt, loose_vertex)
+    ready.ops.ssilk.inspect()
+    show(ready, "isolated-vertices")
+    spoil(ready, skirt, loose_vertex)
+    for operator in (ready.ops.ssilk.fix_finding, ready.ops.ssilk.select_finding):
+        with pytest.raises(RuntimeError, match="'Skirt' has changed since it was inspected"):
+            operator()
+    skirt.name = "Rock"
+    with pytest.raises(RuntimeError, match="'Skirt' was deleted or renamed"):
+        ready.ops.ssilk.fix_finding()
+
+
+def test_a_fix_is_undone(ready, skirt):
+    spoil(ready, skirt, loose_vertex)
+    ready.ops.ssilk.inspect()
+    ready.ops.ed.undo_push(message="before")
+    show(ready, "isolated-vertices")
+    ready.ops.ssilk.fix_finding()
+    ready.ops.ed.undo_push(message="after")
+    assert len(ready.data.objects["Skirt"].data.vertices) == 312
+    ready.ops.ed.undo()
+    assert len(ready.data.objects["Skirt"].data.vertices) == 313
+
+
+def test_the_panel_lists_findings_with_their_buttons(ready, skirt):
+    from blender_addon.panels.preflight import PreflightPanel, line, wrapped
+
+    assert drawn(PreflightPanel, ready.context) == ["ssilk.inspect"]
+    spoil(ready, skirt, loose_vertex)
+    ready.ops.ssilk.inspect()
+    item = show(ready, "isolated-vertices")
+    notes = drawn(PreflightPanel, ready.context)
+    assert {"ssilk.inspect", "ssilk.select_finding", "ssilk.fix_finding", "findings", "Skirt"} <= set(notes)
+    assert line(item) == "1 isolated vertices"
+    region = SimpleNamespace(width=160)
+    narrow = wrapped(SimpleNamespace(region=region, preferences=ready.context.preferences), "one two three four five")
+    assert len(narrow) == 2
+
+
+def test_a_garment_far_from_the_body_is_an_error(ready, skirt):
+    skirt.location.x = 5
+    ready.context.view_layer.update()
+    ready.ops.ssilk.inspect()
+    assert findings(ready)["alignment"].severity == "error"
+
+
+def test_a_body_inside_out_is_turned(ready, skirt):
+    pillar = ready.data.objects["Pillar"]
+    spoil(ready, pillar, turned_inside_out)
+    ready.ops.ssilk.inspect()
+    assert show(ready, "body-inside-out").target == "Pillar"
+    ready.ops.ssilk.select_finding()
+    assert (ready.context.object, pillar.data.total_face_sel) == (pillar, len(pillar.data.polygons))
+    ready.ops.ssilk.fix_finding()
+    activate(ready, skirt)
+    ready.ops.ssilk.inspect()
+    assert "body-inside-out" not in findings(ready)
+
+
+def test_two_bodies_are_told_apart(ready, skirt):
+    extra = add_mesh(ready, "Prop", np.array([[0.0, 0, 2], [0.2, 0, 2], [0, 0.2, 2]]), np.array([[0, 1, 2]]))
+    extra.vertex_groups.new(name="Head").add([0, 1, 2], 1.0, "REPLACE")
+    extra.modifiers.new("Armature", "ARMATURE").object = ready.data.objects["Rig"]
+    activate(ready, skirt)
+    ready.ops.ssilk.inspect()
+    every = ready.context.window_manager.ssilk_preflight.findings
+    items = [item for item in every if item.code == "body-not-watertight"]
+    assert {item.target for item in items} == {"Pillar", "Prop"}
+    assert [item.indices for item in items if item.target == "Prop"] == [[0, 1, 2]]
