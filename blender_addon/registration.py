@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import bpy
 
-from . import panels, preferences, preflight_properties, properties
+from . import overlay, panels, preferences, preflight_properties, properties
 from .operators import baking, classes, environment, fill, preflight, rig, tasks, training
+from .operators import overlay as overlay_switch
 from .panels import plot
 
 CLASSES = (
@@ -17,6 +18,7 @@ CLASSES = (
     *environment.CLASSES,
     *classes.CLASSES,
     *fill.CLASSES,
+    *overlay_switch.CLASSES,
     *rig.CLASSES,
     *preflight.CLASSES,
     *training.CLASSES,
@@ -37,6 +39,7 @@ def register() -> None:
 def unregister() -> None:
     """Stop what runs outside, then remove properties and classes in reverse."""
     tasks.stop()
+    overlay.hide()
     training.stop_watching(bpy.context)
     plot.forget()
     preflight_properties.detach()

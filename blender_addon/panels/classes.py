@@ -8,6 +8,7 @@ import bpy
 from ..classes import counts
 from ..errors import SetupError
 from ..operators.classes import CHOICES
+from ..overlay import shown
 from ..scene.attributes import current_classes
 from ..scene.editing import edited_counts
 from ..scene.garment import unusable
@@ -49,6 +50,7 @@ class ClassesPanel(Panel, bpy.types.Panel):
             column.operator("ssilk.fill_class" if editing else "ssilk.brush_class", text=label).value = name
             column.label(text=str(found[index]) if found else "-")
         layout.operator("ssilk.take_up_painting")
+        layout.operator("ssilk.toggle_overlay", icon="OVERLAY", depress=shown())
         row = layout.row(align=True)
         row.operator("ssilk.show_classes")
         row.operator("ssilk.mirror_classes")

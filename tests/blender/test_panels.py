@@ -38,7 +38,7 @@ class Layout:
         assert hasattr(data, name), name
         self.notes.append(name)
 
-    def operator(self, name: str, text: str = "", icon: str = "NONE") -> SimpleNamespace:
+    def operator(self, name: str, text: str = "", icon: str = "NONE", depress: bool = False) -> SimpleNamespace:
         module, _, function = name.partition(".")
         import bpy
 

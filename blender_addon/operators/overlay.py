@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Switching the overlay of classes."""
+
+from __future__ import annotations
+
+import bpy
+
+from .. import overlay
+from .tasks import redraw
+
+
+class ToggleOverlay(bpy.types.Operator):
+    """Show the classes of all garments over them in 3D views, in any mode; the file is not touched"""
+
+    bl_idname = "ssilk.toggle_overlay"
+    bl_label = "Class Overlay"
+
+    @classmethod
+    def poll(cls, _: bpy.types.Context) -> bool:
+        cls.poll_message_set("There is no window to draw in")
+        return not bpy.app.background
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        if overlay.shown():
+            overlay.hide()
+        else:
+            overlay.show()
+        redraw(context)
+        return {"FINISHED"}
+
+
+CLASSES = (ToggleOverlay,)
