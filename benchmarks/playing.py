@@ -17,6 +17,7 @@ from ssilk_core.baselines.networks import Baseline, BaselineConfig, baseline
 from ssilk_core.checkpoint import ModelFile, network
 from ssilk_core.model.batch import DOWN, driven
 from ssilk_core.model.network import GarmentModel
+from ssilk_core.model.skinning import Skinning, blended, transformed
 from ssilk_core.runtime.drive import drive
 from ssilk_core.runtime.playback import BLOCK, POSED
 from ssilk_core.runtime.player import Player
@@ -77,8 +78,26 @@ def with_numpy(player: Player, motion: Motion) -> Laps:
     return watch.laps
 
 
+class Skinner:
+    """Blendshapes and skinning in PyTorch, with what no frame changes computed beforehand.
+
+    Args:
+        rest: points (V, 3); shapes: of those that move (V', 3, K); free: which ones move (V',).
+        skin: influences; weights: dense ones (V, used joints).
+    """
+
+    def __init__(self, rest: Tensor, shapes: Tensor, free: Tensor, skin: Skinning, weights: Tensor) -> None:
+        whole = shapes.new_zeros(len(rest), *shapes.shape[1:]).index_copy(0, free, shapes)
+        self.rest, self.shapes, self.used, self.weights = rest, whole.flatten(0, 1), skin.used, weights
+
+    def __call__(self, activations: Tensor, matrices: Tensor) -> Tensor:
+        """Return points (V, 3, N) of activations (K, N) and matrices of all joints (J, 3, 4, N)."""
+        offsets = (self.shapes @ activations).unflatten(0, self.rest.shape)
+        return transformed(blended(self.weights, matrices[self.used]), self.rest[:, :, None] + offsets)
+
+
 @torch.no_grad()
-def with_torch(model: GarmentModel, motion: Motion, chunk: int) -> Laps:
+def with_torch(model: GarmentModel, skinner: Skinner, motion: Motion, chunk: int) -> Laps:
     """Play a motion with the network itself, `chunk` frames at a time; return the time of each part [s].
 
     Latents advance frame by frame in any case. The stepper sees each pose moved and held still in one call.
@@ -98,13 +117,13 @@ def with_torch(model: GarmentModel, motion: Motion, chunk: int) -> Laps:
         matrices = model.decoder.proxy_matrices(rotations, character)
         watch.lap(KINEMATICS)
         for part in spans(len(rest), POSED):
-            model.decoder._skinned(activations[:, part], matrices[..., part])
+            skinner(activations[:, part], matrices[..., part])
         watch.lap(SKINNING)
     return watch.laps
 
 
 @torch.no_grad()
-def with_baseline(model: Baseline, motion: Motion, chunk: int) -> Laps:
+def with_baseline(model: Baseline, skinner: Skinner, motion: Motion, chunk: int) -> Laps:
     """Play a motion with a baseline, `chunk` frames at a time; return the time of each part [s]."""
     watch, skeleton = Stopwatch(), model.scene.character.skeleton
     bank = build_bank([motion], skeleton, model.joints, model.config.fps, torch.device("cpu"))
@@ -121,7 +140,7 @@ def with_baseline(model: Baseline, motion: Motion, chunk: int) -> Laps:
         watch.lap(LATENTS)
         codes = model.code(torch.cat(states))
         watch.lap(DECODER)
-        model.skinned(codes, bank.character(every[frames]))
+        skinner(codes.T, bank.character(every[frames]))
         watch.lap(SKINNING)
     return watch.laps
 
@@ -133,10 +152,14 @@ def ways(file: ModelFile, chunks: dict[str, int]) -> dict[str, Way]:
     """
     player, model = Player(file), network(file)
     ncs = baseline(file.scene, BaselineConfig(method="ncs", fps=file.config.fps), file.joints).eval()
+    decoder = model.decoder
+    with torch.no_grad():
+        own = Skinner(decoder.rest, decoder.shapes, decoder.free, decoder.skin, decoder.skin_weights())
+        theirs = Skinner(ncs.rest, ncs.shapes, ncs.free, ncs.skin, ncs.skin.dense(ncs.skin.weights))
     found: dict[str, Way] = {"numpy": lambda motion: with_numpy(player, motion)}
     for name, chunk in chunks.items():
-        found[f"PyTorch, {name}"] = lambda motion, chunk=chunk: with_torch(model, motion, chunk)  # type: ignore[misc]
-        found[f"NCS, {name}"] = lambda motion, chunk=chunk: with_baseline(ncs, motion, chunk)  # type: ignore[misc]
+        found[f"PyTorch, {name}"] = lambda motion, chunk=chunk: with_torch(model, own, motion, chunk)  # type: ignore[misc]
+        found[f"NCS, {name}"] = lambda motion, chunk=chunk: with_baseline(ncs, theirs, motion, chunk)  # type: ignore[misc]
     return found
 
 

@@ -80,12 +80,8 @@ class Baseline(nn.Module, ABC):
 
     def vertices(self, states: Tensor, character: Tensor) -> Tensor:
         """Decode states (N, S) over character skinning matrices (J, 3, 4, N) to positions (V, 3, N) [m]."""
-        return self.skinned(self.code(states), character)
-
-    def skinned(self, codes: Tensor, character: Tensor) -> Tensor:
-        """Return positions (V, 3, N) [m] of what offsets are linear in (N, codes), over character (J, 3, 4, N)."""
         shapes = self.shapes.new_zeros(len(self.rest), *self.shapes.shape[1:]).index_copy(0, self.free, self.shapes)
-        offsets = (shapes.flatten(0, 1) @ codes.T).unflatten(0, (len(self.rest), 3))
+        offsets = (shapes.flatten(0, 1) @ self.code(states).T).unflatten(0, (len(self.rest), 3))
         return self.skin(self.rest, offsets, self.skin.weights, character)
 
 
