@@ -9,7 +9,7 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, FloatProperty, StringProperty
 
-from ..contract.arrays import Dressed
+from ..contract.arrays import Joints
 from ..errors import SetupError, need
 from ..outside.work import Work
 from ..preferences import interpreter, preferences, unready
@@ -17,11 +17,11 @@ from ..scene.armature import read_joints
 from ..scene.baked import apply_shot, has_bake, need_bakeable, remove_bake
 from ..scene.garment import armature_of, unusable
 from ..scene.gather import character_joints, gather
-from ..scene.handover import STAGE, hand_over
+from ..scene.handover import STAGE, expose_usd, hand_over
 from ..scene.models import model_of
 from ..scene.motions import TIMELINE, Source
 from ..scene.objects import found_again
-from ..scene.sampling import Take, prepare_takes, sample
+from ..scene.sampling import Take, need_company, prepare_takes, sample
 from . import tasks
 from .reporting import ReportingOperator
 
@@ -68,31 +68,38 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
         garment = context.object
         need(self.to_timeline or self.to_usd, "Choose where to bake to: the timeline, USD, or both.")
         self.model, armature = model_of(garment), armature_of(garment)
-        self.dressed = gather(garment)
-        need_bakeable(garment, armature, self.dressed.joints)
+        joints = read_joints(armature, garment)
+        need_bakeable(garment, armature, joints)
         (self.take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
-        self.uids = (garment.session_uid, armature.session_uid)
+        self.dressed = None if (self.model.parent / STAGE).exists() else gather(garment)
+        self.called, self.uids = garment.name, (garment.session_uid, armature.session_uid)
         self.shot = usd_path(garment, self.filepath) if self.to_usd else None
         self.python = interpreter(preferences(context))
-        joints = character_joints(self.dressed.joints)
+        self.character = character_joints(joints)
         return Work(f"Baking '{garment.name}'", self.commands, parent=bpy.app.tempdir,
-                    steps=sample(armature, joints, [self.take]))  # fmt: skip
+                    steps=sample(armature, self.character, [self.take]))  # fmt: skip
 
     def commands(self, folder: Path) -> list[list[str]]:
         """Write what is baked from; return the command."""
-        inputs = write_inputs(self.model.parent / INPUTS, self.dressed, self.take, self.things())
+        garment, armature = self.things()
+        need_company(garment, armature, self.take)
+        inputs = inputs_folder(self.model)
+        write_motion_of(inputs / MOTION, self.character, self.take)
+        stage = self.model.parent / STAGE
+        if self.dressed:
+            hand_over(self.dressed, garment, armature, inputs)
+            stage = inputs / STAGE
         self.shot = self.shot or folder / SHOT
-        options = ("--pre-roll", f"{self.pre_roll:g}") if self.pre_roll else ()
         return [
             [
-                self.python, "-m", "ssilk_core", "bake", str(self.model), "--stage", str(inputs / STAGE),
-                "--motion", str(inputs / MOTION), "-o", str(self.shot), "--json", *options,
+                self.python, "-m", "ssilk_core", "bake", str(self.model), "--stage", str(stage), "--motion",
+                str(inputs / MOTION), "-o", str(self.shot), "--pre-roll", f"{self.pre_roll:g}", "--json",
             ]
         ]  # fmt: skip
 
     def things(self) -> tuple[bpy.types.Object, bpy.types.Object]:
         """Return the garment and its armature; raise `SetupError` if one was deleted."""
-        garment, armature = (found_again(uid, self.dressed.garment.name) for uid in self.uids)
+        garment, armature = (found_again(uid, self.called) for uid in self.uids)
         return garment, armature
 
     def finish(self, context: bpy.types.Context, work: Work) -> str:
@@ -105,7 +112,7 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
             apply_shot(garment, armature, joints, read_shot(self.shot, joints))
         where = [f"frames {self.take.frames[0]} to {self.take.frames[-1]}"] if self.to_timeline else []
         where += [str(self.shot)] if self.to_usd else []
-        return f"'{self.dressed.garment.name}' is baked: {' and '.join(where)}."
+        return f"'{self.called}' is baked: {' and '.join(where)}."
 
 
 class RemoveBake(ReportingOperator, bpy.types.Operator):
@@ -142,24 +149,27 @@ def usd_path(garment: bpy.types.Object, chosen: str) -> Path:
     return path
 
 
-def write_inputs(
-    folder: Path, dressed: Dressed, take: Take, things: tuple[bpy.types.Object, bpy.types.Object]
-) -> Path:
-    """Write the character and its motion beside the model, from where shots say they were baked; return the folder.
+def inputs_folder(model: Path) -> Path:
+    """Return the folder beside a model for what is baked from: shots say from there that they come.
 
     Raises:
         SetupError: nothing can be written there.
     """
+    folder = model.parent / INPUTS
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
         raise SetupError(f"{folder} cannot be made ({error.strerror or error}); move the model.") from error
     need(os.access(folder, os.W_OK), f"Nothing can be written into {folder}; move the model.")
-    hand_over(dressed, *things, folder)
+    return folder
+
+
+def write_motion_of(path: Path, joints: Joints, take: Take) -> None:
+    """Write what was sampled."""
+    expose_usd()
     from ..contract.motion import write_motion
 
-    write_motion(folder / MOTION, character_joints(dressed.joints), take.motion())
-    return folder
+    write_motion(path, joints, take.motion())
 
 
 CLASSES = (Bake, RemoveBake)

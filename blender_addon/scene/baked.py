@@ -57,10 +57,9 @@ def apply_shot(garment: bpy.types.Object, armature: bpy.types.Object, joints: Jo
     Raises:
         SetupError: garment or bones are not those that it was trained with.
     """
-    _need_same_binds(armature, joints, shot)
-    _need_same_points(garment, shot)
-    own = np.linalg.inv(np.array(garment.matrix_world)[:3, :3])
-    shapes = write_shapes(garment, shot.offsets @ own.T, shot.shapes)
+    world = _moved_back(armature, joints, shot) @ np.array(garment.matrix_world)
+    _need_same_points(garment, world, shot)
+    shapes = write_shapes(garment, shot.offsets @ np.linalg.inv(world[:3, :3]).T, shot.shapes)
     write_groups(garment, shot.weights, joints.names, ())
     proxies = joints.names[joints.character_count :]
     _free(armature, proxies)
@@ -98,30 +97,40 @@ def _need_linear(garment: bpy.types.Object, armature: bpy.types.Object) -> None:
     need(False, f"'{garment.name}' has no Armature modifier for '{armature.name}'; generate its rig.")
 
 
-def _need_same_binds(armature: bpy.types.Object, joints: Joints, shot: Shot) -> None:
-    size = max(float(np.ptp(shot.points, axis=0).max()), 1e-9)
-    away = np.abs(joints.binds - shot.binds)
-    away[:, :3, 3] /= size
+def _moved_back(armature: bpy.types.Object, joints: Joints, shot: Shot) -> np.ndarray:
+    """Return how the armature has moved as an object, back to where it was when the garment was trained, (4, 4).
+
+    Raises:
+        SetupError: bones have moved.
+    """
+    back = shot.binds[0] @ np.linalg.inv(joints.binds[0])
+    away = np.abs(back @ joints.binds - shot.binds)
+    away[:, :3, 3] /= _size(shot)
     worst = int(away.max(axis=(1, 2)).argmax())
     need(
         away[worst].max() <= TURNED,
         f"The bone '{joints.names[worst]}' of '{armature.name}' was moved since the garment was trained; undo that, "
         "or train again.",
     )
+    return back
 
 
-def _need_same_points(garment: bpy.types.Object, shot: Shot) -> None:
+def _need_same_points(garment: bpy.types.Object, world: np.ndarray, shot: Shot) -> None:
+    """Check a garment's points at rest, given its object to world at the time of the training."""
     count = len(garment.data.vertices)
     need(
         count == len(shot.points),
         f"'{garment.name}' had {len(shot.points)} vertices when it was trained and has {count} now; train it again.",
     )
-    world = np.array(garment.matrix_world)
     away = np.abs(rest_points(garment) @ world[:3, :3].T + world[:3, 3] - shot.points).max()
     need(
-        away <= MOVED * np.ptp(shot.points, axis=0).max(),
-        f"'{garment.name}' has another shape at rest than when it was trained; undo that, or train it again.",
+        away <= MOVED * _size(shot),
+        f"'{garment.name}' has another shape or place at rest than when it was trained; undo that, or train again.",
     )
+
+
+def _size(shot: Shot) -> float:
+    return max(float(np.ptp(shot.points, axis=0).max()), 1e-9)
 
 
 def _free(armature: bpy.types.Object, proxies: Sequence[str]) -> None:

@@ -38,6 +38,8 @@ class Source:
 
 def sources(armature: bpy.types.Object) -> list[Source]:
     """Return all motions that an armature has, but for what was baked."""
+    if armature.library:  # of which nothing can be changed, not even for a moment
+        return [Source(TIMELINE, "Timeline")]
     bones = set(armature.pose.bones.keys())
     actions = [action for action in bpy.data.actions if not is_baked(action) and _moves(action, bones)]
     tracks = armature.animation_data.nla_tracks if armature.animation_data else ()

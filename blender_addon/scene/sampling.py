@@ -17,10 +17,12 @@ import numpy as np
 
 from ..contract.arrays import Joints, Motion
 from ..errors import SetupError, need
+from .follower import leader_of
 from .motions import Source, frames_of, playing
 from .objects import found_again
 
 SLICE = 0.04  # seconds that Blender waits for us at a time
+STILL = 1e-6  # how far an armature that stays in place may move, as a share of its size
 UNEVEN = 1e-3  # how far a bone's axes may be from unit length and right angles, as ssilk has it
 
 
@@ -30,11 +32,13 @@ class Take:
 
     Attributes:
         worlds: joint to world of the frames that were sampled yet, rigid, shape (J, 4, 4) each.
+        placements: object to world of the armature at these frames, shape (4, 4) each.
     """
 
     source: Source
     frames: range
     worlds: list[np.ndarray] = field(default_factory=list)
+    placements: list[np.ndarray] = field(default_factory=list)
 
     @property
     def complete(self) -> bool:
@@ -56,7 +60,23 @@ def prepare_takes(armature: bpy.types.Object, chosen: Sequence[Source]) -> list[
     posed = armature.data.pose_position == "POSE"
     need(posed, f"'{armature.name}' shows its rest position; switch to Pose Position in its data properties.")
     need(not armature.hide_viewport, f"'{armature.name}' is disabled in viewports; enable it in the outliner.")
-    return [Take(source, frames_of(armature, source)) for source in chosen]
+    return [Take(source, frames_of(leader_of(armature), source)) for source in chosen]
+
+
+def need_company(garment: bpy.types.Object, armature: bpy.types.Object, take: Take) -> None:
+    """Check that a garment moves along where its armature moves as an object, besides its bones.
+
+    Raises:
+        SetupError: it stays where it is, so that Blender would deform it from a wrong place.
+    """
+    still = np.ptp(take.placements, axis=0).max() <= STILL * max(armature.dimensions)
+    above = garment.parent
+    while above and above != armature:
+        above = above.parent
+    need(
+        still or above,
+        f"'{armature.name}' moves as an object and leaves '{garment.name}' behind; make it the parent.",
+    )
 
 
 def sample(armature: bpy.types.Object, joints: Joints, takes: Sequence[Take]) -> Iterator[float]:
@@ -80,11 +100,12 @@ def _sample_slice(armature: bpy.types.Object, joints: Joints, take: Take) -> Non
     need(not lost, f"'{armature.name}' lost the bone '{lost[0] if lost else ''}' meanwhile; begin again.")
     columns = [armature.pose.bones.find(name) for name in joints.names]
     until = time.monotonic() + SLICE
-    with playing(armature, take.source), _alone(armature) as scene:
+    with playing(leader_of(armature), take.source), _alone(armature) as scene:
         while not take.complete and time.monotonic() < until:
             frame = take.frames[len(take.worlds)]
             scene.frame_set(frame)
             evaluated = armature.evaluated_get(scene.view_layers[0].depsgraph)
+            take.placements.append(np.array(evaluated.matrix_world))
             take.worlds.append(_rigid(_worlds(evaluated)[columns], joints, take.source.name, frame))
 
 

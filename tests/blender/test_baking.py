@@ -1,0 +1,277 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Baking: what Blender shows is what the decoder says, and what the artist made stays."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
+
+from .conftest import activate
+from .scenes import decoded, ended, enliven, rig_and_animate, shown
+
+EXACT = 1e-5  # [m]
+FRAMES = range(1, 41)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """A folder whose name is not easy, for what several tests open."""
+    return tmp_path_factory.mktemp("shots of größe")
+
+
+@pytest.fixture
+def trained(ready, skirt, folder, ssilk_python):
+    """The skirt on an animated pillar, with a model that moves it visibly."""
+    bpy, path = ready, folder / "trained.blend"
+    if not path.exists():
+        rig_and_animate(bpy, skirt)
+        bpy.ops.wm.save_as_mainfile(filepath=str(path))
+        assert bpy.ops.ssilk.find_motions() == {"FINISHED"}
+        skirt.ssilk.training.preset, skirt.ssilk.training.iterations = "draft", 4
+        assert bpy.ops.ssilk.train() == {"FINISHED"}
+        assert ended(skirt).state == "done"
+        enliven(ssilk_python, model_of(skirt))
+        bpy.ops.wm.save_mainfile()
+    bpy.ops.wm.open_mainfile(filepath=str(path))
+    return bpy.data.objects["Skirt"]
+
+
+def model_of(garment) -> Path:
+    from blender_addon.scene.models import model_of
+
+    return model_of(garment)
+
+
+def bake(bpy, garment, **options) -> None:
+    activate(bpy, garment)
+    assert bpy.ops.ssilk.bake(**options) == {"FINISHED"}
+
+
+def refused(bpy, garment, **options) -> str:
+    activate(bpy, garment)
+    with pytest.raises(RuntimeError) as error:
+        bpy.ops.ssilk.bake(**options)
+    return str(error.value)
+
+
+def strips(thing, garment) -> list:
+    from blender_addon.scene.keys import is_baked
+
+    tracks = thing.animation_data.nla_tracks if thing.animation_data else ()
+    return [strip for track in tracks for strip in track.strips if is_baked(strip.action, garment)]
+
+
+@pytest.mark.parametrize("pre_roll", [0.0, 1.0])
+def test_blender_shows_what_the_decoder_says_on_every_frame(ready, trained, tmp_path, ssilk_python, pre_roll):
+    bake(ready, trained, pre_roll=pre_roll)
+    wanted = decoded(ssilk_python, model_of(trained), tmp_path, pre_roll=pre_roll)
+    plain = decoded(ssilk_python, model_of(trained), tmp_path, plain=True)
+    assert np.abs(wanted - plain).max() > 0.05
+    assert np.abs(shown(ready, trained, FRAMES) - wanted).max() < EXACT
+
+
+def test_the_bake_is_one_action_beneath_the_artists_own(ready, trained):
+    from blender_addon.scene.keys import SLOTS, curves_of, is_baked
+
+    bake(ready, trained)
+    armature, keys = ready.data.objects["Rig"], trained.data.shape_keys
+    assert armature.animation_data.action.name == "Walk"
+    (bones,), (shapes,) = strips(armature, trained), strips(keys, trained)
+    assert (bones.frame_start, bones.frame_end) == (1, 40)
+    if SLOTS:
+        assert bones.action == shapes.action
+        assert (bones.action_slot.target_id_type, shapes.action_slot.target_id_type) == ("OBJECT", "KEY")
+    for action in filter(is_baked, ready.data.actions):
+        for curve in curves_of(action):
+            assert {point.interpolation for point in curve.keyframe_points} == {"LINEAR"}
+            assert [point.co.x for point in curve.keyframe_points] == list(FRAMES)
+    proxies = [bone for bone in armature.pose.bones if bone.name.startswith("Skirt_proxy")]
+    assert len(proxies) == 6
+    assert all(bone.rotation_mode == "QUATERNION" for bone in proxies)
+
+
+def follow(bpy, armature, garment) -> None:
+    """Animate the armature as an object, far from where it was trained."""
+    for frame in (1, 40):
+        armature.location, armature.rotation_euler = (frame / 8, 3.0, 1.0), (0.3, 0.0, frame / 30)
+        armature.keyframe_insert("location", frame=frame)
+        armature.keyframe_insert("rotation_euler", frame=frame)
+
+
+def test_the_armature_may_move_as_an_object_with_the_garment(ready, trained, tmp_path, ssilk_python):
+    armature = ready.data.objects["Rig"]
+    trained.parent = armature
+    follow(ready, armature, trained)
+    ready.context.scene.frame_set(17)
+    bake(ready, trained)
+    wanted = decoded(ssilk_python, model_of(trained), tmp_path, pre_roll=1.0)
+    assert np.ptp(wanted[:, 0, 0]) > 4
+    away = np.abs(shown(ready, trained, FRAMES) - wanted).max()
+    assert away < EXACT
+
+
+def test_a_garment_that_is_left_behind_is_named(ready, trained):
+    follow(ready, ready.data.objects["Rig"], trained)
+    assert "leaves 'Skirt' behind" in refused(ready, trained)
+
+
+def test_baking_again_replaces_only_what_was_baked(ready, trained):
+    bake(ready, trained)
+    armature = ready.data.objects["Rig"]
+    fix = trained.shape_key_add(name="Fix", from_mix=False)
+    fix.data[0].co.x += 0.25
+    fix.value = 1.0
+    proxy = armature.pose.bones["Skirt_proxy_03"]
+    proxy.constraints.new("LIMIT_ROTATION")
+    walk = armature.animation_data.action
+    proxy.keyframe_insert("location", frame=1)
+    own = armature.animation_data.nla_tracks.new()
+    own.strips.new("Spin", 100, ready.data.actions["Spin Ö"])
+    before = {action.name for action in ready.data.actions}
+    first = shown(ready, trained, FRAMES)
+    bake(ready, trained)
+    assert {action.name for action in ready.data.actions} == before
+    assert [track.strips[0].name for track in armature.animation_data.nla_tracks] == ["SSILK Skirt", "Spin"]
+    assert armature.animation_data.action == walk
+    assert len(proxy.constraints) == 1
+    assert trained.data.shape_keys.key_blocks["Fix"].value == 1.0
+    assert len([key for key in trained.data.shape_keys.key_blocks if key.name.startswith("SSILK ")]) == 25
+    np.testing.assert_allclose(shown(ready, trained, FRAMES), first, atol=EXACT)
+    assert ready.ops.ssilk.remove_bake() == {"FINISHED"}
+    assert [key.name for key in trained.data.shape_keys.key_blocks] == ["Basis", "Fix"]
+    assert not strips(armature, trained)
+    assert not ready.ops.ssilk.remove_bake.poll()
+
+
+def test_keys_of_the_artist_win_over_baked_ones(ready, trained):
+    bake(ready, trained)
+    armature = ready.data.objects["Rig"]
+    proxy = armature.pose.bones["Skirt_proxy_03"]
+    proxy.rotation_quaternion = (0.8, 0.6, 0, 0)
+    proxy.keyframe_insert("rotation_quaternion", frame=5)
+    ready.context.scene.frame_set(30)
+    found = np.array(
+        armature.evaluated_get(ready.context.evaluated_depsgraph_get()).pose.bones[proxy.name].rotation_quaternion
+    )
+    np.testing.assert_allclose(found, (0.8, 0.6, 0, 0), atol=1e-6)
+
+
+def test_shapes_go_in_the_objects_own_space(ready, trained, tmp_path, ssilk_python):
+    """The garment's object is turned and scaled unequally; its points are where they were."""
+    from mathutils import Matrix
+
+    turned = Matrix.LocRotScale((0.2, 0.1, 0.3), Matrix.Rotation(0.7, 3, "X"), (2.0, 0.5, 1.5))
+    trained.data.transform(turned.inverted())
+    trained.matrix_world = turned
+    ready.context.view_layer.update()
+    bake(ready, trained)
+    wanted = decoded(ssilk_python, model_of(trained), tmp_path, pre_roll=1.0)
+    assert np.abs(shown(ready, trained, FRAMES) - wanted).max() < EXACT
+
+
+def test_usd_lies_beside_the_blend_file(ready, trained, folder, ssilk_python):
+    from blender_addon.scene.models import model_of
+
+    bake(ready, trained, to_timeline=False, to_usd=True)
+    assert not strips(ready.data.objects["Rig"], trained)
+    shot = folder / "Skirt.usdc"
+    assert shot.stat().st_size > 1000
+    import subprocess
+
+    verified = subprocess.run([ssilk_python, "-m", "ssilk_core", "verify", str(shot)], capture_output=True, text=True)
+    assert verified.returncode == 0, verified.stderr
+    assert model_of(trained).parent.joinpath("bake", "motion.usdc").exists()
+
+
+def test_a_single_frame_is_baked(ready, trained, tmp_path, ssilk_python):
+    scene = ready.context.scene
+    scene.frame_start = scene.frame_end = 7
+    bake(ready, trained, pre_roll=0)
+    assert len(strips(ready.data.objects["Rig"], trained)) == 1
+    wanted = decoded(ssilk_python, model_of(trained), tmp_path)
+    assert wanted.shape[0] == 1
+    assert np.abs(shown(ready, trained, range(7, 8)) - wanted).max() < EXACT
+
+
+def test_frames_before_zero_and_odd_rates_are_baked(ready, trained, tmp_path, ssilk_python):
+    scene = ready.context.scene
+    scene.frame_start, scene.frame_end = 3, 20
+    scene.render.fps, scene.render.fps_base = 24, 1.001
+    bake(ready, trained, pre_roll=0)
+    wanted = decoded(ssilk_python, model_of(trained), tmp_path)
+    assert np.abs(shown(ready, trained, range(3, 21)) - wanted).max() < EXACT
+
+
+def edit_bone(bpy, armature, name, change) -> None:
+    activate(bpy, armature)
+    bpy.ops.object.mode_set(mode="EDIT")
+    change(armature.data.edit_bones, armature.data.edit_bones[name])
+    bpy.ops.object.mode_set(mode="OBJECT")
+
+
+def test_what_does_not_fit_any_more_is_said(ready, trained):
+    armature = ready.data.objects["Rig"]
+    edit_bone(ready, armature, "Skirt_proxy_03", lambda bones, bone: bone.translate(armature.location + bone.vector))
+    assert "was moved since the garment was trained" in refused(ready, trained)
+
+
+@pytest.mark.parametrize(
+    ("harm", "told"),
+    [
+        (lambda bpy, garment: garment.data.vertices[0].co.__setitem__(0, 5.0), "another shape or place at rest"),
+        (lambda bpy, garment: setattr(garment.modifiers[0], "use_deform_preserve_volume", True), "Preserve Volume"),
+        (lambda bpy, garment: setattr(garment.modifiers[0], "use_bone_envelopes", True), "Bone Envelopes"),
+        (lambda bpy, garment: setattr(bpy.data.armatures["Rig"].bones["Spine"], "bbone_segments", 4), "bends"),
+        (lambda bpy, garment: setattr(bpy.data.armatures["Rig"], "pose_position", "REST"), "rest position"),
+        (lambda bpy, garment: setattr(bpy.data.objects["Rig"], "hide_viewport", True), "disabled in viewports"),
+        (lambda bpy, garment: garment.modifiers.clear(), "no Armature modifier"),
+        (lambda bpy, garment: setattr(garment.ssilk, "model", "//no.safetensors"), "has no model at"),
+        (lambda bpy, garment: setattr(bpy.data.objects["Rig"].pose.bones["Spine"], "scale", (1, 2, 1)), "is scaled"),
+    ],
+)
+def test_what_cannot_be_baked_is_named(ready, trained, harm, told):
+    harm(ready, trained)
+    actions = set(ready.data.actions.keys())
+    assert told in refused(ready, trained)
+    assert set(ready.data.actions.keys()) == actions
+    assert not trained.data.shape_keys
+
+
+def test_another_file_than_a_model_fails_in_one_sentence(ready, trained, folder):
+    (folder / "broken.safetensors").write_bytes(b"no model")
+    trained.ssilk.model = "//broken.safetensors"
+    told = refused(ready, trained)
+    assert "broken.safetensors" in told
+    assert "Traceback" not in told
+
+
+def test_a_garment_deleted_meanwhile_changes_nothing(ready, trained, monkeypatch):
+    from blender_addon.operators import baking
+
+    kept = baking.Bake.finish
+    monkeypatch.setattr(baking.Bake, "finish", lambda self, *rest: remove(ready, trained) or kept(self, *rest))
+    activate(ready, trained)
+    with pytest.raises(RuntimeError, match="'Skirt' was deleted meanwhile"):
+        ready.ops.ssilk.bake()
+
+
+def remove(bpy, thing) -> None:
+    bpy.data.objects.remove(thing)
+
+
+def test_an_unsaved_file_can_bake_to_its_timeline_but_not_beside_itself(ready, trained):
+    from blender_addon.scene.models import model_of as path_of
+
+    trained.ssilk.model = str(path_of(trained))
+    ready.ops.wm.save_as_mainfile(filepath=ready.data.filepath, copy=True)
+    from blender_addon.operators.baking import usd_path
+
+    assert usd_path(trained, "//x.usdc").name == "x.usdc"
+    from blender_addon.errors import SetupError
+
+    with pytest.raises(SetupError, match="no name for a shot"):
+        usd_path(trained, "//x.abc")
