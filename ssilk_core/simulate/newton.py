@@ -2,11 +2,9 @@
 """Projected Newton with conjugate gradients, many frames at once.
 
 Each iteration solves with the positive Hessian to a tenth of the residual, then halves the step until the energy has
-fallen enough; the planes of the body hold still meanwhile, and are found anew before the next. The distance to the
-nearest point of a mesh is not continuous, and a vertex pushed to and fro over a seam would never settle: after some
-iterations, a vertex that the surface would jump towards stays before the seam, as if pinned, until the frame is
-solved. Then all are released once more, for as long as that lowers the energy. Of all states on the way the one of
-lowest energy is returned.
+fallen enough. The nearest points of the body are found anew for every state, those of the line search included: the
+energy of a frame never rises, and more iterations never end higher. In gradient and Hessian they hold still, as in
+training; where that misleads so much that no step lowers the energy, the frame stays where it is.
 """
 
 from __future__ import annotations
@@ -17,15 +15,12 @@ import torch
 from torch import Tensor
 
 from ..errors import need
-from ..model.descriptors import GRAVITY
 from .conjugate import inverse_blocks, solve
 from .potential import Planes, Potential, Setting
 
 SUFFICIENT = 1e-4  # share of the slope that a step has to gain
 HALVINGS = 12
 REDUCTION = 0.1  # of the residual by each linear solution
-FALL = 1e-4  # [m]; states whose energies differ by less than such a fall of the garment count as equally low
-FREE = 12  # iterations in which every vertex may cross seams, at first and after each release
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +52,7 @@ class Solution:
     Attributes:
         x: positions [m], shape (V, 3, N).
         energy: with the nearest body points of x [J], shape (N,).
-        imbalance: what `SolverOptions.tolerance` bounds, without the vertices that stay before a seam, shape (N,).
+        imbalance: what `SolverOptions.tolerance` bounds, shape (N,).
         iterations: of Newton's method, shape (N,).
         inner: iterations of conjugate gradients, each for all frames that were still at work.
     """
@@ -69,9 +64,45 @@ class Solution:
     inner: int
 
 
+@dataclass(frozen=True, eq=False)
+class State:
+    """Where N frames are.
+
+    Attributes:
+        x: positions [m], shape (V, 3, N).
+        planes: through the body points nearest to them.
+        energy: [J], shape (N,).
+    """
+
+    x: Tensor
+    planes: Planes | None
+    energy: Tensor
+
+    @classmethod
+    def at(cls, potential: Potential, x: Tensor, setting: Setting) -> State:
+        """Return the state of positions (V, 3, N)."""
+        planes = potential.planes(x, setting)
+        return cls(x, planes, potential.energy(x, setting, planes))
+
+    def tensors(self) -> list[Tensor]:
+        """Return all that it holds, frames last."""
+        return [self.x, self.energy, *([self.planes.normal, self.planes.offset] if self.planes else [])]
+
+    def picked(self, frames: Tensor) -> State:
+        """Return the state of some of the frames, indices (M,)."""
+        return State(self.x[..., frames], self.planes and self.planes.picked(frames), self.energy[frames])
+
+    def replaced(self, frames: Tensor, other: State) -> State:
+        """Return the state with some of the frames, indices (M,), from another."""
+        x, energy, *planes = (
+            own.index_copy(-1, frames, new) for own, new in zip(self.tensors(), other.tensors(), strict=True)
+        )
+        return State(x, Planes(*planes) if planes else None, energy)
+
+
 @torch.no_grad()
 def minimise_from(potential: Potential, start: Tensor, setting: Setting, options: SolverOptions) -> Solution:
-    """Minimise the energy of each frame over the free vertices.
+    """Minimise the energy of each frame over the free vertices; no frame ends higher than it starts.
 
     Args:
         start: first positions, pinned vertices where they stay, shape (V, 3, N).
@@ -84,126 +115,88 @@ def minimise_from(potential: Potential, start: Tensor, setting: Setting, options
         if not search.narrowed():
             break
         search.advance()
-    return search.solution()
+    return search.solution
 
 
 class _Search:
-    """Newton's method under way: the frames still at work, and the best state of every frame so far."""
+    """Newton's method under way: the frames still at work, and where every frame has come to."""
 
-    energy: Tensor
     gradient: Tensor
     imbalance: Tensor
 
     def __init__(self, potential: Potential, start: Tensor, setting: Setting, options: SolverOptions) -> None:
         self.potential, self.options, self.setting = potential, options, setting
-        self.x, self.planes, self.inner = start, potential.planes(start, setting), 0
-        self.held = torch.zeros_like(start[:, 0], dtype=torch.bool)
-        self._look()
-        bad = int((~self.energy.isfinite()).sum())
-        need(bad == 0, "simulation", f"the first state of {bad} of {len(self.energy)} frames has no finite energy",
+        self.state = State.at(potential, start, setting)
+        energy = self.state.energy
+        bad = int((~energy.isfinite()).sum())
+        need(bad == 0, "simulation", f"the first state of {bad} of {len(energy)} frames has no finite energy",
              "positions, body and time step must be finite", "look for NaN in stage and motion")  # fmt: skip
-        self.at_work = torch.arange(len(self.energy), device=start.device)
-        self.moving = torch.ones_like(self.energy, dtype=torch.bool)
-        self.best = Solution(
-            start.clone(), self.energy.clone(), self.imbalance.clone(), torch.zeros_like(self.at_work), 0
-        )
-        self.lowest = self.energy.clone()
-        self.since, self.mark = torch.zeros_like(self.at_work), torch.full_like(self.energy, torch.inf)
-        self.alike = float(potential.mass[potential.free].sum()) * GRAVITY * FALL
+        self.at_work = torch.arange(len(energy), device=start.device)
+        self.moving = torch.ones_like(energy, dtype=torch.bool)
+        self._look()
+        iterations = torch.zeros_like(self.at_work)
+        self.solution = Solution(start.clone(), energy.clone(), self.imbalance.clone(), iterations, 0)
 
     def narrowed(self) -> bool:
-        """Leave out frames that are solved or cannot be improved; return whether any is left."""
-        kept = ((self.moving & (self.imbalance > self.options.tolerance)) | self._released()).nonzero()[:, 0]
+        """Leave out frames that are solved or that no step improves; return whether any is left."""
+        kept = (self.moving & (self.imbalance > self.options.tolerance)).nonzero()[:, 0]
         if 0 < len(kept) < len(self.at_work):
-            self.x, self.gradient, self.at_work = self.x[..., kept], self.gradient[..., kept], self.at_work[kept]
-            self.setting, self.planes = self.setting.picked(kept), self.planes and self.planes.picked(kept)
-            self.held, self.since, self.mark = self.held[:, kept], self.since[kept], self.mark[kept]
+            self.state, self.setting = self.state.picked(kept), self.setting.picked(kept)
+            self.gradient, self.at_work = self.gradient[..., kept], self.at_work[kept]
         return len(kept) > 0
-
-    def _released(self) -> Tensor:
-        """Let go of held vertices in solved frames that the last such time has helped; return which, (N,)."""
-        solved = ~self.moving | (self.imbalance <= self.options.tolerance)
-        again = solved & self.held.any(0) & (self.energy < self.mark - self.alike)
-        if bool(again.any()):
-            self.held &= ~again
-            self.since.masked_fill_(again, 0)
-            self.mark = torch.where(again, self.energy, self.mark)
-            self._look()
-        return again
 
     def advance(self) -> None:
         """Make one step."""
-        potential, setting, x, planes = self.potential, self.setting, self.x, self.planes
-        step, count = newton_step(potential, x, setting, planes, self.gradient, ~self.held, self.options.inner)
-        length = line_search(potential, x, setting, planes, self.gradient, step)
-        self.moving, self.inner = length > 0, self.inner + count
-        self.x = x + length * step
-        self.planes = potential.planes(self.x, setting)
-        if planes and self.planes:
-            jumps = planes.jumps(self.planes, self.x, x) & (self.since >= FREE)
-            self.x, self.planes = torch.where(jumps[:, None], x, self.x), planes.mixed(self.planes, jumps)
-            self.held |= jumps
-        self.since += 1
+        potential, setting = self.potential, self.setting
+        step, count = newton_step(potential, self.state, setting, self.gradient, self.options.inner)
+        self.state, self.moving = line_search(potential, self.state, setting, self.gradient, step)
         self._look()
-        self._remember()
+        self._keep(count)
 
     def _look(self) -> None:
-        """Evaluate the states that the search stands at."""
-        state = self.x, self.setting, self.planes
-        self.energy = self.potential.energy(*state)
-        self.gradient = self.potential.gradient(*state).masked_fill(self.held[:, None], 0)
+        """Find the forces out of balance in the states that the search stands at."""
+        self.gradient = self.potential.gradient(self.state.x, self.setting, self.state.planes)
         self.imbalance = self.potential.imbalance(self.gradient)
 
-    def _remember(self) -> None:
-        """Keep the latest of the states whose energy is as low as any."""
-        best, rows, energy = self.best, self.at_work, self.energy
-        best.iterations[rows] += 1
-        better = energy <= self.lowest[rows] + self.alike
-        rows = rows[better]
-        best.x[..., rows] = self.x[..., better]
-        best.energy[rows], best.imbalance[rows] = energy[better], self.imbalance[better]
-        self.lowest[rows] = torch.minimum(self.lowest[rows], best.energy[rows])
-
-    def solution(self) -> Solution:
-        """Return the best states."""
-        return replace(self.best, inner=self.inner)
+    def _keep(self, inner: int) -> None:
+        """Write down where the frames at work have come to."""
+        found, rows = self.solution, self.at_work
+        found.x[..., rows], found.energy[rows] = self.state.x, self.state.energy
+        found.imbalance[rows] = self.imbalance
+        found.iterations[rows] += 1
+        self.solution = replace(found, inner=found.inner + inner)
 
 
 def newton_step(
-    potential: Potential,
-    x: Tensor,
-    setting: Setting,
-    planes: Planes | None,
-    gradient: Tensor,
-    moves: Tensor,
-    inner: int,
+    potential: Potential, state: State, setting: Setting, gradient: Tensor, inner: int
 ) -> tuple[Tensor, int]:
-    """Return a direction of descent (V, 3, N) and the iterations that it took.
-
-    It is zero in pinned vertices and wherever `moves` (V, N) is false.
-    """
-    matrix = potential.hessian(x, setting, planes)
+    """Return a direction of descent (V, 3, N), zero in pinned vertices, and the iterations that it took."""
+    matrix = potential.hessian(state.x, setting, state.planes)
     inverse = inverse_blocks(matrix.diagonal)
-    mask = moves[potential.free].T[..., None].float()
-    right = -gradient[potential.free].permute(2, 0, 1).float() * mask
-    z, count = solve(
-        lambda v: (matrix @ v) * mask, lambda r: (inverse * r[..., None, :]).sum(-1), right, REDUCTION, inner
-    )
-    step = torch.zeros_like(x)
-    step[potential.free] = z.permute(1, 2, 0).to(x.dtype)
+    right = -gradient[potential.free].permute(2, 0, 1).float()
+    z, count = solve(lambda v: matrix @ v, lambda r: (inverse * r[..., None, :]).sum(-1), right, REDUCTION, inner)
+    step = torch.zeros_like(state.x)
+    step[potential.free] = z.permute(1, 2, 0).to(step.dtype)
     return step, count
 
 
 def line_search(
-    potential: Potential, x: Tensor, setting: Setting, planes: Planes | None, gradient: Tensor, step: Tensor
-) -> Tensor:
-    """Return the largest of 1, 1/2, 1/4 ... at which each frame's energy has fallen enough, else 0, shape (N,)."""
-    energy, slope = potential.energy(x, setting, planes), (gradient * step).sum((0, 1))
-    length, found = torch.ones_like(energy), torch.zeros_like(energy)
+    potential: Potential, state: State, setting: Setting, gradient: Tensor, step: Tensor
+) -> tuple[State, Tensor]:
+    """Return where the largest of 1, 1/2, 1/4 ... of a step takes each frame so that its energy falls enough.
+
+    A frame whose energy falls with none of them stays. Also returned: which frames have moved, shape (N,).
+    """
+    slope = (gradient * step).sum((0, 1))
+    found, left, length = state, (slope < 0).nonzero()[:, 0], 1.0
+    moved = slope < 0
     for _ in range(HALVINGS):
-        fallen = potential.energy(x + length * step, setting, planes) <= energy + SUFFICIENT * length * slope
-        found = torch.where((found == 0) & fallen & (slope < 0), length, found)
-        if bool((found > 0).all()):
+        if not len(left):
             break
-        length = length / 2
-    return found
+        trial = State.at(potential, (state.x + length * step)[..., left], setting.picked(left))
+        fallen = trial.energy <= (state.energy + SUFFICIENT * length * slope)[left]
+        rows = fallen.nonzero()[:, 0]
+        found = found.replaced(left[rows], trial.picked(rows))
+        left, length = left[~fallen], length / 2
+    moved[left] = False
+    return found, moved

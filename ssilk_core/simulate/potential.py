@@ -5,8 +5,8 @@ Implicit Euler with time step dt is the minimum of
 
     stretch + bending + gravity + collision + m/(2 dt^2) |x - (2 x' - x'')|^2 + drag a/(2 dt) |x - carried|^2
 
-(`energy.GarmentEnergy`); a quasi-static state leaves the last two out. The nearest body points are found anew for
-every state, the trial states of a line search included; in gradient and Hessian they hold still, as in training.
+(`energy.GarmentEnergy`); a quasi-static state leaves the last two out. The nearest body points are those of the
+whole surface, found anew for every state; in gradient and Hessian they hold still, as in training.
 """
 
 from __future__ import annotations
@@ -27,8 +27,6 @@ from .blocks import BlockMatrix
 from .hessian import Hessian
 from .hinges import Hinges
 from .membrane import Membrane
-
-SEAM = 5e-4  # [m]; a jump of the surface by less does not keep a vertex from settling
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,16 +68,6 @@ class Planes:
     def picked(self, frames: Tensor) -> Planes:
         """Return the planes of some of the frames, indices (M,)."""
         return Planes(self.normal[..., frames], self.offset[..., frames])
-
-    def jumps(self, fresh: Planes, x: Tensor, before: Tensor) -> Tensor:
-        """Return where the `fresh` planes of x are nearer than these by more than vertices moved from `before`."""
-        return self.distance(x) - fresh.distance(x) > (x - before).norm(dim=1).clamp_min(SEAM)
-
-    def mixed(self, fresh: Planes, own: Tensor) -> Planes:
-        """Return these planes where `own` (V, N), else the fresh ones."""
-        return Planes(
-            torch.where(own[:, None], self.normal, fresh.normal), torch.where(own, self.offset, fresh.offset)
-        )
 
 
 class Potential:

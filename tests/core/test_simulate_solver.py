@@ -21,7 +21,7 @@ from ssilk_core.model.body import CollisionBody
 from ssilk_core.simulate.conjugate import inverse_blocks, solve
 from ssilk_core.simulate.hinges import Hinges
 from ssilk_core.simulate.membrane import Membrane, outer, positive
-from ssilk_core.simulate.newton import SolverOptions, line_search, minimise_from, newton_step
+from ssilk_core.simulate.newton import SolverOptions, State, line_search, minimise_from, newton_step
 from ssilk_core.simulate.potential import Planes, Potential, Setting
 
 CPU = torch.device("cpu")
@@ -175,14 +175,25 @@ def test_conjugate_gradients_solve_each_frame_by_itself() -> None:
 
 def test_a_line_search_accepts_no_worse_state(potential: Potential, scene: Scene) -> None:
     x, setting = moving(scene, 3)
-    planes = potential.planes(x, setting)
-    gradient = potential.gradient(x, setting, planes)
-    step, _ = newton_step(potential, x, setting, planes, gradient, torch.ones_like(x[:, 0]).bool(), 50)
+    state = State.at(potential, x, setting)
+    gradient = potential.gradient(x, setting, state.planes)
+    step, _ = newton_step(potential, state, setting, gradient, 50)
     wild = step * torch.tensor([1.0, 300.0, -1.0], dtype=torch.float64)
-    length = line_search(potential, x, setting, planes, gradient, wild)
-    assert length[0] > 0 and 0 < length[1] < 1 and length[2] == 0  # uphill, no step is good enough
-    before, after = (potential.energy(at, setting, planes) for at in (x, x + length * wild))
-    assert (after[:2] < before[:2]).all() and after[2] == before[2]
+    found, moved = line_search(potential, state, setting, gradient, wild)
+    assert moved.tolist() == [True, True, False]  # uphill, no step is good enough
+    share = (found.x - x).abs().sum((0, 1)) / wild.abs().sum((0, 1))
+    assert 0 < share[1] < 1 and share[2] == 0
+    fresh = State.at(potential, found.x, setting)  # the energy is that of the body points nearest to where it ends
+    torch.testing.assert_close(found.energy, fresh.energy, rtol=1e-12, atol=0)
+    assert (found.energy[:2] < state.energy[:2]).all() and found.energy[2] == state.energy[2]
+
+
+def test_more_iterations_never_end_higher(potential: Potential, scene: Scene) -> None:
+    x, setting = moving(scene, 4)
+    budgets = [SolverOptions(tolerance=1e-9, iterations=n) for n in (1, 2, 3, 4, 6, 8, 12, 16)]
+    energies = [State.at(potential, x, setting).energy]
+    energies += [minimise_from(potential, x, setting, options).energy for options in budgets]
+    assert (torch.stack(energies).diff(dim=0) <= 0).all() and (energies[1] < energies[0]).all()
 
 
 def test_the_solver_is_as_low_as_a_generic_minimiser(potential: Potential, scene: Scene) -> None:
