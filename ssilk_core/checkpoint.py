@@ -24,6 +24,7 @@ from .fabrics import Fabric
 from .files import replacing
 from .packing import narrowest, packed, unpacked
 from .parameters import Shapes, parameter_shapes
+from .tensors import read_tensors
 
 if TYPE_CHECKING:
     from .model.network import GarmentModel
@@ -35,7 +36,6 @@ HEADER: dict[str, Any] = {
     "joint_names": (), "proxy_names": (), "paths": {}, "config": {}, "fabric": {}, "provenance": {},
 }  # fmt: skip
 WEIGHTS = ("scene.plain.weights", "scene.rig.weights")
-HEADER_LIMIT = 64 << 20  # bytes; a header this large is damage or mischief, not a model
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,29 +148,20 @@ def load_model(path: str | Path, shapes: Callable[[ModelFile], Shapes] | None = 
 
 
 def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    from safetensors import SafetensorError, safe_open
-
     need(path.is_file(), str(path), "there is no such model file", "a file written by 'ssilk train' is needed")
-    with path.open("rb") as stream:
-        size = int.from_bytes(stream.read(8).ljust(8, b"\0"), "little")
-    need(
-        0 < size <= HEADER_LIMIT,
-        str(path),
-        "this is no safetensors file",
-        "a file written by 'ssilk train' is needed",
-    )
     try:
-        with safe_open(path, "numpy") as stream:
-            header = (stream.metadata() or {}).get("ssilk", "")
-            tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
-    except (SafetensorError, TypeError) as error:  # the latter for numbers that numpy lacks
+        tensors, words = read_tensors(path)
+    except ValueError as error:
+        first = str(error).partition("\n")[0]
         raise SsilkError(
-            f"{path}: the model file is truncated or damaged ({error}); train again or fetch the file again."
+            f"{path}: this is no safetensors file, or a truncated or damaged one ({first}); train again or fetch the "
+            "file again."
         ) from error
+    header = words.get("ssilk", "")
     need(header, str(path), "a safetensors file without SSILK's header", "a file written by 'ssilk train' is needed")
     try:
         document = json.loads(header)
-    except (ValueError, RecursionError) as error:
+    except (TypeError, ValueError, RecursionError) as error:
         raise SsilkError(f"{path}: the model's header is damaged ({error}); train again.") from error
     found = document.get("format") if isinstance(document, dict) else None
     allowed = f"this version reads formats {', '.join(map(str, READABLE))}"

@@ -18,7 +18,7 @@ CORE, USD = ROOT / "ssilk_core", ROOT / "usd" / "ssilk_usd"
 # From the inside out: a module imports its own layer or those before it.
 LAYERS = (
     {"errors"},
-    {"assets", "config", "devices", "fabrics", "events", "files", "packing"},
+    {"assets", "config", "devices", "fabrics", "events", "files", "packing", "tensors"},
     {"mesh", "kinematics", "kernels", "descriptors", "parameters", "sampling", "targets"},
     {"model", "energy"},
     {"checkpoint"},
