@@ -17,6 +17,7 @@ import json
 import os
 import subprocess
 import tempfile
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -100,7 +101,7 @@ def network_growth(repeats: int) -> dict[str, Times]:
         model, motion = cloak(2500, ModelConfig(latent=latent, widths=widths))
         player = Player(model_file(model, Fabric("default"), {}))
         name = f"{latent}: {', '.join(map(str, widths))}"
-        found[name] = measured({"numpy": lambda motion, player=player: with_numpy(player, motion)}, motion, repeats)
+        found[name] = measured({"numpy": partial(with_numpy, player)}, motion, repeats)
     return found
 
 
@@ -152,7 +153,8 @@ def garment(path: Path, options: argparse.Namespace) -> tuple[str, dict[str, Tim
 
 def main() -> None:
     options = options_of_run()
-    text, found = "", {}
+    text = ""
+    found: dict[str, Times] = {}
     for path in options.models:
         told, times = garment(path, options)
         text, found = text + told, {**found, **times}
