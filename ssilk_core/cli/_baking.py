@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ssilk_core.assets import Deformer, Floats, GarmentPose, Motion, ProxyRig, Scene, Skeleton
+from ssilk_core.devices import chosen_device
 from ssilk_core.errors import VerificationError, need
 from ssilk_core.events import Message, Progress, Reporter
 from ssilk_core.targets import TARGETS, Target, fitted
 
+from ._quality import lost
 from .options import INPUTS
 
 if TYPE_CHECKING:
@@ -47,11 +49,12 @@ class BakeRequest:
     target: str = "usd"
     samples: int = 1  # in each frame
     pre_roll: float = 0.0  # [s]
+    keep: str = ""  # blendshapes, proxies and influences of the model, "24,12,4"; all where empty
 
     @classmethod
     def of(cls, task: Task) -> BakeRequest:
-        """Return what a task asks for."""
-        return cls(**{item.name: getattr(task, item.name) for item in fields(cls)})
+        """Return what a task asks for, which is the whole model."""
+        return cls(**{item.name: getattr(task, item.name) for item in fields(cls) if item.name != "keep"})
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +75,12 @@ class Bake:
     provenance: dict[str, Any]
     record: GarmentRecord
     recovered: list[str] = field(default_factory=list)
+
+    def wearing(self, file: ModelFile) -> Bake:
+        """Return the same with another model of the garment."""
+        assert self.model is not None
+        model, deformer = worn(file, self.model, self.request)
+        return replace(self, model=model, deformer=deformer)
 
     @property
     def start(self) -> float:
@@ -197,16 +206,17 @@ class Dressed:
         source = read_motion(motion, self.file.scene.character.skeleton, root=request.root)
         at_rate = source if request.fps is None else _at_rate(source, request.fps)
         sampled = at_rate if request.samples == 1 else _at_rate(source, at_rate.fps * request.samples)
+        kept = self._cut(source) if request.keep else self
         carried = {key: value for key, value in vars(request).items() if value != getattr(BakeRequest, key, None)}
         provenance = {
-            **self.provenance,
+            **kept.provenance,
             "request": carried,
             "motion_sha256": sha256(split_location(motion)[0]),
         }
         return Bake(
             request=request,
-            model=self.model,
-            deformer=self.deformer,
+            model=kept.model,
+            deformer=kept.deformer,
             motion=sampled,
             source=source,
             hidden=read_hidden(motion, sampled, root=request.root),
@@ -215,10 +225,30 @@ class Dressed:
             record=self.record,
         )
 
+    def _cut(self, motion: Motion) -> Dressed:
+        """Return the garment with as much kept as the request says: what is best for this motion."""
+        from ssilk_core.reduction import Reducer, Size
+
+        reducer = Reducer(self.file, [motion])
+        found = reducer.reduced(Size.of(self.request.keep))
+        assert self.model is not None
+        model, deformer = worn(found.file, self.model, self.request)
+        provenance = {**self.provenance, "reduced": lost(reducer.whole, found)}
+        return replace(self, file=found.file, model=model, deformer=deformer, provenance=provenance)
+
     @property
     def record(self) -> GarmentRecord:
         """Return how the garment's model was made."""
         return _record(self.file, self.provenance["model_sha256"])
+
+
+def worn(file: ModelFile, like: GarmentModel, request: BakeRequest) -> tuple[GarmentModel, Deformer]:
+    """Return a model's network on the character of another of the same garment, and what its target takes."""
+    from ssilk_core.checkpoint import network
+
+    model = network(file, replace(file.scene, character=like.scene.character))
+    model.to(chosen_device(request.device))
+    return model, fitted(model.deformer(), TARGETS[request.target])
 
 
 def open_bake(request: BakeRequest) -> Bake:
@@ -240,7 +270,6 @@ def dressed(request: BakeRequest) -> Dressed:
     from ssilk_usd.read_stage import open_stage
 
     from ssilk_core.checkpoint import load_model, network
-    from ssilk_core.devices import chosen_device
     from ssilk_core.files import sha256
 
     need(request.target in TARGETS, "--target", f"'{request.target}'", f"it is one of {', '.join(TARGETS)}")

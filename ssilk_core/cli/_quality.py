@@ -31,6 +31,16 @@ def level_size(quality: str | None, whole: Size) -> Size:
     return quality_named(quality).size.within(whole) if quality else whole
 
 
+def lost(whole: Size, found: Reduced) -> dict[str, object]:
+    """Return what was kept of a model, and what that loses."""
+    names = dict(zip(NUMBERS, ("blendshapes", "proxies", "influences")))
+    return {
+        **{names[name]: f"{getattr(found.size, name)} of {getattr(whole, name)}" for name in NUMBERS},
+        "loses [mm RMS]": round(1000 * found.rms, 3),
+        "loses at most [mm]": round(1000 * found.largest, 2),
+    }
+
+
 def spent(
     text: str,
     reducer: Reducer,

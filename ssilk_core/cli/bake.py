@@ -19,6 +19,7 @@ from ssilk_core.events import Message, Reporter, Result, Started
 from ssilk_core.files import replacing
 from ssilk_core.targets import TARGETS
 
+from ._quality import add_level
 from .options import add_bake, check_output, is_folder, tasks_of
 
 
@@ -27,12 +28,15 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     add_bake(verb)
     verb.add_argument("-o", "--output", type=Path, required=True,
                       help="shot to write (.usdc, .usd, .usda or .usdz), or a folder of layers")  # fmt: skip
+    add_level(verb, "2MB for the shot")
     verb.add_argument("--again", action="store_true", help="bake what is there and current, too (folders)")
 
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Bake and verify."""
     if is_folder(options.output):
+        need(not (options.quality or options.budget), str(options.output), "a level of quality for layers",
+             "their assets are the same for all shots", "bake models that 'ssilk reduce' made")  # fmt: skip
         return _bake_layers(options, report)
     return _bake_file(options, report)
 
@@ -54,6 +58,7 @@ def _bake_file(options: argparse.Namespace, report: Reporter) -> int:
     from ssilk_usd.shot import write_shot
 
     from ._baking import BakeRequest, open_bake
+    from ._level import levelled
 
     tasks, suffixes = tasks_of(options), TARGETS[options.target].suffixes
     need(len(tasks) == 1 and not options.points, str(options.output), "one file", "it holds one garment in one shot "
@@ -62,7 +67,7 @@ def _bake_file(options: argparse.Namespace, report: Reporter) -> int:
          f"{options.target} takes {', '.join(suffixes)}")  # fmt: skip
     (task,) = tasks
     check_output(options.output, task.model, task.stage, split_location(task.motion)[0])
-    bake = open_bake(BakeRequest.of(task))
+    bake = levelled(open_bake(BakeRequest.of(task)), options, report)
     report(Started("bake", bake.motion.frame_count, {"output": str(options.output)}))
     with replacing(options.output) as unproven:
         with packaged(unproven) as layer:
@@ -90,6 +95,7 @@ def _bake_file(options: argparse.Namespace, report: Reporter) -> int:
         "proxies": summary.proxy_count,
         "blendshapes": summary.shape_count,
         "bytes": options.output.stat().st_size,
+        **bake.provenance.get("reduced", {}),
         **proof,
         **bake.warn(report),
     }

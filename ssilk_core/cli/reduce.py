@@ -13,13 +13,13 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ssilk_core.errors import EXIT_OK, need
 from ssilk_core.events import Reporter, Result
 
 from . import options as shared
-from ._quality import NUMBERS, add_level, level_size, spent
+from ._quality import NUMBERS, add_level, level_size, lost, spent
 
 if TYPE_CHECKING:
     from ssilk_core.assets import Motion
@@ -54,10 +54,11 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     motions = _motions(file, options)
     reducer = Reducer(file, motions)
     found = _chosen(options, reducer, motions, report)
-    told = {"model": str(options.model), "motions": [motion.path for motion in motions], **_figures(reducer, found)}
+    figures = lost(reducer.whole, found)
+    told = {"model": str(options.model), "motions": [motion.path for motion in motions], **figures}
     provenance = {**file.provenance, "reduced": told}
     save_model(options.output, replace(found.file, provenance=provenance), pack=options.precision == "int16")
-    detail = {"model": str(options.output), **_figures(reducer, found), "bytes": options.output.stat().st_size}
+    detail = {"model": str(options.output), **figures, "bytes": options.output.stat().st_size}
     report(Result("reduce", detail))
     return EXIT_OK
 
@@ -84,14 +85,3 @@ def _chosen(options: argparse.Namespace, reducer: Reducer, motions: list[Motion]
         return reducer.reduced(size)
     pack = options.precision == "int16"
     return spent(options.budget, reducer, size, motions[0], lambda file: model_bytes(file, pack=pack), report)
-
-
-def _figures(reducer: Reducer, found: Reduced) -> dict[str, Any]:
-    """Return what was kept, and what that loses."""
-    kept, whole = vars(found.size), vars(reducer.whole)
-    names = dict(zip(NUMBERS, ("blendshapes", "proxies", "influences")))
-    return {
-        **{names[name]: f"{kept[name]} of {whole[name]}" for name in NUMBERS},
-        "loses [mm RMS]": round(1000 * found.rms, 3),
-        "loses at most [mm]": round(1000 * found.largest, 2),
-    }

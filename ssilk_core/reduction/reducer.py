@@ -137,10 +137,12 @@ class Reducer:
 
     def _modes(self, joints: int, influences: int) -> Modes:
         """Return what displacements would make up for other weights, as far as activations tell."""
-        wanted = self.displacements
+        parameters = self.file.parameters
+        more = np.zeros_like(self.displacements)
         if (joints, influences) != (self.whole.joints, self.whole.influences):
-            wanted = wanted - self._shifts(self._skinned(joints, influences))
-        return modes(wanted, self.activations, self.mass[self.free])
+            more = -self._shifts(self._skinned(joints, influences))
+        more += parameters.get("decoder.offset", np.zeros((1, 3)))[:, :, None]
+        return modes(parameters["decoder.shapes"], more, self.activations, self.mass[self.free])
 
     def _shifts(self, weights: Floats) -> NDArray:
         """Return by how much other weights (V, C) move the vertices that are not pinned, turned back to rest.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fewer blendshapes: the best that any so many can do, by reduced-rank regression on the activations."""
+"""Fewer blendshapes: the best that any so many can do, by principal components of what follows the activations."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from ..assets import Floats
 
-LEAST = 1e-10  # of the largest variance: combinations of activations that vary less do not vary
+RIDGE = 3e-4  # of the mean variance of activations: keeps few frames from being learnt by heart
+LEAST = 1e-14  # of the largest share: modes with less are rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,9 +20,9 @@ class Modes:
 
     Attributes:
         mean: shape (V, 3) [m]; middle: mean activations, shape (K,).
-        fields: shape (V, 3, R) [m]; readings: shape (R, K); each field's activation has a variance of one.
-        shares: mean squares that each field accounts for, weighted by mass, shape (R,) [m2].
-        rest: mean square that none accounts for [m2].
+        fields: shape (V, 3, K) [m]; readings: shape (K, K); each field's activation has a variance of one.
+        shares: what each field takes off the mean square of the displacements, weighted by mass, shape (K,) [m2].
+        total: that mean square about the mean [m2].
     """
 
     mean: Floats
@@ -29,42 +30,51 @@ class Modes:
     fields: Floats
     readings: Floats
     shares: Floats
-    rest: float
+    total: float
 
     def lost(self, count: int) -> float:
         """Return the RMS displacement that the first `count` fields miss [m]."""
-        return float(np.sqrt(self.rest + self.shares[count:].sum()))
+        return float(np.sqrt(max(0.0, self.total - self.shares[:count].sum())))
 
 
-def modes(displacements: NDArray, activations: NDArray, mass: Floats) -> Modes:
-    """Find the linear functions of activations that follow displacements best, at every rank [Izenman 1975].
+def modes(shapes: NDArray, more: NDArray, activations: NDArray, mass: Floats) -> Modes:
+    """Find what displacements shapes a + more follow of the activations a.
 
-    With as many terms as asked for no other function of that rank leaves a smaller mean square, weighted by mass.
-    Where displacements are linear in the activations this is their principal component analysis [Eckart, Young 1936].
+    Ridge regression says what `more`, which no shapes give, follows of them; principal components of both together
+    are then the best of their number [Eckart, Young 1936], of the displacements themselves where `more` is zero.
 
     Args:
-        displacements: of the vertices in F frames, shape (V, 3, F) [m].
+        shapes: (V, 3, K) [m]; more: of the vertices in F frames, shape (V, 3, F) [m].
         activations: shape (K, F); mass: of the vertices as shares of the whole garment's, shape (V,).
     """
-    frames = activations.shape[1]
-    mean, middle = displacements.mean(axis=2, dtype=np.float64), activations.mean(axis=1, dtype=np.float64)
-    moved = (displacements - mean[:, :, None]).reshape(-1, frames)
-    whitening = _whitening(activations - middle[:, None])
-    white = whitening @ (activations - middle[:, None])
-    followed = moved @ white.T / frames  # one column for each independent combination of activations
-    weight = np.repeat(mass, 3)
-    shares, turn = np.linalg.eigh(followed.T @ (weight[:, None] * followed))
-    shares, turn = shares[::-1].clip(min=0), turn[:, ::-1]
-    total = float(weight @ np.einsum("vf,vf->v", moved, moved)) / frames
-    fields = (followed @ turn).reshape(*mean.shape, -1)
-    return Modes(mean, middle, fields, turn.T @ whitening, shares, max(0.0, total - float(shares.sum())))
+    frames, weight = activations.shape[1], np.repeat(mass, 3)
+    middle, beyond = activations.mean(axis=1, dtype=np.float64), more.mean(axis=2, dtype=np.float64)
+    centred = activations - middle[:, None]
+    variance = centred @ centred.T / frames
+    rest = (more - beyond[:, :, None]).reshape(-1, frames)
+    given, along = shapes.reshape(len(weight), -1).astype(np.float64), rest @ centred.T / frames
+    ridge = RIDGE * np.trace(variance) / max(len(variance), 1) + 1e-30
+    linear = given + along @ np.linalg.inv(variance + ridge * np.eye(len(variance)))
+    fields, readings = _components(linear, variance, weight)
+    together = given @ variance + along  # covariance of displacements and activations
+    shares = np.einsum("v,vk,vk->k", weight, fields, 2 * together @ readings.T - fields)
+    total = float(
+        weight @ (np.einsum("vk,vk->v", given, together + along) + np.einsum("vf,vf->v", rest, rest) / frames)
+    )
+    mean = shapes @ middle + beyond
+    return Modes(mean, middle, fields.reshape(*mean.shape, -1), readings, shares, total)
 
 
-def _whitening(centred: Floats) -> Floats:
-    """Return combinations (R, K) of centred values (K, F) that vary independently, each by one."""
-    variances, directions = np.linalg.eigh(centred @ centred.T / centred.shape[1])
-    kept = variances > LEAST * max(variances.max(initial=0), 1e-30)
-    return directions[:, kept].T / np.sqrt(variances[kept])[:, None]
+def _components(linear: Floats, variance: Floats, weight: Floats) -> tuple[Floats, Floats]:
+    """Return fields (3 V, K) and readings (K, K) of displacements `linear` a, the most important first."""
+    values, directions = np.linalg.eigh(variance)
+    spread = directions * np.sqrt(values.clip(min=0))
+    scaled = linear @ spread
+    shares, turn = np.linalg.eigh(scaled.T @ (weight[:, None] * scaled))
+    fields, shares = scaled @ turn[:, ::-1], shares[::-1]
+    kept = shares > LEAST * shares.max(initial=0)
+    inverse = np.divide(1, shares, out=np.zeros_like(shares), where=kept)
+    return fields * kept, inverse[:, None] * (fields.T @ (weight[:, None] * linear))
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,5 +100,5 @@ def basis(found: Modes, count: int, readout: Floats) -> Basis:
     fields, readings = found.fields[:, :, :count], found.readings[:count]
     offset = found.mean - fields @ (readings @ found.middle)
     combined = readings @ readout
-    largest = np.abs(combined).sum(axis=1)
+    largest = np.abs(combined).sum(axis=1) + 1e-30
     return Basis(offset, fields * largest, combined / largest[:, None])

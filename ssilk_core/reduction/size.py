@@ -25,6 +25,15 @@ class Size:
             value = getattr(self, name)
             need(value >= least, f"{name} = {value}", "too few to be kept", f"it is at least {least}")
 
+    @classmethod
+    def of(cls, text: str) -> Size:
+        """Return what `str` wrote."""
+        shapes, joints, influences = map(int, text.split(","))
+        return cls(shapes=shapes, joints=joints, influences=influences)
+
+    def __str__(self) -> str:
+        return f"{self.shapes},{self.joints},{self.influences}"
+
     def within(self, other: Size) -> Size:
         """Return what both have."""
         return Size(**{name: min(most, vars(other)[name]) for name, most in vars(self).items()})

@@ -41,8 +41,11 @@ def activations() -> np.ndarray:
 
 
 @pytest.fixture
-def linear(activations) -> np.ndarray:
-    return dice(3).normal(size=(VERTICES, 3, GIVEN)) @ activations
+def linear() -> np.ndarray:
+    return dice(3).normal(size=(VERTICES, 3, GIVEN))
+
+
+NOTHING = np.zeros((VERTICES, 3, FRAMES))
 
 
 def weighted_rms(error: np.ndarray, mass: np.ndarray) -> float:
@@ -55,18 +58,23 @@ def rebuilt(found, activations: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("count", range(GIVEN + 1))
 def test_shapes_lose_what_eckart_and_young_say_is_least(linear, activations, mass, count):
-    found = modes(linear, activations, mass)
-    centred = (linear - linear.mean(2, keepdims=True)) * np.sqrt(mass)[:, None, None]
+    found, wanted = modes(linear, NOTHING, activations, mass), linear @ activations
+    centred = (wanted - wanted.mean(2, keepdims=True)) * np.sqrt(mass)[:, None, None]
     singular = np.linalg.svd(centred.reshape(-1, FRAMES) / np.sqrt(FRAMES), compute_uv=False)
     least = np.sqrt((singular[count:] ** 2).sum())
     smaller = basis(found, count, np.eye(GIVEN))
     assert found.lost(count) == pytest.approx(least, abs=1e-7)
-    assert weighted_rms(linear - rebuilt(smaller, activations), mass) == pytest.approx(least, abs=1e-7)
+    assert weighted_rms(wanted - rebuilt(smaller, activations), mass) == pytest.approx(least, abs=1e-7)
 
 
-def test_no_other_linear_function_of_the_rank_follows_better(activations, mass):
-    wanted = dice(4).normal(size=(VERTICES, 3, FRAMES)) + dice(5).normal(size=(VERTICES, 3, GIVEN)) @ activations**3
-    found = modes(wanted, activations, mass)
+def beyond_shapes(activations: np.ndarray) -> np.ndarray:
+    return dice(4).normal(size=(VERTICES, 3, FRAMES)) + dice(5).normal(size=(VERTICES, 3, GIVEN)) @ activations**3
+
+
+def test_no_other_linear_function_of_the_rank_follows_better(linear, activations, mass, monkeypatch):
+    monkeypatch.setattr("ssilk_core.reduction.shapes.RIDGE", 0.0)
+    more = beyond_shapes(activations)
+    found, wanted = modes(linear, more, activations, mass), linear @ activations + more
     centred = activations - activations.mean(1, keepdims=True)
     goal = ((wanted - wanted.mean(2, keepdims=True)) * np.sqrt(mass)[:, None, None]).reshape(-1, FRAMES)
     reading = dice(6).normal(size=(2, GIVEN))
@@ -79,18 +87,29 @@ def test_no_other_linear_function_of_the_rank_follows_better(activations, mass):
     assert weighted_rms(wanted - rebuilt(smaller, activations), mass) == pytest.approx(left, rel=1e-6)
 
 
+@pytest.mark.parametrize("ridge", [1e-6, 1e-3, 1.0])
+def test_what_is_missed_is_known_however_carefully_it_is_learnt(linear, activations, mass, ridge, monkeypatch):
+    monkeypatch.setattr("ssilk_core.reduction.shapes.RIDGE", ridge)
+    more = beyond_shapes(activations)
+    found = modes(linear, more, activations, mass)
+    for count in range(GIVEN + 1):
+        error = linear @ activations + more - rebuilt(basis(found, count, np.eye(GIVEN)), activations)
+        assert found.lost(count) == pytest.approx(weighted_rms(error, mass), rel=1e-6)
+
+
 def test_activations_stay_in_their_range_whatever_the_network_gives(linear, activations, mass):
-    smaller = basis(modes(linear, activations, mass), 3, np.eye(GIVEN))
+    smaller = basis(modes(linear, NOTHING, activations, mass), 3, np.eye(GIVEN))
     corners = np.array(np.meshgrid(*[[-1.0, 1.0]] * GIVEN)).reshape(GIVEN, -1)
     assert np.abs(smaller.readout @ corners).max(axis=1) == pytest.approx(1)
 
 
-def test_activations_that_never_vary_are_no_trouble(activations, mass):
+def test_activations_that_never_vary_are_no_trouble(linear, activations, mass):
     still = np.repeat(activations[:, :1], FRAMES, axis=1)
-    wanted = np.repeat(dice(7).normal(size=(VERTICES, 3, 1)), FRAMES, axis=2)
-    found = modes(wanted, still, mass)
-    assert found.lost(0) == pytest.approx(0, abs=1e-9)
-    np.testing.assert_allclose(rebuilt(basis(found, GIVEN, np.eye(GIVEN)), still), wanted, atol=1e-9)
+    more = np.repeat(dice(7).normal(size=(VERTICES, 3, 1)), FRAMES, axis=2)
+    found = modes(linear, more, still, mass)
+    assert found.lost(0) == pytest.approx(0, abs=1e-7)
+    every = basis(found, GIVEN, np.eye(GIVEN))
+    np.testing.assert_allclose(rebuilt(every, still), linear @ still + more, atol=1e-9)
 
 
 def random_influences(count: int = 5, vertices: int = 40) -> Influences:

@@ -82,3 +82,39 @@ def test_motions_that_are_gone_must_be_named(world, capsys):
     assert run("reduce model.safetensors -o small.safetensors --shapes 2") == 2
     assert "name motion files or folders with --motions" in capsys.readouterr().err
     assert run("reduce model.safetensors -o small.safetensors --shapes 2 --motions moved.usda") == 0
+
+
+BAKE = "bake model.safetensors --stage rigged.usda --motion clip.usda -o small.usdc"
+
+
+def test_a_level_bakes_what_it_keeps_and_is_verified_again(world, capsys):
+    assert run(f"{BAKE} --quality crowd --json") == 0
+    told = last_result(capsys)
+    assert told["fps"] == 15 and told["frames"] == 20 and told["blendshapes"] == "4 of 4"
+    assert told["loses at most [mm]"] < 0.1 and float(told["largest error [m]"]) < 1e-5
+    assert run(f"{BAKE} --quality crowd --fps 30 --json") == 0
+    assert last_result(capsys)["frames"] == 40
+
+
+def test_a_bake_keeps_to_its_budget_and_verifies_as_it_was_cut(world, capsys):
+    assert run("bake model.safetensors --stage rigged.usda --motion clip.usda -o whole.usdc --json") == 0
+    whole = last_result(capsys)["bytes"]
+    assert run(f"{BAKE} --budget {0.9 * whole / 1000}kB --json") == 0
+    told = last_result(capsys)
+    assert told["bytes"] < 0.92 * whole and told["blendshapes"] != "4 of 4"
+    assert float(told["largest error [m]"]) < 1e-5
+    assert run("verify small.usdc --json") == 0
+    assert float(last_result(capsys)["largest error [m]"]) < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("--quality game --plain", "--plain: plain skinning has no level of quality"),
+        ("--budget 1kB", "nothing fits 1 kB"),
+        ("--quality game -o layers", "bake models that 'ssilk reduce' made"),
+    ],
+)
+def test_levels_that_cannot_be_baked_are_refused(world, capsys, options, message):
+    assert run(f"{BAKE} {options}") == 2
+    assert message in capsys.readouterr().err

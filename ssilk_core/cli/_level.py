@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bakes of some level of quality, or within a budget."""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from ssilk_core.assets import GarmentPose
+from ssilk_core.checkpoint import ModelFile, load_model
+from ssilk_core.errors import need
+from ssilk_core.events import Reporter
+from ssilk_core.quality import quality_named
+from ssilk_core.reduction import Reducer
+
+from ._baking import Bake, open_bake
+from ._quality import level_size, spent
+
+EXCERPTS = 16, 64  # frames of a shot that are written to tell how large all of it becomes
+
+
+def levelled(bake: Bake, options: argparse.Namespace, report: Reporter) -> Bake:
+    """Return a bake with as much of its garment kept, and as many frames, as the options ask for.
+
+    What is kept is the best for this shot's own motion.
+
+    Raises:
+        SsilkError: nothing fits the budget, or plain skinning is baked.
+    """
+    if not (options.quality or options.budget):
+        return bake
+    need(bake.model is not None, "--plain", "plain skinning has no level of quality", "--quality and --budget are "
+         "about the network", "leave one of them out")  # fmt: skip
+    request = bake.request
+    if options.quality and request.fps is None:
+        request = replace(request, fps=quality_named(options.quality).rate(bake.source.fps))
+    reducer = Reducer(load_model(request.model), [bake.source])
+    size = level_size(options.quality, reducer.whole)
+    if options.budget:
+        at_rate = open_bake(request)
+
+        def weight(file: ModelFile) -> float:
+            return shot_bytes(at_rate.wearing(file), options.output.suffix, body=not options.no_body)
+
+        size = spent(options.budget, reducer, size, bake.source, weight, report).size
+    return open_bake(replace(request, keep=str(size)))
+
+
+def shot_bytes(bake: Bake, suffix: str, *, body: bool = True) -> float:
+    """Return about how large a shot becomes: two excerpts are written, of some frames and of more."""
+    frames = bake.motion.frame_count
+    few, many = (min(count * bake.request.samples, frames) for count in EXCERPTS)
+    first, second = (_excerpt_bytes(bake, count, suffix, body) for count in (few, many))
+    return second + (second - first) / max(many - few, 1) * (frames - many)
+
+
+def _excerpt_bytes(bake: Bake, frames: int, suffix: str, body: bool) -> int:
+    from ssilk_usd.shot import write_shot
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"shot{'.usda' if suffix == '.usda' else '.usdc'}"
+        write_shot(
+            path,
+            bake.deformer,
+            bake.motion.clip(0, frames),
+            _first(bake.poses(), frames),
+            units=bake.units,
+            samples_per_frame=bake.request.samples,
+            include_body=body,
+        )
+        return path.stat().st_size
+
+
+def _first(poses: Iterator[GarmentPose], frames: int) -> Iterator[GarmentPose]:
+    """Yield the first so many frames of consecutive poses."""
+    for pose in poses:
+        count = min(pose.frame_count, frames - pose.start)
+        yield GarmentPose(pose.start, pose.rotations[:count], pose.weights[:count])
+        if pose.start + count == frames:
+            return
