@@ -13,9 +13,10 @@ from torch import Tensor
 
 from .assets import Floats, GarmentPose, Motion
 from .errors import need
-from .kinematics import frames_at, motion_transforms, resample, run_up, skinning_matrices, slerp, split_at_cuts
+from .kinematics import frames_at, motion_transforms, resample, run_up, skinning_matrices, split_at_cuts
 from .model.descriptors import gravity_features, pose_features
 from .model.network import GarmentModel
+from .sampling import sample_pose
 
 CHUNK = 256  # frames decoded at once
 HISTORY = 2  # frames before a chunk that its descriptors look back on
@@ -200,22 +201,13 @@ def resample_poses(
         reached = min(int(np.floor((last - shift) * target / source + 1e-6)) + 1, count)
         position = (done + np.arange(max(reached - done, 0))) * source / target + shift
         if len(position):
-            yield _sampled(joined, position.clip(joined.start, last) - float(joined.start), done)
+            yield sample_pose(joined, position.clip(joined.start, last) - float(joined.start), done)
         done = max(reached, done)
         tail = GarmentPose(last, joined.rotations[-1:], joined.weights[-1:])
 
 
 def _joined(a: GarmentPose, b: GarmentPose) -> GarmentPose:
     return GarmentPose(a.start, np.concatenate([a.rotations, b.rotations]), np.concatenate([a.weights, b.weights]))
-
-
-def _sampled(pose: GarmentPose, position: Floats, start: int) -> GarmentPose:
-    low = np.minimum(position.astype(int), pose.frame_count - 1)
-    high = np.minimum(low + 1, pose.frame_count - 1)
-    t = position - low
-    rotations = slerp(pose.rotations[low], pose.rotations[high], t[:, None])
-    weights = pose.weights[low] * (1 - t[:, None]) + pose.weights[high] * t[:, None]
-    return GarmentPose(start, rotations, weights.clip(0, 1))
 
 
 @torch.no_grad()

@@ -17,7 +17,7 @@ from ..kinematics import resample, split_at_cuts
 from ..sampling import sample_pose
 from .drive import character_matrices
 from .skinning import posed
-from .take import Decoded, Take
+from .take import Decoded, Take, take_of
 
 if TYPE_CHECKING:
     from .player import Player
@@ -51,15 +51,16 @@ class Playback:
 
     Args:
         player: what plays; motion: at the shot's rate; block: frames computed together.
+        pre_roll: how long the garment settles before the first frame and after each cut [s].
     """
 
-    def __init__(self, player: Player, motion: Motion, block: int = BLOCK) -> None:
-        self.player, self.motion, self.block = player, motion, block
+    def __init__(self, player: Player, motion: Motion, block: int, pre_roll: float) -> None:
+        self.player, self.motion, self.block, self.pre_roll = player, motion, block, pre_roll
         self.rate = player.file.config.fps / motion.fps
         self.spans = split_at_cuts(motion)
         self.firsts = [int(first) for first in np.cumsum([0, *(span.frame_count for span in self.spans[:-1])])]
         fps = motion.fps if self._steps_with_frames else player.file.config.fps
-        self.takes = [Take(player, resample(span, fps, cover=True), block) for span in self.spans]
+        self.takes = [take_of(player, resample(span, fps, cover=True), block, pre_roll) for span in self.spans]
         # What was computed last; blocks begin at fixed frames, so that rounding does not depend on who asks.
         self._block = lru_cache(2)(self._blocked)
         self._vertices = lru_cache(2)(self._posed)
@@ -74,7 +75,7 @@ class Playback:
 
     def changed(self, motion: Motion, frame: int) -> Playback:
         """Return the garment over a motion that is this one's before `frame`; what was rolled before it is kept."""
-        other, mine = Playback(self.player, motion, self.block), dict(zip(self.firsts, self.takes))
+        other, mine = Playback(self.player, motion, self.block, self.pre_roll), dict(zip(self.firsts, self.takes))
         for first, take in zip(other.firsts, other.takes):
             if first in mine and first < frame:
                 take.resume(mine[first], int((frame - 1 - first) * self.rate + 1e-6) + 1)
@@ -126,7 +127,7 @@ class Playback:
 
     def _interpolated(self, take: Take, positions: Floats) -> Decoded:
         """Return what the decoder said between steps, at fractional ones."""
-        positions = positions.clip(max=take.motion.frame_count - 1)
+        positions = positions.clip(max=take.frame_count - 1)
         low, high = int(positions[0]), int(np.ceil(positions[-1]))
         pose = sample_pose(take.stored(low, high + 1), positions - low)
         return Decoded(*self.player.decoder.taken(pose))

@@ -49,11 +49,12 @@ class Player:
         """Read a model file; raise `SsilkError` as `checkpoint.load_model` does."""
         return cls(load_model(path))
 
-    def play(self, motion: Motion, *, block: int = BLOCK) -> Playback:
+    def play(self, motion: Motion, *, pre_roll: float = 0.0, block: int = BLOCK) -> Playback:
         """Return the garment over a motion of any rate, with cuts or without, rolled when somebody looks.
 
         Args:
             motion: of the model's skeleton, at the shot's rate.
+            pre_roll: how long the garment settles before the first frame and after each cut [s].
             block: frames that are computed together; fewer take longer each, and the first one comes sooner.
 
         Raises:
@@ -62,7 +63,7 @@ class Player:
         joints = self.skeleton.joint_count
         need(motion.rotations.shape[1] == joints, motion.path, f"a motion of {motion.rotations.shape[1]} joints",
              f"the model's character has {joints}")  # fmt: skip
-        return Playback(self, motion, block)
+        return Playback(self, motion, block, pre_roll)
 
     def at_rest(self, static: NDArray) -> NDArray:
         """Return the quasi-static latents (F, latent) of static descriptors (F, S) (Eq. 1)."""

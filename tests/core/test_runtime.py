@@ -188,6 +188,20 @@ def test_what_changes_later_leaves_the_frames_before_as_they_are(model, motion, 
     assert before.changed(edited, 0).takes[0].rolled == 0
 
 
+@pytest.mark.parametrize("fps", [24.0, 30.0])
+def test_garments_run_up_to_the_first_frame_as_in_a_bake(model, motion, fps):
+    shot = resample(motion.clip(0, 60), fps)
+    playback = player_of(model).play(shot, pre_roll=0.7, block=16)
+    theirs = np.concatenate([pose.weights for pose in garment_poses(model, shot, fps, pre_roll=0.7)])
+    for frame in (40, 0, 17):
+        np.testing.assert_allclose(playback.pose(frame).weights[0], theirs[frame], atol=5e-5)
+    assert np.abs(theirs[0] - player_of(model).play(shot).pose(0).weights[0]).max() > 1e-3
+    edited = replace(shot, rotations=np.concatenate([shot.rotations[:40], shot.rotations[40:, ::-1]]))
+    after, anew = playback.changed(edited, 40), player_of(model).play(edited, pre_roll=0.7, block=16)
+    assert after.takes[0].rolled > after.takes[0].before == 21
+    np.testing.assert_array_equal(after.vertices(47), anew.vertices(47))
+
+
 def test_lost_states_rest_for_a_while_as_in_a_bake(scene, toy_model, motion):
     model = toy_model(scene, scale=0.1, bound=0.0, push=0.0).eval()
     with torch.no_grad():
