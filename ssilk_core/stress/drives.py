@@ -81,7 +81,7 @@ def sway(skeleton: Skeleton, fps: float) -> Drive:
 
 
 def looped(motion: Motion, fps: float) -> Drive:
-    """Return a clip played forward and backward without end, slowing at both ends; a loop has whole frames at `fps`."""
+    """Return a clip played to and fro without end, slowing at both ends; a loop has whole frames at `fps`."""
     last = motion.frame_count - 1
     loop = max(1, round(np.pi * last / motion.fps * fps)) / fps  # at the clip's own speed in its middle
 

@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ..assets import Motion, Scene
+from ..assets import PINNED, Motion, Scene
 from ..config import ModelConfig, TrainConfig
 from ..errors import need
 from ..fabrics import Fabric
@@ -37,6 +37,17 @@ class TrainJob:
     device: str = "auto"
     resume: bool = False
     inputs: dict[str, str] | None = None
+
+    def __post_init__(self) -> None:
+        if not self.learns:
+            object.__setattr__(self, "model", replace(self.model, latent=1, widths=(1,), shapes=1))
+            least = replace(self.train, iterations=1, batch=1, warm_batch=1, resting=1, recombined=0)
+            object.__setattr__(self, "train", least)
+
+    @property
+    def learns(self) -> bool:
+        """Whether there is anything to learn; a garment that is pinned all over gets the least of networks."""
+        return bool((self.scene.classes != PINNED).any())
 
     def trained_motions(self) -> list[Motion]:
         """Return the motions and what is recombined from them."""

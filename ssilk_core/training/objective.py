@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from ..assets import PINNED
 from ..energy import GarmentEnergy
 from ..energy.collision import nearest_planes
 from ..energy.nearest import BLOCK, compact_blocks
@@ -16,27 +18,52 @@ from .bank import MotionBank
 from .windows import WindowSampler
 
 Terms = dict[str, Tensor]
+NOWHERE = 1e6  # [m] from a plane that is met by nothing
 
 
 class Objective:
-    """Computes energies of a model's decoded states; each term is [J] per frame, unreduced."""
+    """Computes energies of a model's decoded states; each term is [J] per frame, unreduced.
+
+    Args:
+        body: what the garment can touch, None for nothing. Pinned vertices, which nothing that is learned moves,
+            meet no body.
+    """
 
     def __init__(
-        self, model: GarmentModel, energy: GarmentEnergy, body: CollisionBody, bank: MotionBank, surface: bool = True
+        self,
+        model: GarmentModel,
+        energy: GarmentEnergy,
+        body: CollisionBody | None,
+        bank: MotionBank,
+        surface: bool = True,
     ) -> None:
-        self.model, self.energy, self.body, self.bank = model, energy, body, bank
+        self.model, self.energy, self.bank = model, energy, bank
         self.surface = surface
-        points = model.scene.garment.mesh.points
-        self.blocks = torch.as_tensor(compact_blocks(points, BLOCK), device=bank.static.device)
+        scene, device = model.scene, bank.static.device
+        free = np.flatnonzero(scene.classes != PINNED)
+        self.body = body if len(free) else None
+        self.free = torch.as_tensor(free, device=device)
+        if self.body:
+            self.blocks = torch.as_tensor(compact_blocks(scene.garment.mesh.points[free], BLOCK), device=device)
         self.dt = 1 / model.config.fps
 
     def potential(self, x: Tensor, direction: Tensor, character: Tensor) -> Terms:
         """Return every term but inertia of positions x (V, 3, N) under gravity directions (N, 3)."""
         energy, root = self.energy, character[0, :, 3]  # heights over the root keep the value of gravity small
         stretch, bending = energy.elastic(x)
-        planes = nearest_planes(x, self.body.posed(character, surface=self.surface), self.blocks)
-        gravity, collision = energy.potential(x, root, GRAVITY * direction.T, *planes)
+        gravity, collision = energy.potential(x, root, GRAVITY * direction.T, *self._planes(x.detach(), character))
         return {"stretch": stretch, "bending": bending, "gravity": gravity, "collision": collision}
+
+    def _planes(self, x: Tensor, character: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the plane that each vertex of x (V, 3, N) may meet: normals (V, 3, N) and offsets (V, N)."""
+        normal, offset = torch.zeros_like(x), x.new_full((len(x), x.shape[2]), -NOWHERE)
+        if self.body is None:
+            return normal, offset
+        body = self.body.posed(character, surface=self.surface)
+        found = nearest_planes(x.index_select(0, self.free), body, self.blocks)
+        if len(self.free) == len(x):
+            return found
+        return normal.index_copy_(0, self.free, found[0]), offset.index_copy_(0, self.free, found[1])
 
     def static(self, frames: Tensor, direction: Tensor) -> Terms:
         """Return the terms of the initialiser's quasi-static states on single poses (Section 3.1)."""

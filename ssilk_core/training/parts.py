@@ -27,13 +27,13 @@ class Parts:
 
     Attributes:
         bank: the motions to train on.
-        body: the part of the body that the garment can touch, of `reached` vertices.
+        body: the part of the body that the garment can touch, of `reached` vertices; None for nothing.
     """
 
     model: GarmentModel
     bank: MotionBank
     energy: GarmentEnergy
-    body: CollisionBody
+    body: CollisionBody | None
     validator: Validator
     reached: int
     device: torch.device
@@ -78,7 +78,7 @@ def build_parts(job: TrainJob, device: torch.device, team: Team = ALONE) -> Part
     held = build_bank(job.held_out, skeleton, joints, fps, device)
     energy = GarmentEnergy(scene.garment.mesh, job.fabric, device=device)
     body, count = scene.character.merged_body(), skeleton.joint_count
-    touched = CollisionBody(body, count, vertices=reach.vertices, device=device)
+    touched = CollisionBody(body, count, vertices=reach.vertices, device=device) if len(reach.vertices) else None
     # Validation looks at the whole body: what training leaves out must not go unnoticed.
     whole = CollisionBody(body, count, device=device)
     rest, frames = model.decoder.rest, job.train.valid_frames

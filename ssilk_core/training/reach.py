@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..assets import LOOSE, Floats, Ints, Motion, Scene
+from ..assets import LOOSE, TIGHT, Floats, Ints, Motion, Scene
 from ..kinematics import motion_transforms, skin_points, skinning_matrices
 from ..mesh import topology
 
@@ -28,21 +28,22 @@ def reachable_body(scene: Scene, motions: Sequence[Motion]) -> Reach:
     """Find the body vertices that come within reach of the garment in any of a spread of poses.
 
     A loose vertex hangs from its anchor, the nearest pinned or tight vertex along the cloth, and stays within
-    the length of cloth between them; pinned and tight vertices stay within `SLACK` of plain skinning.
+    the length of cloth between them; tight vertices stay within `SLACK` of plain skinning. Where pinned ones are
+    cannot be helped, so that they touch nothing.
     """
     from scipy.spatial import cKDTree
     from scipy.spatial.distance import cdist
 
     body, skeleton, garment = scene.character.merged_body(), scene.character.skeleton, scene.garment.mesh
-    held = np.flatnonzero(scene.classes != LOOSE)
+    tight = np.flatnonzero(scene.classes == TIGHT)
     anchors, lengths = _tethers(scene)
     reached = np.zeros(body.mesh.vertex_count, dtype=bool)
-    for frame in _spread_frames(motions):
+    for frame in _spread_frames(motions) if len(tight) or len(anchors) else ():
         matrices = skinning_matrices(motion_transforms(frame, skeleton.parents), skeleton.bind_transforms)
         posed = skin_points(body.mesh.points, body.skin, matrices)[0]
         plain = skin_points(garment.points, scene.plain_skin, matrices)[0]
-        if len(held):
-            reached |= cKDTree(plain[held]).query(posed)[0] < SLACK
+        if len(tight):
+            reached |= cKDTree(plain[tight]).query(posed)[0] < SLACK
         reached |= (cdist(plain[anchors], posed) < lengths[:, None] + SLACK).any(axis=0)
     vertices = np.flatnonzero(reached)
     joints = np.zeros(skeleton.joint_count, dtype=bool)

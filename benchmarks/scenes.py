@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measure scenes of growing need: time, memory and bytes of training, rolling out and baking each of them.
+
+    python benchmarks/scenes.py
+
+The same cloak of synthetic.py around the same body, as the classes, the body and the motion ask for less or more: all
+of it pinned, all of it tight, a fifth of it loose, the whole of it, away from the body, on a character that stands
+still, and four at once. Each is measured in a process of its own. What a scene does not need must not be paid for.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import synthetic
+import torch
+from memory import Peak
+from reports import table, write_results
+from ssilk_usd.shot import write_shot
+from ssilk_usd.units import StageUnits
+
+from ssilk_core.assets import LOOSE, PINNED, TIGHT, Character, Motion, ProxyRig, Scene
+from ssilk_core.checkpoint import ModelFile, save_model
+from ssilk_core.config import ModelConfig, TrainConfig
+from ssilk_core.fabrics import Fabric
+from ssilk_core.model.network import GarmentModel
+from ssilk_core.rollout import garment_poses
+from ssilk_core.training.job import TrainJob
+from ssilk_core.training.parts import build_parts
+
+SIZE = synthetic.Size(vertices=2500, body=4000, proxies=20, shapes=64, batch=8, window=6, resting=8)
+STEPS, CLIPS = 6, 4
+HEADER = ("scene", "free vertices", "proxies", "body vertices", "train step [ms]", "memory [MiB]", "roll [ms/frame]",
+          "bake [ms/frame]", "model [kB]", "shot [kB/frame]")  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """One scene: its garments, which are trained and baked one after another, and what the character does."""
+
+    garments: tuple[Scene, ...]
+    motions: tuple[Motion, ...]
+
+
+def dressed(loose: float, *, tight: bool = True) -> Scene:
+    """Return the cloak with a share of it loose, from the hem up; the rest tight or pinned, and no idle proxies."""
+    whole = synthetic.scene(SIZE)
+    height = whole.garment.mesh.points[:, 1]
+    hangs = height < np.quantile(height, loose)
+    held = np.where(whole.classes == PINNED, PINNED, TIGHT) if tight else PINNED
+    classes = np.where(hangs, LOOSE, held)
+    garment = replace(whole.garment, classes=classes)
+    if not hangs.any():
+        none = ProxyRig("/rig", (), np.zeros(0, dtype=np.int32), np.zeros((0, 4, 4)), whole.plain_skin)
+        return Scene(whole.character, garment, none)
+    proxies = max(synthetic.CHAINS, round(SIZE.proxies * loose))
+    joints = whole.character.skeleton.joint_count
+    plain = whole.plain_skin.dense(joints)
+    return Scene(whole.character, garment, synthetic.cloak_rig(garment.mesh, plain, classes, proxies))
+
+
+def beside(scene: Scene) -> Scene:
+    """Return the scene with the bodies too far away to be touched."""
+    bodies = [
+        replace(body, mesh=replace(body.mesh, points=body.mesh.points + [10.0, 0, 0]))
+        for body in scene.character.bodies
+    ]
+    character = Character(scene.character.path, scene.character.skeleton, tuple(bodies))
+    return replace(scene, character=character)
+
+
+def moving() -> tuple[Motion, ...]:
+    skeleton = synthetic.chain()
+    return tuple(synthetic.motion(skeleton, ModelConfig().fps, seed) for seed in range(CLIPS))
+
+
+def still() -> tuple[Motion, ...]:
+    """Return the motions with the first frame held."""
+    return tuple(
+        replace(
+            motion,
+            rotations=np.repeat(motion.rotations[:1], motion.frame_count, axis=0),
+            translations=np.repeat(motion.translations[:1], motion.frame_count, axis=0),
+        )
+        for motion in moving()
+    )
+
+
+WORLDS: dict[str, Callable[[], World]] = {
+    "all pinned": lambda: World((dressed(0, tight=False),), moving()),
+    "all tight": lambda: World((dressed(0),), moving()),
+    "a fifth loose": lambda: World((dressed(0.2),), moving()),
+    "loose, no contact": lambda: World((beside(dressed(0.9)),), moving()),
+    "loose, still character": lambda: World((dressed(0.9),), still()),
+    "loose": lambda: World((dressed(0.9),), moving()),
+    "four loose garments": lambda: World((dressed(0.9),) * 4, moving()),
+}
+
+
+def measure(name: str) -> dict[str, float]:
+    """Return the figures of one scene, summed over its garments."""
+    world = WORLDS[name]()
+    found = [measured(scene, world.motions) for scene in world.garments]
+    return {key: sum(each[key] for each in found) for key in found[0]} | {"memory": max(f["memory"] for f in found)}
+
+
+def measured(scene: Scene, motions: tuple[Motion, ...]) -> dict[str, float]:
+    """Train a few steps, roll and bake one garment."""
+    config = TrainConfig(batch=SIZE.batch, window=SIZE.window, resting=SIZE.resting, warm_batch=SIZE.decoded,
+                         recombined=0)  # fmt: skip
+    job = TrainJob(scene=scene, motions=motions, held_out=motions[:1], model=ModelConfig(shapes=SIZE.shapes),
+                   train=config, fabric=Fabric("default"), output=Path("none"), device="cpu")  # fmt: skip
+    parts = build_parts(job, torch.device("cpu"))
+    stepper, first = parts.stepper(job.train, 0), job.train.warm_iterations
+    peak = Peak(torch.device("cpu"))
+    stepper.run(first)
+    began = time.perf_counter()
+    for step in range(STEPS):
+        stepper.run(first + 1 + step)
+    train = (time.perf_counter() - began) / STEPS
+    memory = peak.bytes()
+    return {
+        "free vertices": int((scene.classes != PINNED).sum()), "proxies": scene.rig.proxy_count,
+        "body vertices": parts.reached, "train": train, "memory": memory, **baked(parts.model, motions[0]),
+    }  # fmt: skip
+
+
+def baked(model: GarmentModel, motion: Motion) -> dict[str, float]:
+    """Roll and bake one garment and write its model; times are for each frame [s], sizes in bytes."""
+    began = time.perf_counter()
+    for _ in garment_poses(model, motion, motion.fps):
+        pass
+    rolled = time.perf_counter() - began
+    with tempfile.TemporaryDirectory() as folder:
+        shot, file = Path(folder) / "shot.usdc", Path(folder) / "model.safetensors"
+        began = time.perf_counter()
+        poses = garment_poses(model, motion, motion.fps)
+        write_shot(shot, model.deformer(), motion, poses, units=StageUnits(1.0, "Y"), include_body=False)
+        bake = time.perf_counter() - began
+        parameters = {name: value.numpy() for name, value in model.state_dict().items()}
+        save_model(file, ModelFile(model.scene, model.config, Fabric("default"), model.joints, parameters), pack=True)
+        count = motion.frame_count
+        return {
+            "roll": rolled / count, "bake": bake / count, "model": file.stat().st_size,
+            "shot": shot.stat().st_size / count,
+        }  # fmt: skip
+
+
+def row(name: str, found: dict[str, float]) -> list[str]:
+    """Return a line of the table."""
+    counts = [f"{found[key]:,}" for key in ("free vertices", "proxies", "body vertices")]
+    times = [f"{1e3 * found['train']:.0f}", f"{found['memory'] / 2**20:.0f}"]
+    each = [f"{1e3 * found[key]:.2f}" for key in ("roll", "bake")]
+    return [name, *counts, *times, *each, f"{found['model'] / 1e3:,.0f}", f"{found['shot'] / 1e3:.1f}"]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--threads", type=int, default=1, help="processor threads (default 1)")
+    parser.add_argument("--only", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    if options.only:
+        print(json.dumps(measure(options.only)))
+        return
+    rows, results = [], {}
+    for name in WORLDS:
+        words = [sys.executable, __file__, "--threads", str(options.threads), "--only", name]
+        done = subprocess.run(words, capture_output=True, text=True, check=True)
+        results[name] = json.loads(done.stdout)
+        rows.append(row(name, results[name]))
+        print(*rows[-1], flush=True)
+    options.name, options.device = "scenes", "cpu"
+    write_results(options, table(HEADER, rows), results)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a scene does not need is not computed: pinned garments, bodies out of reach, vertices that nothing moves."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ssilk_core.assets import LOOSE, PINNED, TIGHT, Character, ProxyRig, Scene
+from ssilk_core.checkpoint import load_model
+from ssilk_core.config import ModelConfig, TrainConfig
+from ssilk_core.energy.collision import nearest_planes, signed_distance
+from ssilk_core.events import Event, Message
+from ssilk_core.fabrics import Fabric
+from ssilk_core.training.job import TrainJob
+from ssilk_core.training.parts import build_parts
+from ssilk_core.training.reach import reachable_body
+from ssilk_core.training.run import train
+
+CPU = torch.device("cpu")
+
+
+def classed(scene: Scene, classes: np.ndarray) -> Scene:
+    """The scene with other vertex classes; without proxies where nothing is loose."""
+    garment = replace(scene.garment, classes=classes)
+    if (classes == LOOSE).any():
+        return replace(scene, garment=garment)
+    none = ProxyRig("/none", (), np.zeros(0, dtype=np.int32), np.zeros((0, 4, 4)), scene.plain_skin)
+    return Scene(scene.character, garment, none)
+
+
+def job_of(scene: Scene, motion, output: Path = Path("none.safetensors")) -> TrainJob:
+    config = TrainConfig(iterations=40, batch=2, window=4, warm_batch=4, resting=2, recombined=0, valid_frames=9)
+    return TrainJob(
+        scene=scene, motions=[motion], held_out=[motion], model=ModelConfig(latent=8, widths=(16,), shapes=4),
+        train=config, fabric=Fabric("toy"), output=output, device="cpu",
+    )  # fmt: skip
+
+
+def moved_away(scene: Scene) -> Scene:
+    bodies = [
+        replace(body, mesh=replace(body.mesh, points=body.mesh.points + [50.0, 0, 0]))
+        for body in scene.character.bodies
+    ]
+    return replace(scene, character=Character("/away", scene.character.skeleton, tuple(bodies)))
+
+
+def test_a_pinned_garment_has_nothing_to_learn(scene, toy_motion, tmp_path):
+    pinned = classed(scene, np.full(len(scene.classes), PINNED))
+    output, told = tmp_path / "pinned.safetensors", []
+
+    def report(event: Event) -> None:
+        told.append(event)
+
+    done = train(job_of(pinned, toy_motion(scene, 30), output), report)
+    assert (done.iterations, done.finished) == (1, True)
+    assert done.score.total == pytest.approx(done.plain.total, rel=1e-4)
+    assert any(isinstance(event, Message) and "nothing to learn" in event.text for event in told)
+    parameters = load_model(output).parameters
+    assert sum(value.size for value in parameters.values()) < 500
+    assert reachable_body(pinned, [toy_motion(scene, 30)]).vertices.size == 0
+
+
+def test_a_garment_with_anything_free_learns_as_asked(scene, toy_motion):
+    asked = job_of(scene, toy_motion(scene, 30))
+    assert asked.learns and asked.model.latent == 8 and asked.train.iterations == 40
+
+
+def test_a_body_out_of_reach_costs_no_collisions_and_no_posing(scene, toy_motion):
+    parts = build_parts(job_of(moved_away(scene), toy_motion(scene, 30)), CPU)
+    assert parts.body is None and parts.reached == 0
+    stepper = parts.stepper(TrainConfig(batch=2, window=4, resting=2, warm=0.0), 0)
+    stepper.run(0)
+    assert float(stepper.terms["collision"]) == 0 < float(stepper.terms["stretch"])
+
+
+def test_only_what_is_not_pinned_meets_the_body(scene, toy_motion):
+    """The others stand where they stand: their planes are far away, and their collisions have no gradient."""
+    classes = np.where(np.arange(len(scene.classes)) % 2, PINNED, TIGHT)
+    parts = build_parts(job_of(classed(scene, classes), toy_motion(scene, 30)), CPU)
+    objective = parts.stepper(TrainConfig(batch=2, window=4, resting=2), 0).objective
+    character = parts.bank.character(torch.arange(5))
+    x = parts.model.vertices(torch.zeros(5, 8), character).detach()
+    normal, offset = objective._planes(x, character)
+    expected = nearest_planes(x, parts.body.posed(character), None)
+    free = torch.tensor(classes != PINNED)
+    torch.testing.assert_close(normal[free], expected[0][free])
+    torch.testing.assert_close(offset[free], expected[1][free])
+    distance = (normal * x).sum(1) - offset
+    torch.testing.assert_close(distance[free], signed_distance(x, parts.body.posed(character))[free])
+    assert distance[~free].min() > 1e5
+
+
+def test_the_body_is_reached_by_what_is_free_alone(scene, toy_motion):
+    motions = [toy_motion(scene, 30)]
+    height = scene.garment.mesh.points[:, 1]
+    half = np.where(height > np.median(height), PINNED, TIGHT)
+    few, all_of_it = (
+        reachable_body(classed(scene, classes), motions).vertices for classes in (half, np.full(len(half), TIGHT))
+    )
+    assert set(few) < set(all_of_it)
