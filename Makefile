@@ -24,7 +24,8 @@ lint: $(STAMP)
 
 extension: $(BLENDER_STAMP)
 	mkdir -p dist
-	$(BLENDER_VENV)/bin/python $(BLENDER_TOOL) build --source-dir blender_addon --output-dir dist
+	$(BLENDER_VENV)/bin/python tools/stage_extension.py build/extension
+	$(BLENDER_VENV)/bin/python $(BLENDER_TOOL) build --source-dir build/extension --output-dir dist
 
 test-blender: $(STAMP) $(BLENDER_STAMP)
 	$(BLENDER_VENV)/bin/python -m pytest tests/blender

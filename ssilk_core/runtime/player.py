@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..assets import Motion
+from ..assets import Deformer, Motion
 from ..checkpoint import ModelFile, load_model
 from ..errors import need
 from ..parameters import descriptor_sizes
 from .decoder import Decoder
+from .deformer import deformer
 from .kinematics import ProxyKinematics
 from .networks import evaluated, layers
 from .playback import BLOCK, Playback
@@ -64,6 +65,10 @@ class Player:
         need(motion.rotations.shape[1] == joints, motion.path, f"a motion of {motion.rotations.shape[1]} joints",
              f"the model's character has {joints}")  # fmt: skip
         return Playback(self, motion, block, pre_roll)
+
+    def deformer(self) -> Deformer:
+        """Return the trained garment as files and hosts hold it."""
+        return deformer(self.file)
 
     def at_rest(self, static: NDArray) -> NDArray:
         """Return the quasi-static latents (F, latent) of static descriptors (F, S) (Eq. 1)."""

@@ -19,12 +19,13 @@ pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-b
 
 ADDON = ROOT / "blender_addon"
 INSTALL = """
-import sys, bpy
+import importlib, sys, bpy
 package = "bl_ext.user_default.ssilk"
 bpy.ops.extensions.package_install_files(filepath=sys.argv[1], repo="user_default", enable_on_install=True)
 for _ in range(2):
     assert package in bpy.context.preferences.addons
     assert "paint_classes" in dir(bpy.ops.ssilk) and hasattr(bpy.types.Object, "ssilk")
+    assert importlib.import_module(package + ".core").core("runtime").Player.__module__.startswith(package + ".vendor")
     bpy.ops.preferences.addon_disable(module=package)
     assert not dir(bpy.ops.ssilk) and not hasattr(bpy.types.Object, "ssilk")
     bpy.ops.preferences.addon_enable(module=package)
@@ -52,9 +53,11 @@ def command_line(*arguments: str) -> str:
 
 @pytest.fixture(scope="module")
 def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("package") / "ssilk.zip"
-    command_line("build", "--source-dir", str(ADDON), "--output-filepath", str(path))
-    return path
+    folder = tmp_path_factory.mktemp("package")
+    stage = [sys.executable, str(ROOT / "tools" / "stage_extension.py"), str(folder / "staged")]
+    subprocess.run(stage, check=True)
+    command_line("build", "--source-dir", str(folder / "staged"), "--output-filepath", str(folder / "ssilk.zip"))
+    return folder / "ssilk.zip"
 
 
 def test_the_zip_is_valid_and_holds_what_it_needs(package):
@@ -62,7 +65,10 @@ def test_the_zip_is_valid_and_holds_what_it_needs(package):
     with zipfile.ZipFile(package) as files:
         names = set(files.namelist())
     sources = {str(path.relative_to(ADDON)) for path in ADDON.rglob("*.py")}
-    assert names == {*sources, "LICENSE", "blender_manifest.toml"}
+    carried = {name for name in names if name.startswith("vendor/")}
+    assert names - carried == {*sources, "LICENSE", "blender_manifest.toml"}
+    assert {"vendor/LICENSE", "vendor/NOTICE", "vendor/ssilk_core/runtime/player.py"} <= carried
+    assert not {name for name in carried if any(part in name for part in ("model", "training", "energy", "cli"))}
 
 
 def test_the_manifest_says_what_the_code_says():

@@ -104,6 +104,15 @@ def test_a_reader_of_the_file_deforms_to_the_same_vertices(model, motion, playba
     np.testing.assert_allclose(all_vertices(playback), frames, atol=1e-5)
 
 
+@pytest.mark.parametrize("options", [{}, {"shapes": 0}, {"activations": 9}])
+def test_what_hosts_are_given_is_what_files_hold(scene, toy_model, options):
+    model = toy_model(scene, **options)
+    mine, theirs = player_of(model).deformer(), model.deformer()
+    np.testing.assert_allclose(mine.shapes, theirs.shapes, atol=1e-7)
+    joints = len(scene.joint_names)
+    np.testing.assert_allclose(mine.skin.dense(joints), theirs.skin.dense(joints), atol=1e-6)
+
+
 def test_matrices_are_those_of_forward_kinematics(model, motion, playback):
     character = torch.from_numpy(character_matrices(motion, model.scene.character.skeleton)[0])
     step = next(roll(model, motion, FRAMES))
