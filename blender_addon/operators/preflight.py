@@ -39,7 +39,7 @@ class InspectOperator(RigOperator):
             self.handover = hand_over(self.dressed, garment, armature, folder)
             return [inspect_command(python, folder, self.handover, repaired=self.repaired)]
 
-        return Work(f"Inspecting '{garment.name}'", commands, parent=bpy.app.tempdir)
+        return Work(f"Inspecting '{garment.name}'", commands, parent=bpy.app.tempdir, rephrase=self.rephrase)
 
     def explain(self, work: Work) -> str:
         return "" if "findings" in work.result else super().explain(work)

@@ -44,10 +44,14 @@ class RigOperator(tasks.OutsideOperator):
             self.handover = hand_over(dressed, garment, armature, folder)
             return [rig_command(python, folder, self.handover, options)]
 
-        return Work(title, commands, parent=bpy.app.tempdir)
+        return Work(title, commands, parent=bpy.app.tempdir, rephrase=self.rephrase)
+
+    def rephrase(self, sentence: str) -> str:
+        """Return a sentence with names of objects in place of files and prims."""
+        return self.handover.in_blender_words(sentence)
 
     def explain(self, work: Work) -> str:
-        return self.handover.in_blender_words(work.error, work.folder)
+        return self.rephrase(work.error)
 
 
 class Classify(RigOperator, bpy.types.Operator):

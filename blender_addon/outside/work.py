@@ -34,6 +34,7 @@ class Work:
         *,
         parent: str = "",
         steps: Iterator[float] | None = None,
+        rephrase: Callable[[str], str] = str,
     ) -> None:
         """Prepare the steps; without any prepare the commands, given the temporary folder, and start the first one.
 
@@ -41,6 +42,7 @@ class Work:
             commands: writes what the commands read, and returns them; the folder goes if it raises.
             parent: where the folder is made; the system's place for temporary files when empty.
             steps: are done in this process first, one in each `poll`; they yield the part that is done.
+            rephrase: turns messages into words for people, without the folder's paths.
         """
         self.title, self.text, self.error = title, "", ""
         self.fraction: float | None = None
@@ -50,7 +52,7 @@ class Work:
         self.folder = Path(self._temporary.name)
         self._process: Process | None = None
         self._commands, self._waiting = commands, list[Command]()
-        self._steps = steps
+        self._steps, self._rephrase = steps, rephrase
         try:
             if steps is None:
                 self._begin()
@@ -102,7 +104,7 @@ class Work:
             self._start_next()
 
     def _hear(self, event: Event) -> None:
-        self.text = event.text or self.text
+        self.text = self._rephrase(event.text) or self.text
         self.fraction = event.fraction if event.fraction is not None else self.fraction
         if event.kind == "result":
             self.result = event.fields.get("detail", {})

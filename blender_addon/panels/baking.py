@@ -8,7 +8,7 @@ import bpy
 from ..errors import SetupError
 from ..scene.garment import unusable
 from ..scene.models import model_of
-from .base import Panel
+from .base import Panel, draw_text
 
 
 def model_line(garment: bpy.types.Object) -> str:
@@ -30,6 +30,6 @@ class BakingPanel(Panel, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         layout.prop(context.object.ssilk, "model")
-        layout.label(text=model_line(context.object))
+        draw_text(layout, model_line(context.object))
         layout.operator("ssilk.bake", icon="REC")
         layout.operator("ssilk.remove_bake", icon="TRASH")

@@ -3,9 +3,27 @@
 
 from __future__ import annotations
 
+import textwrap
+
 import bpy
 
 from ..operators import tasks
+
+LETTER = 7  # how wide a letter is on average [pixels, at an interface scale of one]
+MARGIN = 40  # beside text in a panel [pixels, likewise]
+
+
+def draw_text(layout: bpy.types.UILayout, text: str, icon: str = "NONE") -> None:
+    """Draw text in as many lines as the region needs; labels would be cut short."""
+    column = layout.column(align=True)
+    for number, line in enumerate(lines(text, bpy.context.region.width if bpy.context.region else 0)):
+        column.label(text=line, icon=icon if number == 0 else "NONE", translate=False)
+
+
+def lines(text: str, width: int) -> list[str]:
+    """Return text in lines that fit into a region's width [pixels]; zero stands for a usual one."""
+    scale = bpy.context.preferences.system.ui_scale or 1.0  # zero where there is no display
+    return textwrap.wrap(text, max(20, int(((width or 300) / scale - MARGIN) / LETTER)))
 
 
 def draw_work(layout: bpy.types.UILayout) -> None:
@@ -17,7 +35,7 @@ def draw_work(layout: bpy.types.UILayout) -> None:
     row.progress(factor=work.fraction or 0.0, text=work.title)
     row.operator("ssilk.cancel", text="", icon="CANCEL")
     if work.text:
-        layout.label(text=work.text)
+        draw_text(layout, work.text)
 
 
 class Panel:

@@ -12,7 +12,7 @@ from ..overlay import shown
 from ..scene.attributes import current_classes
 from ..scene.editing import edited_counts
 from ..scene.garment import unusable
-from .base import Panel
+from .base import Panel, draw_text
 
 
 def class_counts(thing: bpy.types.Object) -> tuple[int, int, int] | None:
@@ -40,7 +40,7 @@ class ClassesPanel(Panel, bpy.types.Panel):
         try:
             found = class_counts(context.object)
         except SetupError as error:
-            layout.label(text=str(error), icon="ERROR")
+            draw_text(layout, str(error), icon="ERROR")
         layout.operator("ssilk.classify")
         layout.operator("ssilk.paint_classes", icon="BRUSH_DATA")
         editing = context.mode == "EDIT_MESH"

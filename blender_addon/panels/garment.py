@@ -7,7 +7,7 @@ import bpy
 
 from ..preferences import unready
 from ..scene.garment import unusable
-from .base import Panel, draw_work
+from .base import Panel, draw_text, draw_work
 
 
 class GarmentPanel(Panel, bpy.types.Panel):
@@ -17,13 +17,13 @@ class GarmentPanel(Panel, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         layout, reason = self.layout, unusable(context.object)
         if reason:
-            layout.label(text=reason, icon="INFO")
+            draw_text(layout, reason, icon="INFO")
         else:
             layout.use_property_split = True
             layout.prop(context.object.ssilk, "armature")
             layout.prop(context.object.ssilk, "bodies")
         missing = unready(context)
         if missing:
-            layout.label(text=missing, icon="ERROR")
+            draw_text(layout, missing, icon="ERROR")
             layout.operator("ssilk.find_python")
         draw_work(layout)

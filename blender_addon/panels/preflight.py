@@ -3,17 +3,14 @@
 
 from __future__ import annotations
 
-import textwrap
-
 import bpy
 
 from ..operators.preflight import fixer
 from ..preflight_properties import shown_finding
 from ..scene.garment import unusable
-from .base import Panel
+from .base import Panel, draw_text
 
 ICONS = {"error": "CANCEL", "warning": "ERROR", "info": "INFO"}
-CHARACTER = 7  # points that a letter takes on average, at a scale of one
 
 
 class FindingList(bpy.types.UIList):
@@ -39,8 +36,8 @@ class PreflightPanel(Panel, bpy.types.Panel):
         if item is None:
             return
         layout.template_list(FindingList.bl_idname, "", preflight, "findings", preflight, "active", rows=4)
-        for text in wrapped(context, item.target, item.found, item.why, item.fix):
-            layout.label(text=text, translate=False)
+        for text in (item.target, item.found, item.why, item.fix):
+            draw_text(layout, text)
         row = layout.row(align=True)
         row.operator("ssilk.select_finding")
         row.operator(fixer(item) or "ssilk.fix_finding")
@@ -50,11 +47,3 @@ def line(item: bpy.types.PropertyGroup) -> str:
     """Return a finding in a few words."""
     words = item.code.replace("-", " ")
     return f"{len(item.indices)} {words}" if item.indices else words
-
-
-def wrapped(context: bpy.types.Context, *texts: str) -> list[str]:
-    """Return texts in lines as wide as the region."""
-    scale = context.preferences.system.ui_scale or 1.0  # zero where there is no display
-    width = context.region.width / scale if context.region else 300
-    columns = max(20, int(width / CHARACTER))
-    return [text for given in texts for text in textwrap.wrap(given, columns)]

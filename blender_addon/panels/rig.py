@@ -8,7 +8,7 @@ import bpy
 from ..errors import SetupError
 from ..scene.armature import proxy_names
 from ..scene.garment import armature_of, unusable
-from .base import Panel
+from .base import Panel, draw_text
 
 
 def rig_line(garment: bpy.types.Object) -> str:
@@ -30,5 +30,5 @@ class RigPanel(Panel, bpy.types.Panel):
         return not unusable(context.object)
 
     def draw(self, context: bpy.types.Context) -> None:
-        self.layout.label(text=rig_line(context.object))
+        draw_text(self.layout, rig_line(context.object))
         self.layout.operator("ssilk.generate_rig", icon="BONE_DATA")

@@ -24,6 +24,7 @@ class Handover:
         garment, armature: session_uid of the objects; they may be deleted or renamed meanwhile.
         joints: the character's joints as they were written.
         prims: path of each mesh in the stage by the name of its object.
+        stage: the file.
     """
 
     garment: int
@@ -31,6 +32,7 @@ class Handover:
     name: str
     joints: Joints
     prims: dict[str, str]
+    stage: Path
 
     def objects(self) -> tuple[bpy.types.Object, bpy.types.Object]:
         """Return the garment and the armature.
@@ -49,11 +51,11 @@ class Handover:
 
         return read_rig(folder / RIGGED, self.prims[self.name], self.joints)
 
-    def in_blender_words(self, sentence: str, folder: Path) -> str:
+    def in_blender_words(self, sentence: str) -> str:
         """Return a sentence with names of objects in place of files and prims."""
         for name, prim in sorted(self.prims.items(), key=lambda pair: -len(pair[1])):
-            sentence = sentence.replace(f"{folder / STAGE}:{prim}", f"'{name}'")
-        return sentence.replace(f"{folder / STAGE}:", "").replace(str(folder / STAGE), "the character")
+            sentence = sentence.replace(f"{self.stage}:{prim}", f"'{name}'")
+        return sentence.replace(f"{self.stage}:", "").replace(str(self.stage), "the character")
 
 
 def hand_over(dressed: Dressed, garment: bpy.types.Object, armature: bpy.types.Object, folder: Path) -> Handover:
@@ -62,7 +64,8 @@ def hand_over(dressed: Dressed, garment: bpy.types.Object, armature: bpy.types.O
     from ..contract.write import write_stage
 
     prims = write_stage(dressed, folder / STAGE)
-    return Handover(garment.session_uid, armature.session_uid, garment.name, dressed.joints, prims)
+    uids = (garment.session_uid, armature.session_uid)
+    return Handover(*uids, garment.name, dressed.joints, prims, folder / STAGE)
 
 
 def rig_command(python: str, folder: Path, handover: Handover, options: Sequence[str]) -> list[str]:

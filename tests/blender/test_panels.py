@@ -61,7 +61,7 @@ def test_without_a_python_the_way_to_one_is_shown(bpy, skirt):
 
     notes = drawn(GarmentPanel, bpy.context)
     assert {"armature", "bodies", "ssilk.find_python"} <= set(notes)
-    assert "No Python with ssilk is chosen; find one in the extension's preferences" in notes
+    assert "No Python with ssilk is chosen; find one in the extension's preferences" in " ".join(notes)
 
 
 def test_classes_are_counted_and_buttons_follow_the_mode(bpy, skirt):

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
@@ -242,7 +240,8 @@ def test_a_fix_is_undone(ready, skirt):
 
 
 def test_the_panel_lists_findings_with_their_buttons(ready, skirt):
-    from blender_addon.panels.preflight import PreflightPanel, line, wrapped
+    from blender_addon.panels.base import lines
+    from blender_addon.panels.preflight import PreflightPanel, line
 
     assert drawn(PreflightPanel, ready.context) == ["ssilk.inspect"]
     spoil(ready, skirt, loose_vertex)
@@ -251,9 +250,7 @@ def test_the_panel_lists_findings_with_their_buttons(ready, skirt):
     notes = drawn(PreflightPanel, ready.context)
     assert {"ssilk.inspect", "ssilk.select_finding", "ssilk.fix_finding", "findings", "Skirt"} <= set(notes)
     assert line(item) == "1 isolated vertices"
-    region = SimpleNamespace(width=160)
-    narrow = wrapped(SimpleNamespace(region=region, preferences=ready.context.preferences), "one two three four five")
-    assert len(narrow) == 2
+    assert lines("one two three four five", 200) == ["one two three four", "five"]
 
 
 def test_a_garment_far_from_the_body_is_an_error(ready, skirt):
