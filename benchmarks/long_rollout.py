@@ -10,6 +10,7 @@ the transient from there into the swing; the second and the last do not.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,24 +18,51 @@ import torch
 from plots import COLOURS, Panel, canvas, save
 from reports import RESULTS, table, write_results
 from subjects import Subject, arguments, clip_of, open_subject, parsed
-from timing import back_and_forth
 from torch import Tensor
 
 from ssilk_core.energy import TERMS
-from ssilk_core.training.validation import roll_states
+from ssilk_core.evaluation.methods import Network, reel_of
+from ssilk_core.evaluation.record import recorded
+from ssilk_core.evaluation.takes import Take, back_and_forth
 
 CLIPS = ("02_04", "02_02", "49_08a")
 HEADER = ("garment", "clip", "loops x frames", "term", "first [J]", "second [J]", "last [J]", "first to last",
           "second to last")  # fmt: skip
 
 
-def loop_means(subject: Subject, clip: str, frames: int, options: Any) -> tuple[dict[str, Tensor], int, float]:
-    """Return the mean of each term in each loop [J], shape (loops,), the length of a loop and the largest |z|."""
-    motion, length = back_and_forth(clip_of(options, clip, subject), subject.file.config.fps, frames)
-    validator = subject.validator(motion)
-    terms = validator.frame_terms(validator.clips[0], subject.model)
-    states = roll_states(subject.model, validator.bank, [range(motion.frame_count)], validator.down)[0]
-    return {name: terms[name].reshape(-1, length).mean(1) for name in TERMS}, length, float(states.abs().max())
+@dataclass(frozen=True, eq=False)
+class Looped:
+    """Energies of a clip that loops.
+
+    Attributes:
+        terms: of each frame [J], shape (N,).
+        length: frames of a loop.
+        largest: largest entry of any latent.
+    """
+
+    terms: dict[str, Tensor]
+    length: int
+    largest: float
+
+    @property
+    def means(self) -> dict[str, Tensor]:
+        """Mean of each term in each loop [J], shape (loops,)."""
+        return {name: values.reshape(-1, self.length).mean(1) for name, values in self.terms.items()}
+
+    @property
+    def totals(self) -> Tensor:
+        """Total of each frame [J], shape (N,)."""
+        return torch.stack(list(self.terms.values())).sum(0)
+
+
+def rolled(subject: Subject, clip: str, frames: int, options: Any) -> Looped:
+    """Roll a model over a looped clip."""
+    dressed = subject.dressed
+    motion, length = back_and_forth(clip_of(options, clip, subject), dressed.fps, frames)
+    reel = reel_of([Take(clip, 0, motion)], dressed, subject.model.joints)
+    network = Network(subject.name, subject.model, reel)
+    values = recorded(dressed, reel, network, 0).values
+    return Looped({name: values[name] for name in TERMS}, length, float(network.states[0].abs().max()))
 
 
 def drift(before: Tensor, last: Tensor) -> str:
@@ -53,9 +81,10 @@ def rows_of(garment: str, clip: str, means: dict[str, Tensor], length: int) -> l
     return rows
 
 
-def draw(path: Path, title: str, means: dict[str, Tensor], span: float = 0.05) -> None:
-    """Draw each term's loop means relative to the second loop, within +- `span`, as a PNG."""
-    image, pen = canvas(640, 300)
+def draw(path: Path, title: str, looped: Looped, span: float = 0.05) -> None:
+    """Draw each term's loop means relative to the second loop, within +- `span`, and all totals, as a PNG."""
+    image, pen = canvas(640, 540)
+    means, totals = looped.means, looped.totals
     panel = Panel(pen, (60, 40, 630, 260), (0, len(means["stretch"]) - 1), (-span, span))
     panel.title(f"{title}: mean of each loop, relative to the second")
     for level in (-span, -0.01, 0, 0.01, span):
@@ -64,6 +93,10 @@ def draw(path: Path, title: str, means: dict[str, Tensor], span: float = 0.05) -
         change = (means[name] - means[name][1]) / means[name][1].abs()
         panel.curve(enumerate(change.tolist()), colour)
         pen.text((60 + 110 * place, 278), name, fill=colour)
+    panel = Panel(pen, (60, 325, 630, 510), (0, len(totals)), (min(0.0, float(totals.min())), float(totals.max())))
+    panel.title("total of each frame [J] (the paper's Figure 10)")
+    panel.grid()
+    panel.curve(enumerate(totals.tolist()), "#2c3e50")
     save(image, path)
 
 
@@ -76,12 +109,14 @@ def main() -> None:
     for path in options.models:
         subject = open_subject(path, options.stage, options.device)
         for clip in options.clips:
-            means, length, largest = loop_means(subject, clip, options.frames, options)
-            rows += rows_of(subject.name, clip, means, length)
+            looped = rolled(subject, clip, options.frames, options)
+            means = looped.means
+            rows += rows_of(subject.name, clip, means, looped.length)
             figures = {name: values.tolist() for name, values in means.items()}
-            measured[f"{subject.name} {clip}"] = {"frames of a loop": length, "largest |z|": largest, "J": figures}
-            draw(RESULTS / f"{options.name}_{subject.name}_{clip}.png", f"{subject.name}, {clip} looped", means)
-            print(table(HEADER, rows), f"largest |z| {largest:.3f}", flush=True)
+            told = {"frames of a loop": looped.length, "largest |z|": looped.largest, "J": figures}
+            measured[f"{subject.name} {clip}"] = told
+            draw(RESULTS / f"{options.name}_{subject.name}_{clip}.png", f"{subject.name}, {clip} looped", looped)
+            print(table(HEADER, rows), f"largest |z| {looped.largest:.3f}", flush=True)
     write_results(options, table(HEADER, rows), measured)
 
 

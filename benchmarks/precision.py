@@ -9,7 +9,6 @@ one at a time on the hardest held-out clips, `inertia` and `flips`; the verdict 
 
 from __future__ import annotations
 
-import json
 import tempfile
 from argparse import Namespace
 from collections import Counter
@@ -20,17 +19,17 @@ from typing import Any
 
 import numpy as np
 import torch
-from evaluate import chosen
 from reports import table, write_results
 from safetensors import safe_open
 from subjects import Subject, arguments, clip_of, open_subject, parsed
-from timing import back_and_forth
 from torch import Tensor
 
 from ssilk_core.assets import Motion
 from ssilk_core.checkpoint import ModelFile, network, save_model
 from ssilk_core.energy import TERMS
 from ssilk_core.errors import need
+from ssilk_core.evaluation.splits import chosen, read_index
+from ssilk_core.evaluation.takes import back_and_forth
 from ssilk_core.packing import packed, unpacked
 from ssilk_core.training.validation import DECODED_AT_ONCE, roll_states
 
@@ -235,7 +234,7 @@ def tables(rows: Mapping[str, list[list[str]]]) -> str:
 
 def held_out(options: Namespace, subject: Subject, splits: Sequence[str]) -> list[Motion]:
     """Read the clips of some splits of the index."""
-    index = json.loads(options.index.read_text())
+    index = read_index(options.index)
     names = dict.fromkeys(name for split in splits for name in chosen(index, split))
     need(names, str(options.index), f"no clip of {' or '.join(splits)}", "these are the held-out clips")
     return [clip_of(options, name, subject) for name in names]

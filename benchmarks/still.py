@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stop a moving character and see whether its garment comes to rest, and whether it hangs.
+"""Stop a moving character and see whether its garment comes to rest, where, and whether it hangs.
 
     python benchmarks/still.py cape.safetensors --stage character.usdc --motions FOLDER
 
 A clip plays up to a moment, comes to a stop within a quarter of a second, and its pose is held for five seconds.
-The reference is independent of the network: L-BFGS over the vertices themselves, in float64, on the same static
-energy (stretch, bending, gravity, collision) with the pinned vertices where the skeleton has them, starting from
-where the garment came to rest. What the garment floats is its gravity term above that minimum, as a share of
-m g L: its mass, and its height at rest. A garment that floats is not at a minimum, so the search pulls it down.
+The reference is independent of the network: the simulator's Newton method on the vertices themselves, in float64, on
+the same static energy (stretch, bending, gravity, collision) with the pinned vertices where the skeleton has them,
+from where the garment came to rest, and again from the network's own quasi-static state P. What a garment floats is
+its gravity above that minimum, as a share of m g L: its weight times its height at rest. A garment that floats is not
+at a minimum, so the search pulls it down.
 """
 
 from __future__ import annotations
@@ -18,132 +19,119 @@ from typing import Any
 import torch
 from reports import table, write_results
 from subjects import Subject, arguments, clip_of, open_subject, parsed
-from timing import stopped
 from torch import Tensor
 
-from ssilk_core.assets import PINNED
-from ssilk_core.energy import GarmentEnergy
-from ssilk_core.energy.collision import PosedBody, signed_distance
-from ssilk_core.model.descriptors import GRAVITY
-from ssilk_core.training.validation import roll_states
+from ssilk_core.evaluation.methods import Network, reel_of
+from ssilk_core.evaluation.metrics import mean_square
+from ssilk_core.evaluation.probes import held
+from ssilk_core.evaluation.takes import Take, stopped
+from ssilk_core.simulate import SimulationOptions, Simulator
+from ssilk_core.simulate.newton import SolverOptions
+from ssilk_core.simulate.potential import Planes, Setting
 
 STOPS = (("02_04", 1.7), ("02_04", 3.7), ("02_02", 1.1), ("05_12", 4.0))
 HOLD = 5.0  # [s]
-CALM = 0.01  # [m/s], RMS over the mass
-HEADER = ("garment", "stopped at", "kinetic energy at the stop [J]", "after 1 s", "after 5 s", "calm after [s]",
-          "floats, of m g L", "plain skinning floats", "energy over the minimum [J]", "RMS off it [mm]",
-          "inside the body", "at the minimum")  # fmt: skip
+HEADER = ("garment", "stopped at", "kinetic energy at the stop [J]", "after 5 s", "calm after [s]", "off P [mm]",
+          "over P [J]", "over the minimum [J]", "floats, of m g L", "P floats", "plain skinning floats",
+          "RMS off the minimum [mm]", "inside the body", "at the minimum", "out of balance [g]")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
-class Still:
-    """The static energy of a garment in one held pose, in float64."""
+class Rest:
+    """Cloth in one pose and the minimum of its static energy nearby; positions (V, 3, 1) [m] about the root.
 
-    energy: GarmentEnergy
-    body: PosedBody
-    down: Tensor
+    Attributes:
+        simulator: which found the minimum.
+        setting: body and gravity.
+        start, plain: where the search began, and plain skinning.
+        x: the minimum.
+        imbalance: what the solver left out of balance [g].
+    """
 
-    def gravity(self, x: Tensor) -> Tensor:
-        """Return the gravity term [J] of positions (V, 3, 1)."""
-        return self.energy.gravity(x, GRAVITY * self.down)
+    simulator: Simulator
+    setting: Setting
+    start: Tensor
+    plain: Tensor
+    x: Tensor
+    imbalance: float
 
-    def total(self, x: Tensor) -> Tensor:
-        """Return the static energy [J] of positions (V, 3, 1)."""
-        return self.energy_at(x, signed_distance(x, self.body))
+    def over(self) -> float:
+        """Return the energy of the start over the minimum's [J]."""
+        potential, setting = self.simulator.potential, self.setting
+        start, lowest = (float(potential.energy(x, setting, self.planes(x))) for x in (self.start, self.x))
+        return start - lowest
 
-    def energy_at(self, x: Tensor, distance: Tensor) -> Tensor:
-        """Return the static energy [J] of positions (V, 3, 1) at given distances to the body (V, 1)."""
-        energy = self.energy
-        return (energy.stretch(x) + energy.bending(x) + self.gravity(x) + energy.collision_of(distance)).sum()
+    def planes(self, x: Tensor) -> Planes:
+        planes = self.simulator.potential.planes(x, self.setting)
+        assert planes is not None
+        return planes
+
+    def floats(self, x: Tensor) -> float:
+        """Return how much more gravity has to gain from x than from the minimum [J]."""
+        mass = self.simulator.potential.mass
+        return float((mass * ((self.x - x) * self.setting.gravity).sum(1)).sum())
 
     def inside(self, x: Tensor) -> float:
-        """Return the share of positions (V, 3, 1) that are inside the body."""
-        return float((signed_distance(x, self.body) < 0).double().mean())
+        """Return the share of vertices inside the body."""
+        return float((self.planes(x).distance(x) < 0).double().mean())
 
-    def plane(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Return normals (V, 3, 1) and offsets (V, 1) of the planes that touch the body nearest to each vertex."""
-        x = x.detach().requires_grad_(True)
-        distance = signed_distance(x, self.body)
-        (normal,) = torch.autograd.grad(distance.sum(), x)
-        return normal, (normal * x).sum(1).detach() - distance.detach()
-
-    def minimised(self, x: Tensor, free: Tensor, rounds: int, iterations: int = 100) -> Tensor:
-        """Return positions of least static energy found from `x`, moving the vertices `free` alone.
-
-        The planes of the body hold still within a round, so that each round minimises a smooth function.
-        """
-        moved = x[free].clone().requires_grad_(True)
-        for _ in range(rounds):
-            search = torch.optim.LBFGS([moved], max_iter=iterations, history_size=30, tolerance_grad=1e-9,
-                                       tolerance_change=1e-13, line_search_fn="strong_wolfe")  # fmt: skip
-            normal, offset = self.plane(x.index_copy(0, free, moved.detach()))
-
-            def evaluate(
-                search: torch.optim.Optimizer = search, normal: Tensor = normal, offset: Tensor = offset
-            ) -> Tensor:
-                search.zero_grad()
-                at = x.index_copy(0, free, moved)
-                loss = self.energy_at(at, (normal * at).sum(1) - offset)
-                loss.backward()
-                return loss
-
-            search.step(evaluate)
-        return x.index_copy(0, free, moved.detach())
+    def distance(self) -> float:
+        """Return the RMS distance of the start from the minimum over the mass [m]."""
+        return float(mean_square(self.start - self.x, self.simulator.potential.mass[:, 0])) ** 0.5
 
 
-def rolled(subject: Subject, clip: str, stop: float, options: Any) -> tuple[Tensor, Tensor, PosedBody]:
-    """Return positions (V, 3, N) [m] while the pose is held, plain skinning's (V, 3, 1), and the body then."""
-    motion, first = stopped(clip_of(options, clip, subject), subject.file.config.fps, stop, HOLD)
-    validator = subject.validator(motion)
-    bank, frames = validator.bank, torch.arange(motion.frame_count)
-    with torch.no_grad():
-        z = roll_states(subject.model, bank, [range(motion.frame_count)], validator.down)[0][first - 1 :]
-        x = subject.model.vertices(z, bank.character(frames[first - 1 :]))
-    last = bank.character(frames[-1:])
-    posed = subject.body.posed(last)
-    body = PosedBody(posed.points.double(), posed.normals.double(), posed.rings)
-    return x.double(), validator.plain_vertices(last).double(), body
+def rest_of(simulator: Simulator, take: Take, x: Tensor) -> Rest:
+    """Minimise the static energy in a take's last pose from x (V, 3, 1), which is about the take's first root."""
+    motion, potential = take.motion, simulator.potential
+    poses = simulator.actors.posed(motion.rotations[-1:], motion.translations[-1:])
+    origin = torch.as_tensor(motion.translations[0, 0].copy(), device=x.device)
+    local = x.double() + origin[:, None] - poses.root
+    start = poses.plain.index_copy(0, potential.free, local[potential.free])
+    found = simulator.rest(poses, start)
+    setting = Setting(poses.body, simulator.gravity)
+    return Rest(simulator, setting, start, poses.plain, found.x, float(found.imbalance))
 
 
 def measure(subject: Subject, clip: str, stop: float, options: Any) -> dict[str, float]:
     """Return the figures of one stop."""
-    mesh, fps = subject.scene.garment.mesh, subject.file.config.fps
-    energy = GarmentEnergy(mesh, subject.file.fabric, dtype=torch.float64)
-    x, plain, body = rolled(subject, clip, stop, options)
-    kinetic = energy.mass @ (x.diff(dim=-1) * fps).square().sum(1) / 2
-    speed = (2 * kinetic / energy.mass.sum()).sqrt()
-    moving = (speed > CALM).nonzero()
-    still = Still(energy, body, torch.tensor([[0.0], [-1.0], [0.0]], dtype=torch.float64))
-    free = torch.as_tensor((subject.scene.classes != PINNED).nonzero()[0])
-    held = x[..., -1:]
-    best = still.minimised(held, free, options.rounds)
-    weight = float(energy.mass.sum()) * GRAVITY * float(mesh.points[:, 1].max() - mesh.points[:, 1].min())
-    distance = energy.mass @ (held - best).square().sum(1)[:, 0] / energy.mass.sum()
+    dressed = subject.dressed
+    motion, first = stopped(clip_of(options, clip, subject), dressed.fps, stop, HOLD)
+    take, last = Take(clip, 0, motion), range(motion.frame_count - 1, motion.frame_count)
+    reel = reel_of([take], dressed, subject.model.joints)
+    network = Network("ssilk", subject.model, reel)
+    settings = SimulationOptions(fps=dressed.fps, rest=SolverOptions(iterations=options.iterations))
+    simulator = Simulator(dressed.scene, dressed.fabric, settings, device=dressed.device)
+    hold = held(dressed, reel, network, [first])[0]
+    rest, still = (rest_of(simulator, take, at(0, last)) for at in (network.vertices, network.still))
     return {
-        "kinetic at the stop [J]": float(kinetic[0]),
-        "kinetic after 1 s [J]": float(kinetic[round(fps)]),
-        "kinetic after 5 s [J]": float(kinetic[-1]),
-        "calm after [s]": (int(moving[-1]) + 1) / fps if len(moving) else 0.0,
-        "floats [m g L]": float(still.gravity(held) - still.gravity(best)) / weight,
-        "plain floats [m g L]": float(still.gravity(plain) - still.gravity(best)) / weight,
-        "over the minimum [J]": float(still.total(held) - still.total(best)),
-        "distance [m]": float(distance.sqrt()),
-        "inside": still.inside(held),
-        "inside at the minimum": still.inside(best),
+        "kinetic at the stop [J]": hold.begun,
+        "kinetic after 5 s [J]": hold.kinetic,
+        "calm after [s]": hold.settling,
+        "off P [m]": hold.distance,
+        "over P [J]": hold.above,
+        "over the minimum [J]": rest.over(),
+        "floats [m g L]": rest.floats(rest.start) / dressed.weight,
+        "P floats [m g L]": still.floats(still.start) / dressed.weight,
+        "plain floats [m g L]": rest.floats(rest.plain) / dressed.weight,
+        "distance [m]": rest.distance(),
+        "inside": rest.inside(rest.start),
+        "inside at the minimum": rest.inside(rest.x),
+        "out of balance [g]": rest.imbalance,
     }
 
 
 def row(garment: str, where: str, found: dict[str, float]) -> list[str]:
     """Return one line of the table."""
-    start, second, end, calm, floats, plain, over, distance, *inside = found.values()
+    start, end, calm, off, over_still, over, *floats, distance, inside, below, imbalance = found.values()
     calm_text = f"{calm:.2f}" if calm < HOLD else "never"
-    return [garment, where, f"{start:.2e}", f"{second:.2e}", f"{end:.2e}", calm_text, f"{floats:.2%}", f"{plain:.2%}",
-            f"{over:.4f}", f"{1000 * distance:.0f}", *(f"{share:.2%}" for share in inside)]  # fmt: skip
+    return [garment, where, f"{start:.2e}", f"{end:.2e}", calm_text, f"{1000 * off:.0f}", f"{over_still:.4f}",
+            f"{over:.4f}", *(f"{share:.2%}" for share in floats), f"{1000 * distance:.0f}", f"{inside:.2%}",
+            f"{below:.2%}", f"{imbalance:.1e}"]  # fmt: skip
 
 
 def main() -> None:
     parser = arguments(__doc__ or "")
-    parser.add_argument("--rounds", type=int, default=40, help="of 100 iterations of L-BFGS (default 40)")
+    parser.add_argument("--iterations", type=int, default=150, help="of Newton's method, at most (default 150)")
     options = parsed(parser)
     rows, measured = [], {}
     for path in options.models:

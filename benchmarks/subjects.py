@@ -19,6 +19,7 @@ from ssilk_core.checkpoint import ModelFile, load_model, network
 from ssilk_core.devices import chosen_device
 from ssilk_core.energy import GarmentEnergy
 from ssilk_core.errors import need
+from ssilk_core.evaluation.methods import Dressed
 from ssilk_core.model.body import CollisionBody
 from ssilk_core.model.network import GarmentModel
 from ssilk_core.training.bank import build_bank
@@ -27,18 +28,28 @@ from ssilk_core.training.validation import Validator
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A trained garment on a whole character; `body` holds every body vertex, reachable or not."""
+    """A trained garment on a whole character; `dressed` holds every body vertex, reachable or not."""
 
     name: str
     file: ModelFile
-    scene: Scene
     model: GarmentModel
-    energy: GarmentEnergy
-    body: CollisionBody
+    dressed: Dressed
+
+    @property
+    def scene(self) -> Scene:
+        return self.dressed.scene
+
+    @property
+    def energy(self) -> GarmentEnergy:
+        return self.dressed.energy
+
+    @property
+    def body(self) -> CollisionBody:
+        return self.dressed.body
 
     @property
     def device(self) -> torch.device:
-        return self.model.decoder.rest.device
+        return self.dressed.device
 
     def validator(self, motion: Motion) -> Validator:
         """Return a validator of this garment that holds one whole motion at the model's rate."""
@@ -57,15 +68,19 @@ class Subject:
 
 def open_subject(path: Path, stage: Path, device: str) -> Subject:
     """Load a model and put it on the character of a stage."""
-    file, place = load_model(path), chosen_device(device)
+    file = load_model(path)
+    dressed = dressed_in(file, stage, device)
+    return Subject(path.stem, file, network(file, dressed.scene).to(dressed.device), dressed)
+
+
+def dressed_in(file: ModelFile, stage: Path, device: str) -> Dressed:
+    """Put the garment of a model or a baseline on the character of a stage."""
     skeleton = file.scene.character.skeleton
     character = read_character(open_stage(stage), root=None, garment=None)
     need(character.skeleton.joint_names == skeleton.joint_names, str(stage), "its joints are not the model's",
          "a model is measured on the character it was trained with")  # fmt: skip
     scene = replace(file.scene, character=replace(character, skeleton=skeleton))
-    energy = GarmentEnergy(scene.garment.mesh, file.fabric, device=place)
-    body = CollisionBody(character.merged_body(), skeleton.joint_count, device=place)
-    return Subject(path.stem, file, scene, network(file, scene).to(place), energy, body)
+    return Dressed(scene, file.fabric, file.config.fps, chosen_device(device))
 
 
 def arguments(purpose: str) -> argparse.ArgumentParser:

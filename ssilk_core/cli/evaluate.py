@@ -68,12 +68,15 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     device = chosen_device(options.device)
     opened = [Opened(path, *load_network(path)) for path in options.models]
     rows: list[Row] = []
+    found: list[dict[str, Any]] = []
     for models in _by_garment(opened):
-        dressed = _dressed(models[0].file, options, device)
+        dressed, subjects = _dressed(models[0].file, options, device), _subjects(models, device)
         playlist = _playlist(options, dressed)
         report(Started("evaluate", 0, {"garment": dressed.name, "clips": list(playlist.clips)}))
-        rows += evaluate(dressed, _subjects(models, device), playlist, asked, report)
-    found = [asdict(row) for row in rows]
+        paths = {subject.name: str(one.path) for subject, one in zip(subjects, models)}
+        for row in evaluate(dressed, subjects, playlist, asked, report):
+            rows.append(row)
+            found.append({"model": paths.get(row.method), **asdict(row)})
     if options.output:
         _write(options, found, opened, device)
     if not options.json:

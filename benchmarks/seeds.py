@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Evaluate many models by 'ssilk evaluate', and take those of one garment and method together as seeds."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from collections.abc import Sequence
+from contextlib import redirect_stdout
+from dataclasses import dataclass
+from io import StringIO
+from pathlib import Path
+from statistics import mean, stdev
+from typing import Any
+
+from ssilk_core.cli import main as ssilk
+
+Row = dict[str, Any]
+
+
+def evaluated(options: argparse.Namespace) -> list[Row]:
+    """Return the figures of 'ssilk evaluate' for all models."""
+    named = ("stage", "motions", "index", "reference", "sequence", "device")
+    given = [(f"--{name}", value) for name in named if (value := getattr(options, name)) is not None]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "figures.json"
+        plain = ("--stops", 0), ("--loop", 0), ("--output", path)
+        asked = ["evaluate", *options.models, *(word for pair in (*given, *plain) for word in pair)]
+        with redirect_stdout(StringIO()):  # its own tables
+            code = ssilk([str(word) for word in asked])
+        if code:
+            raise SystemExit(code)
+        return json.loads(path.read_text())["figures"]
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """Figures of the seeds of one method on one garment and split."""
+
+    rows: Sequence[Row]
+
+    def values(self, path: Sequence[str]) -> list[float]:
+        """Return a figure of each seed, by the names that lead to it; nothing where it is lacking."""
+        found = []
+        for row in self.rows:
+            value = row["figures"]
+            for name in path:
+                value = value and value[name]
+            found += [] if value is None else [value]
+        return found
+
+    def shown(self, path: Sequence[str], form: str = ".4g") -> str:
+        """Return a figure as text: its mean, with the standard deviation where there are several seeds."""
+        values = self.values(path)
+        spread = f" ± {stdev(values):.1g}" if len(values) > 1 and form == ".4g" else ""
+        return f"{mean(values):{form}}{spread}" if values else ""
+
+
+def cells(rows: Sequence[Row]) -> dict[tuple[str, str, str], Cell]:
+    """Return figures by garment, method and split."""
+    groups: dict[tuple[str, str, str], list[Row]] = {}
+    for row in rows:
+        method = row["method"].partition(" (")[0]
+        groups.setdefault((row["garment"], method, row["split"]), []).append(row)
+    return {key: Cell(group) for key, group in groups.items()}

@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Regenerate the paper's tables and figures on our data, each by one command, from trained models.
+
+    python benchmarks/tables.py table1 MODELS --stage character.usdc --motions FOLDER --index FOLDER/index.json \\
+        --reference SHOTS --device cuda
+
+MODELS are files, or folders of them: those of 'ssilk train' and baselines, whose files say what they are. Models of
+one garment and method are taken as seeds, and shown as mean and standard deviation. SHOTS is what 'ssilk simulate'
+made of the clips, one folder for each garment.
+
+    table1    every garment, split and method: total, collisions, excess over the simulator
+    table2    the same of `inertia` and `flips`, beside the simulator
+    table3    time of a single frame of one clip, in PyTorch
+    table5    batch, window and latent size, one changed at a time
+    figure8   blendshapes alone, joints alone, and both
+    figure12  numbers of blendshapes, and of proxies
+
+Figure 10 is drawn by `long_rollout.py`, Figure 11 by `curves.py`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from statistics import mean
+from typing import Any
+
+import torch
+from reports import table, write_results
+from seeds import Cell, cells, evaluated
+from single_frames import frame_times
+from ssilk_usd.read_motion import read_motion
+from subjects import dressed_in
+from sweeps import SWEEPS, sweep
+
+from ssilk_core.assets import Motion
+from ssilk_core.baselines.files import load_network
+from ssilk_core.checkpoint import ModelFile
+from ssilk_core.errors import SsilkError, need
+from ssilk_core.evaluation.methods import reel_of
+from ssilk_core.evaluation.splits import SPLITS
+from ssilk_core.evaluation.takes import takes_of
+
+COLUMNS: dict[str, tuple[tuple[str, ...], str]] = {
+    "L_tot [J]": (("total",), ".4g"),
+    "collisions": (("collisions",), ".2%"),
+    "excess [J]": (("truth", "excess"), ".4g"),
+    "floats, of m g L": (("truth", "floats"), "+.1%"),
+}
+
+
+def methods_table(found: Mapping[tuple[str, str, str], Cell], splits: Sequence[str]) -> str:
+    """Return a line for each garment and method, with columns for each split."""
+    names = [name for name, (path, _) in COLUMNS.items() if any(cell.values(path) for cell in found.values())]
+    columns = [(split, name) for split in splits for name in names]
+    rows = []
+    for key in dict.fromkeys((garment, method) for garment, method, _ in found):
+        lines = {split: found.get((*key, split), Cell([])) for split in splits}
+        rows.append([*key, *(lines[split].shown(*COLUMNS[name]) for split, name in columns)])
+    return table(["garment", "method", *(f"{split}: {name}" for split, name in columns)], rows)
+
+
+def verdicts(found: Mapping[tuple[str, str, str], Cell]) -> list[str]:
+    """Return in how many cells the goals are met, where there is what they compare with."""
+    ours = {(garment, split): cell for (garment, method, split), cell in found.items() if method == "ssilk"}
+    lines = []
+    for baseline in ("ncs", "ncs*", "snug"):
+        pairs = [(cell, found[g, baseline, s]) for (g, s), cell in ours.items() if (g, baseline, s) in found]
+        lower = sum(mean(a.values(["total"])) < mean(b.values(["total"])) for a, b in pairs)
+        lines += [f"ssilk's total is lower than {baseline}'s in {lower} of {len(pairs)} cells"] if pairs else []
+    lines += _shares("the excess on flips is at most half of ncs's", [
+        mean(cell.values(["truth", "excess"])) <= 0.5 * mean(other.values(["truth", "excess"]))
+        for (garment, split), cell in ours.items()
+        if split == "flips" and (other := found.get((garment, "ncs", split))) and cell.values(["truth", "excess"])
+    ])  # fmt: skip
+    floats = [mean(values) for cell in ours.values() if (values := cell.values(["truth", "floats"]))]
+    lines += _shares("at most 5 % of m g L over the simulator's gravity", [value <= 0.05 for value in floats])
+    lines += _shares("collisions under 0.5 %", [mean(cell.values(["collisions"])) < 0.005 for cell in ours.values()])
+    return lines
+
+
+def _shares(text: str, met: Sequence[bool]) -> list[str]:
+    return [f"ssilk: {text} in {sum(met)} of {len(met)} cells"] if met else []
+
+
+def table1(options: argparse.Namespace) -> tuple[str, Any]:
+    rows = evaluated(options)
+    found = cells(rows)
+    notes = "".join(f"\n- {line}" for line in verdicts(found))
+    return methods_table(found, SPLITS) + notes + "\n", rows
+
+
+def table2(options: argparse.Namespace) -> tuple[str, Any]:
+    need(options.reference, "table2", "no --reference", "it shows the simulator, whose shots are needed")
+    rows = [row for row in evaluated(options) if row["split"] != "valid"]
+    return methods_table(cells(rows), SPLITS[1:]), rows
+
+
+def table3(options: argparse.Namespace) -> tuple[str, Any]:
+    rows, found = [], {}
+    for path in options.models:
+        file, model = load_network(path)
+        dressed = dressed_in(file, options.stage, options.device)
+        takes = takes_of(options.clip, clip_of(options, file), dressed.fps)
+        times = frame_times(model.to(dressed.device), reel_of(takes[:1], dressed, file.joints), options.frames)
+        found[path.stem] = vars(times)
+        spans = [f"{1000 * value:.2f} ± {1000 * spread:.2f}" for value, spread in (times.full, times.model)]
+        rows.append([path.stem, *spans, f"{1000 * (times.full[0] - times.model[0]):.2f}"])
+    return table(("model", "full pipeline [ms]", "model only [ms]", "blendshapes + skinning [ms]"), rows), found
+
+
+def clip_of(options: argparse.Namespace, file: ModelFile) -> Motion:
+    """Read the clip of table3."""
+    return read_motion(options.motions / f"{options.clip}.usdc", file.scene.character.skeleton)
+
+
+MADE: dict[str, Callable[[argparse.Namespace], tuple[str, Any]]] = {
+    "table1": table1, "table2": table2, "table3": table3, **dict.fromkeys(SWEEPS, sweep),
+}  # fmt: skip
+
+
+def parsed() -> argparse.Namespace:
+    """Parse the command line, and find the models in folders."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("table", choices=sorted(MADE), help="what to make")
+    parser.add_argument("models", type=Path, nargs="+", metavar="MODELS", help="models, or folders of them")
+    parser.add_argument("--stage", type=Path, required=True, help="USD file with the character")
+    parser.add_argument("--motions", type=Path, required=True, metavar="FOLDER", help="folder of motion files")
+    parser.add_argument("--index", type=Path, help="JSON list of clips with their splits and tags")
+    parser.add_argument("--reference", type=Path, metavar="SHOTS", help="folder of the simulator's shots")
+    parser.add_argument("--sequence", type=int, metavar="FRAMES", help="start clips anew after so many (paper: 512)")
+    parser.add_argument("--clip", default="49_08a", help="clip of table3 (default 49_08a)")
+    parser.add_argument("--frames", type=int, default=1000, help="that table3 times (default 1000)")
+    parser.add_argument("--device", default="cpu", help="where everything runs (default cpu)")
+    parser.add_argument("--threads", type=int, default=2, help="processor threads (default 2)")
+    parser.add_argument("--name", help="of the result files (default: the table's)")
+    options = parser.parse_args()
+    options.name = options.name or options.table
+    found = [sorted(path.glob("*.safetensors")) if path.is_dir() else [path] for path in options.models]
+    options.models = [path for paths in found for path in paths if not path.name.endswith(".resume.safetensors")]
+    torch.set_num_threads(options.threads)
+    return options
+
+
+def main() -> None:
+    options = parsed()
+    try:
+        need(options.models, "MODELS", "no model in the folder", "'ssilk train' writes them")
+        markdown, measured = MADE[options.table](options)
+    except SsilkError as error:
+        raise SystemExit(f"error: {error}") from error
+    write_results(options, markdown, measured)
+
+
+if __name__ == "__main__":
+    main()
