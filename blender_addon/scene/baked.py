@@ -57,15 +57,34 @@ def apply_shot(garment: bpy.types.Object, armature: bpy.types.Object, joints: Jo
     Raises:
         SetupError: garment or bones are not those that it was trained with.
     """
+    shapes = wear(garment, armature, joints, shot)
+    keys = garment.data.shape_keys
+    moved = [(armature, _turns(joints, shot)), (keys, _activations(shapes, shot))]
+    bake_keys(garment, shot.start, [(thing, channels) for thing, channels in moved if channels])
+
+
+def wear(garment: bpy.types.Object, armature: bpy.types.Object, joints: Joints, shot: Shot) -> list[str]:
+    """Give a garment the shapes and weights of a shot, its proxies at rest; return its shape keys. In object mode.
+
+    Raises:
+        SetupError: as `apply_shot` does.
+    """
     world = _moved_back(armature, joints, shot) @ np.array(garment.matrix_world)
     _need_same_points(garment, world, shot)
     shapes = write_shapes(garment, shot.offsets @ np.linalg.inv(world[:3, :3]).T, shot.shapes)
     write_groups(garment, shot.weights, joints.names, ())
-    proxies = joints.names[joints.character_count :]
-    _free(armature, proxies)
-    keys = garment.data.shape_keys
-    moved = [(armature, _turns(joints, shot)), (keys, _activations(shapes, shot))]
-    bake_keys(garment, shot.start, [(thing, channels) for thing, channels in moved if channels])
+    _free(armature, joints.names[joints.character_count :])
+    return shapes
+
+
+def turns_from_rest(joints: Joints, rotations: np.ndarray) -> np.ndarray:
+    """Return the proxies' turns from their rest rotations, which is what pose bones hold, shape (F, P, 4).
+
+    Args:
+        rotations: of each proxy to its parent, unit quaternions (w, x, y, z), shape (F, P, 4).
+    """
+    rest = _quaternions(to_parents(joints.binds, joints.parents)[joints.character_count :, :3, :3])
+    return _product(rest * [1, -1, -1, -1], rotations)
 
 
 def has_bake(garment: bpy.types.Object) -> bool:
@@ -142,13 +161,10 @@ def _free(armature: bpy.types.Object, proxies: Sequence[str]) -> None:
 
 
 def _turns(joints: Joints, shot: Shot) -> list[Channel]:
-    """Return the proxies' turns from their rest rotations, which is what pose bones hold."""
-    first = joints.character_count
-    rest = _quaternions(to_parents(joints.binds, joints.parents)[first:, :3, :3])
-    turns = _product(rest * [1, -1, -1, -1], shot.rotations)
+    names = joints.names[joints.character_count :]
     return [
         Channel(f'pose.bones["{bpy.utils.escape_identifier(name)}"].rotation_quaternion', index, name, values)
-        for name, turn in zip(joints.names[first:], turns.swapaxes(0, 1))
+        for name, turn in zip(names, turns_from_rest(joints, shot.rotations).swapaxes(0, 1))
         for index, values in enumerate(turn.T)
     ]
 

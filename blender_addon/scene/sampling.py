@@ -106,7 +106,7 @@ def _sample_slice(armature: bpy.types.Object, joints: Joints, take: Take) -> Non
             scene.frame_set(frame)
             evaluated = armature.evaluated_get(scene.view_layers[0].depsgraph)
             take.placements.append(np.array(evaluated.matrix_world))
-            take.worlds.append(_rigid(_worlds(evaluated)[columns], joints, take.source.name, frame))
+            take.worlds.append(_rigid(worlds(evaluated)[columns], joints, take.source.name, frame))
 
 
 @contextmanager
@@ -119,14 +119,14 @@ def _alone(armature: bpy.types.Object) -> Iterator[bpy.types.Scene]:
         bpy.data.scenes.remove(scene)
 
 
-def _worlds(armature: bpy.types.Object) -> np.ndarray:
+def worlds(armature: bpy.types.Object) -> np.ndarray:
     """Return bone to world of all bones, without the armature's scale in their axes, shape (bones, 4, 4)."""
     poses = np.empty(len(armature.pose.bones) * 16, dtype=np.float32)
     armature.pose.bones.foreach_get("matrix", poses)
     placement = np.array(armature.matrix_world)
-    worlds = placement @ poses.reshape(-1, 4, 4).swapaxes(-1, -2)
-    worlds[:, :3, :3] /= armature.matrix_world.median_scale
-    return worlds
+    found = placement @ poses.reshape(-1, 4, 4).swapaxes(-1, -2)
+    found[:, :3, :3] /= armature.matrix_world.median_scale
+    return found
 
 
 def _rigid(worlds: np.ndarray, joints: Joints, motion: str, frame: int) -> np.ndarray:
