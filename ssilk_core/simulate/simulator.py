@@ -9,7 +9,7 @@ step, where single precision of the body is finest; between steps positions are 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -79,18 +79,34 @@ class SimulatedFrame:
 
 
 @dataclass(frozen=True, eq=False)
-class _State:
-    """The last two positions in the world (V, 3, N), the earlier from the second step on, and the last poses."""
+class Past:
+    """What a step looks back on, in N shots.
+
+    Attributes:
+        last, before: positions one and two steps ago in the world [m], float64, shape (V, 3, N); None for `before` in
+            the step after the first.
+        root: the character's root one step ago [m], float64, shape (3, N).
+        plain: the garment under plain skinning one step ago, relative to that root, shape (V, 3, N).
+    """
 
     last: Tensor
     before: Tensor | None
-    poses: Poses
+    root: Tensor
+    plain: Tensor
 
-    def first(self, count: int) -> _State:
-        """Return the state of the first `count` shots."""
-        poses = replace(self.poses, root=self.poses.root[:, :count], plain=self.poses.plain[..., :count])
+    def first(self, count: int) -> Past:
+        """Return the past of the first `count` shots."""
         before = None if self.before is None else self.before[..., :count]
-        return _State(self.last[..., :count], before, poses)
+        return Past(self.last[..., :count], before, self.root[:, :count], self.plain[..., :count])
+
+    @property
+    def local(self) -> Tensor:
+        """Return the last positions relative to the root then, shape (V, 3, N)."""
+        return (self.last - self.root).to(self.plain.dtype)
+
+    def carried_on(self, poses: Poses) -> Tensor:
+        """Return positions as far from plain skinning as one step ago, relative to the roots of `poses`."""
+        return self.local - self.plain + poses.plain
 
 
 class Simulator:
@@ -125,43 +141,47 @@ class Simulator:
 
     def _advanced(self, spans: Sequence[Span]) -> Iterator[SimulatedFrame]:
         """Yield the frames of spans, the longest first."""
-        state: _State | None = None
+        past: Past | None = None
         for step in range(spans[0].motion.frame_count):
             running = [span for span in spans if span.motion.frame_count > step]
             poses = self.actors.poses(running, step)
-            previous = state and state.first(len(running))
-            solution = self._stepped(poses, previous) if previous else self.rest(poses, poses.plain)
+            past = past and past.first(len(running))
+            solution = self._stepped(poses, past) if past else self.rest(poses, poses.plain)
             world = solution.x.double() + poses.root
-            state = _State(world, previous.last if previous else None, poses)
+            past = Past(world, past.last if past else None, poses.root, poses.plain)
             if step % self.options.substeps == 0:
                 yield from _frames(running, step // self.options.substeps, world, solution)
 
     def rest(self, poses: Poses, start: Tensor) -> Solution:
         """Return the quasi-static states of poses nearest to `start` (V, 3, N), relative to the roots."""
-        setting = Setting(poses.body, self.gravity.expand(3, start.shape[-1]))
-        return minimise_from(self.potential, start, setting, self.options.rest)
+        return minimise_from(self.potential, start, self.setting(poses, None), self.options.rest)
 
-    def _stepped(self, poses: Poses, previous: _State) -> Solution:
+    def setting(self, poses: Poses, past: Past | None) -> Setting:
+        """Return what positions relative to the roots are solved for: a step after `past`, else a state at rest."""
+        gravity = self.gravity.expand(3, poses.root.shape[-1])
+        if past is None:
+            return Setting(poses.body, gravity)
+        shift = poses.root - past.root
+        predicted = past.carried_on(poses) if past.before is None else past.local + (past.last - past.before - shift)
+        return Setting(poses.body, gravity, predicted.to(past.plain.dtype), past.local, self.dt)
+
+    def _stepped(self, poses: Poses, past: Past) -> Solution:
         """Return the states one step later."""
-        local = (previous.last - previous.poses.root).to(self.potential.dtype)
-        follows = local - previous.poses.plain + poses.plain
-        shift = poses.root - previous.poses.root
-        predicted = follows if previous.before is None else local + (previous.last - previous.before - shift)
-        predicted = predicted.to(local.dtype)
-        setting = Setting(poses.body, self.gravity.expand(3, local.shape[-1]), predicted, local, self.dt)
-        start = self._best([self._pinned(x, poses) for x in (predicted, local, follows)], setting)
-        return self.solve(start, setting)
+        setting = self.setting(poses, past)
+        assert setting.predicted is not None
+        starts = [setting.predicted, past.local, past.carried_on(poses)]
+        return self.solve(self.best([self.pinned(x, poses) for x in starts], setting), setting)
 
     def solve(self, start: Tensor, setting: Setting) -> Solution:
         """Return the minima of one step (V, 3, N), sought from `start`."""
         return minimise_from(self.potential, start, setting, self.options.solver)
 
-    def _pinned(self, x: Tensor, poses: Poses) -> Tensor:
+    def pinned(self, x: Tensor, poses: Poses) -> Tensor:
         """Return positions (V, 3, N) with the vertices that do not move freely under plain skinning."""
         free = self.potential.free
         return poses.plain.index_copy(0, free, x[free].to(poses.plain.dtype))
 
-    def _best(self, starts: list[Tensor], setting: Setting) -> Tensor:
+    def best(self, starts: Sequence[Tensor], setting: Setting) -> Tensor:
         """Return for each frame the start of least energy."""
         potential = self.potential
         energies = [potential.energy(x, setting, potential.planes(x, setting)) for x in starts]

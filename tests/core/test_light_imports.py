@@ -23,7 +23,7 @@ LAYERS = (
     {"model", "energy"},
     {"checkpoint"},
     {"demo", "view", "simulate", "training", "rollout", "preflight", "setup", "wardrobe", "runtime", "farm"},
-    {"baselines", "cost", "reduction"},
+    {"baselines", "cost", "reduction", "refine"},
     {"evaluation", "quality", "stress"},
     {"trade"},
     {"cli"},

@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Put garment vertices back onto joints and blendshapes: for each frame least squares over the mass.
+
+Gauss-Newton with damping [Marquardt 1963] on what a shot stores, blendshape weights in [0, 1] and proxy rotations,
+several frames at once. Turning a proxy by a small w about its place c moves a vertex by w x (q - W c): W is what the
+proxy and those below it weigh there, and q where they put the vertex, weighted alike. A step counts only where it
+brings the frame nearer, so no frame ends further off than it starts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..assets import PINNED, Deformer, Floats, GarmentPose, Motion
+from ..errors import need
+from ..kinematics import combined_transforms, matrix_from_quaternion, quaternion_from_matrix, skinning_matrices
+
+STEPS = 15
+ENOUGH = 1e-3  # share of a frame's squared error; a step that gains less is the last
+DAMPING = 1e-4, 1e-9, 1e3  # of the mean diagonal: at first, at least, and where a frame is given up
+AT_ONCE = 16  # frames; the Jacobian of one takes 4 MB for 2,700 vertices, 64 shapes and 20 proxies
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Poses of consecutive frames and what they lose.
+
+    Attributes:
+        rms: distance to the vertices asked for, over the mass [m], shape (F,).
+        largest: of any vertex [m], shape (F,).
+    """
+
+    pose: GarmentPose
+    rms: Floats
+    largest: Floats
+
+
+class Refitter:
+    """Fits poses of one garment; the last blendshape, which puts the middle of all others back, keeps its weight.
+
+    Args:
+        mass: of the vertices [kg], shape (V,).
+        device: where the linear algebra runs.
+    """
+
+    def __init__(self, deformer: Deformer, mass: Floats, *, device: torch.device | str = "cpu") -> None:
+        scene, skin = deformer.scene, deformer.skin
+        self.deformer, self.device = deformer, torch.device(device)
+        self.joints, self.proxies = scene.character.skeleton.joint_count, scene.rig.proxy_count
+        self.free, self.above = np.flatnonzero(scene.classes != PINNED), scene.rig.parents.tolist()
+        self.indices = self._tensor(skin.indices[self.free], torch.int64)
+        self.weights = self._tensor(skin.weights[self.free])
+        self.rest = self._tensor(scene.garment.mesh.points[self.free])
+        self.shapes = self._tensor(deformer.shapes[:, self.free])
+        self.share = self._tensor(mass[self.free] / mass.sum())[:, None]
+        self.below = self._tensor(_below(scene.parents, self.joints))[self.indices]  # (V, I, P)
+        self.bound = torch.einsum("vip,vi->vp", self.below, self.weights)
+
+    def _tensor(self, values: np.ndarray, dtype: torch.dtype = torch.float64) -> Tensor:
+        return torch.as_tensor(np.array(values), dtype=dtype, device=self.device)
+
+    def fit(self, motion: Motion, poses: Iterable[GarmentPose], vertices: Iterable[Floats]) -> Iterator[Fit]:
+        """Yield fits, some frames at a time.
+
+        Args:
+            motion: of the character over the whole shot.
+            poses: consecutive frames to start from.
+            vertices: of each of these frames, in the world [m], shape (V, 3).
+        """
+        wanted = iter(vertices)
+        for pose in poses:
+            for at in range(0, pose.frame_count, AT_ONCE):
+                part = slice(at, at + AT_ONCE)
+                some = GarmentPose(pose.start + at, pose.rotations[part], pose.weights[part])
+                yield self.fitted(motion, some, np.stack([next(wanted) for _ in range(some.frame_count)]))
+
+    def fitted(self, motion: Motion, pose: GarmentPose, vertices: Floats) -> Fit:
+        """Return the fit of a few frames to vertices in the world [m], shape (F, V, 3)."""
+        where = f"frames {pose.start} to {pose.start + pose.frame_count - 1}"
+        need(np.isfinite(vertices).all(), where, "NaN or infinity among the vertices", "all must be finite")
+        root = motion.translations[pose.start : pose.start + pose.frame_count, :1]
+        about = replace(motion, translations=motion.translations - _of_root(motion))
+        search = _Search(self, about, pose, self._tensor((vertices - root)[:, self.free]))
+        for _ in range(STEPS):
+            if not search.advance():
+                break
+        return search.found()
+
+
+def _of_root(motion: Motion) -> Floats:
+    """Return the place of the first joint in its own row and zero in the others, shape (F, J, 3)."""
+    places = np.zeros_like(motion.translations)
+    places[:, 0] = motion.translations[:, 0]
+    return places
+
+
+def _below(parents: np.ndarray, joints: int) -> Floats:
+    """Return which combined joints turn with each proxy, the proxy itself included, shape (J + P, P)."""
+    turning = np.zeros((len(parents), len(parents) - joints))
+    for joint in range(joints, len(parents)):
+        turning[joint, joint - joints] = 1
+        if parents[joint] >= joints:
+            turning[joint] += turning[parents[joint]]
+    return turning
+
+
+@dataclass(frozen=True, eq=False)
+class _Posed:
+    """Frames as a pose has them.
+
+    Attributes:
+        world: joint to world, all combined joints, shape (F, J + P, 4, 4).
+        blended: skinning matrices' linear parts, blended, shape (F, V, 3, 3).
+        moved: where each influence puts a vertex, weighted, shape (F, V, I, 3).
+        away: the vertices asked for less the posed ones, shape (F, V, 3).
+        error: sum of squared distances over the mass [m2], shape (F,).
+    """
+
+    world: Tensor
+    blended: Tensor
+    moved: Tensor
+    away: Tensor
+    error: Tensor
+
+
+class _Search:
+    """The fit of some frames under way."""
+
+    def __init__(self, fitter: Refitter, motion: Motion, pose: GarmentPose, wanted: Tensor) -> None:
+        self.fitter, self.motion, self.pose, self.wanted = fitter, motion, pose, wanted
+        self.posed = self._at(pose)
+        self.damping = torch.full_like(self.posed.error, DAMPING[0])
+        self.active = torch.ones_like(self.posed.error, dtype=torch.bool)
+
+    def _at(self, pose: GarmentPose) -> _Posed:
+        fitter = self.fitter
+        world = combined_transforms(fitter.deformer, self.motion, pose)
+        matrices = fitter._tensor(skinning_matrices(world, fitter.deformer.scene.bind_transforms)[:, :, :3])
+        points = fitter.rest + torch.einsum("fk,kvc->fvc", fitter._tensor(pose.weights), fitter.shapes)
+        each = matrices[:, fitter.indices] * fitter.weights[..., None, None]
+        moved = (each[..., :3] @ points[:, :, None, :, None])[..., 0] + each[..., 3]
+        away = self.wanted - moved.sum(2)
+        return _Posed(fitter._tensor(world), each[..., :3].sum(2), moved, away, (fitter.share * away**2).sum((1, 2)))
+
+    def advance(self) -> bool:
+        """Make one step; return whether any frame may still gain."""
+        trial = self._stepped(self._step())
+        posed, before = self._at(trial), self.posed
+        nearer = (posed.error < before.error) & self.active
+        gain = 1 - posed.error / before.error.clamp_min(torch.finfo(before.error.dtype).tiny)
+        self.damping = torch.where(nearer, self.damping / 10, self.damping * 10).clamp_min(DAMPING[1])
+        self.active &= torch.where(nearer, gain > ENOUGH, self.damping < DAMPING[2])
+        self._accept(nearer, trial, posed)
+        return bool(self.active.any())
+
+    def _accept(self, nearer: Tensor, pose: GarmentPose, posed: _Posed) -> None:
+        def chosen(new: Tensor, old: Tensor) -> Tensor:
+            return torch.where(nearer.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+        rows, own = nearer.cpu().numpy(), self.pose
+        self.pose = GarmentPose(
+            own.start,
+            np.where(rows[:, None, None], pose.rotations, own.rotations),
+            np.where(rows[:, None], pose.weights, own.weights),
+        )
+        self.posed = _Posed(*(chosen(new, old) for new, old in zip(vars(posed).values(), vars(self.posed).values())))
+
+    def _step(self) -> Tensor:
+        """Return changes of weights, then of rotations about the world's axes, shape (F, K + 3 P)."""
+        fitter, posed = self.fitter, self.posed
+        root = fitter.share.sqrt()[..., None]
+        jacobian = (root * self._jacobian()).float().flatten(1, 2)
+        residual = (root[..., 0] * posed.away).float().flatten(1)
+        slope = (jacobian.transpose(1, 2) @ residual[..., None]).double()
+        stuck = self._stuck(slope[..., 0])
+        normal = (jacobian.transpose(1, 2) @ jacobian).double()
+        normal = normal * ~(stuck[:, :, None] | stuck[:, None])
+        slope = slope.masked_fill(stuck[..., None], 0)
+        diagonal = normal.diagonal(dim1=1, dim2=2)
+        scale = diagonal.mean(1, keepdim=True).clamp_min(1e-30)
+        normal = normal + torch.diag_embed(self.damping[:, None] * (diagonal + scale) + stuck * scale)
+        return torch.linalg.solve(normal, slope)[..., 0]
+
+    def _jacobian(self) -> Tensor:
+        """Return derivatives of the vertices, shape (F, V, 3, K + 3 P)."""
+        fitter, posed = self.fitter, self.posed
+        by_weight = torch.einsum("fvij,kvj->fvik", posed.blended, fitter.shapes[:-1])
+        centre = posed.world[:, fitter.joints :, :3, 3]
+        q = torch.einsum("vip,fvic->fvpc", fitter.below, posed.moved)
+        x, y, z = (q - fitter.bound[..., None] * centre[:, None]).unbind(-1)
+        zero = torch.zeros_like(x)
+        turns = [torch.stack(axis, dim=2) for axis in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
+        by_turn = torch.stack(turns, dim=-1).flatten(3)
+        return torch.cat([by_weight, by_turn], dim=-1)
+
+    def _stuck(self, slope: Tensor) -> Tensor:
+        """Return which unknowns are weights at an end of their range that they would leave, shape (F, K + 3 P)."""
+        weights = self.fitter._tensor(self.pose.weights)[:, :-1]
+        ends = ((weights <= 0) & (slope[:, : weights.shape[1]] < 0)) | (
+            (weights >= 1) & (slope[:, : weights.shape[1]] > 0)
+        )
+        return torch.cat([ends, ends.new_zeros(len(ends), 3 * self.fitter.proxies)], dim=1)
+
+    def _stepped(self, step: Tensor) -> GarmentPose:
+        """Return the pose after a step."""
+        fitter, pose = self.fitter, self.pose
+        shapes = fitter.shapes[:-1].shape[0]
+        weights = pose.weights.copy()
+        weights[:, :shapes] = (weights[:, :shapes] + step[:, :shapes].cpu().numpy()).clip(0, 1)
+        turn = torch.matrix_exp(_cross(step[:, shapes:].reshape(len(step), -1, 3))).cpu().numpy()
+        above = self.posed.world[:, fitter.above, :3, :3].cpu().numpy()
+        turned = np.swapaxes(above, -1, -2) @ turn @ above @ matrix_from_quaternion(pose.rotations)
+        return GarmentPose(pose.start, quaternion_from_matrix(turned), weights)
+
+    def found(self) -> Fit:
+        """Return the poses as they are now."""
+        distance = self.posed.away.norm(dim=2).amax(1)
+        return Fit(self.pose, self.posed.error.sqrt().cpu().numpy(), distance.cpu().numpy())
+
+
+def _cross(vectors: Tensor) -> Tensor:
+    """Return the matrices whose products are cross products with vectors (..., 3), shape (..., 3, 3)."""
+    x, y, z = vectors.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(*x.shape, 3, 3)

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Refining a rollout of the toy world: monotone, what it looks back on, and where it ends."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ssilk_core.assets import PINNED
+from ssilk_core.errors import SsilkError
+from ssilk_core.fabrics import Fabric
+from ssilk_core.refine import RefineOptions, Refiner, Summary
+from ssilk_core.rollout import decode, garment_poses
+from ssilk_core.simulate import SimulationOptions, minimise, simulate
+from ssilk_core.simulate.newton import SolverOptions
+
+CLOTH = Fabric("toy", bending=1e-4, margin=0.01)
+FRAMES = 9
+
+
+@pytest.fixture(scope="module")
+def rollout(scene, toy_model, toy_motion):
+    """A motion and the network's vertices over it, some of them inside the ball."""
+    model, motion = toy_model(scene), toy_motion(scene, FRAMES)
+    points = np.concatenate([decode(model, motion, pose) for pose in garment_poses(model, motion, 30.0)])
+    points[:, scene.classes != PINNED] += [0, 0, 0.06]
+    return motion, points
+
+
+def refined(scene, motion, points, **options):
+    """Refined vertices (F, V, 3) and what was changed in each frame."""
+    frames = list(Refiner(scene, CLOTH, RefineOptions(**options), fps=motion.fps).frames(motion, points))
+    return np.stack([frame.points for frame in frames]), [frame.change for frame in frames]
+
+
+def test_no_frame_gains_energy_with_more_iterations(scene, rollout) -> None:
+    motion, points = rollout
+    found = [refined(scene, motion, points, iterations=n)[1] for n in (1, 2, 4, 8, 16)]
+    for few, more in zip(found, found[1:]):
+        assert all(a.before == pytest.approx(b.before, abs=1e-12) for a, b in zip(few, more))
+        assert all(b.after <= a.after + 1e-12 for a, b in zip(few, more))
+    assert all(change.after < change.before for change in found[0])
+
+
+def test_vertices_come_out_of_the_body(scene, rollout) -> None:
+    _, changes = refined(scene, *rollout, iterations=8)
+    summary = Summary(changes).figures()
+    assert summary["inside the body before"] > 0.02 and summary["inside the body"] < 0.002
+    assert summary["energy [J]"] < summary["energy before [J]"]
+
+
+@pytest.mark.parametrize("feedback", [False, True])
+def test_pinned_vertices_stay_and_what_moved_is_stated(scene, rollout, feedback) -> None:
+    motion, points = rollout
+    found, changes = refined(scene, motion, points, iterations=3, feedback=feedback)
+    pinned = scene.classes == PINNED
+    np.testing.assert_allclose(found[:, pinned], points[:, pinned], atol=2e-6)
+    largest = np.linalg.norm(found - points, axis=-1).max(axis=1)
+    assert all(0 < change.moved < most for change, most in zip(changes, largest))
+
+
+def test_without_feedback_a_stretch_by_itself_comes_out_alike(scene, rollout) -> None:
+    motion, points = rollout
+    whole, _ = refined(scene, motion, points, iterations=3, batch=4)
+    one_by_one, _ = refined(scene, motion, points, iterations=3, batch=1)
+    part, _ = refined(scene, motion.clip(3, 8), points[3:8], iterations=3)
+    np.testing.assert_allclose(one_by_one, whole, atol=1e-6)
+    np.testing.assert_allclose(part[2:], whole[5:8], atol=1e-6)  # after the two frames that have less of a past
+
+
+def test_with_feedback_it_becomes_the_simulator(scene, rollout) -> None:
+    motion, points = rollout
+    solver = SolverOptions(tolerance=1e-5, iterations=300)
+    options = SimulationOptions(solver=solver, rest=replace(solver, tolerance=1e-5))
+    (expected,) = simulate(scene, CLOTH, [motion], options)
+    start = points.copy()
+    start[0] = minimise(scene, CLOTH, motion.clip(0, 1), options)[0]  # the rest state that the simulator begins with
+    found, changes = refined(scene, motion, start, iterations=300, tolerance=1e-5, feedback=True)
+    assert max(change.imbalance for change in changes) < 1e-5
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+    alone, _ = refined(scene, motion, start, iterations=300, tolerance=1e-5)
+    assert np.abs(alone - expected).max() > 1e-3
+
+
+def test_a_cut_is_not_looked_back_over(scene, rollout) -> None:
+    motion, points = rollout
+    moved = motion.translations.copy()
+    moved[5:, 0] += [20.0, 0.0, 0.0]
+    points = points + np.where(np.arange(FRAMES) >= 5, 20.0, 0.0)[:, None, None] * [1, 0, 0]
+    cut = replace(motion, translations=moved)
+    found, _ = refined(scene, cut, points, iterations=3, feedback=True)
+    after, _ = refined(scene, cut.clip(5, FRAMES), points[5:], iterations=3, feedback=True)
+    np.testing.assert_allclose(found[5:], after, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"), [({"iterations": 0}, "1 to 10000"), ({"iterations": 2, "batch": 0}, "at least 1")]
+)
+def test_options_that_cannot_be_are_refused(change, words) -> None:
+    with pytest.raises(SsilkError, match=words):
+        RefineOptions(**change)
+
+
+def test_what_does_not_fit_is_refused(scene, rollout) -> None:
+    motion, points = rollout
+    refiner = Refiner(scene, CLOTH, RefineOptions(iterations=1), fps=60.0)
+    with pytest.raises(SsilkError, match="30 frames per second; 60 is needed"):
+        next(refiner.frames(motion, points))
+    broken = points.copy()
+    broken[0, 3] = np.nan
+    with pytest.raises(SsilkError, match="first state of 1 of 1 frames has no finite energy"):
+        refined(scene, motion, broken, iterations=1)
