@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -38,7 +39,7 @@ def refined(scene, motion, points, **options):
 def test_no_frame_gains_energy_with_more_iterations(scene, rollout) -> None:
     motion, points = rollout
     found = [refined(scene, motion, points, iterations=n)[1] for n in (1, 2, 4, 8, 16)]
-    for few, more in zip(found, found[1:]):
+    for few, more in pairwise(found):
         assert all(a.before == pytest.approx(b.before, abs=1e-12) for a, b in zip(few, more))
         assert all(b.after <= a.after + 1e-12 for a, b in zip(few, more))
     assert all(change.after < change.before for change in found[0])
