@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import bpy
-from bpy.props import PointerProperty, StringProperty
+from bpy.props import BoolProperty, PointerProperty, StringProperty
 
 from . import fabric_properties, training_properties
 from .fabric_properties import FabricSettings
@@ -36,6 +36,7 @@ class GarmentSettings(bpy.types.PropertyGroup):
         options=RELATIVE,
         description="Trained model of the garment; that of its own training when empty",
     )
+    live: BoolProperty(description="Whether the garment is played live", options={"HIDDEN"})
     training: PointerProperty(type=TrainingSettings, name="Training", description="How the garment is trained")
 
 

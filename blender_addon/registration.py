@@ -6,7 +6,7 @@ from __future__ import annotations
 import bpy
 
 from . import overlay, panels, preferences, preflight_properties, properties
-from .operators import baking, classes, environment, fill, preflight, rig, tasks, training
+from .operators import baking, classes, environment, fill, preflight, rig, stages, tasks, training
 from .operators import overlay as overlay_switch
 from .panels import plot
 
@@ -20,6 +20,7 @@ CLASSES = (
     *fill.CLASSES,
     *overlay_switch.CLASSES,
     *rig.CLASSES,
+    *stages.CLASSES,
     *preflight.CLASSES,
     *training.CLASSES,
     *baking.CLASSES,

@@ -136,6 +136,23 @@ class Shot:
     activations: np.ndarray
 
 
+@dataclass(frozen=True, eq=False)
+class Staged:
+    """What a stage knows of a garment that Blender's importer leaves out.
+
+    Attributes:
+        name: of its prim.
+        proxies: names of its proxies.
+        plain: its weights before it was rigged, shape (V, len(plain_joints)), or None.
+        plain_joints: names of the joints that these are over.
+    """
+
+    name: str
+    proxies: tuple[str, ...]
+    plain: np.ndarray | None
+    plain_joints: tuple[str, ...]
+
+
 def influences(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return joint indices and weights of each vertex, heaviest first, shape (V, I), of dense weights (V, J)."""
     width = max(int((weights > 0).sum(axis=1).max(initial=0)), 1)

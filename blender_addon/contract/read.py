@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Usd, UsdGeom, UsdSkel
+from pxr import Tf, Usd, UsdGeom, UsdSkel
 
-from .arrays import Joints, Rig, dense
+from ..errors import SetupError
+from .arrays import Joints, Rig, Staged, dense
 from .names import joint_paths
 from .write import CLASS, PLAIN, PROXIES, ROOT, SKIN
 
@@ -32,6 +33,31 @@ def read_rig(path: Path, garment: str, joints: Joints) -> Rig:
         binds=_binds(UsdSkel.Skeleton.Get(stage, ROOT.AppendChild("Skeleton")), proxies),
         weights=_weights(prim, SKIN, "skel:joints", index),
         plain=_weights(prim, PLAIN[:2], PLAIN[2], index)[:, : len(joints.names)],
+    )
+
+
+def read_staged(path: Path) -> tuple[list[Staged], float | None]:
+    """Read the garments with proxies of any stage, and its frames per second, None where it does not say.
+
+    Raises:
+        SetupError: it is no USD file.
+    """
+    try:
+        stage = Usd.Stage.Open(str(path))
+    except Tf.ErrorException as error:
+        raise SetupError(f"'{path}' is no USD file that can be read; choose one that `ssilk rig` wrote.") from error
+    found = [_staged(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh) and _value(prim, PROXIES)]
+    return found, stage.GetFramesPerSecond() if stage.HasAuthoredTimeCodeRange() else None
+
+
+def _staged(prim: Usd.Prim) -> Staged:
+    own = tuple(str(name).rpartition("/")[2] for name in _value(prim, PLAIN[2]) or ())
+    index = {str(name): joint for joint, name in enumerate(_value(prim, PLAIN[2]) or ())}
+    return Staged(
+        name=prim.GetName(),
+        proxies=tuple(str(name).rpartition("/")[2] for name in _value(prim, PROXIES)),
+        plain=_weights(prim, PLAIN[:2], PLAIN[2], index) if own else None,
+        plain_joints=own,
     )
 
 

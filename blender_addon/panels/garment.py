@@ -18,6 +18,7 @@ class GarmentPanel(Panel, bpy.types.Panel):
         layout, reason = self.layout, unusable(context.object)
         if reason:
             draw_text(layout, reason, icon="INFO")
+            layout.operator("ssilk.import_stage", icon="IMPORT")
         else:
             layout.use_property_split = True
             layout.prop(context.object.ssilk, "armature")

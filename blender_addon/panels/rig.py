@@ -32,3 +32,4 @@ class RigPanel(Panel, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         draw_text(self.layout, rig_line(context.object))
         self.layout.operator("ssilk.generate_rig", icon="BONE_DATA")
+        self.layout.operator("ssilk.adopt_rig", icon="IMPORT")
