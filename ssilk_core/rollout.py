@@ -22,6 +22,8 @@ CHUNK = 256  # frames decoded at once
 HISTORY = 2  # frames before a chunk that its descriptors look back on
 DOWN = (0.0, -1.0, 0.0)
 LOST = 1e3  # of a latent: trained ones stay below ten, and no decoder knows what this means
+STILL = 1e-7  # [rad, m] by which a character may move and count as holding still
+CALM = 3e-5  # by which a latent may still move in a frame and count as at rest
 RECOVERY = 15  # frames at rest after a lost state, half a second of the usual rate
 
 OnRecovery = Callable[[range], None]
@@ -61,7 +63,8 @@ def roll(model: GarmentModel, span: Motion, chunk: int = CHUNK, *, pre_roll: flo
 def roll_blocks(model: GarmentModel, blocks: Iterable[Motion]) -> Iterator[Step]:
     """Yield the garment's pose over each of consecutive blocks of a motion without cuts, at the model's rate.
 
-    A motion of any length takes the memory of one block. A state that is not finite, or that leaves all bounds, is
+    A motion of any length takes the memory of one block, and one in which a calm garment's character holds still
+    the work of one frame. A state that is not finite, or that leaves all bounds, is
     replaced by the quasi-static one for `RECOVERY` frames, from which the rollout goes on.
 
     Raises:
@@ -74,10 +77,21 @@ def roll_blocks(model: GarmentModel, blocks: Iterable[Motion]) -> Iterator[Step]
         need(abs(block.fps - fps) < 1e-6, block.path, f"{block.fps:g} frames per second",
              f"the model steps at {fps:g}")  # fmt: skip
         seen = block if past is None else _following(past, block)
-        states, lost = _advance(model, seen, block.frame_count, start, state)
-        yield Step(start, *_decoded(model, torch.cat(states[-block.frame_count :]), lost))
+        if _is_calm(seen, state):
+            states = [state[-1]] * HISTORY
+            parts = _decoded(model, state[-1], torch.zeros(1, dtype=torch.bool, device=state[-1].device))
+            yield Step(start, *(part.expand(*part.shape[:-1], block.frame_count) for part in parts))
+        else:
+            states, lost = _advance(model, seen, block.frame_count, start, state)
+            yield Step(start, *_decoded(model, torch.cat(states[-block.frame_count :]), lost))
         past, state = seen.clip(max(0, seen.frame_count - HISTORY), seen.frame_count), states[-HISTORY:]
         start += block.frame_count
+
+
+def _is_calm(seen: Motion, state: list[Tensor]) -> bool:
+    """Return whether a character holds still in all frames of `seen`, and the garment did in the last of `state`."""
+    held = max(np.ptp(seen.rotations, axis=0).max(), np.ptp(seen.translations, axis=0).max()) < STILL
+    return len(state) == HISTORY and held and bool((state[-1] - state[-2]).abs().max() < CALM)
 
 
 def _following(past: Motion, block: Motion) -> Motion:

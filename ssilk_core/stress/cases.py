@@ -215,7 +215,7 @@ CASES = (
     Case("motion", "a ride at 50 m/s", moved(ride)),
     Case("motion", "a spin of 30 rad/s", turned(DOWN, speed=30.0)),
     Case("motion", "tumbling at 30 rad/s", turned(SIDE, speed=30.0)),
-    Case("motion", "a stop within one frame", driven(lambda subject, base: drives.stopping(base, 1.0))),
+    Case("motion", "a stop within one frame", driven(lambda subject, base: drives.stopping(base, base.loop / 4))),
     Case("motion", "one pose throughout", driven(lambda subject, base: drives.stopping(base, 0.0))),
     Case("motion", "poses of any joint angles", contorted(0.5)),
     Case("motion", "other such poses in each frame", contorted(1e-3)),

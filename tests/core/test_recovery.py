@@ -8,7 +8,9 @@ import pytest
 import torch
 
 from ssilk_core.assets import Motion
+from ssilk_core.config import ModelConfig
 from ssilk_core.kinematics import split_at_cuts
+from ssilk_core.model.network import GarmentModel
 from ssilk_core.rollout import RECOVERY, garment_poses, roll, roll_blocks
 
 
@@ -120,3 +122,21 @@ def test_a_jump_anywhere_is_a_cut(at):
     speeds = np.zeros(59)
     speeds[at] = 300
     assert [span.frame_count for span in split_at_cuts(flight(speeds))] == [at + 1, 59 - at]
+
+
+def test_a_calm_garment_sleeps_while_its_character_holds_still_and_wakes(scene, toy_motion):
+    """All springs of a fresh spring scheme are made quick, so that it comes to rest within the first block."""
+    config = ModelConfig(latent=6, widths=(16,), shapes=4, scheme="spring_verlet")
+    model = GarmentModel(scene, config, np.arange(3)).eval()
+    with torch.no_grad():
+        model.integrator.share.fill_(3.0)
+        model.output[-1].weight.mul_(100)
+    clip = toy_motion(scene, 60)
+    order = np.concatenate([np.arange(60), np.full(440, 59), np.arange(59, -1, -1)])
+    motion = replace(clip, rotations=clip.rotations[order], translations=clip.translations[order])
+    steps = list(roll(model, motion, 100))
+    found = torch.cat([step.activation for step in steps], dim=1)
+    assert not found[:, 300:500].diff(dim=1).any() and found[:, 500:].diff(dim=1).abs().max() > 1e-3
+    assert [step.start for step in steps] == [0, 100, 200, 300, 400, 500]
+    whole = torch.cat([step.activation for step in roll(model, motion, 560)], dim=1)  # one block, never asleep
+    torch.testing.assert_close(found, whole, atol=1e-4, rtol=0)
