@@ -13,21 +13,17 @@ at a minimum, so the search pulls it down.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
-import torch
 from reports import table, write_results
 from subjects import Subject, arguments, clip_of, open_subject, parsed
-from torch import Tensor
 
 from ssilk_core.evaluation.methods import Network, reel_of
-from ssilk_core.evaluation.metrics import mean_square
+from ssilk_core.evaluation.minimum import minima
 from ssilk_core.evaluation.probes import held
 from ssilk_core.evaluation.takes import Take, stopped
 from ssilk_core.simulate import SimulationOptions, Simulator
 from ssilk_core.simulate.newton import SolverOptions
-from ssilk_core.simulate.potential import Planes, Setting
 
 STOPS = (("02_04", 1.7), ("02_04", 3.7), ("02_02", 1.1), ("05_12", 4.0))
 HOLD = 5.0  # [s]
@@ -36,65 +32,9 @@ HEADER = ("garment", "stopped at", "kinetic energy at the stop [J]", "after 5 s"
           "RMS off the minimum [mm]", "inside the body", "at the minimum", "out of balance [g]")  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class Rest:
-    """Cloth in one pose and the minimum of its static energy nearby; positions (V, 3, 1) [m] about the root.
-
-    Attributes:
-        simulator: which found the minimum.
-        setting: body and gravity.
-        start, plain: where the search began, and plain skinning.
-        x: the minimum.
-        imbalance: what the solver left out of balance [g].
-    """
-
-    simulator: Simulator
-    setting: Setting
-    start: Tensor
-    plain: Tensor
-    x: Tensor
-    imbalance: float
-
-    def over(self) -> float:
-        """Return the energy of the start over the minimum's [J]."""
-        potential, setting = self.simulator.potential, self.setting
-        start, lowest = (float(potential.energy(x, setting, self.planes(x))) for x in (self.start, self.x))
-        return start - lowest
-
-    def planes(self, x: Tensor) -> Planes:
-        planes = self.simulator.potential.planes(x, self.setting)
-        assert planes is not None
-        return planes
-
-    def floats(self, x: Tensor) -> float:
-        """Return how much more gravity has to gain from x than from the minimum [J]."""
-        mass = self.simulator.potential.mass
-        return float((mass * ((self.x - x) * self.setting.gravity).sum(1)).sum())
-
-    def inside(self, x: Tensor) -> float:
-        """Return the share of vertices inside the body."""
-        return float((self.planes(x).distance(x) < 0).double().mean())
-
-    def distance(self) -> float:
-        """Return the RMS distance of the start from the minimum over the mass [m]."""
-        return float(mean_square(self.start - self.x, self.simulator.potential.mass[:, 0])) ** 0.5
-
-
-def rest_of(simulator: Simulator, take: Take, x: Tensor) -> Rest:
-    """Minimise the static energy in a take's last pose from x (V, 3, 1), which is about the take's first root."""
-    motion, potential = take.motion, simulator.potential
-    poses = simulator.actors.posed(motion.rotations[-1:], motion.translations[-1:])
-    origin = torch.as_tensor(motion.translations[0, 0].copy(), device=x.device)
-    local = x.double() + origin[:, None] - poses.root
-    start = poses.plain.index_copy(0, potential.free, local[potential.free])
-    found = simulator.rest(poses, start)
-    setting = Setting(poses.body, simulator.gravity)
-    return Rest(simulator, setting, start, poses.plain, found.x, float(found.imbalance))
-
-
 def measure(subject: Subject, clip: str, stop: float, options: Any) -> dict[str, float]:
     """Return the figures of one stop."""
-    dressed = subject.dressed
+    dressed, weight = subject.dressed, subject.dressed.weight
     motion, first = stopped(clip_of(options, clip, subject), dressed.fps, stop, HOLD)
     take, last = Take(clip, 0, motion), range(motion.frame_count - 1, motion.frame_count)
     reel = reel_of([take], dressed, subject.model.joints)
@@ -102,21 +42,21 @@ def measure(subject: Subject, clip: str, stop: float, options: Any) -> dict[str,
     settings = SimulationOptions(fps=dressed.fps, rest=SolverOptions(iterations=options.iterations))
     simulator = Simulator(dressed.scene, dressed.fabric, settings, device=dressed.device)
     hold = held(dressed, reel, network, [first])[0]
-    rest, still = (rest_of(simulator, take, at(0, last)) for at in (network.vertices, network.still))
+    rest, still = (minima(simulator, [take], at(0, last)) for at in (network.vertices, network.still))
     return {
         "kinetic at the stop [J]": hold.begun,
         "kinetic after 5 s [J]": hold.kinetic,
         "calm after [s]": hold.settling,
         "off P [m]": hold.distance,
         "over P [J]": hold.above,
-        "over the minimum [J]": rest.over(),
-        "floats [m g L]": rest.floats(rest.start) / dressed.weight,
-        "P floats [m g L]": still.floats(still.start) / dressed.weight,
-        "plain floats [m g L]": rest.floats(rest.plain) / dressed.weight,
-        "distance [m]": rest.distance(),
-        "inside": rest.inside(rest.start),
-        "inside at the minimum": rest.inside(rest.x),
-        "out of balance [g]": rest.imbalance,
+        "over the minimum [J]": float(rest.over()),
+        "floats [m g L]": float(rest.floats(rest.start)) / weight,
+        "P floats [m g L]": float(still.floats(still.start)) / weight,
+        "plain floats [m g L]": float(rest.floats(rest.poses.plain)) / weight,
+        "distance [m]": float(rest.distance()),
+        "inside": float(rest.inside(rest.start)),
+        "inside at the minimum": float(rest.inside(rest.x)),
+        "out of balance [g]": float(rest.imbalance),
     }
 
 

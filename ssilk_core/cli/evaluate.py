@@ -48,6 +48,8 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--sequence", type=int, metavar="FRAMES", help="start clips anew after so many (paper: 512)")
     verb.add_argument("--stops", type=int, default=2, help="stops in each clip to hold poses after (default 2)")
     verb.add_argument("--hold", type=float, default=3.0, metavar="S", help="how long poses are held (default 3)")
+    verb.add_argument("--minimum", action="store_true",
+                      help="minimise the energy of held poses without the network (slow on a CPU)")  # fmt: skip
     verb.add_argument("--loop", type=int, default=2000, metavar="FRAMES",
                       help="length of loops, none for 0 (default 2000)")  # fmt: skip
     verb.add_argument("-o", "--output", type=Path, help="figures to write (.json), in SI units")
@@ -64,7 +66,9 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     if options.output:
         need(options.output.suffix == ".json", str(options.output), "not a name for figures", "it ends in .json")
         shared.check_output(options.output, *options.models, options.index)
-    asked = EvaluationOptions(sequence=options.sequence, stops=options.stops, hold=options.hold, loop=options.loop)
+    asked = EvaluationOptions(
+        sequence=options.sequence, stops=options.stops, hold=options.hold, minimum=options.minimum, loop=options.loop
+    )
     device = chosen_device(options.device)
     opened = [Opened(path, *load_network(path)) for path in options.models]
     rows: list[Row] = []
@@ -201,7 +205,7 @@ def _write(
     from ssilk_core.devices import device_name
     from ssilk_core.files import sha256
 
-    asked = {name: getattr(options, name) for name in ("clips", "sequence", "stops", "hold", "loop")}
+    asked = {name: getattr(options, name) for name in ("clips", "sequence", "stops", "hold", "minimum", "loop")}
     document = {
         "units": "SI",
         "models": {str(one.path): sha256(one.path) for one in opened},

@@ -70,6 +70,26 @@ class Holds:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Hung:
+    """Where garments were at the end of holds, beside the minimum of the static energy near there.
+
+    Attributes:
+        stops: how many.
+        above: energy over the minimum's [J].
+        floats, plain: gravity over the minimum's, of the garment and of plain skinning, as shares of m g L.
+        distance: RMS from the minimum [m].
+        imbalance: what the solver left out of balance, at most [g].
+    """
+
+    stops: int
+    above: float
+    floats: float
+    plain: float
+    distance: float
+    imbalance: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class Loops:
     """Clips looped seamlessly; the second loop, which no start disturbs, beside the last.
 
@@ -103,7 +123,7 @@ class Figures:
         motion: RMS distance to the method's own quasi-static state of each pose [m].
         jitter: RMS third derivative over mass and frames [m/s3]; `jitter_of_plain`: relative to plain skinning's.
         stretches: 50, 95 and 99 % quantiles and the largest of the larger principal stretch.
-        truth, poses, holds, loops: what else was asked for, where the method has it.
+        truth, poses, holds, hung, loops: what else was asked for, where the method has it.
     """
 
     clips: int
@@ -121,4 +141,5 @@ class Figures:
     truth: Against | None = None
     poses: Poses | None = None
     holds: Holds | None = None
+    hung: Hung | None = None
     loops: Loops | None = None

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -21,6 +22,7 @@ from ..fabrics import Fabric
 from ..model.body import CollisionBody
 from ..model.descriptors import GRAVITY
 from ..model.skinning import Skinning
+from ..simulate import SimulationOptions, Simulator
 from ..training.bank import MotionBank, build_bank
 from ..training.validation import Rolled, roll_states
 from .takes import Take
@@ -72,6 +74,11 @@ class Dressed:
     def name(self) -> str:
         """Name of the garment's prim."""
         return self.scene.garment.mesh.path.rpartition("/")[2]
+
+    @cached_property
+    def simulator(self) -> Simulator:
+        """The reference simulator of this garment."""
+        return Simulator(self.scene, self.fabric, SimulationOptions(fps=self.fps), device=self.device)
 
     def plain(self, character: Tensor) -> Tensor:
         """Return plain skinning's positions (V, 3, N) [m] of skinning matrices (J, 3, 4, N)."""

@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from .figures import Holds, Loops
+from .figures import Holds, Hung, Loops
 from .methods import Dressed, Method, Reel
 from .metrics import kinetic_energy, mean_square, settling_time
 from .record import frame_energies
@@ -63,25 +65,43 @@ def _held(dressed: Dressed, reel: Reel, method: Method, take: int, first: int) -
     )
 
 
+def last_frames(method: Method, takes: Sequence[Take]) -> Tensor:
+    """Return the last positions of all takes (V, 3, N) [m], each about its own first root."""
+    ends = [range(take.frame_count - 1, take.frame_count) for take in takes]
+    return torch.cat([method.vertices(number, last) for number, last in enumerate(ends)], dim=-1)
+
+
 def joined_holds(single: Sequence[Holds]) -> Holds | None:
     """Return the figures of several stops; None of none."""
     if not single:
         return None
-    table = {
-        name: torch.tensor([getattr(hold, name) for hold in single], dtype=torch.float64) for name in vars(single[0])
-    }
-    means = {name: float(values.mean()) for name, values in table.items()}
-    middle = table["settling"].sort().values[(len(single) - 1) // 2]
-    distances = table["distance"]
-    return Holds(
-        **{
-            **means,
-            "stops": len(single),
-            "settling": float(middle),
-            "distance": float(distances.square().mean()) ** 0.5,
-            "furthest": float(distances.max()),
-        }
-    )
+    columns = _columns(single)
+    middle = columns["settling"].sort().values[(len(single) - 1) // 2]
+    changed = {"stops": len(single), "settling": float(middle), "distance": _root_mean_square(columns["distance"])}
+    return replace(single[0], **_means(columns) | changed | {"furthest": float(columns["distance"].max())})
+
+
+def joined_hung(single: Sequence[Hung]) -> Hung | None:
+    """Return the figures of several stops; None of none."""
+    if not single:
+        return None
+    columns = _columns(single)
+    changed = {"stops": len(single), "distance": _root_mean_square(columns["distance"])}
+    return replace(single[0], **_means(columns) | changed | {"imbalance": float(columns["imbalance"].max())})
+
+
+def _columns(figures: Sequence[Holds] | Sequence[Hung] | Sequence[Loops]) -> dict[str, Tensor]:
+    """Return each figure of several ones, shape (N,)."""
+    names = vars(figures[0])
+    return {name: torch.tensor([vars(one)[name] for one in figures], dtype=torch.float64) for name in names}
+
+
+def _means(columns: Mapping[str, Tensor]) -> dict[str, Any]:
+    return {name: float(values.mean()) for name, values in columns.items()}
+
+
+def _root_mean_square(values: Tensor) -> float:
+    return float(values.square().mean()) ** 0.5
 
 
 def looped(takes: Sequence[Take], fps: float, frames: int) -> tuple[list[Take], list[int]]:
@@ -123,17 +143,11 @@ def joined_loops(single: Sequence[Loops]) -> Loops | None:
     """Return the figures of several clips; None of none."""
     if not single:
         return None
-    table = {
-        name: torch.tensor([getattr(loop, name) for loop in single], dtype=torch.float64) for name in vars(single[0])
+    columns = _columns(single)
+    drifts = columns["drift"]
+    changed = {
+        "clips": len(single),
+        "frames": int(columns["frames"].min()),
+        "apart": _root_mean_square(columns["apart"]),
     }
-    means = {name: float(values.mean()) for name, values in table.items()}
-    drifts = table["drift"]
-    return Loops(
-        **{
-            **means,
-            "clips": len(single),
-            "frames": int(table["frames"].min()),
-            "most": float(drifts[drifts.abs().argmax()]),
-            "apart": float(table["apart"].square().mean()) ** 0.5,
-        }
-    )
+    return replace(single[0], **_means(columns) | changed | {"most": float(drifts[drifts.abs().argmax()])})

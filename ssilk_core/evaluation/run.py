@@ -15,10 +15,11 @@ from ..errors import need
 from ..events import Progress, Reporter, silent
 from ..training.bank import MotionBank, build_bank
 from ..training.validation import Rolled
-from .figures import Figures, Holds, Loops
+from .figures import Figures, Holds, Hung, Loops
 from .methods import Cache, Dressed, Method, Network, Plain, Reader, Reel, reel_of
 from .metrics import pose_distance
-from .probes import drifted, held, joined_holds, joined_loops, looped, stops
+from .minimum import hung, minima
+from .probes import drifted, held, joined_holds, joined_hung, joined_loops, last_frames, looped, stops
 from .record import recorded
 from .takes import takes_of
 from .tally import Tally, against, figures, poses, takes_in
@@ -34,12 +35,14 @@ class EvaluationOptions:
         sequence: frames after which a clip starts anew, as in the paper (512); None for whole clips.
         stops: stops in each clip after which poses are held; none for zero.
         hold: how long they are held [s].
+        minimum: whether the reference simulator minimises the energy of held poses, which takes long on a CPU.
         loop: frames that the first seconds of each clip loop for, at least; none for zero.
     """
 
     sequence: int | None = None
     stops: int = 2
     hold: float = 3.0
+    minimum: bool = False
     loop: int = 2000
 
     def __post_init__(self) -> None:
@@ -155,19 +158,18 @@ class _Run:
         """Yield the figures of a network."""
         reel = reel_of(self.takes, self.dressed, subject.joints)
         tally = self._tally(reel, Network(subject.name, subject.model, reel), list(self.clips))
-        far, holds, loops = self._distances(reel, subject), self._holds(subject), self._loops(subject)
+        far, loops = self._distances(reel, subject), self._loops(subject)
+        holds, rested = self._holds(subject)
         for row in self.rows(tally, subject.name):
             names = self.playlist.splits[row.split]
-            takes = takes_in(self.clips, names)
-            yield replace(
-                row,
-                figures=replace(
-                    row.figures,
-                    poses=poses(tally.only(takes), far) if far else None,
-                    holds=joined_holds([hold for clip, hold in holds if clip in names]),
-                    loops=joined_loops([loop for clip, loop in loops if clip in names]),
-                ),
+            found = replace(
+                row.figures,
+                poses=poses(tally.only(takes_in(self.clips, names)), far) if far else None,
+                holds=joined_holds([hold for clip, hold in holds if clip in names]),
+                hung=joined_hung([rest for clip, rest in rested if clip in names]),
+                loops=joined_loops([loop for clip, loop in loops if clip in names]),
             )
+            yield replace(row, figures=found)
 
     def _distances(self, reel: Reel, subject: Subject) -> dict[int, Tensor]:
         """Return how far the poses of each take are from those seen in training [rad], (N,); empty if not known."""
@@ -178,15 +180,21 @@ class _Run:
         far = pose_distance(_upright(reel.bank), _upright(seen), len(subject.joints))
         return dict(enumerate(far.split((reel.bank.stops - reel.bank.starts).tolist())))
 
-    def _holds(self, subject: Subject) -> list[tuple[str, Holds]]:
-        """Return what happens after stops, with the clip of each."""
-        options, fps = self.options, self.dressed.fps
+    def _holds(self, subject: Subject) -> tuple[list[tuple[str, Holds]], list[tuple[str, Hung]]]:
+        """Return what happens after stops, and where that is beside the minimum, with the clip of each."""
+        options, dressed = self.options, self.dressed
         if not options.stops:
-            return []
-        takes, first = stops(self.takes, fps, options.stops, options.hold)
-        reel = reel_of(takes, self.dressed, subject.joints)
-        found = held(self.dressed, reel, Network(subject.name, subject.model, reel), first)
-        return [(take.clip, hold) for take, hold in zip(takes, found)]
+            return [], []
+        takes, first = stops(self.takes, dressed.fps, options.stops, options.hold)
+        reel, clips = reel_of(takes, dressed, subject.joints), [take.clip for take in takes]
+        network = Network(subject.name, subject.model, reel)
+        holds = held(dressed, reel, network, first)
+        rested = (
+            hung(minima(dressed.simulator, takes, last_frames(network, takes)), dressed.weight)
+            if options.minimum
+            else []
+        )
+        return list(zip(clips, holds)), list(zip(clips, rested))
 
     def _loops(self, subject: Subject) -> list[tuple[str, Loops]]:
         """Return how looped takes drift, with the clip of each."""

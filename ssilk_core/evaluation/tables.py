@@ -8,7 +8,7 @@ from math import degrees, isfinite
 from typing import Any
 
 from ..energy import TERMS
-from .figures import Against, Figures, Holds, Loops, Poses
+from .figures import Against, Figures, Holds, Hung, Loops, Poses
 from .run import Row
 
 
@@ -48,6 +48,8 @@ TRUTH = ("frames", "excess [J]", "simulator [J]", "floats, of m g L", "position 
          "acceleration [m/s2]", "jitter, of its")  # fmt: skip
 HOLDS = ("stops", "kinetic at the stop [J]", "at the end", "settle", "within [s]", "off P, RMS [mm]", "at most",
          "over P [J]", "floats over P, of m g L")  # fmt: skip
+HUNG = ("stops", "over the minimum [J]", "floats, of m g L", "plain skinning floats", "off it, RMS [mm]",
+        "out of balance, at most [g]")  # fmt: skip
 LOOPS = ("clips", "frames", "second loop [J]", "last [J]", "drift [J]", "at most", "apart [mm]")
 POSES = ("from trained poses, mean [deg]", "95 %", "total, nearest half [J]", "furthest tenth [J]")
 
@@ -75,6 +77,11 @@ def _holds(f: Holds) -> list[str]:
             _millimetres(f.distance), _millimetres(f.furthest), f"{f.above:.4f}", f"{f.floats:+.2%}"]  # fmt: skip
 
 
+def _hung(f: Hung) -> list[str]:
+    return [str(f.stops), f"{f.above:.4f}", f"{f.floats:+.2%}", f"{f.plain:+.2%}", _millimetres(f.distance),
+            f"{f.imbalance:.1g}"]  # fmt: skip
+
+
 def _loops(f: Loops) -> list[str]:
     return [str(f.clips), str(f.frames), f"{f.second:.4g}", f"{f.last:.4g}", f"{f.drift:+.2g}", f"{f.most:+.2g}",
             _millimetres(f.apart)]  # fmt: skip
@@ -93,6 +100,7 @@ KINDS: tuple[tuple[Callable[[Figures], Any], Sequence[str], Callable[[Any], list
     (lambda figures: figures.truth, TRUTH, _truth),
     (lambda figures: figures, MOVING, _moving),
     (lambda figures: figures.holds, HOLDS, _holds),
+    (lambda figures: figures.hung, HUNG, _hung),
     (lambda figures: figures.loops, LOOPS, _loops),
     (lambda figures: figures.poses, POSES, _poses),
 )

@@ -18,7 +18,18 @@ from ssilk_core.baselines.networks import METHODS, BaselineConfig, baseline
 from ssilk_core.energy import TERMS
 from ssilk_core.errors import SsilkError
 from ssilk_core.evaluation.methods import Cache, Dressed, Network, Plain, Reel, reel_of
-from ssilk_core.evaluation.probes import CALM, drifted, held, joined_holds, joined_loops, looped, stops
+from ssilk_core.evaluation.minimum import hung, minima
+from ssilk_core.evaluation.probes import (
+    CALM,
+    drifted,
+    held,
+    joined_holds,
+    joined_hung,
+    joined_loops,
+    last_frames,
+    looped,
+    stops,
+)
 from ssilk_core.evaluation.record import recorded
 from ssilk_core.evaluation.run import SIMULATOR, EvaluationOptions, Playlist, Subject, evaluate
 from ssilk_core.evaluation.splits import chosen, read_index, splits_of
@@ -195,6 +206,28 @@ def test_cloth_that_is_held_up_is_found_out(dressed, motion):
     assert joined_holds([]) is None and joined_loops([]) is None
 
 
+def test_minima_are_where_forces_balance(dressed, motion):
+    """Of two poses at once, from plain skinning: lower, in balance, and a place to measure heights from."""
+    takes, _ = stops(takes_of("sway", motion, FPS), FPS, 2, 0.5)
+    reel = reel_of(takes, dressed, JOINTS)
+    found = minima(dressed.simulator, takes, last_frames(Plain(dressed, reel), takes))
+    np.testing.assert_allclose(found.start, found.poses.plain, atol=1e-6)
+    assert (found.imbalance < 0.01).all() and (found.over() > 0.01).all() and (found.distance() > 0.01).all()
+    lifted = found.x + torch.tensor([0.3, 0.1, -0.2], dtype=torch.float64)[:, None]
+    mass = float(dressed.energy.mass.sum())
+    np.testing.assert_allclose(found.floats(lifted), mass * GRAVITY * 0.1, rtol=1e-6)
+    figures_of = hung(found, dressed.weight)
+    joined = joined_hung(figures_of)
+    assert joined.floats == pytest.approx(joined.plain, rel=1e-4) and joined.stops == 2 and joined_hung([]) is None
+    assert joined.above == pytest.approx(float(found.over().mean())) and joined.imbalance == found.imbalance.max()
+    again = minima(dressed.simulator, takes, found.x.float() + found.poses.root - _origins(takes))
+    assert (again.over().abs() < 1e-5).all() and (again.distance() < 1e-3).all()
+
+
+def _origins(takes: Sequence[Take]) -> Tensor:
+    return torch.as_tensor(np.stack([take.motion.translations[0, 0] for take in takes], axis=1))
+
+
 def test_holds_come_together(dressed, motion):
     takes, first = stops(takes_of("sway", motion, FPS), FPS, 3, 1.0)
     reel = reel_of(takes, dressed, JOINTS)
@@ -241,7 +274,7 @@ def test_every_method_gets_its_row_in_every_split(scene, dressed, motion, toy_mo
         return cache[clip][frames.start : frames.stop].numpy()
 
     played = playlist(dressed, motion, slow, simulated=frozenset({"slow"}), read=read, seen=[motion])
-    rows = list(evaluate(dressed, subjects, played, EvaluationOptions(stops=1, hold=0.5, loop=1)))
+    rows = list(evaluate(dressed, subjects, played, EvaluationOptions(stops=1, hold=0.5, minimum=True, loop=1)))
     names = [(row.method, row.split) for row in rows]
     methods = ("plain", SIMULATOR, "ssilk", "ncs")
     assert names == [(method, split) for method in methods for split in ("valid", "flips")]
@@ -249,14 +282,15 @@ def test_every_method_gets_its_row_in_every_split(scene, dressed, motion, toy_mo
     model, simulated = by_name["ssilk", "valid"], by_name[SIMULATOR, "valid"]
     assert (model.frames, model.truth.frames, simulated.frames, simulated.clips) == (70, 30, 30, 1)
     assert by_name["plain", "valid"].truth.position < 1e-6 < model.truth.position  # plain is what was written
-    assert (model.holds.stops, model.loops.clips) == (2, 2) and by_name["plain", "valid"].holds is None
+    assert (model.holds.stops, model.hung.stops, model.loops.clips) == (2, 2, 2) and model.hung.above > 0
+    assert by_name["plain", "valid"].holds is None
     # The training saw 'sway' and not 'slow', which is why the whole is nearer than the part.
     assert model.poses.mean < by_name["ssilk", "flips"].poses.mean
     assert model.clip_totals[0] <= model.total <= model.clip_totals[2]
     text = tables(rows)
     first = [line.split("|")[2].strip() for line in text.split("\n\n")[0].splitlines()[2:]]
     assert first == ["valid"] * 4 + ["flips"] * 4  # the methods of a split stand together
-    assert text.count("| garment") == 6 and len({len(line) for line in text.split("\n\n")[0].splitlines()}) == 1
+    assert text.count("| garment") == 7 and len({len(line) for line in text.split("\n\n")[0].splitlines()}) == 1
 
 
 def test_nothing_is_asked_for_nothing_is_computed(scene, dressed, motion, toy_model):

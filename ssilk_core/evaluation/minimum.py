@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where cloth in held poses would be at rest: minima of its static energy, found without any network."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..simulate import Simulator
+from ..simulate.actors import Poses
+from .figures import Hung
+from .metrics import mean_square
+from .takes import Take
+
+
+@dataclass(frozen=True, eq=False)
+class Minima:
+    """Minima of the static energy in N poses; positions (V, 3, N) [m] are about the roots.
+
+    A garment hangs with many folds, each a minimum. These are the ones that searches from `start` lead to.
+
+    Attributes:
+        start: where the searches began.
+        x: the minima.
+        imbalance: what the solver left out of balance [g], shape (N,).
+    """
+
+    simulator: Simulator
+    poses: Poses
+    start: Tensor
+    x: Tensor
+    imbalance: Tensor
+
+    def over(self) -> Tensor:
+        """Return the energy of the starts over that of the minima [J], shape (N,)."""
+        potential, setting = self.simulator.potential, self.simulator.setting(self.poses, None)
+        start, lowest = (potential.energy(x, setting, potential.planes(x, setting)) for x in (self.start, self.x))
+        return start - lowest
+
+    def floats(self, x: Tensor) -> Tensor:
+        """Return how much more gravity has to gain from x than from the minima [J], shape (N,)."""
+        return (self.simulator.potential.mass * ((self.x - x) * self.simulator.gravity).sum(1)).sum(0)
+
+    def inside(self, x: Tensor) -> Tensor:
+        """Return the share of vertices inside the body, shape (N,)."""
+        planes = self.simulator.potential.planes(x, self.simulator.setting(self.poses, None))
+        assert planes is not None
+        return (planes.distance(x) < 0).double().mean(0)
+
+    def distance(self) -> Tensor:
+        """Return the RMS distance over the mass of the starts from the minima [m], shape (N,)."""
+        return mean_square(self.start - self.x, self.simulator.potential.mass[:, 0]).sqrt()
+
+
+def minima(simulator: Simulator, takes: Sequence[Take], x: Tensor) -> Minima:
+    """Minimise the static energy in the last pose of each take, from x (V, 3, N), about the roots of first frames."""
+    motions = [take.motion for take in takes]
+    rotations, translations = (
+        np.stack([getattr(motion, name)[-1] for motion in motions]) for name in ("rotations", "translations")
+    )
+    poses = simulator.actors.posed(rotations, translations)
+    origins = torch.as_tensor(np.stack([m.translations[0, 0] for m in motions], axis=1), device=x.device)
+    start = simulator.pinned(x.double() + origins - poses.root, poses)
+    found = simulator.rest(poses, start)
+    return Minima(simulator, poses, start, found.x, found.imbalance)
+
+
+def hung(found: Minima, weight: float) -> list[Hung]:
+    """Return the figures of each pose, for a garment of m g L [J]."""
+    floats, plain = (found.floats(x) / weight for x in (found.start, found.poses.plain))
+    columns = (found.over(), floats, plain, found.distance(), found.imbalance)
+    names = ("above", "floats", "plain", "distance", "imbalance")
+    return [Hung(stops=1, **dict(zip(names, row))) for row in torch.stack(columns, dim=1).tolist()]
