@@ -1,6 +1,6 @@
 # `make demo` films a cape that ships trained, then trains, bakes, verifies and films a draft; `make test` runs every check.
 # Both create the environment they need in .venv; only Python 3.11 (or later) and make must be there.
-# `make extension` packs the Blender extension into dist/, checked by Blender's own tool; `make test-blender` tests it
+# `make extension` packs the Blender extension, with ssilk in it, into dist/; `make test-blender` tests it
 # in Blender's Python module. Both need Python 3.11 and download some 370 MB into .venv-blender.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
@@ -25,6 +25,7 @@ lint: $(STAMP)
 extension: $(BLENDER_STAMP)
 	mkdir -p dist
 	$(BLENDER_VENV)/bin/python tools/stage_extension.py build/extension
+	$(BLENDER_VENV)/bin/python -m pip wheel --quiet --no-deps --wheel-dir build/extension/wheel .
 	$(BLENDER_VENV)/bin/python $(BLENDER_TOOL) build --source-dir build/extension --output-dir dist
 
 test-blender: $(STAMP) $(BLENDER_STAMP)

@@ -30,7 +30,8 @@ class Preferences(bpy.types.AddonPreferences):
     )
     source: StringProperty(
         name="Install From",
-        description="A wheel of ssilk, or the folder of its project; an environment is made from it",
+        description="A wheel of ssilk, or the folder of its project, to make an environment from; "
+        "what came with the extension when empty",
         subtype="FILE_PATH",
     )
     stop_trainings: BoolProperty(

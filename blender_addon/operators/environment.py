@@ -66,7 +66,7 @@ class CreateEnvironment(tasks.OutsideOperator, bpy.types.Operator):
         reason = tasks.busy()
         if not bpy.app.online_access:
             reason = "Blender may not go online; allow it in the preferences under System, Network"
-        elif not preferences(context).source:
+        elif not source(context):
             reason = reason or "Choose a wheel or a project folder of ssilk to install from"
         cls.poll_message_set(reason)
         return not reason
@@ -77,16 +77,22 @@ class CreateEnvironment(tasks.OutsideOperator, bpy.types.Operator):
         return context.window_manager.invoke_confirm(self, event, title=self.bl_label, message=message)
 
     def prepare(self, context: bpy.types.Context) -> Work:
-        source = Path(bpy.path.abspath(preferences(context).source))
-        need(source.exists(), f"'{source}' does not exist; choose a wheel or a project folder of ssilk.")
+        wheel = source(context)
+        need(Path(wheel).exists(), f"'{wheel}' does not exist; choose a wheel or a project folder of ssilk.")
         made = folder()
         python = str(pythons.venv_python(made))
-        commands = [*pythons.venv_commands(sys.executable, made, str(source)), pythons.probe_command(python)]
+        commands = [*pythons.venv_commands(sys.executable, made, wheel), pythons.probe_command(python)]
         return Work("Creating the environment", lambda _: commands)
 
     def finish(self, context: bpy.types.Context, work: Work) -> str:
         preferences(context).python = str(pythons.venv_python(folder()))
         return greet(context, work)
+
+
+def source(context: bpy.types.Context) -> str:
+    """Return what ssilk is installed from: as chosen, else the wheel that came with the extension."""
+    chosen = preferences(context).source
+    return bpy.path.abspath(chosen) if chosen else pythons.bundled()
 
 
 def ask(python: str) -> Work:

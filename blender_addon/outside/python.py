@@ -13,6 +13,7 @@ NEEDED = (0, 1)  # major and minor version of ssilk that this extension speaks w
 REQUIRED = ("usd-core", "libigl", "scipy")  # what classes and rigs need beside ssilk itself
 EXTRAS = "train,bake"
 PROBE = Path(__file__).with_name("probe.py")
+WHEELS = Path(__file__).parents[1] / "wheel"  # of the zip: ssilk itself, as `make extension` packs it
 VENV_NAMES = (".venv", "venv", "env", ".env")
 
 
@@ -72,6 +73,11 @@ def venv_commands(base: str, folder: Path, source: str) -> list[list[str]]:
     python = str(venv_python(folder))
     pip = [python, "-m", "pip", "install", "--no-input", "--disable-pip-version-check", "--progress-bar", "off"]
     return [[base, "-m", "venv", "--clear", str(folder)], [*pip, f"{source}[{EXTRAS}]"]]
+
+
+def bundled(folder: Path = WHEELS) -> str:
+    """Return the wheel of ssilk that came with the extension, empty where it came without."""
+    return next((str(wheel) for wheel in sorted(folder.glob("ssilk-*.whl"))), "")
 
 
 def venv_python(folder: Path) -> Path:

@@ -25,12 +25,12 @@ bpy.ops.extensions.package_install_files(filepath=sys.argv[1], repo="user_defaul
 for _ in range(2):
     assert package in bpy.context.preferences.addons
     assert "paint_classes" in dir(bpy.ops.ssilk) and hasattr(bpy.types.Object, "ssilk")
-    assert importlib.import_module(package + ".core").core("runtime").Player.__module__.startswith(package + ".vendor")
+    runtime = importlib.import_module(package + ".core").core("runtime")
+    assert runtime.Player.__module__.startswith(package + ".vendor")
     bpy.ops.preferences.addon_disable(module=package)
     assert not dir(bpy.ops.ssilk) and not hasattr(bpy.types.Object, "ssilk")
     bpy.ops.preferences.addon_enable(module=package)
 settings = bpy.context.preferences.addons[package].preferences
-settings.source = sys.argv[2]
 assert not bpy.ops.ssilk.create_environment.poll()
 bpy.context.preferences.system.use_online_access = True
 try:
@@ -53,9 +53,12 @@ def command_line(*arguments: str) -> str:
 
 @pytest.fixture(scope="module")
 def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The zip as `make extension` packs it, but with a wheel that has no dependencies: nothing is downloaded."""
     folder = tmp_path_factory.mktemp("package")
     stage = [sys.executable, str(ROOT / "tools" / "stage_extension.py"), str(folder / "staged")]
     subprocess.run(stage, check=True)
+    (folder / "staged" / "wheel").mkdir()
+    write_wheel(folder / "staged" / "wheel")
     command_line("build", "--source-dir", str(folder / "staged"), "--output-filepath", str(folder / "ssilk.zip"))
     return folder / "ssilk.zip"
 
@@ -66,7 +69,7 @@ def test_the_zip_is_valid_and_holds_what_it_needs(package):
         names = set(files.namelist())
     sources = {str(path.relative_to(ADDON)) for path in ADDON.rglob("*.py")}
     carried = {name for name in names if name.startswith("vendor/")}
-    assert names - carried == {*sources, "LICENSE", "blender_manifest.toml"}
+    assert names - carried == {*sources, "LICENSE", "blender_manifest.toml", "wheel/ssilk-0.1.9-py3-none-any.whl"}
     assert {"vendor/LICENSE", "vendor/NOTICE", "vendor/ssilk_core/runtime/player.py"} <= carried
     assert not {name for name in carried if any(part in name for part in ("model", "training", "energy", "cli"))}
 
@@ -82,12 +85,11 @@ def test_the_manifest_says_what_the_code_says():
 
 
 def test_the_zip_is_installed_and_makes_an_environment(package, tmp_path):
-    """In a profile of its own; the environment comes from a wheel without dependencies, so nothing is downloaded."""
+    """In a profile of its own, from the wheel that the zip holds."""
     program = tmp_path / "install.py"
     program.write_text(INSTALL)
-    wheel = write_wheel(tmp_path)
     profile = {**os.environ, "BLENDER_USER_RESOURCES": str(tmp_path / "profile")}
-    command = [sys.executable, str(program), str(package), str(wheel)]
+    command = [sys.executable, str(program), str(package)]
     done = subprocess.run(command, capture_output=True, text=True, env=profile, cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     lines = dict(line.split(" ", 1) for line in done.stdout.splitlines() if line.startswith(("TOLD ", "PYTHON ")))
