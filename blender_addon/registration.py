@@ -6,9 +6,10 @@ from __future__ import annotations
 import bpy
 
 from . import overlay, panels, preferences, preflight_properties, properties
-from .operators import baking, classes, environment, fill, preflight, rig, stages, tasks, training
+from .operators import baking, classes, environment, fill, playback, preflight, rig, stages, tasks, training
 from .operators import overlay as overlay_switch
 from .panels import plot
+from .scene import playing
 
 CLASSES = (
     *properties.CLASSES,
@@ -24,6 +25,7 @@ CLASSES = (
     *preflight.CLASSES,
     *training.CLASSES,
     *baking.CLASSES,
+    *playback.CLASSES,
     *panels.CLASSES,
 )
 
@@ -35,12 +37,14 @@ def register() -> None:
     properties.attach()
     preflight_properties.attach()
     training.start_watching()
+    playing.start_listening()
 
 
 def unregister() -> None:
     """Stop what runs outside, then remove properties and classes in reverse."""
     tasks.stop()
     overlay.hide()
+    playing.stop_listening()
     training.stop_watching(bpy.context)
     plot.forget()
     preflight_properties.detach()

@@ -7,6 +7,7 @@ from .baking import BakingPanel
 from .classes import ClassesPanel
 from .fabric import FabricPanel
 from .garment import GarmentPanel
+from .playback import PlaybackPanel
 from .preflight import FindingList, PreflightPanel
 from .rig import RigPanel
 from .training import TrainingPanel
@@ -20,4 +21,5 @@ CLASSES = (
     RigPanel,
     TrainingPanel,
     BakingPanel,
+    PlaybackPanel,
 )  # in the order of the sidebar

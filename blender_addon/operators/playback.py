@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Playing a trained garment while the artist works."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..errors import need
+from ..scene import playing
+from ..scene.garment import unusable
+from ..scene.models import model_of
+from .reporting import ReportingOperator
+
+
+class PlayLive(ReportingOperator, bpy.types.Operator):
+    """Play the trained garment on the armature as it is, frame by frame, without a bake"""
+
+    bl_idname = "ssilk.play_live"
+    bl_label = "Play Live"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        reason = unusable(context.object) or ("" if context.mode == "OBJECT" else "Go to Object Mode")
+        if not reason and playing.live(context.object):
+            reason = f"'{context.object.name}' is played already"
+        cls.poll_message_set(reason)
+        return not reason
+
+    def apply(self, context: bpy.types.Context) -> str:
+        playing.play(context.object)
+        need(playing.live(context.object), playing.reason(context.object))
+        return f"'{context.object.name}' plays {model_of(context.object).name}."
+
+
+class LiveOperator(ReportingOperator):
+    """Base of operators on a garment that is played."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        reason = unusable(context.object)
+        if not reason and not playing.live(context.object):
+            reason = f"'{context.object.name}' is not played"
+        cls.poll_message_set(reason)
+        return not reason
+
+
+class StopLive(LiveOperator, bpy.types.Operator):
+    """Play the garment no longer; it stays as it is in this frame"""
+
+    bl_idname = "ssilk.stop_live"
+    bl_label = "Stop Playing"
+
+    def apply(self, context: bpy.types.Context) -> str:
+        playing.stop(context.object)
+        return ""
+
+
+class RefreshLive(LiveOperator, bpy.types.Operator):
+    """Read what the armature does over the scene's frames anew: after edits, or when the frame range changed"""
+
+    bl_idname = "ssilk.refresh_live"
+    bl_label = "Read Motion Again"
+
+    def apply(self, context: bpy.types.Context) -> str:
+        playing.refresh(context.object)
+        return ""
+
+
+CLASSES = (PlayLive, StopLive, RefreshLive)

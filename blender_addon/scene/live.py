@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A trained garment played in Blender, by numpy alone: it follows the armature wherever the timeline stands.
+
+What the armature does over the scene's frames is read once, a little at a time; latents are rolled over it as far as
+frames are looked at, in blocks, and kept. A frame therefore looks the same whether it was scrubbed or played to.
+Where the armature stands otherwise than was read, latents are kept up to there and rolled anew from there on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ..contract.axes import to_core
+from ..core import core
+from .armature import read_joints
+from .baked import need_bakeable, turns_from_rest, wear
+from .garment import armature_of
+from .gather import character_joints
+from .motions import TIMELINE, Source
+from .objects import found_again
+from .sampling import Take, need_company, prepare_takes, sample, worlds
+from .trained import Trained
+
+BLOCK = 16  # frames rolled at once: few, so that an edit costs little at each frame that follows
+PRE_ROLL = 1.0  # seconds in which the garment settles before the first frame, as a bake has it
+MOVED = 1e-5  # by how much a joint's transform differs that was moved since it was read, of its size
+
+
+class Live:
+    """One garment that is played. In object mode when it begins.
+
+    Attributes:
+        done: the part of the motion that was read; None when there is nothing to read.
+        stale: whether the armature does something else by now than what was read.
+
+    Raises:
+        SetupError: the model cannot be read, or is of another garment or other bones.
+    """
+
+    def __init__(self, garment: bpy.types.Object, model: Path) -> None:
+        armature = armature_of(garment)
+        self.joints = read_joints(armature, garment)
+        need_bakeable(garment, armature, self.joints)
+        self.trained = Trained(model, self.joints, bpy.context.scene.unit_settings.scale_length)
+        self.shapes = wear(garment, armature, self.joints, self.trained.shot())
+        self.things = tuple((thing.name, thing.session_uid) for thing in (garment, armature))
+        self.playback, self.first, self.placed = None, 0, np.zeros((0, 0, 4, 4))
+        self.done: float | None = None
+        self.stale = False
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Read the motion anew; what was read goes on being played until that is done."""
+        garment, armature = self.objects()
+        (take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
+        self._steps = self._reading(garment, armature, take)
+        self.done, self.stale = 0.0, False
+
+    def read(self) -> bool:
+        """Read a little of the motion; return whether there is more."""
+        self.done = next(self._steps, None)
+        return self.done is not None
+
+    def objects(self) -> tuple[bpy.types.Object, bpy.types.Object]:
+        """Return the garment and its armature; raise `SetupError` if one was deleted."""
+        garment, armature = (_found(name, uid) for name, uid in self.things)
+        return garment, armature
+
+    def show(self, frame: int, depsgraph: bpy.types.Depsgraph) -> None:
+        """Put proxies and shape keys where the garment is at a frame; what lies outside the range is held."""
+        if self.playback is None:
+            return
+        garment, armature = self.objects()
+        index = min(max(frame - self.first, 0), len(self.placed) - 1)
+        if index == frame - self.first:
+            self._take_notice(armature.evaluated_get(depsgraph), index)
+        pose = self.playback.pose(index)
+        turns = turns_from_rest(self.joints, pose.rotations[:, self.trained.proxies])[0]
+        for name, turn in zip(self.joints.names[self.joints.character_count :], turns.tolist()):
+            armature.pose.bones[name].rotation_quaternion = turn
+        blocks = garment.data.shape_keys.key_blocks if self.shapes else ()
+        for name, weight in zip(self.shapes, pose.weights[0].tolist()):
+            blocks[name].value = weight
+
+    def _reading(self, garment: bpy.types.Object, armature: bpy.types.Object, take: Take) -> Iterator[float]:
+        yield from sample(armature, character_joints(self.joints), [take])
+        need_company(garment, armature, take)
+        self.first, self.placed = take.frames.start, np.array(take.worlds)
+        self.playback = self.trained.player.play(self._motion(), pre_roll=PRE_ROLL, block=BLOCK)
+
+    def _take_notice(self, armature: bpy.types.Object, index: int) -> None:
+        """Go on from a pose that is not the one that was read."""
+        bones = [armature.pose.bones.find(name) for name in self.joints.names[: self.joints.character_count]]
+        placed = worlds(armature)[bones]
+        if np.allclose(placed, self.placed[index], rtol=MOVED, atol=MOVED):
+            return
+        self.placed[index] = placed
+        self.playback, self.stale = self.playback.changed(self._motion(), index), True
+
+    def _motion(self) -> object:
+        """Return what was read as a motion of the model's skeleton."""
+        scene, kinematics = bpy.context.scene, core("kinematics")
+        own = to_core(self.placed[:, self.trained.own], self.trained.meters)
+        local = kinematics.local_transforms(own, self.trained.player.skeleton.parents)
+        rotations = kinematics.quaternion_from_matrix(local[..., :3, :3])
+        fps = scene.render.fps / scene.render.fps_base
+        return core("assets").Motion("the timeline", fps, rotations, local[..., :3, 3])
+
+
+def _found(name: str, uid: int) -> bpy.types.Object:
+    """Return an object, mostly by its name, which is fast; raise `SetupError` if it was deleted."""
+    thing = bpy.data.objects.get(name)
+    return thing if thing and thing.session_uid == uid else found_again(uid, name)

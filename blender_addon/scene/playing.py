@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Which garments are played, and what Blender calls so that they are: when frames change, files open, renders run.
+
+Nothing is written while Blender renders in another thread and its interface is not locked: both would write at once.
+"""
+
+from __future__ import annotations
+
+import bpy
+from bpy.app.handlers import persistent
+
+from ..errors import SetupError
+from .live import Live
+from .models import model_of
+
+PATIENCE = 0.3  # seconds after an edit before the motion is read anew
+BETWEEN = 0.01  # seconds between two slices of reading, for the artist
+_played: dict[int, Live] = {}
+_reasons: dict[int, str] = {}
+_rendering = False
+
+
+def live(garment: bpy.types.Object) -> Live | None:
+    """Return what plays a garment; None where nothing does."""
+    return _played.get(garment.session_uid)
+
+
+def reason(garment: bpy.types.Object) -> str:
+    """Return why a garment is no longer played; empty if nothing went wrong."""
+    return _reasons.get(garment.session_uid, "")
+
+
+def play(garment: bpy.types.Object) -> None:
+    """Play a garment from now on. In object mode.
+
+    Raises:
+        SetupError: it cannot be played.
+    """
+    _reasons.pop(garment.session_uid, None)
+    _played[garment.session_uid] = Live(garment, model_of(garment))
+    garment.ssilk.live = True
+    _read_soon(0.0)
+
+
+def stop(garment: bpy.types.Object) -> None:
+    """Play a garment no longer; it stays as it is."""
+    _played.pop(garment.session_uid, None)
+    garment.ssilk.live = False
+
+
+def refresh(garment: bpy.types.Object) -> None:
+    """Read the motion of a garment that is played anew."""
+    _played[garment.session_uid].refresh()
+    _read_soon(0.0)
+
+
+def start_listening() -> None:
+    """Have Blender call what is here."""
+    for handlers, function in _handlers():
+        handlers.append(function)
+
+
+def stop_listening() -> None:
+    """Leave nothing behind."""
+    _played.clear()
+    _reasons.clear()
+    for handlers, function in _handlers():
+        handlers.remove(function)
+    if bpy.app.timers.is_registered(_read):
+        bpy.app.timers.unregister(_read)
+
+
+def _handlers() -> list[tuple[list, object]]:
+    calls = bpy.app.handlers
+    return [
+        (calls.frame_change_post, _frame_changed),
+        (calls.depsgraph_update_post, _edited),
+        (calls.load_post, _loaded),
+        (calls.render_init, _render_began),
+        (calls.render_complete, _render_ended),
+        (calls.render_cancel, _render_ended),
+    ]
+
+
+def _read_soon(seconds: float) -> None:
+    """Read motions a little at a time; all at once where Blender has no window to keep alive."""
+    if bpy.app.background:
+        while _read() is not None:
+            pass
+    elif not bpy.app.timers.is_registered(_read):
+        bpy.app.timers.register(_read, first_interval=seconds)
+
+
+def _read() -> float | None:
+    """Read a little of one motion; return when to be called again."""
+    for uid, played in list(_played.items()):
+        if played.stale and not bpy.app.background:
+            _attempt(uid, played.refresh)
+        if played.done is not None:
+            more = _attempt(uid, played.read)
+            if not more:
+                _show_all(bpy.context.scene, bpy.context.evaluated_depsgraph_get())
+            return BETWEEN
+    return None
+
+
+def _attempt(uid: int, call, *arguments: object) -> object:  # type: ignore[no-untyped-def]
+    """Return what a call gives; a garment for which it fails is played no longer, and the panel says why."""
+    try:
+        return call(*arguments)
+    except SetupError as error:
+        _played.pop(uid, None)
+        _reasons[uid] = str(error)
+        return None
+
+
+def _show_all(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+    if _rendering and not (scene.render.use_lock_interface or bpy.app.background):
+        return
+    for uid, played in list(_played.items()):
+        name, _ = played.things[0]
+        if name in scene.objects:  # motions are read in a scene that holds nothing but the armature
+            _attempt(uid, played.show, scene.frame_current, depsgraph)
+
+
+@persistent
+def _frame_changed(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+    _show_all(scene, depsgraph)
+    if any(played.stale for played in _played.values()) and not bpy.app.background:
+        _read_soon(PATIENCE)
+
+
+@persistent
+def _edited(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+    """Read the motion anew when keys were edited."""
+    if not _played or not any(isinstance(update.id, bpy.types.Action) for update in depsgraph.updates):
+        return
+    for played in _played.values():
+        played.stale = played.stale or played.things[0][0] in scene.objects
+    if not bpy.app.background:
+        _read_soon(PATIENCE)
+
+
+@persistent
+def _loaded(_: str) -> None:
+    """Go on playing what was played when the file was saved."""
+    _played.clear()
+    _reasons.clear()
+    for garment in bpy.data.objects:
+        if garment.ssilk.live:
+            _attempt(garment.session_uid, play, garment)
+
+
+@persistent
+def _render_began(*_: object) -> None:
+    global _rendering
+    _rendering = True
+
+
+@persistent
+def _render_ended(*_: object) -> None:
+    global _rendering
+    _rendering = False

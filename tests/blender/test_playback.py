@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Live playback: what is seen is what a bake shows, from wherever the artist comes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
+
+from .conftest import activate
+from .scenes import decoded, ended, enliven, rig_and_animate, shown
+
+EXACT = 2e-5  # [m]
+FRAMES = range(1, 41)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("live")
+
+
+@pytest.fixture
+def trained(ready, skirt, folder, ssilk_python):
+    """The skirt on an animated pillar, with a model that moves it visibly."""
+    bpy, path = ready, folder / "trained.blend"
+    if not path.exists():
+        rig_and_animate(bpy, skirt)
+        bpy.ops.wm.save_as_mainfile(filepath=str(path))
+        assert bpy.ops.ssilk.find_motions() == {"FINISHED"}
+        skirt.ssilk.training.preset, skirt.ssilk.training.iterations = "draft", 4
+        assert bpy.ops.ssilk.train() == {"FINISHED"}
+        assert ended(skirt).state == "done"
+        enliven(ssilk_python, model_of(skirt))
+        bpy.ops.wm.save_mainfile()
+    bpy.ops.wm.open_mainfile(filepath=str(path))
+    garment = bpy.data.objects["Skirt"]
+    activate(bpy, garment)
+    return garment
+
+
+def model_of(garment) -> Path:
+    from blender_addon.scene.models import model_of
+
+    return model_of(garment)
+
+
+@pytest.fixture
+def wanted(ready, trained, folder, ssilk_python) -> np.ndarray:
+    """What the decoder says of every frame, by `ssilk bake`."""
+    path = folder / "wanted.npy"
+    if not path.exists():
+        assert ready.ops.ssilk.bake() == {"FINISHED"}
+        np.save(path, decoded(ssilk_python, model_of(trained), folder, pre_roll=1.0))
+        assert ready.ops.ssilk.remove_bake() == {"FINISHED"}
+    return np.load(path)
+
+
+def playing():
+    from blender_addon.scene import playing
+
+    return playing
+
+
+def test_every_frame_shows_what_a_bake_would(ready, trained, wanted):
+    assert ready.ops.ssilk.play_live() == {"FINISHED"}
+    assert np.abs(shown(ready, trained, FRAMES) - wanted).max() < EXACT
+    assert np.ptp(wanted, axis=0).max() > 0.05
+    assert not playing().live(trained).stale
+
+
+def test_scrubbing_shows_the_same_bits_as_playing(ready, trained):
+    ready.ops.ssilk.play_live()
+    played = shown(ready, trained, FRAMES)
+    order = np.random.default_rng(0).permutation(FRAMES)
+    ready.ops.ssilk.stop_live()
+    ready.ops.ssilk.play_live()
+    for frame in order:
+        np.testing.assert_array_equal(shown(ready, trained, [int(frame)])[0], played[frame - 1])
+
+
+def test_outside_the_range_the_garment_is_held(ready, trained):
+    ready.ops.ssilk.play_live()
+    proxies = [bone for bone in ready.data.objects["Rig"].pose.bones if bone.name.startswith("Skirt_proxy")]
+    turns = {}
+    for frame in (40, 55, 1, -3):
+        ready.context.scene.frame_set(frame)
+        turns[frame] = np.array([bone.rotation_quaternion for bone in proxies])
+    np.testing.assert_array_equal(turns[55], turns[40])
+    np.testing.assert_array_equal(turns[-3], turns[1])
+
+
+def test_edits_are_followed_from_where_they_begin(ready, trained):
+    """What was read is found to be old, frames before stay, and reading again gives what playing on has given.
+
+    At the model's rate: at others a frame lies between steps, of which the later one looks ahead.
+    """
+    ready.context.scene.render.fps = 30
+    ready.ops.ssilk.play_live()
+    before = shown(ready, trained, FRAMES)
+    spine = ready.data.objects["Rig"].pose.bones["Spine"]
+    spine.rotation_quaternion = (1, 0.5, 0.3, 0)
+    spine.keyframe_insert("rotation_quaternion", frame=33)
+    shown(ready, trained, [10])  # Blender tells of the edit
+    live = playing().live(trained)
+    after = shown(ready, trained, FRAMES)
+    assert live.stale
+    np.testing.assert_array_equal(after[:24], before[:24])  # where the curves are as they were
+    assert np.abs(after[32:] - before[32:]).max() > 1e-3
+    assert ready.ops.ssilk.refresh_live() == {"FINISHED"}
+    assert not live.stale
+    again = shown(ready, trained, reversed(FRAMES))[::-1]
+    np.testing.assert_allclose(after, again, atol=1e-6)
+
+
+def test_saved_files_go_on_playing_and_handlers_stay_until_disabled(ready, trained, wanted, tmp_path):
+    import addon_utils
+
+    ready.ops.ssilk.play_live()
+    ready.ops.wm.save_as_mainfile(filepath=str(tmp_path / "again.blend"), copy=True)
+    path = model_of(trained)
+    ready.ops.wm.read_homefile(use_empty=True)
+    assert not playing()._played
+    ready.ops.wm.open_mainfile(filepath=str(tmp_path / "again.blend"))
+    garment = ready.data.objects["Skirt"]
+    assert playing().reason(garment)  # the model lies elsewhere now, and the panel says so
+    garment.ssilk.model = str(path)
+    activate(ready, garment)
+    ready.ops.ssilk.play_live()
+    assert np.abs(shown(ready, garment, [25])[0] - wanted[24]).max() < EXACT
+    addon_utils.disable("blender_addon", default_set=True)
+    left = [
+        function
+        for name in dir(ready.app.handlers)
+        if isinstance(handlers := getattr(ready.app.handlers, name), list)
+        for function in handlers
+        if function.__module__.startswith("blender_addon")
+    ]
+    assert not left and addon_utils.enable("blender_addon", default_set=True)
+
+
+def test_stopped_garments_stay_and_deleted_ones_are_let_go(ready, trained):
+    ready.ops.ssilk.play_live()
+    ready.context.scene.frame_set(20)
+    ready.ops.ssilk.stop_live()
+    bone = next(bone for bone in ready.data.objects["Rig"].pose.bones if bone.name.startswith("Skirt_proxy"))
+    held = tuple(bone.rotation_quaternion)
+    ready.context.scene.frame_set(30)
+    assert tuple(bone.rotation_quaternion) == held
+    ready.ops.ssilk.play_live()
+    ready.data.objects.remove(ready.data.objects["Rig"])
+    ready.context.scene.frame_set(10)
+    assert playing().live(trained) is None and "deleted" in playing().reason(trained)
+
+
+def test_what_cannot_be_played_is_said(ready, trained, tmp_path):
+    with pytest.raises(RuntimeError, match="is not played"):
+        ready.ops.ssilk.stop_live()
+    trained.ssilk.model = str(tmp_path / "none.safetensors")
+    with pytest.raises(RuntimeError, match="has no model at"):
+        ready.ops.ssilk.play_live()
+    (tmp_path / "none.safetensors").write_bytes(b"nothing")
+    with pytest.raises(RuntimeError, match="no safetensors file"):
+        ready.ops.ssilk.play_live()
+    trained.ssilk.model = ""
+    ready.context.view_layer.objects.active = ready.data.objects["Rig"]
+    ready.ops.object.mode_set(mode="EDIT")
+    ready.data.objects["Rig"].data.edit_bones["Head"].name = "Kopf"
+    ready.ops.object.mode_set(mode="OBJECT")
+    activate(ready, trained)
+    with pytest.raises(RuntimeError, match="not those that the model was trained with"):
+        ready.ops.ssilk.play_live()
