@@ -21,6 +21,7 @@ from ssilk_core.assets import (
     Character,
     Floats,
     Garment,
+    Ints,
     Mesh,
     Motion,
     ProxyRig,
@@ -97,7 +98,15 @@ def chain() -> Skeleton:
     """Return a chain of joints up the middle of the body."""
     places = np.stack([np.zeros(JOINTS), np.linspace(0, BODY_TOP, JOINTS), np.zeros(JOINTS)], axis=1)
     binds, parents = rigid(np.tile(np.eye(3), (JOINTS, 1, 1)), places), np.arange(-1, JOINTS - 1)
-    return Skeleton("/chain", tuple(map(str, range(JOINTS))), parents, binds, local_transforms(binds, parents))
+    return Skeleton("/chain", joint_paths(parents), parents, binds, local_transforms(binds, parents))
+
+
+def joint_paths(parents: Ints) -> tuple[str, ...]:
+    """Return paths that spell a hierarchy, a parent's before its children's."""
+    paths: list[str] = []
+    for joint, parent in enumerate(parents):
+        paths.append(f"{paths[parent]}/J{joint}" if parent >= 0 else f"J{joint}")
+    return tuple(paths)
 
 
 def hanging_proxies(count: int) -> tuple[Floats, np.ndarray]:
@@ -116,7 +125,8 @@ def cloak_rig(mesh: Mesh, plain: Floats, classes: np.ndarray, proxies: int) -> P
     dense = np.concatenate([plain * ~loose, falloff(mesh.points, places, 0.2) * loose], axis=1)
     binds = rigid(np.tile(np.eye(3), (proxies, 1, 1)), places)
     skin = SkinWeights.from_dense("/rig", dense, INFLUENCES)
-    return ProxyRig("/rig", tuple(f"P{index}" for index in range(proxies)), parents, binds, skin)
+    names = joint_paths(np.concatenate([np.arange(-1, JOINTS - 1), parents]))[JOINTS:]
+    return ProxyRig("/rig", names, parents, binds, skin)
 
 
 def scene(size: Size) -> Scene:
