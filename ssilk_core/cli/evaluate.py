@@ -42,6 +42,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--index", type=Path, metavar="JSON",
                       help='list of {"clip", "split", "tags"} (default: all clips in one split)')  # fmt: skip
     verb.add_argument("--clips", nargs="+", default=[], metavar="NAME", help="only these clips")
+    verb.add_argument("--by-clip", action="store_true", help="show each clip by itself too")
     verb.add_argument("--reference", type=Path, metavar="FOLDER", help="shots of 'ssilk simulate' to compare with")
     verb.add_argument("--trained-on", type=Path, nargs="+", default=[], metavar="PATH",
                       help="motion files or folders of the training, to tell how unfamiliar poses are")  # fmt: skip
@@ -192,7 +193,7 @@ def _splits(options: argparse.Namespace) -> tuple[dict[str, list[str]], dict[str
     missing = sorted({name for names in splits.values() for name in names} - files.keys())
     need(not missing, str(folder), f"{len(missing)} clips are missing ({', '.join(missing[:3])})",
          f"it holds {', '.join(list(files)[:3])} and so on")  # fmt: skip
-    return splits, files
+    return splits | ({name: [name] for names in splits.values() for name in names} if options.by_clip else {}), files
 
 
 def _write(

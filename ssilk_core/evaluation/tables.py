@@ -12,17 +12,15 @@ from .figures import Against, Figures, Holds, Hung, Loops, Poses
 from .run import Row
 
 
-def aligned(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a Markdown table with columns of even width, words to the left and figures to the right."""
-    columns = list(zip(header, *rows))
-    widths = [max(map(len, column)) for column in columns]
-    words = [not any(cell[:1] in "+-0123456789" for cell in column[1:] if cell) for column in columns]
+def aligned(header: Sequence[str], rows: Sequence[Sequence[str]], words: int) -> str:
+    """Return a Markdown table with columns of even width, the first ones with words and the others with figures."""
+    widths = [max(map(len, column)) for column in zip(header, *rows)]
 
     def line(cells: Sequence[str]) -> str:
-        padded = (cell.ljust(w) if left else cell.rjust(w) for cell, w, left in zip(cells, widths, words))
+        padded = [cell.ljust(w) if n < words else cell.rjust(w) for n, (cell, w) in enumerate(zip(cells, widths))]
         return f"| {' | '.join(padded)} |"
 
-    rule = ["-" * w if left else "-" * (w - 1) + ":" for w, left in zip(widths, words)]
+    rule = ["-" * w if n < words else "-" * (w - 1) + ":" for n, w in enumerate(widths)]
     return "\n".join([line(header), line(rule), *map(line, rows)]) + "\n"
 
 
@@ -39,7 +37,7 @@ def _table(
     lines = [
         [row.garment, row.split, row.method, *cells(part)] for row in rows if (part := pick(row.figures)) is not None
     ]
-    return aligned(["garment", "split", "method", *header], lines) if lines else ""
+    return aligned(["garment", "split", "method", *header], lines, 3) if lines else ""
 
 
 ENERGIES = ("frames", "total [J]", *TERMS, "inside the body", "gravity, of m g L", "clips: min / median / max")

@@ -370,5 +370,5 @@ def test_no_take_is_refused(dressed, motion):
 
 
 def test_tables_are_aligned():
-    text = aligned(["name", "value"], [["a", "1.5"], ["longer", "-20"]])
-    assert text == "| name   | value |\n| ------ | ----: |\n| a      |   1.5 |\n| longer |   -20 |\n"
+    text = aligned(["name", "value"], [["1_a", "1.5"], ["longer", "-20"]], 1)
+    assert text == "| name   | value |\n| ------ | ----: |\n| 1_a    |   1.5 |\n| longer |   -20 |\n"

@@ -60,6 +60,13 @@ def test_the_simulators_shots_are_the_reference(world, capsys):
     assert rows["simulator"]["truth"] is None
 
 
+def test_each_clip_can_be_seen_by_itself(world, capsys):
+    assert evaluated(f"{QUICK} --by-clip --json --stops 0 --loop 0") == 0
+    event = json.loads(capsys.readouterr().out.splitlines()[-1])
+    frames = {row["split"]: row["figures"]["frames"] for row in event["detail"]["figures"]}
+    assert frames == {"all": 22, "brief": 12, "turn": 10}
+
+
 def test_several_models_of_a_garment_share_its_table(world, capsys):
     (world / "again.safetensors").write_bytes((world / "model.safetensors").read_bytes())
     assert evaluated(f"again.safetensors {QUICK} --clips brief --stops 0 --loop 0") == 0
