@@ -54,11 +54,13 @@ def armature_of(garment: bpy.types.Object) -> bpy.types.Object:
 def bodies_of(garment: bpy.types.Object, armature: bpy.types.Object) -> list[bpy.types.Object]:
     """Return the meshes that a garment collides with: those chosen, else all others bound to its armature.
 
+    Hidden ones count; what the view layer excludes, such as a body of another level of detail, must be chosen.
+
     Raises:
         SetupError: there is none, or one that was chosen is not bound to the armature.
     """
     chosen = garment.ssilk.bodies
-    things = chosen.all_objects if chosen else bpy.context.scene.objects
+    things = chosen.all_objects if chosen else bpy.context.view_layer.objects
     meshes = [thing for thing in things if thing.type == "MESH" and thing != garment]
     wearers = (armature, leader_of(armature))
     bound = [thing for thing in meshes if _modifier_armature(thing) in wearers]

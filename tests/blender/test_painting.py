@@ -214,3 +214,84 @@ def test_no_mesh_is_no_garment(bpy, quad):
     bpy.data.objects.remove(quad)
     with pytest.raises(RuntimeError, match="Select the garment, a mesh, first"):
         bpy.ops.ssilk.paint_classes()
+
+
+def half_loose(bpy, thing) -> None:
+    thing.data.attributes.new(palette.ATTRIBUTE, "INT", "POINT").data.foreach_set("value", [0, 2, 2, 0])
+
+
+def extrude(bpy, thing):
+    select(bpy, thing, [1, 2])
+    bpy.ops.mesh.extrude_region_move(TRANSFORM_OT_translate={"value": (1, 0, 0)})
+    bpy.ops.object.mode_set(mode="OBJECT")
+
+
+def bisect(bpy, thing):
+    select(bpy, thing, [0, 1, 2, 3])
+    bpy.ops.mesh.bisect(plane_co=(0.9, 0, 0), plane_no=(1, 0, 0))
+    bpy.ops.object.mode_set(mode="OBJECT")
+
+
+def mirror(bpy, thing):
+    thing.modifiers.new("Mirror", "MIRROR").use_axis = (False, True, False)
+    bpy.ops.object.modifier_apply(modifier="Mirror")
+
+
+def join(bpy, thing):
+    other = thing.copy()
+    other.data = thing.data.copy()
+    bpy.context.collection.objects.link(other)
+    other.select_set(True)
+    bpy.ops.object.join()
+
+
+def duplicate(bpy, thing):
+    bpy.ops.object.duplicate()
+
+
+def triangulate(bpy, thing):
+    select(bpy, thing, [0, 1, 2, 3])
+    bpy.ops.mesh.quads_convert_to_tris()
+    bpy.ops.object.mode_set(mode="OBJECT")
+
+
+def edit_undone(bpy, thing):
+    bpy.ops.ed.undo_push(message="before")
+    extrude(bpy, thing)
+    bpy.ops.ed.undo_push(message="after")
+    bpy.ops.ed.undo()
+
+
+@pytest.mark.parametrize("edit", [extrude, bisect, mirror, join, duplicate, triangulate, edit_undone])
+def test_the_truth_survives(bpy, quad, edit):
+    """Right of the middle stays loose and left of it pinned, whatever is done to the mesh."""
+    half_loose(bpy, quad)
+    edit(bpy, quad)
+    thing = bpy.context.view_layer.objects.active
+    x = np.array([vertex.co.x for vertex in thing.data.vertices])
+    assert len(x) >= 4
+    values = np.array(classes_of(thing))
+    assert set(values[x > 0.95]) == {2}
+    assert set(values[x < -0.95]) == {0}
+    attribute = thing.data.attributes[palette.ATTRIBUTE]
+    assert (attribute.data_type, attribute.domain) == ("INT", "POINT")
+
+
+def test_shape_keys_do_not_matter_to_painting(bpy, quad):
+    quad.shape_key_add(name="Basis")
+    quad.shape_key_add(name="Wide").data[0].co.x -= 1
+    bpy.ops.ssilk.paint_classes()
+    paint(quad, [1], (0, 1, 0))
+    bpy.ops.ssilk.take_up_painting()
+    assert classes_of(quad) == [1, 2, 1, 1]
+    assert quad.data.shape_keys.key_blocks["Wide"].data[0].co.x == -2
+
+
+def test_operators_are_undone(bpy, quad):
+    half_loose(bpy, quad)
+    bpy.ops.ed.undo_push(message="before")
+    bpy.ops.ssilk.mirror_classes(source="LEFT")
+    bpy.ops.ed.undo_push(message="after")
+    assert classes_of(bpy.data.objects["Quad"]) == [2, 2, 2, 2]
+    bpy.ops.ed.undo()
+    assert classes_of(bpy.data.objects["Quad"]) == [0, 2, 2, 0]

@@ -360,3 +360,63 @@ def test_a_garment_deleted_meanwhile_is_told(ready, skirt, monkeypatch):
 def test_an_environment_is_made_only_online(bpy):
     with pytest.raises(RuntimeError, match="Blender may not go online"):
         bpy.ops.ssilk.create_environment()
+
+
+def test_shape_keys_stay_on_top_of_the_rig(ready, classified):
+    """Corrective shapes act before the bones, as the artist made them."""
+    classified.shape_key_add(name="Basis")
+    classified.shape_key_add(name="Wide").data[20].co.x += 0.1
+    assert ready.ops.ssilk.generate_rig(proxies=4) == {"FINISHED"}
+    assert classified.data.shape_keys.key_blocks["Wide"].data[20].co.x == pytest.approx(
+        classified.data.vertices[20].co.x + 0.1
+    )
+
+
+def test_a_hidden_body_counts_and_an_excluded_one_must_be_chosen(ready, skirt):
+    from blender_addon.scene.garment import bodies_of
+
+    group = ready.data.collections.new("Away")
+    ready.context.scene.collection.children.link(group)
+    pillar = ready.data.objects["Pillar"]
+    ready.context.scene.collection.objects.unlink(pillar)
+    group.objects.link(pillar)
+    pillar.hide_set(True)
+    pillar.hide_viewport = True
+    assert bodies_of(skirt, ready.data.objects["Rig"]) == [pillar]
+    ready.context.view_layer.layer_collection.children["Away"].exclude = True
+    with pytest.raises(RuntimeError, match="No body is bound to 'Rig'"):
+        ready.ops.ssilk.classify()
+    skirt.ssilk.bodies = group
+    assert ready.ops.ssilk.classify() == {"FINISHED"}
+
+
+def test_an_armature_that_is_renamed_meanwhile_is_found(ready, classified, monkeypatch):
+    from blender_addon.operators import rig
+
+    original = rig.GenerateRig.finish
+
+    def renamed(self, context, work):
+        ready.data.objects["Rig"].name = "Gerüst"
+        return original(self, context, work)
+
+    monkeypatch.setattr(rig.GenerateRig, "finish", renamed)
+    assert ready.ops.ssilk.generate_rig(proxies=4) == {"FINISHED"}
+    assert len(ready.data.objects["Gerüst"].data.bones) == 3 + 4
+
+
+def test_a_garment_that_was_edited_meanwhile_is_told(ready, classified, monkeypatch):
+    from blender_addon.operators import rig
+
+    original = rig.GenerateRig.finish
+
+    def edited(self, context, work):
+        ready.ops.object.mode_set(mode="EDIT")
+        ready.ops.mesh.select_all(action="SELECT")
+        ready.ops.mesh.subdivide()
+        ready.ops.object.mode_set(mode="OBJECT")
+        return original(self, context, work)
+
+    monkeypatch.setattr(rig.GenerateRig, "finish", edited)
+    with pytest.raises(RuntimeError, match="'Skirt' had 312 vertices when this began"):
+        ready.ops.ssilk.generate_rig(proxies=4)
+    assert not proxies_of(ready)
