@@ -40,7 +40,7 @@ VERTICES = (500, 2_500, 10_000, 30_000, 100_000)
 NETWORKS = ((32, (128, 128)), (64, (256, 256)), (128, (256, 256, 256)), (128, (256, 512, 512)))
 GROWTH_FRAMES = 64
 ALL, CHUNKS = {"in chunks": BLOCK, "frame by frame": 1}, {"in chunks": BLOCK}
-CLOTH = Path(__file__).with_name("blender_cloth.py")
+CLOTH, LIVE = (Path(__file__).with_name(f"blender_{name}.py") for name in ("cloth", "live"))
 
 
 def times_table(found: Times) -> str:
@@ -75,6 +75,14 @@ def cloth(scene: Scene, motion: Motion, python: str) -> dict[str, list[float]]:
         "cloth modifier": spread(np.array(found["with"][1:]) - without),
         "body and caches without it": spread(found["without"][1:]),
     }
+
+
+def live(path: Path, python: str) -> dict[str, list[float]]:
+    """Return median and 95th percentile [us] per frame of what the extension does in Blender to play a model live."""
+    with tempfile.TemporaryDirectory() as folder:
+        times = Path(folder) / "times.json"
+        subprocess.run([python, str(LIVE), str(path), str(times)], check=True)
+        return {"live playback, the extension's part": spread(json.loads(times.read_text())["show"])}
 
 
 def cloak(vertices: int, config: ModelConfig) -> tuple[GarmentModel, Motion]:
@@ -143,7 +151,7 @@ def garment(path: Path, options: argparse.Namespace) -> tuple[str, dict[str, Tim
     text += f"{scene.rig.proxy_count} proxies, {scene.character.skeleton.joint_count} joints, "
     text += f"{motion.frame_count} frames of {options.clip}\n\n{times_table(found[path.stem])}\n"
     if options.bpy:
-        taken = cloth(scene, motion, options.bpy)
+        taken = {**cloth(scene, motion, options.bpy), **live(path, options.bpy)}
         found[f"{path.stem}, Blender"] = {"Blender": taken}
         text += "".join(
             f"Blender's {name}: {median:,.0f} ({late:,.0f})  \n" for name, (median, late) in taken.items()

@@ -65,7 +65,8 @@ def stop_listening() -> None:
     _played.clear()
     _reasons.clear()
     for handlers, function in _handlers():
-        handlers.remove(function)
+        if function in handlers:
+            handlers.remove(function)
     if bpy.app.timers.is_registered(_read):
         bpy.app.timers.unregister(_read)
 
