@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from ssilk_core.baselines.networks import Baseline
     from ssilk_core.checkpoint import ModelFile
     from ssilk_core.evaluation.methods import Dressed
-    from ssilk_core.evaluation.run import Playlist, Row, Subject
+    from ssilk_core.evaluation.run import EvaluationOptions, Playlist, Row, Subject
     from ssilk_core.model.network import GarmentModel
 
 
@@ -51,6 +51,8 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--hold", type=float, default=3.0, metavar="S", help="how long poses are held (default 3)")
     verb.add_argument("--minimum", action="store_true",
                       help="minimise the energy of held poses without the network (slow on a CPU)")  # fmt: skip
+    verb.add_argument("--simulate-stops", action="store_true",
+                      help="simulate the stops too, beside --reference (slow on a CPU)")  # fmt: skip
     verb.add_argument("--loop", type=int, default=2000, metavar="FRAMES",
                       help="length of loops, none for 0 (default 2000)")  # fmt: skip
     verb.add_argument("-o", "--output", type=Path, help="figures to write (.json), in SI units")
@@ -61,15 +63,13 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     """Evaluate; return 0."""
     from ssilk_core.baselines.files import load_network
     from ssilk_core.devices import chosen_device
-    from ssilk_core.evaluation.run import EvaluationOptions, evaluate
+    from ssilk_core.evaluation.run import evaluate
     from ssilk_core.evaluation.tables import tables
 
     if options.output:
         need(options.output.suffix == ".json", str(options.output), "not a name for figures", "it ends in .json")
         shared.check_output(options.output, *options.models, options.index)
-    asked = EvaluationOptions(
-        sequence=options.sequence, stops=options.stops, hold=options.hold, minimum=options.minimum, loop=options.loop
-    )
+    asked = _asked(options)
     device = chosen_device(options.device)
     opened = [Opened(path, *load_network(path)) for path in options.models]
     rows: list[Row] = []
@@ -77,17 +77,30 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     for models in _by_garment(opened):
         dressed, subjects = _dressed(models[0].file, options, device), _subjects(models, device)
         playlist = _playlist(options, dressed)
-        report(Started("evaluate", 0, {"garment": dressed.name, "clips": list(playlist.clips)}))
+        report(Started("evaluate", len(playlist.clips), {"garment": dressed.name, "clips": list(playlist.clips)}))
         paths = {subject.name: str(one.path) for subject, one in zip(subjects, models)}
         for row in evaluate(dressed, subjects, playlist, asked, report):
             rows.append(row)
             found.append({"model": paths.get(row.method), **asdict(row)})
     if options.output:
-        _write(options, found, opened, device)
+        _write(options, asked, opened, found)
     if not options.json:
         print(tables(rows))
     report(Result("evaluate", {"figures": found} if options.json else {}))
     return EXIT_OK
+
+
+def _asked(options: argparse.Namespace) -> EvaluationOptions:
+    from ssilk_core.evaluation.run import EvaluationOptions
+
+    return EvaluationOptions(
+        sequence=options.sequence,
+        stops=options.stops,
+        hold=options.hold,
+        minimum=options.minimum,
+        simulate=options.simulate_stops,
+        loop=options.loop,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,22 +210,22 @@ def _splits(options: argparse.Namespace) -> tuple[dict[str, list[str]], dict[str
 
 
 def _write(
-    options: argparse.Namespace, rows: list[dict[str, Any]], opened: list[Opened], device: torch.device
+    options: argparse.Namespace, asked: EvaluationOptions, opened: list[Opened], rows: list[dict[str, Any]]
 ) -> None:
     """Write the figures with where they come from."""
     import torch
 
     from ssilk_core import __version__
-    from ssilk_core.devices import device_name
+    from ssilk_core.devices import chosen_device, device_name
     from ssilk_core.files import sha256
 
-    asked = {name: getattr(options, name) for name in ("clips", "sequence", "stops", "hold", "minimum", "loop")}
     document = {
         "units": "SI",
         "models": {str(one.path): sha256(one.path) for one in opened},
         "stage": {str(options.stage): sha256(options.stage)},
-        "options": {**asked, "reference": options.reference and str(options.reference)},
-        "hardware": device_name(device),
+        "reference": options.reference and str(options.reference),
+        "options": {**asdict(asked), "clips": options.clips},
+        "hardware": device_name(chosen_device(options.device)),
         "versions": {"ssilk": __version__, "torch": torch.__version__},
         "figures": rows,
     }

@@ -22,9 +22,10 @@ from ..fabrics import Fabric
 from ..model.body import CollisionBody
 from ..model.descriptors import GRAVITY
 from ..model.skinning import Skinning
-from ..simulate import SimulationOptions, Simulator
+from ..simulate import SimulationOptions, Simulator, simulate
 from ..training.bank import MotionBank, build_bank
 from ..training.validation import Rolled, roll_states
+from .minimum import minima
 from .takes import Take
 
 SAME = 0.02  # [m] that pinned vertices of a point cache may be away from the skeleton of the motion
@@ -195,3 +196,24 @@ class Cache:
 
     def still(self, take: int, frames: range) -> None:
         return None
+
+
+class Simulated:
+    """The reference simulator itself, over all takes side by side."""
+
+    def __init__(self, name: str, dressed: Dressed, reel: Reel) -> None:
+        self.name, self.dressed, self.reel = name, dressed, reel
+        scene, motions = dressed.scene, [take.motion for take in reel.takes]
+        options, device = dressed.simulator.options, dressed.device
+        self.points = simulate(scene, dressed.fabric, motions, options, device=device)
+
+    def vertices(self, take: int, frames: range) -> Tensor:
+        local = self.points[take][frames.start : frames.stop] - self.reel.takes[take].motion.translations[0, 0]
+        return torch.as_tensor(local.transpose(1, 2, 0).copy(), dtype=torch.float32, device=self.dressed.device)
+
+    def still(self, take: int, frames: range) -> Tensor:
+        motion = self.reel.takes[take].motion
+        ends = [Take("", 0, motion.clip(0, frame + 1)) for frame in frames]
+        found = minima(self.dressed.simulator, ends, self.vertices(take, frames))
+        origin = torch.as_tensor(motion.translations[0, 0].copy(), device=self.dressed.device)
+        return (found.x + found.poses.root - origin[:, None]).float()

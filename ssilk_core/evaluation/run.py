@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,7 +17,7 @@ from ..events import Progress, Reporter, silent
 from ..training.bank import MotionBank, build_bank
 from ..training.validation import Rolled
 from .figures import Figures, Holds, Hung, Loops
-from .methods import Cache, Dressed, Method, Network, Plain, Reader, Reel, reel_of
+from .methods import Cache, Dressed, Method, Network, Plain, Reader, Reel, Simulated, reel_of
 from .metrics import pose_distance
 from .minimum import hung, minima
 from .probes import drifted, held, joined_holds, joined_hung, joined_loops, last_frames, looped, stops
@@ -25,6 +26,8 @@ from .takes import takes_of
 from .tally import Tally, against, figures, poses, takes_in
 
 SIMULATOR = "simulator"
+Stop = tuple[str, Holds, Hung | None]
+"""The clip of a stop, with what happened after it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +38,8 @@ class EvaluationOptions:
         sequence: frames after which a clip starts anew, as in the paper (512); None for whole clips.
         stops: stops in each clip after which poses are held; none for zero.
         hold: how long they are held [s].
-        minimum: whether the reference simulator minimises the energy of held poses, which takes long on a CPU.
+        minimum: whether the simulator minimises the energy of held poses.
+        simulate: whether it plays the stops as well, to see how it settles; both take long on a CPU.
         loop: frames that the first seconds of each clip loop for, at least; none for zero.
     """
 
@@ -43,6 +47,7 @@ class EvaluationOptions:
     stops: int = 2
     hold: float = 3.0
     minimum: bool = False
+    simulate: bool = False
     loop: int = 2000
 
     def __post_init__(self) -> None:
@@ -104,7 +109,7 @@ def evaluate(
     """
     run = _Run(dressed, subjects, playlist, options or EvaluationOptions(), report)
     yield from run.rows(run.plain, "plain")
-    yield from run.rows(run.truth, SIMULATOR)
+    yield from run.truth_rows()
     for subject in subjects:
         yield from run.network_rows(subject)
 
@@ -126,7 +131,8 @@ class _Run:
         self.clips = {number: take.clip for number, take in enumerate(self.takes)}
         self.simulated = takes_in(self.clips, playlist.simulated)
         self.done, self.total = 0, len(self.takes) * (len(subjects) + 1) + len(self.simulated)
-        reel = reel_of(self.takes, dressed, subjects[0].joints)
+        self.joints = subjects[0].joints
+        reel = reel_of(self.takes, dressed, self.joints)
         read = playlist.read
         self.cache = Cache(SIMULATOR, read, dressed, reel) if read else None
         self.truth = self._tally(reel, self.cache, self.simulated) if self.cache else Tally({}, self.clips)
@@ -154,19 +160,25 @@ class _Run:
         found = figures(tally, self.plain.only(takes), weight)
         return replace(found, truth=against(tally, self.truth.only(takes), weight))
 
+    def truth_rows(self) -> Iterator[Row]:
+        """Yield the figures of the simulator."""
+        wanted = self.options.simulate and self.options.stops and self.truth.records
+        stopped = self._stopped(self.joints, lambda reel: Simulated(SIMULATOR, self.dressed, reel)) if wanted else []
+        for row in self.rows(self.truth, SIMULATOR):
+            yield replace(row, figures=replace(row.figures, **self._rested(stopped, row.split)))
+
     def network_rows(self, subject: Subject) -> Iterator[Row]:
         """Yield the figures of a network."""
         reel = reel_of(self.takes, self.dressed, subject.joints)
         tally = self._tally(reel, Network(subject.name, subject.model, reel), list(self.clips))
         far, loops = self._distances(reel, subject), self._loops(subject)
-        holds, rested = self._holds(subject)
+        stopped = self._stopped(subject.joints, lambda reel: Network(subject.name, subject.model, reel))
         for row in self.rows(tally, subject.name):
             names = self.playlist.splits[row.split]
             found = replace(
                 row.figures,
+                **self._rested(stopped, row.split),
                 poses=poses(tally.only(takes_in(self.clips, names)), far) if far else None,
-                holds=joined_holds([hold for clip, hold in holds if clip in names]),
-                hung=joined_hung([rest for clip, rest in rested if clip in names]),
                 loops=joined_loops([loop for clip, loop in loops if clip in names]),
             )
             yield replace(row, figures=found)
@@ -180,21 +192,27 @@ class _Run:
         far = pose_distance(_upright(reel.bank), _upright(seen), len(subject.joints))
         return dict(enumerate(far.split((reel.bank.stops - reel.bank.starts).tolist())))
 
-    def _holds(self, subject: Subject) -> tuple[list[tuple[str, Holds]], list[tuple[str, Hung]]]:
+    def _stopped(self, joints: np.ndarray, method_on: Callable[[Reel], Method]) -> list[Stop]:
         """Return what happens after stops, and where that is beside the minimum, with the clip of each."""
         options, dressed = self.options, self.dressed
-        if not options.stops:
-            return [], []
         takes, first = stops(self.takes, dressed.fps, options.stops, options.hold)
-        reel, clips = reel_of(takes, dressed, subject.joints), [take.clip for take in takes]
-        network = Network(subject.name, subject.model, reel)
-        holds = held(dressed, reel, network, first)
-        rested = (
-            hung(minima(dressed.simulator, takes, last_frames(network, takes)), dressed.weight)
-            if options.minimum
-            else []
-        )
-        return list(zip(clips, holds)), list(zip(clips, rested))
+        if not takes:
+            return []
+        reel = reel_of(takes, dressed, joints)
+        method = method_on(reel)
+        holds = held(dressed, reel, method, first)
+        rested: Sequence[Hung | None] = [None] * len(takes)
+        if options.minimum:
+            rested = hung(minima(dressed.simulator, takes, last_frames(method, takes)), dressed.weight)
+        return [(take.clip, hold, rest) for take, hold, rest in zip(takes, holds, rested)]
+
+    def _rested(self, stopped: Sequence[Stop], split: str) -> dict[str, Any]:
+        """Return the figures of the stops of a split."""
+        own = [stop for stop in stopped if stop[0] in self.playlist.splits[split]]
+        return {
+            "holds": joined_holds([hold for _, hold, _ in own]),
+            "hung": joined_hung([rest for _, _, rest in own if rest]),
+        }
 
     def _loops(self, subject: Subject) -> list[tuple[str, Loops]]:
         """Return how looped takes drift, with the clip of each."""
