@@ -14,7 +14,7 @@ Surface = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def class_surface(thing: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Surface | None:
-    """Return points in the world (V, 3), sRGB colours (V, 4) and triangles (T, 3), in any mode, as modifiers shape it.
+    """Return points in the world (V, 3), sRGB colours (V, 4) and triangles (T, 3), in any mode.
 
     None without classes, or where what is stored are none: the panel says what is wrong.
     """
