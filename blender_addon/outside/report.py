@@ -27,7 +27,7 @@ def progress(state: JobState) -> str:
     if not state.total:
         return "Prepares the training"
     left = "" if state.seconds_left is None else f", {duration(state.seconds_left)} left"
-    return f"{state.done} of {state.total}{left}"
+    return f"Iteration {state.done} of {state.total}{left}"
 
 
 def findings(state: JobState, curve: Mapping[str, Any], *, moves: bool) -> list[tuple[str, bool]]:

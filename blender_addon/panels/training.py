@@ -14,7 +14,7 @@ from ..scene.armature import proxy_names
 from ..scene.garment import armature_of, unusable
 from ..scene.models import job_of
 from ..scene.motions import FILE
-from .base import Panel
+from .base import Panel, draw_text
 from .plot import plot, swatch
 
 ICONS = {"TIMELINE": "TIME", "ACTION": "ACTION", "STRIP": "NLA", "FILE": "FILE"}
@@ -46,13 +46,14 @@ def draw_motions(layout: bpy.types.UILayout, garment: bpy.types.Object) -> None:
 def draw_state(layout: bpy.types.UILayout, folder: Path, state: JobState, *, moves: bool) -> None:
     """Draw how far a training is, what it found, and its energies."""
     row = layout.row(align=True)
-    row.progress(factor=state.fraction, text=progress(state))
+    row.progress(factor=state.fraction, text=f"{state.done} of {state.total}")
     if state.alive:
         row.operator("ssilk.cancel_training", text="", icon="CANCEL")
     elif state.state != "done":
         row.operator("ssilk.resume_training", text="", icon="PLAY")
+    draw_text(layout, progress(state), icon="NONE" if state.alive or state.state == "done" else "INFO")
     for text, warns in findings(state, read_curve(folder), moves=moves):
-        layout.label(text=text, icon="ERROR" if warns else "NONE")
+        draw_text(layout, text, icon="ERROR" if warns else "NONE")
     lines = series(state.curve)
     if not lines:
         return

@@ -101,12 +101,14 @@ def _sample_slice(armature: bpy.types.Object, joints: Joints, take: Take) -> Non
     columns = [armature.pose.bones.find(name) for name in joints.names]
     until = time.monotonic() + SLICE
     with playing(leader_of(armature), take.source), _alone(armature) as scene:
-        while not take.complete and time.monotonic() < until:
+        while True:
             frame = take.frames[len(take.worlds)]
             scene.frame_set(frame)
             evaluated = armature.evaluated_get(scene.view_layers[0].depsgraph)
             take.placements.append(np.array(evaluated.matrix_world))
             take.worlds.append(_rigid(worlds(evaluated)[columns], joints, take.source.name, frame))
+            if take.complete or time.monotonic() > until:
+                return
 
 
 @contextmanager

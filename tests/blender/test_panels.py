@@ -23,8 +23,11 @@ class Layout:
 
     column = row
 
-    def label(self, text: str, icon: str = "NONE", translate: bool = True) -> None:
+    def label(self, text: str, icon: str = "NONE", translate: bool = True, icon_value: int = 0) -> None:
         self.notes.append(text)
+
+    def template_icon(self, icon_value: int, scale: float) -> None:
+        assert isinstance(icon_value, int)  # zero where there is no window
 
     def template_list(
         self, kind: str, _: str, data: object, name: str, active: object, index: str, rows: int
@@ -34,7 +37,7 @@ class Layout:
         assert hasattr(bpy.types, kind) and hasattr(data, name) and hasattr(active, index)
         self.notes.append(name)
 
-    def prop(self, data: object, name: str) -> None:
+    def prop(self, data: object, name: str, text: str = "", icon: str = "NONE") -> None:
         assert hasattr(data, name), name
         self.notes.append(name)
 

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is said and drawn of a training, without Blender."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import numpy as np
+import pytest
+
+from blender_addon.curves import COLORS, GROUND, picture, series
+from blender_addon.outside.jobs import JobState
+from blender_addon.outside.report import NO_DYNAMICS, duration, findings, progress
+from ssilk_core.events import format_seconds
+
+from .conftest import ROOT
+
+SCORE = {"total": 0.6, "collisions": 0.0123, "dynamics": 0.023}
+CURVE = {"plain": {"total": 1.0}, "points": [{"iteration": 5, "validation": SCORE}]}
+
+
+@pytest.mark.parametrize(
+    ("state", "told"),
+    [
+        (JobState("waiting"), "Waits until the trainings before it have ended"),
+        (JobState("running"), "Prepares the training"),
+        (JobState("running", 120, 500, 185.2), "Iteration 120 of 500, 3 min 05 s left"),
+        (JobState("running", 1, 500), "Iteration 1 of 500"),
+        (JobState("done", 500, 500), "Trained for 500 iterations"),
+        (JobState("stopped", 120, 500), "Stopped at 120 of 500; it can be resumed"),
+        (JobState("lost", 3, 9), "Ended without a word at 3 of 9, perhaps with the machine; resume it"),
+        (JobState("failed", error="clip.usdc: no joints."), "clip.usdc: no joints."),
+    ],
+)
+def test_progress_is_one_line(state, told):
+    assert progress(state) == told
+
+
+def test_validations_say_what_is_learned():
+    running = JobState("running", checkpoint=5)
+    assert findings(running, CURVE, moves=True) == [
+        ("40% less energy than plain skinning", False),
+        ("1.23% of the vertices inside the body", False),
+        ("Dynamics are being learned: 23 mm of motion of its own", False),
+        ("Best model: from iteration 5; bake to see it on your shot", False),
+    ]
+    stiff = {**CURVE, "points": [{"iteration": 5, "validation": {**SCORE, "total": 1.5, "dynamics": 0.0019}}]}
+    told = findings(running, stiff, moves=True)
+    assert ("50% more energy than plain skinning", True) in told
+    assert ("Nothing dynamic is being learned: check that the motions move", True) in told
+    assert not any("ynamic" in text for text, _ in findings(running, stiff, moves=False))
+    assert findings(running, {}, moves=True)[0][0].startswith("No validation yet")
+    assert findings(JobState("stopped"), {}, moves=True) == []
+
+
+def test_words_are_those_of_ssilk():
+    source = (ROOT / "ssilk_core" / "training" / "verdict.py").read_text()
+    assert float(re.search(r"^NO_DYNAMICS = (\S+)", source, re.MULTILINE)[1]) == NO_DYNAMICS
+    for seconds in (0.2, 59.6, 185.2, 3600, 7800):
+        assert duration(seconds) == format_seconds(seconds)
+
+
+def test_series_leave_out_what_is_not_finite():
+    found = series(
+        [(1, {"stretch": 2.0}), (2, {"stretch": None, "inertia": 0.5}), (3, {"stretch": 1.0, "drag": None})]
+    )
+    assert {name: rows.tolist() for name, rows in found.items()} == {
+        "stretch": [[1, 2], [3, 1]],
+        "inertia": [[2, 0.5]],
+    }
+
+
+def test_a_picture_shows_each_line_where_it_is():
+    rising, flat = np.array([[0, 0.0], [10, math.sinh(1)]]) * [1, 1e-3], np.array([[0, 0.0], [10, 0.0]])
+    image = picture([rising, flat], 64)
+    assert image.shape == (64, 64, 4)
+    assert (image[..., 3] == 1).all()
+    marked = [np.isclose(image[..., :3], color).all(-1) for color in COLORS[:2]]
+    rows = [np.argmax(marked[0][:, column]) for column in (20, 40, 63)]
+    assert rows[0] < rows[1] < rows[2] >= 58
+    assert marked[1][:3, 5:].all()
+    assert not marked[1][3:].any()
+    np.testing.assert_array_equal(image[60, 3], GROUND)
+
+
+def test_pictures_of_nothing_and_of_one_point_are_drawn():
+    assert (picture([], 8) == GROUND).all()
+    assert (picture([np.array([[3, 0.1]])], 8)[..., :3] == COLORS[0]).all(-1).any()

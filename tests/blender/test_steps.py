@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Work that begins with steps in Blender's own process, a little at a time."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+from blender_addon.errors import SetupError
+from blender_addon.outside.work import Work
+
+
+def steps(done: list[int], *, failing: bool = False):
+    for number in range(3):
+        if failing and number == 2:
+            raise SetupError("'Rig' was deleted meanwhile; nothing was changed.")
+        done.append(number)
+        yield number / 3
+
+
+def test_one_step_is_done_at_each_look_and_commands_follow():
+    done: list[int] = []
+    work = Work("Testing", lambda _: done.append(9) or [[sys.executable, "-c", "print('hello')"]], steps=steps(done))
+    seen = [(work.poll(), list(done), work.fraction) for _ in range(3)]
+    assert seen == [(False, [0], 0.0), (False, [0, 1], 1 / 3), (False, [0, 1, 2], 2 / 3)]
+    while not work.poll():
+        time.sleep(0.01)
+    assert (done, work.error, work.text) == ([0, 1, 2, 9], "", "hello")
+    work.close()
+
+
+def test_work_may_consist_of_steps_alone():
+    done: list[int] = []
+    work = Work("Testing", lambda _: (), steps=steps(done))
+    while not work.poll():
+        pass
+    assert (done, work.error) == ([0, 1, 2], "")
+    work.close()
+
+
+def test_a_step_that_fails_ends_the_work_before_its_commands():
+    done: list[int] = []
+    work = Work("Testing", lambda _: done.append(9) or (), steps=steps(done, failing=True))
+    while not work.poll():
+        pass
+    assert (done, work.error) == ([0, 1], "'Rig' was deleted meanwhile; nothing was changed.")
+    work.close()
+
+
+def test_steps_end_when_work_is_cancelled():
+    done: list[int] = []
+    work = Work("Testing", lambda _: done.append(9) or (), steps=steps(done))
+    work.poll()
+    work.cancel()
+    assert work.poll()
+    assert (done, work.error) == ([0], "Testing was cancelled.")
+    work.close()
