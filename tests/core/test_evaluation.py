@@ -270,7 +270,7 @@ def playlist(dressed: Dressed, motion: Motion, slow: Motion, **options: object) 
 
 
 def test_every_method_gets_its_row_in_every_split(scene, dressed, motion, toy_motion, toy_model):
-    slow = toy_motion(scene, 30, speed=0.3)
+    motion, slow = motion.clip(0, 20), toy_motion(scene, 12, speed=0.3)
     subjects = [
         Subject("ssilk", toy_model(scene), JOINTS),
         Subject("ncs", baseline(scene, BaselineConfig(method="ncs"), JOINTS), JOINTS),
@@ -280,19 +280,19 @@ def test_every_method_gets_its_row_in_every_split(scene, dressed, motion, toy_mo
     def read(clip: str, frames: range) -> np.ndarray:
         if not cache:
             reel = reel_of(takes_of("slow", slow, FPS), dressed, JOINTS)
-            cache["slow"] = Plain(dressed, reel).vertices(0, range(30)).permute(2, 0, 1) + slow.translations[0, 0]
+            cache["slow"] = Plain(dressed, reel).vertices(0, range(12)).permute(2, 0, 1) + slow.translations[0, 0]
         return cache[clip][frames.start : frames.stop].numpy()
 
     played = playlist(dressed, motion, slow, simulated=frozenset({"slow"}), read=read, seen=[motion])
     rows = list(
-        evaluate(dressed, subjects, played, EvaluationOptions(stops=1, hold=0.5, minimum=True, simulate=True, loop=1))
+        evaluate(dressed, subjects, played, EvaluationOptions(stops=1, hold=0.2, minimum=True, simulate=True, loop=1))
     )
     names = [(row.method, row.split) for row in rows]
     methods = ("plain", SIMULATOR, "ssilk", "ncs")
     assert names == [(method, split) for method in methods for split in ("valid", "flips")]
     by_name = {name: row.figures for name, row in zip(names, rows)}
     model, simulated = by_name["ssilk", "valid"], by_name[SIMULATOR, "valid"]
-    assert (model.frames, model.truth.frames, simulated.frames, simulated.clips) == (70, 30, 30, 1)
+    assert (model.frames, model.truth.frames, simulated.frames, simulated.clips) == (32, 12, 12, 1)
     assert by_name["plain", "valid"].truth.position < 1e-6 < model.truth.position  # plain is what was written
     assert (model.holds.stops, model.hung.stops, model.loops.clips) == (2, 2, 2) and model.hung.above > 0
     assert by_name["plain", "valid"].holds is None and simulated.holds.stops == 2

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's tables on the toy world: models and baselines side by side, seeds together, one setting at a time."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from ssilk_core.baselines.files import save_baseline
+from ssilk_core.baselines.networks import BaselineConfig, baseline
+from ssilk_core.checkpoint import load_model, save_model
+
+WORLD = "--stage rigged.usda --motions clips --index index.json"
+
+
+@pytest.fixture
+def world(toy, tmp_path, monkeypatch):
+    toy.copy(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    for name, frames in (("brief", 10), ("turn", 8)):
+        (tmp_path / "clips").mkdir(exist_ok=True)
+        toy.write_clip(tmp_path / "clips" / f"{name}.usdc", frames=frames)
+    index = [{"clip": "brief", "split": "valid", "tags": ["inertia"]}, {"clip": "turn", "split": "flips"}]
+    (tmp_path / "index.json").write_text(json.dumps(index))
+    file = load_model("model.safetensors")
+    for batch in (2, 4):
+        train = {**file.provenance["train"], "batch": batch}
+        save_model(tmp_path / "models" / f"{batch}.safetensors", replace(file, provenance={"train": train}))
+    ncs = baseline(file.scene, BaselineConfig(method="ncs"), file.joints)
+    save_baseline(tmp_path / "ncs.safetensors", ncs, file.fabric, {"train": {"rotated": 0.5}})
+    return tmp_path
+
+
+@pytest.fixture
+def made(world, monkeypatch):
+    """Makes a table as its command does, into the folder of the world; returns its lines and figures."""
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "benchmarks")
+    import reports
+    import sweeps
+    import tables
+
+    monkeypatch.setattr(reports, "RESULTS", world)
+    monkeypatch.setattr(sweeps, "RESULTS", world)
+
+    def make(words: str) -> tuple[list[list[str]], object]:
+        monkeypatch.setattr(sys, "argv", ["tables.py", *shlex.split(words)])
+        tables.main()
+        name = words.split()[0]
+        lines = (world / f"{name}.md").read_text().splitlines()
+        cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines if line.startswith("|")]
+        return [cells[0], *cells[2:]], json.loads((world / f"{name}.json").read_text())["measured"]
+
+    return make
+
+
+def test_methods_stand_side_by_side_and_seeds_together(made, world):
+    (header, *lines), figures = made(f"table1 models ncs.safetensors {WORLD}")
+    assert header[:4] == ["garment", "method", "valid: L_tot [J]", "valid: collisions"] and len(header) == 8
+    assert [line[:2] for line in lines] == [["Skirt", "plain"], ["Skirt", "ssilk"], ["Skirt", "ncs*"]]
+    assert "±" in lines[1][2] and "±" not in lines[2][2]  # two models are seeds of one method
+    assert {row["model"] for row in figures} == {
+        None,
+        "models/2.safetensors",
+        "models/4.safetensors",
+        "ncs.safetensors",
+    }
+    assert "- ssilk's total is lower than ncs*'s in" in (world / "table1.md").read_text()
+
+
+def test_one_setting_at_a_time(made, world):
+    (_, *lines), figures = made(f"table5 models {WORLD}")
+    assert [line[:2] for line in lines] == [["batch", "2"], ["batch", "4"], ["window", "4"], ["latent", "8"]]
+    assert figures["batch"].keys() == {"2", "4"} and (world / "table5.png").is_file()
+
+
+def test_settings_vary_about_what_most_models_have(made):
+    from sweeps import alone
+
+    told = {
+        "usual": {"batch": 32, "window": 6}, "again": {"batch": 32, "window": 6},
+        "small": {"batch": 8, "window": 6}, "long": {"batch": 32, "window": 16},
+    }  # fmt: skip
+    assert alone(told, "batch") == {8: ["small"], 32: ["usual", "again"]}
+    assert alone(told, "window") == {6: ["usual", "again"], 16: ["long"]}
+
+
+def test_single_frames_are_timed(made):
+    (_, *lines), figures = made(f"table3 models/2.safetensors ncs.safetensors {WORLD} --clip brief --frames 3")
+    assert [line[0] for line in lines] == ["2", "ncs"]
+    assert all(0 < times["model"][0] < times["full"][0] for times in figures.values())
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        ("table2 models", "no --reference"),
+        ("table5 ncs.safetensors", "ncs.safetensors is a baseline"),
+        ("table1 clips", "no model in the folder"),
+        ("table3 nothing.safetensors", "no such model file"),
+    ],
+)
+def test_what_cannot_be_made_is_refused_in_one_sentence(made, words, complaint):
+    with pytest.raises(SystemExit, match=f"error: .*{complaint}"):
+        made(f"{words} {WORLD}")
