@@ -1,0 +1,267 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""German."""
+
+from __future__ import annotations
+
+WORDS = {
+    # Garment, fabric
+    "Garment": "Kleidungsstück",
+    "Armature": "Armatur",
+    "Armature of the character that wears the garment; found by its Armature modifier when empty": (
+        "Armatur der Figur, die das Kleidungsstück trägt; leer: die seines Armatur-Modifikators"
+    ),
+    "Bodies": "Körper",
+    "Meshes that the garment collides with; all others bound to the armature when empty": (
+        "Netze, mit denen das Kleidungsstück kollidiert; leer: alle anderen, die an die Armatur gebunden sind"
+    ),
+    "Fabric": "Stoff",
+    "What the garment is made of": "Woraus das Kleidungsstück besteht",
+    "Preset": "Vorgabe",
+    "Cloth to start from; sets all values": "Stoff, von dem ausgegangen wird; setzt alle Werte",
+    "Default": "Standard",
+    "The paper's: light and soft": "Der des Artikels: leicht und weich",
+    "Silk": "Seide",
+    "Light and very soft, 80 g/m²": "Leicht und sehr weich, 80 g/m²",
+    "Cotton": "Baumwolle",
+    "A shirt, 150 g/m²": "Ein Hemd, 150 g/m²",
+    "Denim": "Jeansstoff",
+    "Stiff and heavy, 400 g/m²": "Steif und schwer, 400 g/m²",
+    "Wool": "Wolle",
+    "A coat, soft and heavy, 300 g/m²": "Ein Mantel, weich und schwer, 300 g/m²",
+    "Leather": "Leder",
+    "Very stiff and heavy, 600 g/m²": "Sehr steif und schwer, 600 g/m²",
+    "Stretch Model": "Dehnungsmodell",
+    "How the cloth resists stretching": "Wie der Stoff sich gegen Dehnung wehrt",
+    "Membrane with Lamé parameters": "Membran mit Lamé-Parametern",
+    "Stretch along the threads and shear across, by texture coordinates": (
+        "Dehnung längs und Scherung quer zu den Fäden, nach Texturkoordinaten"
+    ),
+    "Density": "Flächengewicht",
+    "Mass for each area, in kg/m²": "Masse je Fläche, in kg/m²",
+    "Lamé μ": "Lamé-μ",
+    "Resistance to shear of the membrane, in N/m": "Widerstand der Membran gegen Scherung, in N/m",
+    "Lamé λ": "Lamé-λ",
+    "Resistance to changes of area of the membrane, in N/m": (
+        "Widerstand der Membran gegen Änderungen der Fläche, in N/m"
+    ),
+    "Stretch": "Dehnung",
+    "Stiffness along the threads, in N/m": "Steifigkeit längs der Fäden, in N/m",
+    "Shear": "Scherung",
+    "Stiffness across the threads, in N/m": "Steifigkeit quer zu den Fäden, in N/m",
+    "Bending": "Biegung",
+    "Stiffness of folds, in N m": "Steifigkeit von Falten, in N m",
+    "Collision": "Kollision",
+    "How hard the body pushes each vertex away, in N/m": "Wie stark der Körper jeden Punkt wegdrückt, in N/m",
+    "Margin": "Abstand",
+    "Distance at which the body begins to push": "Abstand, ab dem der Körper drückt",
+    "Air Drag": "Luftwiderstand",
+    "Resistance of the air for each area and speed, in kg/(m² s); zero is a vacuum": (
+        "Widerstand der Luft je Fläche und Geschwindigkeit, in kg/(m² s); null ist luftleer"
+    ),
+    # The Python outside
+    "Check Python": "Python prüfen",
+    "Ask the chosen Python for its versions and its device": "Das gewählte Python nach Versionen und Gerät fragen",
+    "Find Python": "Python suchen",
+    "Look for a Python that has ssilk: on the PATH, in common environments, beside the blend file": (
+        "Ein Python mit ssilk suchen: im PATH, in üblichen Umgebungen, neben der Blend-Datei"
+    ),
+    "Interpreter of the environment in which ssilk is installed": (
+        "Interpreter der Umgebung, in der ssilk installiert ist"
+    ),
+    "Install From": "Installieren aus",
+    "A wheel of ssilk, or the folder of its project, to make an environment from; "
+    "what came with the extension when empty": (
+        "Ein Wheel von ssilk oder der Ordner des Projekts für eine neue Umgebung; leer: was der Erweiterung beiliegt"
+    ),
+    "Create": "Anlegen",
+    "Create Environment for SSILK": "Umgebung für SSILK anlegen",
+    "Make a Python environment for ssilk, with what pip downloads: up to several gigabytes with PyTorch": (
+        "Eine Python-Umgebung für ssilk anlegen, mit dem, was pip lädt: mit PyTorch bis zu einige Gigabyte"
+    ),
+    "Stop Trainings with Blender": "Training mit Blender beenden",
+    "End trainings when Blender closes; otherwise they go on. The best model is kept either way": (
+        "Training beenden, wenn Blender schließt; sonst läuft es weiter. Das beste Modell bleibt in beiden Fällen"
+    ),
+    "Cancel": "Abbrechen",
+    "Stop what runs outside Blender": "Beenden, was außerhalb von Blender läuft",
+    # Preflight
+    "Preflight": "Vorprüfung",
+    "Inspect": "Prüfen",
+    "Look for what would spoil the training: on the mesh, on how the garment fits the body, and on its classes": (
+        "Suchen, was das Training verdirbt: am Netz, am Sitz auf dem Körper und an den Klassen"
+    ),
+    "Select": "Auswählen",
+    "Select what the finding is about": "Auswählen, worum es in dem Befund geht",
+    "Fix": "Beheben",
+    "Repair what was found, where that needs no decision; look again afterwards": (
+        "Beheben, was gefunden wurde, wo nichts zu entscheiden ist; danach neu prüfen"
+    ),
+    "Push Out": "Herausdrücken",
+    "Push shallow patches out of the body to where collisions begin, with all shape keys": (
+        "Flache Stellen aus dem Körper drücken, bis dorthin, wo Kollisionen beginnen, mit allen Formschlüsseln"
+    ),
+    # Classes
+    "Class": "Klasse",
+    "Classes": "Klassen",
+    "Pinned": "Fest",
+    "Rigidly follows the skeleton, black: belts, collars, what is sewn on": (
+        "Folgt starr dem Skelett, schwarz: Gürtel, Kragen, Angenähtes"
+    ),
+    "Tight": "Eng",
+    "Follows the body closely, red": "Folgt dem Körper dicht, rot",
+    "Loose": "Lose",
+    "Moves freely, green: moved by proxy joints and the network": (
+        "Bewegt sich frei, grün: durch Stellvertreter-Knochen und das Netzwerk"
+    ),
+    "Classify Automatically": "Automatisch einteilen",
+    "Find classes by the garment's distance to the body and by where limbs part; replaces what is painted": (
+        "Klassen finden nach dem Abstand zum Körper und danach, wo Glieder sich trennen; ersetzt Gemaltes"
+    ),
+    "Paint Classes": "Klassen malen",
+    "Paint vertex classes with Blender's vertex-paint brushes: pinned black, tight red, loose green": (
+        "Klassen mit Blenders Pinseln malen: fest schwarz, eng rot, lose grün"
+    ),
+    "Paint This Class": "Diese Klasse malen",
+    "Paint this class from now on": "Von jetzt an diese Klasse malen",
+    "Fill Selection": "Auswahl füllen",
+    "Give the selected vertices this class": "Den ausgewählten Punkten diese Klasse geben",
+    "Take Up Painting": "Gemaltes übernehmen",
+    "Turn painted colours into classes, each into the nearest one, and make the colours pure again": (
+        "Aus gemalten Farben Klassen machen, je die nächste, und die Farben wieder rein machen"
+    ),
+    "Class Overlay": "Klassen einblenden",
+    "Show the classes of all garments over them in 3D views, in any mode; the file is not touched": (
+        "Die Klassen aller Kleidungsstücke in 3D-Ansichten darüberlegen, in jedem Modus; die Datei bleibt unberührt"
+    ),
+    "Show Classes": "Klassen zeigen",
+    "Show classes as colours, made anew from the stored ones; in Solid shading, in this view": (
+        "Klassen als Farben zeigen, neu aus den gespeicherten; in fester Schattierung, in dieser Ansicht"
+    ),
+    "Mirror Classes": "Klassen spiegeln",
+    "Give one side the classes of the other, by the places of vertices along the garment's own x axis": (
+        "Einer Seite die Klassen der anderen geben, nach der Lage der Punkte längs der x-Achse des Kleidungsstücks"
+    ),
+    "From": "Von",
+    "Left (+x)": "Links (+x)",
+    "From the character's left": "Von links, aus Sicht der Figur",
+    "Right (-x)": "Rechts (-x)",
+    "From its right": "Von rechts, aus ihrer Sicht",
+    "Tolerance": "Toleranz",
+    "How far from the mirrored place a vertex may lie": (
+        "Wie weit ein Punkt vom gespiegelten Ort entfernt sein darf"
+    ),
+    # Rig
+    "Proxy Rig": "Stellvertreter-Rig",
+    "Generate Proxy Rig": "Stellvertreter-Rig erzeugen",
+    "Make proxy bones for the loose part, if there is one, and weights for the whole garment, from its classes": (
+        "Aus den Klassen Stellvertreter-Knochen für den losen Teil machen, falls es ihn gibt, und Gewichte für alles"
+    ),
+    "Proxies": "Stellvertreter",
+    "Proxy bones on the loose part": "Stellvertreter-Knochen auf dem losen Teil",
+    "Roots per Cluster": "Wurzeln je Teil",
+    "How many proxies of each connected loose part hang from the character's bones directly": (
+        "Wie viele Stellvertreter jedes zusammenhängenden losen Teils direkt an Knochen der Figur hängen"
+    ),
+    "Keep Edits by Hand": "Handarbeit behalten",
+    "Keep proxies that were moved, reparented or added, leave out those that were deleted, and keep "
+    "the weights of repainted vertices": (
+        "Behalten, was verschoben, umgehängt oder hinzugefügt wurde, Gelöschtes weglassen, gemalte Gewichte behalten"
+    ),
+    "Adopt Rig": "Rig übernehmen",
+    "Recognise the proxies of garments that were imported from a stage of `ssilk rig`": (
+        "Die Stellvertreter von Kleidungsstücken erkennen, die aus einer Datei von `ssilk rig` importiert wurden"
+    ),
+    "Import Rigged Stage": "Fertiges Rig importieren",
+    "Import a dressed character that `ssilk rig` wrote, with its proxies and its frame rate": (
+        "Eine bekleidete Figur importieren, die `ssilk rig` schrieb, mit Stellvertretern und Bildrate"
+    ),
+    # Training
+    "Training": "Training",
+    "How the garment is trained": "Wie das Kleidungsstück trainiert wird",
+    "Motions": "Bewegungen",
+    "What can be trained on": "Womit trainiert werden kann",
+    "Find Motions": "Bewegungen suchen",
+    "List what the armature plays: the timeline, its actions, its NLA strips; what was chosen stays chosen": (
+        "Auflisten, was die Armatur spielt: Zeitleiste, Aktionen, NLA-Streifen; Gewähltes bleibt gewählt"
+    ),
+    "Add Motion Files": "Dateien hinzufügen",
+    "Train on animations of this skeleton in USD files, too": (
+        "Auch mit Animationen dieses Skeletts aus USD-Dateien trainieren"
+    ),
+    "Remove Motion": "Bewegung entfernen",
+    "Take this motion off the list": "Diese Bewegung von der Liste nehmen",
+    "Kind": "Art",
+    "Timeline": "Zeitleiste",
+    "All that the armature plays over the scene's frame range": (
+        "Alles, was die Armatur im Bildbereich der Szene spielt"
+    ),
+    "Action": "Aktion",
+    "One of the armature's actions by itself": "Eine Aktion der Armatur für sich",
+    "Strip": "Streifen",
+    "One strip of the armature's NLA tracks by itself": "Ein Streifen der NLA-Spuren der Armatur für sich",
+    "File": "Datei",
+    "A USD file with an animation of this skeleton": "Eine USD-Datei mit einer Animation dieses Skeletts",
+    "Track": "Spur",
+    "NLA track of the strip": "NLA-Spur des Streifens",
+    "Use": "Verwenden",
+    "Train on this motion": "Mit dieser Bewegung trainieren",
+    "Draft": "Entwurf",
+    "A first look, after minutes on any machine": "Ein erster Eindruck, nach Minuten auf jedem Rechner",
+    "Preview": "Vorschau",
+    "Nearly the final quality, after minutes on a GPU": "Fast die endgültige Qualität, nach Minuten auf einer GPU",
+    "Final": "Endgültig",
+    "The paper's schedule, after about an hour on a GPU": "Wie im Artikel, nach etwa einer Stunde auf einer GPU",
+    "Iterations": "Schritte",
+    "Optimiser steps; zero for as many as the preset has": "Schritte des Optimierers; null: so viele wie die Vorgabe",
+    "Folder": "Ordner",
+    "Folder of the garment's training, relative to the blend file": (
+        "Ordner des Trainings dieses Kleidungsstücks, relativ zur Blend-Datei"
+    ),
+    "Train": "Trainieren",
+    "Train the garment on the chosen motions, outside Blender: it goes on when Blender closes": (
+        "Das Kleidungsstück mit den gewählten Bewegungen außerhalb von Blender trainieren: läuft ohne Blender weiter"
+    ),
+    "Cancel Training": "Training beenden",
+    "End the training; its best model is kept, and it can go on from where it is": (
+        "Das Training beenden; sein bestes Modell bleibt, und es kann von hier weitergehen"
+    ),
+    "Resume Training": "Training fortsetzen",
+    "Let the training go on from where it ended": "Das Training dort fortsetzen, wo es endete",
+    # Baking and playback
+    "Baking": "Backen",
+    "Model": "Modell",
+    "Trained model of the garment; that of its own training when empty": (
+        "Trainiertes Modell des Kleidungsstücks; leer: das seines eigenen Trainings"
+    ),
+    "Bake": "Backen",
+    "Bake the trained garment over the scene's frames, as bones and shape keys; what was baked before is replaced": (
+        "Das trainierte Kleidungsstück über die Bilder der Szene backen, in Knochen und Formschlüssel; ersetzt das letzte"
+    ),
+    "To Timeline": "In die Zeitleiste",
+    "Put keys on the proxies and on shape keys of the garment": (
+        "Schlüsselbilder auf Stellvertreter und Formschlüssel des Kleidungsstücks setzen"
+    ),
+    "To USD": "Nach USD",
+    "Write a UsdSkel shot, with the body": "Einen UsdSkel-Shot schreiben, mit dem Körper",
+    "Pre-Roll": "Vorlauf",
+    "How long the garment settles in the first pose before the first frame": (
+        "Wie lange das Kleidungsstück sich in der ersten Pose setzt, vor dem ersten Bild"
+    ),
+    "Remove Bake": "Gebackenes entfernen",
+    "Remove the keys and shape keys that were baked; the weights stay as trained": (
+        "Gebackene Schlüsselbilder und Formschlüssel entfernen; die Gewichte bleiben wie trainiert"
+    ),
+    "Live Playback": "Live-Wiedergabe",
+    "Play Live": "Live spielen",
+    "Play the trained garment on the armature as it is, frame by frame, without a bake": (
+        "Das trainierte Kleidungsstück auf der Armatur spielen, wie sie ist, Bild für Bild, ohne zu backen"
+    ),
+    "Stop Playing": "Wiedergabe beenden",
+    "Play the garment no longer; it stays as it is in this frame": (
+        "Das Kleidungsstück nicht länger spielen; es bleibt wie in diesem Bild"
+    ),
+    "Read Motion Again": "Bewegung neu lesen",
+    "Read what the armature does over the scene's frames anew: after edits, or when the frame range changed": (
+        "Neu lesen, was die Armatur über die Bilder der Szene tut: nach Änderungen, oder bei anderem Bildbereich"
+    ),
+}
