@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fewer influences: the weights with which fewer joints keep each vertex nearest to where all of them have it.
 
-A vertex that joint c alone would carry to p_c is at x = sum_c w_c p_c. Other weights v, summing to one, put it
-sum_c v_c (p_c - x) away, whose mean square over frames is v^T H v with H_cd = mean (p_c - x) . (p_d - x).
+A vertex that joint c alone would carry to p_c is at x = sum_c w_c p_c. Other weights v, summing to one too, put it
+sum_c (v_c - w_c) p_c away from there, whose mean square over frames is (v - w)^T H (v - w) with
+H_cd = mean (p_c - x) . (p_d - x).
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from ..assets import Floats, Ints
 
 AT_ONCE = 64  # vertices; H of so many takes some 50 MB of positions
-RIDGE = 1e-9  # pull towards the weights that were, relative to H: decides where joints move alike
+RIDGE = 1e-3  # pull towards the weights that were, relative to H: decides where joints move alike
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +25,7 @@ class Influences:
 
     Attributes:
         joints: candidates, shape (V, C), -1 where a vertex has fewer.
-        weights: shape (V, C), zero for candidates that do not move the vertex.
+        weights: w, shape (V, C), zero for candidates that do not move the vertex.
         costs: H of each vertex, shape (V, C, C) [m2].
     """
 
@@ -33,8 +34,9 @@ class Influences:
     costs: Floats
 
     def lost(self, weights: Floats) -> Floats:
-        """Return the mean squared distances (V,) [m2] from where the vertices were that weights (V, C) bring."""
-        return np.einsum("vc,vcd,vd->v", weights, self.costs, weights).clip(min=0)
+        """Return the mean squared distances (V,) [m2] by which other weights (V, C) move the vertices."""
+        change = weights - self.weights
+        return np.einsum("vc,vcd,vd->v", change, self.costs, change).clip(min=0)
 
     def of(self, rows: Ints) -> Influences:
         """Return those of some vertices."""
@@ -67,7 +69,7 @@ def carried_by(joints: Ints, matrices: NDArray, points: NDArray) -> NDArray:
 def fitted(influences: Influences, allowed: NDArray, most: int) -> Floats:
     """Return weights (V, C), not negative and summing to one, of at most `most` of the `allowed` candidates (V, C).
 
-    Each is the least v^T H v over its own support. Supports shrink one candidate at a time: first those whose weight
+    Each is the one that moves the vertex least over its own support. Supports shrink one candidate at a time: first those whose weight
     would be negative, then whichever is missed least (w_c^2 / [K^-1]_cc, K of the constrained least squares).
     """
     allowed, weights = allowed.copy(), np.empty(influences.weights.shape)
@@ -87,13 +89,15 @@ def _constrained(influences: Influences, allowed: NDArray) -> tuple[Floats, Floa
     count, size = allowed.shape
     scale = np.einsum("vcc->v", influences.costs)[:, None, None] / size + 1e-30
     both = allowed[:, :, None] & allowed[:, None]
+    costs = influences.costs / scale
     system = np.zeros((count, size + 1, size + 1))
-    system[:, :size, :size] = np.where(both, influences.costs / scale, 0)
+    system[:, :size, :size] = np.where(both, costs, 0)
     diagonal = np.arange(size)
     system[:, diagonal, diagonal] += np.where(allowed, RIDGE, 1)
     system[:, :size, size] = system[:, size, :size] = allowed
-    wanted = np.append(RIDGE * influences.weights * allowed, np.ones((count, 1)), axis=1)
+    pull = np.einsum("vcd,vd->vc", costs, influences.weights) + RIDGE * influences.weights
     inverse = np.linalg.inv(system)
+    wanted = np.append(pull * allowed, np.ones((count, 1)), axis=1)
     weights = np.where(allowed, (inverse @ wanted[:, :, None])[:, :size, 0], 0)
     missed = weights**2 / np.maximum(inverse[:, diagonal, diagonal], 1e-30)
     return weights, np.where(allowed, missed, np.inf)

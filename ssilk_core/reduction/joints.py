@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fewer proxy joints: ends of chains are taken off, those that are missed least first.
 
-Only ends, so that all that stay move as before: a joint within a chain carries those after it.
+Only ends, so that all that stay move as before: a joint within a chain carries those after it. What a joint moved
+follows the one that carried it, in the same shares, which leaves cloth as smooth as it was. Weights fitted anew for each
+vertex by least squares come nearer by themselves, but neighbours part; and what follows smoothly is what blendshapes
+can make up for: on the cape with 10 of 20 proxies, they leave half as much.
 """
 
 from __future__ import annotations
@@ -10,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..assets import Floats, Ints, Scene
-from .influences import Influences, fitted
+from .influences import Influences
 
 
 def candidates(scene: Scene, weights: Floats) -> Ints:
@@ -42,29 +45,33 @@ def least_missed(scene: Scene, influences: Influences, mass: Floats) -> list[int
     kept = set(range(character, len(scene.parents)))
     while kept:
         ends = sorted(kept - {int(scene.parents[proxy]) for proxy in kept})
-        gone = min(ends, key=lambda end: _missed(influences, mass, [*order, end]))
+        gone = min(ends, key=lambda end: _missed(influences, scene.parents, mass, [*order, end]))
         order.append(gone)
         kept.remove(gone)
     return order
 
 
-def _missed(influences: Influences, mass: Floats, gone: list[int]) -> float:
+def _missed(influences: Influences, parents: Ints, mass: Floats, gone: list[int]) -> float:
     """Return what the vertices that the last of these joints moves lose more by its going [m2, weighted by mass]."""
     rows = np.flatnonzero((influences.joints == gone[-1]).any(axis=1))
     own = influences.of(rows)
-    before, after = (own.lost(refitted(own, gone[:count])) for count in (-1, len(gone)))
+    before, after = (own.lost(handed_down(own, parents, gone[:count])) for count in (-1, len(gone)))
     return float(mass[rows] @ (after - before))
 
 
-def refitted(influences: Influences, gone: list[int], most: int | None = None) -> Floats:
-    """Return the best weights (V, C) without some joints, of at most `most` joints each.
+def handed_down(influences: Influences, parents: Ints, gone: list[int]) -> Floats:
+    """Return weights (V, C) with those of some joints given to what carries them.
 
-    Vertices that lose no joint keep to those that move them.
+    Args:
+        parents: of all joints; gone: ends of chains first.
     """
-    stays = (influences.joints >= 0) & ~np.isin(influences.joints, gone)
-    moving = influences.weights > 0
-    whole = (stays | ~moving).all(axis=1, keepdims=True)
-    return fitted(influences, np.where(whole, stays & moving, stays), most or stays.shape[1])
+    weights = influences.weights.copy()
+    for joint in gone:
+        row, column = np.nonzero(influences.joints == joint)
+        above = (influences.joints[row] == parents[joint]).argmax(axis=1)
+        weights[row, above] += weights[row, column]
+        weights[row, column] = 0
+    return weights
 
 
 def dense(joints: Ints, weights: Floats, count: int) -> NDArray:

@@ -8,7 +8,7 @@ add up over time.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -20,8 +20,8 @@ from ..mesh.topology import vertex_areas
 from ..runtime import Player
 from ..runtime.skinning import trained_weights
 from .files import with_basis, with_weights
-from .influences import AT_ONCE, Influences, carried_by, measured
-from .joints import candidates, dense, least_missed, refitted
+from .influences import AT_ONCE, Influences, carried_by, fitted, measured
+from .joints import candidates, dense, handed_down, least_missed
 from .observed import observe
 from .shapes import Modes, basis, modes
 from .size import Size
@@ -133,7 +133,9 @@ class Reducer:
         return self.order[: self.whole.joints - joints]
 
     def _fitted(self, joints: int, influences: int) -> Floats:
-        return refitted(self.influences, self._gone(joints), influences)
+        own = self.influences
+        weights = handed_down(own, self.scene.parents, self._gone(joints))
+        return fitted(replace(own, weights=weights), weights > 0, influences)
 
     def _modes(self, joints: int, influences: int) -> Modes:
         """Return what displacements would make up for other weights, as far as activations tell."""

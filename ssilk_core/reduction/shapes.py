@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..assets import Floats
 
-RIDGE = 3e-4  # of the mean variance of activations: keeps few frames from being learnt by heart
+RIDGE = 1e-3  # of the mean variance of activations: keeps few frames from being learnt by heart
 LEAST = 1e-14  # of the largest share: modes with less are rounding
 
 
