@@ -235,7 +235,7 @@ WORDS = {
     ),
     "Bake": "Backen",
     "Bake the trained garment over the scene's frames, as bones and shape keys; what was baked before is replaced": (
-        "Das trainierte Kleidungsstück über die Bilder der Szene backen, in Knochen und Formschlüssel; ersetzt das letzte"
+        "Das trainierte Kleidungsstück über die Bilder der Szene backen, in Knochen und Formschlüssel; ersetzt alte"
     ),
     "To Timeline": "In die Zeitleiste",
     "Put keys on the proxies and on shape keys of the garment": (
