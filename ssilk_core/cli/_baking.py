@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,10 +15,12 @@ import numpy as np
 from ssilk_core.assets import Deformer, Floats, GarmentPose, Motion, ProxyRig, Scene, Skeleton
 from ssilk_core.devices import chosen_device
 from ssilk_core.errors import VerificationError, need
-from ssilk_core.events import Message, Progress, Reporter
+from ssilk_core.events import Message, Progress, Reporter, silent
+from ssilk_core.fabrics import Fabric
 from ssilk_core.targets import TARGETS, Target, fitted
 
 from ._quality import lost
+from ._refining import Refinement
 from .options import INPUTS
 
 if TYPE_CHECKING:
@@ -49,6 +52,9 @@ class BakeRequest:
     target: str = "usd"
     samples: int = 1  # in each frame
     pre_roll: float = 0.0  # [s]
+    refine: int = 0  # iterations of the solver in each frame
+    feedback: bool = False  # refined frames look back on refined ones
+    refined: str = "points"  # or "joints"
     keep: str = ""  # blendshapes, proxies and influences of the model, "24,12,4"; all where empty
 
     @classmethod
@@ -74,6 +80,7 @@ class Bake:
     units: StageUnits
     provenance: dict[str, Any]
     record: GarmentRecord
+    fabric: Fabric
     recovered: list[str] = field(default_factory=list)
 
     def wearing(self, file: ModelFile) -> Bake:
@@ -93,7 +100,25 @@ class Bake:
 
     def carried(self, output: Path) -> dict[str, Any]:
         """Return what a file says of its origin; `recovered` fills as the poses go through."""
-        return {**self.provenance, "beside": _beside(self.request, output), "recovered": self.recovered}
+        refined = {"refined": self.refinement.figures} if self.refinement else {}
+        return {**self.provenance, "beside": _beside(self.request, output), "recovered": self.recovered, **refined}
+
+    @cached_property
+    def refinement(self) -> Refinement | None:
+        """Return the refined frames, where they are asked for."""
+        return Refinement(self) if self.request.refine else None
+
+    @property
+    def as_points(self) -> bool:
+        """Return whether the garment is written as points instead of joints."""
+        return bool(self.request.refine) and self.request.refined == "points"
+
+    def refine(self, report: Reporter) -> dict[str, object]:
+        """Refine, where that is asked for; return figures."""
+        if self.refinement is None:
+            return {}
+        self.refinement.compute(report)
+        return {f"refined: {name}": value for name, value in self.refinement.figures.items()}
 
     def warn(self, report: Reporter) -> dict[str, object]:
         """Say at which frames the rollout was lost; return that as figures."""
@@ -103,6 +128,14 @@ class Bake:
 
     def poses(self) -> Iterator[GarmentPose]:
         """Yield the shot's poses, some frames at a time."""
+        if self.refinement is None or self.as_points:
+            yield from self.rollout()
+            return
+        self.refinement.compute(silent)
+        yield from self.refinement.poses
+
+    def rollout(self) -> Iterator[GarmentPose]:
+        """Yield the network's poses, some frames at a time."""
         count = self.motion.frame_count
         if self.model is None:
             for start in range(0, count, CHUNK):
@@ -117,6 +150,20 @@ class Bake:
 
     def _note(self, frames: range) -> None:
         self.recovered.append(f"{frames[0]} to {frames[-1]}")
+
+    def rolled(self, report: Reporter) -> Iterator[Floats]:
+        """Yield the decoder's own garment points (V, 3) [m] of the network's poses."""
+        for pose in self.rollout():
+            yield from self._decoded(pose)
+            report(Progress(pose.start + pose.frame_count, self.motion.frame_count))
+
+    def points(self, report: Reporter) -> Iterator[Floats]:
+        """Yield the points (V, 3) [m] that a point cache holds at each sample: refined where that is asked for."""
+        if self.refinement is None or not self.as_points:
+            yield from self.vertices(report)
+            return
+        self.refinement.compute(report)
+        yield from self.refinement.points
 
     def vertices(self, report: Reporter) -> Iterator[Floats]:
         """Yield the garment's points (V, 3) [m] at each sample: the decoder's own, or as the target takes them."""
@@ -155,11 +202,14 @@ class Bake:
     def verify(self, path: Path, report: Reporter) -> dict[str, object]:
         """Check a written shot and compare it, re-skinned by UsdSkel, with the decoder; return figures.
 
+        Points that were refined are compared with those just computed; where none were, as of a shot that is there
+        already, by their energy (`Refinement.judge`).
+
         Raises:
             VerificationError: a check fails, or a vertex is further off than allowed.
         """
         from ssilk_usd.check import check_shot, compare_points
-        from ssilk_usd.play import Shot
+        from ssilk_usd.play import Shot, frame_times
 
         findings = check_shot(path)
         for finding in findings:
@@ -169,14 +219,19 @@ class Bake:
             raise VerificationError(
                 f"{path}: {len(errors)} checks failed, first at {errors[0].prim}: {errors[0].text}."
             )
-        found = compare_points(Shot(path), self.vertices(report), samples_per_frame=self.request.samples)
+        shot, samples = Shot(path), self.request.samples
+        if not shot.is_skinned and self.refinement and not self.refinement.figures:
+            times = frame_times(shot.stage, samples)
+            return self.refinement.judge(map(shot.garment_points, times), report)
+        expected = self.vertices(report) if shot.is_skinned else self.points(report)
+        found = compare_points(shot, expected, samples_per_frame=samples)
         if not found.passed:
             raise VerificationError(
                 f"{path}: vertex {found.vertex} at time code {found.time:g} is {found.worst:.3g} m from where the "
                 f"decoder has it; at most {found.bound:.3g} m is allowed."
             )
         proof = {"largest error [m]": f"{found.worst:.3g}", "allowed [m]": f"{found.bound:.3g}"}
-        return {**proof, **self.departure()}
+        return {**proof, **(self.departure() if shot.is_skinned else {})}
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,6 +278,7 @@ class Dressed:
             units=self.units,
             provenance=provenance,
             record=self.record,
+            fabric=self.file.fabric,
         )
 
     def _cut(self, motion: Motion) -> Dressed:

@@ -58,6 +58,11 @@ def key_of(task: Task) -> str:
     return task_key(task, contents)
 
 
+def is_done(task: Task, folder: Path) -> bool:
+    """Return whether a task is done with the inputs as they are now, and its files are as they were written."""
+    return is_current(layout_of(task, folder).animation.parent, key_of(task))
+
+
 def bake_task(
     task: Task, folder: Path, wardrobe: Wardrobe, report: Reporter, *, again: bool = False
 ) -> dict[str, object]:
@@ -96,6 +101,19 @@ def _write_animation(layout: Layout, asset: Asset, bake: Bake, task: Task, repor
     """Write and prove what moves; return figures."""
     from ssilk_usd import layers
 
+    refined = bake.refine(report)
+    if task.points:
+        layers.write_points(
+            layout,
+            asset,
+            bake.points(silent),
+            bake.deformer,
+            bake.motion,
+            units=bake.units,
+            start=bake.start,
+            samples_per_frame=task.samples,
+            lean=bake.target.lean,
+        )
     with replacing(layout.animation) as unproven:
         summary = layers.write_animation(
             layout,
@@ -113,22 +131,11 @@ def _write_animation(layout: Layout, asset: Asset, bake: Bake, task: Task, repor
             points=task.points,
         )
         proof = bake.verify(unproven, report) if task.verify else {}
-    if task.points:
-        layers.write_points(
-            layout,
-            asset,
-            bake.vertices(silent),
-            bake.deformer,
-            bake.motion,
-            units=bake.units,
-            start=bake.start,
-            samples_per_frame=task.samples,
-            lean=bake.target.lean,
-        )
     return {
         "frames": summary.frame_count,
         "fps": summary.fps,
         "bytes": layout.animation.stat().st_size,
+        **refined,
         **proof,
         **bake.warn(report),
     }

@@ -7,20 +7,35 @@ stage for each shot. What is there already and would come out the same is left a
 
 A file that fails the proof (exit code 3) is not kept, and an older one of its name stays as it was. --plain bakes
 the same garments under plain skinning, to compare with.
+
+--refine lets the simulator's solver go on from the network in every frame, for hero shots: what is inside the body
+comes out, and wrinkles that no blendshape has appear. The garment is then written as time-sampled points, bound to
+nothing; in a folder of layers, beside the joints, as the variant "points" of "deformation". --refined-output joints
+puts it back onto joints and blendshapes, which loses much of what was refined, and says how much.
 """
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from ssilk_core.errors import EXIT_OK, need
-from ssilk_core.events import Message, Reporter, Result, Started
+from ssilk_core.events import Message, Reporter, Result, Started, silent
 from ssilk_core.files import replacing
+from ssilk_core.quality import quality_named
 from ssilk_core.targets import TARGETS
 
 from ._quality import add_level
 from .options import add_bake, check_output, is_folder, tasks_of
+
+if TYPE_CHECKING:
+    from ssilk_usd.shot import ShotSummary
+
+    from ssilk_core.farm.tasks import Task
+
+    from ._baking import Bake, BakeRequest
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -55,9 +70,8 @@ def _bake_layers(options: argparse.Namespace, report: Reporter) -> int:
 def _bake_file(options: argparse.Namespace, report: Reporter) -> int:
     from ssilk_usd.export import packaged
     from ssilk_usd.read_stage import split_location
-    from ssilk_usd.shot import write_shot
 
-    from ._baking import BakeRequest, open_bake
+    from ._baking import open_bake
     from ._level import levelled
 
     tasks, suffixes = tasks_of(options), TARGETS[options.target].suffixes
@@ -67,23 +81,12 @@ def _bake_file(options: argparse.Namespace, report: Reporter) -> int:
          f"{options.target} takes {', '.join(suffixes)}")  # fmt: skip
     (task,) = tasks
     check_output(options.output, task.model, task.stage, split_location(task.motion)[0])
-    bake = levelled(open_bake(BakeRequest.of(task)), options, report)
+    bake = levelled(open_bake(_request(task, options)), options, report)
     report(Started("bake", bake.motion.frame_count, {"output": str(options.output)}))
+    refined = bake.refine(report)
     with replacing(options.output) as unproven:
         with packaged(unproven) as layer:
-            summary = write_shot(
-                layer,
-                bake.deformer,
-                bake.motion,
-                bake.poses(),
-                units=bake.units,
-                start=bake.start,
-                samples_per_frame=task.samples,
-                include_body=task.body,
-                hidden=bake.hidden,
-                provenance=bake.carried(options.output),
-                record=bake.record,
-            )
+            summary = _write(layer, bake, task, options.output)
         if not task.verify:
             report(Message("not verified, as asked", "warning"))
         proof = bake.verify(unproven, report) if task.verify else {}
@@ -96,8 +99,39 @@ def _bake_file(options: argparse.Namespace, report: Reporter) -> int:
         "blendshapes": summary.shape_count,
         "bytes": options.output.stat().st_size,
         **bake.provenance.get("reduced", {}),
+        **refined,
         **proof,
         **bake.warn(report),
     }
     report(Result("bake", detail))
     return EXIT_OK
+
+
+def _request(task: Task, options: argparse.Namespace) -> BakeRequest:
+    """Return what a task asks for, refined as its level of quality is where the options say nothing of it."""
+    from ._baking import BakeRequest
+
+    level = quality_named(options.quality).refine if options.quality else 0
+    return replace(BakeRequest.of(task), refine=task.refine or level)
+
+
+def _write(layer: Path, bake: Bake, task: Task, output: Path) -> ShotSummary:
+    """Write a shot whose garment joints move, or one that has its points refined."""
+    from ssilk_usd.points import point_cache
+    from ssilk_usd.shot import write_shot
+
+    common: dict[str, Any] = {
+        "units": bake.units,
+        "start": bake.start,
+        "samples_per_frame": task.samples,
+        "include_body": task.body,
+        "hidden": bake.hidden,
+        "provenance": bake.carried(output),
+        "record": bake.record,
+    }
+    if not bake.as_points:
+        return write_shot(layer, bake.deformer, bake.motion, bake.poses(), **common)
+    with point_cache(layer, bake.deformer.scene, bake.motion, **common) as cache:
+        for frame, points in enumerate(bake.points(silent)):
+            cache.write(frame, points)
+    return cache.shot

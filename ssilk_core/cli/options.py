@@ -97,6 +97,23 @@ def add_bake(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--root", metavar="PRIM", help="SkelRoot of the models that name none")
     verb.add_argument("--plain", action="store_true", help="bake plain skinning instead of the network")
     verb.add_argument("--points", action="store_true", help="write point caches as well (folders)")
+    verb.add_argument(
+        "--refine",
+        type=int,
+        default=0,
+        metavar="N",
+        help="iterations of the simulator's solver in each frame, from the network's state (default 0)",
+    )
+    verb.add_argument(
+        "--feedback", action="store_true", help="refined frames look back on refined ones instead of the network's"
+    )
+    verb.add_argument(
+        "--refined-output",
+        choices=("points", "joints"),
+        default="points",
+        help="refined garments as time-sampled points (default), or put back onto joints and "
+        "blendshapes, with the error stated",
+    )
     verb.add_argument("--no-body", action="store_true", help="leave the body meshes out")
     verb.add_argument("--no-verify", action="store_true", help="do not re-skin the written files")
     verb.add_argument("--device", default="cpu", help="where the network runs (default cpu)")
@@ -116,7 +133,10 @@ def tasks_of(options: argparse.Namespace) -> list[Task]:
         target=options.target,
         plain=options.plain,
         body=not options.no_body,
-        points=options.points,
+        points=options.points or (options.refine > 0 and options.refined_output == "points"),
+        refine=options.refine,
+        feedback=options.feedback,
+        refined=options.refined_output,
         verify=not options.no_verify,
         device=options.device,
     )  # fmt: skip

@@ -28,6 +28,9 @@ class Task:
         plain: plain skinning instead of the network.
         body: write the character's body meshes as well.
         points: write a point cache as well.
+        refine: iterations of the solver in each frame.
+        feedback: refined frames look back on refined ones.
+        refined: "points" or "joints", what refined frames become.
         verify: re-skin the written file and compare it.
         device: where the network runs.
     """
@@ -45,6 +48,9 @@ class Task:
     plain: bool = False
     body: bool = True
     points: bool = False
+    refine: int = 0
+    feedback: bool = False
+    refined: str = "points"
     verify: bool = True
     device: str = "cpu"
 

@@ -29,7 +29,7 @@ from ..fabrics import Fabric
 from ..kinematics import split_at_cuts
 from ..simulate import SimulationOptions, Simulator
 from ..simulate.actors import Poses
-from ..simulate.newton import Solution, SolverOptions, State, minimise_from
+from ..simulate.newton import SolverOptions, State, minimise_from
 from ..simulate.potential import Setting
 from ..simulate.simulator import Past
 
@@ -123,37 +123,51 @@ class Refiner:
         Raises:
             SsilkError: the motion is at another rate, or a frame is not finite.
         """
-        fps = self.simulator.options.fps
-        need(abs(motion.fps - fps) < 1e-6, motion.path, f"{motion.fps:g} frames per second", f"{fps:g} is needed")
-        vertices = iter(network)
-        for span in split_at_cuts(motion):
-            yield from self._span(span, vertices)
+        yield from self._spans(motion, iter(network), None)
+
+    def changes(self, motion: Motion, network: Iterable[Floats], refined: Iterable[Floats]) -> Iterator[Change]:
+        """Yield what was changed in each frame of a shot that is refined already; arguments as for `frames`."""
+        for frame in self._spans(motion, iter(network), iter(refined)):
+            yield frame.change
 
     @torch.no_grad()
-    def _span(self, span: Motion, network: Iterator[Floats]) -> Iterator[RefinedFrame]:
+    def _spans(
+        self, motion: Motion, network: Iterator[Floats], given: Iterator[Floats] | None
+    ) -> Iterator[RefinedFrame]:
+        fps = self.simulator.options.fps
+        need(abs(motion.fps - fps) < 1e-6, motion.path, f"{motion.fps:g} frames per second", f"{fps:g} is needed")
+        for span in split_at_cuts(motion):
+            yield from self._span(span, network, given)
+
+    def _span(
+        self, span: Motion, network: Iterator[Floats], given: Iterator[Floats] | None
+    ) -> Iterator[RefinedFrame]:
         """Yield the frames of a motion without cuts."""
         tail: _Tail | None = None
         for start, stop in _blocks(span.frame_count, 1 if self.options.feedback else self.options.batch):
-            world = torch.as_tensor(np.stack(list(islice(network, stop - start)), axis=-1), dtype=torch.float64)
-            world = world.to(self.potential.free.device)
+            world = self._taken(network, stop - start)
             poses = self.simulator.actors.posed(span.rotations[start:stop], span.translations[start:stop])
-            past = None if tail is None else _past(tail, world, poses)
-            setting = self.simulator.setting(poses, past)
-            before, solution = self._refined(world, poses, setting, tail)
-            refined = solution.x.double() + poses.root
-            yield from self._reported(before, solution, setting, refined)
+            setting = self.simulator.setting(poses, None if tail is None else _past(tail, world, poses))
+            before = State.at(self.potential, self.simulator.pinned(world - poses.root, poses), setting)
+            if given is None:
+                refined = self._refined(before, tail, world, poses, setting) + poses.root
+            else:
+                refined = self._taken(given, stop - start)
+            yield from self._reported(before, setting, refined, poses.root)
             tail = self._tail(tail, world, refined, poses)
 
-    def _refined(self, world: Tensor, poses: Poses, setting: Setting, tail: _Tail | None) -> tuple[State, Solution]:
-        """Return the network's state and the refined one, both relative to the roots."""
-        own = self.simulator.pinned(world - poses.root, poses)
-        start = own
+    def _taken(self, vertices: Iterator[Floats], count: int) -> Tensor:
+        """Return the next frames' positions (V, 3, N)."""
+        points = np.stack(list(islice(vertices, count)), axis=-1)
+        return torch.as_tensor(points, dtype=torch.float64, device=self.potential.free.device)
+
+    def _refined(self, before: State, tail: _Tail | None, world: Tensor, poses: Poses, setting: Setting) -> Tensor:
+        """Return refined positions relative to the roots (V, 3, N)."""
+        start = before.x
         if tail and self.options.feedback:
             corrected = self.simulator.pinned(world + tail.correction - poses.root, poses)
-            start = self.simulator.best([own, corrected], setting)
-        return State.at(self.potential, own, setting), minimise_from(
-            self.potential, start, setting, self.options.solver
-        )
+            start = self.simulator.best([start, corrected], setting)
+        return minimise_from(self.potential, start, setting, self.options.solver).x.double()
 
     def _tail(self, tail: _Tail | None, world: Tensor, refined: Tensor, poses: Poses) -> _Tail:
         """Return what the frames after these look back on."""
@@ -161,20 +175,19 @@ class Refiner:
         kept = kept if tail is None else torch.cat([tail.world, kept], dim=-1)
         return _Tail(kept[..., -2:], poses.root[:, -1:], poses.plain[..., -1:], (refined - world)[..., -1:])
 
-    def _reported(
-        self, before: State, solution: Solution, setting: Setting, refined: Tensor
-    ) -> Iterator[RefinedFrame]:
+    def _reported(self, before: State, setting: Setting, refined: Tensor, root: Tensor) -> Iterator[RefinedFrame]:
         """Yield frames with what was changed in them."""
         mass = self.potential.mass
+        after = State.at(self.potential, (refined - root).to(before.x.dtype), setting)
         inside = [
-            (planes.distance(x) < 0).double().mean(0) if planes else torch.zeros_like(before.energy)
-            for x, planes in ((before.x, before.planes), (solution.x, self.potential.planes(solution.x, setting)))
+            (state.planes.distance(state.x) < 0).double().mean(0) if state.planes else torch.zeros_like(state.energy)
+            for state in (before, after)
         ]
-        moved = ((mass * ((solution.x - before.x) ** 2).sum(1)).sum(0) / mass.sum()).sqrt()
-        figures = [before.energy, solution.energy, *inside, moved, solution.imbalance]
-        changes = [Change(*values) for values in torch.stack(figures, dim=1).tolist()]
-        for points, change in zip(refined.permute(2, 0, 1).cpu().numpy(), changes):
-            yield RefinedFrame(points, change)
+        moved = ((mass * ((after.x - before.x) ** 2).sum(1)).sum(0) / mass.sum()).sqrt()
+        imbalance = self.potential.imbalance(self.potential.gradient(after.x, setting, after.planes))
+        figures = torch.stack([before.energy, after.energy, *inside, moved, imbalance], dim=1).tolist()
+        for points, values in zip(refined.permute(2, 0, 1).cpu().numpy(), figures):
+            yield RefinedFrame(points, Change(*values))
 
 
 def _blocks(count: int, size: int) -> Iterator[tuple[int, int]]:

@@ -69,16 +69,25 @@ class Shot:
         xforms = UsdGeom.XformCache(code)
         return [apply(self.units.matrix, player.points(code, xforms)) for player in self._players]
 
+    @property
+    def is_skinned(self) -> bool:
+        """Return whether joints move the garment; else its points are stored."""
+        garment = self._garment()
+        return isinstance(garment, _SkinnedMesh) and bool(garment.skinning.HasJointInfluences())
+
     def garment_points(self, time: float) -> Floats:
         """Return the points of the one garment [m], shape (V, 3).
 
         Raises:
             SsilkError: the shot has no garment, or several.
         """
+        code = Usd.TimeCode(float(time))
+        return apply(self.units.matrix, self._garment().points(code, UsdGeom.XformCache(code)))
+
+    def _garment(self) -> _SkinnedMesh | _PlainMesh:
         garments = [player for player, mesh in zip(self._players, self.meshes) if mesh.is_garment]
         need(len(garments) == 1, self.name, f"{len(garments)} meshes are marked as garments", "one is needed")
-        code = Usd.TimeCode(float(time))
-        return apply(self.units.matrix, garments[0].points(code, UsdGeom.XformCache(code)))
+        return garments[0]
 
 
 def _skinning_of(stage: Usd.Stage) -> dict[Usd.Prim, tuple[UsdSkel.SkeletonQuery, UsdSkel.SkinningQuery]]:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -17,9 +17,10 @@ from ssilk_core.files import replacing
 
 from .author import extent_array
 from .export import need_layer_suffix
+from .garment_api import GarmentRecord
 from .read_mesh import is_garment
 from .read_stage import PRIMS, usd_reason
-from .shot import write_shot
+from .shot import ShotSummary, write_shot
 from .units import StageUnits
 
 FRAMES_PER_SAVE = 128  # 5 MB of points in memory for a garment of 3,000 vertices
@@ -27,12 +28,18 @@ POSES_AT_ONCE = 256
 
 
 class PointCache:
-    """A file under way, whose frames may come in any order."""
+    """A file under way, whose frames may come in any order.
 
-    def __init__(self, path: Path, frame_count: int, vertex_count: int, units: StageUnits, start: float) -> None:
-        self.path, self.frame_count, self.vertex_count = path, frame_count, vertex_count
-        self.units, self.start, self.unsaved_count = units, start, 0
-        self.written = np.zeros(frame_count, dtype=bool)
+    Attributes:
+        shot: what the file holds.
+    """
+
+    def __init__(
+        self, path: Path, shot: ShotSummary, vertex_count: int, units: StageUnits, samples_per_frame: int
+    ) -> None:
+        self.path, self.shot, self.frame_count, self.vertex_count = path, shot, shot.frame_count, vertex_count
+        self.units, self.step, self.unsaved_count = units, 1 / samples_per_frame, 0
+        self.written = np.zeros(self.frame_count, dtype=bool)
         self.layer = Sdf.Layer.FindOrOpen(str(path))
         stage = Usd.Stage.Open(self.layer)
         self.garment, self.root = _unbind(stage), stage.GetDefaultPrim().GetPath()
@@ -50,7 +57,7 @@ class PointCache:
         need(np.isfinite(points).all(), where, "NaN or infinity among the points", "all must be finite")
         placed = np.ascontiguousarray(self.units.points_from_core(points), dtype=np.float32)
         low, high = placed.min(axis=0), placed.max(axis=0)
-        time = self.start + frame
+        time = self.shot.start + self.step * frame
         self._set("points", time, Vt.Vec3fArray.FromNumpy(placed))
         self._set("extent", time, extent_array(low, high))
         around = np.array(self.layer.QueryTimeSample(self.root.AppendProperty("extent"), time))
@@ -80,8 +87,12 @@ def point_cache(
     motion: Motion,
     *,
     units: StageUnits,
+    start: float | None = None,
+    samples_per_frame: int = 1,
     include_body: bool = True,
+    hidden: Sequence[tuple[int, bool]] = (),
     provenance: Mapping[str, object] | None = None,
+    record: GarmentRecord | None = None,
 ) -> Iterator[PointCache]:
     """Yield a cache that takes the garment's points frame by frame; the file appears once all are in it.
 
@@ -89,25 +100,29 @@ def point_cache(
 
     Args:
         path: the file to write: .usdc, .usd, or .usda for people.
-        motion: the character's motion at the frames of the shot, whose rate becomes the shot's.
-        units: units and up axis of the written stage.
+        motion: the character's motion at the samples of the shot, whose rate becomes the shot's.
+        start: time code of the first frame, by default the motion's own.
+        units, samples_per_frame, include_body, hidden, provenance, record: as `write_shot` takes them.
 
     Raises:
         SsilkError: frames are missing at the end, or the file cannot be written.
     """
     need_layer_suffix(path)
     with replacing(path) as temporary:
-        write_shot(
+        shot = write_shot(
             temporary,
             _plain(scene),
             motion,
             _no_poses(motion.frame_count),
             units=units,
-            start=motion.start,
+            start=motion.start if start is None else start,
+            samples_per_frame=samples_per_frame,
             include_body=include_body,
+            hidden=hidden,
             provenance=provenance,
+            record=record,
         )
-        cache = PointCache(temporary, motion.frame_count, scene.garment.mesh.vertex_count, units, motion.start)
+        cache = PointCache(temporary, shot, scene.garment.mesh.vertex_count, units, samples_per_frame)
         yield cache
         missing = int((~cache.written).sum())
         need(missing == 0, str(path), f"{missing} of {motion.frame_count} frames have no points", "each needs some")
