@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 
 import bpy
-from bpy.props import BoolProperty, FloatProperty, StringProperty
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
 
 from ..contract.arrays import Joints
 from ..errors import SetupError, need
@@ -21,10 +21,18 @@ from ..scene.handover import STAGE, expose_usd, hand_over
 from ..scene.models import model_of
 from ..scene.motions import TIMELINE, Source
 from ..scene.objects import found_again
-from ..scene.sampling import Take, need_company, prepare_takes, sample
+from ..scene.sampling import Take, need_company, prepare_takes, sample, scene_rate
 from . import tasks
 from .reporting import ReportingOperator
 
+WHOLE, HERO = "WHOLE", "hero"
+QUALITIES = [
+    (WHOLE, "Whole", "All that the model has"),
+    ("crowd", "Crowd", "For many characters, far away: few shapes and proxies, three influences"),
+    ("game", "Game", "For real time: some shapes and proxies, four influences"),
+    ("film", "Film", "What cannot be told from the whole model"),
+    (HERO, "Hero", "The whole model, refined by a solver; to USD alone, as points"),
+]
 INPUTS, MOTION, SHOT = "bake", "motion.usdc", "shot.usdc"  # folder of a bake's inputs beside the model; files
 
 
@@ -43,6 +51,7 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
         name="USD File", description="Shot to write; named like the garment, beside the blend file, when empty",
         subtype="FILE_PATH",
     )  # fmt: skip
+    quality: EnumProperty(name="Quality", items=QUALITIES)
     pre_roll: FloatProperty(
         name="Pre-Roll",
         description="How long the garment settles in the first pose before the first frame",
@@ -67,6 +76,8 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
     def prepare(self, context: bpy.types.Context) -> Work:
         garment = context.object
         need(self.to_timeline or self.to_usd, "Choose where to bake to: the timeline, USD, or both.")
+        refined = self.to_timeline and self.quality == HERO
+        need(not refined, "Hero refines points, which bones and shape keys cannot hold; bake it to USD alone.")
         self.model, armature = model_of(garment), armature_of(garment)
         joints = read_joints(armature, garment)
         need_bakeable(garment, armature, joints)
@@ -90,10 +101,13 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
             hand_over(self.dressed, garment, armature, inputs)
             stage = inputs / STAGE
         self.shot = self.shot or folder / SHOT
+        level = [] if self.quality == WHOLE else ["--quality", self.quality]
+        rate = ["--fps", repr(scene_rate())] if self.to_timeline else []  # a level may have fewer frames
         return [
             [
-                self.python, "-m", "ssilk_core", "bake", str(self.model), "--stage", str(stage), "--motion",
-                str(inputs / MOTION), "-o", str(self.shot), "--pre-roll", f"{self.pre_roll:g}", "--json",
+                self.python, "-m", "ssilk_core", "bake", str(self.model), "--stage", str(stage),
+                "--motion", str(inputs / MOTION), "-o", str(self.shot), "--pre-roll", f"{self.pre_roll:g}",
+                *level, *rate, "--json",
             ]
         ]  # fmt: skip
 
@@ -109,7 +123,7 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
             garment, armature = self.things()
             joints = read_joints(armature, garment)
             need_bakeable(garment, armature, joints)
-            apply_shot(garment, armature, joints, read_shot(self.shot, joints))
+            apply_shot(garment, armature, joints, read_shot(self.shot, joints, reduced=self.quality != WHOLE))
         where = [f"frames {self.take.frames[0]} to {self.take.frames[-1]}"] if self.to_timeline else []
         where += [str(self.shot)] if self.to_usd else []
         return f"'{self.called}' is baked: {' and '.join(where)}."

@@ -46,9 +46,14 @@ class Take:
 
     def motion(self) -> Motion:
         """Return what was sampled, at the scene's rate and in its units."""
-        scene = bpy.context.scene
-        fps = scene.render.fps / scene.render.fps_base
-        return Motion(np.array(self.worlds), self.frames.start, fps, scene.unit_settings.scale_length)
+        scale = bpy.context.scene.unit_settings.scale_length
+        return Motion(np.array(self.worlds), self.frames.start, scene_rate(), scale)
+
+
+def scene_rate() -> float:
+    """Return the scene's frames per second [1/s]."""
+    render = bpy.context.scene.render
+    return render.fps / render.fps_base
 
 
 def prepare_takes(armature: bpy.types.Object, chosen: Sequence[Source]) -> list[Take]:

@@ -74,6 +74,25 @@ def test_blender_shows_what_the_decoder_says_on_every_frame(ready, trained, tmp_
     assert np.abs(shown(ready, trained, FRAMES) - wanted).max() < EXACT
 
 
+def test_lower_qualities_leave_proxies_and_shapes_out(ready, trained, tmp_path, ssilk_python):
+    bake(ready, trained)
+    whole = shown(ready, trained, FRAMES)
+    bake(ready, trained, quality="crowd")
+    few = shown(ready, trained, FRAMES)
+    away = np.linalg.norm(few - whole, axis=-1)
+    assert 1e-3 < away.max() < np.linalg.norm(whole - decoded_plain(ssilk_python, trained, tmp_path), axis=-1).max()
+    keys = [key.name for key in trained.data.shape_keys.key_blocks]
+    assert len([name for name in keys if name.startswith("SSILK ")]) <= 9
+    moved = {group.name for group in trained.vertex_groups if group.name.startswith("Skirt_proxy")}
+    assert len(moved) <= 4
+    told = refused(ready, trained, quality="hero")
+    assert "bake it to USD alone" in told
+
+
+def decoded_plain(python, garment, folder):
+    return decoded(python, model_of(garment), folder, plain=True)
+
+
 def test_the_bake_is_one_action_beneath_the_artists_own(ready, trained):
     from blender_addon.scene.keys import SLOTS, curves_of, is_baked
 
