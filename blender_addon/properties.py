@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import bpy
-from bpy.props import BoolProperty, PointerProperty, StringProperty
+from bpy.props import BoolProperty, FloatProperty, PointerProperty, StringProperty
 
 from . import fabric_properties, training_properties
 from .fabric_properties import FabricSettings
@@ -37,6 +37,8 @@ class GarmentSettings(bpy.types.PropertyGroup):
         description="Trained model of the garment; that of its own training when empty",
     )
     live: BoolProperty(description="Whether the garment is played live", options={"HIDDEN"})
+    heat: StringProperty(description="What the heat map shows; empty for none", options={"HIDDEN"})
+    heat_red: FloatProperty(description="Value that is red", options={"HIDDEN"})
     training: PointerProperty(type=TrainingSettings, name="Training", description="How the garment is trained")
 
 

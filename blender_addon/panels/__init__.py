@@ -9,6 +9,7 @@ from .fabric import FabricPanel
 from .garment import GarmentPanel
 from .playback import PlaybackPanel
 from .preflight import FindingList, PreflightPanel
+from .quality import QualityPanel
 from .rig import RigPanel
 from .training import TrainingPanel
 
@@ -22,4 +23,5 @@ CLASSES = (
     TrainingPanel,
     BakingPanel,
     PlaybackPanel,
+    QualityPanel,
 )  # in the order of the sidebar

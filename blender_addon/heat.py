@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""How far cloth is stretched, which frames are worst, and the colours of both; numpy alone."""
+
+from __future__ import annotations
+
+import numpy as np
+
+COLORS = np.array([[0.1, 0.2, 0.6], [0.1, 0.7, 0.8], [0.3, 0.8, 0.2], [1.0, 0.9, 0.1], [0.9, 0.1, 0.1]])  # sRGB
+GREY = np.array([0.35, 0.35, 0.35])  # where there is nothing to see
+
+
+def colors_of(values: np.ndarray, largest: float) -> np.ndarray:
+    """Return opaque sRGB colours, shape (V, 4): grey at zero and below, then blue to red at `largest` and beyond."""
+    place = np.clip(values / largest, 0, 1) * (len(COLORS) - 1)
+    ramp = np.stack([np.interp(place, np.arange(len(COLORS)), channel) for channel in COLORS.T], axis=1)
+    shown = np.where((values > 0)[:, None], ramp, GREY)
+    return np.concatenate([shown, np.ones((len(values), 1))], axis=1)
+
+
+def elongations(rest: np.ndarray, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Return how much longer the cloth is at each vertex than at rest, of its triangles the most, shape (V,).
+
+    That of a triangle is the larger principal stretch less one: the larger singular value of the deformation
+    gradient, from the plane of the triangle at rest to space.
+
+    Args:
+        rest, points: shape (V, 3), in the same units; triangles: shape (T, 3).
+    """
+    first, second = (rest[triangles[:, corner]] - rest[triangles[:, 0]] for corner in (1, 2))
+    length = np.linalg.norm(first, axis=1)
+    along = (first * second).sum(axis=1) / np.maximum(length, 1e-30)
+    height = np.sqrt(np.maximum((second**2).sum(axis=1) - along**2, 0))
+    flat = length * height > 1e-20  # others have no plane
+    a, b = (points[triangles[:, corner]] - points[triangles[:, 0]] for corner in (1, 2))
+    u = a[flat] / length[flat, None]
+    v = (b[flat] - along[flat, None] * u) / height[flat, None]
+    uu, vv, uv = ((p * q).sum(axis=1) for p, q in ((u, u), (v, v), (u, v)))
+    largest = np.sqrt((uu + vv) / 2 + np.sqrt(((uu - vv) / 2) ** 2 + uv**2))
+    found = np.zeros(len(rest))
+    for corners in triangles[flat].T:
+        np.maximum.at(found, corners, largest - 1)
+    return found
+
+
+def worst_frames(values: np.ndarray, count: int, apart: int) -> list[int]:
+    """Return the indices of the largest values above zero, largest first, no two nearer than `apart`."""
+    chosen: list[int] = []
+    for index in np.argsort(-values, kind="stable").tolist():
+        if len(chosen) == count or values[index] <= 0:
+            break
+        if all(abs(index - other) >= apart for other in chosen):
+            chosen.append(index)
+    return chosen

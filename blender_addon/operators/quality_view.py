@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Seeing how good a garment is: heat maps, the worst frames, and plain skinning beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import bpy
+import numpy as np
+from bpy.props import EnumProperty, FloatProperty, IntProperty
+
+from ..heat import worst_frames
+from ..outside.work import Work
+from ..scene import beside, heat
+from ..scene.garment import unusable
+from ..scene.objects import found_again
+from . import tasks
+from .reporting import ReportingOperator
+
+KINDS = [
+    (heat.PENETRATION, "Penetration", "How deep vertices lie inside the body"),
+    (heat.STRETCH, "Stretch", "How much longer the cloth is than at rest"),
+]
+MARKER = "SSILK "  # begins the names of markers
+APART = 0.5  # seconds between two of the worst frames
+
+
+class QualityOperator(ReportingOperator):
+    """Base of operators on how a garment looks, in object mode."""
+
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        reason = unusable(context.object) or ("" if context.mode == "OBJECT" else "Go to Object Mode")
+        cls.poll_message_set(reason)
+        return not reason
+
+
+class ShowHeat(QualityOperator, bpy.types.Operator):
+    """Colour the garment by penetration or stretch, frame by frame; in Solid shading, in this view"""
+
+    bl_idname = "ssilk.show_heat"
+    bl_label = "Show Heat"
+
+    kind: EnumProperty(name="Show", items=KINDS)
+    deepest: FloatProperty(
+        name="Red Depth", description="Depth that is red", default=0.01, min=1e-4, subtype="DISTANCE", unit="LENGTH"
+    )
+    longest: FloatProperty(
+        name="Red Stretch",
+        description="Elongation that is red",
+        default=0.2,
+        min=1e-3,
+        soft_max=1.0,
+        subtype="FACTOR",
+    )
+
+    def apply(self, context: bpy.types.Context) -> str:
+        garment = context.object
+        meters = context.scene.unit_settings.scale_length
+        red = self.longest if self.kind == heat.STRETCH else self.deepest * meters
+        measured = heat.show(garment, self.kind, red, context.evaluated_depsgraph_get())
+        if context.space_data and context.space_data.type == "VIEW_3D":
+            context.space_data.shading.color_type = "VERTEX"
+        return f"'{garment.name}', frame {context.scene.frame_current}: {measured.told()}."
+
+
+class HideHeat(QualityOperator, bpy.types.Operator):
+    """Remove the colours of the heat map"""
+
+    bl_idname = "ssilk.hide_heat"
+    bl_label = "Hide Heat"
+
+    def apply(self, context: bpy.types.Context) -> str:
+        heat.hide(context.object)
+        return ""
+
+
+class FindWorst(tasks.OutsideOperator, bpy.types.Operator):
+    """Go through the scene's frames and mark those in which penetration or stretch is worst"""
+
+    bl_idname = "ssilk.find_worst"
+    bl_label = "Mark Worst Frames"
+    undo = "Mark Worst Frames"
+
+    kind: EnumProperty(name="Look For", items=KINDS)
+    count: IntProperty(name="Markers", description="How many frames are marked at most", default=3, min=1, max=50)
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        reason = tasks.busy() or unusable(context.object) or ("" if context.mode == "OBJECT" else "Go to Object Mode")
+        cls.poll_message_set(reason)
+        return not reason
+
+    def prepare(self, context: bpy.types.Context) -> Work:
+        garment = context.object
+        self.garment, self.called, self.found = garment.session_uid, garment.name, []
+        heat.measure(garment, self.kind, context.evaluated_depsgraph_get())
+        return Work(f"Looking at '{garment.name}'", lambda _: (), parent=bpy.app.tempdir, steps=self.looks(context))
+
+    def looks(self, context: bpy.types.Context) -> Iterator[float]:
+        """Measure frame after frame; the timeline stands where it stood afterwards."""
+        scene = context.scene
+        before, frames = scene.frame_current, range(scene.frame_start, scene.frame_end + 1)
+        try:
+            for frame in frames:
+                scene.frame_set(frame)
+                garment = found_again(self.garment, self.called)
+                self.found.append(heat.measure(garment, self.kind, context.evaluated_depsgraph_get()))
+                yield len(self.found) / len(frames)
+        finally:
+            scene.frame_set(before)
+
+    def finish(self, context: bpy.types.Context, work: Work) -> str:
+        scene, values = context.scene, np.array([each.most for each in self.found])
+        fps = scene.render.fps / scene.render.fps_base
+        worst = worst_frames(values, self.count, max(1, round(APART * fps)))
+        clear_markers(scene)
+        for index in worst:
+            scene.timeline_markers.new(f"{MARKER}{self.found[index].told()}", frame=scene.frame_start + index)
+        if not worst:
+            return f"'{self.called}' is fine in every frame."
+        first = worst[0]
+        return f"'{self.called}' is worst in frame {scene.frame_start + first}: {self.found[first].told()}."
+
+
+class ClearWorst(ReportingOperator, bpy.types.Operator):
+    """Remove the markers of worst frames"""
+
+    bl_idname = "ssilk.clear_worst"
+    bl_label = "Clear Marks"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def apply(self, context: bpy.types.Context) -> str:
+        return f"{clear_markers(context.scene)} markers removed."
+
+
+class ToggleBeside(QualityOperator, bpy.types.Operator):
+    """Show the garment as plain skinning has it, beside it, or take that away"""
+
+    bl_idname = "ssilk.toggle_plain"
+    bl_label = "Plain Skinning Beside"
+
+    def apply(self, context: bpy.types.Context) -> str:
+        garment = context.object
+        shown = beside.beside(garment)
+        if shown:
+            beside.take_away(shown)
+        else:
+            beside.put_beside(garment)
+        return ""
+
+
+def clear_markers(scene: bpy.types.Scene) -> int:
+    """Remove the markers that were set here; return how many."""
+    own = [marker for marker in scene.timeline_markers if marker.name.startswith(MARKER)]
+    for marker in own:
+        scene.timeline_markers.remove(marker)
+    return len(own)
+
+
+_keys: list[tuple[bpy.types.KeyMap, bpy.types.KeyMapItem]] = []
+
+
+def add_key() -> None:
+    """Let Ctrl Alt P toggle plain skinning in 3D views; without windows there are no keys."""
+    configuration = bpy.context.window_manager.keyconfigs.addon
+    if configuration:
+        keymap = configuration.keymaps.new(name="3D View", space_type="VIEW_3D")
+        _keys.append((keymap, keymap.keymap_items.new(ToggleBeside.bl_idname, "P", "PRESS", ctrl=True, alt=True)))
+
+
+def remove_key() -> None:
+    """Take the key back."""
+    while _keys:
+        keymap, item = _keys.pop()
+        keymap.keymap_items.remove(item)
+
+
+CLASSES = (ShowHeat, HideHeat, FindWorst, ClearWorst, ToggleBeside)

@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Seeing quality."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..operators.quality_view import KINDS
+from ..scene.beside import beside
+from ..scene.garment import unusable
+from .base import Panel
+
+
+class QualityPanel(Panel, bpy.types.Panel):
+    bl_idname = "SSILK_PT_quality"
+    bl_label = "Quality"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return not unusable(context.object)
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        for kind, label, _ in KINDS:
+            row = layout.row(align=True)
+            row.operator("ssilk.show_heat", text=f"Show {label}", icon="SHADING_RENDERED").kind = kind
+            row.operator("ssilk.find_worst", text="", icon="MARKER_HLT").kind = kind
+        row = layout.row(align=True)
+        if context.object.ssilk.heat:
+            row.operator("ssilk.hide_heat")
+        row.operator("ssilk.clear_worst")
+        shown = beside(context.object) is not None
+        layout.operator("ssilk.toggle_plain", depress=shown)

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The garment as plain skinning has it, beside the garment as it is.
+
+The copy hangs on the same armature; an empty shows it moved to the side, after bones have moved it.
+"""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+
+from .armature import read_joints
+from .garment import armature_of
+from .models import model_of
+from .trained import Trained
+from .weights import write_groups
+
+OWNER = "ssilk_plain_of"  # custom property of the empty and the copy: the garment
+GAP = 1.3  # distance in widths of the garment
+
+
+def beside(garment: bpy.types.Object) -> bpy.types.Object | None:
+    """Return the empty that shows a garment's plain copy; None where there is none."""
+    return next((thing for thing in bpy.data.objects if thing.type == "EMPTY" and thing.get(OWNER) == garment), None)
+
+
+def put_beside(garment: bpy.types.Object) -> None:
+    """Show a copy without proxies and shapes to the side. In object mode.
+
+    Raises:
+        SetupError: there is no model, or it is of other bones.
+    """
+    armature = armature_of(garment)
+    joints = read_joints(armature, garment)
+    trained = Trained(model_of(garment), joints, bpy.context.scene.unit_settings.scale_length)
+    copy = _plain_copy(garment, trained)
+    collection = bpy.data.collections.new(f"{garment.name} plain")
+    collection.objects.link(copy)
+    shown = bpy.data.objects.new(f"{garment.name} plain, beside", None)
+    shown[OWNER] = garment
+    shown.instance_type, shown.instance_collection = "COLLECTION", collection
+    shown.location.x = GAP * max(garment.dimensions.x, garment.dimensions.y)
+    garment.users_collection[0].objects.link(shown)
+
+
+def take_away(shown: bpy.types.Object) -> None:
+    """Remove the copy and what shows it."""
+    collection = shown.instance_collection
+    for copy in list(collection.objects):
+        bpy.data.meshes.remove(copy.data)
+    bpy.data.collections.remove(collection)
+    bpy.data.objects.remove(shown)
+
+
+def _plain_copy(garment: bpy.types.Object, trained: Trained) -> bpy.types.Object:
+    copy = garment.copy()
+    copy.data, copy.name = garment.data.copy(), f"{garment.name} plain"
+    copy[OWNER] = garment
+    keys = copy.data.shape_keys
+    if keys:
+        copy.shape_key_clear()
+        bpy.data.batch_remove([keys])  # Blender would keep it, unused, until the file is saved
+    copy.vertex_groups.clear()
+    skin, names = trained.player.file.scene.plain_skin, trained.joints.names
+    write_groups(copy, skin.dense(len(names))[:, trained.order].astype(np.float32), names, ())
+    return copy

@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Heat maps against closed forms, worst frames, and plain skinning beside the garment."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
+
+from mathutils import Matrix
+
+from blender_addon import heat
+
+from .conftest import activate, add_mesh, tube
+from .scenes import ended, rig_and_animate
+
+RED, BLUE = heat.COLORS[-1], heat.COLORS[0]
+
+
+def sheet(columns: int = 4) -> tuple[np.ndarray, np.ndarray]:
+    """A flat square sheet of triangles."""
+    x, y = (part.reshape(-1) for part in np.mgrid[0:columns, 0:columns])
+    a = np.arange(columns * columns).reshape(columns, columns)[:-1, :-1].reshape(-1)
+    triangles = np.concatenate([np.c_[a, a + columns, a + 1], np.c_[a + 1, a + columns, a + columns + 1]])
+    return np.stack([x, y, 0 * x], axis=1).astype(float), triangles
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_elongation_is_the_larger_principal_stretch_whatever_the_pose(seed):
+    points, triangles = sheet()
+    random = np.random.default_rng(seed)
+    gradient = random.normal(size=(3, 2))
+    moved = points[:, :2] @ gradient.T + random.normal(size=3)
+    expected = np.linalg.svd(gradient, compute_uv=False)[0] - 1
+    np.testing.assert_allclose(heat.elongations(points, moved, triangles), max(expected, 0), atol=1e-12)
+
+
+def test_elongation_is_that_of_the_worst_triangle_at_each_vertex():
+    points, triangles = sheet(3)
+    moved = points.copy()
+    moved[points[:, 0] == 2, 0] = 2.5  # the last column of triangles is half as long again
+    np.testing.assert_allclose(
+        heat.elongations(points, moved, triangles), np.where(points[:, 0] >= 1, 0.5, 0), atol=1e-12
+    )
+
+
+def test_triangles_without_a_plane_are_left_out():
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    assert heat.elongations(points, 5 * points, np.array([[0, 1, 2], [1, 1, 2]])).tolist() == [0, 0, 0]
+
+
+def test_colours_run_from_grey_over_blue_to_red():
+    found = heat.colors_of(np.array([-1.0, 0.0, 1e-9, 0.5, 1.0, 7.0]), 1.0)
+    np.testing.assert_allclose(found[:, :3], [heat.GREY, heat.GREY, BLUE, heat.COLORS[2], RED, RED], atol=1e-6)
+    assert (found[:, 3] == 1).all()
+
+
+def test_the_worst_frames_lie_apart_and_above_zero():
+    values = np.array([0.0, 3, 9, 8, 1, 0, 0, 5, 0, -2])
+    assert heat.worst_frames(values, 5, 3) == [2, 7]
+    assert heat.worst_frames(values, 3, 1) == [2, 3, 7]
+    assert heat.worst_frames(-values.clip(0), 3, 1) == []
+
+
+@pytest.fixture
+def dressed(bpy, skirt):
+    """The skirt and its pillar; the garment becomes a tube that is 20 mm inside the pillar over its upper half."""
+    pillar = bpy.data.objects["Pillar"]
+    inside = add_mesh(bpy, "Sleeve", *tube(24, 9, (0.6, 1.0, 1.3), (0.2, 0.13, 0.13)))
+    inside.ssilk.armature = bpy.data.objects["Rig"]
+    bpy.data.objects.remove(skirt)
+    activate(bpy, inside)
+    assert len(pillar.data.vertices) == 288
+    return inside
+
+
+def depths(bpy, garment) -> np.ndarray:
+    from blender_addon.scene import heat as measuring
+
+    return measuring.measure(garment, measuring.PENETRATION, bpy.context.evaluated_depsgraph_get()).values
+
+
+def expected_depths(garment) -> np.ndarray:
+    """Of points about a pillar of 16 sides, to the nearest one of these."""
+    points = np.array([vertex.co for vertex in garment.data.vertices])[:, None, :2]
+    corners = 0.15 * np.stack([np.cos(np.arange(17) * np.pi / 8), np.sin(np.arange(17) * np.pi / 8)], axis=1)
+    begin, side = corners[:-1], np.diff(corners, axis=0)
+    along = (((points - begin) * side).sum(-1) / (side**2).sum(-1)).clip(0, 1)
+    away = np.linalg.norm(points - begin - along[..., None] * side, axis=-1).min(axis=1)
+    outward = np.stack([side[:, 1], -side[:, 0]], axis=1)
+    inside = (((points - begin) * outward).sum(-1) < 0).all(axis=1)
+    return np.where(inside, away, -away)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.01])
+def test_penetration_is_the_depth_behind_the_nearest_triangle_in_metres(bpy, dressed, scale):
+    bpy.context.scene.unit_settings.scale_length = scale
+    np.testing.assert_allclose(depths(bpy, dressed), scale * expected_depths(dressed), atol=1e-5 * scale)
+
+
+def test_moved_turned_and_scaled_objects_make_no_difference(bpy, dressed):
+    before = depths(bpy, dressed)
+    pillar = bpy.data.objects["Pillar"]
+    for thing, scale in ((pillar, (2, 0.5, 1)), (dressed, (-1.5, 1, 3))):
+        points = np.array([vertex.co for vertex in thing.data.vertices])
+        thing.data.vertices.foreach_set("co", (points / scale).astype(np.float32).reshape(-1))
+        thing.scale = scale
+    bpy.context.view_layer.update()
+    np.testing.assert_allclose(depths(bpy, dressed), before, atol=2e-5)
+    pillar.data.transform(Matrix.Scale(-1, 4, (1, 0, 0)))  # the same pillar, mirrored in its mesh and as an object
+    pillar.data.flip_normals()
+    pillar.scale.x = -2
+    bpy.context.view_layer.update()
+    np.testing.assert_allclose(depths(bpy, dressed), before, atol=2e-5)
+
+
+def colors(garment) -> np.ndarray:
+    layer = garment.data.color_attributes["SSILK Heat"]
+    assert (layer.data_type, layer.domain) == ("FLOAT_COLOR", "POINT")
+    assert garment.data.color_attributes.active_color == layer
+    found = np.empty(len(layer.data) * 4, dtype=np.float32)
+    layer.data.foreach_get("color_srgb", found)
+    return found.reshape(-1, 4)
+
+
+def test_heat_is_shown_follows_frames_and_goes(bpy, dressed):
+    from blender_addon.scene import warming
+
+    assert bpy.ops.ssilk.show_heat(kind="PENETRATION", deepest=0.02) == {"FINISHED"}
+    expected = heat.colors_of(expected_depths(dressed), 0.02)
+    np.testing.assert_allclose(colors(dressed), expected, atol=2e-3)
+    assert np.ptp(colors(dressed), axis=0)[:3].min() > 0.2
+    dressed.scale = (3, 3, 1)
+    bpy.context.scene.frame_set(5)
+    warming.show_all()  # what a timer does as soon as the frame stands
+    np.testing.assert_allclose(colors(dressed)[:, :3], np.tile(heat.GREY, (len(expected), 1)), atol=2e-3)
+    assert bpy.ops.ssilk.hide_heat() == {"FINISHED"}
+    assert "SSILK Heat" not in dressed.data.color_attributes and not dressed.ssilk.heat
+
+
+def test_stretch_is_that_of_what_blender_shows(bpy, dressed):
+    dressed.shape_key_add(name="Basis")
+    longer = dressed.shape_key_add(name="Longer")
+    for point in longer.data:
+        point.co.z *= 1.25
+    longer.value = 1.0
+    assert bpy.ops.ssilk.show_heat(kind="STRETCH", longest=0.25) == {"FINISHED"}
+    found = colors(dressed)
+    upright = np.array([vertex.co.z > 1.05 for vertex in dressed.data.vertices])  # where the tube is upright
+    np.testing.assert_allclose(found[upright, :3], np.tile(RED, (upright.sum(), 1)), atol=5e-3)
+
+
+def test_worst_frames_are_marked_and_the_timeline_stays(bpy, dressed):
+    scene = bpy.context.scene
+    scene.frame_start, scene.frame_end, scene.render.fps = 1, 60, 30
+    for frame, width in ((1, 2.0), (18, 2.0), (20, 1.0), (22, 2.0), (48, 2.0), (50, 1.06), (52, 2.0)):
+        dressed.scale = (width, width, 1)
+        dressed.keyframe_insert("scale", frame=frame)
+    scene.frame_set(7)
+    scene.timeline_markers.new("Mine", frame=3)
+    for _ in range(2):  # the second time replaces what the first one marked
+        assert bpy.ops.ssilk.find_worst(kind="PENETRATION") == {"FINISHED"}
+    marks = sorted((marker.frame, marker.name) for marker in scene.timeline_markers)
+    assert [frame for frame, _ in marks] == [3, 20, 50] and scene.frame_current == 7
+    assert marks[1][1].startswith("SSILK ") and "mm at most" in marks[1][1]
+    assert bpy.ops.ssilk.clear_worst() == {"FINISHED"}
+    assert [marker.name for marker in scene.timeline_markers] == ["Mine"]
+
+
+def test_what_cannot_be_measured_is_said(bpy, dressed):
+    dressed.modifiers.new("Finer", "SUBSURF")
+    with pytest.raises(RuntimeError, match="A modifier gives 'Sleeve'"):
+        bpy.ops.ssilk.show_heat()
+    dressed.modifiers.clear()
+    bpy.data.objects.remove(bpy.data.objects["Pillar"])
+    with pytest.raises(RuntimeError, match="No body is bound"):
+        bpy.ops.ssilk.find_worst()
+    assert not dressed.ssilk.heat and "SSILK Heat" not in dressed.data.color_attributes
+
+
+def test_plain_skinning_stands_beside_and_goes(ready, skirt, ssilk_python, tmp_path):
+    """The copy is what the model's plain weights give; nothing of it is left afterwards."""
+    bpy = ready
+    rig_and_animate(bpy, skirt)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "beside.blend"))
+    assert bpy.ops.ssilk.find_motions() == {"FINISHED"}
+    skirt.ssilk.training.preset, skirt.ssilk.training.iterations = "draft", 2
+    assert bpy.ops.ssilk.train() == {"FINISHED"}
+    assert ended(skirt).state == "done"
+    bpy.ops.ssilk.play_live()
+    bpy.context.scene.frame_set(21)
+    before = {kind: len(getattr(bpy.data, kind)) for kind in ("objects", "meshes", "collections", "shape_keys")}
+    assert bpy.ops.ssilk.toggle_plain() == {"FINISHED"}
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    (found,) = [
+        world_points(each.object, each.matrix_world)
+        for each in depsgraph.object_instances
+        if each.is_instance and each.object.type == "MESH"
+    ]
+    found -= [1.3 * max(skirt.dimensions[:2]), 0, 0]
+    plain = plainly_skinned(bpy, skirt)
+    assert np.abs(found - plain).max() < 1e-4
+    assert bpy.ops.ssilk.toggle_plain() == {"FINISHED"}
+    assert {kind: len(getattr(bpy.data, kind)) for kind in before} == before
+
+
+def world_points(evaluated, world) -> np.ndarray:
+    points = np.array([vertex.co for vertex in evaluated.data.vertices])
+    return points @ np.array(world)[:3, :3].T + np.array(world)[:3, 3]
+
+
+def plainly_skinned(bpy, skirt) -> np.ndarray:
+    """Skin by the model's plain weights and Blender's own pose matrices."""
+    from blender_addon.scene.models import model_of
+    from ssilk_core.checkpoint import load_model
+
+    scene, armature = load_model(model_of(skirt)).scene, bpy.data.objects["Rig"]
+    names = [path.rpartition("/")[2] for path in scene.joint_names]
+    points = np.array([(*vertex.co, 1) for vertex in skirt.data.shape_keys.reference_key.data])
+    weights = scene.plain_skin.dense(len(names))
+    moved = np.zeros((len(points), 3))
+    for name, share in zip(names, weights.T):
+        bone = armature.pose.bones[name]
+        moved += share[:, None] * (points @ np.array(bone.matrix @ bone.bone.matrix_local.inverted()).T)[:, :3]
+    return moved
