@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from math import nan
+from typing import Any, Literal
 
 from .meter import Extent
 
@@ -50,6 +51,15 @@ class Outcome:
     said: str
     measured: Measured
     seconds: float
+
+    @classmethod
+    def of(cls, document: Mapping[str, Any]) -> Outcome:
+        """Return an outcome that was written as JSON, where None stands for what is not finite."""
+        found = dict(document["measured"])
+        if found["extent"]:
+            figures: dict[str, Any] = {k: nan if value is None else value for k, value in found["extent"].items()}
+            found["extent"] = Extent(**figures)
+        return cls(**{**document, "measured": Measured(**found)})
 
     def row(self) -> list[str]:
         """Return the line as words."""

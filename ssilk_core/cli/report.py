@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Write one page (.html) about a shot or a model: energies over time, worst frames, tables, provenance.
+
+A shot is measured as its file plays, whoever computed it. A model shows how it was trained; with --stage and --motion
+it is baked and shown as a shot as well. --figures adds what 'ssilk stress', 'ssilk trade' and 'ssilk evaluate' wrote
+with --output. The page holds everything in itself and loads nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ssilk_core.errors import EXIT_OK, need
+from ssilk_core.events import Reporter, Result, Started
+from ssilk_core.fabrics import Fabric
+from ssilk_core.files import replacing
+
+from .options import check_output
+
+if TYPE_CHECKING:
+    from ssilk_usd.garment_api import GarmentRecord
+
+    from ssilk_core.report.page import Section
+
+MODEL = ".safetensors"
+
+
+def add_arguments(verb: argparse.ArgumentParser) -> None:
+    """Add the options of this verb."""
+    verb.add_argument("subject", type=Path, metavar="MODEL|SHOT", help="what the page is about")
+    verb.add_argument("-o", "--output", type=Path, required=True, help="page to write (.html)")
+    verb.add_argument("--stage", type=Path, help="for a model: USD file with the character")
+    verb.add_argument("--motion", type=Path, metavar="SHOT[:/PRIM]", help="for a model: the motion to show it on")
+    verb.add_argument("--root", metavar="PRIM", help="SkelRoot of the character, where the stage has several")
+    verb.add_argument(
+        "--figures", type=Path, nargs="+", default=[], metavar="JSON", help="figures to show as tables and plots"
+    )
+
+
+def run(options: argparse.Namespace, report: Reporter) -> int:
+    """Measure, draw and write."""
+    from ssilk_core.report.figures import section_of
+    from ssilk_core.report.page import page
+
+    _check(options)
+    given = [section_of(path) for path in options.figures]
+    own = _model(options, report) if options.subject.suffix == MODEL else _shot(options.subject, report)
+    *measured, provenance = own
+    text = page(options.subject.name, [*measured, *given, provenance])
+    with replacing(options.output) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    report(Result("report", {"page": str(options.output), "bytes": options.output.stat().st_size}))
+    return EXIT_OK
+
+
+def _check(options: argparse.Namespace) -> None:
+    need(options.output.suffix == ".html", str(options.output), "not a name for a page", "it ends in .html")
+    check_output(options.output, options.subject, *options.figures)
+    need(options.subject.is_file(), str(options.subject), "there is no such file", "a model or a shot is needed")
+    need(bool(options.stage) == bool(options.motion), "report", "one of --stage and --motion",
+         "a model is shown on both, or on neither")  # fmt: skip
+    need(options.subject.suffix == MODEL or not options.stage, str(options.subject), "--stage for a shot",
+         "shots hold their character")  # fmt: skip
+
+
+def _shot(path: Path, report: Reporter) -> list[Section]:
+    """Return the sections of a shot, its provenance last."""
+    from ssilk_usd.play import Shot
+    from ssilk_usd.provenance import read_provenance
+    from ssilk_usd.read_shot import read_parts
+
+    from ssilk_core.report.page import Section, facts
+    from ssilk_core.report.shots import Dressed, shot_sections
+
+    shot = Shot(path)
+    parts = read_parts(shot)
+    report(Started("report", len(shot.frame_times)))
+    garments = [
+        Dressed(index, part.mesh, _fabric(part.record))
+        for index, (mesh, part) in enumerate(zip(shot.meshes, parts))
+        if mesh.is_garment
+    ]
+    need(garments, str(path), "no mesh is marked as a garment", "one at least is needed", "see 'ssilk rig'")
+    need(shot.frame_times, str(path), "the shot has no frames", "one at least is needed")
+    bodies = {index: part.mesh for index, part in enumerate(parts) if not shot.meshes[index].is_garment}
+    sections = shot_sections(shot, garments, bodies, report)
+    records = {str(part.mesh.path): asdict(part.record) for part in parts if part.record}
+    return [*sections, Section("Provenance", facts({**read_provenance(path), **records}))]
+
+
+def _fabric(record: GarmentRecord | None) -> Fabric:
+    """Return what a garment is made of, as it says itself; the default where it does not."""
+    if record is None:
+        return Fabric("default")
+    known = {item.name for item in fields(Fabric)}
+    numbers: dict[str, Any] = {name: value for name, value in record.parameters.items() if name in known}
+    return replace(Fabric(record.fabric), **numbers)
+
+
+def _model(options: argparse.Namespace, report: Reporter) -> list[Section]:
+    """Return the sections of a model, its provenance last."""
+    from ssilk_core.checkpoint import load_model
+    from ssilk_core.report.figures import learning, read_json
+    from ssilk_core.report.page import Section, facts
+
+    path: Path = options.subject
+    file, curve = load_model(path), path.with_suffix(".curve.json")
+    sections = [learning(read_json(curve))] if curve.is_file() else []
+    if options.stage:
+        sections += _baked(options, report)
+    scene = file.scene
+    sizes = {
+        "vertices": scene.garment.mesh.vertex_count,
+        "proxies": scene.rig.proxy_count,
+        "parameters": sum(value.size for value in file.parameters.values()),
+        "bytes": path.stat().st_size,
+    }
+    whole = {"garment": sizes, "model": asdict(file.config), "fabric": asdict(file.fabric), **file.provenance}
+    return [*sections, Section("Provenance", facts(whole))]
+
+
+def _baked(options: argparse.Namespace, report: Reporter) -> list[Section]:
+    """Bake a model, and return what there is to say about the shot but its provenance."""
+    from ssilk_usd.shot import write_shot
+
+    from ._baking import BakeRequest, open_bake
+
+    model, stage, motion = (str(path) for path in (options.subject, options.stage, options.motion))
+    bake = open_bake(BakeRequest(model=model, stage=stage, motion=motion, root=options.root))
+    with tempfile.TemporaryDirectory() as folder:
+        shot = Path(folder) / f"{options.subject.stem}.usdc"
+        write_shot(shot, bake.deformer, bake.motion, bake.poses(), units=bake.units, record=bake.record)
+        return _shot(shot, report)[:-1]

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sections of a page from the JSON that other commands write: learning curves, extremes, trades, evaluations."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import SsilkError, need
+from ..stress.outcome import HEADER, Outcome
+from .charts import scatter, strip
+from .page import Section, facts, flattened, table
+from .terms import SHARE
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file; raise `SsilkError` for one that is none."""
+    need(path.is_file(), str(path), "there is no such file", "figures in JSON are needed")
+    try:
+        return json.loads(path.read_text())
+    except ValueError as error:
+        raise SsilkError(f"{path}: this is no JSON ({error}); name a file that ssilk wrote.") from error
+
+
+def section_of(path: Path) -> Section:
+    """Return what a file of figures says, by what it holds.
+
+    Raises:
+        SsilkError: it is none that 'ssilk stress', 'trade' or 'evaluate' writes.
+    """
+    document = read_json(path)
+    kinds = {"outcomes": extremes, "points": trade, "figures": evaluation}
+    kind = next((key for key in kinds if isinstance(document, dict) and isinstance(document.get(key), list)), None)
+    need(kind, str(path), "none of the figures that are known", f"a document with {' or '.join(kinds)} is needed",
+         "name what 'ssilk stress', 'ssilk trade' or 'ssilk evaluate' wrote")  # fmt: skip
+    try:
+        return kinds[str(kind)](document)
+    except (KeyError, TypeError, ValueError) as error:
+        raise SsilkError(f"{path}: these figures are incomplete ({error}); measure again.") from error
+
+
+def extremes(document: Mapping[str, Any]) -> Section:
+    """Return the table of 'ssilk stress'."""
+    found = [Outcome.of(each) for each in document["outcomes"]]
+    bad = [number for number, outcome in enumerate(found) if outcome.verdict == "breaks"]
+    rest = facts({name: value for name, value in document.items() if name != "outcomes"})
+    return Section("Extremes", table(HEADER, [outcome.row() for outcome in found], bad) + rest)
+
+
+def trade(document: Mapping[str, Any]) -> Section:
+    """Return the table and the plot of 'ssilk trade'."""
+    points = document["points"]
+    groups: dict[str, list[tuple[float, float, str]]] = {}
+    for point in points:
+        words = f"{point['variant']} ({point['milliseconds']:.3g} ms, {1000 * point['position']:.3g} mm)"
+        groups.setdefault(point["swept"], []).append((point["milliseconds"], 1000 * point["position"], words))
+    chart = ""
+    if points:
+        best = cheapest([(x, y) for group in groups.values() for x, y, _ in group])
+        chart = scatter("Time against distance from the whole model", ("ms a frame", "RMS [mm]"), groups, best)
+    return Section("Trade", chart + records(points) + facts(document["asked"]))
+
+
+def cheapest(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Return the points (cost, error) that no other beats in one without losing in the other, the cheapest first."""
+    best: list[tuple[float, float]] = []
+    for point in sorted(points):
+        if not best or point[1] < best[-1][1]:
+            best.append(point)
+    return best
+
+
+def evaluation(document: Mapping[str, Any]) -> Section:
+    """Return the table of 'ssilk evaluate'."""
+    rest = facts({name: value for name, value in document.items() if name != "figures"})
+    return Section("Evaluation", records(document["figures"]) + rest)
+
+
+def records(found: Sequence[Mapping[str, Any]]) -> str:
+    """Return records as a table with a column for each name that any has."""
+    flat = [flattened(record) for record in found]
+    names = list(dict.fromkeys(name for record in flat for name in record))
+    return table(names, [[record.get(name, "") for name in names] for record in flat])
+
+
+def learning(document: Mapping[str, Any]) -> Section:
+    """Return the learning curve that a training leaves beside its model."""
+    points, plain = document["points"], document["plain"]
+    need(points, "learning curve", "no validation yet", "one at least is needed")
+    best = min(range(len(points)), key=lambda number: points[number]["validation"]["total"])
+    times = np.array([point["seconds"] for point in points])
+    totals, inside = ([point["validation"][name] for point in points] for name in ("total", "collisions"))
+    words = f"plain skinning: {plain['total']:.4g} J, {plain['collisions']:.2%} inside the body"
+    charts = strip("total at validation", "J", times, np.array(totals), {best: "best"})
+    charts += strip(SHARE, "%", times, 100.0 * np.array(inside), {best: "best"})
+    return Section("Training", charts + f'<p class="note">{words}</p>')

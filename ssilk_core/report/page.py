@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A page of HTML that is whole by itself: its style, charts and pictures are in it, and it may load nothing else."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from io import BytesIO
+from typing import Any
+
+from ..view.render import Image
+
+# Nothing is fetched and nothing runs, whatever a name or a message in the figures may contain.
+POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+STYLE = """
+:root { color-scheme: light dark; --ink: #22262b; --paper: #fff; --faint: #d9dde2; --line: #2f6f9f; --bad: #b03a48; }
+@media (prefers-color-scheme: dark) {
+  :root { --ink: #dfe3e8; --paper: #17191c; --faint: #3a3f46; --line: #6fb1e0; --bad: #ef8792; }
+}
+body { font: 15px/1.5 system-ui, sans-serif; color: var(--ink); background: var(--paper); max-width: 60rem;
+       margin: 2rem auto; padding: 0 1rem; }
+h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2.2rem; border-bottom: 1px solid var(--faint); }
+svg { width: 100%; height: auto; display: block; } text { font: 11px system-ui, sans-serif; fill: var(--ink); }
+text.title { font-weight: 600; font-size: 12px; } text.end { text-anchor: end; } text.small { opacity: .75; }
+.axis { stroke: var(--faint); } .line { fill: none; stroke: var(--line); stroke-width: 1.2; }
+.front { fill: none; stroke: var(--ink); stroke-dasharray: 4 3; } .mark { fill: var(--bad); }
+.scroll { overflow-x: auto; } table { border-collapse: collapse; font-size: 13px; }
+td, th { padding: .2rem .6rem; text-align: left; border-bottom: 1px solid var(--faint); vertical-align: top; }
+td.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+tr.bad td { color: var(--bad); }
+td:first-child { white-space: nowrap; }
+.pictures { display: flex; flex-wrap: wrap; gap: 1rem; } figure { margin: 0; width: 13rem; } img { width: 100%; }
+figcaption, .legend, .note { font-size: 13px; opacity: .8; }
+"""
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the page: its heading and its HTML."""
+
+    title: str
+    body: str
+
+
+def page(title: str, sections: Sequence[Section]) -> str:
+    """Return a whole page."""
+    parts = "\n".join(f"<section><h2>{escape(part.title)}</h2>\n{part.body}\n</section>" for part in sections)
+    head = (
+        f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{POLICY}">'
+        f'<meta name="viewport" content="width=device-width"><title>{escape(title)}</title><style>{STYLE}</style>'
+    )
+    body = f"<h1>{escape(title)}</h1>\n{parts}"
+    return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head>\n<body>\n{body}\n</body></html>\n'
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]], bad: Sequence[int] = ()) -> str:
+    """Return a table; figures stand to the right, and rows whose numbers are in `bad` stand out."""
+    lines = []
+    for number, row in enumerate(rows):
+        kind = ' class="bad"' if number in bad else ""
+        lines.append(f"<tr{kind}>{''.join(map(_cell, row))}</tr>")
+    heading = "".join(f"<th>{escape(word)}</th>" for word in header)
+    rows_of = "\n".join(lines)
+    return f'<div class="scroll"><table><thead><tr>{heading}</tr></thead>\n<tbody>{rows_of}</tbody></table></div>'
+
+
+def _cell(words: str) -> str:
+    kind = ' class="number"' if words[:1] in set("+-0123456789") and len(words) < 24 else ""
+    return f"<td{kind}>{escape(words)}</td>"
+
+
+def facts(document: Mapping[str, Any]) -> str:
+    """Return nested plain values as a table of names and values, inner names after a dot."""
+    return table(("what", "value"), [(name, words) for name, words in flattened(document).items()])
+
+
+def flattened(document: Mapping[str, Any], above: str = "") -> dict[str, str]:
+    """Return nested plain values by their names joined with dots, as words."""
+    found: dict[str, str] = {}
+    for name, value in document.items():
+        path = f"{above}{name}"
+        if isinstance(value, Mapping):
+            found |= flattened(value, f"{path}.")
+        else:
+            found[path] = worded(value)
+    return found
+
+
+def worded(value: object) -> str:
+    """Return a plain value as words for people."""
+    if isinstance(value, bool) or value is None:
+        return {True: "yes", False: "no", None: "–"}[value]
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, list | tuple):
+        return ", ".join(map(worded, value))
+    return str(value)
+
+
+def figure(image: Image, caption: str) -> str:
+    """Return a picture (H, W, 3) with words below it."""
+    from PIL import Image as Pictures
+
+    stream = BytesIO()
+    Pictures.fromarray(image).save(stream, format="PNG", optimize=True)
+    data = base64.b64encode(stream.getvalue()).decode()
+    words = escape(caption)
+    return f'<figure><img alt="{words}" src="data:image/png;base64,{data}"><figcaption>{words}</figcaption></figure>'

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sections about a shot: energies over time, and its worst frames as pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..assets import Floats, Mesh
+from ..events import Progress, Reporter, silent
+from ..fabrics import Fabric
+from ..view.camera import follow_cameras
+from ..view.player import Player
+from ..view.render import Image, render
+from ..view.shots import shot_surfaces
+from .charts import strip
+from .page import Section, figure, table
+from .terms import SHARE, UNITS, TermsMeter, worst_frames
+
+PICTURES, APART = 4, 0.5  # worst frames to show, and how far they are from each other at least [s]
+WIDTH, HEIGHT = 300, 400  # of a picture [pixels]
+LETTERS = "ABCDEFGH"
+
+
+@dataclass(frozen=True, eq=False)
+class Dressed:
+    """A garment of a shot: which of the player's meshes it is, at rest, and what it is made of."""
+
+    index: int
+    mesh: Mesh
+    fabric: Fabric
+
+
+def shot_sections(
+    player: Player, garments: Sequence[Dressed], bodies: Mapping[int, Mesh], report: Reporter = silent
+) -> list[Section]:
+    """Return the sections about a shot.
+
+    Args:
+        player: the shot; garments: those to measure.
+        bodies: the meshes at rest that garments meet, by their index in the player.
+    """
+    meters = [TermsMeter(each.mesh, joined(list(bodies.values())), each.fabric, player.fps) for each in garments]
+    for number, time in enumerate(player.frame_times):
+        points = player.points(time)
+        body = np.concatenate([points[index] for index in bodies]) if bodies else None
+        for each, meter in zip(garments, meters):
+            meter.add(points[each.index], body)
+        report(Progress(number + 1, len(player.frame_times)))
+    return [part for each, meter in zip(garments, meters) for part in _sections(player, each, meter)]
+
+
+def joined(meshes: Sequence[Mesh]) -> Mesh | None:
+    """Return meshes as one, in their order; None for none."""
+    if not meshes:
+        return None
+    starts = np.cumsum([0, *(mesh.vertex_count for mesh in meshes)])
+    faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts)])
+    return Mesh(meshes[0].path, np.concatenate([mesh.points for mesh in meshes]), faces)
+
+
+def _sections(player: Player, garment: Dressed, meter: TermsMeter) -> list[Section]:
+    values = {name: np.array(found) for name, found in meter.values.items()}
+    worst = worst_frames(values["total"], PICTURES, max(1, round(APART * player.fps)))
+    times, marks = np.arange(len(values["total"])) / player.fps, dict(zip(worst, LETTERS))
+    shown = [name for name in UNITS if meter.body or name not in ("collision", SHARE)]
+    charts = "".join(strip(name, UNITS[name], times, values[name], marks) for name in shown)
+    rows = [[f"{name} [{UNITS[name]}]", *_spread(values[name])] for name in shown]
+    name = player.meshes[garment.index].name
+    pictures = "".join(
+        figure(picture(player, frame), f"{letter}: {times[frame]:.2f} s, {values['total'][frame]:.4g} J")
+        for frame, letter in marks.items()
+    )
+    return [
+        Section(f"{name}: energies over time", charts + table(("", "mean", "median", "95 %", "most"), rows)),
+        Section(f"{name}: its worst frames", f'<div class="pictures">{pictures}</div>'),
+    ]
+
+
+def _spread(values: Floats) -> list[str]:
+    figures = values.mean(), np.median(values), np.quantile(values, 0.95), values.max()
+    return [f"{value:.4g}" for value in figures]
+
+
+def picture(player: Player, frame: int) -> Image:
+    """Return one frame of a shot, the figure filling it."""
+    surfaces = shot_surfaces(player, frame)
+    points = np.concatenate([surface.points for surface in surfaces])
+    (camera,) = follow_cameras([points], player.fps, WIDTH / HEIGHT)
+    return render(surfaces, camera, WIDTH, HEIGHT, ground=float(points[:, 1].min()))

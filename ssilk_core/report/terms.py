@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Energies of a shot's garment in each frame, from its points alone, whoever computed them."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..assets import Floats, Mesh
+from ..energy import GarmentEnergy
+from ..energy.collision import PosedBody, signed_distance
+from ..energy.surface_point import triangle_rings
+from ..fabrics import Fabric
+from ..mesh.topology import vertex_normals
+
+GRAVITY = 9.81  # [m/s2]
+SHARE = "inside the body"
+UNITS = {"total": "J", "stretch": "J", "bending": "J", "gravity": "J", "inertia": "J", "collision": "J", SHARE: "%"}
+
+
+@dataclass(eq=False)
+class TermsMeter:
+    """Takes the frames of a shot in order and keeps the energies of each.
+
+    Attributes:
+        garment: at rest; body: at rest, all meshes as one, or None.
+        fps: frames per second of what is given.
+        values: by name, one for each frame: energies [J], and the share of vertices inside the body [%]. Gravity
+            counts heights over the body's middle, from what they are at rest; inertia is of the air's frame.
+    """
+
+    garment: Mesh
+    body: Mesh | None
+    fabric: Fabric
+    fps: float
+    values: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in UNITS})
+
+    def __post_init__(self) -> None:
+        import torch
+
+        self.energy = GarmentEnergy(self.garment, self.fabric)
+        self.past: deque = deque(maxlen=2)
+        self.rings = None
+        if self.body:
+            self.rings = torch.as_tensor(triangle_rings(self.body.faces, self.body.vertex_count))
+        self.rest = self._height(self.garment.points, None if self.body is None else self.body.points)
+
+    def add(self, points: Floats, body: Floats | None) -> None:
+        """Take a frame: points of the garment (V, 3) and of the body (B, 3) [m]."""
+        import torch
+
+        origin = points.mean(axis=0)
+        x = torch.as_tensor(points - origin, dtype=torch.float32)[:, :, None]
+        stretch, bending = self.energy.elastic(x)
+        found = {
+            "stretch": float(stretch),
+            "bending": float(bending),
+            "gravity": self._height(points, body) - self.rest,
+            "inertia": self._inertia(points),
+            **self._collision(x, None if body is None else body - origin),
+        }
+        total = sum(value for name, value in found.items() if UNITS[name] == "J")
+        for name, value in {"total": total, **found}.items():
+            self.values[name].append(value)
+
+    def _height(self, points: Floats, body: Floats | None) -> float:
+        """Return the garment's weight times its height over the middle of the body, or over the ground [J]."""
+        ground = 0.0 if body is None else float(body[:, 1].mean())
+        return GRAVITY * float(self.energy.mass.numpy() @ (points[:, 1] - ground))
+
+    def _inertia(self, points: Floats) -> float:
+        """Return sum m/(2 dt^2) |x - 2 x_{t-1} + x_{t-2}|^2; zero for the first two frames."""
+        enough = len(self.past) == 2
+        squared = ((points - 2 * self.past[1] + self.past[0]) ** 2).sum(1) if enough else np.zeros(len(points))
+        self.past.append(points)
+        return float(self.energy.mass.numpy() @ squared) * self.fps**2 / 2
+
+    def _collision(self, x, body: Floats | None) -> dict[str, float]:  # type: ignore[no-untyped-def]  # torch is heavy
+        import torch
+
+        if body is None or self.body is None:
+            return {"collision": 0.0, SHARE: 0.0}
+        normals = vertex_normals(body, self.body.faces)
+        at, towards = (torch.as_tensor(values, dtype=torch.float32)[:, :, None] for values in (body, normals))
+        distance = signed_distance(x, PosedBody(at, towards, self.rings))
+        inside = 100 * float((distance < 0).double().mean())
+        return {"collision": float(self.energy.collision_of(distance)), SHARE: inside}
+
+
+def worst_frames(values: Floats, count: int, apart: int) -> list[int]:
+    """Return up to `count` frames of the largest values, the worst first, each so many frames from the others."""
+    found: list[int] = []
+    for frame in np.argsort(-np.asarray(values), kind="stable").tolist():
+        if len(found) == count:
+            break
+        if all(abs(frame - other) >= apart for other in found):
+            found.append(frame)
+    return found

@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pages: energies of points, charts that show their peaks, words that cannot become markup."""
+
+import json
+import re
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import trimesh
+
+from ssilk_core.assets import Mesh
+from ssilk_core.errors import SsilkError
+from ssilk_core.fabrics import Fabric
+from ssilk_core.report.charts import peaks, scatter, strip
+from ssilk_core.report.figures import cheapest, learning, section_of
+from ssilk_core.report.page import Section, facts, figure, flattened, page, table
+from ssilk_core.report.shots import joined
+from ssilk_core.report.terms import SHARE, TermsMeter, worst_frames
+
+CLOTH = Fabric("toy", density=0.2, margin=0.0, collision=7.0)
+
+
+@pytest.fixture
+def sheet(toy_grid) -> Mesh:
+    points, faces = toy_grid(12, 5)
+    return Mesh("/sheet", points, faces)
+
+
+def ball(radius: float = 0.3) -> Mesh:
+    sphere = trimesh.creation.icosphere(subdivisions=4, radius=radius)
+    return Mesh("/ball", np.asarray(sphere.vertices), np.asarray(sphere.faces))
+
+
+def test_a_sheet_that_falls_freely_has_the_energies_of_one(sheet):
+    meter, times = TermsMeter(sheet, None, CLOTH, 50.0), np.arange(6) / 50
+    for time in times:
+        meter.add(sheet.points - [0, 4.9 * time**2, 0], None)
+    mass = 0.2 * 0.55 * 0.2
+    np.testing.assert_allclose(meter.values["stretch"], 0, atol=1e-6)
+    np.testing.assert_allclose(meter.values["gravity"], -mass * 9.81 * 4.9 * times**2, atol=1e-9)
+    inertia = [0, 0, *[mass * (9.8 / 50**2) ** 2 * 50**2 / 2] * 4]
+    np.testing.assert_allclose(meter.values["inertia"], inertia, atol=1e-9)
+    np.testing.assert_allclose(meter.values["total"], np.add(meter.values["gravity"], inertia), atol=1e-5)
+
+
+def test_what_is_inside_the_body_is_counted_and_costs_its_depth(sheet):
+    """Far from the origin: points are taken about the garment, where single precision is fine."""
+    body, far = ball(), np.array([4000.0, 0, -9000])
+    meter = TermsMeter(sheet, body, CLOTH, 30.0)
+    points = sheet.points + [0, 0.275, 0]  # its middle in the ball's
+    meter.add(points + far, body.points + far)
+    depth = 0.3 - np.linalg.norm(points, axis=1)
+    assert meter.values[SHARE] == [pytest.approx(100 * np.mean(depth > 0), abs=2)]
+    assert meter.values["collision"][0] == pytest.approx(7.0 * (depth.clip(0) ** 2).sum(), rel=0.03)
+    assert meter.values["gravity"][0] == pytest.approx(9.81 * 0.022 * 0.275, rel=1e-6)
+
+
+def test_bodies_are_joined_in_their_order():
+    whole = joined([ball(0.1), ball(0.2)])
+    count = ball().vertex_count
+    assert whole.vertex_count == 2 * count and whole.faces.max() == 2 * count - 1 and joined([]) is None
+    np.testing.assert_array_equal(whole.faces[len(whole.faces) // 2 :], ball().faces + count)
+
+
+def test_the_worst_frames_are_apart():
+    values = np.zeros(100)
+    values[[10, 11, 40, 80]] = 5, 6, 3, 4
+    assert worst_frames(values, 3, 5) == [11, 80, 40]
+    assert worst_frames(values, 9, 200) == [11]
+
+
+def test_no_peak_is_lost_to_thinning():
+    values = np.sin(np.arange(100_000) / 500)
+    values[77_777] = 9
+    shown = peaks(values)
+    assert 77_777 in shown and len(shown) < 700 and shown[0] == 0 and shown[-1] == 99_999
+    assert peaks(np.zeros(1)) == [0]
+
+
+@pytest.mark.parametrize("values", [[0.0], [1.0, 2, 3], [-5.0, -1], [0.0, 0, 0]])
+def test_a_strip_is_well_formed_and_stays_within_its_frame(values):
+    found = np.array(values)
+    svg = ElementTree.fromstring(strip("a < b", "J", np.arange(len(found)) / 30.0, found, {0: "A"}))
+    line = next(part for part in svg if part.tag == "polyline")
+    places = np.array([[float(x) for x in pair.split(",")] for pair in line.get("points").split()])
+    assert (places >= [0, 0]).all() and (places <= [860, 96]).all()
+    if len(found) > 1 and np.ptp(found):
+        assert places[found.argmax(), 1] < places[found.argmin(), 1]  # up is more
+
+
+def test_a_front_holds_what_nothing_beats():
+    points = [(1.0, 5.0), (2.0, 3.0), (2.5, 4.0), (3.0, 3.0), (4.0, 1.0)]
+    assert cheapest(points) == [(1.0, 5.0), (2.0, 3.0), (4.0, 1.0)]
+    chart = scatter("t", ("ms", "mm"), {"one": [(x, y, "w") for x, y in points]}, cheapest(points))
+    assert chart.count("<circle") == 5
+
+
+def test_words_cannot_become_markup():
+    evil = "<img src=x onerror=alert(1)>\"'&"
+    text = page(evil, [Section(evil, table([evil], [[evil]]) + facts({evil: evil}))])
+    text += strip(evil, evil, np.zeros(1), np.ones(1), {0: evil})
+    assert "<img" not in text and text.count("&lt;img") >= 7
+
+
+def test_a_page_refers_to_nothing_outside():
+    picture = figure(np.zeros((4, 6, 3), dtype=np.uint8), "black")
+    text = page("page", [Section("one", picture)])
+    assert re.findall(r'(?:src|href|url)\s*[=(]\s*"?([^">]{0,22})', text) == ["data:image/png;base64,"]
+    assert "default-src 'none'" in text and "<script" not in text
+
+
+def test_nested_values_are_flattened_to_words():
+    found = flattened({"a": {"b": [1, 2.5], "c": None}, "d": True})
+    assert found == {"a.b": "1, 2.5", "a.c": "–", "d": "yes"}
+
+
+OUTCOME = {
+    "name": "x", "group": "motion", "verdict": "breaks", "said": "", "seconds": 1.0,
+    "measured": {
+        "extent": {"frames": 5, "finite": False, "speed": None, "distance": 1.0, "size": 1.0, "latent": 2.0,
+                   "growth": 1.0, "recovered": 0},
+        "error": None, "unit": "", "note": "",
+    },
+}  # fmt: skip
+POINT = {"model": "m", "swept": "shapes", "variant": "16", "milliseconds": 0.5, "position": 0.002, "total": 1.5}
+FIGURES = {
+    "Extremes": ({"ssilk": "1", "outcomes": [OUTCOME]}, "breaks"),
+    "Trade": ({"asked": {"clips": ["a"]}, "points": [POINT]}, "0.002"),
+    "Evaluation": ({"units": "SI", "figures": [{"method": "plain", "figures": {"total": 2.5}}]}, "figures.total"),
+}
+
+
+@pytest.mark.parametrize("title", FIGURES)
+def test_figures_become_sections_by_what_they_hold(tmp_path, title):
+    document, word = FIGURES[title]
+    path = tmp_path / "figures.json"
+    path.write_text(json.dumps(document))
+    section = section_of(path)
+    assert section.title == title and word in section.body
+    if title == "Extremes":
+        assert '<tr class="bad">' in section.body and "nan" in section.body
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [("{", "this is no JSON"), ("[1]", "none of the figures"), ('{"points": [{}]}', "incomplete ('variant')"),
+     ('{"outcomes": [{"name": 1}]}', "incomplete ('measured')")],
+)  # fmt: skip
+def test_other_files_are_refused(tmp_path, text, said):
+    path = tmp_path / "figures.json"
+    path.write_text(text)
+    with pytest.raises(SsilkError, match=re.escape(said)):
+        section_of(path)
+
+
+def test_a_learning_curve_marks_its_best(tmp_path):
+    score = {"total": 2.0, "collisions": 0.01}
+    points = [{"seconds": 9.0 * i, "validation": {**score, "total": abs(i - 2) + 0.5}} for i in range(5)]
+    section = learning({"plain": score, "points": points})
+    assert "best: 0.5 J at 18.00 s" in section.body and "plain skinning: 2 J, 1.00% inside" in section.body

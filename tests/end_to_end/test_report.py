@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ssilk report: pages about shots and models, opened in a browser where there is one."""
+
+import json
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ssilk_core.cli import main
+
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
+SIZE = 900, 1200  # [pixels]
+
+
+@pytest.fixture(scope="module")
+def pages(toy, tmp_path_factory) -> Path:
+    """A folder with shot.html, with figures, and model.html, with a shot of its own."""
+    folder = tmp_path_factory.mktemp("pages")
+    figures = folder / "stress.json"
+    model, stage = str(toy.folder / "model.safetensors"), str(toy.folder / "rigged.usda")
+    stress = ["stress", model, "--stage", stage, "--quick", "--only", "upside", "NaN", "-o", str(figures)]
+    assert main(stress) == 0
+    shot = ["report", str(toy.folder / "shot.usda"), "-o", str(folder / "shot.html"), "--figures", str(figures)]
+    assert main(shot) == 0
+    motion = str(toy.folder / "clip.usda")
+    assert main(["report", model, "--stage", stage, "--motion", motion, "-o", str(folder / "model.html")]) == 0
+    return folder
+
+
+class Outline(HTMLParser):
+    """Headings, and how many there are of each element."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.headings, self.counts, self._within = [], {}, ""
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.counts[tag] = self.counts.get(tag, 0) + 1
+        self._within = tag
+
+    def handle_data(self, data):
+        if self._within == "h2" and data.strip():
+            self.headings.append(data)
+
+
+def test_a_page_holds_what_was_asked_for(pages):
+    shot = Outline((pages / "shot.html").read_text())
+    assert shot.headings == ["Skirt: energies over time", "Skirt: its worst frames", "Extremes", "Provenance"]
+    assert shot.counts["svg"] == 7 and 1 <= shot.counts["img"] <= 4 and "script" not in shot.counts
+    model = Outline((pages / "model.html").read_text())
+    assert model.headings == ["Training", "Skirt: energies over time", "Skirt: its worst frames", "Provenance"]
+    text = (pages / "shot.html").read_text()
+    assert "model_sha256" in text and "first number 7" in text
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium or Chrome is installed")
+@pytest.mark.parametrize("name", ["shot", "model"])
+def test_a_browser_draws_the_page_and_fetches_nothing(pages, name, tmp_path):
+    from PIL import Image
+
+    picture = tmp_path / "page.png"
+    command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--v=0",
+               f"--user-data-dir={tmp_path / 'profile'}", f"--window-size={SIZE[0]},{SIZE[1]}"]  # fmt: skip
+    address = (pages / f"{name}.html").as_uri()
+    shot = subprocess.run([*command, f"--screenshot={picture}", address], capture_output=True, text=True, timeout=120)
+    assert "CONSOLE" not in shot.stderr, shot.stderr  # where a refused request or an error would be told
+    drawn = np.asarray(Image.open(picture).convert("RGB"), dtype=int)
+    assert drawn.shape[:2] == (SIZE[1], SIZE[0])
+    assert (np.ptp(drawn, axis=2) > 60).sum() > 300  # coloured lines, marks and cloth, not a blank or an error page
+    dom = subprocess.run([*command, "--dump-dom", address], capture_output=True, text=True, timeout=120).stdout
+    seen, written = Outline(dom), Outline((pages / f"{name}.html").read_text())
+    assert seen.headings == written.headings
+    assert all(seen.counts[tag] == written.counts[tag] for tag in ("svg", "polyline", "circle", "img", "table", "tr"))
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("{shot} -o {out}.pdf", "it ends in .html"),
+        ("{shot} -o {out}.html --stage {stage} --motion {clip}", "shots hold their character"),
+        ("{model} -o {out}.html --stage {stage}", "one of --stage and --motion"),
+        ("{out}/none.usda -o {out}.html", "there is no such file"),
+        ("{stage} -o {out}.html --figures {stage}", "this is no JSON"),
+        ("{shot} -o {out}.html --figures {other}", "none of the figures that are known"),
+    ],
+)
+def test_bad_input_is_one_sentence(toy, tmp_path, capsys, words, said):
+    (tmp_path / "other.json").write_text(json.dumps({"a": 1}))
+    files = {"shot": "shot.usda", "model": "model.safetensors", "stage": "rigged.usda", "clip": "clip.usda"}
+    names = {name: toy.folder / file for name, file in files.items()}
+    filled = words.format(**names, out=tmp_path / "out", other=tmp_path / "other.json").split()
+    assert main(["report", *filled]) == 2
+    assert said in capsys.readouterr().err and not (tmp_path / "out.html").exists()
