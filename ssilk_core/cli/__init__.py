@@ -12,9 +12,9 @@ from ssilk_core import __version__
 from ssilk_core.errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, SsilkError, fail
 from ssilk_core.events import Failed, JsonReporter, Reporter, TextReporter
 
-from . import bake, demo, evaluate, inspect, reduce, rig, simulate, stress, train, verify, view, wardrobe
+from . import bake, demo, evaluate, farm, inspect, reduce, rig, simulate, stress, task, train, verify, view, wardrobe
 
-VERBS = (inspect, rig, train, wardrobe, reduce, bake, simulate, evaluate, stress, verify, view, demo)
+VERBS = (inspect, rig, train, wardrobe, reduce, bake, simulate, evaluate, stress, verify, view, farm, task, demo)
 
 # The extra of the distribution that brings all that a verb needs.
 EXTRAS = {
@@ -29,9 +29,11 @@ EXTRAS = {
     "stress": "train",
     "verify": "bake",
     "view": "view",
+    "farm": "farm",
+    "task": "bake",
     "demo": "all",
 }
-OPTIONAL = ("torch", "pxr", "igl", "scipy", "trimesh", "embreex", "imageio_ffmpeg", "PIL")
+OPTIONAL = ("torch", "pxr", "igl", "scipy", "trimesh", "embreex", "imageio_ffmpeg", "PIL", "ray")
 
 
 class Parser(argparse.ArgumentParser):
@@ -64,7 +66,7 @@ def parser() -> Parser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; return its exit code (0 well, 2 bad input, 3 not verified, 130 interrupted)."""
+    """Run the command line; return its exit code (0 well, 2 bad input, 3 not verified, 4 tasks failed, 130 stopped)."""
     words = sys.argv[1:] if arguments is None else list(arguments)
     report: Reporter = JsonReporter() if "--json" in words else TextReporter()
     try:

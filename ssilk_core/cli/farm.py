@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bake many shots on a farm: write a job bundle of Open Job Description, or run its tasks on a Ray cluster.
+
+The bundle runs unchanged with 'openjd run' on one machine and with 'deadline bundle submit' on Deadline Cloud. Each
+task is one garment in one shot; what is done already is left alone, however often and wherever a job is run.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ssilk_core.errors import EXIT_OK, EXIT_TASKS, need
+from ssilk_core.events import Failed, Garment, Progress, Reporter, Result, Started, silent
+from ssilk_core.farm.openjd import TEMPLATE, BundleOptions, write_bundle
+from ssilk_core.farm.tasks import Task
+
+from .options import add_bake, tasks_of
+
+if TYPE_CHECKING:
+    from ._layers import Wardrobe
+
+
+def add_arguments(verb: argparse.ArgumentParser) -> None:
+    """Add the options of this verb."""
+    add_bake(verb)
+    verb.add_argument("-o", "--output", type=Path, help="folder of the layers (default: 'layers' in the bundle)")
+    where = verb.add_mutually_exclusive_group(required=True)
+    where.add_argument("--bundle", type=Path, metavar="FOLDER", help="folder of the job bundle to write")
+    where.add_argument("--cluster", nargs="?", const="", metavar="ADDRESS",
+                       help="run now on a Ray cluster (default: all cores of this machine)")  # fmt: skip
+    group = verb.add_argument_group("job bundle")
+    defaults = BundleOptions()
+    group.add_argument("--name", default=defaults.name, help="of the job (default '%(default)s')")
+    for name, about in (
+        ("chunk", "tasks that a worker takes at once, to begin with"),
+        ("seconds", "how long a chunk should take, to which farms adapt its size"),
+        ("memory", "MiB that a host needs"),
+        ("timeout", "seconds after which a chunk is given up"),
+    ):
+        group.add_argument(
+            f"--{name}", type=int, default=getattr(defaults, name), help=f"{about} (default %(default)s)"
+        )
+    group.add_argument("--gpu", action="store_true", help="a host needs a GPU (see --device)")
+
+
+def run(options: argparse.Namespace, report: Reporter) -> int:
+    """Write the bundle, or run the tasks."""
+    tasks = [_absolute(task) for task in tasks_of(options)]
+    if options.bundle:
+        return _write(tasks, options, report)
+    need(options.output, "--cluster", "no folder for the layers", "-o names one")
+    return _run(tasks, options, report)
+
+
+def _absolute(task: Task) -> Task:
+    """Return a task whose inputs are named from the root: workers start elsewhere."""
+    from ssilk_usd.read_stage import split_location
+
+    file, prim = split_location(task.motion)
+    motion = f"{Path(file).absolute()}{f':{prim}' if prim else ''}"
+    return replace(
+        task, model=str(Path(task.model).absolute()), stage=str(Path(task.stage).absolute()), motion=motion
+    )
+
+
+def _write(tasks: Sequence[Task], options: argparse.Namespace, report: Reporter) -> int:
+    for name in ("chunk", "memory", "timeout"):
+        need(getattr(options, name) > 0, f"--{name}", str(getattr(options, name)), "a positive number is needed")
+    chosen = BundleOptions(**{name: getattr(options, name) for name in BundleOptions.__dataclass_fields__})
+    write_bundle(options.bundle, tasks, options.output, chosen)
+    output = f" -p Output={options.output.absolute()}" if options.output else ""
+    detail = {
+        "bundle": str(options.bundle),
+        "tasks": len(tasks),
+        "on this machine": f"openjd run {options.bundle / TEMPLATE}{output}",
+        "on Deadline Cloud": f"deadline bundle submit {options.bundle}",
+    }
+    report(Result("farm", detail))
+    return EXIT_OK
+
+
+def _run(tasks: Sequence[Task], options: argparse.Namespace, report: Reporter) -> int:
+    from ssilk_core.farm.cluster import run_on_cluster
+
+    from ._layers import write_stages
+
+    report(Started("farm", len(tasks), {"output": str(options.output)}))
+    done = failed = current = 0
+    for outcome in run_on_cluster(tasks, options.output, bake_here, address=options.cluster or None, gpu=options.gpu):
+        done, failed = done + 1, failed + bool(outcome.error)
+        current += bool(outcome.detail.get("current"))
+        if outcome.error:
+            report(Garment(outcome.task.name, Failed(outcome.error)))
+        report(Progress(done, len(tasks)))
+    write_stages(tasks, options.output, report)
+    baked = done - failed - current
+    report(Result("farm", {"tasks": len(tasks), "baked": baked, "current": current, "failed": failed}))
+    return EXIT_TASKS if failed else EXIT_OK
+
+
+def bake_here(task: Task, folder: Path) -> dict[str, object]:
+    """Bake a task in this process, which keeps the garment of the last one."""
+    from ._layers import bake_task
+
+    return bake_task(task, folder, _wardrobe(), silent)
+
+
+@lru_cache(maxsize=1)
+def _wardrobe() -> Wardrobe:
+    from ._layers import Wardrobe
+
+    return Wardrobe()

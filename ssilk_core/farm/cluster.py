@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tasks of a job on a Python cluster: Ray starts them, and starts those anew whose worker died."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ssilk_core.errors import SsilkError, fail
+
+from .tasks import Task
+
+Bake = Callable[[Task, Path], dict[str, object]]
+RETRIES = 10  # of a task whose worker died
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a task ended: `detail` as the bake says it, or what was wrong."""
+
+    task: Task
+    detail: dict[str, object]
+    error: str = ""
+
+
+def run_on_cluster(
+    tasks: Sequence[Task], folder: Path, bake: Bake, *, address: str | None = None, gpu: bool = False
+) -> Iterator[Outcome]:
+    """Yield the outcome of each task as it ends, on a cluster that is there or on the cores of this machine.
+
+    Args:
+        bake: what a worker does, a function of a module that workers can import.
+        address: of the cluster, "auto" for the one that this machine is in; None starts one here.
+        gpu: each task needs a GPU.
+
+    Raises:
+        SsilkError: there is no such cluster.
+    """
+    import ray
+    from ray.exceptions import RayError
+
+    try:
+        ray.init(address=address, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        fail("--cluster", f"no cluster at {address} ({str(error).splitlines()[0]})", "start one with 'ray start'")
+    try:
+        remote = ray.remote(num_cpus=1, num_gpus=int(gpu), max_retries=RETRIES)(_outcome)
+        pending = {remote.remote(bake, task, folder.absolute()): task for task in tasks}
+        while pending:
+            (done, *_), _ = ray.wait(list(pending))
+            task = pending.pop(done)
+            try:
+                yield ray.get(done)
+            except RayError as error:
+                yield Outcome(task, {}, f"its workers died ({str(error).splitlines()[0]})")
+    finally:
+        ray.shutdown()
+
+
+def _outcome(bake: Bake, task: Task, folder: Path) -> Outcome:
+    try:
+        return Outcome(task, bake(task, folder))
+    except SsilkError as error:
+        return Outcome(task, {}, str(error))

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A job as a file: its tasks, which workers name by their numbers."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
+
+from ssilk_core import __version__
+from ssilk_core.errors import fail, need
+from ssilk_core.files import replacing
+
+from .record import INPUTS
+from .tasks import Task
+
+NAME = "job.json"
+
+
+def write_job(path: str | Path, tasks: Sequence[Task]) -> None:
+    """Write the tasks of a job; raise `SsilkError` where that is not possible."""
+    document = {"ssilk": __version__, "tasks": [asdict(task) for task in tasks]}
+    with replacing(path, keep_same=True) as temporary:
+        temporary.write_text(json.dumps(document, indent=1) + "\n")
+
+
+def read_job(path: str | Path, mapping: str | Path | None = None) -> list[Task]:
+    """Return the tasks of a job.
+
+    Args:
+        mapping: a file with Open Job Description's rules for where paths of another machine lie on this one.
+
+    Raises:
+        SsilkError: a file is missing or damaged.
+    """
+    document = _json(Path(path), "a file written by 'ssilk farm' is needed")
+    rules = _json(Path(mapping), "path mapping rules are needed").get("path_mapping_rules", []) if mapping else []
+    try:
+        tasks = [Task(**entry) for entry in document["tasks"]]
+        for task in tasks:
+            _check_types(task)
+        return [_mapped(task, rules) for task in tasks]
+    except (KeyError, TypeError, AttributeError) as error:
+        fail(str(path), f"it is no job ({type(error).__name__}: {error})", "a file written by 'ssilk farm' is needed")
+
+
+def _json(path: Path, allowed: str) -> dict[str, Any]:
+    need(path.is_file(), str(path), "there is no such file", allowed)
+    try:
+        document = json.loads(path.read_text())
+    except (ValueError, RecursionError) as error:
+        fail(str(path), f"it is no JSON ({error})", allowed)
+    need(isinstance(document, dict), str(path), "it holds no names", allowed)
+    return document
+
+
+def _check_types(task: Task) -> None:
+    """Raise `TypeError` unless all values have the types that were written."""
+    like = Task(garment="", shot="", model="", stage="", motion="")
+    for name, value in vars(task).items():
+        allowed = {"fps": (int, float, type(None)), "root": (str, type(None))}.get(name, (type(getattr(like, name)),))
+        if type(value) not in allowed:
+            raise TypeError(f"{name!r} is {str(value)[:40]}")
+    if not re.fullmatch(r"[A-Za-z_]\w*/[\w-]+", f"{task.garment}/{task.shot}", flags=re.ASCII):
+        raise TypeError(f"{task.name!r} names no files")
+
+
+def _mapped(task: Task, rules: Iterable[dict[str, str]]) -> Task:
+    """Return a task with its inputs where they lie on this machine."""
+    model, stage, motion = (_found(getattr(task, name), rules) for name in INPUTS)
+    return replace(task, model=model, stage=stage, motion=motion)
+
+
+def _found(path: str, rules: Iterable[dict[str, str]]) -> str:
+    for rule in rules:
+        kind = PureWindowsPath if rule["source_path_format"] == "WINDOWS" else PurePosixPath
+        if kind(path).is_relative_to(rule["source_path"]):
+            return str(Path(rule["destination_path"], *kind(path).relative_to(rule["source_path"]).parts))
+    return path
+
+
+def numbers(text: str, count: int) -> list[int]:
+    """Return the numbers of tasks that "0-9,12" names, of `count` that there are.
+
+    Raises:
+        SsilkError: it names none, or some that there are not.
+    """
+    where, allowed = "--tasks", f"numbers from 0 to {count - 1} are needed, such as 0-9,12"
+    found: list[int] = []
+    for part in text.split(","):
+        first, dash, last = part.partition("-")
+        plain = first.strip().isdecimal() and (not dash or last.strip().isdecimal())
+        need(plain, where, f"'{text}'", allowed)
+        span = range(int(first), int(last if dash else first) + 1)
+        need(len(span) and span[-1] < count, where, f"'{text}'", allowed)
+        found += span
+    return sorted(set(found))

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Open Job Description: the bundle that a farm takes, and the lines by which a worker speaks to it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TextIO
+
+from ssilk_core.events import Event, Failed, Garment, Message, Progress, Result, Started, describe
+from ssilk_core.files import replacing
+
+from .job import NAME, write_job
+from .record import INPUTS
+from .tasks import Task
+
+TEMPLATE, VALUES, ASSETS = "template.json", "parameter_values.json", "asset_references.json"
+NOTICE = 30  # seconds that a worker has to stop
+_STOP = {"mode": "NOTIFY_THEN_TERMINATE", "notifyPeriodInSeconds": NOTICE}
+
+
+@dataclass(frozen=True, kw_only=True)
+class BundleOptions:
+    """How a job is cut and what its hosts need.
+
+    Attributes:
+        name: of the job.
+        chunk: tasks that a worker takes at once, to begin with.
+        seconds: how long such a chunk should take [s]; farms adapt its size to that, 0 leaves it.
+        memory: of a host [MiB].
+        gpu: a host needs a GPU.
+        timeout: seconds after which a chunk is given up.
+    """
+
+    name: str = "SSILK bake"
+    chunk: int = 10
+    seconds: int = 300
+    memory: int = 2048
+    gpu: bool = False
+    timeout: int = 3600
+
+
+def write_bundle(folder: Path, tasks: Sequence[Task], output: Path | None, options: BundleOptions) -> None:
+    """Write a job bundle: template, job, parameter values and the files that it takes and gives.
+
+    Raises:
+        SsilkError: it cannot be written.
+    """
+    write_job(folder / NAME, tasks)
+    _write(folder / TEMPLATE, template(len(tasks), options))
+    values = [] if output is None else [{"name": "Output", "value": str(output.absolute())}]
+    _write(folder / VALUES, {"parameterValues": values})
+    _write(folder / ASSETS, _asset_references(tasks, output))
+
+
+def _write(path: Path, document: dict[str, Any]) -> None:
+    with replacing(path, keep_same=True) as temporary:
+        temporary.write_text(json.dumps(document, indent=1) + "\n")
+
+
+def _asset_references(tasks: Sequence[Task], output: Path | None) -> dict[str, Any]:
+    files = sorted({getattr(task, name).partition(":/")[0] for task in tasks for name in INPUTS})
+    folders = [] if output is None else [str(output.absolute())]
+    return {
+        "assetReferences": {"inputs": {"filenames": files, "directories": []}, "outputs": {"directories": folders}}
+    }
+
+
+def template(count: int, options: BundleOptions) -> dict[str, Any]:
+    """Return a job template of `count` tasks."""
+    return {
+        "specificationVersion": "jobtemplate-2023-09",
+        "extensions": ["TASK_CHUNKING"],
+        "name": options.name,
+        "parameterDefinitions": _parameters(options),
+        "jobEnvironments": [_environment()],
+        "steps": [_bake_step(count, options), _check_step(options)],
+    }
+
+
+def _parameters(options: BundleOptions) -> list[dict[str, Any]]:
+    return [
+        {"name": "Job", "type": "PATH", "objectType": "FILE", "dataFlow": "IN", "default": NAME,
+         "description": "What is to be baked."},
+        {"name": "Output", "type": "PATH", "objectType": "DIRECTORY", "dataFlow": "OUT", "default": "layers",
+         "description": "Where the layers go."},
+        {"name": "ChunkSize", "type": "INT", "minValue": 1, "default": options.chunk,
+         "description": "Shots that a worker takes at once, to begin with."},
+        {"name": "ChunkSeconds", "type": "INT", "minValue": 0, "default": options.seconds,
+         "description": "How long a chunk should take; its size is adapted to that."},
+        {"name": "Ssilk", "type": "STRING", "default": "ssilk", "description": "The command of SSILK on a worker."},
+    ]  # fmt: skip
+
+
+def _environment() -> dict[str, Any]:
+    """Return what a session sets up once: one thread for each worker, and a host without SSILK fails at once."""
+    return {
+        "name": "SSILK",
+        "variables": {"OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"},
+        "script": {"actions": {"onEnter": {"command": "{{Param.Ssilk}}", "args": ["--version"], "timeout": 120}}},
+    }
+
+
+def _bake_step(count: int, options: BundleOptions) -> dict[str, Any]:
+    chunks = {
+        "defaultTaskCount": "{{Param.ChunkSize}}",
+        "targetRuntimeSeconds": "{{Param.ChunkSeconds}}",
+        "rangeConstraint": "CONTIGUOUS",
+    }
+    shots = {"name": "Shots", "type": "CHUNK[INT]", "range": f"0-{count - 1}", "chunks": chunks}
+    return {
+        "name": "Bake",
+        "parameterSpace": {"taskParameterDefinitions": [shots]},
+        "hostRequirements": _host(options),
+        "script": _script(options, "--tasks", "{{Task.Param.Shots}}"),
+    }
+
+
+def _check_step(options: BundleOptions) -> dict[str, Any]:
+    return {
+        "name": "Check",
+        "dependencies": [{"dependsOn": "Bake"}],
+        "script": _script(options, "--check"),
+    }
+
+
+def _host(options: BundleOptions) -> dict[str, Any]:
+    amounts = [{"name": "amount.worker.vcpu", "min": 1}, {"name": "amount.worker.memory", "min": options.memory}]
+    return {"amounts": [*amounts, *([{"name": "amount.worker.gpu", "min": 1}] if options.gpu else [])]}
+
+
+def _script(options: BundleOptions, *words: str) -> dict[str, Any]:
+    arguments = ["task", "{{Param.Job}}", "-o", "{{Param.Output}}", *words, "--openjd"]
+    mapping = ["--path-mapping", "{{Session.PathMappingRulesFile}}"]
+    run = {"command": "{{Param.Ssilk}}", "args": [*arguments, *mapping], "timeout": options.timeout}
+    return {"actions": {"onRun": {**run, "cancelation": _STOP}}}
+
+
+class OpenJdReporter:
+    """Progress, status and failures as the lines that Open Job Description's sessions read."""
+
+    def __init__(self, stream: TextIO | None = None) -> None:
+        self.stream = stream or sys.stdout
+        self.percent = -1
+
+    def __call__(self, event: Event) -> None:
+        match event:
+            case Progress():
+                self._progress(100 * event.done / max(event.total, 1))
+            case Garment(name, Started(task)):
+                self._say(f"openjd_status: {task} {name}")
+            case Failed() | Garment(_, Failed()):
+                self._say(f"openjd_fail: {describe(event)}")
+            case Message() | Result() | Garment():
+                self._say(describe(event))
+
+    def _progress(self, percent: float) -> None:
+        if int(percent) > self.percent:  # sessions log each line
+            self.percent = int(percent)
+            self._say(f"openjd_progress: {percent:.1f}")
+
+    def _say(self, text: str) -> None:
+        print(text, file=self.stream, flush=True)
