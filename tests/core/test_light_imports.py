@@ -25,7 +25,7 @@ LAYERS = (
     {"demo", "view", "simulate", "training", "rollout", "preflight", "setup", "wardrobe", "runtime", "farm"},
     {"baselines", "cost", "reduction", "refine"},
     {"evaluation", "quality", "stress"},
-    {"trade"},
+    {"trade", "report"},
     {"cli"},
     {"__main__"},
 )
