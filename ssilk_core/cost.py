@@ -41,6 +41,18 @@ class Time:
         return cls(*(float(value) for value in np.percentile(milliseconds, (50, 95))))
 
 
+@dataclass(frozen=True)
+class ShotBytes:
+    """Bytes of a shot: what lies there before its first frame, and what each frame adds."""
+
+    asset: float
+    frame: float
+
+    def of(self, frames: int) -> float:
+        """Return the bytes of a shot of so many frames."""
+        return self.asset + self.frame * frames
+
+
 def play_time(player: Player, motion: Motion, *, seconds: float = SECONDS) -> Time:
     """Measure what a frame takes to play: character, latents, decoder and all vertices, on a processor."""
     _pass(player, motion)  # warms up

@@ -12,9 +12,43 @@ from ssilk_core import __version__
 from ssilk_core.errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, SsilkError, fail
 from ssilk_core.events import Failed, JsonReporter, Reporter, TextReporter
 
-from . import bake, demo, evaluate, farm, inspect, reduce, rig, simulate, stress, task, train, verify, view, wardrobe
+from . import (
+    bake,
+    demo,
+    evaluate,
+    farm,
+    inspect,
+    reduce,
+    report,
+    rig,
+    simulate,
+    stress,
+    task,
+    trade,
+    train,
+    verify,
+    view,
+    wardrobe,
+)
 
-VERBS = (inspect, rig, train, wardrobe, reduce, bake, simulate, evaluate, stress, verify, view, farm, task, demo)
+VERBS = (
+    inspect,
+    rig,
+    train,
+    wardrobe,
+    reduce,
+    bake,
+    simulate,
+    evaluate,
+    trade,
+    stress,
+    report,
+    verify,
+    view,
+    farm,
+    task,
+    demo,
+)
 
 # The extra of the distribution that brings all that a verb needs.
 EXTRAS = {
@@ -26,7 +60,9 @@ EXTRAS = {
     "bake": "bake",
     "simulate": "train",
     "evaluate": "train",
+    "trade": "all",
     "stress": "train",
+    "report": "all",
     "verify": "bake",
     "view": "view",
     "farm": "farm",

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from ssilk_core.assets import GarmentPose
 from ssilk_core.checkpoint import ModelFile, load_model
+from ssilk_core.cost import ShotBytes
 from ssilk_core.errors import need
 from ssilk_core.events import Reporter
 from ssilk_core.quality import quality_named
@@ -43,18 +44,19 @@ def levelled(bake: Bake, options: argparse.Namespace, report: Reporter) -> Bake:
         at_rate = open_bake(request)
 
         def weight(file: ModelFile) -> float:
-            return shot_bytes(at_rate.wearing(file), options.output.suffix, body=not options.no_body)
+            size = shot_bytes(at_rate.wearing(file), options.output.suffix, body=not options.no_body)
+            return size.of(at_rate.motion.frame_count)
 
         size = spent(options.budget, reducer, size, bake.source, weight, report).size
     return open_bake(replace(request, keep=str(size)))
 
 
-def shot_bytes(bake: Bake, suffix: str, *, body: bool = True) -> float:
+def shot_bytes(bake: Bake, suffix: str, *, body: bool) -> ShotBytes:
     """Return about how large a shot becomes: two excerpts are written, of some frames and of more."""
-    frames = bake.motion.frame_count
-    few, many = (min(count * bake.request.samples, frames) for count in EXCERPTS)
+    few, many = (min(count * bake.request.samples, bake.motion.frame_count) for count in EXCERPTS)
     first, second = (_excerpt_bytes(bake, count, suffix, body) for count in (few, many))
-    return second + (second - first) / max(many - few, 1) * (frames - many)
+    frame = (second - first) / max(many - few, 1)
+    return ShotBytes(second - frame * many, frame)
 
 
 def _excerpt_bytes(bake: Bake, frames: int, suffix: str, body: bool) -> int:

@@ -69,8 +69,9 @@ def carried_by(joints: Ints, matrices: NDArray, points: NDArray) -> NDArray:
 def fitted(influences: Influences, allowed: NDArray, most: int) -> Floats:
     """Return weights (V, C), not negative and summing to one, of at most `most` of the `allowed` candidates (V, C).
 
-    Each is the one that moves the vertex least over its own support. Supports shrink one candidate at a time: first those whose weight
-    would be negative, then whichever is missed least (w_c^2 / [K^-1]_cc, K of the constrained least squares).
+    Each moves its vertex as little as its support allows. Supports shrink by one candidate at a time, first by those
+    whose weight would be negative, then by what is missed least: w_c^2 / [K^-1]_cc, with K the matrix of the
+    constrained least squares.
     """
     allowed, weights = allowed.copy(), np.empty(influences.weights.shape)
     rows = np.arange(len(weights))

@@ -2,9 +2,9 @@
 """Fewer proxy joints: ends of chains are taken off, those that are missed least first.
 
 Only ends, so that all that stay move as before: a joint within a chain carries those after it. What a joint moved
-follows the one that carried it, in the same shares, which leaves cloth as smooth as it was. Weights fitted anew for each
-vertex by least squares come nearer by themselves, but neighbours part; and what follows smoothly is what blendshapes
-can make up for: on the cape with 10 of 20 proxies, they leave half as much.
+follows the one that carried it, in the same shares, which leaves cloth as smooth as it was. Weights fitted anew for
+each vertex come nearer by themselves, but neighbours part; and what is lost smoothly is what blendshapes can make up
+for: on the cape with 10 of 20 proxies they then leave half as much.
 """
 
 from __future__ import annotations

@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measure what speed and size cost in accuracy, for all that can be changed without training again.
+
+Blendshapes, proxies, influences, precision, frame rate, refinement and the quality levels are tried one after the
+other, and several models (of other latent sizes or widths) side by side: time and memory to play, bytes of model and
+shot, against energy, collisions, and the distance of vertices and velocities from the whole model. Times are of this
+machine and of the first clip. --output keeps each point as it comes: a sweep that was interrupted goes on from there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+from dataclasses import asdict, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ssilk_core import __version__
+from ssilk_core.errors import EXIT_OK, need
+from ssilk_core.events import Reporter, Result, Started
+
+from . import options as shared
+
+if TYPE_CHECKING:
+    from ssilk_core.assets import Motion
+    from ssilk_core.checkpoint import ModelFile
+    from ssilk_core.evaluation.methods import Dressed, Method, Reel
+    from ssilk_core.trade.measure import Meter, Weigh
+
+    from ._baking import Bake
+
+CLIPS = 2  # that are measured on where none are named
+
+
+def add_arguments(verb: argparse.ArgumentParser) -> None:
+    """Add the options of this verb."""
+    verb.add_argument("models", type=Path, nargs="+", metavar="MODEL", help="models of one garment")
+    verb.add_argument("--stage", type=Path, required=True, help="USD file with the character")
+    verb.add_argument("--root", metavar="PRIM", help="SkelRoot of the character, where the stage has several")
+    verb.add_argument("--motions", type=Path, required=True, metavar="FOLDER",
+                      help="motion files; what is measured on some is cut to be best on the others")  # fmt: skip
+    verb.add_argument(
+        "--clips", nargs="+", default=[], metavar="NAME", help="measure on these (default: the first two)"
+    )
+    verb.add_argument("--reference", type=Path, metavar="FOLDER", help="shots of 'ssilk simulate' of these clips")
+    verb.add_argument("--no-refine", action="store_true", help="leave the solver out, which takes most of the time")
+    verb.add_argument("-o", "--output", type=Path, help="figures to write (.json), and a plot beside them (.png)")
+    verb.add_argument("--device", default="cpu", help="where PyTorch and the solver run (default cpu)")
+
+
+def run(options: argparse.Namespace, report: Reporter) -> int:
+    """Sweep; return 0."""
+    from ssilk_core.trade.plot import write_plot
+    from ssilk_core.trade.sweep import Results, sweep
+    from ssilk_core.trade.table import table
+    from ssilk_core.trade.variants import variants
+
+    if options.output:
+        need(options.output.suffix == ".json", str(options.output), "not a name for figures", "it ends in .json")
+        shared.check_output(options.output, *options.models)
+    bench = Bench(options)
+    results = Results(options.output, bench.asked)
+    results.resume(report)
+    report(Started("trade", 0, {"clips": list(bench.clips)}))
+    for path, file in bench.files.items():
+        meter = bench.meter(path, file)
+        tried = list(variants(meter.reducer.whole, file.config.fps, refined=not options.no_refine))
+        for _ in sweep(meter, tried, results, report):
+            if options.output:
+                write_plot(options.output.with_suffix(".png"), results.points)
+    if not options.json:
+        print(table(results.points))
+    report(Result("trade", {"points": [asdict(point) for point in results.points]} if options.json else {}))
+    return EXIT_OK
+
+
+class Bench:
+    """What all models of a sweep are measured on.
+
+    Attributes:
+        clips: motions to measure on, by name; others: motions that models are cut for.
+        asked: what tells one sweep from another.
+    """
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        from ssilk_core.checkpoint import load_model
+        from ssilk_core.devices import chosen_device
+        from ssilk_core.files import sha256
+
+        self.options, self.device = options, chosen_device(options.device)
+        self.files: dict[Path, ModelFile] = {path: load_model(path) for path in options.models}
+        first = next(iter(self.files.values()))
+        for path, file in self.files.items():
+            same = file.scene.garment.mesh.points.tobytes() == first.scene.garment.mesh.points.tobytes()
+            need(same and file.config.fps == first.config.fps, str(path), "a model of another garment, or rate",
+                 "models of one garment are compared", "sweep it by itself")  # fmt: skip
+        self.paths, self.others = self._motions(first)
+        self.clips = {name: self._read(path, first) for name, path in self.paths.items()}
+        self.asked: dict[str, Any] = {
+            "models": {str(path): sha256(path) for path in options.models},
+            "stage": sha256(options.stage),
+            "clips": list(self.clips),
+            "reference": options.reference and str(options.reference),
+            "hardware": f"{platform.processor() or platform.machine()}, {self.device}",
+            "ssilk": __version__,
+        }
+
+    def meter(self, path: Path, file: ModelFile) -> Meter:
+        """Return what measures a model."""
+        from ssilk_core.evaluation.methods import reel_of
+        from ssilk_core.evaluation.takes import takes_of
+        from ssilk_core.reduction import Reducer
+        from ssilk_core.trade.measure import Meter
+
+        dressed = self._dressed(file)
+        takes = [take for name, clip in self.clips.items() for take in takes_of(name, clip, dressed.fps)]
+        reel = reel_of(takes, dressed, file.joints)
+        reducer = Reducer(file, self.others)
+        return Meter(path.stem, reducer, dressed, reel, self._weigh(path), self._reference(dressed, reel))
+
+    def _dressed(self, file: ModelFile) -> Dressed:
+        """Put a garment on the character of the stage."""
+        from ssilk_usd.read_character import read_character
+        from ssilk_usd.read_stage import open_stage
+
+        from ssilk_core.evaluation.methods import Dressed
+
+        from ._baking import need_same_skeleton
+
+        character = read_character(open_stage(self.options.stage), root=self.options.root, garment=None)
+        skeleton = file.scene.character.skeleton
+        need_same_skeleton(character.skeleton, skeleton)
+        scene = replace(file.scene, character=replace(character, skeleton=skeleton))
+        return Dressed(scene, file.fabric, file.config.fps, self.device)
+
+    def _reference(self, dressed: Dressed, reel: Reel) -> Method | None:
+        """Return what the simulator made of the clips, where a folder of that is named."""
+        from ssilk_core.evaluation.methods import Cache
+
+        from ._reference import References
+
+        folder: Path | None = self.options.reference
+        if folder is None:
+            return None
+        found = References(folder, dressed.name, dressed.scene.garment.mesh.vertex_count, dressed.fps)
+        missing = sorted(self.clips.keys() - found.clips)
+        need(not missing, str(folder), f"no shot of {', '.join(missing)}", "each clip needs one",
+             "simulate them with 'ssilk simulate'")  # fmt: skip
+        return Cache("simulator", found.read, dressed, reel)
+
+    def _weigh(self, path: Path) -> Weigh:
+        """Return what tells how large a model's shots of the first clip are, without the body."""
+        from ._baking import BakeRequest, open_bake
+        from ._level import shot_bytes
+
+        motion, stage = str(next(iter(self.paths.values()))), str(self.options.stage)
+
+        @lru_cache(4)
+        def bake(fps: float) -> Bake:
+            return open_bake(
+                BakeRequest(model=str(path), stage=stage, motion=motion, fps=fps, root=self.options.root)
+            )
+
+        return lambda file, fps: shot_bytes(bake(fps).wearing(file), ".usdc", body=False)
+
+    def _motions(self, file: ModelFile) -> tuple[dict[str, Path], list[Motion]]:
+        """Return the files of the clips to measure on, and the motions to cut models for: the others, or the same."""
+        from ssilk_usd.read_motion import motion_files
+
+        folder: Path = self.options.motions
+        need(folder.is_dir(), str(folder), "there is no such folder", "one of motion files is needed")
+        files = {path.stem: path for path in motion_files([folder])}
+        names = self.options.clips or list(files)[:CLIPS]
+        missing = sorted(set(names) - files.keys())
+        need(not missing, str(folder), f"no clip is called {', '.join(missing)}",
+             f"it holds {', '.join(list(files)[:3])} and so on")  # fmt: skip
+        others = [path for name, path in files.items() if name not in names] or list(files.values())
+        return {name: files[name] for name in names}, [self._read(path, file) for path in others]
+
+    def _read(self, path: Path, file: ModelFile) -> Motion:
+        from ssilk_usd.read_motion import read_motion
+
+        return read_motion(path, file.scene.character.skeleton)

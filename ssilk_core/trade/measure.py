@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measure variants of a model: what they cost, and what they do to the garment."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+
+from ..assets import Motion
+from ..checkpoint import ModelFile, network
+from ..cost import ShotBytes, Time, memory, model_bytes, operations, play_time
+from ..evaluation.methods import Dressed, Method, Reel
+from ..evaluation.record import recorded
+from ..evaluation.tally import Tally
+from ..kinematics import resample
+from ..reduction import Reducer, Size
+from ..rollout import decode, garment_poses
+from ..runtime import Player
+from .played import Played
+from .point import Point
+from .variants import Variant
+
+HALVES = ("float16", "bfloat16")  # two bytes on disk for each parameter
+POINT = 12  # bytes of a vertex in a point cache
+
+
+Weigh = Callable[[ModelFile, float], ShotBytes]
+"""Tells how large shots of a model are at a frame rate."""
+
+
+class Meter:
+    """Measures variants of one model on takes.
+
+    Args:
+        name: of the model; reducer: cuts it; dressed, reel: what it is judged on.
+        weigh: tells how large its shots are.
+        reference: what energies are compared with; the model as trained without one.
+    """
+
+    def __init__(
+        self, name: str, reducer: Reducer, dressed: Dressed, reel: Reel, weigh: Weigh, reference: Method | None = None
+    ) -> None:
+        self.name, self.reducer, self.dressed, self.reel, self.weigh = name, reducer, dressed, reel, weigh
+        self.whole = Played(name, reducer.player, dressed, reel, fps=dressed.fps)
+        self.base = self._tally(reference or self.whole).totals().mean()
+        self._cut = lru_cache(1)(lambda size: reducer.reduced(size).file)
+        self._torch = lru_cache(1)(self._torch_time)
+
+    def point(self, variant: Variant) -> Point:
+        """Measure one variant."""
+        cut = self._cut(variant.size)
+        player = Player(variant.rounded(cut))
+        method = Played(variant.name, player, self.dressed, self.reel, fps=variant.fps, refine=variant.refine)
+        tally, timed = self._tally(method, self.whole), self._time(variant, method)
+        shot = self._shot(variant, cut)
+        total = float(tally.totals().mean())
+        return Point(
+            model=self.name,
+            swept=variant.swept,
+            variant=variant.name,
+            **vars(variant.size),
+            precision=variant.precision,
+            fps=variant.fps,
+            refine=variant.refine,
+            milliseconds=timed.median,
+            high=timed.high,
+            torch=None if variant.refine else self._torch(variant.size),
+            operations=sum(operations(cut).values()),
+            memory=memory(player),
+            model_bytes=_bytes(cut, variant.precision),
+            shot_bytes=shot.frame * variant.fps,
+            asset_bytes=shot.asset,
+            total=total,
+            excess=total - float(self.base),
+            collisions=tally.mean("collisions"),
+            position=tally.root("position"),
+            velocity=tally.root("velocity"),
+        )
+
+    @property
+    def motion(self) -> Motion:
+        """What is timed."""
+        return self.reel.takes[0].motion
+
+    def _tally(self, method: Method, truth: Method | None = None) -> Tally:
+        takes = range(len(self.reel.takes))
+        records = {take: recorded(self.dressed, self.reel, method, take, truth) for take in takes}
+        return Tally(records, {take: self.reel.takes[take].clip for take in takes})
+
+    def _time(self, variant: Variant, method: Played) -> Time:
+        if not variant.refine:
+            return play_time(method.player, resample(self.motion, variant.fps))
+        begun = time.perf_counter()
+        method.finished(self.motion)
+        each = 1000 * (time.perf_counter() - begun) / self.motion.frame_count
+        return Time(each, each)
+
+    def _torch_time(self, size: Size) -> float:
+        """Return the milliseconds that a frame takes in PyTorch, of the second of two passes over a clip."""
+        model = network(self._cut(size)).to(self.dressed.device)
+        for _ in range(2):
+            begun = time.perf_counter()
+            for pose in garment_poses(model, self.motion, self.motion.fps):
+                decode(model, self.motion, pose)
+        return 1000 * (time.perf_counter() - begun) / self.motion.frame_count
+
+    def _shot(self, variant: Variant, cut: ModelFile) -> ShotBytes:
+        shot = self.weigh(cut, variant.fps)
+        if not variant.refine:
+            return shot
+        return replace(shot, frame=shot.frame + POINT * self.dressed.scene.garment.mesh.vertex_count)
+
+
+def _bytes(file: ModelFile, precision: str) -> int:
+    """Return how large a model's file is in a precision."""
+    if precision in HALVES:
+        parameters = {name: value.astype(np.float16) for name, value in file.parameters.items()}
+        file = replace(file, parameters=parameters)
+    return model_bytes(file, pack=precision == "int16")

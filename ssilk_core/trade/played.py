@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Garments as they are played, for the evaluation: at any frame rate, refined or not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..assets import Floats, GarmentPose, Motion
+from ..evaluation.methods import Dressed, Reel
+from ..kinematics import resample, sample_motion
+from ..refine import RefineOptions, Refiner
+from ..runtime import Player
+from ..runtime.drive import character_matrices
+from ..runtime.skinning import posed
+from ..sampling import sample_pose
+
+POSED = 64  # frames whose vertices are computed together
+
+
+class Played:
+    """A `Method` of the evaluation: a garment over takes, as a reader of its shot shows it.
+
+    Args:
+        fps: of the shot. Between its frames poses of garment and character are interpolated, as USD does.
+        refine: solver iterations in each frame; none for zero.
+    """
+
+    def __init__(
+        self, name: str, player: Player, dressed: Dressed, reel: Reel, *, fps: float, refine: int = 0
+    ) -> None:
+        self.name, self.player, self.dressed, self.reel, self.fps = name, player, dressed, reel, fps
+        self.options = RefineOptions(iterations=refine) if refine else None
+        self._points = lru_cache(1)(self._take)
+
+    def vertices(self, take: int, frames: range) -> Tensor:
+        """Return positions [m] of consecutive frames of a take about its first root, shape (V, 3, N)."""
+        points = self._points(take)[frames.start : frames.stop]
+        return torch.as_tensor(points.transpose(1, 2, 0).copy(), dtype=torch.float32, device=self.dressed.device)
+
+    def still(self, take: int, frames: range) -> None:
+        """Return nothing: it is how shots move that is compared."""
+
+    def _take(self, take: int) -> Floats:
+        """Return all frames of a take, shape (N, V, 3)."""
+        motion = self.reel.takes[take].motion
+        return self.finished(motion) - motion.translations[0, 0]
+
+    def finished(self, motion: Motion) -> Floats:
+        """Return the vertices at the frames of a motion [m], refined where that is asked for, shape (N, V, 3)."""
+        points, dressed = self.shown(motion), self.dressed
+        if self.options is None:
+            return points
+        refiner = Refiner(dressed.scene, dressed.fabric, self.options, fps=motion.fps, device=dressed.device)
+        return np.stack([frame.points for frame in refiner.frames(motion, points)])
+
+    def shown(self, motion: Motion) -> Floats:
+        """Return the vertices at the frames of a motion as the network gives them [m], shape (N, V, 3)."""
+        if abs(self.fps - motion.fps) < 1e-6:
+            playback = self.player.play(motion)
+            return np.stack([playback.vertices(frame) for frame in range(motion.frame_count)])
+        shot = resample(motion, self.fps, cover=True)
+        steps, last = motion.fps / self.fps, motion.frame_count - 1
+        frames = np.minimum(np.arange(shot.frame_count) * steps, last)
+        stored = sample_pose(_joined(self.player.play(motion).poses()), frames)
+        at = np.arange(motion.frame_count) / steps
+        starts = range(0, motion.frame_count, POSED)
+        return np.concatenate([self._between(shot, stored, at[start : start + POSED]) for start in starts])
+
+    def _between(self, shot: Motion, stored: GarmentPose, at: Floats) -> Floats:
+        """Return the vertices at fractional frames (N,) of a shot."""
+        activations, rotations = self.player.decoder.taken(sample_pose(stored, at))
+        moved = Motion(shot.path, shot.fps, *sample_motion(shot, at))
+        character, origins = character_matrices(moved, self.player.skeleton)
+        return posed(self.player.tiles, activations, self.player.kinematics.matrices(rotations, character), origins)
+
+
+def _joined(poses: Iterable[GarmentPose]) -> GarmentPose:
+    parts = list(poses)
+    return GarmentPose(0, *(np.concatenate([getattr(part, n) for part in parts]) for n in ("rotations", "weights")))

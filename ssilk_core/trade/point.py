@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What was measured of one variant, and which variants no other beats."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from operator import attrgetter
+
+
+@dataclass(frozen=True, kw_only=True)
+class Point:
+    """One variant of one model; SI units but for times.
+
+    Attributes:
+        model, swept, variant: the model's name, what was tried, and its name.
+        shapes, joints, influences, precision, fps, refine: as in `variants.Variant`.
+        milliseconds, high: of a frame of the shot on the processor, numpy runtime: median and 95 % quantile.
+        torch: milliseconds of a frame of the network and decoder in PyTorch, on the device; None if not measured.
+        operations: multiply-adds of a frame; memory: bytes held.
+        model_bytes: of the model's file; shot_bytes: of a second of the shot; asset_bytes: of the shot before its
+            first frame.
+        total: the paper's L_tot [J]; excess: over what it is compared with [J].
+        collisions: share of the vertices inside the body.
+        position, velocity: RMS errors against the whole model [m], [m/s].
+    """
+
+    model: str
+    swept: str
+    variant: str
+    shapes: int
+    joints: int
+    influences: int
+    precision: str
+    fps: float
+    refine: int
+    milliseconds: float
+    high: float
+    torch: float | None
+    operations: int
+    memory: int
+    model_bytes: int
+    shot_bytes: float
+    asset_bytes: float
+    total: float
+    excess: float
+    collisions: float
+    position: float
+    velocity: float
+
+
+COSTS = ("milliseconds", "shot_bytes", "model_bytes")
+
+
+def front(points: Sequence[Point], cost: str, error: str = "position") -> list[Point]:
+    """Return the points that no other equals at less cost or beats at equal cost, the cheapest first (Pareto)."""
+    best: list[Point] = []
+    for point in sorted(points, key=attrgetter(cost, error)):
+        if not best or getattr(point, error) < getattr(best[-1], error):
+            best.append(point)
+    return best

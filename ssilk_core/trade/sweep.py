@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A sweep over variants of models that can stop at any time and go on where it stopped."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ..errors import SsilkError
+from ..events import Message, Progress, Reporter, silent
+from ..files import replacing
+from .measure import Meter
+from .point import Point
+from .variants import Variant
+
+
+@dataclass
+class Results:
+    """Points in a file, which is whole after each of them.
+
+    Attributes:
+        path: where they are kept, or None.
+        asked: what was measured on what; points of another question do not count.
+    """
+
+    path: Path | None
+    asked: Mapping[str, Any]
+    points: list[Point] = field(default_factory=list)
+
+    def resume(self, report: Reporter) -> None:
+        """Take over what an earlier run with the same question has measured."""
+        if self.path is None or not self.path.exists():
+            return
+        try:
+            document = json.loads(self.path.read_text())
+            points = [Point(**point) for point in document["points"]]
+            same = document["asked"] == json.loads(json.dumps(self.asked))
+        except (ValueError, TypeError, KeyError) as error:
+            raise SsilkError(f"{self.path}: these are no figures of a trade ({error}); name another file.") from error
+        self.points = points if same else []
+        if self.points:
+            report(Message(f"{len(self.points)} variants were measured before, and are kept"))
+
+    def found(self, model: str, variant: Variant) -> bool:
+        """Return whether a variant was measured."""
+        return any((p.model, p.swept, p.variant) == (model, variant.swept, variant.name) for p in self.points)
+
+    def add(self, point: Point) -> None:
+        """Keep a point."""
+        self.points.append(point)
+        if self.path is not None:
+            document = {"units": "SI, times in ms", "asked": self.asked, "points": [asdict(p) for p in self.points]}
+            with replacing(self.path) as temporary:
+                temporary.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")
+
+
+def sweep(meter: Meter, tried: Sequence[Variant], results: Results, report: Reporter = silent) -> Iterator[Point]:
+    """Yield the points of a model's variants as they are measured, those measured before left out."""
+    for done, variant in enumerate(tried):
+        report(Progress(done, len(tried), terms={}))
+        if not results.found(meter.name, variant):
+            point = meter.point(variant)
+            results.add(point)
+            yield point

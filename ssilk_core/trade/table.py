@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Points of a trade as a table for people."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ..evaluation.tables import aligned
+from .point import COSTS, Point, front
+
+HEADER = ("model", "swept", "variant", "size", "ms a frame", "95 %", "PyTorch", "memory [MB]", "model [MB]",
+          "shot [kB/s]", "+ [MB]", "total [J]", "excess [J]", "inside", "RMS [mm]", "velocity [mm/s]",
+          "best at")  # fmt: skip
+MARKS = dict(zip(COSTS, ("time", "shot", "model")))
+
+
+def table(points: Sequence[Point]) -> str:
+    """Return a line for each point; "best at" says for which costs no other is nearer to the whole model."""
+    fronts = {mark: {id(point) for point in front(points, cost)} for cost, mark in MARKS.items()}
+    rows = [_cells(point, [mark for mark, best in fronts.items() if id(point) in best]) for point in points]
+    return aligned(HEADER, rows, 3)
+
+
+def _cells(p: Point, best: list[str]) -> list[str]:
+    return [
+        p.model,
+        p.swept,
+        p.variant,
+        f"{p.shapes}/{p.joints}/{p.influences}",
+        f"{p.milliseconds:.3g}",
+        f"{p.high:.3g}",
+        "" if p.torch is None else f"{p.torch:.3g}",
+        f"{p.memory / 1e6:.3g}",
+        f"{p.model_bytes / 1e6:.3g}",
+        f"{p.shot_bytes / 1e3:.3g}",
+        f"{p.asset_bytes / 1e6:.2g}",
+        f"{p.total:.4g}",
+        f"{p.excess:+.3g}",
+        f"{p.collisions:.2%}",
+        f"{1000 * p.position:.3g}",
+        f"{1000 * p.velocity:.3g}",
+        ", ".join(best),
+    ]

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a sweep tries: one thing changed at a time, and the quality levels, which change several."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..checkpoint import ModelFile
+from ..packing import packed, unpacked
+from ..quality import QUALITIES
+from ..reduction import Size
+
+WHOLE = "as trained"
+SHAPES, JOINTS = (0.75, 0.5, 0.25, 0.125, 0.0), (0.75, 0.5, 0.25, 0.0)  # shares of what there is
+INFLUENCES, RATES, REFINED = (6, 4, 3, 2, 1), (1 / 2, 1 / 3), (1, 4, 16)
+
+Array = np.ndarray
+PRECISIONS: dict[str, Callable[[Array], Array]] = {
+    "float32": lambda values: values,
+    "int16": lambda values: unpacked(*packed(values)) if values.ndim > 1 else values,
+    "float16": lambda values: values.astype(np.float16).astype(np.float32),
+    "bfloat16": lambda values: _bfloat16(values),
+}
+
+
+def _bfloat16(values: Array) -> Array:
+    """Round to the 8 bits of mantissa that bfloat16 has, to the nearest, ties to even."""
+    bits = np.ascontiguousarray(values, dtype=np.float32).view(np.uint32)
+    return ((bits + 0x7FFF + ((bits >> 16) & 1)) & 0xFFFF0000).view(np.float32)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variant:
+    """One way to play a garment.
+
+    Attributes:
+        swept: what it is tried for; name: what it is called in tables.
+        size: what is kept; precision: of the parameters; fps: of the shot [1/s].
+        refine: solver iterations in each frame.
+    """
+
+    swept: str
+    name: str
+    size: Size
+    precision: str = "float32"
+    fps: float
+    refine: int = 0
+
+    def rounded(self, file: ModelFile) -> ModelFile:
+        """Return a model with its parameters in this precision."""
+        parameters = {name: PRECISIONS[self.precision](value) for name, value in file.parameters.items()}
+        return replace(file, parameters=parameters)
+
+
+def variants(whole: Size, fps: float, *, refined: bool = True) -> Iterator[Variant]:
+    """Yield the whole model first, then what each sweep tries, then the quality levels.
+
+    Args:
+        whole: what the model has; fps: at which it steps.
+        refined: try the solver too, which takes a thousand times as long as all else.
+    """
+    base = Variant(swept=WHOLE, name=WHOLE, size=whole, fps=fps)
+    yield base
+    for share in SHAPES:
+        size = replace(whole, shapes=round(share * whole.shapes))
+        yield replace(base, swept="blendshapes", name=f"{size.shapes} blendshapes", size=size)
+    for share in JOINTS if whole.joints else ():
+        size = replace(whole, joints=round(share * whole.joints))
+        yield replace(base, swept="proxies", name=f"{size.joints} proxies", size=size)
+    for count in (count for count in INFLUENCES if count < whole.influences):
+        yield replace(base, swept="influences", name=f"{count} influences", size=replace(whole, influences=count))
+    for name in list(PRECISIONS)[1:]:
+        yield replace(base, swept="precision", name=name, precision=name)
+    for share in RATES:
+        yield replace(base, swept="frame rate", name=f"{share * fps:g} frames/s", fps=share * fps)
+    for count in REFINED if refined else ():
+        yield replace(base, swept="refinement", name=f"{count} iterations", refine=count)
+    yield from _levels(base, refined)
+
+
+def _levels(base: Variant, refined: bool) -> Iterator[Variant]:
+    for level in QUALITIES.values():
+        if refined or not level.refine:
+            kept, fps = level.size.within(base.size), level.rate(base.fps)
+            yield replace(base, swept="level", name=level.name, size=kept, fps=fps, refine=level.refine)

@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The trade: what is measured of a variant is what it does, the front is the front, and sweeps can stop."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+import torch
+
+from ssilk_core.checkpoint import model_file
+from ssilk_core.cost import ShotBytes, model_bytes
+from ssilk_core.errors import SsilkError
+from ssilk_core.evaluation.methods import Dressed, Network, reel_of
+from ssilk_core.evaluation.record import recorded
+from ssilk_core.evaluation.takes import takes_of
+from ssilk_core.fabrics import FABRICS
+from ssilk_core.kinematics import deform, resample, sample_motion
+from ssilk_core.reduction import Reducer, Size
+from ssilk_core.runtime import Player
+from ssilk_core.sampling import sample_pose
+from ssilk_core.trade.measure import Meter
+from ssilk_core.trade.played import Played
+from ssilk_core.trade.plot import Axis, write_plot
+from ssilk_core.trade.point import Point, front
+from ssilk_core.trade.sweep import Results, sweep
+from ssilk_core.trade.table import table
+from ssilk_core.trade.variants import PRECISIONS, variants
+
+FPS = 30.0
+
+
+@pytest.fixture(scope="module")
+def model(scene, toy_model):
+    return toy_model(scene, scale=0.1, shapes=6).eval()
+
+
+@pytest.fixture(scope="module")
+def bench(scene, model, toy_motion):
+    """A reducer, and a dressed garment with a reel of two takes."""
+    file = model_file(model, FABRICS["silk"], {})
+    dressed = Dressed(scene, file.fabric, FPS, torch.device("cpu"))
+    takes = [
+        take
+        for name, frames in (("long", 50), ("short", 20))
+        for take in takes_of(name, toy_motion(scene, frames), FPS)
+    ]
+    return Reducer(file, [toy_motion(scene, 60, speed=1.3)]), dressed, reel_of(takes, dressed, file.joints)
+
+
+@pytest.fixture(scope="module")
+def meter(bench):
+    return Meter("toy", *bench, lambda file, fps: ShotBytes(1000.0 * file.config.shapes, 60.0))
+
+
+def chosen(meter: Meter, name: str):
+    return next(v for v in variants(meter.reducer.whole, FPS) if v.name == name)
+
+
+@pytest.fixture(scope="module")
+def points(meter) -> dict[str, Point]:
+    names = ("as trained", "2 blendshapes", "0 proxies", "int16", "float16", "15 frames/s", "1 iterations")
+    sizes = {name: chosen(meter, name) for name in names if name != "2 blendshapes"}
+    sizes["2 blendshapes"] = replace(
+        sizes["as trained"], name="2 blendshapes", size=Size(shapes=2, joints=2, influences=2)
+    )
+    return {name: meter.point(variant) for name, variant in sizes.items()}
+
+
+def test_one_thing_is_swept_at_a_time_and_levels_come_last():
+    whole = Size(shapes=64, joints=20, influences=8)
+    tried = list(variants(whole, FPS))
+    base = tried[0]
+    assert base.size == whole and len({(v.swept, v.name) for v in tried}) == len(tried)
+    for variant in tried[1:]:
+        changed = [k for k, v in vars(variant).items() if v != vars(base)[k] and k not in ("swept", "name", "size")]
+        changed += [k for k, v in vars(variant.size).items() if v != vars(whole)[k]]
+        assert len(changed) == 1 or variant.swept == "level", variant
+    assert [v.name for v in tried if v.swept == "level"] == ["crowd", "game", "film", "hero"]
+    assert not any(v.refine for v in variants(whole, FPS, refined=False))
+
+
+def test_precisions_round_as_they_should():
+    values = np.random.default_rng(0).normal(size=(50, 40)).astype(np.float32)
+    np.testing.assert_array_equal(PRECISIONS["bfloat16"](values), torch.tensor(values).bfloat16().float().numpy())
+    np.testing.assert_array_equal(PRECISIONS["float16"](values), torch.tensor(values).half().float().numpy())
+    assert np.abs(PRECISIONS["int16"](values) - values).max() <= np.abs(values).max() / 32767
+
+
+def test_the_whole_model_is_what_the_network_in_pytorch_is(meter, bench, model, points):
+    reducer, dressed, reel = bench
+    network = Network("ssilk", model, reel)
+    records = [recorded(dressed, reel, network, take) for take in range(2)]
+    total = sum(
+        torch.cat([r.values[name] for r in records])
+        for name in ("stretch", "bending", "gravity", "inertia", "collision")
+    )
+    whole = points["as trained"]
+    assert whole.total == pytest.approx(float(total.mean()), rel=1e-3)
+    assert whole.position == whole.velocity == whole.excess == 0
+    assert whole.model_bytes == model_bytes(reducer.file, pack=False)
+    assert whole.shot_bytes == 30 * 60 and whole.asset_bytes == 6000
+
+
+def test_errors_are_distances_and_speeds_from_the_whole_model(meter, bench, points):
+    reducer, dressed, reel = bench
+    small = Player(reducer.reduced(Size(shapes=2, joints=2, influences=2)).file)
+    mass, squares, speeds = dressed.energy.mass.numpy(), [], []
+    for take in reel.takes:
+        played = [player.play(take.motion) for player in (small, reducer.player)]
+        mine, theirs = (np.stack([p.vertices(f) for f in range(take.frame_count)]) for p in played)
+        squares.append(((mine - theirs) ** 2).sum(2) @ mass / mass.sum())
+        speeds.append(((np.diff(mine - theirs, axis=0) * FPS) ** 2).sum(2) @ mass / mass.sum())
+    found = points["2 blendshapes"]
+    assert found.position == pytest.approx(np.sqrt(np.concatenate(squares).mean()), rel=1e-3)
+    assert found.velocity == pytest.approx(np.sqrt(np.concatenate(speeds).mean()), rel=1e-3)
+    assert found.excess == pytest.approx(found.total - points["as trained"].total)
+
+
+def test_what_costs_less_is_seen_to_cost_less(points):
+    whole = points["as trained"]
+    assert points["2 blendshapes"].operations < whole.operations and points["2 blendshapes"].memory < whole.memory
+    assert points["int16"].model_bytes < whole.model_bytes and points["float16"].model_bytes < whole.model_bytes
+    assert 0 < points["int16"].position < points["float16"].position < 1e-3
+    assert points["15 frames/s"].shot_bytes == whole.shot_bytes / 2
+    assert points["1 iterations"].total < whole.total
+    assert points["1 iterations"].milliseconds > whole.milliseconds and points["1 iterations"].torch is None
+
+
+def test_between_frames_of_a_shot_poses_are_interpolated(meter, bench, model):
+    reducer, dressed, reel = bench
+    motion = reel.takes[0].motion
+    slow = Played("slow", reducer.player, dressed, reel, fps=10.0).shown(motion)
+    np.testing.assert_allclose(slow[::3], every_frame(reducer, motion)[::3], atol=1e-5)  # frames of the shot
+    shot, at = resample(motion, 10.0, cover=True), np.array([1 / 3])
+    pose = sample_pose(next(iter(reducer.player.play(motion).poses())), np.array([3.0, 6.0]))
+    rotations, translations = sample_motion(shot.clip(1, 3), at)
+    between = replace(shot, rotations=rotations, translations=translations)
+    np.testing.assert_allclose(slow[4], deform(model.deformer(), between, sample_pose(pose, at))[0], atol=1e-5)
+
+
+def every_frame(reducer: Reducer, motion) -> np.ndarray:
+    playback = reducer.player.play(motion)
+    return np.stack([playback.vertices(frame) for frame in range(motion.frame_count)])
+
+
+def point(name: str, **values: float) -> Point:
+    rest = dict.fromkeys(Point.__dataclass_fields__, 1)
+    return Point(**{**rest, "model": "m", "swept": "s", "variant": name, "precision": "float32", **values})
+
+
+def test_the_front_holds_what_nothing_beats():
+    dice = np.random.default_rng(3)
+    cloud = [
+        point(str(i), milliseconds=c, position=e) for i, (c, e) in enumerate(dice.uniform(0.1, 1, (60, 2)).round(1))
+    ]
+    best = front(cloud, "milliseconds")
+    for p in cloud:
+        beaten = any(
+            q.milliseconds <= p.milliseconds
+            and q.position <= p.position
+            and (q.milliseconds, q.position) != (p.milliseconds, p.position)
+            for q in cloud
+        )
+        same = [q for q in best if (q.milliseconds, q.position) == (p.milliseconds, p.position)]
+        assert len(same) == (0 if beaten else 1)
+
+
+def test_a_sweep_that_was_stopped_goes_on(meter, points, tmp_path, monkeypatch):
+    tried = [chosen(meter, name) for name in ("as trained", "int16", "float16")]
+    measured: list[str] = []
+
+    def counted(variant):
+        if len(measured) == 2:
+            raise KeyboardInterrupt
+        measured.append(variant.name)
+        return points[variant.name]
+
+    monkeypatch.setattr(meter, "point", counted)
+    path, asked = tmp_path / "trade.json", {"clips": ["a"], "n": (1, 2)}
+    with pytest.raises(KeyboardInterrupt):
+        list(sweep(meter, tried, Results(path, asked)))
+    assert [p["variant"] for p in json.loads(path.read_text())["points"]] == measured == ["as trained", "int16"]
+    said, again = [], Results(path, asked)
+    again.resume(said.append)
+    assert "2 variants were measured before" in said[0].text
+    measured.clear()
+    assert [p.variant for p in sweep(meter, tried, again)] == measured == ["float16"]
+    assert len(again.points) == 3 and again.points[0] == points["as trained"]
+    other = Results(path, {"clips": ["b"]})
+    other.resume(said.append)
+    assert not other.points
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"asked": 1}', '{"asked": {}, "points": [{"model": "m"}]}'])
+def test_files_that_hold_something_else_are_refused(tmp_path, text):
+    (tmp_path / "other.json").write_text(text)
+    with pytest.raises(SsilkError, match=r"other.json: these are no figures of a trade"):
+        Results(tmp_path / "other.json", {}).resume(lambda event: None)
+
+
+def test_tables_and_plots_show_every_point(points, tmp_path):
+    from PIL import Image
+
+    lines = table(list(points.values())).splitlines()
+    assert len(lines) == len(points) + 2 and all(name in text for name, text in zip(points, lines[2:]))
+    assert "time" in lines[2] + lines[3] and "nan" not in "".join(lines)
+    write_plot(tmp_path / "trade.png", list(points.values()))
+    colours = {colour for _, colour in Image.open(tmp_path / "trade.png").getcolors(1 << 20)}
+    assert len({(44, 62, 80), (41, 128, 185), (39, 174, 96)} & colours) == 3
+
+
+def test_axes_are_logarithmic_and_hold_what_is_on_them():
+    axis = Axis.over([0.1, 1.0, 10.0], 100, 600)
+    low, middle, high = (axis.place(value) for value in (0.1, 1.0, 10.0))
+    assert 100 < low < middle < high < 700 and middle - low == pytest.approx(high - middle)
+    assert axis.place(1e-9) == 100 and axis.place(1e9) == 700
+    assert {0.1, 1.0, 10.0} <= {round(tick, 6) for tick in axis.ticks()}
+    assert Axis.over([5.0], 0, 100).place(5.0) == pytest.approx(50)
+
+
+def test_points_survive_the_file_they_are_kept_in(points, tmp_path):
+    results = Results(tmp_path / "t.json", {"a": 1})
+    results.add(points["int16"])
+    again = Results(tmp_path / "t.json", {"a": 1})
+    again.resume(lambda event: None)
+    assert asdict(again.points[0]) == asdict(points["int16"])
