@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How far cloth is stretched, which frames are worst, and the colours of both; numpy alone."""
+"""How far cloth is stretched or inside a body, which frames are worst, and the colours of it; numpy alone."""
 
 from __future__ import annotations
 
@@ -40,6 +40,48 @@ def elongations(rest: np.ndarray, points: np.ndarray, triangles: np.ndarray) -> 
     for corners in triangles[flat].T:
         np.maximum.at(found, corners, largest - 1)
     return found
+
+
+def depths(
+    points: np.ndarray, places: np.ndarray, nearest: np.ndarray, body: np.ndarray, triangles: np.ndarray
+) -> np.ndarray:
+    """Return how deep points lie inside a closed surface, negative outside, shape (N,).
+
+    The side is told by normals between the corners' angle-weighted ones: beyond an edge or a corner, where several
+    triangles are as near, that of one of them may point the wrong way [Baerentzen, Aanaes 2005].
+
+    Args:
+        points: shape (N, 3); places: the nearest point of the surface to each one, shape (N, 3).
+        nearest: the triangle that it lies on, shape (N,).
+        body: points of the surface, shape (B, 3); triangles: outward, shape (T, 3).
+    """
+    corners = triangles[nearest]
+    shares = _barycentric(places, body[corners])
+    normals = (shares[:, :, None] * _corner_normals(body, triangles)[corners]).sum(axis=1)
+    away = points - places
+    return np.where((away * normals).sum(axis=1) < 0, 1, -1) * np.linalg.norm(away, axis=1)
+
+
+def _barycentric(places: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Return the shares of a triangle's corners (N, 3, 3) in points of its plane (N, 3), shape (N, 3)."""
+    opposite = np.stack(
+        [np.cross(corners[:, (k + 1) % 3] - places, corners[:, (k + 2) % 3] - places) for k in range(3)], 1
+    )
+    whole = opposite.sum(axis=1, keepdims=True)
+    return (opposite * whole).sum(axis=2) / np.maximum((whole**2).sum(axis=2), 1e-30)
+
+
+def _corner_normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Return the normals of points, of their triangles' weighted by the angle at the point, shape (V, 3)."""
+    corners = points[triangles]
+    faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    faces /= np.maximum(np.linalg.norm(faces, axis=1, keepdims=True), 1e-30)
+    normals = np.zeros_like(points)
+    for k in range(3):
+        u, v = (corners[:, (k + step) % 3] - corners[:, k] for step in (1, 2))
+        angles = np.arctan2(np.linalg.norm(np.cross(u, v), axis=1), (u * v).sum(axis=1))
+        np.add.at(normals, triangles[:, k], angles[:, None] * faces)
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
 
 
 def worst_frames(values: np.ndarray, count: int, apart: int) -> list[int]:

@@ -121,14 +121,15 @@ def _triangles(mesh: bpy.types.Mesh) -> np.ndarray:
 
 
 def _depths(points: np.ndarray, body: bpy.types.Object) -> np.ndarray:
-    """Return how deep points lie behind the nearest triangle of an evaluated body, in world units, shape (V,).
+    """Return how deep points lie inside an evaluated body, by its nearest triangles, in world units, shape (V,).
 
     In the world: what is nearest to a scaled object is not what is nearest before it is scaled.
     """
     triangles = _triangles(body.data)
     if body.matrix_world.determinant() < 0:  # mirrored, and so are its faces
         triangles = triangles[:, ::-1]
-    tree = BVHTree.FromPolygons(_world_points(body).tolist(), triangles.tolist())
+    surface = _world_points(body)
+    tree = BVHTree.FromPolygons(surface.tolist(), triangles.tolist())
     found = [tree.find_nearest(point) for point in points.tolist()]
-    places, normals, distances = (np.array([each[part] for each in found]) for part in (0, 1, 3))
-    return np.where(((points - places) * normals).sum(axis=1) < 0, distances, -distances)
+    places, nearest = (np.array([each[part] for each in found]) for part in (0, 2))
+    return heat.depths(points, places, nearest, surface, triangles)

@@ -9,6 +9,7 @@ import pytest
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
 from mathutils import Matrix
+from mathutils.bvhtree import BVHTree
 
 from blender_addon import heat
 
@@ -54,6 +55,25 @@ def test_colours_run_from_grey_over_blue_to_red():
     found = heat.colors_of(np.array([-1.0, 0.0, 1e-9, 0.5, 1.0, 7.0]), 1.0)
     np.testing.assert_allclose(found[:, :3], [heat.GREY, heat.GREY, BLUE, heat.COLORS[2], RED, RED], atol=1e-6)
     assert (found[:, 3] == 1).all()
+
+
+def test_the_side_is_right_beyond_sharp_corners_too():
+    """A flat spike: the face whose plane a point lies behind is often as near as any other."""
+    body = np.array([[0, 0, 0], [0.1, 0, 0], [0.03, 0.1, 0], [0.03, 0.03, 2]])
+    triangles = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+    tree = BVHTree.FromPolygons(body.tolist(), triangles.tolist())
+    random = np.random.default_rng(0)
+    points = np.concatenate(
+        [random.uniform(-0.5, 2.5, (2000, 3)) * [0.3, 0.3, 1], random.dirichlet([1] * 4, 500) @ body]
+    )
+    found = [tree.find_nearest(point) for point in points.tolist()]
+    places, nearest = (np.array([each[part] for each in found]) for part in (0, 2))
+    normals = np.cross(*(body[triangles[:, corner]] - body[triangles[:, 0]] for corner in (1, 2)))
+    inside = (((points[:, None] - body[triangles[:, 0]]) * normals).sum(-1) < 0).all(axis=1)
+    depths = heat.depths(points, places, nearest, body, triangles)
+    np.testing.assert_array_equal(depths > 0, inside)
+    np.testing.assert_allclose(np.abs(depths), np.linalg.norm(points - places, axis=1))
+    assert 500 <= inside.sum() < 600
 
 
 def test_the_worst_frames_lie_apart_and_above_zero():
