@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bake whose rollout runs away: the garment is put to rest, and the command, the file and its proof say so."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+from ssilk_usd.provenance import read_provenance
+
+from ssilk_core.checkpoint import load_model, save_model
+from ssilk_core.cli import main
+
+
+def test_a_bake_says_where_its_rollout_was_lost(toy, tmp_path, capsys):
+    file = load_model(toy.folder / "model.safetensors")
+    free = replace(file.config, bound=0.0, push=0.0)
+    wild = {**file.parameters, "integrator.alpha": np.full(free.latent, -9, dtype=np.float32)}
+    model, shot = tmp_path / "wild.safetensors", tmp_path / "shot.usda"
+    save_model(model, replace(file, config=free, parameters=wild))
+    words = [str(model), "--stage", str(toy.folder / "rigged.usda"), "--motion", str(toy.folder / "clip.usda")]
+    assert main(["bake", *words, "-o", str(shot), "--json"]) == 0
+    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    warned = [event["text"] for event in events if event["event"] == "message" and event["level"] == "warning"]
+    spans = list(read_provenance(shot)["recovered"])
+    assert spans and warned == [
+        f"frames {span}: the rollout was lost, and the garment is put to rest" for span in spans
+    ]
+    assert events[-1]["event"] == "result" and events[-1]["detail"]["put to rest"] == spans
+    assert all(0 < int(word) < 40 for span in spans for word in span.split(" to "))
+    assert main(["verify", str(shot)]) == 0
+
+
+def test_a_calm_bake_says_nothing_of_it(toy):
+    assert "recovered" not in read_provenance(toy.folder / "shot.usda")
