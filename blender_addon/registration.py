@@ -5,11 +5,23 @@ from __future__ import annotations
 
 import bpy
 
-from . import overlay, panels, preferences, preflight_properties, properties
-from .operators import baking, classes, environment, fill, playback, preflight, rig, stages, tasks, training
+from . import overlay, panels, preferences, preflight_properties, properties, translations
+from .operators import (
+    baking,
+    classes,
+    environment,
+    fill,
+    playback,
+    preflight,
+    quality_view,
+    rig,
+    stages,
+    tasks,
+    training,
+)
 from .operators import overlay as overlay_switch
 from .panels import plot
-from .scene import playing
+from .scene import playing, warming
 
 CLASSES = (
     *properties.CLASSES,
@@ -26,6 +38,7 @@ CLASSES = (
     *training.CLASSES,
     *baking.CLASSES,
     *playback.CLASSES,
+    *quality_view.CLASSES,
     *panels.CLASSES,
 )
 
@@ -36,17 +49,23 @@ def register() -> None:
         bpy.utils.register_class(kind)
     properties.attach()
     preflight_properties.attach()
+    translations.register()
     training.start_watching()
     playing.start_listening()
+    warming.start_listening()
+    quality_view.add_key()
 
 
 def unregister() -> None:
     """Stop what runs outside, then remove properties and classes in reverse."""
     tasks.stop()
     overlay.hide()
+    quality_view.remove_key()
+    warming.stop_listening()
     playing.stop_listening()
     training.stop_watching(bpy.context)
     plot.forget()
+    translations.unregister()
     preflight_properties.detach()
     properties.detach()
     for kind in reversed(CLASSES):
