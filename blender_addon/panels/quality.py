@@ -5,10 +5,17 @@ from __future__ import annotations
 
 import bpy
 
-from ..operators.quality_view import KINDS
 from ..scene.beside import beside
 from ..scene.garment import unusable
+from ..scene.heat import PENETRATION, STRETCH
 from .base import Panel
+
+
+def draw_kind(layout: bpy.types.UILayout, kind: str, text: str) -> None:
+    """Draw the buttons of one kind of heat."""
+    row = layout.row(align=True)
+    row.operator("ssilk.show_heat", text=text, icon="SHADING_RENDERED").kind = kind
+    row.operator("ssilk.find_worst", text="", icon="MARKER_HLT").kind = kind
 
 
 class QualityPanel(Panel, bpy.types.Panel):
@@ -22,10 +29,8 @@ class QualityPanel(Panel, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
-        for kind, label, _ in KINDS:
-            row = layout.row(align=True)
-            row.operator("ssilk.show_heat", text=f"Show {label}", icon="SHADING_RENDERED").kind = kind
-            row.operator("ssilk.find_worst", text="", icon="MARKER_HLT").kind = kind
+        draw_kind(layout, PENETRATION, text="Show Penetration")
+        draw_kind(layout, STRETCH, text="Show Stretch")
         row = layout.row(align=True)
         if context.object.ssilk.heat:
             row.operator("ssilk.hide_heat")

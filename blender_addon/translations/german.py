@@ -264,4 +264,35 @@ WORDS = {
     "Read what the armature does over the scene's frames anew: after edits, or when the frame range changed": (
         "Neu lesen, was die Armatur über die Bilder der Szene tut: nach Änderungen, oder bei anderem Bildbereich"
     ),
+    "Quality": "Qualität",
+    "Penetration": "Durchdringung",
+    "Show Penetration": "Durchdringung zeigen",
+    "How deep vertices lie inside the body": "Wie tief Vertices im Körper liegen",
+    "Stretch": "Dehnung",
+    "Show Stretch": "Dehnung zeigen",
+    "How much longer the cloth is than at rest": "Um wie viel länger der Stoff ist als in Ruhe",
+    "Show": "Zeigen",
+    "Show Heat": "Wärmebild zeigen",
+    "Colour the garment by penetration or stretch, frame by frame; in Solid shading, in this view": (
+        "Das Kleidungsstück nach Durchdringung oder Dehnung färben, Bild für Bild; in der Solid-Ansicht, hier"
+    ),
+    "Red Depth": "Rote Tiefe",
+    "Depth that is red": "Tiefe, die rot ist",
+    "Red Stretch": "Rote Dehnung",
+    "Elongation that is red": "Dehnung, die rot ist",
+    "Hide Heat": "Wärmebild verbergen",
+    "Remove the colours of the heat map": "Die Farben des Wärmebilds entfernen",
+    "Look For": "Suchen nach",
+    "Markers": "Marken",
+    "How many frames are marked at most": "Wie viele Bilder höchstens markiert werden",
+    "Mark Worst Frames": "Schlechteste Bilder markieren",
+    "Go through the scene's frames and mark those in which penetration or stretch is worst": (
+        "Die Bilder der Szene durchgehen und jene markieren, in denen Durchdringung oder Dehnung am größten ist"
+    ),
+    "Clear Marks": "Marken entfernen",
+    "Remove the markers of worst frames": "Die Marken der schlechtesten Bilder entfernen",
+    "Plain Skinning Beside": "Einfaches Skinning daneben",
+    "Show the garment as plain skinning has it, beside it, or take that away": (
+        "Das Kleidungsstück mit einfachem Skinning daneben zeigen, oder das wieder entfernen"
+    ),
 }
