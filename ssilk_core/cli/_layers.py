@@ -63,11 +63,6 @@ def is_done(task: Task, folder: Path) -> bool:
     return is_current(layout_of(task, folder).animation.parent, key_of(task))
 
 
-def is_done(task: Task, folder: Path) -> bool:
-    """Return whether a task is done with the inputs as they are now, and its files are as they were written."""
-    return is_current(layout_of(task, folder).animation.parent, key_of(task))
-
-
 def bake_task(
     task: Task, folder: Path, wardrobe: Wardrobe, report: Reporter, *, again: bool = False
 ) -> dict[str, object]:

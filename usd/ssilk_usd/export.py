@@ -3,16 +3,23 @@
 
 from __future__ import annotations
 
+import shutil
+import struct
+import tempfile
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from pxr import Sdf, Tf, UsdUtils
+from pxr import Sdf, Tf
 
 from ssilk_core.errors import fail, need
 from ssilk_core.files import replacing
 
 from .read_stage import LAYER_SUFFIXES, usd_reason
+
+PACKED = "shot.usdc"  # the layer in a package
+ZIP_HEADER, EXTRA_HEADER, EXTRA_FIELD, ALIGNMENT = 30, 4, 0x1986, 64  # bytes, and the field that USD pads with
 
 
 def need_layer_suffix(out: str | Path) -> None:
@@ -40,13 +47,25 @@ def packaged(out: str | Path) -> Iterator[Path]:
     """Yield a layer to write: `out` itself, or one beside it that is then packed into it where it ends in .usdz.
 
     Raises:
-        SsilkError: the package cannot be written.
+        OSError: the package cannot be written.
     """
     out = Path(out)
     if out.suffix != ".usdz":
         yield out
         return
-    with replacing(out.with_suffix(".usdc")) as layer:
+    with tempfile.TemporaryDirectory(dir=out.parent) as folder:
+        layer = Path(folder) / PACKED
         yield layer
-        packed = UsdUtils.CreateNewUsdzPackage(str(layer), str(out), "shot.usdc")
-        need(packed, str(out), "the package cannot be written", "free some space or choose another output")
+        _pack(layer, out)
+
+
+def _pack(layer: Path, out: Path) -> None:
+    """Write a package of one layer: a zip without compression, its data 64 bytes aligned, as USD maps it into memory.
+
+    USD's own function stores times of day, so that no two packages are alike.
+    """
+    entry = zipfile.ZipInfo(layer.name, date_time=(1980, 1, 1, 0, 0, 0))
+    padding = -(ZIP_HEADER + len(entry.filename) + EXTRA_HEADER) % ALIGNMENT
+    entry.extra = struct.pack("<HH", EXTRA_FIELD, padding) + bytes(padding)
+    with zipfile.ZipFile(out, "w") as package, layer.open("rb") as source, package.open(entry, "w") as target:
+        shutil.copyfileobj(source, target)

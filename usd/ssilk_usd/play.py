@@ -90,8 +90,8 @@ class Shot:
         return garments[0]
 
 
-def _skinning_of(stage: Usd.Stage) -> dict[Usd.Prim, tuple[UsdSkel.SkeletonQuery, UsdSkel.SkinningQuery]]:
-    """Return skeleton and skinning query of each skinned prim."""
+def _skinning_of(stage: Usd.Stage) -> dict[Usd.Prim, tuple[Usd.Prim, UsdSkel.SkeletonQuery, UsdSkel.SkinningQuery]]:
+    """Return the Skeleton, its query and the skinning query of each skinned prim."""
     cache, found = UsdSkel.Cache(), {}
     for prim in Usd.PrimRange(stage.GetPseudoRoot(), PRIMS):
         root = UsdSkel.Root(prim)
@@ -99,17 +99,20 @@ def _skinning_of(stage: Usd.Stage) -> dict[Usd.Prim, tuple[UsdSkel.SkeletonQuery
             continue
         cache.Populate(root, PRIMS)
         for binding in cache.ComputeSkelBindings(root, PRIMS):
-            skeleton = cache.GetSkelQuery(binding.GetSkeleton())
+            skeleton = binding.GetSkeleton()
             for query in binding.GetSkinningTargets():
-                found[query.GetPrim()] = (skeleton, query)
+                found[query.GetPrim()] = (skeleton.GetPrim(), cache.GetSkelQuery(skeleton), query)
     return found
 
 
 class _SkinnedMesh:
     """A mesh that UsdSkel deforms: blendshapes in rest space, then linear blend skinning."""
 
-    def __init__(self, prim: Usd.Prim, skeleton: UsdSkel.SkeletonQuery, skinning: UsdSkel.SkinningQuery) -> None:
-        self.prim, self.skeleton, self.skinning = prim, skeleton, skinning
+    def __init__(
+        self, prim: Usd.Prim, rig: Usd.Prim, skeleton: UsdSkel.SkeletonQuery, skinning: UsdSkel.SkinningQuery
+    ) -> None:
+        # The query's own prim may be that of a prototype, which stands at no place in the world.
+        self.prim, self.rig, self.skeleton, self.skinning = prim, rig, skeleton, skinning
         self.rest = UsdGeom.Mesh(prim).GetPointsAttr()
         self.shapes = UsdSkel.BlendShapeQuery(UsdSkel.BindingAPI(prim)) if self._has_shapes() else None
         if self.shapes:
@@ -131,7 +134,7 @@ class _SkinnedMesh:
         space = self.prim
         if self.skinning.HasJointInfluences():
             self.skinning.ComputeSkinnedPoints(self.skeleton.ComputeSkinningTransforms(time), points, time)
-            space = self.skeleton.GetPrim()
+            space = self.rig
         return apply(column_matrix(xforms.GetLocalToWorldTransform(space)), np.array(points, dtype=np.float64))
 
 
