@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,6 +167,14 @@ def dense(indices: np.ndarray, weights: np.ndarray, joint_count: int) -> np.ndar
     matrix = np.zeros((len(indices), joint_count), dtype=np.float32)
     np.add.at(matrix, (np.arange(len(indices))[:, None], indices), weights)
     return matrix
+
+
+def orthonormal(transforms: ArrayLike) -> np.ndarray:
+    """Return nearly rigid transforms (..., 4, 4) with the rotations that are nearest to their axes."""
+    rigid = np.array(transforms, dtype=np.float64)
+    left, _, right = np.linalg.svd(rigid[..., :3, :3])
+    rigid[..., :3, :3] = left @ right
+    return rigid
 
 
 def to_parents(worlds: np.ndarray, parents: np.ndarray) -> np.ndarray:

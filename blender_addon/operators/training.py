@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import bpy
+import numpy as np
 from bpy.props import CollectionProperty, IntProperty, StringProperty
 
 from ..classes import LOOSE
@@ -228,6 +229,13 @@ def need_trainable(garment: bpy.types.Object, armature: bpy.types.Object, dresse
     need(dressed.classes is not None, f"'{garment.name}' has no classes; classify or paint it first.")
     rigged = dressed.joints.proxy_count or not (dressed.classes == LOOSE).any()
     need(rigged, f"'{garment.name}' is loose but has no proxies; generate its rig first.")
+    weights = dressed.garment.weights
+    bare = 0 if weights is None else int(np.count_nonzero(~weights.any(axis=1)))
+    need(
+        not bare,
+        f"{bare} vertices of '{garment.name}' have no bone's weight, as where a proxy was deleted; generate its rig "
+        "again, or paint them.",
+    )
     need_bakeable(garment, armature, dressed.joints)
 
 

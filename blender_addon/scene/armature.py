@@ -14,7 +14,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ..contract.arrays import Joints
+from ..contract.arrays import Joints, orthonormal
 from ..errors import need
 
 OWNER = "ssilk_garment"  # custom property of a bone collection: the garment object
@@ -37,7 +37,8 @@ def read_joints(armature: bpy.types.Object, garment: bpy.types.Object) -> Joints
     return Joints(
         names=tuple(index),
         parents=np.array([_parent(bone, index) for bone in ordered], dtype=np.int64),
-        binds=np.array([_rigid(armature) @ bone.matrix_local @ _shrunk(armature) for bone in ordered]),
+        # Blender's axes are orthonormal to 1e-5 only, which far from a bone is more than vertices may be off.
+        binds=orthonormal([_rigid(armature) @ bone.matrix_local @ _shrunk(armature) for bone in ordered]),
         proxy_count=len(proxies),
     )
 

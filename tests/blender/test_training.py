@@ -280,6 +280,7 @@ def unproxied(bpy, garment) -> None:
         (lambda bpy, garment: setattr(garment.ssilk.training.motions[2], "name", "Run"), "The action 'Run' is gone"),
         (lambda bpy, garment: garment.data.attributes.remove(garment.data.attributes["ssilk:class"]), "no classes"),
         (unproxied, "'Skirt' is loose but has no proxies"),
+        (lambda bpy, garment: garment.vertex_groups.clear(), "have no bone's weight, as where a proxy was deleted"),
         (
             lambda bpy, garment: setattr(bpy.data.objects["Rig"].pose.bones["Spine"], "scale", (1, 2, 1)),
             "is scaled at",
