@@ -268,7 +268,6 @@ WORDS = {
     "Penetration": "Durchdringung",
     "Show Penetration": "Durchdringung zeigen",
     "How deep vertices lie inside the body": "Wie tief Vertices im Körper liegen",
-    "Stretch": "Dehnung",
     "Show Stretch": "Dehnung zeigen",
     "How much longer the cloth is than at rest": "Um wie viel länger der Stoff ist als in Ruhe",
     "Show": "Zeigen",

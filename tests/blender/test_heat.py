@@ -15,6 +15,7 @@ from blender_addon import heat
 
 from .conftest import activate, add_mesh, tube
 from .scenes import ended, rig_and_animate
+from .test_panels import drawn
 
 RED, BLUE = heat.COLORS[-1], heat.COLORS[0]
 
@@ -157,6 +158,15 @@ def test_heat_is_shown_follows_frames_and_goes(bpy, dressed):
     np.testing.assert_allclose(colors(dressed)[:, :3], np.tile(heat.GREY, (len(expected), 1)), atol=2e-3)
     assert bpy.ops.ssilk.hide_heat() == {"FINISHED"}
     assert "SSILK Heat" not in dressed.data.color_attributes and not dressed.ssilk.heat
+
+
+def test_the_panel_offers_to_hide_what_is_shown(bpy, dressed):
+    from blender_addon.panels.quality import QualityPanel
+
+    shown = ["ssilk.show_heat", "ssilk.find_worst"] * 2
+    assert drawn(QualityPanel, bpy.context) == [*shown, "ssilk.clear_worst", "ssilk.toggle_plain"]
+    bpy.ops.ssilk.show_heat()
+    assert drawn(QualityPanel, bpy.context) == [*shown, "ssilk.hide_heat", "ssilk.clear_worst", "ssilk.toggle_plain"]
 
 
 def test_stretch_is_that_of_what_blender_shows(bpy, dressed):

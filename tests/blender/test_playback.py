@@ -12,6 +12,7 @@ pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-b
 
 from .conftest import activate
 from .scenes import decoded, ended, enliven, rig_and_animate, shown
+from .test_panels import drawn
 
 EXACT = 2e-5  # [m]
 FRAMES = range(1, 41)
@@ -69,6 +70,21 @@ def test_every_frame_shows_what_a_bake_would(ready, trained, wanted):
     assert np.abs(shown(ready, trained, FRAMES) - wanted).max() < EXACT
     assert np.ptp(wanted, axis=0).max() > 0.05
     assert not playing().live(trained).stale
+
+
+def test_the_panel_says_what_live_playback_is_at(ready, trained):
+    from blender_addon.panels.playback import PlaybackPanel
+
+    assert drawn(PlaybackPanel, ready.context) == ["ssilk.play_live"]
+    ready.ops.ssilk.play_live()
+    live = playing().live(trained)
+    assert drawn(PlaybackPanel, ready.context) == ["ssilk.stop_live", "ssilk.refresh_live", "Follows the armature"]
+    live.stale = True
+    assert drawn(PlaybackPanel, ready.context)[-1] == "The motion changed since it was read"
+    live.refresh()
+    assert drawn(PlaybackPanel, ready.context)[-1] == "Reading the motion: 0%"
+    live.read()
+    assert drawn(PlaybackPanel, ready.context)[-1].startswith("Reading the motion: ")
 
 
 def test_scrubbing_shows_the_same_bits_as_playing(ready, trained):
