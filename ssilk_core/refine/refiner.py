@@ -10,7 +10,8 @@ solved. What inertia looks back on is a choice:
 - with feedback, the refined frames before, one after the other; each starts from the network's state as it is or
   carrying the last correction, whichever has less energy. With iterations without end this is the simulator.
 
-The first frame of a shot, and after a cut, is quasi-static.
+The first frame of a shot, and after a cut, is quasi-static with feedback; without, it looks back on itself at rest:
+it alone would be free of inertia otherwise, and the next frame would jump back.
 """
 
 from __future__ import annotations
@@ -147,7 +148,7 @@ class Refiner:
         for start, stop in _blocks(span.frame_count, 1 if self.options.feedback else self.options.batch):
             world = self._taken(network, stop - start)
             poses = self.simulator.actors.posed(span.rotations[start:stop], span.translations[start:stop])
-            setting = self.simulator.setting(poses, None if tail is None else _past(tail, world, poses))
+            setting = self.simulator.setting(poses, self._past(tail, world, poses))
             before = State.at(self.potential, self.simulator.pinned(world - poses.root, poses), setting)
             if given is None:
                 refined = self._refined(before, tail, world, poses, setting) + poses.root
@@ -168,6 +169,15 @@ class Refiner:
             corrected = self.simulator.pinned(world + tail.correction - poses.root, poses)
             start = self.simulator.best([start, corrected], setting)
         return minimise_from(self.potential, start, setting, self.options.solver).x.double()
+
+    def _past(self, tail: _Tail | None, world: Tensor, poses: Poses) -> Past | None:
+        """Return what each of some consecutive frames looks back on."""
+        if tail is None:
+            return None if self.options.feedback else Past(world, None, poses.root, poses.plain)
+        seen, count = torch.cat([tail.world, world[..., :-1]], dim=-1), world.shape[-1]
+        before = seen[..., -count - 1 : -1] if seen.shape[-1] > count else None
+        root = torch.cat([tail.root, poses.root[:, :-1]], dim=1)
+        return Past(seen[..., -count:], before, root, torch.cat([tail.plain, poses.plain[..., :-1]], dim=-1))
 
     def _tail(self, tail: _Tail | None, world: Tensor, refined: Tensor, poses: Poses) -> _Tail:
         """Return what the frames after these look back on."""
@@ -194,14 +204,6 @@ def _blocks(count: int, size: int) -> Iterator[tuple[int, int]]:
     """Yield the frames refined together: the first two, which have less of a past, each alone."""
     yield from ((frame, frame + 1) for frame in range(min(2, count)))
     yield from ((start, min(start + size, count)) for start in range(2, count, size))
-
-
-def _past(tail: _Tail, world: Tensor, poses: Poses) -> Past:
-    """Return what each of some consecutive frames looks back on."""
-    seen, count = torch.cat([tail.world, world[..., :-1]], dim=-1), world.shape[-1]
-    before = seen[..., -count - 1 : -1] if seen.shape[-1] > count else None
-    root = torch.cat([tail.root, poses.root[:, :-1]], dim=1)
-    return Past(seen[..., -count:], before, root, torch.cat([tail.plain, poses.plain[..., :-1]], dim=-1))
 
 
 @dataclass

@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Refine trained models on the beginning of clips with growing budgets, and say what each buys and costs.
+
+    python benchmarks/refine.py cape.safetensors --stage cape.usdc --motions FOLDER --clips 01_walk
+
+Energies are means over frames, inertia by each method's own past, gravity from the root. Jitter is the RMS of the
+third difference of positions. What joints lose is measured after the refined vertices are put back onto joints and
+blendshapes. The last row of each clip is the simulator, which starts from no network.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from reports import table, write_results
+from subjects import Subject, arguments, clip_of, open_subject, parsed
+
+from ssilk_core.assets import Floats, GarmentPose, Motion
+from ssilk_core.kinematics import deform, resample
+from ssilk_core.refine import RefineOptions, Refiner, Refitter
+from ssilk_core.rollout import decode, garment_poses
+from ssilk_core.simulate import SimulationOptions, simulate
+
+HEADER = ("garment, clip", "iterations", "looks back on", "s a frame", "energy [J]", "inside the body", "moved [mm]",
+          "jitter [mm]", "joints lose [mm]", "at most [mm]", "energy of the joints [J]", "inside")  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Take:
+    """A garment over a stretch of a clip, as the network has it."""
+
+    subject: Subject
+    motion: Motion
+    poses: list[GarmentPose]
+    points: Floats
+
+    @classmethod
+    def of(cls, subject: Subject, clip: Motion, frames: int) -> Take:
+        """Roll the network over the first frames of a clip."""
+        motion = resample(clip, subject.file.config.fps).clip(0, frames)
+        poses = list(garment_poses(subject.model, motion, motion.fps))
+        points = np.concatenate([decode(subject.model, motion, pose) for pose in poses])
+        return cls(subject, motion, poses, points)
+
+    def refiner(self, iterations: int, feedback: bool) -> Refiner:
+        options, dressed = RefineOptions(iterations=iterations, feedback=feedback), self.subject.dressed
+        return Refiner(dressed.scene, dressed.fabric, options, fps=self.motion.fps, device=dressed.device)
+
+    def measured(self, points: Floats) -> dict[str, float]:
+        """Return the figures of vertices (F, V, 3), by their own past."""
+        changes = list(self.refiner(1, True).changes(self.motion, points, points))
+        return {
+            "energy": float(np.mean([change.after for change in changes])),
+            "inside": float(np.mean([change.inside_after for change in changes])),
+            "moved": float(np.sqrt(((points - self.points) ** 2).sum(-1).mean())),
+            "jitter": float(np.sqrt((np.diff(points, 3, axis=0) ** 2).sum(-1).mean())),
+        }
+
+    def put_back(self, points: Floats) -> dict[str, float]:
+        """Return what is lost when vertices go back onto joints and blendshapes."""
+        deformer, mass = self.subject.model.deformer(), self.subject.energy.mass.cpu().numpy()
+        fits = list(Refitter(deformer, mass).fit(self.motion, self.poses, points))
+        back = np.concatenate([deform(deformer, self.motion, fit.pose) for fit in fits])
+        found = self.measured(back)
+        return {
+            "lost": float(np.sqrt(np.mean(np.concatenate([fit.rms for fit in fits]) ** 2))),
+            "lost at most": max(float(fit.largest.max()) for fit in fits),
+            "joints energy": found["energy"],
+            "joints inside": found["inside"],
+        }
+
+
+def refined(take: Take, iterations: int, feedback: bool) -> dict[str, float]:
+    """Return the figures of one budget; none for no iterations."""
+    if not iterations:
+        return {"seconds": 0.0, **take.measured(take.points)}
+    begun = time.perf_counter()
+    points = np.stack([frame.points for frame in take.refiner(iterations, feedback).frames(take.motion, take.points)])
+    seconds = (time.perf_counter() - begun) / len(points)
+    return {"seconds": seconds, **take.measured(points), **take.put_back(points)}
+
+
+def simulated(take: Take) -> dict[str, float]:
+    """Return the figures of the simulator."""
+    dressed, begun = take.subject.dressed, time.perf_counter()
+    options = SimulationOptions(fps=take.motion.fps)
+    (points,) = simulate(dressed.scene, dressed.fabric, [take.motion], options, device=dressed.device)
+    return {"seconds": (time.perf_counter() - begun) / len(points), **take.measured(points)}
+
+
+def row(where: str, iterations: str, past: str, found: dict[str, float]) -> list[str]:
+    """Return one line of the table."""
+    line = [where, iterations, past, f"{found['seconds']:.3g}", f"{found['energy']:.4f}", f"{found['inside']:.2%}",
+            f"{1000 * found['moved']:.1f}", f"{1000 * found['jitter']:.2f}"]  # fmt: skip
+    if "lost" not in found:
+        return [*line, "", "", "", ""]
+    lost = [f"{1000 * found[name]:.2f}" for name in ("lost", "lost at most")]
+    return [*line, *lost, f"{found['joints energy']:.4f}", f"{found['joints inside']:.2%}"]
+
+
+def measure(take: Take, where: str, budgets: list[int]) -> tuple[list[list[str]], dict[str, Any]]:
+    """Return the rows of one garment and clip, and their figures."""
+    rows, figures = [], {}
+    for iterations in budgets:
+        for feedback in (False, True) if iterations else (False,):
+            past = ("refined" if feedback else "network") if iterations else ""
+            figures[f"{iterations} {past}".strip()] = found = refined(take, iterations, feedback)
+            rows.append(row(where, str(iterations), past, found))
+            print(rows[-1], flush=True)
+    figures["simulator"] = found = simulated(take)
+    return [*rows, row(where, "simulator", "itself", found)], figures
+
+
+def main() -> None:
+    parser = arguments(__doc__ or "")
+    parser.add_argument("--clips", nargs="+", required=True, help="names of motion files")
+    parser.add_argument("--frames", type=int, default=30, help="from the beginning of each clip (default 30)")
+    parser.add_argument("--budgets", type=int, nargs="+", default=[0, 1, 2, 4, 8, 16], help="iterations a frame")
+    options = parsed(parser)
+    rows, measured = [], {}
+    for path in options.models:
+        subject = open_subject(path, options.stage, options.device)
+        for clip in options.clips:
+            take = Take.of(subject, clip_of(options, clip, subject), options.frames)
+            more, measured[f"{subject.name} {clip}"] = measure(take, f"{subject.name}, {clip}", options.budgets)
+            rows += more
+    write_results(options, table(HEADER, rows), measured)
+
+
+if __name__ == "__main__":
+    main()
