@@ -38,7 +38,7 @@ class Extent:
         latent: largest entry of any latent.
         growth: mean elastic and kinetic energy in the last loop of the motion over that in the second, the first one
             being the transient's; 1 where there are not three.
-        recovered: frames at which the rollout was lost.
+        recovered: frames at which the rollout was lost, or a solver stopped out of balance.
     """
 
     frames: int
@@ -107,6 +107,11 @@ class Meter:
             return 1.0
         return float(np.mean(self.energies[-1]) / np.mean(self.energies[0]))
 
+    def extent(self, frames: int, *, latent: float = 0.0, recovered: int = 0) -> Extent:
+        """Return what was measured, with what others know."""
+        size = garment_size(self.scene)
+        return Extent(frames, self.finite, self.speed, self.distance, size, latent, self.growth, recovered)
+
 
 def compared_loops(drive: Drive) -> tuple[range, ...]:
     """Return the frames of a drive's second loop and of its last; nothing where there are not three."""
@@ -170,9 +175,8 @@ def extent(model: GarmentModel, fabric: Fabric, drive: Drive) -> Extent:
                 meter.add(motion, decode(model, motion, pose))
     finally:
         handle.remove()
-    size = garment_size(model.scene)
     lost = sum(map(len, course.recovered))
-    return Extent(drive.frames, meter.finite, meter.speed, meter.distance, size, latents.largest, meter.growth, lost)
+    return meter.extent(drive.frames, latent=latents.largest, recovered=lost)
 
 
 def positions(model: GarmentModel, drive: Drive) -> Floats:

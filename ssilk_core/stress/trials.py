@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from ..assets import PINNED, Motion, Scene
 from ..config import ModelConfig, TrainConfig
 from ..energy import GarmentEnergy
 from ..fabrics import Fabric
+from ..model.descriptors import GRAVITY
 from ..model.network import GarmentModel
 from ..model.skinning import Skinning
 from ..simulate import SimulationOptions
@@ -23,7 +23,6 @@ from ..training.job import TrainJob
 from ..training.parts import build_parts
 from .drives import Drive
 from .meter import Extent, Meter, extent, matrices_about_root
-from .worlds import garment_size
 
 SMALL = ModelConfig(latent=16, widths=(32, 32), shapes=8)
 WIGGLE = 1e-3  # of the garment's size: by how much points are moved off plain skinning to have energies compared
@@ -62,14 +61,18 @@ def trained(scene: Scene, fabric: Fabric, drive: Drive, steps: int, *, windows: 
     return Trial(extent(model, fabric, drive), int(stepper.faults.count), steps, error)
 
 
-def simulated(scene: Scene, fabric: Fabric, motion: Motion, gravity: Sequence[float]) -> Extent:
-    """Simulate a motion under a gravity [m/s2] and measure what comes out."""
-    x, y, z = gravity
-    options = SimulationOptions(fps=motion.fps, gravity=(x, y, z))
+def simulated(scene: Scene, fabric: Fabric, motion: Motion, gravity: float = GRAVITY) -> tuple[Extent, float]:
+    """Simulate a motion under a gravity [m/s2]; return its extent and the largest imbalance of a frame [g].
+
+    Frames that the solver left out of balance by more than its tolerance count as recovered.
+    """
+    options = SimulationOptions(fps=motion.fps, gravity=(0.0, -gravity, 0.0))
     meter = Meter(scene, fabric, motion.fps)
-    points = np.stack([frame.points for frame in Simulator(scene, fabric, options).frames([motion])])
-    meter.add(motion, points)
-    return Extent(len(points), meter.finite, meter.speed, meter.distance, garment_size(scene), 0.0, meter.growth, 0)
+    frames = list(Simulator(scene, fabric, options).frames([motion]))
+    imbalance = [frame.imbalance for frame in frames]
+    meter.add(motion, np.stack([frame.points for frame in frames]))
+    unsolved = sum(value > options.solver.tolerance for value in imbalance)
+    return meter.extent(len(frames), recovered=unsolved), max(imbalance)
 
 
 def gradient_error(scene: Scene, fabric: Fabric, motion: Motion) -> float:

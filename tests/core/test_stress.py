@@ -18,7 +18,7 @@ from ssilk_core.stress.outcome import Measured, markdown
 from ssilk_core.stress.subject import Effort, Subject
 from ssilk_core.stress.trials import gradient_error, trained
 
-TINY = Effort(seconds=1.0, frames=0.02, steps=2, simulated=2, vertices=800)
+TINY = Effort(seconds=1.0, frames=0.02, steps=2, simulated=2, vertices=120)
 FABRIC = Fabric("toy", bending=1e-4)
 
 
