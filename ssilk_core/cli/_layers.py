@@ -142,14 +142,12 @@ def _write_animation(layout: Layout, asset: Asset, bake: Bake, task: Task, repor
 
 
 def write_stages(tasks: Sequence[Task], folder: Path, report: Reporter) -> None:
-    """Write the stage of each shot, of those of its garments that are baked; name shots that an asset outgrew."""
+    """Write the stage of each shot of tasks that are done; name shots that an asset outgrew."""
     from ssilk_usd.layers import write_stage
 
     layouts = [layout_of(task, folder) for task in tasks]
     for shot in dict.fromkeys(layout.shot for layout in layouts):
-        found = [layout for layout in layouts if layout.shot == shot and layout.animation.is_file()]
-        if found:
-            write_stage(found)
+        write_stage([layout for layout in layouts if layout.shot == shot])
     for layout in {layout.garment: layout for layout in layouts}.values():
         outgrown = list(_outgrown(layout))
         if outgrown:

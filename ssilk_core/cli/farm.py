@@ -22,6 +22,8 @@ from ssilk_core.farm.tasks import Task
 from .options import add_bake, tasks_of
 
 if TYPE_CHECKING:
+    from ssilk_core.farm.cluster import Outcome
+
     from ._layers import Wardrobe
 
 
@@ -90,16 +92,16 @@ def _run(tasks: Sequence[Task], options: argparse.Namespace, report: Reporter) -
     from ._layers import write_stages
 
     report(Started("farm", len(tasks), {"output": str(options.output)}))
-    done = failed = current = 0
+    ended: list[Outcome] = []
     for outcome in run_on_cluster(tasks, options.output, bake_here, address=options.cluster or None, gpu=options.gpu):
-        done, failed = done + 1, failed + bool(outcome.error)
-        current += bool(outcome.detail.get("current"))
+        ended.append(outcome)
         if outcome.error:
             report(Garment(outcome.task.name, Failed(outcome.error)))
-        report(Progress(done, len(tasks)))
-    write_stages(tasks, options.output, report)
-    baked = done - failed - current
-    report(Result("farm", {"tasks": len(tasks), "baked": baked, "current": current, "failed": failed}))
+        report(Progress(len(ended), len(tasks)))
+    done = [outcome for outcome in ended if not outcome.error]
+    write_stages([outcome.task for outcome in done], options.output, report)
+    current, failed = sum("current" in outcome.detail for outcome in done), len(ended) - len(done)
+    report(Result("farm", {"baked": len(done) - current, "current": current, "failed": failed}))
     return EXIT_TASKS if failed else EXIT_OK
 
 

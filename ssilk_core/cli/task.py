@@ -79,8 +79,9 @@ def _check(tasks: Sequence[Task], output: Path, report: Reporter) -> int:
     """Write the stages of the shots and raise `VerificationError` unless everything is there."""
     from ._layers import write_stages
 
-    write_stages(tasks, output, report)
-    missing = [task.name for task in tasks if not _is_done(task, output, report)]
+    done = [task for task in tasks if _is_done(task, output, report)]
+    write_stages(done, output, report)
+    missing = [task.name for task in tasks if task not in done]
     if missing:
         raise VerificationError(
             f"{output}: {len(missing)} of {len(tasks)} tasks are not done, or their files are not as they were "

@@ -26,6 +26,7 @@ from ssilk_core.files import replacing
 from .author import Asset, define_asset, extent_array
 from .garment_api import GarmentRecord
 from .layers_facts import asset_facts
+from .read_stage import open_stage
 from .samples import PATH_OP, Samples, kept_joints, root_path, save
 from .shot import ShotSummary, TimeSpan, set_metadata, set_visibility, summary, write_samples
 from .units import StageUnits
@@ -253,9 +254,8 @@ def write_points(
 def write_stage(garments: Sequence[Layout]) -> None:
     """Write the stage of a shot, each garment by reference, over all frames of theirs; same bytes are left alone."""
     layout = garments[0]
-    layers = [Sdf.Layer.FindOrOpen(str(garment.animation)) for garment in garments]
-    for layer in layers:
-        layer.Reload()
+    stages = [open_stage(garment.animation) for garment in garments]
+    layers = [stage.GetRootLayer() for stage in stages]
     first = layers[0].pseudoRoot
     with replacing(layout.stage, keep_same=True) as temporary:
         stage = Usd.Stage.Open(Sdf.Layer.CreateNew(str(temporary)))

@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Farms: what docs/farm.md promises of jobs that run, fail, are killed, and run again."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from pxr import Sdf
+
+from ssilk_core.cli import farm as farm_verb
+from ssilk_core.cli import main
+from ssilk_core.files import sha256
+
+BIN = Path(sys.executable).parent
+SHOTS = ("a", "b", "c")
+WORDS = "farm model.safetensors --stage rigged.usda --motion a.usda b.usda c.usda"
+
+
+@pytest.fixture
+def farm(toy, tmp_path, monkeypatch):
+    """The toy world with three clips, and a job of them in `bundle`."""
+    toy.copy(tmp_path)
+    for index, name in enumerate(SHOTS):
+        toy.write_clip(tmp_path / f"{name}.usda", frames=6 + index)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    run(f"{WORDS} --bundle bundle --chunk 2")
+    return tmp_path
+
+
+def run(words: str) -> int:
+    return main(shlex.split(words))
+
+
+def task(words: str = "") -> int:
+    return run(f"task bundle/job.json -o out {words}")
+
+
+def started(words: str) -> subprocess.Popen:
+    command = [sys.executable, "-m", "ssilk_core", "task", "bundle/job.json", "-o", "out", *shlex.split(words)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def layers(folder: str = "out") -> dict[str, str]:
+    found = Path(folder).rglob("*.usd*")
+    return {str(path.relative_to(folder)): sha256(path) for path in found if path.is_file()}
+
+
+def animations(folder: str) -> dict[str, str]:
+    """Return what the shots hold, by their names; where they come from differs with the paths they were asked by."""
+    found = {}
+    for path in Path(folder).glob("shots/*/model/anim.usdc"):
+        layer = Sdf.Layer.OpenAsAnonymous(str(path))
+        layer.customLayerData = {}
+        found[path.parts[-3]] = layer.ExportToString()
+    return found
+
+
+def unfinished() -> list[Path]:
+    return [path for path in Path("out").rglob(".*") if "partial" in path.name]
+
+
+def test_a_bundle_runs_unchanged_with_openjd(farm):
+    """Twice: the second time everything is current."""
+    command = [
+        BIN / "openjd",
+        "run",
+        "bundle/template.json",
+        "-p",
+        f"Ssilk={BIN / 'ssilk'}",
+        "--timestamp-format",
+        "utc",
+    ]
+    for expected in ("largest error", "current: True"):
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout
+        assert "Session ended successfully" in done.stdout and expected in done.stdout
+        assert "openjd_progress: 100.0" in done.stdout and "openjd_status: bake b/model" in done.stdout
+    assert set(layers("bundle/layers")) == {
+        "assets/model/asset.usda", "assets/model/geometry.usdc",
+        *(f"shots/{shot}/{name}" for shot in SHOTS for name in ("shot.usda", "model/anim.usdc")),
+    }  # fmt: skip
+
+
+def test_bad_input_fails_its_task_alone_and_what_is_done_stays_done(farm, capsys):
+    whole = Path("b.usda").read_bytes()
+    Path("b.usda").write_bytes(whole[:300])
+    capsys.readouterr()
+    assert task("--openjd") == 4
+    said = capsys.readouterr().out
+    assert said.count("openjd_fail: b/model: error:") == 1 and "b.usda" in said and said.count("openjd_fail") == 1
+    assert Path("out/shots/a/model/anim.usdc").is_file() and Path("out/shots/c/model/anim.usdc").is_file()
+    assert not Path("out/shots/b/model/anim.usdc").exists() and not unfinished()
+    assert task("--check") == 3
+    Path("b.usda").write_bytes(whole)
+    before = Path("out/shots/a/model/anim.usdc").stat().st_mtime_ns
+    assert task() == 0 and task("--check") == 0
+    assert Path("out/shots/a/model/anim.usdc").stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize(("damage", "code"), [("missing", 3), ("changed", 3), ("half", 3)])
+def test_the_last_step_finds_what_is_not_as_it_was_written(farm, toy, capsys, damage, code):
+    assert task() == 0 and task("--check") == 0
+    path = Path("out/shots/b/model/anim.usdc")
+    if damage == "missing":
+        path.unlink()
+    elif damage == "changed":
+        toy.write_clip(farm / "b.usda", frames=5)
+    else:
+        path.write_bytes(path.read_bytes()[:500])
+    capsys.readouterr()
+    assert task("--check") == code
+    assert "1 of 3 tasks" in capsys.readouterr().err
+
+
+def test_killed_workers_lose_no_finished_shot_and_leave_no_half_file(farm):
+    """Killed again and again at other moments, then let through: the same bytes as of one undisturbed run."""
+    assert run("task bundle/job.json -o quiet --tasks 0-2") == 0 and run("task bundle/job.json -o quiet --check") == 0
+    finished: dict[Path, int] = {}
+    for delay in (0.8, 1.1, 1.4, 1.7):
+        worker = started("--tasks 0-2")
+        time.sleep(delay)
+        os.kill(worker.pid, signal.SIGKILL)
+        worker.communicate()
+        records = {path: path.stat().st_mtime_ns for path in Path("out").glob("shots/*/*/bake.json")}
+        assert finished.items() <= records.items()  # what was finished was not done again
+        assert all(sha256(path.with_name("anim.usdc")) == json.loads(path.read_text())["files"]["anim.usdc"]
+                   for path in records)  # fmt: skip
+        finished = records
+    assert task() == 0 and task("--check") == 0 and not unfinished()
+    assert layers("out") == layers("quiet")
+
+
+def test_a_cancelled_worker_stops_in_time_and_leaves_nothing_half_written(farm, toy):
+    toy.write_clip(farm / "a.usda", frames=1200)
+    worker = started("--tasks 0 --openjd")
+    assert worker.stdout is not None
+    for line in worker.stdout:
+        if line.startswith("openjd_progress"):
+            break
+    worker.send_signal(signal.SIGTERM)
+    said, _ = worker.communicate(timeout=30)
+    assert worker.returncode == 130 and "interrupted" in said and not unfinished()
+
+
+def test_a_job_runs_where_its_inputs_lie_elsewhere(farm):
+    (farm / "moved").mkdir()
+    for name in ("model.safetensors", "rigged.usda", "hero.usda", "a.usda"):
+        shutil.move(farm / name, farm / "moved" / name)
+    rules = [{"source_path_format": "POSIX", "source_path": str(farm), "destination_path": str(farm / "moved")}]
+    Path("rules.json").write_text(json.dumps({"version": "pathmapping-1.0", "path_mapping_rules": rules}))
+    assert task("--tasks 0") == 4
+    assert task("--tasks 0 --path-mapping rules.json") == 0
+
+
+def test_a_cluster_whose_workers_die_bakes_every_shot_once(farm, monkeypatch, capsys):
+    """Each worker dies at its first try of a task: before it, after its file is there, or with all of it done."""
+    ray = pytest.importorskip("ray")
+    assert run("task bundle/job.json -o quiet") == 0
+
+    def dying(job, folder):
+        from ssilk_core.cli.farm import bake_here
+
+        first = not (tried := folder.with_name(f"tried_{job.shot}")).exists()
+        tried.touch()
+        if first and job.shot == "a":
+            os.kill(os.getpid(), signal.SIGKILL)
+        detail = bake_here(job, folder)
+        if first and job.shot == "b":
+            (folder / "shots/b/model/bake.json").unlink()
+            os.kill(os.getpid(), signal.SIGKILL)
+        if "current" not in detail:
+            with folder.with_name("log").open("a") as log:
+                log.write(f"{job.name}\n")
+        if first and job.shot == "c":
+            os.kill(os.getpid(), signal.SIGKILL)
+        return detail
+
+    monkeypatch.setattr(farm_verb, "bake_here", dying)
+    Path("d.usda").write_text("no usd")
+    capsys.readouterr()
+    assert run(f"{WORDS} d.usda -o out --cluster") == 4
+    said = capsys.readouterr().err
+    assert said.count("d/model: error:") == 1 and "d.usda" in said
+    assert "failed: 1" in said and "baked: 2" in said and "current: 1" in said
+    assert sorted(Path("log").read_text().split()) == [f"{shot}/model" for shot in SHOTS]  # none lost, none twice
+    assert task("--check") == 0 and not ray.is_initialized()
+    assert animations("out") == animations("quiet") and set(animations("out")) == set(SHOTS)

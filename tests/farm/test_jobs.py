@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Jobs, records and bundles as files, and what Open Job Description's own model says of them."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from openjd.model import create_job, decode_job_template, preprocess_job_parameters
+
+from ssilk_core.errors import SsilkError
+from ssilk_core.events import Failed, Garment, Message, Progress, Started
+from ssilk_core.farm.job import numbers, read_job, write_job
+from ssilk_core.farm.openjd import BundleOptions, OpenJdReporter, template, write_bundle
+from ssilk_core.farm.record import INPUTS, NAME, Record, is_current, read_record, task_key, write_record
+from ssilk_core.farm.tasks import Task, plan
+from ssilk_core.files import sha256
+
+LIKE = Task(garment="", shot="", model="", stage="/s/hero.usd", motion="")
+TASK = replace(LIKE, garment="cape", shot="walk", model="/m/cape.safetensors", motion="/s/walk.usd")
+CONTENTS = dict.fromkeys(INPUTS, "0")
+SETTINGS = settings(max_examples=200, deadline=None, derandomize=True, database=None,
+                    suppress_health_check=[HealthCheck.function_scoped_fixture])  # fmt: skip
+
+
+def test_tasks_of_one_model_follow_each_other_and_a_character_has_one_body():
+    models = [("/m/cape.safetensors", "/World/Anna"), ("/m/hat.safetensors", "/World/Anna"),
+              ("/m/cape.safetensors", "/World/Bert")]  # fmt: skip
+    tasks = plan(models, ["a/01 walk.usd", "b/run.usd:/Clips/Fast"], LIKE)
+    assert [task.name for task in tasks] == [
+        f"{shot}/{garment}" for garment in ("Anna_cape", "Anna_hat", "Bert_cape") for shot in ("01_walk", "run_Fast")
+    ]
+    assert [task.body for task in tasks] == [True, True, False, False, True, True]
+
+
+@pytest.mark.parametrize(("models", "motions", "says"), [
+    (["a/x.safetensors", "b/x.safetensors"], ["w.usd"], "2 garments are named 'x'"),
+    (["x.safetensors"], ["a/w.usd", "b/w.usda"], "2 shots are named 'w'"),
+])  # fmt: skip
+def test_no_two_tasks_write_the_same_file(models, motions, says):
+    with pytest.raises(SsilkError, match=says):
+        plan([(model, None) for model in models], motions, LIKE)
+
+
+@pytest.mark.parametrize(("text", "expected"), [("0-3", [0, 1, 2, 3]), ("4", [4]), ("1,3-4", [1, 3, 4])])
+def test_numbers_of_tasks(text, expected):
+    assert numbers(text, 5) == expected
+
+
+@pytest.mark.parametrize("text", ["", "5", "3-1", "-1", "a", "0-", "1-99999999999999", "0x1"])
+def test_numbers_that_name_no_task(text):
+    with pytest.raises(SsilkError, match="--tasks"):
+        numbers(text, 5)
+
+
+def test_a_key_is_of_all_that_decides_what_is_written():
+    key = task_key(TASK, CONTENTS)
+    others = [task_key(replace(TASK, **{name: value}), CONTENTS) for name, value in (
+        ("fps", 24.0), ("samples", 2), ("target", "game4"), ("plain", True), ("body", False), ("points", True),
+        ("garment", "hat"), ("shot", "run"), ("refine", 1),
+    )]  # fmt: skip
+    others += [task_key(TASK, {**CONTENTS, name: "1"}) for name in INPUTS]
+    assert len({key, *others}) == len(others) + 1
+    assert task_key(replace(TASK, model="/elsewhere/cape.safetensors"), CONTENTS) == key
+
+
+def test_a_task_is_current_while_its_files_are_as_written(tmp_path):
+    (tmp_path / "anim.usdc").write_bytes(b"shot")
+    write_record(tmp_path, Record(key="k", files={"anim.usdc": sha256(tmp_path / "anim.usdc")}))
+    assert is_current(tmp_path, "k") and not is_current(tmp_path, "other")
+    (tmp_path / "anim.usdc").write_bytes(b"shut")
+    assert not is_current(tmp_path, "k")
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"key": 1}', '{"key": "k", "files": 3}', "[" * 100_000])
+def test_a_damaged_record_means_that_the_task_is_done_again(tmp_path, text):
+    (tmp_path / NAME).write_text(text)
+    assert read_record(tmp_path) is None and not is_current(tmp_path, "k")
+
+
+def test_a_job_reads_as_it_was_written_and_where_its_inputs_lie_now(tmp_path):
+    write_job(tmp_path / "job.json", [TASK, replace(TASK, shot="run", motion="/s/run.usd:/Clip", fps=24.0)])
+    assert read_job(tmp_path / "job.json")[0] == TASK
+    rules = [{"source_path_format": "POSIX", "source_path": "/s", "destination_path": "/farm/7"}]
+    (tmp_path / "rules.json").write_text(json.dumps({"version": "pathmapping-1.0", "path_mapping_rules": rules}))
+    mapped = read_job(tmp_path / "job.json", tmp_path / "rules.json")[1]
+    assert (mapped.model, mapped.stage, mapped.motion) == (
+        "/m/cape.safetensors", "/farm/7/hero.usd", "/farm/7/run.usd:/Clip")  # fmt: skip
+
+
+@pytest.mark.parametrize("change", [
+    {"garment": "../../etc"}, {"shot": "a/b"}, {"shot": ".."}, {"garment": ""}, {"model": 3}, {"samples": "2"},
+    {"unknown": 1}, {"fps": "24"}, {"shot": "/tmp"},
+])  # fmt: skip
+def test_a_job_cannot_name_files_elsewhere_or_values_of_other_types(tmp_path, change):
+    write_job(tmp_path / "job.json", [TASK])
+    document = json.loads((tmp_path / "job.json").read_text())
+    document["tasks"][0] |= change
+    (tmp_path / "job.json").write_text(json.dumps(document))
+    with pytest.raises(SsilkError, match="it is no job"):
+        read_job(tmp_path / "job.json")
+
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=6), inner, max_size=3),
+    max_leaves=6,
+)
+
+
+@SETTINGS
+@given(document=VALUES | st.fixed_dictionaries({"tasks": VALUES | st.lists(st.fixed_dictionaries(
+    dict.fromkeys(("garment", "shot", "model", "stage", "motion"), VALUES)), max_size=2)}))  # fmt: skip
+def test_any_json_is_a_job_or_one_sentence(tmp_path, document):
+    path = tmp_path / "job.json"
+    path.write_text(json.dumps(document))
+    try:
+        assert all(isinstance(task, Task) for task in read_job(path))
+    except SsilkError as error:
+        assert str(error).startswith(str(path)) and str(error).endswith(".")
+
+
+@pytest.mark.parametrize("gpu", [False, True])
+def test_a_template_passes_the_specification(gpu):
+    decoded = decode_job_template(
+        template=template(500, BundleOptions(chunk=7, seconds=60, gpu=gpu)), supported_extensions=["TASK_CHUNKING"]
+    )
+    values = preprocess_job_parameters(
+        job_template=decoded, job_parameter_values={}, job_template_dir=Path("/bundle"), current_working_dir=Path("/")
+    )
+    job = create_job(job_template=decoded, job_parameter_values=values)
+    assert values["Job"].value == "/bundle/job.json" and values["Output"].value == "/bundle/layers"
+    bake, check = job.steps
+    chunks = bake.parameterSpace.taskParameterDefinitions["Shots"].chunks
+    assert (int(chunks.defaultTaskCount), int(chunks.targetRuntimeSeconds)) == (7, 60)
+    assert str(bake.script.actions.onRun.cancelation.mode.value) == "NOTIFY_THEN_TERMINATE"
+    assert ("amount.worker.gpu" in {amount.name for amount in bake.hostRequirements.amounts}) == gpu
+    assert [dependency.dependsOn for dependency in check.dependencies] == ["Bake"]
+
+
+def test_a_bundle_names_the_files_that_it_takes_and_gives(tmp_path):
+    write_bundle(tmp_path, [TASK], tmp_path / "out", BundleOptions())
+    assets = json.loads((tmp_path / "asset_references.json").read_text())["assetReferences"]
+    assert assets["inputs"]["filenames"] == ["/m/cape.safetensors", "/s/hero.usd", "/s/walk.usd"]
+    assert assets["outputs"]["directories"] == [str(tmp_path / "out")]
+    values = json.loads((tmp_path / "parameter_values.json").read_text())["parameterValues"]
+    assert values == [{"name": "Output", "value": str(tmp_path / "out")}]
+
+
+def test_what_sessions_read_of_a_worker():
+    stream = io.StringIO()
+    report = OpenJdReporter(stream)
+    for event in (
+        Garment("walk/cape", Started("bake", 1)), Progress(1, 8), Progress(1, 8), Progress(8, 8),
+        Message("mind this", "warning"), Garment("walk/cape", Failed("x: bad.")),
+    ):  # fmt: skip
+        report(event)
+    assert stream.getvalue().splitlines() == [
+        "openjd_status: bake walk/cape", "openjd_progress: 12.5", "openjd_progress: 100.0", "warning: mind this",
+        "openjd_fail: walk/cape: error: x: bad.",
+    ]  # fmt: skip
