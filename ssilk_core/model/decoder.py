@@ -103,7 +103,7 @@ class Decoder(nn.Module):
         return activation, rotation_from_six_d(six_d)
 
     def _split(self, output: Tensor) -> tuple[Tensor, Tensor]:
-        delta = output[:, self.given :].T.reshape(self.proxy_count, 6, len(output))
+        delta = output[:, self.given :].T.reshape(self.proxy_count, 6, output.shape[0])
         activation = torch.tanh(output[:, : self.given].T)
         return self.readout @ activation if self.is_reduced else activation, self.identity[:, None] + delta
 

@@ -119,9 +119,9 @@ class SpringVerlet(Verlet):
         away = -self.alpha * (now - rest) - self.beta * velocity
         seen = torch.cat([now, self.velocity_scale * velocity, self.distance_scale * away, pose], dim=1)
         nothing = torch.zeros_like(rest)
-        still = torch.cat([pose[:, : pose.shape[1] - self.rates], pose.new_zeros(len(pose), self.rates)], dim=1)
+        still = torch.cat([pose[:, : pose.shape[1] - self.rates], pose.new_zeros(pose.shape[0], self.rates)], dim=1)
         calm = torch.cat([rest, nothing, nothing, still], dim=1)
-        moved, held = stepper(torch.cat([seen, calm])).clamp(-self.most, self.most).chunk(2)
+        moved, held = stepper(torch.cat([seen, calm])).clamp(-self.most, self.most).unflatten(0, (2, -1))
         pull = self.config.stiffness * torch.sigmoid(self.share) * away
         return rest - away + limited(pull + self.reach * (moved - held), self.config.push)
 

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from ..assets import Deformer, Floats, GarmentPose, Scene, SkinWeights
 from ..config import ModelConfig
 from ..kinematics import matrix_from_quaternion, quaternion_from_matrix
+from ..parameters import descriptor_sizes
 from .decoder import Decoder
 from .descriptors import joints_in_view
 from .integrators import INTEGRATORS
@@ -50,7 +51,7 @@ class GarmentModel(nn.Module):
         self.scene, self.config, self.joints = scene, config, np.asarray(joints, dtype=np.int64)
         generator = torch.Generator().manual_seed(seed)
         self.decoder = Decoder(scene, config.shapes, generator, config.activations)
-        static, dynamic = self._descriptor_sizes()
+        static, dynamic = descriptor_sizes(scene, self.joints)
         z = config.latent
         self.initialiser = mlp(static, config.widths, z, generator, 1.0)
         # Zero: training starts as pure Verlet integration.
@@ -59,10 +60,6 @@ class GarmentModel(nn.Module):
         self.stepper = mlp(seen, config.widths, z, generator, 0.0, bias)
         # Small: training starts as plain skinning.
         self.output = mlp(z, config.widths, self.decoder.output_count, generator, 0.01)
-
-    def _descriptor_sizes(self) -> tuple[int, int]:
-        inner = int((self.scene.character.skeleton.parents[self.joints] >= 0).sum())
-        return 6 * inner + 3 * len(self.joints), 12 * inner + 12 + 3 * len(self.joints)
 
     def initial(self, static: Tensor) -> Tensor:
         """Return quasi-static latents (N, latent) from static descriptors (Eq. 1)."""
