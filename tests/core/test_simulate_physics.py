@@ -127,6 +127,28 @@ def test_the_error_in_time_is_of_first_order(scene) -> None:
     assert errors[1] / errors[2] == pytest.approx(2, abs=0.15)
 
 
+def bounced(scene: Scene, toy_grid, dt: float, seconds: float) -> np.ndarray:
+    """Kinetic and elastic energy [J] of a strip that was drawn out by a twentieth and let go, step by step."""
+    points, faces = toy_grid(5, 2)
+    potential = Potential(dressed(scene, points, faces, points[:, 1] > -1e-9), CALM, device=CPU)
+    x0 = tensor(points * [1.0, 1.05, 1.0])
+    path = advance(potential, x0, torch.zeros(3, 1), dt, round(seconds / dt), gravity=0.0)
+    speed = path.diff(dim=-1) / dt
+    kinetic = (0.5 * potential.mass * (speed * speed).sum(1)).sum(0)
+    return (kinetic + potential.membrane.energy(path[..., 1:])).numpy()
+
+
+def test_energy_never_grows_and_less_is_lost_with_shorter_steps(scene, toy_grid) -> None:
+    start = None
+    left = []
+    for dt in (1 / 120, 1 / 360, 1 / 1080):
+        energy = bounced(scene, toy_grid, dt, 0.1)
+        start = energy[0] if start is None else start
+        assert (np.diff(energy) <= 1e-9 * energy[0]).all() and energy[-1] > 0
+        left.append(energy[-1] / start)
+    assert left[0] < left[1] < left[2] and left[0] < 0.5 < left[2]
+
+
 def test_drag_only_decays_motion(scene, toy_grid) -> None:
     points, faces = toy_grid(5, 3)
     fabric = replace(CALM, drag=0.6)
@@ -151,6 +173,20 @@ def test_a_batch_of_shots_equals_one_by_one(scene, toy_motion) -> None:
     for motion, points in zip(motions, together):
         (alone,) = simulate(scene, CLOTH, [motion], SHORT)
         np.testing.assert_allclose(points, alone, atol=2e-5)
+
+
+def test_more_substeps_approach_a_limit_at_first_order(scene, toy_motion) -> None:
+    motion = toy_motion(scene, 4)
+    quiet = replace(CLOTH, bending=0.05, drag=2.0)  # stiff and slow enough not to buckle one way or the other
+    found = [simulate(scene, quiet, [motion], replace(SHORT, substeps=n))[0][-1] for n in (1, 2, 4)]
+    steps = [float(np.sqrt(((a - b) ** 2).sum(-1).mean())) for a, b in pairwise(found)]
+    assert steps[1] > 1e-4 and steps[0] / steps[1] > 1.5
+
+
+def test_progress_counts_every_frame_of_every_shot(scene, toy_motion) -> None:
+    told: list = []
+    simulate(scene, CLOTH, [toy_motion(scene, 3), toy_motion(scene, 2)], SHORT, report=told.append)
+    assert [(event.done, event.total) for event in told] == [(n, 5) for n in range(1, 6)]
 
 
 def test_pinned_vertices_are_skinned_plainly(scene, toy_motion) -> None:
