@@ -25,6 +25,7 @@ from .checkpoint import ModelFile, save_model
 from .runtime import Player
 from .runtime.playback import BLOCK
 
+POINT = 12  # bytes of a vertex in a point cache
 SECONDS, FEWEST = 0.6, 3  # to measure for at least, and passes over the motion
 
 

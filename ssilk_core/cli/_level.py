@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ssilk_core.assets import GarmentPose
 from ssilk_core.checkpoint import ModelFile, load_model
-from ssilk_core.cost import ShotBytes
+from ssilk_core.cost import POINT, ShotBytes
 from ssilk_core.errors import need
 from ssilk_core.events import Reporter
 from ssilk_core.quality import quality_named
@@ -48,7 +48,7 @@ def levelled(bake: Bake, options: argparse.Namespace, report: Reporter) -> Bake:
             return size.of(at_rate.motion.frame_count)
 
         size = spent(options.budget, reducer, size, bake.source, weight, report).size
-    return open_bake(replace(request, keep=str(size)))
+    return open_bake(replace(request, keep="" if size == reducer.whole else str(size)))
 
 
 def shot_bytes(bake: Bake, suffix: str, *, body: bool) -> ShotBytes:
@@ -56,7 +56,8 @@ def shot_bytes(bake: Bake, suffix: str, *, body: bool) -> ShotBytes:
     few, many = (min(count * bake.request.samples, bake.motion.frame_count) for count in EXCERPTS)
     first, second = (_excerpt_bytes(bake, count, suffix, body) for count in (few, many))
     frame = (second - first) / max(many - few, 1)
-    return ShotBytes(second - frame * many, frame)
+    points = POINT * bake.deformer.scene.garment.mesh.vertex_count if bake.as_points else 0
+    return ShotBytes(second - frame * many, frame + points)
 
 
 def _excerpt_bytes(bake: Bake, frames: int, suffix: str, body: bool) -> int:

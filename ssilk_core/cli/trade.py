@@ -59,6 +59,12 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     if options.output:
         need(options.output.suffix == ".json", str(options.output), "not a name for figures", "it ends in .json")
         shared.check_output(options.output, *options.models)
+    need(
+        options.stage.is_file(),
+        str(options.stage),
+        "there is no such file",
+        "a USD stage with the character is needed",
+    )
     bench = Bench(options)
     results = Results(options.output, bench.asked)
     results.resume(report)

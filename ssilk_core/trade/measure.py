@@ -12,7 +12,7 @@ import numpy as np
 
 from ..assets import Motion
 from ..checkpoint import ModelFile, network
-from ..cost import ShotBytes, Time, memory, model_bytes, operations, play_time
+from ..cost import POINT, ShotBytes, Time, memory, model_bytes, operations, play_time
 from ..evaluation.methods import Dressed, Method, Reel
 from ..evaluation.record import recorded
 from ..evaluation.tally import Tally
@@ -21,11 +21,10 @@ from ..reduction import Reducer, Size
 from ..rollout import decode, garment_poses
 from ..runtime import Player
 from .played import Played
-from .point import Point
+from .point import SECONDS, Point
 from .variants import Variant
 
 HALVES = ("float16", "bfloat16")  # two bytes on disk for each parameter
-POINT = 12  # bytes of a vertex in a point cache
 
 
 Weigh = Callable[[ModelFile, float], ShotBytes]
@@ -72,8 +71,7 @@ class Meter:
             operations=sum(operations(cut).values()),
             memory=memory(player),
             model_bytes=_bytes(cut, variant.precision),
-            shot_bytes=shot.frame * variant.fps,
-            asset_bytes=shot.asset,
+            shot_bytes=shot.of(round(SECONDS * variant.fps)),
             total=total,
             excess=total - float(self.base),
             collisions=tally.mean("collisions"),

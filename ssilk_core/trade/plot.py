@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..files import replacing
-from .point import Point, front
+from .point import SECONDS, Point, front
 
 if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
@@ -20,7 +20,7 @@ COLOURS = ("#2c3e50", "#2980b9", "#27ae60", "#8e44ad", "#d68910", "#16a085", "#7
 GRID, TEXT, FRONT = "#e4e4e4", "#444444", "#c9c9c9"
 COSTS = {
     "milliseconds": ("ms a frame", 1.0),
-    "shot_bytes": ("kB of shot a second", 1e-3),
+    "shot_bytes": (f"MB of a shot of {SECONDS} s", 1e-6),
     "model_bytes": ("MB of model", 1e-6),
 }
 ERRORS = {"position": ("RMS from the whole model [mm]", 1e3), "excess": ("excess energy [J]", 1.0)}
@@ -90,23 +90,22 @@ def _legend(pen: ImageDraw, colours: dict[str, str]) -> None:
 def _panel(
     pen: ImageDraw, corner: tuple[int, int], points: Sequence[Point], cost: str, error: str, colours: dict[str, str]
 ) -> None:
-    """Draw one cost against one error."""
+    """Draw one cost against one error; what the solver refined lies beyond, at the edge."""
     (name, unit), (title, scale) = COSTS[cost], ERRORS[error]
-    places = {id(p): (unit * getattr(p, cost), max(LEAST[error], scale * getattr(p, error))) for p in points}
-    x = Axis.over([place[0] for place in places.values()], corner[0], WIDTH)
-    y = Axis.over([place[1] for place in places.values()], corner[1] + HEIGHT, -HEIGHT)
+    places = [(unit * getattr(p, cost), max(LEAST[error], scale * getattr(p, error))) for p in points]
+    shown = [place for place, point in zip(places, points) if not point.refine] or places
+    x = Axis.over([place[0] for place in shown], corner[0], WIDTH)
+    y = Axis.over([place[1] for place in shown], corner[1] + HEIGHT, -HEIGHT)
     _grid(pen, x, y, corner, f"{title} over {name}")
-    best = front(points, cost, error)
-    line = [(x.place(places[id(p)][0]), y.place(places[id(p)][1])) for p in best]
-    pen.line(line, fill=FRONT, width=4)
-    for point in points:
-        across, down = x.place(places[id(point)][0]), y.place(places[id(point)][1])
-        marked = point in best
-        radius = 6 if marked else 4
-        pen.ellipse((across - radius, down - radius, across + radius, down + radius), fill=colours[point.swept],
-                    outline="black" if marked else None)  # fmt: skip
-        if marked or point.swept == "level":
-            pen.text((across + 8, down - 15), point.variant, fill=colours[point.swept], font=_font(11))
+    best = front(places)
+    pen.line([(x.place(places[index][0]), y.place(places[index][1])) for index in best], fill=FRONT, width=4)
+    for index, (point, place) in enumerate(zip(points, places)):
+        across, down = x.place(place[0]), y.place(place[1])
+        colour, radius = colours[point.swept], 6 if index in best else 4
+        pen.ellipse((across - radius, down - radius, across + radius, down + radius), fill=colour,
+                    outline="black" if index in best else None)  # fmt: skip
+        if index in best or point.swept == "level" or point.refine:
+            pen.text((across + 8, down - 15), point.variant, fill=colour, font=_font(11))
 
 
 def _grid(pen: ImageDraw, x: Axis, y: Axis, corner: tuple[int, int], title: str) -> None:

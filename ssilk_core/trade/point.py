@@ -5,7 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from operator import attrgetter
+
+SECONDS = 10  # of the shots whose bytes are compared
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,8 +19,7 @@ class Point:
         milliseconds, high: of a frame of the shot on the processor, numpy runtime: median and 95 % quantile.
         torch: milliseconds of a frame of the network and decoder in PyTorch, on the device; None if not measured.
         operations: multiply-adds of a frame; memory: bytes held.
-        model_bytes: of the model's file; shot_bytes: of a second of the shot; asset_bytes: of the shot before its
-            first frame.
+        model_bytes: of the model's file; shot_bytes: of a shot of `SECONDS`, garment and skeleton.
         total: the paper's L_tot [J]; excess: over what it is compared with [J].
         collisions: share of the vertices inside the body.
         position, velocity: RMS errors against the whole model [m], [m/s].
@@ -41,7 +41,6 @@ class Point:
     memory: int
     model_bytes: int
     shot_bytes: float
-    asset_bytes: float
     total: float
     excess: float
     collisions: float
@@ -49,13 +48,10 @@ class Point:
     velocity: float
 
 
-COSTS = ("milliseconds", "shot_bytes", "model_bytes")
-
-
-def front(points: Sequence[Point], cost: str, error: str = "position") -> list[Point]:
-    """Return the points that no other equals at less cost or beats at equal cost, the cheapest first (Pareto)."""
-    best: list[Point] = []
-    for point in sorted(points, key=attrgetter(cost, error)):
-        if not best or getattr(point, error) < getattr(best[-1], error):
-            best.append(point)
+def front(places: Sequence[tuple[float, float]]) -> list[int]:
+    """Return which of some (cost, error) no other equals at less cost or beats at equal cost, the cheapest first."""
+    best: list[int] = []
+    for index in sorted(range(len(places)), key=places.__getitem__):
+        if not best or places[index][1] < places[best[-1]][1]:
+            best.append(index)
     return best

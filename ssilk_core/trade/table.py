@@ -6,18 +6,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ..evaluation.tables import aligned
-from .point import COSTS, Point, front
+from .point import SECONDS, Point, front
 
 HEADER = ("model", "swept", "variant", "size", "ms a frame", "95 %", "PyTorch", "memory [MB]", "model [MB]",
-          "shot [kB/s]", "+ [MB]", "total [J]", "excess [J]", "inside", "RMS [mm]", "velocity [mm/s]",
+          f"{SECONDS} s shot [MB]", "total [J]", "excess [J]", "inside", "RMS [mm]", "velocity [mm/s]",
           "best at")  # fmt: skip
-MARKS = dict(zip(COSTS, ("time", "shot", "model")))
+MARKS = {"milliseconds": "time", "shot_bytes": "shot", "model_bytes": "model"}
 
 
 def table(points: Sequence[Point]) -> str:
     """Return a line for each point; "best at" says for which costs no other is nearer to the whole model."""
-    fronts = {mark: {id(point) for point in front(points, cost)} for cost, mark in MARKS.items()}
-    rows = [_cells(point, [mark for mark, best in fronts.items() if id(point) in best]) for point in points]
+    best = {mark: front([(getattr(p, cost), p.position) for p in points]) for cost, mark in MARKS.items()}
+    rows = [_cells(point, [mark for mark, own in best.items() if row in own]) for row, point in enumerate(points)]
     return aligned(HEADER, rows, 3)
 
 
@@ -32,8 +32,7 @@ def _cells(p: Point, best: list[str]) -> list[str]:
         "" if p.torch is None else f"{p.torch:.3g}",
         f"{p.memory / 1e6:.3g}",
         f"{p.model_bytes / 1e6:.3g}",
-        f"{p.shot_bytes / 1e3:.3g}",
-        f"{p.asset_bytes / 1e6:.2g}",
+        f"{p.shot_bytes / 1e6:.3g}",
         f"{p.total:.4g}",
         f"{p.excess:+.3g}",
         f"{p.collisions:.2%}",
