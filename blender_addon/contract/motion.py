@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 from pxr import Gf, Usd, UsdGeom, UsdSkel, Vt
@@ -12,8 +13,8 @@ from .names import joint_paths
 from .write import matrices
 
 
-def write_motion(path: Path, joints: Joints, motion: Motion) -> None:
-    """Write a motion of the character's joints; frames become time codes.
+def write_motion(path: Path, joints: Joints, motion: Motion) -> Iterator[float]:
+    """Write a motion of the character's joints, yielding the part that is done; frames become time codes.
 
     Args:
         path: the file to make: .usdc, .usd or .usda.
@@ -30,8 +31,9 @@ def write_motion(path: Path, joints: Joints, motion: Motion) -> None:
     stage.SetDefaultPrim(animation.GetPrim())
     animation.CreateJointsAttr(Vt.TokenArray(joint_paths(joints.names, joints.parents)))
     animation.CreateScalesAttr(Vt.Vec3hArray(len(joints.names), Gf.Vec3h(1)))
-    for frame, transforms in enumerate(to_parents(motion.worlds, joints.parents), motion.start):
-        translations, rotations, _ = UsdSkel.DecomposeTransforms(matrices(transforms))
-        animation.GetTranslationsAttr().Set(translations, frame)
-        animation.GetRotationsAttr().Set(rotations, frame)
+    for done, worlds in enumerate(motion.worlds):
+        translations, rotations, _ = UsdSkel.DecomposeTransforms(matrices(to_parents(worlds, joints.parents)))
+        animation.GetTranslationsAttr().Set(translations, motion.start + done)
+        animation.GetRotationsAttr().Set(rotations, motion.start + done)
+        yield done / len(motion.worlds)
     stage.GetRootLayer().Save()

@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 import os
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
 
-from ..contract.arrays import Joints
 from ..errors import SetupError, need
 from ..outside.work import Work
 from ..preferences import interpreter, preferences, unready
@@ -21,7 +22,7 @@ from ..scene.handover import STAGE, expose_usd, hand_over
 from ..scene.models import model_of
 from ..scene.motions import TIMELINE, Source
 from ..scene.objects import found_again
-from ..scene.sampling import Take, need_company, prepare_takes, sample, scene_rate
+from ..scene.sampling import need_company, prepare_takes, sample, scene_rate
 from . import tasks
 from .reporting import ReportingOperator
 
@@ -87,15 +88,23 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
         self.shot = usd_path(garment, self.filepath) if self.to_usd else None
         self.python = interpreter(preferences(context))
         self.character = character_joints(joints)
-        return Work(f"Baking '{garment.name}'", self.commands, parent=bpy.app.tempdir,
-                    steps=sample(armature, self.character, [self.take]))  # fmt: skip
+        return Work(f"Baking '{garment.name}'", self.commands, parent=bpy.app.tempdir, steps=self.steps())
+
+    def steps(self) -> Iterator[float]:
+        """Sample the timeline, then write it."""
+        _, armature = self.things()
+        yield from sample(armature, self.character, [self.take])
+        expose_usd()
+        from ..contract.motion import write_motion
+
+        yield from write_motion(self.work.folder / MOTION, self.character, self.take.motion())
 
     def commands(self, folder: Path) -> list[list[str]]:
         """Write what is baked from; return the command."""
         garment, armature = self.things()
         need_company(garment, armature, self.take)
         inputs = inputs_folder(self.model)
-        write_motion_of(inputs / MOTION, self.character, self.take)
+        shutil.copyfile(folder / MOTION, inputs / MOTION)
         stage = self.model.parent / STAGE
         if self.dressed:
             hand_over(self.dressed, garment, armature, inputs)
@@ -176,14 +185,6 @@ def inputs_folder(model: Path) -> Path:
         raise SetupError(f"{folder} cannot be made ({error.strerror or error}); move the model.") from error
     need(os.access(folder, os.W_OK), f"Nothing can be written into {folder}; move the model.")
     return folder
-
-
-def write_motion_of(path: Path, joints: Joints, take: Take) -> None:
-    """Write what was sampled."""
-    expose_usd()
-    from ..contract.motion import write_motion
-
-    write_motion(path, joints, take.motion())
 
 
 CLASSES = (Bake, RemoveBake)

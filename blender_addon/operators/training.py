@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+import shutil
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import bpy
@@ -12,7 +13,7 @@ import numpy as np
 from bpy.props import CollectionProperty, IntProperty, StringProperty
 
 from ..classes import LOOSE
-from ..contract.arrays import Dressed
+from ..contract.arrays import Dressed, Joints
 from ..contract.names import identifiers
 from ..errors import need
 from ..fabric_properties import fabric_options
@@ -138,16 +139,27 @@ class Train(tasks.OutsideOperator, bpy.types.Operator):
         self.takes = prepare_takes(armature, [source_of(item) for item in chosen if item.kind != FILE])
         self.files = [Path(bpy.path.abspath(item.name)) for item in chosen if item.kind == FILE]
         self.uids = (garment.session_uid, armature.session_uid)
-        joints = character_joints(self.dressed.joints)
-        return Work(f"Sampling motions for '{garment.name}'", lambda _: (), parent=bpy.app.tempdir,
-                    steps=sample(armature, joints, self.takes))  # fmt: skip
+        title, steps = f"Sampling motions for '{garment.name}'", self.steps()
+        return Work(title, lambda _: (), parent=bpy.app.tempdir, steps=steps)
 
-    def finish(self, context: bpy.types.Context, _: Work) -> str:
+    def steps(self) -> Iterator[float]:
+        """Sample the motions, then write them."""
+        _, armature = self.things()
+        joints = character_joints(self.dressed.joints)
+        yield from sample(armature, joints, self.takes)
+        yield from write_takes(self.work.folder / MOTIONS, joints, self.takes)
+
+    def things(self) -> tuple[bpy.types.Object, bpy.types.Object]:
+        """Return the garment and its armature; raise `SetupError` if one was deleted."""
+        garment, armature = (found_again(uid, self.dressed.garment.name) for uid in self.uids)
+        return garment, armature
+
+    def finish(self, context: bpy.types.Context, work: Work) -> str:
+        garment, armature = self.things()
         name = self.dressed.garment.name
-        garment, armature = (found_again(uid, name) for uid in self.uids)
         folder = jobs.create(Path(bpy.data.filepath).parent / "ssilk", identifiers([name])[0])
         prim = hand_over(self.dressed, garment, armature, folder).prims[name]
-        write_takes(folder / MOTIONS, self.dressed, self.takes)
+        shutil.move(work.folder / MOTIONS, folder / MOTIONS)
         command = train_command(garment, prim, self.takes, [beside(path, folder) for path in self.files])
         jobs.begin(interpreter(preferences(context)), folder, command)
         begun.add(folder)
@@ -239,14 +251,14 @@ def need_trainable(garment: bpy.types.Object, armature: bpy.types.Object, dresse
     need_bakeable(garment, armature, dressed.joints)
 
 
-def write_takes(folder: Path, dressed: Dressed, takes: Sequence[Take]) -> None:
-    """Write sampled motions into a new folder, a file each."""
+def write_takes(folder: Path, joints: Joints, takes: Sequence[Take]) -> Iterator[float]:
+    """Write sampled motions into a new folder, a file each, yielding the part of each that is done."""
     expose_usd()
     from ..contract.motion import write_motion
 
     folder.mkdir()
     for name, take in zip(file_names(takes), takes):
-        write_motion(folder / name, character_joints(dressed.joints), take.motion())
+        yield from write_motion(folder / name, joints, take.motion())
 
 
 def file_names(takes: Sequence[Take]) -> list[str]:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from .events import Event, parse
 from .process import Process
 
 Command = Sequence[str]
+SLICE = 0.04  # seconds that Blender waits for steps at a time
 
 
 class Work:
@@ -41,7 +43,7 @@ class Work:
         Args:
             commands: writes what the commands read, and returns them; the folder goes if it raises.
             parent: where the folder is made; the system's place for temporary files when empty.
-            steps: are done in this process first, one in each `poll`; they yield the part that is done.
+            steps: are done in this process first, for a moment in each `poll`; they yield the part that is done.
             rephrase: turns messages into words for people, without the folder's paths.
         """
         self.title, self.text, self.error = title, "", ""
@@ -61,7 +63,7 @@ class Work:
             raise
 
     def poll(self) -> bool:
-        """Do the next step, or take in what was said meanwhile; return whether everything has ended."""
+        """Do some steps, or take in what was said meanwhile; return whether everything has ended."""
         if self._steps is not None:
             self._step(self._steps)
         if self._process is None:
@@ -88,13 +90,15 @@ class Work:
         self._temporary.cleanup()
 
     def _step(self, steps: Iterator[float]) -> None:
-        """Do the next step; after the last one start the commands."""
+        """Do steps for a moment; after the last one start the commands."""
+        until = time.monotonic() + SLICE
         try:
             need(not self.cancelled, f"{self.title} was cancelled.")
-            self.fraction = next(steps, None)
-            if self.fraction is None:
-                self._steps = None
-                self._begin()
+            for self.fraction in steps:
+                if time.monotonic() >= until:
+                    return
+            self._steps = self.fraction = None
+            self._begin()
         except SetupError as error:
             self._steps, self.error = None, str(error)
 

@@ -6,7 +6,10 @@ from __future__ import annotations
 import sys
 import time
 
+import pytest
+
 from blender_addon.errors import SetupError
+from blender_addon.outside import work as works
 from blender_addon.outside.work import Work
 
 
@@ -16,6 +19,12 @@ def steps(done: list[int], *, failing: bool = False):
             raise SetupError("'Rig' was deleted meanwhile; nothing was changed.")
         done.append(number)
         yield number / 3
+
+
+@pytest.fixture(autouse=True)
+def no_time(monkeypatch):
+    """Let each look last for one step alone."""
+    monkeypatch.setattr(works, "SLICE", -1.0)
 
 
 def test_one_step_is_done_at_each_look_and_commands_follow():
@@ -54,4 +63,12 @@ def test_steps_end_when_work_is_cancelled():
     work.cancel()
     assert work.poll()
     assert (done, work.error) == ([0], "Testing was cancelled.")
+    work.close()
+
+
+def test_steps_that_take_no_time_are_done_at_one_look(monkeypatch):
+    monkeypatch.setattr(works, "SLICE", 10.0)
+    done: list[int] = []
+    work = Work("Testing", lambda _: (), steps=steps(done))
+    assert (work.poll(), done, work.fraction) == (True, [0, 1, 2], None)
     work.close()
