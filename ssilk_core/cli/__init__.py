@@ -16,6 +16,7 @@ from . import (
     bake,
     demo,
     evaluate,
+    export,
     farm,
     inspect,
     reduce,
@@ -37,6 +38,7 @@ VERBS = (
     train,
     wardrobe,
     reduce,
+    export,
     bake,
     simulate,
     evaluate,
@@ -57,6 +59,7 @@ EXTRAS = {
     "train": "train",
     "wardrobe": "train",
     "reduce": "usd",
+    "export": "export",
     "bake": "bake",
     "simulate": "train",
     "evaluate": "train",
@@ -69,7 +72,7 @@ EXTRAS = {
     "task": "bake",
     "demo": "all",
 }
-OPTIONAL = ("torch", "pxr", "igl", "scipy", "trimesh", "embreex", "imageio_ffmpeg", "PIL", "ray")
+OPTIONAL = ("torch", "pxr", "igl", "scipy", "trimesh", "embreex", "imageio_ffmpeg", "PIL", "ray", "onnxscript")
 
 
 class Parser(argparse.ArgumentParser):

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Write a trained model's network as ONNX, for engines that play it themselves.
+
+One call is one frame of any number of characters. It takes the latents of the two frames before, the descriptors of
+the pose (static ones and rates, as ssilk_core/descriptors.py has them) and whether the garment begins there; it
+gives the new latents, the weights of the blendshapes and the local rotations of the proxy joints, as shots hold them.
+Blendshapes and skinning weights are those of any baked shot.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from ssilk_core.errors import EXIT_OK, need
+from ssilk_core.events import Reporter, Result
+
+from . import options as shared
+
+
+def add_arguments(verb: argparse.ArgumentParser) -> None:
+    """Add the options of this verb."""
+    verb.add_argument("model", type=Path, help="model written by 'ssilk train'")
+    verb.add_argument("-o", "--output", type=Path, required=True, help="file to write (.onnx)")
+
+
+def run(options: argparse.Namespace, report: Reporter) -> int:
+    """Write the network; say what goes in and comes out."""
+    from ssilk_core.checkpoint import load_model, network
+    from ssilk_core.model.export import export_onnx
+    from ssilk_core.parameters import descriptor_sizes
+
+    output: Path = options.output
+    need(output.suffix == ".onnx", str(output), f"a file that ends in '{output.suffix}'", "ONNX files end in .onnx")
+    shared.check_output(output, options.model)
+    file = load_model(options.model)
+    model = network(file)
+    export_onnx(model, output)
+    static, rates = descriptor_sizes(file.scene, file.joints)
+    report(
+        Result(
+            "export",
+            {
+                "network": str(output),
+                "latents": file.config.latent,
+                "static descriptors": static,
+                "dynamic descriptors": rates,
+                "weights": file.config.shapes + model.decoder.has_constant,
+                "proxies": file.scene.rig.proxy_count,
+                "frames per second": file.config.fps,
+                "bytes": output.stat().st_size,
+            },
+        )
+    )
+    return EXIT_OK

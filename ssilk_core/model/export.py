@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The network as one ONNX graph, for engines: a frame in, what bones and blendshapes do out."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from ..files import replacing
+from ..parameters import descriptor_sizes
+from .network import GarmentModel
+
+OPSET = 18
+INPUTS = ("before", "now", "static", "rates", "begins")
+OUTPUTS = ("state", "weights", "rotations")
+
+
+class FrameNetwork(nn.Module):
+    """One frame of a garment in N characters; what deforms the mesh is outside, for engines skin by themselves."""
+
+    above: Tensor
+    own: Tensor
+
+    def __init__(self, model: GarmentModel) -> None:
+        super().__init__()
+        self.model = model
+        joints, bind = model.scene.character.skeleton.joint_count, model.scene.bind_transforms[:, :3, :3]
+        self.register_buffer("above", torch.tensor(bind[model.scene.rig.parents]).float())
+        self.register_buffer("own", torch.tensor(bind[joints:]).float())
+
+    def forward(
+        self, before: Tensor, now: Tensor, static: Tensor, rates: Tensor, begins: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the new latents (N, latent), and weights (N, K + 1) and local proxy rotations (N, P, 3, 3) of files.
+
+        Args:
+            before, now: the two latents before this frame, (N, latent).
+            static: static descriptors, gravity in each joint's frame included (N, S); rates: dynamic ones (N, R).
+            begins: whether the garment is at rest in this frame, as in the first two of a shot (N, 1), bool.
+        """
+        model = self.model
+        rest = model.initial(static)
+        z = torch.where(begins, rest, model.step(before, now, rest, torch.cat([static, rates], dim=1)))
+        activation, rotations = model.pose(z)
+        weights = (activation.T + 1) / 2
+        if model.decoder.has_constant:
+            weights = torch.cat([weights, torch.ones_like(z[:, :1])], dim=1)
+        local = self.above.mT @ rotations.permute(3, 0, 1, 2) @ self.own
+        return z, weights.clamp(0, 1), local
+
+
+def export_onnx(model: GarmentModel, path: str | Path) -> None:
+    """Write the network as ONNX, whole or not at all; batches of any size are its first dimension."""
+    network, config = FrameNetwork(model).eval(), model.config
+    static, rates = descriptor_sizes(model.scene, model.joints)
+    sizes = (config.latent, config.latent, static, rates)
+    frame = (*(torch.zeros(3, size) for size in sizes), torch.zeros(3, 1, dtype=torch.bool))
+    characters = torch.export.Dim("characters", min=1)
+    shapes = {name: {0: characters} for name in INPUTS}
+    with replacing(path) as temporary, _quietly():
+        program = torch.onnx.export(
+            network, frame, dynamo=True, input_names=INPUTS, output_names=OUTPUTS, dynamic_shapes=shapes,
+            opset_version=OPSET, verbose=False,
+        )  # fmt: skip
+        assert program is not None  # only the older exporter gives nothing
+        program.save(temporary, external_data=False)
+
+
+@contextmanager
+def _quietly() -> Iterator[None]:
+    """Keep back what the exporter says of its own insides."""
+    log = logging.getLogger("torch.onnx")
+    level = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        log.setLevel(level)
