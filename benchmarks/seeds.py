@@ -27,6 +27,7 @@ def evaluated(options: argparse.Namespace) -> list[Row]:
         path = Path(folder) / "figures.json"
         plain = ("--stops", 0), ("--loop", 0), ("--output", path)
         asked = ["evaluate", *options.models, *(word for pair in (*given, *plain) for word in pair)]
+        asked += ["--exact"] if options.exact else []
         with redirect_stdout(StringIO()):  # its own tables
             code = ssilk([str(word) for word in asked])
         if code:

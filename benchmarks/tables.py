@@ -129,6 +129,7 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--motions", type=Path, required=True, metavar="FOLDER", help="folder of motion files")
     parser.add_argument("--index", type=Path, help="JSON list of clips with their splits and tags")
     parser.add_argument("--reference", type=Path, metavar="SHOTS", help="folder of the simulator's shots")
+    parser.add_argument("--exact", action="store_true", help="collide with the whole body, as the simulator does")
     parser.add_argument("--sequence", type=int, metavar="FRAMES", help="start clips anew after so many (paper: 512)")
     parser.add_argument("--clip", default="49_08a", help="clip of table3 (default 49_08a)")
     parser.add_argument("--frames", type=int, default=1000, help="that table3 times (default 1000)")

@@ -55,6 +55,8 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
                       help="simulate the stops too, beside --reference (slow on a CPU)")  # fmt: skip
     verb.add_argument("--loop", type=int, default=2000, metavar="FRAMES",
                       help="length of loops, none for 0 (default 2000)")  # fmt: skip
+    verb.add_argument("--exact", action="store_true",
+                      help="collide with the whole body, as the simulator does (slow on a CPU)")  # fmt: skip
     verb.add_argument("-o", "--output", type=Path, help="figures to write (.json), in SI units")
     verb.add_argument("--device", default="cpu", help="where it runs (default cpu)")
 
@@ -162,7 +164,7 @@ def _dressed(file: ModelFile, options: argparse.Namespace, device: torch.device)
     character = read_character(open_stage(options.stage), root=options.root, garment=None)
     need_same_skeleton(character.skeleton, skeleton)
     scene = replace(file.scene, character=replace(character, skeleton=skeleton))
-    return Dressed(scene, file.fabric, file.config.fps, device)
+    return Dressed(scene, file.fabric, file.config.fps, device, exact=options.exact)
 
 
 def _playlist(options: argparse.Namespace, dressed: Dressed) -> Playlist:
@@ -224,7 +226,7 @@ def _write(
         "models": {str(one.path): sha256(one.path) for one in opened},
         "stage": {str(options.stage): sha256(options.stage)},
         "reference": options.reference and str(options.reference),
-        "options": {**asdict(asked), "clips": options.clips},
+        "options": {**asdict(asked), "clips": options.clips, "exact": options.exact},
         "hardware": device_name(chosen_device(options.device)),
         "versions": {"ssilk": __version__, "torch": torch.__version__},
         "figures": rows,

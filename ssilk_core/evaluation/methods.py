@@ -54,15 +54,19 @@ class Dressed:
     Args:
         scene: with every body mesh, reachable or not.
         fps: of every method.
+        exact: collide with the nearest point of the whole body, as the simulator does, rather than of the triangles
+            around the nearest vertex, as training does.
 
     Attributes:
         columns: from positions to both columns of all deformation gradients.
         weight: m g L, the garment's weight times its height at rest [J].
     """
 
-    def __init__(self, scene: Scene, fabric: Fabric, fps: float, device: torch.device) -> None:
+    def __init__(
+        self, scene: Scene, fabric: Fabric, fps: float, device: torch.device, *, exact: bool = False
+    ) -> None:
         mesh = scene.garment.mesh
-        self.scene, self.fabric, self.fps, self.device = scene, fabric, fps, device
+        self.scene, self.fabric, self.fps, self.device, self.exact = scene, fabric, fps, device, exact
         self.energy = GarmentEnergy(mesh, fabric, device=device)
         self.columns = deformation_gradient_operator(mesh, device, torch.float32)
         skeleton = scene.character.skeleton

@@ -57,11 +57,9 @@ def recorded(dressed: Dressed, reel: Reel, method: Method, take: int, truth: Met
 def frame_energies(dressed: Dressed, reel: Reel, take: int, frames: range, path: Tensor) -> dict[str, Tensor]:
     """Return `training.validation.energies` of the last frames of a path (V, 3, past + N), shape (N,)."""
     x, character = path[..., -len(frames) :], reel.character(take, frames)
+    body, joined = dressed.body.posed(character, exact=dressed.exact), path[..., -len(frames) - 2 :]
     down = x.new_tensor([0.0, -1.0, 0.0])
-    joined = path[..., -len(frames) - 2 :]
-    return energies(
-        dressed.energy, x, dressed.plain(character), dressed.body.posed(character), joined, dressed.fps, down
-    )
+    return energies(dressed.energy, x, dressed.plain(character), body, joined, dressed.fps, down)
 
 
 class _Past:

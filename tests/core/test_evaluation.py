@@ -16,6 +16,7 @@ from torch import Tensor
 from ssilk_core.assets import Motion
 from ssilk_core.baselines.networks import METHODS, BaselineConfig, baseline
 from ssilk_core.energy import TERMS
+from ssilk_core.energy.collision import signed_distance
 from ssilk_core.errors import SsilkError
 from ssilk_core.evaluation.methods import Cache, Dressed, Network, Plain, Reel, Simulated, reel_of
 from ssilk_core.evaluation.minimum import hung, minima
@@ -152,6 +153,21 @@ def test_errors_against_a_reference_are_those_of_the_offset(dressed, reel):
     assert found.excess == pytest.approx(own.total - found.total) and found.frames == 40
     assert own.motion == pytest.approx(expected[0], rel=1e-3) and own.lift == pytest.approx(found.floats, rel=1e-3)
     assert own.jitter_of_plain == pytest.approx(found.jitter)
+
+
+def test_collisions_can_be_with_the_whole_body(scene, dressed, reel):
+    """A spike of the ball right behind the cloth: its long triangles are near where its only vertex is far."""
+    ball = scene.character.bodies[0]
+    points = ball.mesh.points.copy()
+    points[points[:, 2].argmin()] = [0.0, 0.9, -0.16]
+    body = replace(ball, mesh=replace(ball.mesh, points=points))
+    spiked = replace(scene, character=replace(scene.character, bodies=(body,)))
+    near, whole = (Dressed(spiked, dressed.fabric, FPS, CPU, exact=exact) for exact in (False, True))
+    found = [recorded(one, reel, Plain(one, reel), 0).values["collision"] for one in (near, whole)]
+    character = reel.character(0, range(40))
+    distance = signed_distance(whole.plain(character), whole.body.posed(character, exact=True))
+    np.testing.assert_allclose(found[1], whole.energy.collision_of(distance), rtol=1e-5)
+    assert (found[0] - found[1]).abs().max() > 1e-3
 
 
 def test_the_weight_is_that_of_the_cloth_at_its_height(dressed):
