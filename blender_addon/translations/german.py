@@ -241,6 +241,22 @@ WORDS = {
     "Put keys on the proxies and on shape keys of the garment": (
         "Schlüsselbilder auf Stellvertreter und Formschlüssel des Kleidungsstücks setzen"
     ),
+    "Whole": "Ganz",
+    "All that the model has": "Alles, was das Modell hat",
+    "Film": "Film",
+    "What cannot be told from the whole model": "Vom ganzen Modell nicht zu unterscheiden",
+    "Game": "Spiel",
+    "For real time: some shapes and proxies, four influences": (
+        "Für Echtzeit: einige Formen und Stellvertreter, vier Einflüsse"
+    ),
+    "Crowd": "Menge",
+    "For many characters, far away: few shapes and proxies, three influences": (
+        "Für viele Figuren in der Ferne: wenige Formen und Stellvertreter, drei Einflüsse"
+    ),
+    "Hero": "Hauptfigur",
+    "The whole model, refined by a solver; to USD alone, as points": (
+        "Das ganze Modell, von einem Löser verfeinert; nur nach USD, als Punkte"
+    ),
     "To USD": "Nach USD",
     "Write a UsdSkel shot, with the body": "Einen UsdSkel-Shot schreiben, mit dem Körper",
     "Pre-Roll": "Vorlauf",
