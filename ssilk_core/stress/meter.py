@@ -34,7 +34,7 @@ class Extent:
         finite: whether every number was.
         speed: largest of any vertex, relative to the character's root [m/s].
         distance: largest of any vertex from plain skinning [m].
-        size: of the garment at rest: the diagonal of its box [m].
+        allowed: largest distance that still counts as bounded [m].
         latent: largest entry of any latent.
         growth: mean elastic and kinetic energy in the last loop of the motion over that in the second, the first one
             being the transient's; 1 where there are not three.
@@ -45,14 +45,14 @@ class Extent:
     finite: bool
     speed: float
     distance: float
-    size: float
+    allowed: float
     latent: float
     growth: float
     recovered: int
 
     @property
     def bounded(self) -> bool:
-        return self.finite and self.distance <= FAR * self.size
+        return self.finite and self.distance <= self.allowed
 
 
 @dataclass(eq=False)
@@ -107,10 +107,10 @@ class Meter:
             return 1.0
         return float(np.mean(self.energies[-1]) / np.mean(self.energies[0]))
 
-    def extent(self, frames: int, *, latent: float = 0.0, recovered: int = 0) -> Extent:
-        """Return what was measured, with what others know."""
-        size = garment_size(self.scene)
-        return Extent(frames, self.finite, self.speed, self.distance, size, latent, self.growth, recovered)
+    def extent(self, frames: int, *, latent: float = 0.0, recovered: int = 0, far: float = FAR) -> Extent:
+        """Return what was measured, with what others know; bounded means within `far` times the garment's size."""
+        allowed = far * garment_size(self.scene)
+        return Extent(frames, self.finite, self.speed, self.distance, allowed, latent, self.growth, recovered)
 
 
 def compared_loops(drive: Drive) -> tuple[range, ...]:

@@ -26,6 +26,7 @@ from .meter import Extent, Meter, extent, matrices_about_root
 
 SMALL = ModelConfig(latent=16, widths=(32, 32), shapes=8)
 WIGGLE = 1e-3  # of the garment's size: by how much points are moved off plain skinning to have energies compared
+ELASTIC = 1e4  # times its size: how far the softest fabric may hang, which is physics
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ def simulated(scene: Scene, fabric: Fabric, motion: Motion, gravity: float = GRA
     imbalance = [frame.imbalance for frame in frames]
     meter.add(motion, np.stack([frame.points for frame in frames]))
     unsolved = sum(value > options.solver.tolerance for value in imbalance)
-    return meter.extent(len(frames), recovered=unsolved), max(imbalance)
+    return meter.extent(len(frames), recovered=unsolved, far=ELASTIC), max(imbalance)
 
 
 def gradient_error(scene: Scene, fabric: Fabric, motion: Motion) -> float:

@@ -118,7 +118,7 @@ def test_nested_values_are_flattened_to_words():
 OUTCOME = {
     "name": "x", "group": "motion", "verdict": "breaks", "said": "", "seconds": 1.0,
     "measured": {
-        "extent": {"frames": 5, "finite": False, "speed": None, "distance": 1.0, "size": 1.0, "latent": 2.0,
+        "extent": {"frames": 5, "finite": False, "speed": None, "distance": 1.0, "allowed": 1.0, "latent": 2.0,
                    "growth": 1.0, "recovered": 0},
         "error": None, "unit": "", "note": "",
     },

@@ -42,7 +42,7 @@ def test_the_product_does_what_it_may(subject, case):
         assert outcome.said.endswith(".") and "\n" not in outcome.said
     else:
         found = outcome.measured.extent
-        assert found.finite and 0 <= found.distance <= meter.FAR * found.size and found.latent <= 4.001
+        assert found.finite and 0 <= found.distance <= found.allowed and found.latent <= 4.001
         assert len(outcome.row()) == markdown([outcome]).splitlines()[0].count("|") - 1
 
 
