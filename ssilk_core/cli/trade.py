@@ -69,14 +69,17 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     results = Results(options.output, bench.asked)
     results.resume(report)
     report(Started("trade", 0, {"clips": list(bench.clips)}))
-    for path, file in bench.files.items():
-        meter = bench.meter(path, file)
-        tried = list(variants(meter.reducer.whole, file.config.fps, refined=not options.no_refine))
-        for _ in sweep(meter, tried, results, report):
-            if options.output:
-                write_plot(options.output.with_suffix(".png"), results.points)
-    if not options.json:
-        print(table(results.points))
+    try:
+        for path, file in bench.files.items():
+            meter = bench.meter(path, file)
+            sweep(
+                meter, variants(meter.reducer.whole, file.config.fps, refined=not options.no_refine), results, report
+            )
+    finally:  # an interrupted sweep shows what it has
+        if results.points and options.output:
+            write_plot(options.output.with_suffix(".png"), results.points)
+        if not options.json:
+            print(table(results.points))
     report(Result("trade", {"points": [asdict(point) for point in results.points]} if options.json else {}))
     return EXIT_OK
 

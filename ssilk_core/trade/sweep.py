@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -57,11 +57,10 @@ class Results:
                 temporary.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
-def sweep(meter: Meter, tried: Sequence[Variant], results: Results, report: Reporter = silent) -> Iterator[Point]:
-    """Yield the points of a model's variants as they are measured, those measured before left out."""
+def sweep(meter: Meter, variants: Iterable[Variant], results: Results, report: Reporter = silent) -> None:
+    """Measure a model's variants but for those that were measured before, and keep each as it comes."""
+    tried = list(variants)
     for done, variant in enumerate(tried):
-        report(Progress(done, len(tried), terms={}))
+        report(Progress(done, len(tried)))
         if not results.found(meter.name, variant):
-            point = meter.point(variant)
-            results.add(point)
-            yield point
+            results.add(meter.point(variant))

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The trade as users measure it."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import shutil
+
+import pytest
+
+from ssilk_core.cli import main
+from ssilk_core.cost import Time
+
+TRADE = "trade model.safetensors --stage rigged.usda --motions motions"
+
+
+def run(command: str) -> int:
+    return main(shlex.split(command))
+
+
+@pytest.fixture
+def world(toy, tmp_path, monkeypatch):
+    """A folder with the toy's files and three motions, as the working folder."""
+    monkeypatch.chdir(toy.copy(tmp_path))
+    (tmp_path / "motions").mkdir()
+    for name, frames in (("long", 40), ("short", 24), ("other", 40)):
+        toy.write_clip(tmp_path / "motions" / f"{name}.usda", frames)
+    return tmp_path
+
+
+@pytest.fixture
+def no_clock(monkeypatch):
+    """Takes no time to tell the time."""
+    monkeypatch.setattr("ssilk_core.trade.measure.play_time", lambda player, motion: Time(1.0, 2.0))
+
+
+def test_a_sweep_is_written_drawn_and_taken_up_again(world, capsys, no_clock):
+    assert run(f"{TRADE} --clips long short --no-refine -o trade.json") == 0
+    document, text = json.loads((world / "trade.json").read_text()), capsys.readouterr().out
+    points = {point["variant"]: point for point in document["points"]}
+    assert {"as trained", "2 blendshapes", "0 proxies", "int16", "15 frames/s", "crowd", "film"} <= points.keys()
+    assert all(name in text for name in points) and document["asked"]["clips"] == ["long", "short"]
+    whole, half = points["as trained"], points["15 frames/s"]
+    assert whole["position"] == 0 and half["shot_bytes"] < whole["shot_bytes"]
+    assert points["2 blendshapes"]["shot_bytes"] < whole["shot_bytes"]
+    assert (world / "trade.png").stat().st_size > 1000
+    assert run(f"{TRADE} --clips long short --no-refine -o trade.json") == 0
+    assert f"{len(points)} variants were measured before" in capsys.readouterr().err
+    assert json.loads((world / "trade.json").read_text()) == document
+
+
+def test_models_are_put_on_one_table_and_judged_by_a_simulation(world, capsys, no_clock, monkeypatch):
+    monkeypatch.setattr("ssilk_core.trade.variants.SHAPES", (0.5,))
+    for name in ("JOINTS", "INFLUENCES", "RATES"):
+        monkeypatch.setattr(f"ssilk_core.trade.variants.{name}", ())
+    shutil.copy("model.safetensors", "again.safetensors")
+    clip = "simulate rigged.usda --motion motions/short.usda -o simulated/short.usdc --tolerance 1"
+    assert run(clip) == 0
+    command = TRADE.replace("trade model", "trade model.safetensors again", 1)
+    assert run(f"{command} --clips short --reference simulated --no-refine --json") == 0
+    points = json.loads(capsys.readouterr().out.splitlines()[-1])["detail"]["points"]
+    first, second = ([p for p in points if p["model"] == name] for name in ("model", "again"))
+    assert [p["total"] for p in first] == pytest.approx([p["total"] for p in second])
+    assert first[0]["excess"] > 0  # a few iterations of training are no match for a solver
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("--clips nothing", "no clip is called nothing; it holds long, other, short and so on"),
+        ("-o trade.txt", "it ends in .json"),
+        ("-o model.json --stage nowhere.usda", "nowhere.usda: there is no such file"),
+        ("--clips long --reference motions", "no visible mesh"),
+        ("--clips long --reference nowhere", "nowhere: there is no such folder"),
+        ("--motions clip.usda", "clip.usda: there is no such folder"),
+    ],
+)
+def test_what_cannot_be_is_said_in_one_sentence(world, capsys, options, message):
+    assert run(f"{TRADE} {options}") == 2
+    error = capsys.readouterr().err
+    assert message in error and "Traceback" not in error
+
+
+def test_garments_are_not_mixed(world, capsys):
+    assert (
+        run(
+            "train rigged.usda --garment Skirt --motions clip.usda -o other.safetensors --preset draft --set "
+            "iterations=2 --set latent=4 --set widths=8 --set shapes=2 --set fps=24 --set valid_frames=8"
+        )
+        == 0
+    )
+    capsys.readouterr()
+    assert run(TRADE.replace("trade model", "trade other.safetensors model")) == 2
+    assert "a model of another garment, or rate" in capsys.readouterr().err
