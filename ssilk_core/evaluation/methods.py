@@ -106,6 +106,11 @@ class Reel:
         """Return skinning matrices (J, 3, 4, N) of frames of a take."""
         return self.bank.character(self.frames(take, frames))
 
+    def local(self, take: int, points: Floats) -> Tensor:
+        """Return points in the world (N, V, 3) about the root of a take's first frame, shape (V, 3, N)."""
+        local = points - self.takes[take].motion.translations[0, 0]
+        return torch.as_tensor(local.transpose(1, 2, 0).copy(), dtype=torch.float32, device=self.bank.root.device)
+
 
 def reel_of(takes: Sequence[Take], dressed: Dressed, joints: np.ndarray) -> Reel:
     """Return takes with what networks that have these joints in view see of them.
@@ -185,8 +190,7 @@ class Cache:
         """
         played = self.reel.takes[take]
         points = self.read(played.clip, range(played.first + frames.start, played.first + frames.stop))
-        local = points - played.motion.translations[0, 0]
-        x = torch.as_tensor(local.transpose(1, 2, 0).copy(), dtype=torch.float32, device=self.dressed.device)
+        x = self.reel.local(take, points)
         self._check(x, take, frames)
         return x
 
@@ -212,8 +216,7 @@ class Simulated:
         self.points = simulate(scene, dressed.fabric, motions, options, device=device)
 
     def vertices(self, take: int, frames: range) -> Tensor:
-        local = self.points[take][frames.start : frames.stop] - self.reel.takes[take].motion.translations[0, 0]
-        return torch.as_tensor(local.transpose(1, 2, 0).copy(), dtype=torch.float32, device=self.dressed.device)
+        return self.reel.local(take, self.points[take][frames.start : frames.stop])
 
     def still(self, take: int, frames: range) -> Tensor:
         motion = self.reel.takes[take].motion

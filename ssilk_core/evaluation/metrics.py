@@ -7,6 +7,8 @@ a finer mesh of the same garment measures the same.
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -27,6 +29,11 @@ def mean_square(vectors: Tensor, mass: Tensor) -> Tensor:
 def kinetic_energy(x: Tensor, mass: Tensor, fps: float) -> Tensor:
     """Return the kinetic energy of mass (V,) [kg] at the last N - 1 frames [J], shape (N - 1,)."""
     return mass.sum() * mean_square(derivative(x, 1, fps), mass) / 2
+
+
+def ratio(value: float, of: float) -> float:
+    """Return a quotient; NaN of nothing, as where a character or a garment does not move."""
+    return value / of if of else math.nan
 
 
 def settling_time(speed: Tensor, calm: float, fps: float) -> Tensor:

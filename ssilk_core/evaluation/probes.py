@@ -12,7 +12,7 @@ from torch import Tensor
 
 from .figures import Holds, Hung, Loops
 from .methods import Dressed, Method, Reel
-from .metrics import kinetic_energy, mean_square, settling_time
+from .metrics import kinetic_energy, mean_square, ratio, settling_time
 from .record import frame_energies
 from .takes import EASE, Take, back_and_forth, stopped
 
@@ -61,7 +61,7 @@ def _held(dressed: Dressed, reel: Reel, method: Method, take: int, first: int) -
         distance=distance,
         furthest=distance,
         above=sum(float(ours[name] - theirs[name]) for name in STATIC),
-        floats=float(ours["gravity"] - theirs["gravity"]) / dressed.weight,
+        floats=ratio(float(ours["gravity"] - theirs["gravity"]), dressed.weight),
     )
 
 

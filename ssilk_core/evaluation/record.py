@@ -22,7 +22,7 @@ class Record:
 
     Attributes:
         values: for each frame, float64 on the CPU, shape (N,): the energies of `training.validation.energies`,
-            "kinetic" energy [J], "jerk" squared, "stretch" at most, "motion" squared [m2] away from the method's own
+            "kinetic" energy [J], "jerk" squared, "largest stretch", "motion" squared [m2] away from the method's own
             quasi-static state, and squared errors of `TRUTH`. NaN where the take has no past to tell it from.
         stretches: histogram of the larger principal stretch of all triangles.
     """

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..energy import TERMS
 from .figures import Against, Figures, Poses
-from .metrics import histogram_quantiles
+from .metrics import histogram_quantiles, ratio
 from .record import TRUTH, Record
 
 SHARES = (0.5, 0.95, 0.99)  # of triangles and frames, below which quantiles of stretch lie
@@ -49,7 +49,7 @@ class Tally:
         """Return the smallest, the median and the largest mean total of a clip [J]."""
         names = dict.fromkeys(self.clips[take] for take in self.records)
         means = torch.stack([self.only(takes_in(self.clips, [name])).totals().mean() for name in names])
-        return float(means.min()), float(means.median()), float(means.max())
+        return float(means.min()), float(means.quantile(0.5)), float(means.max())
 
 
 def takes_in(clips: Mapping[int, str], names: Collection[str]) -> list[int]:
@@ -74,11 +74,11 @@ def figures(tally: Tally, plain: Tally, weight: float) -> Figures:
         terms={name: tally.mean(name) for name in TERMS},
         collisions=tally.mean("collisions"),
         clip_totals=tally.clip_totals(),
-        lift=tally.mean("gravity") / weight,
+        lift=ratio(tally.mean("gravity"), weight),
         kinetic=tally.mean("kinetic"),
         motion=tally.root("motion") if has_still else None,
         jitter=jitter,
-        jitter_of_plain=jitter / plain.root("jerk"),
+        jitter_of_plain=ratio(jitter, plain.root("jerk")),
         stretches=(*histogram_quantiles(stretches, SHARES), float(tally.each("largest stretch").max())),
     )
 
@@ -95,11 +95,11 @@ def against(tally: Tally, truth: Tally, weight: float) -> Against | None:
         frames=len(ours.totals()),
         total=total,
         excess=float(ours.totals().mean()) - total,
-        floats=(ours.mean("gravity") - theirs.mean("gravity")) / weight,
+        floats=ratio(ours.mean("gravity") - theirs.mean("gravity"), weight),
         position=position,
         velocity=velocity,
         acceleration=acceleration,
-        jitter=ours.root("jerk") / theirs.root("jerk"),
+        jitter=ratio(ours.root("jerk"), theirs.root("jerk")),
     )
 
 

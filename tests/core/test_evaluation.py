@@ -321,6 +321,15 @@ def test_every_method_gets_its_row_in_every_split(scene, dressed, motion, toy_mo
     assert text.count("| garment") == 7 and len({len(line) for line in text.split("\n\n")[0].splitlines()}) == 1
 
 
+def test_a_character_that_never_moves_has_no_jitter_to_compare_with(scene, dressed, motion, toy_model):
+    frozen = replace(motion, rotations=motion.rotations[[5] * 12], translations=motion.translations[[5] * 12])
+    played = Playlist(clips={"frozen": frozen}, splits={"all": ["frozen"]})
+    rows = list(
+        evaluate(dressed, [Subject("ssilk", toy_model(scene), JOINTS)], played, EvaluationOptions(stops=0, loop=0))
+    )
+    assert rows[0].figures.jitter == 0 and math.isnan(rows[1].figures.jitter_of_plain) and "nan" in tables(rows)
+
+
 def test_nothing_is_asked_for_nothing_is_computed(scene, dressed, motion, toy_model):
     played = Playlist(clips={"sway": motion}, splits={"all": ["sway"]})
     rows = list(
