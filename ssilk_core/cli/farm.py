@@ -35,6 +35,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     where.add_argument("--bundle", type=Path, metavar="FOLDER", help="folder of the job bundle to write")
     where.add_argument("--cluster", nargs="?", const="", metavar="ADDRESS",
                        help="run now on a Ray cluster (default: all cores of this machine)")  # fmt: skip
+    verb.add_argument("--cores", type=int, help="of this machine, where --cluster names no other (default: all)")
     group = verb.add_argument_group("job bundle")
     defaults = BundleOptions()
     group.add_argument("--name", default=defaults.name, help="of the job (default '%(default)s')")
@@ -55,6 +56,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     tasks = [_absolute(task) for task in tasks_of(options)]
     if options.bundle:
         return _write(tasks, options, report)
+    need((options.cores or 1) > 0, "--cores", str(options.cores), "a positive number is needed")
     need(options.output, "--cluster", "no folder for the layers", "-o names one")
     return _run(tasks, options, report)
 
@@ -93,7 +95,8 @@ def _run(tasks: Sequence[Task], options: argparse.Namespace, report: Reporter) -
 
     report(Started("farm", len(tasks), {"output": str(options.output)}))
     ended: list[Outcome] = []
-    for outcome in run_on_cluster(tasks, options.output, bake_here, address=options.cluster or None, gpu=options.gpu):
+    where = {"address": options.cluster or None, "cores": options.cores, "gpu": options.gpu}
+    for outcome in run_on_cluster(tasks, options.output, bake_here, **where):
         ended.append(outcome)
         if outcome.error:
             report(Garment(outcome.task.name, Failed(outcome.error)))

@@ -26,13 +26,20 @@ class Outcome:
 
 
 def run_on_cluster(
-    tasks: Sequence[Task], folder: Path, bake: Bake, *, address: str | None = None, gpu: bool = False
+    tasks: Sequence[Task],
+    folder: Path,
+    bake: Bake,
+    *,
+    address: str | None = None,
+    cores: int | None = None,
+    gpu: bool = False,
 ) -> Iterator[Outcome]:
     """Yield the outcome of each task as it ends, on a cluster that is there or on the cores of this machine.
 
     Args:
         bake: what a worker does, a function of a module that workers can import.
         address: of the cluster, "auto" for the one that this machine is in; None starts one here.
+        cores: how many of this machine's, where a cluster is started here; None for all.
         gpu: each task needs a GPU.
 
     Raises:
@@ -42,7 +49,7 @@ def run_on_cluster(
     from ray.exceptions import RayError
 
     try:
-        ray.init(address=address, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
+        ray.init(address, num_cpus=cores, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
     except (ConnectionError, RuntimeError, ValueError) as error:
         fail("--cluster", f"no cluster at {address} ({str(error).splitlines()[0]})", "start one with 'ray start'")
     try:

@@ -32,7 +32,7 @@ from .read_stage import (
 from .units import StageUnits
 
 _SCALE_TOLERANCE = 1e-3
-_MOST_FRAMES = 1_000_000
+_MOST_FRAMES = 200_000  # close to two hours at 30 frames a second
 
 
 def read_motions(paths: Iterable[str | Path], skeleton: Skeleton) -> list[Motion]:

@@ -17,6 +17,7 @@ from ssilk_core.errors import fail, need
 from ssilk_core.files import sha256
 
 from .garment_api import register_schema
+from .memory import MOST, bounded_memory
 
 Reader = TypeVar("Reader", bound=Callable[..., Any])
 StageLike: TypeAlias = str | Path | Usd.Stage
@@ -35,14 +36,16 @@ def needs_whole_files(read: Reader) -> Reader:
     @wraps(read)
     def reader(source: StageLike, *args: Any, **options: Any) -> Any:
         try:
-            return read(source, *args, **options)
-        except Tf.ErrorException as error:
+            with bounded_memory():
+                return read(source, *args, **options)
+        except MemoryError:
             where = stage_name(source) if isinstance(source, Usd.Stage) else str(source)
-            fail(
-                where,
-                f"it cannot be read as USD ({usd_reason(error)})",
-                "a whole .usd, .usda, .usdc or .usdz file is needed",
-            )
+            fail(where, "it declares arrays that do not fit into memory", f"reading takes at most {MOST >> 30} GiB")
+        except (Tf.ErrorException, UnicodeDecodeError) as error:
+            where = stage_name(source) if isinstance(source, Usd.Stage) else str(source)
+            reason = usd_reason(error) if isinstance(error, Tf.ErrorException) else "it holds text that is no UTF-8"
+            allowed = "a whole .usd, .usda, .usdc or .usdz file is needed"
+            fail(where, f"it cannot be read as USD ({reason})", allowed)
 
     return cast(Reader, reader)
 

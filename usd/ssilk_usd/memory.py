@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bound on the memory that a file may take while it is read: a few bytes can declare arrays of any size."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+MOST = 4 << 30  # bytes; a character of a million vertices takes a tenth of it
+
+
+@contextmanager
+def bounded_memory(most: int = MOST) -> Iterator[None]:
+    """Let this process take at most `most` bytes more than it has; USD and numpy then refuse what does not fit.
+
+    Where the system knows no such bound (all but Linux), and within another one, nothing changes.
+    """
+    if not sys.platform.startswith("linux"):
+        yield
+        return
+    import resource
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    bound = pages * resource.getpagesize() + most
+    if soft != resource.RLIM_INFINITY and soft <= bound:
+        yield
+        return
+    resource.setrlimit(resource.RLIMIT_AS, (bound, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
