@@ -12,7 +12,7 @@ from ssilk_core.checkpoint import ModelFile
 from ssilk_core.errors import SsilkError
 from ssilk_core.fabrics import Fabric
 from ssilk_core.kinematics import motion_transforms, split_at_cuts
-from ssilk_core.stress import cases, drives, meter, worlds
+from ssilk_core.stress import drives, measures, meter, worlds
 from ssilk_core.stress.cases import CASES, Case
 from ssilk_core.stress.outcome import Measured, markdown
 from ssilk_core.stress.subject import Effort, Subject
@@ -55,7 +55,7 @@ def test_names_are_unique_and_match():
 @pytest.mark.parametrize("points", [np.nan, 1e3])
 def test_what_leaves_all_bounds_is_a_fault(subject, monkeypatch, points):
     monkeypatch.setattr(meter, "decode", lambda model, motion, pose: np.full((pose.frame_count, 60, 3), points))
-    outcome = Case("motion", "none", cases.driven(lambda subject, base: base)).run(subject)
+    outcome = Case("motion", "none", measures.driven(lambda subject, base: base)).run(subject)
     assert outcome.verdict == "breaks" and not outcome.measured.extent.bounded
 
 
@@ -71,7 +71,7 @@ def test_what_raises_is_a_fault_and_what_is_refused_is_none(subject):
 def test_a_lost_rollout_falls_back(subject):
     lost = replace(subject, file=replace(subject.file, config=replace(subject.file.config, bound=0.0, push=0.0)))
     lost.file.parameters["integrator.alpha"] = np.full(lost.file.config.latent, -3.0, dtype=np.float32)
-    outcome = Case("motion", "none", cases.driven(lambda subject, base: base), ("falls back",)).run(lost)
+    outcome = Case("motion", "none", measures.driven(lambda subject, base: base), ("falls back",)).run(lost)
     assert outcome.verdict == "falls back" and outcome.measured.extent.recovered > 10
 
 
@@ -114,11 +114,11 @@ def test_a_turn_turns_everything_about_the_first_joint(scene, base):
 
 def test_rides_are_no_cuts_and_teleports_are(scene, base):
     skeleton = scene.character.skeleton
-    ride = drives.carried(base, cases.ride, skeleton).motion()
+    ride = drives.carried(base, measures.ride, skeleton).motion()
     steps = np.diff(ride.translations[:, 0, 0] - base.motion().translations[:, 0, 0])
     np.testing.assert_allclose(steps * 30, 50.0)
     assert len(split_at_cuts(ride)) == 1
-    assert len(split_at_cuts(drives.carried(base, cases.jumps, skeleton).motion())) == 13  # after each of 12 s
+    assert len(split_at_cuts(drives.carried(base, measures.jumps, skeleton).motion())) == 13  # after each of 12 s
 
 
 def test_stopped_contorted_and_broken_motions_are_what_they_say(scene, base):
@@ -228,3 +228,11 @@ def test_single_precision_costs_what_rounding_costs(scene, base):
 def test_a_trial_trains_what_it_says(scene, base):
     trial = trained(scene, FABRIC, replace(base, frames=30), 2)
     assert (trial.steps, trial.undone, trial.extent.frames) == (2, 0, 30) and trial.extent.bounded
+
+
+def test_a_training_that_never_moves_is_a_fault(subject):
+    def measure(subject: Subject) -> Measured:
+        trial = trained(subject.scene, FABRIC, replace(subject.base, frames=30), 2)
+        return measures.measured(replace(trial, undone=2))
+
+    assert Case("", "", measure).run(subject).said == "ArithmeticError: 2 of 2 steps undone"

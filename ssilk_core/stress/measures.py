@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is done to a garment at an extreme, and what is measured of it; each function returns one that does it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from math import gcd
+
+import numpy as np
+import torch
+
+from ..assets import Floats, Scene
+from ..fabrics import Fabric
+from ..model.descriptors import GRAVITY
+from ..preflight.units import FileUnits, body_size
+from . import drives, worlds
+from .drives import Drive
+from .meter import extent, positions, precision_errors
+from .outcome import Measured
+from .subject import Subject
+from .trials import Trial, simulated, trained
+
+PATCH = 600  # vertices of what is simulated
+
+Measure = Callable[[Subject], Measured]
+
+
+def driven(change: Callable[[Subject, Drive], Drive]) -> Measure:
+    """Return what rolls the model over a changed motion."""
+    return lambda subject: Measured(extent(subject.model, subject.fabric, change(subject, subject.base)))
+
+
+def lasting(frames: int) -> Measure:
+    """Return what rolls the model over so many frames."""
+
+    def measure(subject: Subject) -> Measured:
+        count = round(frames * subject.effort.frames)
+        return Measured(extent(subject.model, subject.fabric, replace(subject.base, frames=count)))
+
+    return measure
+
+
+def at_rate(fps: int) -> Measure:
+    """Return what bakes at another rate; the error is the distance from the bake at the model's rate [m]."""
+
+    def measure(subject: Subject) -> Measured:
+        base, own = subject.base, round(subject.fps)
+        drive = base.lasting((base.frames - 1) / base.fps, fps)
+        shared = gcd(fps, own)
+        found, expected = (positions(subject.model, each) for each in (drive, base))
+        found, expected = found[:: fps // shared], expected[:: own // shared]
+        count = min(len(found), len(expected))
+        error = float(np.linalg.norm(found[:count] - expected[:count], axis=2).max())
+        return Measured(extent(subject.model, subject.fabric, drive), error, "m")
+
+    return measure
+
+
+def turned(axis: tuple[float, float, float], speed: float = 0.0, angle: float = 0.0) -> Measure:
+    """Return what turns the character about its root, at a speed [rad/s] or by an angle [rad]."""
+    turn = drives.about(axis, speed, angle)
+    return driven(lambda subject, base: drives.turned(base, subject.scene.character.skeleton, turn))
+
+
+def moved(path: Callable[[Floats], Floats]) -> Measure:
+    """Return what moves the character along a path."""
+    return driven(lambda subject, base: drives.carried(base, path, subject.scene.character.skeleton))
+
+
+def contorted(every: float) -> Measure:
+    """Return what turns every joint anywhere, anew every so often [s]."""
+    return driven(lambda subject, base: drives.contorted(base, subject.scene.character.skeleton, every))
+
+
+def interrupted(frame: int) -> Measure:
+    """Return what puts NaN into all rotations of a frame."""
+    return driven(lambda subject, base: drives.broken(base, frame))
+
+
+def weighed(factor: float) -> Measure:
+    """Return what simulates under so many times gravity: networks know its direction alone."""
+    return lambda subject: solved(subject, patch(subject), subject.fabric, factor * GRAVITY)
+
+
+def solved_of(stiffness: float) -> Measure:
+    """Return what simulates a fabric of so many N/m."""
+    return lambda subject: solved(subject, patch(subject), membrane(subject.fabric, stiffness))
+
+
+def solved_with(height: float) -> Measure:
+    """Return what simulates slivers so many times as high as long."""
+    return lambda subject: solved(subject, worlds.pinched(patch(subject), height), subject.fabric)
+
+
+def patch(subject: Subject) -> Scene:
+    """Return as much of a garment as is simulated."""
+    return worlds.resized(subject.scene, min(PATCH, subject.effort.vertices))
+
+
+def solved(subject: Subject, scene: Scene, fabric: Fabric, gravity: float = GRAVITY) -> Measured:
+    """Simulate some frames; the error is how far out of balance the solver stopped at worst [g]."""
+    motion = subject.base.motion(0, subject.effort.simulated)
+    found, imbalance = simulated(scene, fabric, motion, gravity)
+    return Measured(found, imbalance, "g", f"simulated, {found.recovered} of {found.frames} frames not to tolerance")
+
+
+def membrane(fabric: Fabric, stiffness: float) -> Fabric:
+    """Return a fabric with so many N/m for each constant of its membranes."""
+    return replace(fabric, lame_mu=stiffness, lame_lambda=stiffness, stretch=stiffness, shear=stiffness)
+
+
+def measured(trial: Trial, note: str = "") -> Measured:
+    """Return a trial training as a measurement; the error is that of single-precision forces, relative to them.
+
+    Raises:
+        ArithmeticError: most steps were undone because something was not finite.
+    """
+    undone = f"{trial.undone} of {trial.steps} steps undone" if trial.undone else ""
+    if 2 * trial.undone > trial.steps:
+        raise ArithmeticError(undone)
+    return Measured(trial.extent, trial.error, "of the force", "; ".join(filter(None, (note, undone))))
+
+
+def sized(metres: float) -> Measure:
+    """Return what trains a garment of another size, with everything around it."""
+
+    def measure(subject: Subject) -> Measured:
+        scale = metres / worlds.garment_size(subject.scene)
+        scene, drive = worlds.enlarged(subject.scene, scale), drives.enlarged(subject.base, scale)
+        body, units = scene.character.merged_body().mesh, FileUnits("", 1.0, "Y", True, True)
+        warned = "; ".join(f"inspect: {finding.found}" for finding in body_size(body, units))
+        return measured(trained(scene, subject.fabric, drive, subject.effort.steps), warned)
+
+    return measure
+
+
+def made_of(stiffness: float) -> Measure:
+    """Return what trains with a fabric of so many N/m in each of its membranes' constants."""
+
+    def measure(subject: Subject) -> Measured:
+        fabric = membrane(subject.fabric, stiffness)
+        return measured(trained(subject.scene, fabric, subject.base, subject.effort.steps))
+
+    return measure
+
+
+def meshed(height: float) -> Measure:
+    """Return what trains with slivers among the triangles, so many times as high as long."""
+
+    def measure(subject: Subject) -> Measured:
+        scene = worlds.pinched(subject.scene, height)
+        return measured(trained(scene, subject.fabric, subject.base, subject.effort.steps))
+
+    return measure
+
+
+def counted(vertices: int) -> Measure:
+    """Return what trains a garment of about so many vertices."""
+
+    def measure(subject: Subject) -> Measured:
+        scene = worlds.resized(subject.scene, min(vertices, subject.effort.vertices))
+        few = scene.garment.mesh.vertex_count > 50_000
+        base, steps = subject.base, min(subject.effort.steps, 4) if few else subject.effort.steps
+        drive = replace(base, frames=8) if few else base
+        trial = trained(scene, subject.fabric, drive, steps, windows=1 if few else 2)
+        return measured(trial, f"{scene.garment.mesh.vertex_count:,} vertices")
+
+    return measure
+
+
+def in_precision(dtype: torch.dtype) -> Measure:
+    """Return what rolls and skins in a precision; the error is the distance from float64 [m]."""
+
+    def measure(subject: Subject) -> Measured:
+        model, exact = subject.in_precision(dtype), subject.in_precision(torch.float64)
+        networks, whole = precision_errors(model, exact, subject.base)
+        note = f"{networks:.2g} m of that by the networks, skinned in float64"
+        return Measured(extent(model, subject.fabric, subject.base), whole, "m", note)
+
+    return measure
+
+
+def jumps(times: Floats) -> Floats:
+    """Return a path that is 30 m elsewhere every second [m]."""
+    return 30.0 * np.outer(np.floor(times) % 2, (1, 0, 0))
+
+
+def ride(times: Floats) -> Floats:
+    """Return a path at 50 m/s [m]."""
+    return np.outer(times, (50, 0, 0))
