@@ -21,7 +21,7 @@ from .operators import (
 )
 from .operators import overlay as overlay_switch
 from .panels import plot
-from .scene import playing, warming
+from .scene import playing, saving, warming
 
 CLASSES = (
     *properties.CLASSES,
@@ -52,6 +52,7 @@ def register() -> None:
     translations.register()
     training.start_watching()
     playing.start_listening()
+    saving.start_listening()
     warming.start_listening()
     quality_view.add_key()
 
@@ -62,6 +63,7 @@ def unregister() -> None:
     overlay.hide()
     quality_view.remove_key()
     warming.stop_listening()
+    saving.stop_listening()
     playing.stop_listening()
     training.stop_watching(bpy.context)
     plot.forget()
