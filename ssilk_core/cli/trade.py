@@ -51,9 +51,10 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Sweep; return 0."""
+    from ssilk_core.trade.judging import judged
     from ssilk_core.trade.plot import write_plot
     from ssilk_core.trade.sweep import Results, sweep
-    from ssilk_core.trade.table import table
+    from ssilk_core.trade.table import judging_table, table
     from ssilk_core.trade.variants import variants
 
     if options.output:
@@ -72,6 +73,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     try:
         for path, file in bench.files.items():
             meter = bench.meter(path, file)
+            results.judging = results.judging or judged(meter.dressed, meter.reel, meter.whole)
             sweep(
                 meter, variants(meter.reducer.whole, file.config.fps, refined=not options.no_refine), results, report
             )
@@ -79,7 +81,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         if results.points and options.output:
             write_plot(options.output.with_suffix(".png"), results.points)
         if not options.json:
-            print(table(results.points))
+            print(table(results.points), judging_table(results.judging), sep="\n")
     report(Result("trade", {"points": [asdict(point) for point in results.points]} if options.json else {}))
     return EXIT_OK
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from typing import Any
 from ..errors import SsilkError
 from ..events import Message, Progress, Reporter, silent
 from ..files import replacing
+from .judging import Judged
 from .measure import Meter
 from .point import Point
 from .variants import Variant
@@ -24,10 +25,12 @@ class Results:
     Attributes:
         path: where they are kept, or None.
         asked: what was measured on what; points of another question do not count.
+        judging: what telling collisions costs, on the first model.
     """
 
     path: Path | None
     asked: Mapping[str, Any]
+    judging: Sequence[Judged] = ()
     points: list[Point] = field(default_factory=list)
 
     def resume(self, report: Reporter) -> None:
@@ -52,7 +55,12 @@ class Results:
         """Keep a point."""
         self.points.append(point)
         if self.path is not None:
-            document = {"units": "SI, times in ms", "asked": self.asked, "points": [asdict(p) for p in self.points]}
+            document = {
+                "units": "SI, times in ms",
+                "asked": self.asked,
+                "judging": [asdict(each) for each in self.judging],
+                "points": [asdict(each) for each in self.points],
+            }
             with replacing(self.path) as temporary:
                 temporary.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")
 

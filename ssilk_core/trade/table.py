@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ..evaluation.tables import aligned
+from .judging import Judged
 from .point import SECONDS, Point, front
 
 HEADER = ("model", "swept", "variant", "size", "ms a frame", "95 %", "PyTorch", "memory [MB]", "model [MB]",
@@ -19,6 +20,15 @@ def table(points: Sequence[Point]) -> str:
     best = {mark: front([(getattr(p, cost), p.position) for p in points]) for cost, mark in MARKS.items()}
     rows = [_cells(point, [mark for mark, own in best.items() if row in own]) for row, point in enumerate(points)]
     return aligned(HEADER, rows, 3)
+
+
+def judging_table(found: Sequence[Judged]) -> str:
+    """Return a line for each body that collisions were told with."""
+    header = ("collisions with", "vertices", "ms a frame", "collision [J]", "inside")
+    rows = [
+        [j.body, f"{j.vertices:,}", f"{j.milliseconds:.3g}", f"{j.collision:.3g}", f"{j.inside:.2%}"] for j in found
+    ]
+    return aligned(header, rows, 1)
 
 
 def _cells(p: Point, best: list[str]) -> list[str]:

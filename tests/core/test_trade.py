@@ -12,6 +12,7 @@ import torch
 
 from ssilk_core.checkpoint import model_file
 from ssilk_core.cost import ShotBytes, model_bytes
+from ssilk_core.energy.collision import signed_distance
 from ssilk_core.errors import SsilkError
 from ssilk_core.evaluation.methods import Dressed, Network, reel_of
 from ssilk_core.evaluation.record import recorded
@@ -21,12 +22,13 @@ from ssilk_core.kinematics import deform, resample, sample_motion
 from ssilk_core.reduction import Reducer, Size
 from ssilk_core.runtime import Player
 from ssilk_core.sampling import sample_pose
+from ssilk_core.trade.judging import judged
 from ssilk_core.trade.measure import Meter
 from ssilk_core.trade.played import Played
 from ssilk_core.trade.plot import Axis, write_plot
 from ssilk_core.trade.point import Point, front
 from ssilk_core.trade.sweep import Results, sweep
-from ssilk_core.trade.table import table
+from ssilk_core.trade.table import judging_table, table
 from ssilk_core.trade.variants import PRECISIONS, variants
 
 FPS = 30.0
@@ -117,6 +119,17 @@ def test_errors_are_distances_and_speeds_from_the_whole_model(meter, bench, poin
     assert found.position == pytest.approx(np.sqrt(np.concatenate(squares).mean()), rel=1e-3)
     assert found.velocity == pytest.approx(np.sqrt(np.concatenate(speeds).mean()), rel=1e-3)
     assert found.excess == pytest.approx(found.total - points["as trained"].total)
+
+
+def test_collisions_are_told_with_any_body(meter):
+    surface, points, few = judged(meter.dressed, meter.reel, meter.whole)
+    body = meter.dressed.body.posed(meter.reel.character(0, range(50)))
+    distance = signed_distance(meter.whole.vertices(0, range(50)), body)
+    assert surface.inside == pytest.approx(float((distance < 0).double().mean()))
+    assert surface.collision == pytest.approx(float(meter.dressed.energy.collision_of(distance).mean()))
+    assert surface.vertices == points.vertices == meter.dressed.scene.character.merged_body().mesh.vertex_count
+    assert few.vertices == -(-points.vertices // 4) and few.collision != points.collision != surface.collision
+    assert len(judging_table([surface, points, few]).splitlines()) == 5
 
 
 def test_what_costs_less_is_seen_to_cost_less(points):
