@@ -88,8 +88,11 @@ class BrushClass(ReportingOperator, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        cls.poll_message_set("Choose Paint Classes first")
-        return context.mode == "PAINT_VERTEX" and context.tool_settings.vertex_paint.brush is not None
+        reason = "" if context.mode == "PAINT_VERTEX" else "Choose Paint Classes first"
+        if not reason and context.tool_settings.vertex_paint.brush is None:
+            reason = "Choose a brush first"
+        cls.poll_message_set(reason)
+        return not reason
 
     def apply(self, context: bpy.types.Context) -> str:
         choose_color(context, palette.COLORS[VALUES[self.value]])

@@ -5,9 +5,24 @@ from __future__ import annotations
 
 import bpy
 
+from ..errors import SetupError
 from ..preferences import unready
-from ..scene.garment import unusable
+from ..scene.garment import armature_of, garments_of, unusable
 from .base import Panel, draw_text, draw_work
+
+
+def draw_garments(layout: bpy.types.UILayout, shown: bpy.types.Object) -> None:
+    """Draw the garments of the character, where there are several, to go from one to another."""
+    try:
+        garments = garments_of(armature_of(shown))
+    except SetupError:
+        return  # other panels say what is wrong
+    if len(garments) < 2:
+        return
+    column = layout.column(align=True)
+    for garment in garments:
+        chosen = column.operator("ssilk.choose_garment", text=garment.name, icon="MATCLOTH", depress=garment == shown)
+        chosen.garment = garment.name
 
 
 class GarmentPanel(Panel, bpy.types.Panel):
@@ -23,6 +38,7 @@ class GarmentPanel(Panel, bpy.types.Panel):
             layout.use_property_split = True
             layout.prop(context.object.ssilk, "armature")
             layout.prop(context.object.ssilk, "bodies")
+            draw_garments(layout, context.object)
         missing = unready(context)
         if missing:
             draw_text(layout, missing, icon="ERROR")

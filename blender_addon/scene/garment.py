@@ -51,6 +51,13 @@ def armature_of(garment: bpy.types.Object) -> bpy.types.Object:
     return found[0]
 
 
+def garments_of(armature: bpy.types.Object) -> list[bpy.types.Object]:
+    """Return the garments of the view layer that belong to an armature, by name."""
+    found = [thing for thing in bpy.context.view_layer.objects if is_garment(thing)]
+    bound = [thing for thing in found if (thing.ssilk.armature or _modifier_armature(thing)) == armature]
+    return sorted(bound, key=lambda thing: thing.name)
+
+
 def bodies_of(garment: bpy.types.Object, armature: bpy.types.Object) -> list[bpy.types.Object]:
     """Return the meshes that a garment collides with: those chosen, else all others bound to its armature.
 

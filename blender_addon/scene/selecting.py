@@ -11,7 +11,7 @@ import numpy as np
 
 def select_elements(thing: bpy.types.Object, elements: str, indices: Sequence[int]) -> None:
     """Be in edit mode of a mesh with these of its "vertices" or "polygons" selected, and nothing else."""
-    _only(thing)
+    select_object(thing)
     mesh, vertices = thing.data, elements == "vertices"
     for items in (mesh.vertices, mesh.edges, mesh.polygons):
         items.foreach_set("select", np.zeros(len(items), dtype=bool))
@@ -24,14 +24,14 @@ def select_elements(thing: bpy.types.Object, elements: str, indices: Sequence[in
 
 def select_bones(armature: bpy.types.Object, names: Sequence[str]) -> None:
     """Be in pose mode of an armature with these bones selected, and no other."""
-    _only(armature)
+    select_object(armature)
     bpy.ops.object.mode_set(mode="POSE")
     for bone in armature.pose.bones:
         # Since Blender 5 pose bones are selected, before it was their bones.
         (bone if "select" in bone.bl_rna.properties else bone.bone).select = bone.name in names
 
 
-def _only(thing: bpy.types.Object) -> None:
+def select_object(thing: bpy.types.Object) -> None:
     """Make an object the active and only selected one, in object mode."""
     if bpy.context.mode != "OBJECT":
         bpy.ops.object.mode_set(mode="OBJECT")

@@ -10,6 +10,9 @@ WORDS = {
     "Armature of the character that wears the garment; found by its Armature modifier when empty": (
         "Armatur der Figur, die das Kleidungsstück trägt; leer: die seines Armatur-Modifikators"
     ),
+    "Choose Garment": "Kleidungsstück wählen",
+    "Work on this garment": "An diesem Kleidungsstück arbeiten",
+    "Name of the object to work on": "Name des Objekts, an dem gearbeitet wird",
     "Bodies": "Körper",
     "Meshes that the garment collides with; all others bound to the armature when empty": (
         "Netze, mit denen das Kleidungsstück kollidiert; leer: alle anderen, die an die Armatur gebunden sind"

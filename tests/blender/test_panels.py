@@ -121,3 +121,22 @@ def test_preferences_show_the_python(bpy):
         "python", "ssilk.find_python", "ssilk.check_python", "No Python with ssilk is chosen", "source",
         "ssilk.create_environment", "stop_trainings",
     ]  # fmt: skip
+
+
+def test_garments_of_a_character_are_gone_through(bpy, skirt):
+    from blender_addon.panels.garment import GarmentPanel
+
+    skirt.modifiers.new("Armature", "ARMATURE").object = bpy.data.objects["Rig"]
+    skirt.data.attributes.new("ssilk:class", "INT", "POINT")
+    assert "ssilk.choose_garment" not in drawn(GarmentPanel, bpy.context)
+    apron = skirt.copy()
+    apron.name = "Apron"
+    bpy.context.collection.objects.link(apron)
+    assert drawn(GarmentPanel, bpy.context).count("ssilk.choose_garment") == 2
+    assert bpy.ops.ssilk.choose_garment(garment="Apron") == {"FINISHED"}
+    assert (bpy.context.object, bpy.context.selected_objects) == (apron, [apron])
+    apron.hide_set(True)
+    bpy.ops.ssilk.choose_garment(garment="Skirt")
+    for name, reason in (("Apron", "'Apron' is hidden"), ("Hat", "'Hat' is not in this view layer")):
+        with pytest.raises(RuntimeError, match=reason):
+            bpy.ops.ssilk.choose_garment(garment=name)
