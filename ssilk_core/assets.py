@@ -35,7 +35,7 @@ def _set(instance: object, **values: object) -> None:
 
 
 def _need_finite(array: NDArray, where: str, what: str) -> None:
-    bad = np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1)) if array.size else np.zeros(0, dtype=int)
+    bad = np.flatnonzero(~np.isfinite(array).all(axis=tuple(range(1, array.ndim))))
     need(
         len(bad) == 0,
         where,
