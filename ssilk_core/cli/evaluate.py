@@ -45,7 +45,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--by-clip", action="store_true", help="show each clip by itself too")
     verb.add_argument("--reference", type=Path, metavar="FOLDER", help="shots of 'ssilk simulate' to compare with")
     verb.add_argument("--trained-on", type=Path, nargs="+", default=[], metavar="PATH",
-                      help="motion files or folders of the training, to tell how unfamiliar poses are")  # fmt: skip
+                      help="motions trained on, to tell unfamiliar poses (default: train of --index)")  # fmt: skip
     verb.add_argument("--sequence", type=int, metavar="FRAMES", help="start clips anew after so many (paper: 512)")
     verb.add_argument("--stops", type=int, default=2, help="stops in each clip to hold poses after (default 2)")
     verb.add_argument("--hold", type=float, default=3.0, metavar="S", help="how long poses are held (default 3)")
@@ -176,7 +176,7 @@ def _playlist(options: argparse.Namespace, dressed: Dressed) -> Playlist:
     from ._reference import References
 
     skeleton = dressed.scene.character.skeleton
-    splits, files = _splits(options)
+    splits, files, seen = _splits(options)
     names = dict.fromkeys(name for split in splits.values() for name in split)
     reference = None
     if options.reference:
@@ -187,28 +187,28 @@ def _playlist(options: argparse.Namespace, dressed: Dressed) -> Playlist:
         splits=splits,
         simulated=reference.clips & names.keys() if reference else frozenset(),
         read=reference.read if reference else None,
-        seen=read_motions(options.trained_on, skeleton),
+        seen=read_motions(seen, skeleton),
     )
 
 
-def _splits(options: argparse.Namespace) -> tuple[dict[str, list[str]], dict[str, Path]]:
-    """Return the names of clips by split, and their files."""
+def _splits(options: argparse.Namespace) -> tuple[dict[str, list[str]], dict[str, Path], list[Path]]:
+    """Return the names of clips by split, their files, and the motions of the training."""
     from ssilk_usd.read_motion import motion_files
 
-    from ssilk_core.evaluation.splits import read_index, splits_of
+    from ssilk_core.evaluation.splits import chosen, read_index, splits_of
 
     folder: Path = options.motions
     need(folder.is_dir(), str(folder), "there is no such folder", "one of motion files is needed")
     files = {path.stem: path for path in motion_files([folder])}
-    if options.index:
-        splits = splits_of(read_index(options.index), options.clips)
-        need(splits, str(options.index), "no clip of valid, inertia or flips is chosen", "one at least is needed")
-    else:
-        splits = {"all": options.clips or list(files)}
+    index = read_index(options.index) if options.index else []
+    splits = splits_of(index, options.clips) if options.index else {"all": options.clips or list(files)}
+    need(splits, str(options.index), "no clip of valid, inertia or flips is chosen", "one at least is needed")
     missing = sorted({name for names in splits.values() for name in names} - files.keys())
     need(not missing, str(folder), f"{len(missing)} clips are missing ({', '.join(missing[:3])})",
          f"it holds {', '.join(list(files)[:3])} and so on")  # fmt: skip
-    return splits | ({name: [name] for names in splits.values() for name in names} if options.by_clip else {}), files
+    single = {name: [name] for names in splits.values() for name in names} if options.by_clip else {}
+    seen = options.trained_on or [files[name] for name in chosen(index, "train") if name in files]
+    return splits | single, files, seen
 
 
 def _write(

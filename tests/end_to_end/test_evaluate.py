@@ -45,6 +45,17 @@ def test_figures_by_split_are_shown_and_written(world, capsys):
     assert {row["garment"] for row in document["figures"]} == {"Skirt"} and found["holds"]["stops"] == 1
 
 
+def test_poses_of_the_index_that_were_trained_on_are_familiar(world, capsys):
+    """The clip itself is its own nearest neighbour; without it poses are some way off."""
+    found = []
+    for clip in ("brief", "turn"):
+        (world / "index.json").write_text(json.dumps([*INDEX, {"clip": clip, "split": "train", "tags": []}]))
+        assert evaluated(f"{QUICK} --index index.json --json --stops 0 --loop 0 --clips turn") == 0
+        event = json.loads(capsys.readouterr().out.splitlines()[-1])
+        found += [row["figures"]["poses"]["mean"] for row in event["detail"]["figures"] if row["method"] == "ssilk"]
+    assert found[0] > 0.001 and found[1] < 0.2 * found[0]
+
+
 def test_the_simulators_shots_are_the_reference(world, capsys):
     assert (
         main(["simulate", "rigged.usda", "--motion", "clips/brief.usda", "--no-body", "-o", "ref/Skirt/brief.usdc"])
