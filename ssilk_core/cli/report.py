@@ -104,12 +104,12 @@ def _fabric(record: GarmentRecord | None) -> Fabric:
 def _model(options: argparse.Namespace, report: Reporter) -> list[Section]:
     """Return the sections of a model, its provenance last."""
     from ssilk_core.checkpoint import load_model
-    from ssilk_core.report.figures import learning, read_json
+    from ssilk_core.report.figures import learning_of
     from ssilk_core.report.page import Section, facts
 
     path: Path = options.subject
-    file, curve = load_model(path), path.with_suffix(".curve.json")
-    sections = [learning(read_json(curve))] if curve.is_file() else []
+    file = load_model(path)
+    sections = learning_of(path.with_suffix(".curve.json"))
     if options.stage:
         sections += _baked(options, report)
     scene = file.scene

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from ..errors import SsilkError, need
 from ..stress.outcome import HEADER, Outcome
+from ..trade.point import front
 from .charts import scatter, strip
 from .page import Section, facts, flattened, table
 from .terms import SHARE
@@ -37,8 +38,22 @@ def section_of(path: Path) -> Section:
     kind = next((key for key in kinds if isinstance(document, dict) and isinstance(document.get(key), list)), None)
     need(kind, str(path), "none of the figures that are known", f"a document with {' or '.join(kinds)} is needed",
          "name what 'ssilk stress', 'ssilk trade' or 'ssilk evaluate' wrote")  # fmt: skip
+    return _made(path, kinds[str(kind)], document)
+
+
+def learning_of(path: Path) -> list[Section]:
+    """Return what the learning curve beside a model says; nothing where there is none, or no validation in it.
+
+    Raises:
+        SsilkError: the file is no learning curve.
+    """
+    document = read_json(path) if path.is_file() else {"points": []}
+    return [_made(path, learning, document)] if document.get("points", True) else []
+
+
+def _made(path: Path, make: Callable[[Mapping[str, Any]], Section], document: Mapping[str, Any]) -> Section:
     try:
-        return kinds[str(kind)](document)
+        return make(document)
     except (KeyError, TypeError, ValueError) as error:
         raise SsilkError(f"{path}: these figures are incomplete ({error}); measure again.") from error
 
@@ -60,18 +75,11 @@ def trade(document: Mapping[str, Any]) -> Section:
         groups.setdefault(point["swept"], []).append((point["milliseconds"], 1000 * point["position"], words))
     chart = ""
     if points:
-        best = cheapest([(x, y) for group in groups.values() for x, y, _ in group])
+        places = [(x, y) for group in groups.values() for x, y, _ in group]
+        best = [places[index] for index in front(places)]
         chart = scatter("Time against distance from the whole model", ("ms a frame", "RMS [mm]"), groups, best)
-    return Section("Trade", chart + records(points) + facts(document["asked"]))
-
-
-def cheapest(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Return the points (cost, error) that no other beats in one without losing in the other, the cheapest first."""
-    best: list[tuple[float, float]] = []
-    for point in sorted(points):
-        if not best or point[1] < best[-1][1]:
-            best.append(point)
-    return best
+    judged = records(document.get("judging", ()))
+    return Section("Trade", chart + records(points) + judged + facts(document["asked"]))
 
 
 def evaluation(document: Mapping[str, Any]) -> Section:
@@ -90,7 +98,6 @@ def records(found: Sequence[Mapping[str, Any]]) -> str:
 def learning(document: Mapping[str, Any]) -> Section:
     """Return the learning curve that a training leaves beside its model."""
     points, plain = document["points"], document["plain"]
-    need(points, "learning curve", "no validation yet", "one at least is needed")
     best = min(range(len(points)), key=lambda number: points[number]["validation"]["total"])
     times = np.array([point["seconds"] for point in points])
     totals, inside = ([point["validation"][name] for point in points] for name in ("total", "collisions"))

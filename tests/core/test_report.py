@@ -13,7 +13,7 @@ from ssilk_core.assets import Mesh
 from ssilk_core.errors import SsilkError
 from ssilk_core.fabrics import Fabric
 from ssilk_core.report.charts import peaks, scatter, strip
-from ssilk_core.report.figures import cheapest, learning, section_of
+from ssilk_core.report.figures import learning_of, section_of
 from ssilk_core.report.page import Section, facts, figure, flattened, page, table
 from ssilk_core.report.shots import joined
 from ssilk_core.report.terms import SHARE, TermsMeter, worst_frames
@@ -89,11 +89,13 @@ def test_a_strip_is_well_formed_and_stays_within_its_frame(values):
         assert places[found.argmax(), 1] < places[found.argmin(), 1]  # up is more
 
 
-def test_a_front_holds_what_nothing_beats():
-    points = [(1.0, 5.0), (2.0, 3.0), (2.5, 4.0), (3.0, 3.0), (4.0, 1.0)]
-    assert cheapest(points) == [(1.0, 5.0), (2.0, 3.0), (4.0, 1.0)]
-    chart = scatter("t", ("ms", "mm"), {"one": [(x, y, "w") for x, y in points]}, cheapest(points))
-    assert chart.count("<circle") == 5
+def test_a_scatter_has_a_mark_for_each_point_and_a_line_along_its_front():
+    groups = {"one": [(1.0, 5.0, "a"), (2.0, 3.0, "b")], "two": [(2.5, 4.0, "<c>")]}
+    chart = scatter("t", ("ms", "mm"), groups, [(1.0, 5.0), (2.0, 3.0)])
+    assert chart.count("<circle") == 3 and "two: &lt;c&gt;" in chart
+    line = ElementTree.fromstring(chart.partition("</svg>")[0] + "</svg>").find("polyline").get("points").split()
+    centres = re.findall(r'cx="([\d.]+)" cy="([\d.]+)"', chart)
+    assert line == [",".join(place) for place in centres[:2]]
 
 
 def test_words_cannot_become_markup():
@@ -155,7 +157,14 @@ def test_other_files_are_refused(tmp_path, text, said):
 
 
 def test_a_learning_curve_marks_its_best(tmp_path):
-    score = {"total": 2.0, "collisions": 0.01}
+    score, path = {"total": 2.0, "collisions": 0.01}, tmp_path / "model.curve.json"
+    assert learning_of(path) == []
     points = [{"seconds": 9.0 * i, "validation": {**score, "total": abs(i - 2) + 0.5}} for i in range(5)]
-    section = learning({"plain": score, "points": points})
+    path.write_text(json.dumps({"plain": score, "points": points}))
+    (section,) = learning_of(path)
     assert "best: 0.5 J at 18.00 s" in section.body and "plain skinning: 2 J, 1.00% inside" in section.body
+    path.write_text(json.dumps({"plain": score, "points": []}))
+    assert learning_of(path) == []
+    path.write_text(json.dumps({"points": points}))
+    with pytest.raises(SsilkError, match="incomplete \\('plain'\\)"):
+        learning_of(path)
