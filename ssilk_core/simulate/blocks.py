@@ -1,21 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
 """Symmetric matrices of 3 x 3 blocks over the free vertices of a garment, one for each frame.
 
-The sparsity is found once. Element blocks are summed into vertex blocks by constant sparse operators, and the vertex
-blocks of all frames make one block-diagonal matrix in compressed rows, which every device multiplies fast.
+The sparsity is found once. Element blocks are summed into vertex blocks by constant sparse operators. Systems are
+solved by kernels on the blocks themselves where there are any; elsewhere the blocks of all frames make one
+block-diagonal matrix in compressed rows.
 """
 
 from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from .. import kernels
 from ..assets import Ints
 from ..energy.operators import SparseOperator
+from .conjugate import CHECK_EVERY, inverse_blocks, solve
+
+if TYPE_CHECKING:
+    from ..kernels.conjugate import BlockTable
 
 
 def adjoint(operator: SparseOperator, y: Tensor) -> Tensor:
@@ -28,16 +36,38 @@ class BlockMatrix:
     """A symmetric matrix for each of N frames.
 
     Attributes:
-        rows: all of them, block-diagonal, in compressed rows, (3 U N, 3 U N) for U free vertices.
-        diagonal: the diagonal blocks, shape (N, U, 3, 3).
+        blocks: as stored, those on the diagonal first and symmetric, shape (stored, 3, 3, N).
     """
 
-    rows: Tensor
-    diagonal: Tensor
+    pattern: BlockPattern
+    blocks: Tensor
+
+    @cached_property
+    def rows(self) -> Tensor:
+        """Return all of them, block-diagonal, in compressed rows, (3 U N, 3 U N) for U free vertices."""
+        return self.pattern.rows(self.blocks)
 
     def __matmul__(self, vectors: Tensor) -> Tensor:
         """Multiply vectors (N, U, 3)."""
         return torch.mv(self.rows, vectors.reshape(-1)).reshape(vectors.shape)
+
+    def solve(self, right: Tensor, reduction: float, iterations: int) -> tuple[Tensor, int]:
+        """Solve approximately for right sides (U, 3, N); arguments and result are those of `conjugate.solve`."""
+        diagonal = self.blocks[: self.pattern.count].permute(3, 0, 1, 2)
+        inverse = inverse_blocks(diagonal.contiguous())
+        if kernels.available(right.device):
+            from ..kernels.conjugate import solve_kernel
+
+            inverse, table = inverse.permute(1, 2, 3, 0), self.pattern.table
+            return solve_kernel(self.blocks, table, inverse, right, reduction, iterations, CHECK_EVERY)
+        z, count = solve(
+            lambda v: self @ v,
+            lambda r: (inverse * r[..., None, :]).sum(-1),
+            right.permute(2, 0, 1).contiguous(),
+            reduction,
+            iterations,
+        )
+        return z.permute(1, 2, 0), count
 
 
 class BlockPattern:
@@ -54,7 +84,6 @@ class BlockPattern:
         self.place[free] = np.arange(len(free))
         low, high = self._ordered(pairs)
         self.keys = np.unique((low * self.count + high)[(low >= 0) & (low < high)])
-        self._index_rows()
         self._tiled: tuple[int, Tensor, Tensor] | None = None  # of one number of frames, which is used for long
 
     @property
@@ -78,43 +107,62 @@ class BlockPattern:
         shape = (self.block_count, source_count)
         return SparseOperator(slots[kept], sources[kept], weights[kept], shape, self.device, torch.float32)
 
-    def _index_rows(self) -> None:
-        """Find the stored entry behind each entry of the compressed rows of one frame."""
+    def _blocks(self) -> tuple[Ints, Ints, Ints, np.ndarray]:
+        """Return row and column of all blocks in order, where each is stored, and whether as its transpose, (E,)."""
         low, high = self.keys // self.count, self.keys % self.count
         above = self.count + np.arange(len(self.keys))
         own, none = np.arange(self.count), np.zeros(self.count + len(low), dtype=bool)
         row, column = np.concatenate([own, low, high]), np.concatenate([own, high, low])
         stored, below = np.concatenate([own, above, above]), np.concatenate([none, np.ones(len(low), dtype=bool)])
         order = np.lexsort((column, row))
-        stored, below, column = (part[order, None, None] for part in (stored, below, column))
+        return row[order], column[order], stored[order], below[order]
+
+    @cached_property
+    def table(self) -> BlockTable:
+        """Return the blocks of each row, for kernels."""
+        from ..kernels.conjugate import BlockTable
+
+        row, column, stored, below = self._blocks()
+        counts = np.bincount(row, minlength=self.count)
+        at = np.arange(len(row)) - np.repeat(counts.cumsum() - counts, counts)
+        columns, places = np.zeros((2, self.count, counts.max()), dtype=np.int32)
+        columns[row, at], places[row, at] = column, 2 * stored + below
+        tables = (
+            torch.as_tensor(values, device=self.device) for values in (columns, places, counts.astype(np.int32))
+        )
+        return BlockTable(*tables)
+
+    @cached_property
+    def _row_entries(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the stored entry behind each of one frame's compressed rows, its column, and where rows end."""
+        row, column, stored, below = (part[:, None, None] for part in self._blocks())
         a, b = np.mgrid[:3, :3]
         entries = 9 * stored + np.where(below, 3 * b + a, 3 * a + b)
         # Rows of numbers, not of blocks: for each vertex and axis all its blocks in turn.
-        axes = 3 * row[order, None, None] + a
+        axes = 3 * row + a + 0 * b
         by_row = np.argsort(axes.reshape(-1), kind="stable")
 
         def tensor(values: np.ndarray) -> Tensor:
             return torch.as_tensor(values, device=self.device)
 
-        self.entries = tensor(entries.reshape(-1)[by_row])
-        self.columns = tensor((3 * column + b + 0 * a).reshape(-1)[by_row])
-        self.ends = tensor(np.bincount(axes.reshape(-1)).cumsum())
+        columns, ends = (3 * column + b + 0 * a).reshape(-1)[by_row], np.bincount(axes.reshape(-1)).cumsum()
+        return tensor(entries.reshape(-1)[by_row]), tensor(columns), tensor(ends)
 
     def _tile(self, frames: int) -> tuple[Tensor, Tensor]:
         """Return row starts and columns of the block-diagonal matrix of so many frames."""
         if self._tiled is None or self._tiled[0] != frames:
+            _, columns, ends = self._row_entries
             frame = torch.arange(frames, device=self.device)[:, None]
-            starts = (self.ends + frame * len(self.columns)).reshape(-1)
-            columns = (self.columns + frame * 3 * self.count).reshape(-1)
+            starts = (ends + frame * len(columns)).reshape(-1)
+            columns = (columns + frame * 3 * self.count).reshape(-1)
             self._tiled = frames, torch.cat([starts.new_zeros(1), starts]).int(), columns.int()
         return self._tiled[1:]
 
-    def matrix(self, blocks: Tensor) -> BlockMatrix:
-        """Return the matrix of stored blocks (stored, 3, 3, N); those on the diagonal must be symmetric."""
+    def rows(self, blocks: Tensor) -> Tensor:
+        """Return the matrices of stored blocks (stored, 3, 3, N), block-diagonal, in compressed rows."""
         frames = blocks.shape[-1]
-        values = blocks.reshape(-1, frames)[self.entries].T.reshape(-1)
+        values = blocks.reshape(-1, frames)[self._row_entries[0]].T.reshape(-1)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="Sparse (CSR|invariant)")
             side = 3 * self.count * frames
-            rows = torch.sparse_csr_tensor(*self._tile(frames), values, size=(side, side))
-        return BlockMatrix(rows, blocks[: self.count].permute(3, 0, 1, 2).contiguous())
+            return torch.sparse_csr_tensor(*self._tile(frames), values, size=(side, side))

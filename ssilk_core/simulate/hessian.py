@@ -75,4 +75,4 @@ class Hessian:
         diagonal += weight[:, None, None] * torch.eye(3, device=x.device)[:, :, None]
         if pushed is not None:
             diagonal += outer(pushed, pushed)
-        return self.pattern.matrix(blocks)
+        return BlockMatrix(self.pattern, blocks)

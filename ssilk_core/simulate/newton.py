@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from ..errors import need
-from .conjugate import inverse_blocks, solve
 from .potential import Planes, Potential, Setting
 
 SUFFICIENT = 1e-4  # share of the slope that a step has to gain
@@ -171,12 +170,10 @@ def newton_step(
     potential: Potential, state: State, setting: Setting, gradient: Tensor, inner: int
 ) -> tuple[Tensor, int]:
     """Return a direction of descent (V, 3, N), zero in pinned vertices, and the iterations that it took."""
-    matrix = potential.hessian(state.x, setting, state.planes)
-    inverse = inverse_blocks(matrix.diagonal)
-    right = -gradient[potential.free].permute(2, 0, 1).float()
-    z, count = solve(lambda v: matrix @ v, lambda r: (inverse * r[..., None, :]).sum(-1), right, REDUCTION, inner)
+    right = -gradient[potential.free].float()
+    z, count = potential.hessian(state.x, setting, state.planes).solve(right, REDUCTION, inner)
     step = torch.zeros_like(state.x)
-    step[potential.free] = z.permute(1, 2, 0).to(step.dtype)
+    step[potential.free] = z.to(step.dtype)
     return step, count
 
 

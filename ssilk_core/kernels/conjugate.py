@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Conjugate gradients on symmetric matrices of blocks, in three kernels an iteration; `simulate.conjugate` holds the
+plain twin.
+
+The frames of a batch share one sparsity: columns are read once for all of them, and of two symmetric blocks only one
+is stored. A program owns some rows and some frames. It leaves its part of an inner product in a row of its own, and
+the next kernel's programs each sum these in the same order: nothing waits for the host, no result depends on timing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+ROWS, FRAMES, WARPS = 16, 32, 4  # rows, at most so many frames, and warps of one program
+CHUNK = tl.constexpr(32)  # parts of an inner product summed together
+TINY = tl.constexpr(1.1754943508222875e-38)
+
+
+@dataclass(frozen=True, eq=False)
+class BlockTable:
+    """Which blocks a row holds.
+
+    Attributes:
+        columns: their columns, shape (U, W), int32; shorter rows are filled up.
+        places: twice where each is stored, and one more where its transpose is stored, shape (U, W), int32.
+        counts: blocks of each row, shape (U,), int32.
+    """
+
+    columns: Tensor
+    places: Tensor
+    counts: Tensor
+
+
+def solve_kernel(
+    blocks: Tensor,
+    table: BlockTable,
+    inverse: Tensor,
+    right: Tensor,
+    reduction: float,
+    iterations: int,
+    check_every: int,
+) -> tuple[Tensor, int]:
+    """Return what `simulate.conjugate.solve` does, with the inverse of the diagonal blocks for a preconditioner.
+
+    Args:
+        blocks: as stored, shape (S, 3, 3, N), float32.
+        inverse: shape (U, 3, 3, N); right: shape (U, 3, N).
+        check_every: iterations between looks at the residuals, which halt the GPU.
+    """
+    rows, _, frames = right.shape
+    tile = min(FRAMES, triton.next_power_of_2(frames))
+    grid = triton.cdiv(rows, ROWS), triton.cdiv(frames, tile)
+    blocks, inverse = blocks.contiguous(), inverse.contiguous()
+    residual = right.clone(memory_format=torch.contiguous_format)
+    y = (inverse * residual[:, None]).sum(2)
+    step, image, z = y.clone(), torch.empty_like(y), torch.zeros_like(y)
+    product = (residual * y).sum((0, 1))
+    enough, fresh = product * reduction**2, torch.empty_like(product)
+    along, left = product.new_empty(2, grid[0], frames).unbind()
+    size = (rows, frames, ROWS, tile)
+    for done in range(1, iterations + 1):
+        _multiply[grid](blocks, table.columns, table.places, table.counts, step, image, along, table.columns.shape[1],
+                        *size, num_warps=WARPS)  # fmt: skip
+        _descend[grid](z, residual, y, step, image, inverse, product, enough, along, left, grid[0], *size,
+                       num_warps=WARPS)  # fmt: skip
+        _turn[grid](step, y, product, fresh, left, grid[0], *size, num_warps=WARPS)
+        product, fresh = fresh, product
+        if done % check_every == 0 and not bool((product > enough).any()):
+            break
+    return z, done
+
+
+@triton.jit
+def _tile(rows, frames, block_u: tl.constexpr, block_n: tl.constexpr):
+    """Rows and frames of a program, which of them there are, and where its vectors begin."""
+    u, n = tl.program_id(0) * block_u + tl.arange(0, block_u), tl.program_id(1) * block_n + tl.arange(0, block_n)
+    inside = (u < rows)[:, None] & (n < frames)[None, :]
+    return u, n, inside, u.to(tl.int64)[:, None] * 3 * frames + n[None, :]
+
+
+@triton.jit
+def _load3(base, width, mask):
+    return (
+        tl.load(base, mask=mask, other=0.0),
+        tl.load(base + width, mask=mask, other=0.0),
+        tl.load(base + 2 * width, mask=mask, other=0.0),
+    )
+
+
+@triton.jit
+def _store3(base, width, mask, x, y, z):
+    tl.store(base, x, mask=mask)
+    tl.store(base + width, y, mask=mask)
+    tl.store(base + 2 * width, z, mask=mask)
+
+
+@triton.jit
+def _summed(parts, count, frames, n, block_n: tl.constexpr):
+    """The sum of the parts of an inner product, for frames n."""
+    total = tl.zeros((block_n,), tl.float32)
+    for start in range(0, count, CHUNK):
+        part = start + tl.arange(0, CHUNK)
+        mask = (part < count)[:, None] & (n < frames)[None, :]
+        total += tl.sum(tl.load(parts + part[:, None] * frames + n[None, :], mask=mask, other=0.0), axis=0)
+    return total
+
+
+@triton.jit
+def _multiply(blocks, columns, places, counts, step, image, along, width, rows, frames,
+              block_u: tl.constexpr, block_n: tl.constexpr):  # fmt: skip
+    u, n, inside, own = _tile(rows, frames, block_u, block_n)
+    count = tl.load(counts + u, mask=u < rows, other=0)
+    zero = tl.zeros((block_u, block_n), tl.float32)
+    ax, ay, az = zero, zero, zero
+    for k in range(tl.max(count, axis=0)):
+        here = k < count
+        column = tl.load(columns + u * width + k, mask=here, other=0).to(tl.int64)[:, None]
+        place = tl.load(places + u * width + k, mask=here, other=0).to(tl.int64)[:, None]
+        mask = here[:, None] & (n < frames)[None, :]
+        vx, vy, vz = _load3(step + column * 3 * frames + n[None, :], frames, mask)
+        block, turned = blocks + place // 2 * 9 * frames + n[None, :], (place % 2) == 1
+        row, line = tl.where(turned, frames, 3 * frames), tl.where(turned, 3 * frames, frames)
+        xx, xy, xz = _load3(block, line, mask)
+        yx, yy, yz = _load3(block + row, line, mask)
+        zx, zy, zz = _load3(block + 2 * row, line, mask)
+        ax += xx * vx + xy * vy + xz * vz
+        ay += yx * vx + yy * vy + yz * vz
+        az += zx * vx + zy * vy + zz * vz
+    _store3(image + own, frames, inside, ax, ay, az)
+    sx, sy, sz = _load3(step + own, frames, inside)
+    tl.store(along + tl.program_id(0) * frames + n, tl.sum(ax * sx + ay * sy + az * sz, axis=0), mask=n < frames)
+
+
+@triton.jit
+def _descend(z, residual, y, step, image, inverse, product, enough, along, left, parts, rows, frames,
+             block_u: tl.constexpr, block_n: tl.constexpr):  # fmt: skip
+    u, n, inside, own = _tile(rows, frames, block_u, block_n)
+    before = tl.load(product + n, mask=n < frames, other=0.0)
+    slope = tl.maximum(_summed(along, parts, frames, n, block_n), TINY)
+    # A frame that has converged takes no more steps: rounding could spoil what it has.
+    moves = before > tl.load(enough + n, mask=n < frames, other=0.0)
+    rate = tl.where(moves, before / slope, 0.0)[None, :]
+    zx, zy, zz = _load3(z + own, frames, inside)
+    sx, sy, sz = _load3(step + own, frames, inside)
+    _store3(z + own, frames, inside, zx + rate * sx, zy + rate * sy, zz + rate * sz)
+    rx, ry, rz = _load3(residual + own, frames, inside)
+    ix, iy, iz = _load3(image + own, frames, inside)
+    rx, ry, rz = rx - rate * ix, ry - rate * iy, rz - rate * iz
+    _store3(residual + own, frames, inside, rx, ry, rz)
+    block = inverse + u.to(tl.int64)[:, None] * 9 * frames + n[None, :]
+    xx, xy, xz = _load3(block, frames, inside)
+    yx, yy, yz = _load3(block + 3 * frames, frames, inside)
+    zx, zy, zz = _load3(block + 6 * frames, frames, inside)
+    px, py, pz = xx * rx + xy * ry + xz * rz, yx * rx + yy * ry + yz * rz, zx * rx + zy * ry + zz * rz
+    _store3(y + own, frames, inside, px, py, pz)
+    tl.store(left + tl.program_id(0) * frames + n, tl.sum(px * rx + py * ry + pz * rz, axis=0), mask=n < frames)
+
+
+@triton.jit
+def _turn(step, y, product, fresh, left, parts, rows, frames, block_u: tl.constexpr, block_n: tl.constexpr):
+    _u, n, inside, own = _tile(rows, frames, block_u, block_n)
+    now = _summed(left, parts, frames, n, block_n)
+    share = (now / tl.maximum(tl.load(product + n, mask=n < frames, other=0.0), TINY))[None, :]
+    sx, sy, sz = _load3(step + own, frames, inside)
+    px, py, pz = _load3(y + own, frames, inside)
+    _store3(step + own, frames, inside, px + share * sx, py + share * sy, pz + share * sz)
+    if tl.program_id(0) == 0:
+        tl.store(fresh + n, now, mask=n < frames)
