@@ -9,11 +9,14 @@ import pytest
 import torch
 
 from ssilk_core.assets import LOOSE, PINNED, TIGHT, Character, ProxyRig, Scene
-from ssilk_core.checkpoint import load_model
+from ssilk_core.checkpoint import load_model, network
 from ssilk_core.config import ModelConfig, TrainConfig
 from ssilk_core.energy.collision import nearest_planes, signed_distance
 from ssilk_core.events import Event, Message
 from ssilk_core.fabrics import Fabric
+from ssilk_core.kinematics import deform, motion_transforms, skin_points, skinning_matrices
+from ssilk_core.rollout import garment_poses
+from ssilk_core.runtime import Player
 from ssilk_core.training.job import TrainJob
 from ssilk_core.training.parts import build_parts
 from ssilk_core.training.reach import reachable_body
@@ -58,8 +61,15 @@ def test_a_pinned_garment_has_nothing_to_learn(scene, toy_motion, tmp_path):
     assert (done.iterations, done.finished) == (1, True)
     assert done.score.total == pytest.approx(done.plain.total, rel=1e-4)
     assert any(isinstance(event, Message) and "nothing to learn" in event.text for event in told)
-    parameters = load_model(output).parameters
-    assert sum(value.size for value in parameters.values()) < 500
+    file = load_model(output)
+    assert sum(value.size for value in file.parameters.values()) < 500
+    model, motion = network(file, pinned), toy_motion(scene, 12)
+    (pose,) = garment_poses(model, motion, 30.0)
+    world = motion_transforms(motion, pinned.character.skeleton.parents)
+    matrices = skinning_matrices(world, pinned.character.skeleton.bind_transforms)
+    plain = skin_points(pinned.garment.mesh.points, pinned.plain_skin, matrices)
+    np.testing.assert_allclose(deform(model.deformer(), motion, pose), plain, atol=1e-6)
+    assert Player(file).play(motion).vertices(5) == pytest.approx(plain[5], abs=1e-5)
     assert reachable_body(pinned, [toy_motion(scene, 30)]).vertices.size == 0
 
 
