@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measure bakes in bulk: shots on a local cluster whose workers are killed at random, cores, and a long soak.
+
+    python benchmarks/farm.py cape.safetensors --stage cape.usdc --motion 01_walk.usdc 07_run_2.usdc
+
+Each shot is some frames of one of the motions. One process bakes a share of the shots undisturbed; on the cluster,
+a worker is killed every few seconds. Then every shot must be there once, and those of the share hold the same bytes.
+The soak bakes one shot again and again in one process, whose memory and file handles are watched.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import signal
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from reports import table, write_results
+from ssilk_usd.read_character import read_character
+from ssilk_usd.read_motion import read_motion
+from ssilk_usd.write import write_motion
+
+from ssilk_core.assets import Motion
+from ssilk_core.cli._layers import Wardrobe, bake_task, is_done, layout_of
+from ssilk_core.cli.farm import bake_here
+from ssilk_core.events import silent
+from ssilk_core.farm.cluster import run_on_cluster
+from ssilk_core.farm.tasks import Task, plan
+from ssilk_core.files import sha256
+
+PERIOD = 10.0  # seconds from one kill to the next; a worker takes a few to start
+PARTS = ("cluster", "cores", "soak")
+SHARE = 25  # shots that are compared byte by byte
+
+
+@dataclass
+class Killer:
+    """Kills workers of the cluster that this process started, and watches their memory.
+
+    Attributes:
+        killed: how many.
+        memory: most that a worker took [MiB], for each tenth of the time.
+    """
+
+    kill: bool
+    killed: int = 0
+    memory: list[tuple[float, float]] = field(default_factory=list)
+    over: threading.Event = field(default_factory=threading.Event)
+
+    def run(self) -> None:
+        """Kill and watch until it is over."""
+        began, choice = time.monotonic(), random.Random(0)
+        while not self.over.wait(PERIOD):
+            busy = workers(os.getpid())
+            self.memory.append((time.monotonic() - began, max(map(resident, busy), default=0.0)))
+            if self.kill and busy:
+                os.kill(choice.choice(busy), signal.SIGKILL)
+                self.killed += 1
+
+
+def workers(ancestor: int) -> list[int]:
+    """Return the processes below `ancestor` that bake at the moment."""
+    parents, names = {}, {}
+    for path in Path("/proc").glob("[0-9]*"):
+        try:
+            parents[int(path.name)] = int((path / "stat").read_text().rpartition(")")[2].split()[1])
+            names[int(path.name)] = (path / "cmdline").read_bytes()
+        except OSError:  # it ended meanwhile
+            continue
+    return [
+        pid for pid, name in names.items() if name.startswith(b"ray::_outcome") and _below(pid, ancestor, parents)
+    ]
+
+
+def _below(pid: int, ancestor: int, parents: dict[int, int]) -> bool:
+    while pid > 1 and pid != ancestor:
+        pid = parents.get(pid, 0)
+    return pid == ancestor
+
+
+def resident(pid: int) -> float:
+    """Return the memory of a process [MiB]; 0 where it has ended."""
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+    except OSError:
+        return 0.0
+
+
+def main() -> None:
+    """Measure and write the tables."""
+    options = _options()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        tasks = plan([(options.model, None)], _shots(options, folder), _like(options))
+        measured: dict[str, dict[str, Any]] = {}
+        if "cluster" in options.parts:
+            measured["cluster"] = _on_cluster(tasks, folder)
+        if "cores" in options.parts:
+            measured["cores"] = _cores(tasks[: options.scaling], folder, options.cores)
+        if "soak" in options.parts:
+            measured["soak"] = _soak(tasks[0], folder, options.soak)
+    rows = [[name, value] for part in measured.values() for name, value in part.items()]
+    write_results(options, table(["what", "measured"], rows), measured)
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("model", help="trained model")
+    parser.add_argument("--stage", required=True, help="USD file with its character")
+    parser.add_argument("--motion", nargs="+", required=True, help="USD files with motions")
+    parser.add_argument("--shots", type=int, default=500, help="to bake (default 500)")
+    parser.add_argument("--frames", type=int, default=60, help="of each (default 60)")
+    parser.add_argument("--scaling", type=int, default=48, help="shots baked by each number of cores (default 48)")
+    parser.add_argument("--cores", type=int, nargs="+", default=[1, 2, 4], help="numbers of cores (default 1 2 4)")
+    parser.add_argument("--soak", type=int, default=10_000, help="bakes of one shot (default 10,000)")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="what to measure (default: all)")
+    parser.add_argument("--name", default="farm", help="of the results (default farm)")
+    parser.set_defaults(device="cpu", threads=torch.get_num_threads())
+    return parser.parse_args()
+
+
+def _like(options: argparse.Namespace) -> Task:
+    return Task(garment="", shot="", motion="", model=options.model, stage=str(Path(options.stage).absolute()))
+
+
+def _shots(options: argparse.Namespace, folder: Path) -> list[str]:
+    """Write the motions of the shots, each from another frame on."""
+    skeleton = read_character(options.stage).skeleton
+    motions = [read_motion(motion, skeleton) for motion in options.motion]
+    paths = []
+    for shot in range(options.shots):
+        path = folder / f"shot_{shot:04d}.usdc"
+        write_motion(path, _part(motions[shot % len(motions)], shot, options.frames), skeleton)
+        paths.append(str(path))
+    return paths
+
+
+def _part(motion: Motion, shot: int, frames: int) -> Motion:
+    start = shot % max(motion.frame_count - frames, 1)
+    return replace(motion.clip(start, start + frames), start=0.0)
+
+
+def _on_cluster(tasks: Sequence[Task], folder: Path) -> dict[str, Any]:
+    """Bake all tasks while workers are killed; return what became of them."""
+    killer = Killer(kill=True)
+    watch = threading.Thread(target=killer.run)
+    watch.start()
+    began = time.perf_counter()
+    outcomes = list(run_on_cluster(tasks, folder / "cluster", bake_here))
+    seconds = time.perf_counter() - began
+    killer.over.set()
+    watch.join()
+    names = Counter(outcome.task.name for outcome in outcomes if not outcome.error)
+    half = len(killer.memory) // 2
+    return {
+        "shots": len(tasks),
+        "seconds": round(seconds, 1),
+        "workers killed": killer.killed,
+        "shots lost": len(tasks) - sum(is_done(task, folder / "cluster") for task in tasks),
+        "shots ended twice": sum(count > 1 for count in names.values()),
+        "shots that differ from an undisturbed bake": _differing(tasks, folder),
+        "shots compared": min(SHARE, len(tasks)),
+        "half-written files": sum(1 for path in (folder / "cluster").rglob(".*partial-*") if path.is_file()),
+        "largest worker in the first half [MiB]": round(max((size for _, size in killer.memory[:half]), default=0)),
+        "largest worker in the second half [MiB]": round(max((size for _, size in killer.memory[half:]), default=0)),
+    }
+
+
+def _differing(tasks: Sequence[Task], folder: Path) -> int:
+    """Return how many of a share of the tasks hold other bytes than one process makes undisturbed."""
+    wardrobe, differing = Wardrobe(), 0
+    for task in random.Random(1).sample(list(tasks), min(SHARE, len(tasks))):
+        bake_task(task, folder / "single", wardrobe, silent)
+        places = [layout_of(task, folder / name) for name in ("single", "cluster")]
+        there = places[1].animation.is_file()  # those that are not are counted as lost
+        differing += there and len({sha256(place.animation) for place in places}) > 1
+    return differing
+
+
+def _cores(tasks: Sequence[Task], folder: Path, cores: Sequence[int]) -> dict[str, Any]:
+    """Return the rate of numbers of cores, without what starting a cluster and its workers takes."""
+    rates: dict[str, Any] = {}
+    for count in cores:
+        outcomes = run_on_cluster(tasks, folder / f"cores_{count}", bake_here, cores=count)
+        for _ in range(count):  # each worker has loaded the model
+            next(outcomes)
+        began = time.perf_counter()
+        done = len(list(outcomes))
+        rates[f"shots per second, cores: {count}"] = round(done / (time.perf_counter() - began), 2)
+    return {**rates, "load of the machine meanwhile": round(os.getloadavg()[1], 1)}
+
+
+def _soak(task: Task, folder: Path, bakes: int) -> dict[str, Any]:
+    """Bake one shot again and again; return memory and file handles at the start and at the end."""
+    wardrobe, seen = Wardrobe(), []
+    settled = max(bakes // 20, 1)
+    for count in range(bakes):
+        bake_task(task, folder / "soak", wardrobe, silent, again=True)
+        if count == settled or count == bakes - 1:
+            seen.append((resident(os.getpid()), len(os.listdir("/proc/self/fd"))))
+    (early, handles), (late, handles_late) = seen[0], seen[-1]
+    return {
+        "bakes of the soak": bakes,
+        f"memory after {settled} [MiB]": round(early),
+        "memory at the end [MiB]": round(late),
+        f"file handles after {settled}": handles,
+        "file handles at the end": handles_late,
+    }
+
+
+if __name__ == "__main__":
+    main()
