@@ -50,6 +50,15 @@ def bpy() -> Iterator[ModuleType]:
     addon_utils.disable("blender_addon", default_set=True)
 
 
+@pytest.fixture(autouse=True)
+def own_queue(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Let trainings line up apart from those of whoever works on this machine."""
+    from blender_addon.outside import jobs
+
+    folder = tmp_path_factory.getbasetemp() / "queue"
+    monkeypatch.setattr(jobs, "queue_folder", lambda: folder)
+
+
 @pytest.fixture(scope="session")
 def met() -> dict[str, str]:
     """What the Python with ssilk said of itself: asking takes seconds, once is enough."""
