@@ -63,14 +63,15 @@ def joined(meshes: Sequence[Mesh]) -> Mesh | None:
 
 def _sections(player: Player, garment: Dressed, meter: TermsMeter) -> list[Section]:
     values = {name: np.array(found) for name, found in meter.values.items()}
-    worst = worst_frames(values["total"], PICTURES, max(1, round(APART * player.fps)))
+    bad = values["total"] - values["gravity"]  # height is no fault
+    worst = worst_frames(bad, PICTURES, max(1, round(APART * player.fps)))
     times, marks = np.arange(len(values["total"])) / player.fps, dict(zip(worst, LETTERS))
     shown = [name for name in UNITS if meter.body or name not in ("collision", SHARE)]
     charts = "".join(strip(name, UNITS[name], times, values[name], marks) for name in shown)
     rows = [[f"{name} [{UNITS[name]}]", *_spread(values[name])] for name in shown]
     name = player.meshes[garment.index].name
     pictures = "".join(
-        figure(picture(player, frame), f"{letter}: {times[frame]:.2f} s, {values['total'][frame]:.4g} J")
+        figure(picture(player, frame), f"{letter}: {times[frame]:.2f} s, {bad[frame]:.4g} J without gravity")
         for frame, letter in marks.items()
     )
     return [
