@@ -19,20 +19,22 @@ from ssilk_core.cli import main as ssilk
 Row = dict[str, Any]
 
 
-def evaluated(options: argparse.Namespace) -> list[Row]:
-    """Return the figures of 'ssilk evaluate' for all models."""
+def evaluated(options: argparse.Namespace, *, probes: bool = False) -> tuple[list[Row], str]:
+    """Return the figures of 'ssilk evaluate' for all models, and its tables; stops and loops only for `probes`."""
     named = ("stage", "motions", "index", "reference", "sequence", "device")
     given = [(f"--{name}", value) for name in named if (value := getattr(options, name)) is not None]
+    words = [word for pair in given for word in pair]
+    words += [
+        f"--{name}" for name in ("exact", "minimum", "simulate-stops") if getattr(options, name.replace("-", "_"))
+    ]
+    words += ["--loop", options.loop] if probes else ["--stops", 0, "--loop", 0]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "figures.json"
-        plain = ("--stops", 0), ("--loop", 0), ("--output", path)
-        asked = ["evaluate", *options.models, *(word for pair in (*given, *plain) for word in pair)]
-        asked += ["--exact"] if options.exact else []
-        with redirect_stdout(StringIO()):  # its own tables
-            code = ssilk([str(word) for word in asked])
+        with redirect_stdout(StringIO()) as shown:
+            code = ssilk([str(word) for word in ("evaluate", *options.models, *words, "--output", path)])
         if code:
             raise SystemExit(code)
-        return json.loads(path.read_text())["figures"]
+        return json.loads(path.read_text())["figures"], shown.getvalue()
 
 
 @dataclass(frozen=True, eq=False)

@@ -68,7 +68,7 @@ def alone(told: Mapping[str, Mapping[str, Any]], name: str) -> dict[Any, list[st
 
 def sweep(options: argparse.Namespace) -> tuple[str, Any]:
     """Return totals by setting, one changed at a time."""
-    told, rows = told_by(options), evaluated(options)
+    told, (rows, _) = told_by(options), evaluated(options)
     lines, found = [], Totals()
     for name in SWEEPS[options.table]:
         for value, paths in alone(told, name).items():

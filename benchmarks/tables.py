@@ -8,6 +8,7 @@ MODELS are files, or folders of them: those of 'ssilk train' and baselines, whos
 one garment and method are taken as seeds, and shown as mean and standard deviation. SHOTS is what 'ssilk simulate'
 made of the clips, one folder for each garment.
 
+    evaluate  all that 'ssilk evaluate' tells
     table1    every garment, split and method: total, collisions, excess over the simulator
     table2    the same of `inertia` and `flips`, beside the simulator
     table3    time of a single frame of one clip, in PyTorch
@@ -85,7 +86,7 @@ def _shares(text: str, met: Sequence[bool]) -> list[str]:
 
 
 def table1(options: argparse.Namespace) -> tuple[str, Any]:
-    rows = evaluated(options)
+    rows, _ = evaluated(options)
     found = cells(rows)
     notes = "".join(f"\n- {line}" for line in verdicts(found))
     return methods_table(found, SPLITS) + notes + "\n", rows
@@ -93,8 +94,13 @@ def table1(options: argparse.Namespace) -> tuple[str, Any]:
 
 def table2(options: argparse.Namespace) -> tuple[str, Any]:
     need(options.reference, "table2", "no --reference", "it shows the simulator, whose shots are needed")
-    rows = [row for row in evaluated(options) if row["split"] != "valid"]
+    rows = [row for row in evaluated(options)[0] if row["split"] != "valid"]
     return methods_table(cells(rows), SPLITS[1:]), rows
+
+
+def everything(options: argparse.Namespace) -> tuple[str, Any]:
+    rows, text = evaluated(options, probes=True)
+    return text, rows
 
 
 def table3(options: argparse.Namespace) -> tuple[str, Any]:
@@ -116,7 +122,7 @@ def clip_of(options: argparse.Namespace, file: ModelFile) -> Motion:
 
 
 MADE: dict[str, Callable[[argparse.Namespace], tuple[str, Any]]] = {
-    "table1": table1, "table2": table2, "table3": table3, **dict.fromkeys(SWEEPS, sweep),
+    "evaluate": everything, "table1": table1, "table2": table2, "table3": table3, **dict.fromkeys(SWEEPS, sweep),
 }  # fmt: skip
 
 
@@ -130,6 +136,9 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--index", type=Path, help="JSON list of clips with their splits and tags")
     parser.add_argument("--reference", type=Path, metavar="SHOTS", help="folder of the simulator's shots")
     parser.add_argument("--exact", action="store_true", help="collide with the whole body, as the simulator does")
+    parser.add_argument("--loop", type=int, default=2000, help="of evaluate: frames to loop (default 2000)")
+    parser.add_argument("--minimum", action="store_true", help="of evaluate: minimise the energy of held poses")
+    parser.add_argument("--simulate-stops", action="store_true", help="of evaluate: simulate the stops too")
     parser.add_argument("--sequence", type=int, metavar="FRAMES", help="start clips anew after so many (paper: 512)")
     parser.add_argument("--clip", default="49_08a", help="clip of table3 (default 49_08a)")
     parser.add_argument("--frames", type=int, default=1000, help="that table3 times (default 1000)")

@@ -72,6 +72,12 @@ def test_methods_stand_side_by_side_and_seeds_together(made, world):
     assert "- ssilk's total is lower than ncs*'s in" in (world / "table1.md").read_text()
 
 
+def test_everything_is_what_evaluate_tells(made, world):
+    _, figures = made(f"evaluate models/2.safetensors {WORLD} --loop 1")
+    assert (world / "evaluate.md").read_text().count("| garment |") == 4  # energies, motion, stops, loops
+    assert figures[-1]["figures"]["holds"]["stops"] == 2 and figures[-1]["figures"]["loops"]["clips"] == 1
+
+
 def test_one_setting_at_a_time(made, world):
     (_, *lines), figures = made(f"table5 models {WORLD}")
     assert [line[:2] for line in lines] == [["batch", "2"], ["batch", "4"], ["window", "4"], ["latent", "8"]]
