@@ -6,16 +6,16 @@ from __future__ import annotations
 WORDS = {
     # Garment, fabric
     "Garment": "Kleidungsstück",
-    "Armature": "Armatur",
+    "Armature": "Skelett",
     "Armature of the character that wears the garment; found by its Armature modifier when empty": (
-        "Armatur der Figur, die das Kleidungsstück trägt; leer: die seines Armatur-Modifikators"
+        "Skelett der Figur, die das Kleidungsstück trägt; leer: das seines Skelett-Modifikators"
     ),
     "Choose Garment": "Kleidungsstück wählen",
     "Work on this garment": "An diesem Kleidungsstück arbeiten",
     "Name of the object to work on": "Name des Objekts, an dem gearbeitet wird",
     "Bodies": "Körper",
     "Meshes that the garment collides with; all others bound to the armature when empty": (
-        "Netze, mit denen das Kleidungsstück kollidiert; leer: alle anderen, die an die Armatur gebunden sind"
+        "Netze, mit denen das Kleidungsstück kollidiert; leer: alle anderen, die an das Skelett gebunden sind"
     ),
     "Fabric": "Stoff",
     "What the garment is made of": "Woraus das Kleidungsstück besteht",
@@ -185,7 +185,7 @@ WORDS = {
     "What can be trained on": "Womit trainiert werden kann",
     "Find Motions": "Bewegungen suchen",
     "List what the armature plays: the timeline, its actions, its NLA strips; what was chosen stays chosen": (
-        "Auflisten, was die Armatur spielt: Zeitleiste, Aktionen, NLA-Streifen; Gewähltes bleibt gewählt"
+        "Auflisten, was das Skelett spielt: Zeitleiste, Aktionen, NLA-Streifen; Gewähltes bleibt gewählt"
     ),
     "Add Motion Files": "Dateien hinzufügen",
     "Train on animations of this skeleton in USD files, too": (
@@ -196,12 +196,12 @@ WORDS = {
     "Kind": "Art",
     "Timeline": "Zeitleiste",
     "All that the armature plays over the scene's frame range": (
-        "Alles, was die Armatur im Bildbereich der Szene spielt"
+        "Alles, was das Skelett im Bildbereich der Szene spielt"
     ),
     "Action": "Aktion",
-    "One of the armature's actions by itself": "Eine Aktion der Armatur für sich",
+    "One of the armature's actions by itself": "Eine Aktion des Skeletts für sich",
     "Strip": "Streifen",
-    "One strip of the armature's NLA tracks by itself": "Ein Streifen der NLA-Spuren der Armatur für sich",
+    "One strip of the armature's NLA tracks by itself": "Ein Streifen der NLA-Spuren des Skeletts für sich",
     "File": "Datei",
     "A USD file with an animation of this skeleton": "Eine USD-Datei mit einer Animation dieses Skeletts",
     "Track": "Spur",
@@ -273,7 +273,7 @@ WORDS = {
     "Live Playback": "Live-Wiedergabe",
     "Play Live": "Live spielen",
     "Play the trained garment on the armature as it is, frame by frame, without a bake": (
-        "Das trainierte Kleidungsstück auf der Armatur spielen, wie sie ist, Bild für Bild, ohne zu backen"
+        "Das trainierte Kleidungsstück auf dem Skelett spielen, wie es ist, Bild für Bild, ohne zu backen"
     ),
     "Stop Playing": "Wiedergabe beenden",
     "Play the garment no longer; it stays as it is in this frame": (
@@ -281,7 +281,7 @@ WORDS = {
     ),
     "Read Motion Again": "Bewegung neu lesen",
     "Read what the armature does over the scene's frames anew: after edits, or when the frame range changed": (
-        "Neu lesen, was die Armatur über die Bilder der Szene tut: nach Änderungen, oder bei anderem Bildbereich"
+        "Neu lesen, was das Skelett über die Bilder der Szene tut: nach Änderungen, oder bei anderem Bildbereich"
     ),
     "Quality": "Qualität",
     "Penetration": "Durchdringung",
