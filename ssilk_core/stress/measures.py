@@ -45,16 +45,22 @@ def at_rate(fps: int) -> Measure:
     """Return what bakes at another rate; the error is the distance from the bake at the model's rate [m]."""
 
     def measure(subject: Subject) -> Measured:
-        base, own = subject.base, round(subject.fps)
+        base = subject.base
         drive = base.lasting((base.frames - 1) / base.fps, fps)
-        shared = gcd(fps, own)
-        found, expected = (positions(subject.model, each) for each in (drive, base))
-        found, expected = found[:: fps // shared], expected[:: own // shared]
-        count = min(len(found), len(expected))
-        error = float(np.linalg.norm(found[:count] - expected[:count], axis=2).max())
+        error = rate_error(subject, drive) if subject.fps.is_integer() else None
         return Measured(extent(subject.model, subject.fabric, drive), error, "m")
 
     return measure
+
+
+def rate_error(subject: Subject, drive: Drive) -> float:
+    """Return the largest distance of a vertex from the bake at the model's rate, at the times of both [m]."""
+    fps, own = round(drive.fps), round(subject.fps)
+    shared = gcd(fps, own)
+    found, expected = (positions(subject.model, each) for each in (drive, subject.base))
+    found, expected = found[:: fps // shared], expected[:: own // shared]
+    count = min(len(found), len(expected))
+    return float(np.linalg.norm(found[:count] - expected[:count], axis=2).max())
 
 
 def turned(axis: tuple[float, float, float], speed: float = 0.0, angle: float = 0.0) -> Measure:

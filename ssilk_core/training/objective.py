@@ -56,7 +56,7 @@ class Objective:
 
     def _planes(self, x: Tensor, character: Tensor) -> tuple[Tensor, Tensor]:
         """Return the plane that each vertex of x (V, 3, N) may meet: normals (V, 3, N) and offsets (V, N)."""
-        normal, offset = torch.zeros_like(x), x.new_full((len(x), x.shape[2]), -NOWHERE)
+        normal, offset = x.new_zeros(x.shape), x.new_full((len(x), x.shape[2]), -NOWHERE)
         if self.body is None:
             return normal, offset
         body = self.body.posed(character, surface=self.surface)

@@ -163,6 +163,18 @@ def test_streaming_gives_what_a_bake_gives(subject, monkeypatch):
     np.testing.assert_allclose(streamed, baked, atol=1e-5)
 
 
+def test_a_model_of_another_rate_is_measured_at_its_own(subject):
+    odd = replace(subject, file=replace(subject.file, config=replace(subject.file.config, fps=23.976)))
+    outcome = next(case for case in CASES if case.matches(["rate: 60"])).run(odd)
+    assert outcome.verdict == "works" and outcome.measured.error is None
+
+
+def test_a_clip_of_one_frame_is_a_pose_that_is_held(subject, toy_motion):
+    still = replace(subject, clip=toy_motion(subject.scene, 1))
+    found = next(case for case in CASES if case.matches(["upside down"])).run(still).measured.extent
+    assert found.finite and found.speed < 1e-3 and found.growth == pytest.approx(1.0, abs=1e-3)
+
+
 def test_double_precision_is_its_own_truth_and_half_is_not(subject):
     exact = subject.in_precision(torch.float64)
     assert meter.precision_errors(exact, exact, subject.base) == (0, 0)
