@@ -76,6 +76,7 @@ class GenerateRig(RigOperator, bpy.types.Operator):
     bl_idname = "ssilk.generate_rig"
     bl_label = "Generate Proxy Rig"
     undo = "Generate Proxy Rig"
+    edits = ""
 
     proxies: IntProperty(name="Proxies", description="Proxy bones on the loose part", default=20, min=1, max=200)
     roots: IntProperty(
@@ -94,14 +95,14 @@ class GenerateRig(RigOperator, bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, _: bpy.types.Event) -> set[str]:
         """Ask for the options."""
+        self.edits = edits_line(context.object)
         return context.window_manager.invoke_props_dialog(self)
 
-    def draw(self, context: bpy.types.Context) -> None:
+    def draw(self, _: bpy.types.Context) -> None:
         """Draw the options, with what there is to keep."""
-        layout = self.layout
         for name in ("proxies", "roots", "keep_edits"):
-            layout.prop(self, name)
-        layout.label(text=edits_line(context.object))
+            self.layout.prop(self, name)
+        self.layout.label(text=self.edits, translate=False)
 
     def prepare(self, context: bpy.types.Context) -> Work:
         garment = context.object

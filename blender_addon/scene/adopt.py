@@ -64,4 +64,4 @@ def _remember(armature: bpy.types.Object, garment: bpy.types.Object) -> None:
         records[bone.name] = {"matrix": matrix, "parent": bone.parent.name if bone.parent else ""}
     remember_bones(armature, garment, records)
     names = [group.name for group in garment.vertex_groups]
-    remember_weights(garment.data, read_groups(garment, garment.data, names), names)
+    remember_weights(armature, garment, read_groups(garment, garment.data, names), names)

@@ -12,7 +12,7 @@ from ..errors import need
 from .armature import need_editable, proxy_names
 from .attributes import write_classes
 from .gather import own_weights
-from .handmade import MADE, find_edits, generated, remember_weights
+from .handmade import find_edits, generated, remember_weights
 from .proxies import replace_proxies
 from .weights import keep_plain, read_groups, read_plain, write_groups
 
@@ -75,8 +75,7 @@ def _give_weights(
     total = painted.sum(axis=1, keepdims=True)
     painted = np.divide(painted, total, out=made.copy(), where=total > 0)
     write_groups(garment, np.where(repainted[:, None], painted, made), names, old)
-    bones = armature.data.bones
-    remember_weights(garment.data, made, [bones[name].get(MADE, name) for name in names])
+    remember_weights(armature, garment, made, names)
 
 
 def _need_same(garment: bpy.types.Object, rig: Rig) -> None:

@@ -9,13 +9,14 @@ stays right where a mesh is subdivided.
 from __future__ import annotations
 
 import zlib
+from collections.abc import Sequence
 
 import bpy
 import numpy as np
 
 from ..contract.edits import Edits
 from .armature import collection_of, made_collection, proxy_names
-from .weights import read_groups
+from .weights import read_groups, write_groups
 
 MADE = "ssilk_made"  # custom property of the collection: the proxies by key; of a bone: its key
 SIGNATURE = "ssilk:made"  # attribute of points
@@ -30,10 +31,34 @@ def remember_bones(
     made_collection(armature.data, garment)[MADE] = records
 
 
-def remember_weights(mesh: bpy.types.Mesh, weights: np.ndarray, keys: list[str]) -> None:
-    """Remember generated weights, shape (V, J), over joints with these keys."""
-    attribute = mesh.attributes.get(SIGNATURE) or mesh.attributes.new(SIGNATURE, "FLOAT", "POINT")
-    attribute.data.foreach_set("value", _signature(weights, keys))
+def remember_weights(
+    armature: bpy.types.Object,
+    garment: bpy.types.Object,
+    weights: np.ndarray,
+    names: Sequence[str],
+    *,
+    repainted: np.ndarray | None = None,
+) -> None:
+    """Remember generated weights, shape (V, J), over joints with these names.
+
+    Args:
+        repainted: vertices (V,) whose weights are an artist's, whatever they are now.
+    """
+    attributes, bones = garment.data.attributes, armature.data.bones
+    attribute = attributes.get(SIGNATURE) or attributes.new(SIGNATURE, "FLOAT", "POINT")
+    numbers = _signature(weights, [bones[name].get(MADE, name) if name in bones else name for name in names])
+    if repainted is not None:
+        numbers[repainted] = np.inf  # which no weights have
+    attribute.data.foreach_set("value", numbers)
+
+
+def learn_weights(
+    armature: bpy.types.Object, garment: bpy.types.Object, weights: np.ndarray, names: Sequence[str]
+) -> None:
+    """Give a garment weights that were trained, shape (V, J); that is no repainting. In object mode."""
+    repainted = find_edits(armature, garment).repainted
+    write_groups(garment, weights, names, ())
+    remember_weights(armature, garment, weights, names, repainted=repainted)
 
 
 def generated(armature: bpy.types.Object, garment: bpy.types.Object) -> dict[str, dict[str, object]]:

@@ -188,3 +188,29 @@ def test_fewer_proxies_leave_an_edited_one_its_own(ready, rigged, edit):  # noqa
     assert name in proxies_of(ready)
     assert len(proxies_of(ready)) in {3, 4}
     np.testing.assert_allclose(weights_of(rigged).sum(axis=1), 1, atol=1e-6)
+
+
+def test_trained_weights_are_no_repainting_and_repainted_vertices_stay_known(ready, rigged):  # noqa: F811
+    from blender_addon.scene.handmade import learn_weights
+
+    armature, names = ready.data.objects["Rig"], [*BONES, *proxies_of(ready)]
+    for group in rigged.vertex_groups:
+        group.remove([5])
+    rigged.vertex_groups["Hips"].add([5], 1.0, "REPLACE")
+    learned = np.random.default_rng(0).dirichlet(np.ones(len(names)), len(rigged.data.vertices)).astype(np.float32)
+    learn_weights(armature, rigged, learned, names)
+    found = edits_of(ready, rigged)
+    assert (found.summary, np.flatnonzero(found.repainted).tolist()) == ("1 vertices repainted", [5])
+    ready.ops.ssilk.generate_rig(proxies=6)
+    columns = [rigged.vertex_groups[name].index if name in rigged.vertex_groups else -1 for name in names]
+    row = np.pad(weights_of(rigged)[5], (0, 1))[columns]
+    np.testing.assert_allclose(row, learned[5], atol=1e-5)
+    assert np.count_nonzero(weights_of(rigged)[6]) < len(names)
+
+
+def test_the_dialog_says_what_there_is_to_keep(ready, rigged, edit):  # noqa: F811
+    from blender_addon.operators.rig import edits_line
+
+    assert edits_line(rigged) == "By hand: nothing"
+    edit(lambda bones: bones.remove(bones[proxies_of(ready)[-1]]))
+    assert edits_line(rigged) == "By hand: 1 deleted"
