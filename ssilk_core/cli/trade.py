@@ -117,17 +117,18 @@ class Bench:
             "ssilk": __version__,
         }
 
-    def meter(self, path: Path, file: ModelFile) -> Meter:
-        """Return what measures a model."""
+    def meter(self, path: Path, file: ModelFile, *, only: str | None = None) -> Meter:
+        """Return what measures a model on all clips, cut for other motions; or on `only` one, cut for it."""
         from ssilk_core.evaluation.methods import reel_of
         from ssilk_core.evaluation.takes import takes_of
         from ssilk_core.reduction import Reducer
         from ssilk_core.trade.measure import Meter
 
         dressed = self._dressed(file)
-        takes = [take for name, clip in self.clips.items() for take in takes_of(name, clip, dressed.fps)]
+        clips = {only: self.clips[only]} if only else self.clips
+        takes = [take for name, clip in clips.items() for take in takes_of(name, clip, dressed.fps)]
         reel = reel_of(takes, dressed, file.joints)
-        reducer = Reducer(file, self.others)
+        reducer = Reducer(file, [self.clips[only]] if only else self.others)
         return Meter(path.stem, reducer, dressed, reel, self._weigh(path), self._reference(dressed, reel))
 
     def _dressed(self, file: ModelFile) -> Dressed:
