@@ -3,7 +3,8 @@
 
 Every frame minimises the energy that networks are trained with, for every vertex. The result is a shot whose garment
 has its points at each frame, with the body playing beside it. Several motions advance together, which a GPU takes
-hardly longer for, into one file each.
+hardly longer for, into one file each in a folder. A file appears as soon as its shot is done; what an interrupted
+simulation has finished is left alone by the next one that asks for the same.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import argparse
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,8 +25,9 @@ from . import options as shared
 
 if TYPE_CHECKING:
     import torch
+    from ssilk_usd.points import PointCache
 
-    from ssilk_core.assets import Motion, Scene
+    from ssilk_core.assets import Floats, Motion, Scene
     from ssilk_core.simulate import SimulationOptions
 
 
@@ -48,6 +51,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
                       help="of positions and energies (default float64)")  # fmt: skip
     verb.add_argument("--batch", type=int, default=64, help="motions that advance together (default 64)")
     verb.add_argument("--no-body", action="store_true", help="leave the body meshes out")
+    verb.add_argument("--again", action="store_true", help="simulate what is there and current, too (folders)")
     verb.add_argument("--device", default="cpu", help="where it runs (default cpu)")
 
 
@@ -64,7 +68,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         shared.check_output(output, options.stage, *motion_files(options.motion))
     device = chosen_device(options.device)
     scene = shared.load_scene(options, report)
-    motions = [read_motion(str(path), scene.character.skeleton) for path in options.motion]
+    fabric = shared.fabric(options)
     settings = SimulationOptions(
         fps=options.fps,
         substeps=options.substeps,
@@ -73,10 +77,32 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         solver=SolverOptions(tolerance=options.tolerance),
         rest=SolverOptions(tolerance=options.tolerance, iterations=150),
     )
-    fabric = shared.fabric(options)
-    found = _written(options, outputs, scene, fabric, motions, settings, device, report)
-    report(Result("simulate", {"shots": ", ".join(map(str, outputs)), **found}))
+    motions = [read_motion(str(path), scene.character.skeleton) for path in options.motion]
+    shots = [
+        _Shot(output, motion, _provenance(options, path))
+        for output, motion, path in zip(outputs, motions, options.motion)
+    ]
+    missing = [shot for shot in shots if options.again or outputs == [options.output] or not shot.is_done]
+    found = _written(options, missing, scene, fabric, settings, device, report) if missing else {}
+    left = {"current": len(shots) - len(missing)} if len(missing) < len(shots) else {}
+    report(Result("simulate", {"shots": ", ".join(map(str, outputs)), **left, **found}))
     return EXIT_OK
+
+
+@dataclass(frozen=True, eq=False)
+class _Shot:
+    """A shot to be simulated: its file, the character's motion, and what the file says of its origin."""
+
+    output: Path
+    motion: Motion
+    provenance: dict[str, str | float]
+
+    @property
+    def is_done(self) -> bool:
+        """Return whether the file is there and was simulated from the same."""
+        from ssilk_usd.provenance import read_provenance
+
+        return self.output.is_file() and read_provenance(self.output).get("simulated") == self.provenance
 
 
 def _outputs(output: Path, motions: Sequence[Path]) -> list[Path]:
@@ -96,44 +122,92 @@ def _outputs(output: Path, motions: Sequence[Path]) -> list[Path]:
 
 def _written(
     options: argparse.Namespace,
-    outputs: Sequence[Path],
+    shots: Sequence[_Shot],
     scene: Scene,
     fabric: Fabric,
-    motions: Sequence[Motion],
     settings: SimulationOptions,
     device: torch.device,
     report: Reporter,
 ) -> dict[str, object]:
     """Simulate into open files, frame by frame, and return figures of the whole."""
-    from ssilk_usd.points import point_cache
-    from ssilk_usd.read_stage import open_stage
-    from ssilk_usd.units import StageUnits
-
     from ssilk_core.simulate import Simulator, shots_of
 
-    simulator = Simulator(scene, fabric, settings, device=device)
-    shots = shots_of(motions, settings)
-    units, total = StageUnits.of(open_stage(options.stage)), sum(shot.frame_count for shot in shots)
-    report(Started("simulate", total, {"outputs": [str(path) for path in outputs]}))
-    figures = _Figures(settings.solver.tolerance)
+    simulator, motions = Simulator(scene, fabric, settings, device=device), [shot.motion for shot in shots]
+    played = shots_of(motions, settings)
+    total = sum(motion.frame_count for motion in played)
+    report(Started("simulate", total, {"outputs": [str(shot.output) for shot in shots]}))
+    figures, start = _Figures(settings.solver.tolerance), time.monotonic()
     with ExitStack() as stack:
-        caches = [
-            stack.enter_context(point_cache(path, scene, shot, units=units, include_body=not options.no_body,
-                                            provenance=_provenance(options, motion)))
-            for path, shot, motion in zip(outputs, shots, options.motion)
-        ]  # fmt: skip
-        start = time.monotonic()
+        caches = _Caches(stack, options, shots, scene, played)
         for done, frame in enumerate(simulator.frames(motions), start=1):
-            caches[frame.shot].write(frame.number, frame.points)
+            caches.write(frame.shot, frame.number, frame.points)
             figures.add(frame.imbalance, frame.iterations)
             report(Progress(done, total, (time.monotonic() - start) / done * (total - done)))
     return figures.of_all(total, time.monotonic() - start)
 
 
-def _provenance(options: argparse.Namespace, motion: Path) -> dict[str, object]:
-    names = ("fabric", "material", "fps", "substeps", "tolerance", "precision")
-    return {"simulated": {"stage": str(options.stage), "motion": str(motion)}
-            | {name: getattr(options, name) for name in names}}  # fmt: skip
+class _Caches:
+    """The point caches of shots under way: each is opened by its first frame, and a file once it has all of them."""
+
+    def __init__(
+        self,
+        stack: ExitStack,
+        options: argparse.Namespace,
+        shots: Sequence[_Shot],
+        scene: Scene,
+        played: Sequence[Motion],
+    ) -> None:
+        from ssilk_usd.read_stage import open_stage
+        from ssilk_usd.units import StageUnits
+
+        self.stack, self.options, self.shots, self.scene, self.played = stack, options, shots, scene, played
+        self.units = StageUnits.of(open_stage(options.stage))
+        self.open: dict[int, tuple[ExitStack, PointCache]] = {}
+
+    def write(self, shot: int, frame: int, points: Floats) -> None:
+        """Write the garment's points (V, 3) [m] of one frame."""
+        if shot not in self.open:
+            self.open[shot] = self._opened(shot)
+        own, cache = self.open[shot]
+        cache.write(frame, points)
+        if cache.written.all():
+            del self.open[shot], cache
+            own.close()
+
+    def _opened(self, shot: int) -> tuple[ExitStack, PointCache]:
+        from ssilk_usd.points import point_cache
+
+        asked, own = self.shots[shot], self.stack.enter_context(ExitStack())
+        cache = own.enter_context(
+            point_cache(
+                asked.output,
+                self.scene,
+                self.played[shot],
+                units=self.units,
+                include_body=not self.options.no_body,
+                provenance={"simulated": asked.provenance},
+            )
+        )
+        return own, cache
+
+
+def _provenance(options: argparse.Namespace, motion: Path) -> dict[str, str | float]:
+    """Return all that decides what a shot's file holds."""
+    from ssilk_usd.read_stage import content_hash, split_location
+
+    garment, _ = shared.wardrobe(options)
+    names = ("fabric", "fps", "substeps", "tolerance", "precision", "proxies", "no_body")
+    lists = ("material", "body", "classes", "rig")
+    return {
+        "stage": str(options.stage),
+        "motion": str(motion),
+        "garment": str(options.garment or ""),
+        "root": options.root or "",
+        "contents": " ".join(content_hash(str(path))
+                             for path in (options.stage, garment, split_location(str(motion))[0])),
+        **{name: getattr(options, name) for name in names},
+        **{name: ", ".join(getattr(options, name)) for name in lists},
+    }  # fmt: skip
 
 
 class _Figures:

@@ -70,6 +70,39 @@ def test_an_interruption_leaves_nothing_half_written(stage, monkeypatch):
     assert sorted(stage.iterdir()) == before
 
 
+def test_what_an_interrupted_simulation_finished_is_not_done_again(stage, monkeypatch, capsys):
+    words = [
+        "simulate",
+        "rigged.usda",
+        "--motion",
+        "brief.usda",
+        "short.usda",
+        "--no-body",
+        "--batch",
+        "1",
+        "-o",
+        "caches",
+    ]
+    advanced, asked = Simulator.frames, []
+
+    def interrupted(self, motions):
+        asked.append(len(motions))
+        for frame in advanced(self, motions):
+            if len(asked) == 1 and frame.shot == 1:  # the longer one is through
+                raise KeyboardInterrupt
+            yield frame
+
+    monkeypatch.setattr(Simulator, "frames", interrupted)
+    assert main(words) == 130
+    assert [path.name for path in (stage / "caches").iterdir()] == ["brief.usdc"]
+    written = (stage / "caches" / "brief.usdc").stat().st_mtime_ns
+    assert main(words) == 0 and asked == [2, 1]
+    assert (stage / "caches" / "brief.usdc").stat().st_mtime_ns == written
+    assert main(words) == 0 and asked == [2, 1] and "current: 2" in capsys.readouterr().err
+    assert main([*words, "--material", "density=0.2"]) == 0 and main([*words, "--again"]) == 0
+    assert asked == [2, 1, 2, 2]
+
+
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
