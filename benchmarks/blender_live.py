@@ -91,7 +91,7 @@ def main(model: Path, result: Path) -> None:
         scene.frame_set(frame)
         depsgraph = bpy.context.evaluated_depsgraph_get()
         start = time.process_time()
-        played.show(frame, depsgraph)
+        played.show(scene, depsgraph)
         taken.append(time.process_time() - start)
     result.write_text(json.dumps({"show": taken}))
 

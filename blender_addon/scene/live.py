@@ -70,13 +70,18 @@ class Live:
         garment, armature = (_found(name, uid) for name, uid in self.things)
         return garment, armature
 
-    def show(self, frame: int, depsgraph: bpy.types.Depsgraph) -> None:
-        """Put proxies and shape keys where the garment is at a frame; what lies outside the range is held."""
-        if self.playback is None:
+    def is_in(self, scene: bpy.types.Scene) -> bool:
+        """Return whether a scene holds the garment; motions are read in one that does not."""
+        garment, _ = self.objects()
+        return garment.name in scene.objects
+
+    def show(self, scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+        """Put proxies and shape keys where the garment is in this frame; what lies outside the range is held."""
+        if self.playback is None or not self.is_in(scene):
             return
         garment, armature = self.objects()
-        index = min(max(frame - self.first, 0), len(self.placed) - 1)
-        if index == frame - self.first:
+        index = min(max(scene.frame_current - self.first, 0), len(self.placed) - 1)
+        if index == scene.frame_current - self.first:
             self._take_notice(armature.evaluated_get(depsgraph), index)
         pose = self.playback.pose(index)
         turns = turns_from_rest(self.joints, pose.rotations[:, self.trained.proxies])[0]

@@ -17,6 +17,7 @@ PATIENCE = 0.3  # seconds after an edit before the motion is read anew
 BETWEEN = 0.01  # seconds between two slices of reading, for the artist
 _played: dict[int, Live] = {}
 _reasons: dict[int, str] = {}
+_outdated: set[int] = set()  # those whose keys were edited since their motion was read
 _rendering = False
 
 
@@ -37,6 +38,7 @@ def play(garment: bpy.types.Object) -> None:
         SetupError: it cannot be played.
     """
     _reasons.pop(garment.session_uid, None)
+    _outdated.discard(garment.session_uid)
     _played[garment.session_uid] = Live(garment, model_of(garment))
     garment.ssilk.live = True
     _read_soon(0.0)
@@ -50,6 +52,7 @@ def stop(garment: bpy.types.Object) -> None:
 
 def refresh(garment: bpy.types.Object) -> None:
     """Read the motion of a garment that is played anew."""
+    _outdated.discard(garment.session_uid)
     _played[garment.session_uid].refresh()
     _read_soon(0.0)
 
@@ -62,13 +65,17 @@ def start_listening() -> None:
 
 def stop_listening() -> None:
     """Leave nothing behind."""
-    _played.clear()
-    _reasons.clear()
+    _forget()
     for handlers, function in _handlers():
         if function in handlers:
             handlers.remove(function)
     if bpy.app.timers.is_registered(_read):
         bpy.app.timers.unregister(_read)
+
+
+def _forget() -> None:
+    for known in (_played, _reasons, _outdated):
+        known.clear()
 
 
 def _handlers() -> list[tuple[list, object]]:
@@ -95,7 +102,8 @@ def _read_soon(seconds: float) -> None:
 def _read() -> float | None:
     """Read a little of one motion; return when to be called again."""
     for uid, played in list(_played.items()):
-        if played.stale and not bpy.app.background:
+        if uid in _outdated:
+            _outdated.discard(uid)
             _attempt(uid, played.refresh)
         if played.done is not None:
             more = _attempt(uid, played.read)
@@ -119,25 +127,23 @@ def _show_all(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     if _rendering and not (scene.render.use_lock_interface or bpy.app.background):
         return
     for uid, played in list(_played.items()):
-        name, _ = played.things[0]
-        if name in scene.objects:  # motions are read in a scene that holds nothing but the armature
-            _attempt(uid, played.show, scene.frame_current, depsgraph)
+        _attempt(uid, played.show, scene, depsgraph)
 
 
 @persistent
 def _frame_changed(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     _show_all(scene, depsgraph)
-    if any(played.stale for played in _played.values()) and not bpy.app.background:
-        _read_soon(PATIENCE)
 
 
 @persistent
 def _edited(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    """Read the motion anew when keys were edited."""
+    """Read the motion anew when keys were edited; what else may move the armature is for the artist to say."""
     if not _played or not any(isinstance(update.id, bpy.types.Action) for update in depsgraph.updates):
         return
-    for played in _played.values():
-        played.stale = played.stale or played.things[0][0] in scene.objects
+    for uid, played in list(_played.items()):
+        if _attempt(uid, played.is_in, scene):
+            played.stale = True
+            _outdated.add(uid)
     if not bpy.app.background:
         _read_soon(PATIENCE)
 
@@ -145,8 +151,7 @@ def _edited(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
 @persistent
 def _loaded(_: str) -> None:
     """Go on playing what was played when the file was saved."""
-    _played.clear()
-    _reasons.clear()
+    _forget()
     for garment in bpy.data.objects:
         if garment.ssilk.live:
             _attempt(garment.session_uid, play, garment)
