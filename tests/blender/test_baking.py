@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import re
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +12,7 @@ import pytest
 
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
-from .conftest import activate
+from .conftest import ROOT, activate
 from .scenes import decoded, ended, enliven, rig_and_animate, shown
 
 EXACT = 1e-5  # [m]
@@ -74,23 +76,35 @@ def test_blender_shows_what_the_decoder_says_on_every_frame(ready, trained, tmp_
     assert np.abs(shown(ready, trained, FRAMES) - wanted).max() < EXACT
 
 
-def test_lower_qualities_leave_proxies_and_shapes_out(ready, trained, tmp_path, ssilk_python):
+def test_a_level_of_quality_leaves_shapes_out(ready, trained, tmp_path, ssilk_python):
     bake(ready, trained)
     whole = shown(ready, trained, FRAMES)
     bake(ready, trained, quality="crowd")
-    few = shown(ready, trained, FRAMES)
-    away = np.linalg.norm(few - whole, axis=-1)
-    assert 1e-3 < away.max() < np.linalg.norm(whole - decoded_plain(ssilk_python, trained, tmp_path), axis=-1).max()
-    keys = [key.name for key in trained.data.shape_keys.key_blocks]
-    assert len([name for name in keys if name.startswith("SSILK ")]) <= 9
-    moved = {group.name for group in trained.vertex_groups if group.name.startswith("Skirt_proxy")}
-    assert len(moved) <= 4
-    told = refused(ready, trained, quality="hero")
-    assert "bake it to USD alone" in told
+    away = np.linalg.norm(shown(ready, trained, FRAMES) - whole, axis=-1).max()
+    plain = decoded(ssilk_python, model_of(trained), tmp_path, plain=True)
+    assert 1e-4 < away < np.linalg.norm(whole - plain, axis=-1).max()
+    assert len([key for key in trained.data.shape_keys.key_blocks if key.name.startswith("SSILK ")]) < 25
+    assert "bake it to USD alone" in refused(ready, trained, quality="hero")
 
 
-def decoded_plain(python, garment, folder):
-    return decoded(python, model_of(garment), folder, plain=True)
+def test_a_reduced_model_leaves_its_proxies_at_rest(ready, trained, tmp_path, ssilk_python):
+    few = model_of(trained).with_name("few.safetensors")
+    words = ["-m", "ssilk_core", "reduce", str(model_of(trained)), "--joints", "3", "-o", str(few)]
+    subprocess.run([ssilk_python, *words], check=True, cwd=few.parent)
+    trained.ssilk.model = str(few)
+    bake(ready, trained)
+    wanted = decoded(ssilk_python, few, tmp_path, pre_roll=1.0)
+    assert np.abs(shown(ready, trained, FRAMES) - wanted).max() < EXACT
+    assert len([group for group in trained.vertex_groups if group.name.startswith("Skirt_proxy")]) == 3
+
+
+def test_levels_are_those_of_ssilk(bpy):
+    from blender_addon.operators.baking import QUALITIES
+    from blender_addon.training_properties import PRESETS
+
+    config, quality = ((ROOT / "ssilk_core" / f"{name}.py").read_text() for name in ("config", "quality"))
+    assert [name for name, *_ in PRESETS] == re.findall(r'(?:Preset\(|^ {12})name="(\w+)"', config, re.MULTILINE)
+    assert [name for name, *_ in QUALITIES[1:]] == re.findall(r'Quality\(name="(\w+)"', quality)
 
 
 def test_the_bake_is_one_action_beneath_the_artists_own(ready, trained):
@@ -200,8 +214,6 @@ def test_usd_lies_beside_the_blend_file(ready, trained, folder, ssilk_python):
     assert not strips(ready.data.objects["Rig"], trained)
     shot = folder / "Skirt.usdc"
     assert shot.stat().st_size > 1000
-    import subprocess
-
     verified = subprocess.run([ssilk_python, "-m", "ssilk_core", "verify", str(shot)], capture_output=True, text=True)
     assert verified.returncode == 0, verified.stderr
     assert model_of(trained).parent.joinpath("bake", "motion.usdc").exists()
