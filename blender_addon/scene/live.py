@@ -16,6 +16,7 @@ import numpy as np
 
 from ..contract.axes import to_core
 from ..core import core
+from ..errors import need
 from .armature import read_joints
 from .baked import need_bakeable, turns_from_rest, wear
 from .garment import armature_of
@@ -27,6 +28,7 @@ from .trained import Trained
 
 BLOCK = 16  # frames rolled at once: few, so that an edit costs little at each frame that follows
 PRE_ROLL = 1.0  # seconds in which the garment settles before the first frame, as a bake has it
+READING = 0.8  # the part of the preparation that is reading, mostly; the rest is rolling
 MOVED = 1e-5  # by how much a joint's transform differs that was moved since it was read, of its size
 
 
@@ -84,6 +86,7 @@ class Live:
         if index == scene.frame_current - self.first:
             self._take_notice(armature.evaluated_get(depsgraph), index)
         pose = self.playback.pose(index)
+        self._need_all(garment, armature)
         turns = turns_from_rest(self.joints, pose.rotations[:, self.trained.proxies])[0]
         for name, turn in zip(self.joints.names[self.joints.character_count :], turns.tolist()):
             armature.pose.bones[name].rotation_quaternion = turn
@@ -91,11 +94,23 @@ class Live:
         for name, weight in zip(self.shapes, pose.weights[0].tolist()):
             blocks[name].value = weight
 
+    def _need_all(self, garment: bpy.types.Object, armature: bpy.types.Object) -> None:
+        """Check that nothing that is written to was deleted."""
+        keys = garment.data.shape_keys
+        lost = [name for name in self.joints.names if name not in armature.pose.bones]
+        lost += [name for name in self.shapes if not keys or name not in keys.key_blocks]
+        need(not lost, f"'{lost[0] if lost else ''}' was deleted while '{garment.name}' was played; play it again.")
+
     def _reading(self, garment: bpy.types.Object, armature: bpy.types.Object, take: Take) -> Iterator[float]:
-        yield from sample(armature, character_joints(self.joints), [take])
+        """Read the motion, then roll over it, so that scrubbing waits for nothing; yield the part that is done."""
+        yield from (READING * done for done in sample(armature, character_joints(self.joints), [take]))
         need_company(garment, armature, take)
-        self.first, self.placed = take.frames.start, np.array(take.worlds)
-        self.playback = self.trained.player.play(self._motion(), pre_roll=PRE_ROLL, block=BLOCK)
+        placed = np.array(take.worlds)
+        playback = self.trained.player.play(self._motion(placed), pre_roll=PRE_ROLL, block=BLOCK)
+        for frame in range(0, len(placed), BLOCK):
+            playback.pose(frame)
+            yield READING + (1 - READING) * frame / len(placed)
+        self.first, self.placed, self.playback = take.frames.start, placed, playback
 
     def _take_notice(self, armature: bpy.types.Object, index: int) -> None:
         """Go on from a pose that is not the one that was read."""
@@ -104,12 +119,12 @@ class Live:
         if np.allclose(placed, self.placed[index], rtol=MOVED, atol=MOVED):
             return
         self.placed[index] = placed
-        self.playback, self.stale = self.playback.changed(self._motion(), index), True
+        self.playback, self.stale = self.playback.changed(self._motion(self.placed), index), True
 
-    def _motion(self) -> object:
-        """Return what was read as a motion of the model's skeleton."""
+    def _motion(self, placed: np.ndarray) -> object:
+        """Return joints of the armature to the world, shape (F, J, 4, 4), as a motion of the model's skeleton."""
         scene, kinematics = bpy.context.scene, core("kinematics")
-        own = to_core(self.placed[:, self.trained.own], self.trained.meters)
+        own = to_core(placed[:, self.trained.own], self.trained.meters)
         local = kinematics.local_transforms(own, self.trained.player.skeleton.parents)
         rotations = kinematics.quaternion_from_matrix(local[..., :3, :3])
         fps = scene.render.fps / scene.render.fps_base

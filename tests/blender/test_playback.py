@@ -163,6 +163,10 @@ def test_stopped_garments_stay_and_deleted_ones_are_let_go(ready, trained):
     ready.context.scene.frame_set(30)
     assert tuple(bone.rotation_quaternion) == held
     ready.ops.ssilk.play_live()
+    trained.shape_key_remove(trained.data.shape_keys.key_blocks["SSILK shape_003"])
+    ready.context.scene.frame_set(11)
+    assert playing().live(trained) is None and "'SSILK shape_003' was deleted" in playing().reason(trained)
+    ready.ops.ssilk.play_live()
     ready.data.objects.remove(ready.data.objects["Rig"])
     ready.context.scene.frame_set(10)
     assert playing().live(trained) is None and "deleted" in playing().reason(trained)
