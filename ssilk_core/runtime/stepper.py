@@ -19,8 +19,6 @@ from .networks import Parameters, continued, layers
 
 VELOCITY, DISTANCE, REACH, MOST = 10.0, 3.0, 0.1, 100.0  # the constants of SpringVerlet
 SAFE = (REACH * MOST) ** 2  # no entry of a vector with a smaller square passes REACH * MOST
-
-
 LOST, RECOVERY = 1e3, 15  # those of `rollout`: a latent beyond is lost, and this many frames rest after it
 
 
