@@ -28,7 +28,7 @@ from ssilk_core.quality import quality_named
 from ssilk_core.targets import TARGETS
 
 from ._quality import add_level
-from .options import add_bake, check_output, is_folder, tasks_of
+from .options import add_bake, check_output, is_folder, layer_tasks, tasks_of
 
 if TYPE_CHECKING:
     from ssilk_usd.shot import ShotSummary
@@ -59,7 +59,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 def _bake_layers(options: argparse.Namespace, report: Reporter) -> int:
     from ._layers import Wardrobe, bake_task, write_stages
 
-    tasks, wardrobe = tasks_of(options), Wardrobe()
+    tasks, wardrobe = layer_tasks(options), Wardrobe()
     report(Started("bake", len(tasks), {"output": str(options.output)}))
     for task in tasks:
         report(Result("bake", bake_task(task, options.output, wardrobe, report, again=options.again)))

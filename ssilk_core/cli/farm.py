@@ -19,7 +19,7 @@ from ssilk_core.events import Failed, Garment, Progress, Reporter, Result, Start
 from ssilk_core.farm.openjd import TEMPLATE, BundleOptions, write_bundle
 from ssilk_core.farm.tasks import Task
 
-from .options import add_bake, tasks_of
+from .options import add_bake, layer_tasks
 
 if TYPE_CHECKING:
     from ssilk_core.farm.cluster import Outcome
@@ -53,7 +53,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Write the bundle, or run the tasks."""
-    tasks = [_absolute(task) for task in tasks_of(options)]
+    tasks = [_absolute(task) for task in layer_tasks(options)]
     if options.bundle:
         return _write(tasks, options, report)
     need((options.cores or 1) > 0, "--cores", str(options.cores), "a positive number is needed")

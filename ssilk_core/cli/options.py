@@ -143,6 +143,18 @@ def tasks_of(options: argparse.Namespace) -> list[Task]:
     return plan([(model, root or options.root) for model, root in named], options.motion, like)
 
 
+def layer_tasks(options: argparse.Namespace) -> list[Task]:
+    """Return the tasks that the options of `add_bake` ask for, as layers.
+
+    Raises:
+        SsilkError: the target takes no layers.
+    """
+    suffixes = TARGETS[options.target].suffixes
+    need(".usdc" in suffixes, f"--target {options.target}", "layers", f"it takes {', '.join(suffixes)}",
+         "bake one garment over one motion into such a file")  # fmt: skip
+    return tasks_of(options)
+
+
 def is_folder(output: Path) -> bool:
     """Return whether an output is a folder, there already or by its name."""
     return output.is_dir() or not output.suffix

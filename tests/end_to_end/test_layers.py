@@ -228,6 +228,8 @@ def test_a_package_is_what_arkit_takes(copy, capsys):
     capsys.readouterr()
     assert bake("--motion walk.usda --target arkit -o new.usdc") == 2
     assert "arkit takes .usdz" in capsys.readouterr().err
+    assert bake("--motion walk.usda --target arkit -o new") == 2 and not Path("new").exists()
+    assert "it takes .usdz" in capsys.readouterr().err
 
 
 def test_several_characters_wear_several_garments_in_one_stage(copy, toy):
