@@ -11,6 +11,7 @@ import numpy as np
 
 from .armature import read_joints
 from .garment import armature_of
+from .heat import hide
 from .models import model_of
 from .trained import Trained
 from .weights import write_groups
@@ -56,6 +57,8 @@ def _plain_copy(garment: bpy.types.Object, trained: Trained) -> bpy.types.Object
     copy = garment.copy()
     copy.data, copy.name = garment.data.copy(), f"{garment.name} plain"
     copy[OWNER] = garment
+    copy.ssilk.live = False
+    hide(copy)  # the heat of the garment is not its own
     keys = copy.data.shape_keys
     if keys:
         copy.shape_key_clear()

@@ -220,8 +220,12 @@ def test_plain_skinning_stands_beside_and_goes(ready, skirt, ssilk_python, tmp_p
     assert ended(skirt).state == "done"
     bpy.ops.ssilk.play_live()
     bpy.context.scene.frame_set(21)
+    bpy.ops.ssilk.show_heat(kind="STRETCH")
     before = {kind: len(getattr(bpy.data, kind)) for kind in ("objects", "meshes", "collections", "shape_keys")}
     assert bpy.ops.ssilk.toggle_plain() == {"FINISHED"}
+    copy = bpy.data.objects["Skirt plain"]
+    assert not copy.ssilk.live and not copy.ssilk.heat and "SSILK Heat" not in copy.data.attributes
+    assert skirt.ssilk.live and skirt.ssilk.heat and "SSILK Heat" in skirt.data.attributes
     depsgraph = bpy.context.evaluated_depsgraph_get()
     (found,) = [
         world_points(each.object, each.matrix_world)
