@@ -87,6 +87,8 @@ class Process:
         except subprocess.TimeoutExpired:
             self._popen.kill()
             self._popen.wait()
+        for thread in self._threads:
+            thread.join(PATIENCE)  # what it said last is being read
 
 
 def _read(stream: IO[str], take: Callable[[str], object]) -> None:
