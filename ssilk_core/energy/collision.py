@@ -29,6 +29,7 @@ class PosedBody:
         faces: triangles (F, 3); with them the nearest body point is that of the whole surface (`closest`), for
             simulating and measuring. It differs from what training sees where a triangle away from the nearest
             vertex is nearer than those around it.
+        patches: the triangles in compact patches (`closest.patches_of`), int32; a GPU searches by them.
     """
 
     points: Tensor
@@ -36,6 +37,7 @@ class PosedBody:
     rings: Tensor | None = None
     groups: Tensor | None = None
     faces: Tensor | None = None
+    patches: Tensor | None = None
 
     def picked(self, frames: Tensor) -> PosedBody:
         """Return the body in some of the frames, indices (M,)."""
@@ -63,7 +65,7 @@ def nearest_planes(x: Tensor, body: PosedBody, blocks: Tensor | None = None) -> 
         blocks: garment vertices in compact blocks (`nearest.compact_blocks` of `nearest.BLOCK`), int32; they make
             the search on a GPU fast, and change no result.
     """
-    if body.faces is None and x.dtype == torch.float32 and kernels.available(x.device):
+    if x.dtype == torch.float32 and kernels.available(x.device) and (body.faces is None or body.patches is not None):
         return _by_kernels(x, body, blocks)
     index = _nearest_vertex(x, body, blocks).long()
     normal, point = gather_frames(body.normals, index), gather_frames(body.points, index)
@@ -83,15 +85,22 @@ def _nearest_vertex(x: Tensor, body: PosedBody, blocks: Tensor | None) -> Tensor
         return nearest_vertex(x, body.points)
     from ..kernels.nearest import nearest_kernel
 
-    blocks = consecutive_blocks(len(x), BLOCK, x.device) if blocks is None else blocks
     groups = consecutive_blocks(len(body.points), GROUP, x.device) if body.groups is None else body.groups
-    return nearest_kernel(x, body.points, blocks, groups)
+    return nearest_kernel(x, body.points, _in_blocks(x, blocks), groups)
+
+
+def _in_blocks(x: Tensor, blocks: Tensor | None) -> Tensor:
+    """Return the blocks, or those of vertices as they come where there are none."""
+    return consecutive_blocks(len(x), BLOCK, x.device) if blocks is None else blocks
 
 
 def _by_kernels(x: Tensor, body: PosedBody, blocks: Tensor | None) -> tuple[Tensor, Tensor]:
+    from ..kernels.closest import closest_kernel
     from ..kernels.surface import surface_kernel
 
     index = _nearest_vertex(x, body, blocks)
+    if body.faces is not None and body.patches is not None:
+        return closest_kernel(x, index, body.points, body.normals, _in_blocks(x, blocks), body.patches, FAR)
     rings = index.new_zeros(len(body.points), 1) if body.rings is None else body.rings
     return surface_kernel(x, index, body.points, body.normals, rings, FAR)
 

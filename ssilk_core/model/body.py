@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ..assets import Body, Ints, SkinWeights
+from ..energy.closest import patches_of
 from ..energy.collision import PosedBody
 from ..energy.nearest import GROUP, compact_blocks
 from ..energy.surface_point import triangle_rings
@@ -32,6 +33,7 @@ class CollisionBody:
         faces = faces[(faces >= 0).all(axis=1)]
         rings = triangle_rings(faces, len(chosen))
         self.faces = torch.as_tensor(faces, device=device)
+        self.patches = torch.as_tensor(patches_of(body.mesh.points[chosen], faces), device=device)
         self.rings = torch.as_tensor(rings, device=device)
         self.groups = torch.as_tensor(compact_blocks(body.mesh.points[chosen], GROUP), device=device)
         skin = SkinWeights(body.skin.path, body.skin.indices[chosen], body.skin.weights[chosen])
@@ -46,5 +48,5 @@ class CollisionBody:
         Without `surface` only vertices are collided with; `exact` finds the nearest point of the whole surface.
         """
         points, normals = self.skin.surface(self.points[:, :, 0], self.normals[:, :, 0], character)
-        rings, faces = self.rings if surface else None, self.faces if exact else None
-        return PosedBody(points, normals, rings, self.groups, faces)
+        rings, exactly = self.rings if surface else None, (self.faces, self.patches) if exact else (None, None)
+        return PosedBody(points, normals, rings, self.groups, *exactly)

@@ -20,6 +20,7 @@ from torch import Tensor
 from ..assets import PINNED, Scene
 from ..energy import GarmentEnergy
 from ..energy.collision import PosedBody, nearest_planes
+from ..energy.nearest import BLOCK, compact_blocks
 from ..fabrics import Fabric
 from ..mesh import topology
 from ..model.descriptors import GRAVITY
@@ -88,6 +89,7 @@ class Potential:
         hinges = topology.hinges(mesh.faces) if fabric.bending else np.zeros((0, 4), dtype=np.int64)
         self.fabric, self.dtype = fabric, dtype
         self.mass: Tensor = energy.mass[:, None]
+        self.blocks = torch.as_tensor(compact_blocks(mesh.points, BLOCK), device=device)
         self.membrane = Membrane(mesh, fabric, device, dtype)
         self.hinges = Hinges(hinges, energy, mesh.vertex_count) if len(hinges) else None
         free = np.flatnonzero((scene.classes != PINNED) & (topology.vertex_areas(mesh.points, mesh.faces) > 0))
@@ -98,7 +100,7 @@ class Potential:
         """Return the planes through the body points nearest to x."""
         if setting.body is None:
             return None
-        normal, offset = nearest_planes(x.float(), setting.body)
+        normal, offset = nearest_planes(x.float(), setting.body, self.blocks)
         return Planes(normal.to(x.dtype), offset.to(x.dtype))
 
     def energy(self, x: Tensor, setting: Setting, planes: Planes | None) -> Tensor:

@@ -10,8 +10,8 @@ import pytest
 import torch
 import trimesh
 
-from ssilk_core.energy import closest
-from ssilk_core.energy.closest import closest_on_faces
+from ssilk_core.energy import closest, collision
+from ssilk_core.energy.closest import closest_on_faces, patches_of
 from ssilk_core.energy.collision import PosedBody, nearest_planes
 from ssilk_core.energy.surface_point import triangle_rings
 
@@ -72,6 +72,15 @@ def test_it_is_the_distance_of_training_where_the_triangle_touches_the_nearest_v
     body = body_of(ball)
     x = (scattered(400, 1) * torch.tensor([0.4, 1.2, 1.0])[:, None]).to(DEVICE)
     torch.testing.assert_close(distances(x, body), distances(x, replace(body, faces=None)), rtol=0, atol=2e-6)
+
+
+def test_the_kernel_finds_what_its_plain_twin_does() -> None:
+    meshes = [slab(), slab(1.1)]
+    body, x = body_of(*meshes), scattered(90, 2).to(DEVICE)
+    patches = torch.as_tensor(patches_of(meshes[0].vertices, np.array(meshes[0].faces)), device=DEVICE)
+    on_device = replace(body, patches=patches)
+    for found, expected in zip(collision._by_kernels(x, on_device, None), nearest_planes(x, body), strict=True):
+        torch.testing.assert_close(found, expected, rtol=0, atol=1e-5)
 
 
 def test_the_distance_has_no_seams() -> None:
