@@ -35,15 +35,16 @@ def picture(lines: Sequence[np.ndarray], size: int) -> np.ndarray:
     heights = np.arcsinh(every[:, 1] / FINEST)
     low, high = heights.min(), heights.max()
     for line, color in zip(lines, np.resize(COLORS, (len(lines), 3))):
-        rise = (np.arcsinh(line[:, 1] / FINEST) - low) / max(high - low, 1e-9)
-        columns = np.linspace(left, right, size)
-        rows = np.interp(columns, line[:, 0], rise) * (size - 1 - THICKNESS)
-        _draw(image, rows.astype(int), color)
+        across = (line[:, 0] - left) / max(right - left, 1e-9) * (size - 1)
+        rise = (np.arcsinh(line[:, 1] / FINEST) - low) / max(high - low, 1e-9) * (size - 1 - THICKNESS)
+        first, last = round(across[0]), round(across[-1])
+        rows = np.interp(np.arange(first, last + 1), across, rise).astype(int)
+        _draw(image[:, first : last + 1], rows, color)
     return image
 
 
 def _draw(image: np.ndarray, rows: np.ndarray, color: np.ndarray) -> None:
-    """Draw a line that has one row in each column, without gaps where it is steep."""
+    """Draw a line that has one row in each column of an image, without gaps where it is steep."""
     following = np.append(rows[1:], rows[-1])
     for column, (low, high) in enumerate(zip(np.minimum(rows, following), np.maximum(rows, following))):
         image[low : high + THICKNESS, column, :3] = color

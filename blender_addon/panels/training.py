@@ -35,7 +35,8 @@ def draw_motions(layout: bpy.types.UILayout, garment: bpy.types.Object) -> None:
     column = layout.column(align=True)
     for index, item in enumerate(garment.ssilk.training.motions):
         row = column.row(align=True)
-        row.prop(item, "use", text=item.name, icon=ICONS[item.kind])
+        name = bpy.path.basename(item.name) if item.kind == FILE else item.name
+        row.prop(item, "use", text=name, icon=ICONS[item.kind])
         if item.kind == FILE:
             row.operator("ssilk.remove_motion", text="", icon="X").index = index
     row = layout.row(align=True)

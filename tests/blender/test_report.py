@@ -87,3 +87,10 @@ def test_a_picture_shows_each_line_where_it_is():
 def test_pictures_of_nothing_and_of_one_point_are_drawn():
     assert (picture([], 8) == GROUND).all()
     assert (picture([np.array([[3, 0.1]])], 8)[..., :3] == COLORS[0]).all(-1).any()
+
+
+def test_a_line_begins_where_its_term_does():
+    early, late = np.array([[0, 0.0], [10, 0.0]]), np.array([[5, 1.0], [10, 1.0]])
+    image = picture([early, late], 65)
+    columns = np.flatnonzero(np.isclose(image[..., :3], COLORS[1]).all(-1).any(axis=0))
+    assert (columns[0], columns[-1]) == (32, 64)
