@@ -18,10 +18,22 @@ Parameters = Mapping[str, NDArray]
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """One layer: weights (outputs, inputs) and biases (outputs,), float32, signs folded in."""
+    """One layer, float32, signs folded in: weights transposed, then biases, shape (inputs + 1, outputs).
 
-    weights: NDArray
-    bias: NDArray
+    One vector or many meet the same memory: what has to come from it is what takes time.
+    """
+
+    rows: NDArray
+
+    @property
+    def weights(self) -> NDArray:
+        """Weights (outputs, inputs)."""
+        return self.rows[:-1].T
+
+    @property
+    def bias(self) -> NDArray:
+        """Biases, shape (outputs, 1)."""
+        return self.rows[-1][:, None]
 
 
 def layers(parameters: Parameters, name: str) -> list[Layer]:
@@ -32,18 +44,19 @@ def layers(parameters: Parameters, name: str) -> list[Layer]:
         weights = parameters[f"{name}.{2 * index}.weight"]
         bias = parameters.get(f"{name}.{2 * index}.bias", np.zeros(len(weights)))
         seen, given = (1 if index == 0 else -1), (1 if index == last else -1)
-        folded.append(Layer(_single(seen * given * weights), _single(given * bias)))
+        folded.append(Layer(single(np.vstack([seen * given * weights.T, given * bias]))))
     return folded
 
 
-def _single(values: NDArray) -> NDArray:
+def single(values: NDArray) -> NDArray:
+    """Return values in one piece of memory, float32."""
     return np.ascontiguousarray(values, dtype=np.float32)
 
 
 def evaluated(network: list[Layer], seen: NDArray) -> NDArray:
     """Return what a perceptron gives, shape (outputs, N), for inputs (inputs, N)."""
     first = network[0]
-    return continued(network[1:], first.weights @ seen + first.bias[:, None])
+    return continued(network[1:], first.weights @ seen + first.bias)
 
 
 def continued(network: list[Layer], sums: NDArray) -> NDArray:
@@ -52,5 +65,5 @@ def continued(network: list[Layer], sums: NDArray) -> NDArray:
         with np.errstate(over="ignore"):  # an activation of minus infinity is zero
             active = sums / (np.exp(sums) + np.float32(1))
         sums = layer.weights @ active
-        sums += layer.bias[:, None]
+        sums += layer.bias
     return sums

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..config import ModelConfig
-from .networks import Parameters, continued, layers
+from .networks import Layer, Parameters, continued, layers, single
 
 VELOCITY, DISTANCE, REACH, MOST = 10.0, 3.0, 0.1, 100.0  # the constants of SpringVerlet
 SAFE = (REACH * MOST) ** 2  # no entry of a vector with a smaller square passes REACH * MOST
@@ -97,14 +97,13 @@ class SpringStepper:
 
     def __init__(self, config: ModelConfig, parameters: Parameters, static: int) -> None:
         alpha, beta, share = (parameters[f"integrator.{name}"] for name in ("alpha", "beta", "share"))
-        first, *self.later = layers(parameters, "stepper")
+        first, *hidden, last = layers(parameters, "stepper")
         blocks = np.cumsum([config.latent] * 3 + [static])
         of_now, of_speed, of_away, of_static, self.of_rates = np.split(first.weights, blocks, axis=1)
         speed, away = VELOCITY * of_speed, DISTANCE * of_away
         self.bias, self.of_still = first.bias, np.hstack([of_now, of_static])
-        self.first = _transposed(np.hstack([of_now - away * alpha, speed - away * beta]))
-        self.hidden = [_transposed(np.hstack([layer.weights, layer.bias[:, None]])) for layer in self.later[:-1]]
-        self.last = _transposed(REACH * np.pad(self.later[-1].weights, [(0, 0), (0, 1)]))
+        self.first = single(np.hstack([of_now - away * alpha, speed - away * beta]).T)
+        self.later = [*hidden, Layer(single(REACH * last.rows))]
         self.inertia = np.hstack([alpha, beta]).astype(np.float32)
         self.stiffness = (config.stiffness / (1 + np.exp(-share))).astype(np.float32)
         self.config = config
@@ -116,9 +115,9 @@ class SpringStepper:
             rest: quasi-static latents (F, latent); static, rates: descriptors (F, S) and (F, R).
             before: the two latents before the first frame (2, latent); None where a motion begins, at rest.
         """
-        still = self.of_still @ np.hstack([rest, static]).T + self.bias[:, None]
+        still = self.of_still @ np.hstack([rest, static]).T + self.bias
         driven = np.ascontiguousarray((still + self.of_rates @ rates.T).T)
-        held = REACH * np.ascontiguousarray(continued(self.later, still).T.clip(-MOST, MOST))
+        held = np.ascontiguousarray(continued(self.later, still).T.clip(-REACH * MOST, REACH * MOST))
         history = np.empty((len(rest) + 2, 2, rest.shape[1]), dtype=np.float32)
         history[:-2, 0] = rest
         if before is None:
@@ -142,10 +141,11 @@ class SpringStepper:
 
     def _advance(self, history: NDArray, driven: NDArray, held: NDArray) -> None:
         z = self.config.latent
-        rooms = [Room(rows) for rows in (self.first, *self.hidden)]
+        rooms = [Room(rows) for rows in (self.first, *(layer.rows for layer in self.later[:-1]))]
         differences, terms = np.empty((2, z), np.float32), np.empty(2 * z, np.float32)
         along, pull, own = (np.empty(z, np.float32) for _ in range(3))
-        state, of_w, of_v, sums = differences.reshape(-1), terms[:z], terms[z:], rooms[0].sums
+        state, of_w, of_v = differences.reshape(-1), terms[:z], terms[z:]
+        sums, last = rooms[0].sums, self.later[-1].rows
         push, bound = Limit(self.config.push, (z,)), Limit(self.config.bound, (z,))
         frames = zip(history[:-2], history[:-2, 0], history[1:-1, 1], history[2:, 1], driven, held)
         with np.errstate(over="ignore", invalid="ignore"):  # `rolled` looks for lost states
@@ -157,7 +157,7 @@ class SpringStepper:
                 for room in rooms[1:]:
                     np.dot(seen, room.rows, room.sums)
                     seen = room.activate()
-                np.dot(seen, self.last, own)
+                np.dot(seen, last, own)
                 if not own.dot(own) < SAFE:
                     np.clip(own, -REACH * MOST, REACH * MOST, own)
                 np.multiply(self.inertia, state, terms)
@@ -169,7 +169,3 @@ class SpringStepper:
                 np.add(own, along, own)
                 np.add(own, rest, new)
                 bound(new)
-
-
-def _transposed(weights: NDArray) -> NDArray:
-    return np.ascontiguousarray(weights.T, dtype=np.float32)
