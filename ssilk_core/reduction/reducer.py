@@ -37,14 +37,12 @@ class Reduced:
     Attributes:
         file: the model; size: what it keeps.
         rms, largest: distances of its vertices from the whole model's over the motions [m], RMS weighted by mass.
-        predicted: RMS of the displacements that its blendshapes miss, before skinning [m].
     """
 
     file: ModelFile
     size: Size
     rms: float
     largest: float
-    predicted: float
 
 
 class Reducer:
@@ -81,7 +79,7 @@ class Reducer:
 
     def reduced(self, size: Size) -> Reduced:
         """Return the model with so much kept; what it has less of stays as it is."""
-        kept, file, predicted = size.within(self.whole), self.file, 0.0
+        kept, file = size.within(self.whole), self.file
         skin = (kept.joints, kept.influences)
         if skin != (self.whole.joints, self.whole.influences):
             weights = dense(self.influences.joints, self._skinned(*skin), len(self.scene.joint_names))
@@ -89,8 +87,8 @@ class Reducer:
         if kept != self.whole and file.config.given:
             found = self._followed(*skin)
             readout = file.parameters.get("decoder.readout", np.eye(file.config.given))
-            file, predicted = with_basis(file, basis(found, kept.shapes, readout)), found.lost(kept.shapes)
-        return Reduced(file, kept, *self._difference(file), predicted)
+            file = with_basis(file, basis(found, kept.shapes, readout))
+        return Reduced(file, kept, *self._difference(file))
 
     def predicted(self, size: Size) -> float:
         """Return about what a model of this size loses [m], RMS weighted by mass, without making it."""
@@ -108,7 +106,7 @@ class Reducer:
     def displacements(self) -> NDArray:
         """By how much blendshapes move the vertices that are not pinned, shape (V', 3, F) [m]."""
         moved = self.file.parameters["decoder.shapes"] @ self.activations
-        return moved + self.file.parameters.get("decoder.offset", np.zeros((1, 3)))[:, :, None]
+        return moved + self.file.parameters.get("decoder.offset", np.zeros((1, 3), np.float32))[:, :, None]
 
     @cached_property
     def influences(self) -> Influences:
@@ -125,7 +123,8 @@ class Reducer:
     @cached_property
     def _points(self) -> NDArray:
         """The vertices before skinning, shape (V, 3, F) [m]."""
-        points = np.repeat(self.scene.garment.mesh.points[:, :, None], self.matrices.shape[-1], axis=2)
+        rest = self.scene.garment.mesh.points.astype(np.float32)
+        points = np.repeat(rest[:, :, None], self.matrices.shape[-1], axis=2)
         points[self.free] += self.displacements
         return points
 

@@ -90,12 +90,9 @@ class Meter:
         return Tally(records, {take: self.reel.takes[take].clip for take in takes})
 
     def _time(self, variant: Variant, method: Played) -> Time:
-        if not variant.refine:
-            return play_time(method.player, resample(self.motion, variant.fps))
-        begun = time.perf_counter()
-        method.finished(self.motion)
-        each = 1000 * (time.perf_counter() - begun) / self.motion.frame_count
-        return Time(each, each)
+        if variant.refine:
+            return Time.of(method.milliseconds)
+        return play_time(method.player, resample(self.motion, variant.fps))
 
     def _torch_time(self, size: Size) -> float:
         """Return the milliseconds that a frame takes in PyTorch, of the second of two passes over a clip."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable
 from functools import lru_cache
 
@@ -35,6 +36,7 @@ class Played:
     ) -> None:
         self.name, self.player, self.dressed, self.reel, self.fps = name, player, dressed, reel, fps
         self.options = RefineOptions(iterations=refine) if refine else None
+        self.milliseconds: list[float] = []  # that a frame of each take took, as far as they were asked for
         self._points = lru_cache(1)(self._take)
 
     def vertices(self, take: int, frames: range) -> Tensor:
@@ -47,10 +49,12 @@ class Played:
 
     def _take(self, take: int) -> Floats:
         """Return all frames of a take, shape (N, V, 3)."""
-        motion = self.reel.takes[take].motion
-        return self.finished(motion) - motion.translations[0, 0]
+        motion, begun = self.reel.takes[take].motion, time.perf_counter()
+        points = self._finished(motion)
+        self.milliseconds.append(1000 * (time.perf_counter() - begun) / len(points))
+        return points - motion.translations[0, 0]
 
-    def finished(self, motion: Motion) -> Floats:
+    def _finished(self, motion: Motion) -> Floats:
         """Return the vertices at the frames of a motion [m], refined where that is asked for, shape (N, V, 3)."""
         points, dressed = self.shown(motion), self.dressed
         if self.options is None:
