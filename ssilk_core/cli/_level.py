@@ -69,7 +69,7 @@ def _excerpt_bytes(bake: Bake, frames: int, suffix: str, body: bool) -> int:
             path,
             bake.deformer,
             bake.motion.clip(0, frames),
-            _first(bake.poses(), frames),
+            _first(bake.rollout(), frames),
             units=bake.units,
             samples_per_frame=bake.request.samples,
             include_body=body,

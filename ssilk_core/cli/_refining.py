@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ssilk_core.assets import Floats, GarmentPose
+from ssilk_core.devices import chosen_device
 from ssilk_core.errors import VerificationError, need
 from ssilk_core.events import Progress, Reporter, silent
 
@@ -63,8 +64,8 @@ class Refinement:
 
         bake = self.bake
         options = RefineOptions(iterations=bake.request.refine, feedback=bake.request.feedback)
-        scene, fps = bake.deformer.scene, bake.motion.fps
-        return Refiner(scene, bake.fabric, options, fps=fps, device=bake.request.device)
+        device = chosen_device(bake.request.device)
+        return Refiner(bake.deformer.scene, bake.fabric, options, fps=bake.motion.fps, device=device)
 
     def _put_back(self) -> dict[str, float]:
         """Fit poses to the points; return what that loses, in mm."""
@@ -74,7 +75,8 @@ class Refinement:
         bake = self.bake
         assert bake.model is not None
         mass = GarmentEnergy(bake.deformer.scene.garment.mesh, bake.fabric).mass.numpy()
-        fits = list(Refitter(bake.model.deformer(), mass).fit(bake.motion, bake.rollout(), self.points))
+        refitter = Refitter(bake.model.deformer(), mass, device=chosen_device(bake.request.device))
+        fits = list(refitter.fit(bake.motion, bake.rollout(), self.points))
         self.poses = [fit.pose for fit in fits]
         rms = np.concatenate([fit.rms for fit in fits])
         largest = max(float(fit.largest.max()) for fit in fits)

@@ -112,7 +112,11 @@ def _request(task: Task, options: argparse.Namespace) -> BakeRequest:
     from ._baking import BakeRequest
 
     level = quality_named(options.quality).refine if options.quality else 0
-    return replace(BakeRequest.of(task), refine=task.refine or level)
+    request = replace(BakeRequest.of(task), refine=task.refine or level)
+    need(not (options.budget and request.refine and request.refined == "points"), "--budget", "a budget for points",
+         "every vertex is stored at every frame, whatever is kept of the model", "use --refined-output joints, or "
+         "leave the budget out")  # fmt: skip
+    return request
 
 
 def _write(layer: Path, bake: Bake, task: Task, output: Path) -> ShotSummary:

@@ -100,6 +100,7 @@ def test_samples_within_frames_are_refined_too(there):
     [
         (["--refine", "-1"], "-1 iterations; 1 to 10000"),
         (["--refine", "2", "--plain", "--refined-output", "joints"], "use --refined-output points"),
+        (["--refine", "2", "--budget", "1MB"], "a budget for points"),
     ],
 )
 def test_what_cannot_be_done_is_refused(there, capsys, words, complaint):
