@@ -125,6 +125,7 @@ class Shot:
         shapes: names of the blendshapes, length K.
         offsets: of each blendshape, shape (K, V, 3).
         activations: weights of the blendshapes, shape (F, K).
+        left_out: how many proxies of the armature it does not have; they stay at rest and move nothing.
     """
 
     start: int
@@ -135,6 +136,7 @@ class Shot:
     shapes: tuple[str, ...]
     offsets: np.ndarray
     activations: np.ndarray
+    left_out: int = 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,23 +15,23 @@ from .names import joint_paths
 from .write import CLASS, matrices
 
 
-def read_shot(path: Path, joints: Joints, *, reduced: bool = False) -> Shot:
+def read_shot(path: Path, joints: Joints) -> Shot:
     """Read a baked garment.
 
     Args:
         path: what was baked from a stage of `write_stage`.
         joints: of the armature now, proxies included.
-        reduced: whether proxies may have been left out; they stay at rest and move nothing.
 
     Raises:
-        SetupError: the armature has other joints than the shot.
+        SetupError: the shot has other joints than the armature.
     """
     stage = Usd.Stage.Open(str(path))
     mesh = next(prim for prim in stage.Traverse() if prim.HasAttribute(CLASS))
     skeleton, skinning = _queries(mesh)
     order = [str(name) for name in skeleton.GetJointOrder()]
     own = joint_paths(joints.names, joints.parents)
-    _need_same_joints(order, [name for name in own if name in order] if reduced else own)
+    left_out = [name for name in own[joints.character_count :] if name not in order]
+    _need_same_joints(order, [name for name in own if name not in left_out])
     times = np.arange(stage.GetStartTimeCode(), stage.GetEndTimeCode() + 1)
     binds = dict(zip(order, np.array(skeleton.GetJointWorldBindTransforms()).swapaxes(-1, -2)))
     shapes = tuple(str(name) for name in UsdSkel.BindingAPI(mesh).GetBlendShapesAttr().Get() or ())
@@ -45,6 +45,7 @@ def read_shot(path: Path, joints: Joints, *, reduced: bool = False) -> Shot:
         shapes=shapes,
         offsets=_offsets(mesh, len(shapes), len(points)),
         activations=_activations(skeleton.GetAnimQuery(), shapes, times),
+        left_out=len(left_out),
     )
 
 

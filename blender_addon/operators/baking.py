@@ -14,15 +14,18 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
 from ..errors import SetupError, need
 from ..outside.work import Work
 from ..preferences import interpreter, preferences, unready
+from ..scene import playing
 from ..scene.armature import read_joints
-from ..scene.baked import apply_shot, has_bake, need_bakeable, remove_bake
+from ..scene.baked import animated, apply_shot, need_bakeable, remove_bake
 from ..scene.garment import armature_of, unusable
 from ..scene.gather import character_joints, gather
 from ..scene.handover import STAGE, expose_usd, hand_over
+from ..scene.keys import has_keys, need_tracks
 from ..scene.models import model_of
 from ..scene.motions import TIMELINE, Source
-from ..scene.objects import found_again
+from ..scene.objects import Pair
 from ..scene.sampling import need_company, prepare_takes, sample, scene_rate
+from ..training_properties import RELATIVE
 from . import tasks
 from .reporting import ReportingOperator
 
@@ -50,7 +53,7 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
     to_usd: BoolProperty(name="To USD", description="Write a UsdSkel shot, with the body")
     filepath: StringProperty(
         name="USD File", description="Shot to write; named like the garment, beside the blend file, when empty",
-        subtype="FILE_PATH",
+        subtype="FILE_PATH", options=RELATIVE,
     )  # fmt: skip
     quality: EnumProperty(name="Quality", items=QUALITIES)
     pre_roll: FloatProperty(
@@ -82,9 +85,10 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
         self.model, armature = model_of(garment), armature_of(garment)
         joints = read_joints(armature, garment)
         need_bakeable(garment, armature, joints)
+        need_tracks(animated(garment, armature))
         (self.take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
         self.dressed = None if (self.model.parent / STAGE).exists() else gather(garment)
-        self.called, self.uids = garment.name, (garment.session_uid, armature.session_uid)
+        self.pair = Pair.of(garment, armature)
         self.shot = usd_path(garment, self.filepath) if self.to_usd else None
         self.python = interpreter(preferences(context))
         self.character = character_joints(joints)
@@ -92,7 +96,7 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
 
     def steps(self) -> Iterator[float]:
         """Sample the timeline, then write it."""
-        _, armature = self.things()
+        _, armature = self.pair.objects()
         yield from sample(armature, self.character, [self.take])
         expose_usd()
         from ..contract.motion import write_motion
@@ -101,7 +105,7 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
 
     def commands(self, folder: Path) -> list[list[str]]:
         """Write what is baked from; return the command."""
-        garment, armature = self.things()
+        garment, armature = self.pair.objects()
         need_company(garment, armature, self.take)
         inputs = inputs_folder(self.model)
         shutil.copyfile(folder / MOTION, inputs / MOTION)
@@ -120,22 +124,24 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
             ]
         ]  # fmt: skip
 
-    def things(self) -> tuple[bpy.types.Object, bpy.types.Object]:
-        """Return the garment and its armature; raise `SetupError` if one was deleted."""
-        garment, armature = (found_again(uid, self.called) for uid in self.uids)
-        return garment, armature
-
     def finish(self, context: bpy.types.Context, work: Work) -> str:
-        if self.to_timeline:
-            from ..contract.shot import read_shot
-
-            garment, armature = self.things()
-            joints = read_joints(armature, garment)
-            need_bakeable(garment, armature, joints)
-            apply_shot(garment, armature, joints, read_shot(self.shot, joints, reduced=self.quality != WHOLE))
-        where = [f"frames {self.take.frames[0]} to {self.take.frames[-1]}"] if self.to_timeline else []
+        where = [self.put_on_timeline()] if self.to_timeline else []
         where += [str(self.shot)] if self.to_usd else []
-        return f"'{self.called}' is baked: {' and '.join(where)}."
+        return f"'{self.pair.name}' is baked: {' and '.join(where)}."
+
+    def put_on_timeline(self) -> str:
+        """Put keys in place of those baked before; return what was done."""
+        from ..contract.shot import read_shot
+
+        garment, armature = self.pair.objects()
+        joints = read_joints(armature, garment)
+        need_bakeable(garment, armature, joints)
+        need_tracks(animated(garment, armature))
+        shot = read_shot(self.shot, joints)
+        playing.stop(garment)
+        apply_shot(garment, armature, joints, shot)
+        still = f" ({shot.left_out} proxies are not in it and stay at rest)" if shot.left_out else ""
+        return f"frames {self.take.frames[0]} to {self.take.frames[-1]}{still}"
 
 
 class RemoveBake(ReportingOperator, bpy.types.Operator):
@@ -148,7 +154,7 @@ class RemoveBake(ReportingOperator, bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         reason = unusable(context.object) or ("" if context.mode == "OBJECT" else "Go to Object Mode")
-        if not reason and not has_bake(context.object):
+        if not reason and not has_keys(context.object):
             reason = f"Nothing was baked for '{context.object.name}'"
         cls.poll_message_set(reason)
         return not reason

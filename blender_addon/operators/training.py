@@ -27,7 +27,7 @@ from ..scene.gather import character_joints, gather
 from ..scene.handover import STAGE, expose_usd, hand_over
 from ..scene.models import job_of, relative
 from ..scene.motions import FILE, Source, sources
-from ..scene.objects import found_again
+from ..scene.objects import Pair
 from ..scene.sampling import Take, prepare_takes, sample
 from . import tasks
 from .reporting import ReportingOperator
@@ -138,25 +138,19 @@ class Train(tasks.OutsideOperator, bpy.types.Operator):
         need_trainable(garment, armature, self.dressed)
         self.takes = prepare_takes(armature, [source_of(item) for item in chosen if item.kind != FILE])
         self.files = [Path(bpy.path.abspath(item.name)) for item in chosen if item.kind == FILE]
-        self.uids = (garment.session_uid, armature.session_uid)
+        self.pair = Pair.of(garment, armature)
         title, steps = f"Sampling motions for '{garment.name}'", self.steps()
         return Work(title, lambda _: (), parent=bpy.app.tempdir, steps=steps)
 
     def steps(self) -> Iterator[float]:
         """Sample the motions, then write them."""
-        _, armature = self.things()
+        _, armature = self.pair.objects()
         joints = character_joints(self.dressed.joints)
         yield from sample(armature, joints, self.takes)
         yield from write_takes(self.work.folder / MOTIONS, joints, self.takes)
 
-    def things(self) -> tuple[bpy.types.Object, bpy.types.Object]:
-        """Return the garment and its armature; raise `SetupError` if one was deleted."""
-        garment, armature = (found_again(uid, self.dressed.garment.name) for uid in self.uids)
-        return garment, armature
-
     def finish(self, context: bpy.types.Context, work: Work) -> str:
-        garment, armature = self.things()
-        name = self.dressed.garment.name
+        (garment, armature), name = self.pair.objects(), self.pair.name
         folder = jobs.create(Path(bpy.data.filepath).parent / "ssilk", identifiers([name])[0])
         prim = hand_over(self.dressed, garment, armature, folder).prims[name]
         shutil.move(work.folder / MOTIONS, folder / MOTIONS)
@@ -290,7 +284,7 @@ def watch() -> float:
     from ..panels.training import changed
 
     garments = [thing for thing in bpy.data.objects if thing.type == "MESH" and thing.ssilk.training.folder]
-    if sum(changed(garment) for garment in garments):
+    if sum(changed(garment) for garment in garments):  # all are asked, so that none is drawn for once more
         tasks.redraw(bpy.context)
     return LOOK
 

@@ -12,9 +12,9 @@ from mathutils import Matrix
 from ..contract.arrays import Joints, Shot, to_parents
 from ..errors import need
 from .armature import proxy_names
-from .keys import Channel, bake_keys, is_baked, need_tracks, remove_keys
+from .handmade import learn_weights
+from .keys import Channel, bake_keys, remove_keys
 from .shapes import need_relative, remove_shapes, rest_points, write_shapes
-from .weights import write_groups
 
 MOVED = 1e-4  # how far rest points may be from those that were trained on, as a share of the garment's size
 TURNED = 1e-3  # how far the axes and places of bones may be
@@ -24,10 +24,9 @@ def need_bakeable(garment: bpy.types.Object, armature: bpy.types.Object, joints:
     """Check that Blender will deform a garment as ssilk does.
 
     Raises:
-        SetupError: an option of the modifier, of a bone, of shape keys or of NLA tracks is in the way.
+        SetupError: an option of the modifier, of a bone or of shape keys is in the way.
     """
     need_relative(garment)
-    need_tracks(animated(garment, armature))
     _need_linear(garment, armature)
     names = joints.names
     for name, parent in list(zip(names, joints.parents))[joints.character_count :]:
@@ -60,7 +59,7 @@ def apply_shot(garment: bpy.types.Object, armature: bpy.types.Object, joints: Jo
     shapes = wear(garment, armature, joints, shot)
     keys = garment.data.shape_keys
     moved = [(armature, _turns(joints, shot)), (keys, _activations(shapes, shot))]
-    bake_keys(garment, shot.start, [(thing, channels) for thing, channels in moved if channels])
+    bake_keys(garment, shot.start, [(thing, channels) for thing, channels in moved if thing])
 
 
 def wear(garment: bpy.types.Object, armature: bpy.types.Object, joints: Joints, shot: Shot) -> list[str]:
@@ -72,7 +71,7 @@ def wear(garment: bpy.types.Object, armature: bpy.types.Object, joints: Joints, 
     world = _moved_back(armature, joints, shot) @ np.array(garment.matrix_world)
     _need_same_points(garment, world, shot)
     shapes = write_shapes(garment, shot.offsets @ np.linalg.inv(world[:3, :3]).T, shot.shapes)
-    write_groups(garment, shot.weights, joints.names, ())
+    learn_weights(armature, garment, shot.weights, joints.names)
     _free(armature, joints.names[joints.character_count :])
     return shapes
 
@@ -85,11 +84,6 @@ def turns_from_rest(joints: Joints, rotations: np.ndarray) -> np.ndarray:
     """
     rest = _quaternions(to_parents(joints.binds, joints.parents)[joints.character_count :, :3, :3])
     return _product(rest * [1, -1, -1, -1], rotations)
-
-
-def has_bake(garment: bpy.types.Object) -> bool:
-    """Return whether anything was baked for a garment."""
-    return any(is_baked(action, garment) for action in bpy.data.actions)
 
 
 def remove_bake(garment: bpy.types.Object, armature: bpy.types.Object) -> None:

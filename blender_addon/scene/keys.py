@@ -42,6 +42,11 @@ def is_baked(action: bpy.types.Action, garment: bpy.types.Object | None = None) 
     return baked and (garment is None or action[OWNER] == garment)
 
 
+def has_keys(garment: bpy.types.Object) -> bool:
+    """Return whether anything was baked for a garment."""
+    return any(is_baked(action, garment) for action in bpy.data.actions)
+
+
 def curves_of(action: bpy.types.Action) -> Iterator[bpy.types.FCurve]:
     """Yield the F-curves of all slots."""
     if not SLOTS:
@@ -75,12 +80,16 @@ def bake_keys(garment: bpy.types.Object, start: int, moved: Sequence[tuple[Any, 
 
     Args:
         start: the first frame.
-        moved: objects or shape keys, each with what moves on it.
+        moved: objects or shape keys, each with what moves on it, which may be nothing.
     """
-    tracks = [_cleared_track(thing, garment) for thing, _ in moved]
+    for thing, channels in moved:
+        if not channels:
+            _remove_tracks(thing, garment)
+    moving = [(thing, channels) for thing, channels in moved if channels]
+    tracks = [_cleared_track(thing, garment) for thing, _ in moving]
     _remove_actions(garment)
     action = None
-    for track, (thing, channels) in zip(tracks, moved):
+    for track, (thing, channels) in zip(tracks, moving):
         if action is None or not SLOTS:
             action = bpy.data.actions.new(f"SSILK {garment.name}")
             action[OWNER] = garment
@@ -93,9 +102,13 @@ def bake_keys(garment: bpy.types.Object, start: int, moved: Sequence[tuple[Any, 
 def remove_keys(garment: bpy.types.Object, things: Sequence[Any]) -> None:
     """Remove what was baked for a garment from the animation of objects and shape keys."""
     for thing in things:
-        for track in _tracks(thing, garment):
-            thing.animation_data.nla_tracks.remove(track)
+        _remove_tracks(thing, garment)
     _remove_actions(garment)
+
+
+def _remove_tracks(thing: Any, garment: bpy.types.Object) -> None:
+    for track in _tracks(thing, garment):
+        thing.animation_data.nla_tracks.remove(track)
 
 
 def _tracks(thing: Any, garment: bpy.types.Object) -> list[bpy.types.NlaTrack]:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import bpy
 
 from ..errors import need
@@ -17,3 +19,25 @@ def found_again(uid: int, name: str) -> bpy.types.Object:
     thing = next((thing for thing in bpy.data.objects if thing.session_uid == uid), None)
     need(thing, f"'{name}' was deleted meanwhile; nothing was changed.")
     return thing
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A garment and its armature, by session_uid, with the names that they had."""
+
+    garment: tuple[int, str]
+    armature: tuple[int, str]
+
+    @classmethod
+    def of(cls, garment: bpy.types.Object, armature: bpy.types.Object) -> Pair:
+        """Remember both."""
+        return cls((garment.session_uid, garment.name), (armature.session_uid, armature.name))
+
+    @property
+    def name(self) -> str:
+        """The name that the garment had."""
+        return self.garment[1]
+
+    def objects(self) -> tuple[bpy.types.Object, bpy.types.Object]:
+        """Return the garment and the armature; raise `SetupError` if one was deleted."""
+        return found_again(*self.garment), found_again(*self.armature)

@@ -181,6 +181,30 @@ def test_baking_again_replaces_only_what_was_baked(ready, trained):
     assert not ready.ops.ssilk.remove_bake.poll()
 
 
+def test_garments_of_one_armature_are_baked_apart(bpy, skirt):
+    from blender_addon.scene.keys import Channel, bake_keys, has_keys, remove_keys
+
+    armature, apron = bpy.data.objects["Rig"], bpy.data.objects.new("Apron", skirt.data.copy())
+
+    def turn(bone: str, value: float) -> list[Channel]:
+        return [Channel(f'pose.bones["{bone}"].location', 0, bone, np.full(5, value))]
+
+    def places(frame: int) -> list[float]:
+        bpy.context.scene.frame_set(frame)
+        return [armature.pose.bones[bone].location.x for bone in ("Hips", "Spine")]
+
+    bake_keys(skirt, 3, [(armature, turn("Hips", 1.0))])
+    bake_keys(apron, 3, [(armature, turn("Spine", 2.0))])
+    assert places(5) == [1.0, 2.0]
+    bake_keys(skirt, 3, [(armature, turn("Hips", 4.0))])
+    assert places(5) == [4.0, 2.0]
+    remove_keys(skirt, [armature])
+    assert [len(strips(armature, thing)) for thing in (skirt, apron)] == [0, 1]
+    bake_keys(apron, 3, [(armature, [])])
+    assert not armature.animation_data.nla_tracks
+    assert not has_keys(apron)
+
+
 def test_keys_of_the_artist_win_over_baked_ones(ready, trained):
     bake(ready, trained)
     armature = ready.data.objects["Rig"]
