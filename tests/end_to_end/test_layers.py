@@ -319,6 +319,28 @@ def test_a_retimed_motion_is_baked_as_it_plays(copy):
     assert 1e-5 < np.abs(slow - garment_points(anim())).max() < 0.2
 
 
+def test_value_clips_are_read_as_they_play_and_count_as_inputs(copy, toy, capsys):
+    stage = Usd.Stage.CreateNew("edit.usda")
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.SetTimeCodesPerSecond(30.0)
+    prim = UsdSkel.Animation.Define(stage, "/Clip").GetPrim()
+    UsdSkel.Animation(prim).CreateJointsAttr(["Hips", "Hips/Spine", "Hips/Spine/Head"])
+    clips = Usd.ClipsAPI(prim)
+    clips.SetClipAssetPaths([Sdf.AssetPath("./run.usda"), Sdf.AssetPath("./walk.usda")])
+    clips.SetClipPrimPath("/Clip")
+    clips.SetClipActive([(0, 0), (5, 1)])
+    clips.SetClipTimes([(0, 0), (5, 5), (16, 11)])  # the second at half its speed
+    clips.SetClipManifestAssetPath("./walk.usda")
+    stage.Save()
+    del stage, prim, clips
+    assert bake("--motion edit.usda -o edited") == 0
+    layer = Sdf.Layer.FindOrOpen("edited/shots/edit/skirt/anim.usdc")
+    assert layer.endTimeCode >= 16
+    toy.write_clip(copy / "run.usda", frames=7, fps=25.0)
+    events = said(capsys, "--motion edit.usda -o edited")
+    assert [event["detail"].get("current") for event in events if event["event"] == "result"] == [None]
+
+
 @pytest.mark.parametrize("instanced", [False, True])
 def test_a_finished_shot_can_be_referenced_offset_and_instanced(copy, instanced):
     """A speed change behind the bake: the samples are spread in time, nothing is baked again."""

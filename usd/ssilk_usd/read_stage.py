@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import wraps
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar, cast
@@ -85,8 +85,16 @@ def content_hash(source: str | Path) -> str:
         SsilkError: as `open_stage`.
     """
     stage = open_stage(source)
-    paths = {layer.realPath for layer in stage.GetUsedLayers() if layer.realPath}
+    paths = {layer.realPath for layer in stage.GetUsedLayers() if layer.realPath} | set(_clips(stage))
     return hashlib.sha256("".join(sorted(map(sha256, paths))).encode()).hexdigest()
+
+
+def _clips(stage: Usd.Stage) -> Iterator[str]:
+    """Yield the files of value clips, which USD opens only when their times come."""
+    for prim in Usd.PrimRange(stage.GetPseudoRoot(), PRIMS):
+        clips = Usd.ClipsAPI(prim)
+        for name in clips.GetClips() or {}:
+            yield from (path.resolvedPath for path in clips.ComputeClipAssetPaths(name) if path.resolvedPath)
 
 
 def location(prim: Usd.Prim) -> str:
