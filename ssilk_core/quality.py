@@ -49,7 +49,7 @@ QUALITIES = {
         Quality(name="crowd", shapes=12, joints=8, influences=4, fps=15.0, about="many characters, far away"),
         Quality(name="game", shapes=32, joints=16, influences=4, fps=30.0, about="real time, four influences"),
         Quality(name="film", shapes=48, about="what cannot be told from the whole model"),
-        Quality(name="hero", refine=8, about="the whole model, refined by the solver"),
+        Quality(name="hero", refine=4, about="the whole model, refined by the solver"),
     )
 }
 
