@@ -9,7 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ssilk_core.energy.collision import nearest_planes
+from ssilk_core.energy.collision import PosedBody
 from ssilk_core.training.step import Stepper
 
 Tensors = tuple[Tensor, ...]
@@ -46,7 +46,7 @@ class Moment:
         self.x = self.skinned(self.offsets, self.matrices)
 
     def _met(self) -> None:
-        self.body = self.objective.body.posed(self.character)
+        self.body = self.posed()
         self.normal, self.offset = self.planes()
         self.first = self.decoded_first()
         path = self.path()
@@ -92,13 +92,17 @@ class Moment:
     def path(self) -> Tensor:
         return torch.cat([self.first, self.x[..., : (self.window - 3) * self.batch]], dim=-1)
 
+    def posed(self) -> PosedBody:
+        assert self.objective.body is not None
+        return self.objective.body.posed(self.character)
+
     def surface(self) -> Tensors:
-        body = self.objective.body.posed(self.character)
+        body = self.posed()
         return body.points, body.normals
 
     def planes(self, *, surface: bool = True) -> tuple[Tensor, Tensor]:
         body = self.body if surface else replace(self.body, rings=None)
-        return nearest_planes(self.x, body, self.objective.blocks)
+        return self.objective.planes(self.x, body)
 
     def update(self) -> Callable[[], Tensors]:
         """Return what gives the parameters known gradients, in one copy, and moves them."""

@@ -101,7 +101,7 @@ def garment_parts(at: Moment) -> list[Part]:
 
 def contact_parts(at: Moment) -> list[Part]:
     body, x, posed = at.objective.body, at.x, at.body
-    assert posed.rings is not None
+    assert body is not None and posed.rings is not None
     influences = at.model.scene.character.bodies[0].skin.indices.shape[1]
     placing = (influences * BLEND + 2 * TRANSFORM + NORMALISE) * posed.points.shape[0] * at.count
     pairs = x.shape[0] * at.count

@@ -34,7 +34,7 @@ class BaselineObjective(Objective):
         self,
         model: Baseline,
         energy: GarmentEnergy,
-        body: CollisionBody,
+        body: CollisionBody | None,
         bank: JointBank,
         surface: bool,
         *,

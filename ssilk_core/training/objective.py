@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..assets import PINNED
 from ..energy import GarmentEnergy
-from ..energy.collision import nearest_planes
+from ..energy.collision import PosedBody, nearest_planes
 from ..energy.nearest import BLOCK, compact_blocks
 from ..model.body import CollisionBody
 from ..model.descriptors import GRAVITY
@@ -56,13 +56,16 @@ class Objective:
 
     def _planes(self, x: Tensor, character: Tensor) -> tuple[Tensor, Tensor]:
         """Return the plane that each vertex of x (V, 3, N) may meet: normals (V, 3, N) and offsets (V, N)."""
-        normal, offset = x.new_zeros(x.shape), x.new_full((len(x), x.shape[2]), -NOWHERE)
         if self.body is None:
-            return normal, offset
-        body = self.body.posed(character, surface=self.surface)
+            return _no_planes(x)
+        return self.planes(x, self.body.posed(character, surface=self.surface))
+
+    def planes(self, x: Tensor, body: PosedBody) -> tuple[Tensor, Tensor]:
+        """Return the planes of a body that is near enough to be met; those of pinned vertices are far away."""
         found = nearest_planes(x.index_select(0, self.free), body, self.blocks)
         if len(self.free) == len(x):
             return found
+        normal, offset = _no_planes(x)
         return normal.index_copy_(0, self.free, found[0]), offset.index_copy_(0, self.free, found[1])
 
     def static(self, frames: Tensor, direction: Tensor) -> Terms:
@@ -119,6 +122,11 @@ class Objective:
             x, path[..., batch:], path[..., :-batch], root[:, 2 * batch :] - root[:, batch:-batch], self.dt
         )
         return dynamic, resting, torch.stack(z[-2:]).detach()
+
+
+def _no_planes(x: Tensor) -> tuple[Tensor, Tensor]:
+    """Return planes that no vertex of x (V, 3, N) meets."""
+    return x.new_zeros(x.shape), x.new_full((len(x), x.shape[2]), -NOWHERE)
 
 
 def total(terms: Terms) -> Tensor:
