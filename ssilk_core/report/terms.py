@@ -28,7 +28,7 @@ class TermsMeter:
         garment: at rest; body: at rest, all meshes as one, or None.
         fps: frames per second of what is given.
         values: by name, one for each frame: energies [J], and the share of vertices inside the body [%]. Gravity
-            counts heights over the body's middle, from what they are at rest; inertia is of the air's frame.
+            counts heights over the body's middle, from what they are at rest.
     """
 
     garment: Mesh
