@@ -65,8 +65,9 @@ class OutsideOperator:
         return self._end(context)
 
     def cancel(self, context: bpy.types.Context) -> None:
-        """Stop, as Blender asks when it closes the file."""
-        self._leave(context)
+        """Stop, as Blender asks when it closes the file, or a dialog before anything has begun."""
+        if self.work:
+            self._leave(context)
 
     def _begin(self, context: bpy.types.Context) -> bool:
         global current

@@ -23,7 +23,7 @@ class FabricPanel(Panel, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, fabric = self.layout, context.object.ssilk.fabric
-        layout.use_property_split = True
+        layout.use_property_split, layout.use_property_decorate = True, False  # a fabric is not animated
         for name in ("preset", "density", "stretch_model", *MEMBRANE[fabric.stretch_model]):
             layout.prop(fabric, name)
         for name in ("bending", "drag", "collision", "margin"):

@@ -122,3 +122,10 @@ def test_work_is_stopped(world, how):
     assert not process.running
     assert (world.window_manager.timers, world.tasks.current) == ([], None)
     assert not run.work.folder.exists()
+
+
+def test_a_dialog_is_left_before_anything_began(world):
+    """Blender tells an operator that its dialog was cancelled, too."""
+    run = operator(world.tasks, "print('never')")
+    run.cancel(world)
+    assert (run.work, world.window_manager.timers) == (None, [])
