@@ -15,7 +15,7 @@ from ..reduction import Size
 
 WHOLE = "as trained"
 SHAPES, JOINTS = (0.75, 0.5, 0.25, 0.125, 0.0), (0.75, 0.5, 0.25, 0.0)  # shares of what there is
-INFLUENCES, RATES, REFINED = (6, 4, 3, 2, 1), (1 / 2, 1 / 3), (1, 4)
+INFLUENCES, RATES, REFINED = (6, 4, 3, 2, 1), (1 / 2, 1 / 3), (1, 2)
 
 Array = np.ndarray
 PRECISIONS: dict[str, Callable[[Array], Array]] = {
