@@ -30,7 +30,7 @@ from ssilk_usd.read_motion import read_motion
 from ssilk_usd.write import write_motion
 
 from ssilk_core.assets import Motion
-from ssilk_core.cli._layers import Wardrobe, bake_task, is_done, layout_of
+from ssilk_core.cli._layers import Wardrobe, bake_task, clear, is_done, layout_of
 from ssilk_core.cli.farm import bake_here
 from ssilk_core.events import silent
 from ssilk_core.farm.cluster import run_on_cluster
@@ -157,6 +157,7 @@ def _on_cluster(tasks: Sequence[Task], folder: Path) -> dict[str, Any]:
     began = time.perf_counter()
     outcomes = list(run_on_cluster(tasks, folder / "cluster", bake_here))
     seconds = time.perf_counter() - began
+    clear(tasks, folder / "cluster")
     killer.over.set()
     watch.join()
     names = Counter(outcome.task.name for outcome in outcomes if not outcome.error)

@@ -64,9 +64,10 @@ def remove_unfinished(target: str | Path) -> None:
     Nobody else may be writing `target` meanwhile.
     """
     target = Path(target)
-    names = f"{glob.escape(UNFINISHED.format(target.stem))}*{glob.escape(target.suffix)}"
-    for path in target.parent.glob(names):
-        path.unlink(missing_ok=True)
+    name = glob.escape(UNFINISHED.format(target.stem))
+    for prefix in (name, f".{name}"):  # the latter of files that were written for one that is not yet proven
+        for path in target.parent.glob(f"{prefix}*{glob.escape(target.suffix)}"):
+            path.unlink(missing_ok=True)
 
 
 def need_writable(target: str | Path) -> None:

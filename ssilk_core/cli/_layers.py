@@ -76,7 +76,7 @@ def bake_task(
     home = layout.animation.parent
     if not again and is_current(home, key):
         return {"layer": str(layout.animation), "current": True}
-    for path in (layout.animation, layout.points, home / NAME):
+    for path in _own(layout):
         remove_unfinished(path)
     bake = wardrobe.dressed(task).over(task.motion)
     asset = write_asset(layout, bake, task, report)
@@ -154,6 +154,19 @@ def write_stages(tasks: Sequence[Task], folder: Path, report: Reporter) -> None:
             report(Message(
                 f"{layout.asset}: {len(outgrown)} shots were baked with the asset as it was before "
                 f"({', '.join(outgrown[:3])}); bake them again", "warning"))  # fmt: skip
+
+
+def clear(tasks: Sequence[Task], folder: Path) -> None:
+    """Remove what killed processes left half-written of tasks that nobody works on any more."""
+    layouts = [layout_of(task, folder) for task in tasks]
+    shared = {path for layout in layouts for path in (layout.asset, layout.geometry, layout.stage)}
+    for path in shared.union(*(_own(layout) for layout in layouts)):
+        remove_unfinished(path)
+
+
+def _own(layout: Layout) -> tuple[Path, ...]:
+    """Return the files that one task alone writes."""
+    return (layout.animation, layout.points, layout.animation.with_name(NAME))
 
 
 def _outgrown(layout: Layout) -> Iterator[str]:

@@ -91,7 +91,7 @@ def _write(tasks: Sequence[Task], options: argparse.Namespace, report: Reporter)
 def _run(tasks: Sequence[Task], options: argparse.Namespace, report: Reporter) -> int:
     from ssilk_core.farm.cluster import run_on_cluster
 
-    from ._layers import write_stages
+    from ._layers import clear, write_stages
 
     report(Started("farm", len(tasks), {"output": str(options.output)}))
     ended: list[Outcome] = []
@@ -101,6 +101,7 @@ def _run(tasks: Sequence[Task], options: argparse.Namespace, report: Reporter) -
         if outcome.error:
             report(Garment(outcome.task.name, Failed(outcome.error)))
         report(Progress(len(ended), len(tasks)))
+    clear(tasks, options.output)
     done = [outcome for outcome in ended if not outcome.error]
     write_stages([outcome.task for outcome in done], options.output, report)
     current, failed = sum("current" in outcome.detail for outcome in done), len(ended) - len(done)

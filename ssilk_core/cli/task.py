@@ -77,8 +77,9 @@ def _part(report: Reporter, index: int, count: int) -> Reporter:
 
 def _check(tasks: Sequence[Task], output: Path, report: Reporter) -> int:
     """Write the stages of the shots and raise `VerificationError` unless everything is there."""
-    from ._layers import write_stages
+    from ._layers import clear, write_stages
 
+    clear(tasks, output)
     done = [task for task in tasks if _is_done(task, output, report)]
     write_stages(done, output, report)
     missing = [task.name for task in tasks if task not in done]

@@ -141,6 +141,19 @@ def test_killed_workers_lose_no_finished_shot_and_leave_no_half_file(farm):
     assert layers("out") == layers("quiet")
 
 
+@pytest.mark.parametrize("name", [
+    "assets/model/.geometry.partial-x1.usdc", "assets/model/.asset.partial-x2.usda", "shots/b/.shot.partial-x3.usda",
+    "shots/b/model/.anim.partial-x4.usdc", "shots/b/model/..anim.partial-x4.partial-x5.usdc",
+    "shots/b/model/.bake.partial-x6.json",
+])  # fmt: skip
+def test_the_last_step_removes_what_killed_workers_left(farm, name):
+    assert task() == 0
+    path = Path("out") / name
+    path.write_text("half")
+    assert task("--check") == 0
+    assert not path.exists() and len(layers()) == 8
+
+
 def test_a_cancelled_worker_stops_in_time_and_leaves_nothing_half_written(farm, toy):
     toy.write_clip(farm / "a.usda", frames=1200)
     worker = started("--tasks 0 --openjd")
