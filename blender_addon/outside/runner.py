@@ -140,6 +140,16 @@ def train(folder, record, command):
     said: queue.SimpleQueue[str] = queue.SimpleQueue()
     reader = threading.Thread(target=pass_on, args=(process.stdout, said.put), daemon=True)
     reader.start()
+    try:
+        attend(process, said, reader, folder, record)
+    finally:
+        if process.poll() is None:  # the folder is gone, and nobody will ask for the model
+            process.terminate()
+    return process.returncode
+
+
+def attend(process, said, reader, folder, record):
+    """Write what a training says until it ends; interrupt it when that is asked for."""
     asked = False
     while process.poll() is None or reader.is_alive() or not said.empty():
         if not asked and (folder / CANCEL).exists() and process.poll() is None:
@@ -148,7 +158,6 @@ def train(folder, record, command):
         if listen(said, record) or time.monotonic() - record.written > BEAT:
             record.write()
         time.sleep(LOOK)
-    return process.returncode
 
 
 def pass_on(stream, take):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import sys
 import time
@@ -133,6 +134,31 @@ def test_a_killed_runner_is_lost_and_leaves_its_place(folder, tmp_path, monkeypa
     jobs.begin(sys.executable, other := jobs.create(tmp_path, "B"), ["-c", SAYS])
     until(other, "done")
     assert not list((tmp_path / "queue").iterdir())
+
+
+@pytest.mark.skipif(not Path("/proc").exists(), reason="looks for a process where Linux lists them")
+def test_a_training_ends_when_its_folder_is_removed(folder):
+    program = f"# {folder}\n{WAITS}"
+    jobs.begin(sys.executable, folder, ["-c", program])
+    until_heard(folder)
+    assert running(program)
+    shutil.rmtree(folder)
+    deadline = time.monotonic() + 30
+    while running(program):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def running(program: str) -> bool:
+    """Return whether a Python runs a program."""
+    return any(program.encode() in read_bytes(path) for path in Path("/proc").glob("[0-9]*/cmdline"))
+
+
+def read_bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError:  # it has ended
+        return b""
 
 
 def test_what_cannot_be_started_or_read_is_said(folder, tmp_path):
