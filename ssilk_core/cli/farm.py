@@ -75,6 +75,7 @@ def _absolute(task: Task) -> Task:
 def _write(tasks: Sequence[Task], options: argparse.Namespace, report: Reporter) -> int:
     for name in ("chunk", "memory", "timeout"):
         need(getattr(options, name) > 0, f"--{name}", str(getattr(options, name)), "a positive number is needed")
+    need(options.seconds >= 0, "--seconds", str(options.seconds), "no negative number is allowed")
     chosen = BundleOptions(**{name: getattr(options, name) for name in BundleOptions.__dataclass_fields__})
     write_bundle(options.bundle, tasks, options.output, chosen)
     output = f" -p Output={options.output.absolute()}" if options.output else ""

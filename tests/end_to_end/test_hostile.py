@@ -189,10 +189,10 @@ def test_arrays_that_declare_a_thousand_million_elements_take_no_memory(files, t
 
 
 def test_the_bound_on_memory_ends_with_the_reading():
-    before = resource.getrlimit(resource.RLIMIT_AS)
+    before = resource.getrlimit(resource.RLIMIT_DATA)
     with pytest.raises(MemoryError), bounded_memory(1 << 28):
         bytearray(1 << 30)
-    assert resource.getrlimit(resource.RLIMIT_AS) == before and len(bytearray(1 << 20)) == 1 << 20
+    assert resource.getrlimit(resource.RLIMIT_DATA) == before and len(bytearray(1 << 20)) == 1 << 20
 
 
 @pytest.mark.parametrize("name", ["a pipe", "a device", "a folder"])

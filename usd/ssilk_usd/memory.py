@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-MOST = 4 << 30  # bytes; a character of a million vertices takes a tenth of it
+MOST = 3 << 30  # bytes; a character of a million vertices takes a fifth of it
 
 
 @contextmanager
@@ -22,14 +22,15 @@ def bounded_memory(most: int = MOST) -> Iterator[None]:
         return
     import resource
 
-    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    # Addresses (RLIMIT_AS) would be the wrong bound: USD's threads reserve some for each core of a machine.
+    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    pages = int(Path("/proc/self/statm").read_text().split()[5])
     bound = pages * resource.getpagesize() + most
     if soft != resource.RLIM_INFINITY and soft <= bound:
         yield
         return
-    resource.setrlimit(resource.RLIMIT_AS, (bound, hard))
+    resource.setrlimit(resource.RLIMIT_DATA, (bound, hard))
     try:
         yield
     finally:
-        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
