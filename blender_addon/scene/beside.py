@@ -53,16 +53,24 @@ def take_away(shown: bpy.types.Object) -> None:
     bpy.data.objects.remove(shown)
 
 
+def _clear_shapes(copy: bpy.types.Object) -> None:
+    keys = copy.data.shape_keys
+    if keys is None:
+        return
+    name = keys.name
+    copy.shape_key_clear()
+    left = bpy.data.shape_keys.get(name)  # Blender frees them since 5.2; before, they stay unused in the file
+    if left:
+        bpy.data.batch_remove([left])
+
+
 def _plain_copy(garment: bpy.types.Object, trained: Trained) -> bpy.types.Object:
     copy = garment.copy()
     copy.data, copy.name = garment.data.copy(), f"{garment.name} plain"
     copy[OWNER] = garment
     copy.ssilk.live = False
     hide(copy)  # the heat of the garment is not its own
-    keys = copy.data.shape_keys
-    if keys:
-        copy.shape_key_clear()
-        bpy.data.batch_remove([keys])  # Blender would keep it, unused, until the file is saved
+    _clear_shapes(copy)
     copy.vertex_groups.clear()
     skin, names = trained.player.file.scene.plain_skin, trained.joints.names
     write_groups(copy, skin.dense(len(names))[:, trained.order].astype(np.float32), names, ())
