@@ -146,8 +146,11 @@ def write_stages(tasks: Sequence[Task], folder: Path, report: Reporter) -> None:
     from ssilk_usd.layers import write_stage
 
     layouts = [layout_of(task, folder) for task in tasks]
-    for shot in dict.fromkeys(layout.shot for layout in layouts):
-        write_stage([layout for layout in layouts if layout.shot == shot])
+    shots: dict[str, list[Layout]] = {}
+    for layout in layouts:
+        shots.setdefault(layout.shot, []).append(layout)
+    for garments in shots.values():
+        write_stage(garments)
     for layout in {layout.garment: layout for layout in layouts}.values():
         outgrown = list(_outgrown(layout))
         if outgrown:

@@ -82,11 +82,11 @@ def _check(tasks: Sequence[Task], output: Path, report: Reporter) -> int:
     clear(tasks, output)
     done = [task for task in tasks if _is_done(task, output, report)]
     write_stages(done, output, report)
-    missing = [task.name for task in tasks if task not in done]
+    missing = [task.name for task in set(tasks).difference(done)]
     if missing:
         raise VerificationError(
             f"{output}: {len(missing)} of {len(tasks)} tasks are not done, or their files are not as they were "
-            f"written ({', '.join(missing[:5])}); run them again."
+            f"written ({', '.join(sorted(missing)[:5])}); run them again."
         )
     report(Result("check", {"tasks": len(tasks), "output": str(output)}))
     return EXIT_OK
