@@ -29,8 +29,7 @@ from .tensors import read_tensors
 if TYPE_CHECKING:
     from .model.network import GarmentModel
 
-FORMAT = 3
-READABLE = (1, 2, FORMAT)  # 1 knew nothing of packed matrices, 2 nothing of reduced models
+FORMAT = 3  # before it, spring_verlet had an alpha, and no model was reduced
 # Parts of the header that are no plain values, as tuples (JSON: lists) and dicts.
 HEADER: dict[str, Any] = {
     "joint_names": (), "proxy_names": (), "paths": {}, "config": {}, "fabric": {}, "provenance": {},
@@ -164,8 +163,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     except (TypeError, ValueError, RecursionError) as error:
         raise SsilkError(f"{path}: the model's header is damaged ({error}); train again.") from error
     found = document.get("format") if isinstance(document, dict) else None
-    allowed = f"this version reads formats {', '.join(map(str, READABLE))}"
-    need(found in READABLE, str(path), f"model format {found}", allowed, "train it again")
+    need(found == FORMAT, str(path), f"model format {found}", f"this version reads format {FORMAT}", "train it again")
     return tensors, document
 
 

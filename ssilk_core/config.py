@@ -85,8 +85,8 @@ class TrainConfig:
         through_time: back-propagate through the whole window, as the paper does, or through each step by itself.
         warm_rate: Adam's step size in the warm start, decaying to a tenth.
         rate, final_rate: Adam's step size in training proper, after its warm-up and at the end (cosine in between).
-        skin_rate: factor on the step size of skinning weights, alpha and beta.
-        clip: bound on the norm of a gradient, as a multiple of what was typical lately.
+        skin_rate: factor on the step size of skinning weights and of the integrator's own parameters.
+        shape_rate: factor on the step size of blendshapes, all of which move a vertex at once.
         validate_every: iterations between validations; valid_frames: frames of each clip used for them.
         average: decay of the running average of the parameters, which is what is validated and kept; 0 for none.
         surface: nearest body point on "triangles", or at "vertices", which is faster and blunter.
@@ -107,11 +107,11 @@ class TrainConfig:
     noise_correlation: float = 0.99
     through_time: bool = False
     warm_rate: float = 1e-3
-    rate: float = 5e-4
+    rate: float = 3e-4
     final_rate: float = 2e-5
     rate_warmup: int = 500
     skin_rate: float = 0.1
-    clip: float = 2.0
+    shape_rate: float = 0.3
     average: float = 0.998
     surface: str = "triangles"
     validate_every: int = 1000
@@ -125,8 +125,9 @@ class TrainConfig:
         _need_between(self, 3, MOST, "valid_frames")
         _need_between(self, 0, 1, "carry", "rotated", "noise_correlation", "kick")
         _need_between(self, 0, 0.99999, "warm", "average")
-        _need_between(self, 0, MOST, "noise", "warm_rate", "rate", "final_rate", "rate_warmup", "skin_rate")
-        _need_between(self, 1, MOST, "clip")
+        _need_between(
+            self, 0, MOST, "noise", "warm_rate", "rate", "final_rate", "rate_warmup", "skin_rate", "shape_rate"
+        )
         _need_between(self, 0, 1000, "recombined")
         _need_between(self, 0, 2**63 - 1, "seed")
 

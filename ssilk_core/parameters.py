@@ -11,7 +11,7 @@ from .config import ModelConfig
 Shapes = dict[str, tuple[int, ...]]
 # Of each scheme: latents that the stepper sees, parameters of its own, whether the stepper ends in a bias.
 SCHEMES: dict[str, tuple[int, tuple[str, ...], bool]] = {
-    "spring_verlet": (3, ("alpha", "beta", "share"), False),
+    "spring_verlet": (3, ("beta", "share"), False),
     "verlet": (2, ("alpha", "beta"), True),
     "direct": (2, (), True),
     "direct_residual": (2, (), True),

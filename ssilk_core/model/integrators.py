@@ -11,6 +11,8 @@ from torch import Tensor, nn
 
 from ..config import ModelConfig
 
+SMALLEST = 1e-12  # far below any length that counts; its square's inverse is finite in float32
+
 
 def limited(values: Tensor, bound: float) -> Tensor:
     """Return values kept within a bound b; unlimited for a bound of zero.
@@ -23,6 +25,16 @@ def limited(values: Tensor, bound: float) -> Tensor:
     half = bound / 2
     inner = values.clamp(-half, half)
     return inner + half * torch.tanh((values - inner) / half)
+
+
+def length(vectors: Tensor) -> Tensor:
+    """Return the Euclidean length of each row, shape (batch, 1)."""
+    return torch.linalg.vector_norm(vectors, dim=1, keepdim=True)
+
+
+def shortened(vectors: Tensor, longest: Tensor) -> Tensor:
+    """Return rows (batch, n) no longer than (batch, 1), with their directions."""
+    return vectors * (longest / length(vectors).clamp_min(SMALLEST)).clamp(max=1)
 
 
 class Integrator(nn.Module, ABC):
@@ -78,25 +90,29 @@ class Verlet(Integrator):
         # 1 would turn noise on the first two states into a steady drift; 0.9 lets it die within a second.
         self.beta = nn.Parameter(torch.full((config.latent,), 0.9))
 
-    def extrapolated(self, before: Tensor, now: Tensor) -> Tensor:
-        return self.alpha * now + self.beta * (now - before)
-
     def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor) -> Tensor:
-        forward = self.extrapolated(before, now)
+        forward = self.alpha * now + self.beta * (now - before)
         return forward + limited(stepper(torch.cat([forward, now, pose], dim=1)), self.config.push)
 
 
-class SpringVerlet(Verlet):
+class SpringVerlet(Integrator):
     """Eqs. 2 and 3 about the quasi-static state p = P(theta_t), with a spring towards it.
 
-        zbar = p + alpha (z_{t-1} - p) + beta v,    v = z_{t-1} - z_{t-2}
-        z_t = zbar + k (p - zbar) + s (S(z_{t-1}, v, p - zbar, pose) - S(p, 0, 0, pose held still))
+        zbar = z_{t-1} + beta v,    v = z_{t-1} - z_{t-2},    f = k (p - zbar)
+        z_t = zbar + f + u,         u = s (S(z_{t-1}, v, p - zbar, pose) - S(p, 0, 0, pose held still))
 
     Without S every dimension is a damped spring, stable for any k in (0, 1]; S learns what such a spring misses.
     What S would do to a garment at rest under a character that holds still is taken off, so that the garment rests
     at p exactly: where gravity alone pulls, an error of a millimetre a frame is a tenth of gravity, and no loss
     that also holds stretch and collisions can see it. Stiffnesses start spread from slow swings to quick following
     and stay under `config.stiffness`; spring and S together are limited by `config.push`.
+
+    And it rests nowhere else, whatever S has learnt: S may give half of what the spring gives, and more only
+    while something moves,
+
+        |u| <= (|f| + |v|) / 2 + |rates of the pose| / 20,
+
+    which motion seldom comes near. Eq. 2's alpha is one: a larger one would undo the spring.
 
     S sees velocities and distances themselves, scaled to order one: given as states side by side they would be
     small differences of large inputs, and those are learnt last. `reach` s scales S to what it has to give.
@@ -107,23 +123,27 @@ class SpringVerlet(Verlet):
     slowest = 0.01
     most = 100.0  # of what S gives; far beyond what a push lets through, and finite
     velocity_scale, distance_scale, reach = 10.0, 3.0, 0.1
+    own_share, rate_share = 0.5, 0.05
 
     def __init__(self, config: ModelConfig, rates: int = 0) -> None:
         super().__init__(config, rates)
         slowest = min(self.slowest, 0.05 * config.stiffness)
         start = torch.logspace(math.log10(slowest), math.log10(0.9 * config.stiffness), config.latent)
+        # S learns what this damps too much; what it damps too little would excite itself.
+        self.beta = nn.Parameter(torch.full((config.latent,), 0.7))
         self.share = nn.Parameter(torch.logit(start / config.stiffness))
 
     def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor) -> Tensor:
         velocity = now - before
-        away = -self.alpha * (now - rest) - self.beta * velocity
+        forward = now + self.beta * velocity
+        away, (static, rates) = rest - forward, pose.tensor_split([pose.shape[1] - self.rates], dim=1)
         seen = torch.cat([now, self.velocity_scale * velocity, self.distance_scale * away, pose], dim=1)
         nothing = torch.zeros_like(rest)
-        still = torch.cat([pose[:, : pose.shape[1] - self.rates], pose.new_zeros(pose.shape[0], self.rates)], dim=1)
-        calm = torch.cat([rest, nothing, nothing, still], dim=1)
+        calm = torch.cat([rest, nothing, nothing, static, torch.zeros_like(rates)], dim=1)
         moved, held = stepper(torch.cat([seen, calm])).clamp(-self.most, self.most).unflatten(0, (2, -1))
-        pull = self.config.stiffness * torch.sigmoid(self.share) * away
-        return rest - away + limited(pull + self.reach * (moved - held), self.config.push)
+        spring = self.config.stiffness * torch.sigmoid(self.share) * away
+        allowed = self.own_share * (length(spring) + length(velocity)) + self.rate_share * length(rates)
+        return forward + limited(spring + shortened(self.reach * (moved - held), allowed), self.config.push)
 
 
 class Direct(Integrator):

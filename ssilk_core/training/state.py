@@ -134,8 +134,7 @@ def restore(path: Path, stepper: Stepper, tensors: Tensors, rank: int = 0) -> No
 
 def learned(stepper: Stepper) -> Tensors:
     """Return copies on the CPU of all that training changes: parameters, their average, what the optimiser keeps."""
-    tensors = {"typical": stepper.typical}
-    tensors |= {f"model.{name}": value for name, value in stepper.model.state_dict().items()}
+    tensors = {f"model.{name}": value for name, value in stepper.model.state_dict().items()}
     tensors |= {f"averaged.{name}": value for name, value in stepper.averaged.state_dict().items()}
     for index, moments in stepper.optimiser.state_dict()["state"].items():
         tensors |= {f"adam.{index}.{name}": torch.as_tensor(value) for name, value in moments.items()}
@@ -144,7 +143,6 @@ def learned(stepper: Stepper) -> Tensors:
 
 def restore_learned(stepper: Stepper, tensors: Tensors) -> None:
     """Put what `learned` returned into a freshly built `stepper`, which may have another batch."""
-    stepper.typical.copy_(tensors["typical"])
     stepper.model.load_state_dict(_group(tensors, "model."))
     stepper.averaged.load_state_dict(_group(tensors, "averaged."))
     moments: dict[int, Tensors] = {}

@@ -16,7 +16,7 @@ from .faults import Faults
 from .objective import Objective, total
 from .windows import WindowSampler
 
-FORGET = 0.02  # of the typical gradient in each step
+SMALLEST = 1e-30  # norm of a gradient that is not zero
 EAGER_STEPS = 3  # before a CUDA graph is captured: allocators, handles and kernels settle
 
 
@@ -44,7 +44,6 @@ class Stepper:
     Attributes:
         terms: energies of the last step [J], updated in place so that reading them needs no new launch.
         averaged: running average of the model's parameters.
-        typical: running average of the gradient's norm, as it was bounded; zero before the first step.
         faults: steps that were undone because something was not finite.
     """
 
@@ -60,10 +59,9 @@ class Stepper:
         self.share = share
         self.device = sampler.first.device
         self.optimiser = _optimiser(model, self.device)
-        self.factors = [1.0, config.skin_rate]
+        self.factors = [1.0, config.skin_rate, config.shape_rate]
         self.averaged = copy.deepcopy(model).requires_grad_(False)
         self.terms: dict[str, Tensor] = {}
-        self.typical = torch.zeros((), device=self.device)
         self.faults = Faults(self.device)
         self._iteration = torch.zeros((), dtype=torch.int64, device=self.device)
         self._graph: torch.cuda.CUDAGraph | None = None
@@ -105,7 +103,9 @@ class Stepper:
             self.share([*gradients, judged])  # the loss too: all processes must undo the same steps
         norm = nn.utils.get_total_norm(gradients, foreach=True)
         bad = ~(norm.isfinite() & judged.isfinite())
-        torch._foreach_mul_(gradients, self._kept(norm, bad) / norm.clamp_min(1e-30))
+        # Only directions count. Adam divides by what gradients were lately: one a hundred times as large, of one
+        # torn garment, would move every parameter by as much as all the others of the last iterations do.
+        torch._foreach_div_(gradients, norm.clamp_min(SMALLEST))
         # The fused optimiser leaves parameters, moments and step counts as they are where this is one.
         self.optimiser.found_inf = bad.float()  # type: ignore[attr-defined]
         self.optimiser.step()
@@ -115,18 +115,6 @@ class Stepper:
         self.faults.record(bad, self._iteration, terms | (beside or {}), window)
         for name, value in terms.items():
             self.terms.setdefault(name, torch.zeros((), device=self.device)).copy_(value)
-
-    def _kept(self, norm: Tensor, bad: Tensor) -> Tensor:
-        """Return the norm that a gradient may have, and take it into what is typical.
-
-        Adam divides by what gradients were lately: one a hundred times as large, of one torn garment, moves every
-        parameter by as much as all the others of the last iterations do, and a fixed bound is no measure of that.
-        """
-        begun = self.typical > 0
-        kept = torch.where(begun, torch.minimum(norm, self.config.clip * self.typical), norm)
-        latest = torch.where(begun, torch.lerp(self.typical, kept, FORGET), kept)
-        self.typical.copy_(torch.where(bad, self.typical, latest))
-        return kept
 
     def run(self, iteration: int) -> None:
         """Do the step of an iteration, in the phase that it belongs to."""
@@ -166,10 +154,12 @@ class Stepper:
 
 
 def _optimiser(model: GarmentModel, device: torch.device) -> torch.optim.Adam:
-    """Return Adam over two groups: networks and shapes, then integration and skinning, which move more slowly."""
-    slow = [v for name, v in model.named_parameters() if name.startswith("integrator.") or "skin_offset" in name]
-    fast = [value for value in model.parameters() if all(value is not other for other in slow)]
+    """Return Adam over networks, then over integration and skinning, then over blendshapes: each at its own pace."""
+    groups: list[list[nn.Parameter]] = [[], [], []]
+    for name, value in model.named_parameters():
+        slow = name.startswith("integrator.") or "skin_offset" in name
+        groups[1 if slow else 2 if name == "decoder.shapes" else 0].append(value)
     on_gpu = device.type == "cuda"
     # A captured graph reads the step size from a tensor; elsewhere a number is faster.
-    groups = [{"params": group, "lr": torch.tensor(0.0, device=device) if on_gpu else 0.0} for group in (fast, slow)]
-    return torch.optim.Adam(groups, capturable=on_gpu, fused=True)
+    rated = [{"params": group, "lr": torch.tensor(0.0, device=device) if on_gpu else 0.0} for group in groups]
+    return torch.optim.Adam(rated, capturable=on_gpu, fused=True)
