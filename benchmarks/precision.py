@@ -54,11 +54,11 @@ PARTS: dict[str, Callable[[str, np.ndarray], bool]] = {
     "skinning weights": lambda name, values: name == "decoder.skin_offset",
     "all matrices": lambda name, values: values.ndim > 1,
     "biases": lambda name, values: name.endswith("bias"),
-    "alpha, beta, spring": lambda name, values: name.startswith("integrator"),
+    "beta, spring": lambda name, values: name.startswith("integrator"),
 }
 SIZES = {
     "model.initialiser": "P", "model.stepper": "S", "model.output": "D", "model.decoder.shapes": "blendshapes",
-    "model.integrator": "alpha, beta, spring", "model.decoder.skin_offset": "skinning weights",
+    "model.integrator": "beta, spring", "model.decoder.skin_offset": "skinning weights",
     "scene.plain": "skinning weights", "scene.rig": "skinning weights", "scene.mesh": "garment mesh",
 }  # fmt: skip
 

@@ -110,7 +110,7 @@ def save_model(path: str | Path, model: ModelFile, *, pack: bool = False) -> Non
 
 
 def _packed(tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the tensors of a file with matrices packed; vectors stay as they are: errors in alpha add up in time."""
+    """Return the tensors of a file with matrices packed; vectors stay as they are: errors in beta add up in time."""
     weights = {name: tensors[name].astype(np.float32) for name in WEIGHTS}
     matrices = {
         name: packed(value) for name, value in tensors.items() if name.startswith("model.") and value.ndim > 1

@@ -4,12 +4,15 @@
 With p the quasi-static state, w = z_{t-1} - p and v = z_{t-1} - z_{t-2}, the first layer of S is linear in w and v
 plus a part that the pose alone decides, as it decides all of what S gives to a garment at rest:
 
-    z_t = p + f + limited(s (S(w, v, pose) - S(0, 0, pose held still)) - k f),    f = alpha w + beta v
+    z_t = p + f + limited(u - k f),    f = w + beta v,    u = s (S(w, v, pose) - S(0, 0, pose held still))
+
+where u is shortened to what the spring and motion allow it, |u| <= (|k f| + |v|) / 2 + |rates of the pose| / 20.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +21,7 @@ from ..config import ModelConfig
 from .networks import Layer, Parameters, continued, layers, single
 
 VELOCITY, DISTANCE, REACH, MOST = 10.0, 3.0, 0.1, 100.0  # the constants of SpringVerlet
+OWN_SHARE, RATE_SHARE = 0.5, 0.05
 SAFE = (REACH * MOST) ** 2  # no entry of a vector with a smaller square passes REACH * MOST
 LOST, RECOVERY = 1e3, 15  # those of `rollout`: a latent beyond is lost, and this many frames rest after it
 
@@ -78,12 +82,14 @@ class Course:
         history: p of frame t and z_{t-2} in row t, so that one subtraction gives w and v, shape (F + 2, 2, latent).
         driven: what the pose adds to the sums of S's first layer, shape (F, hidden).
         held: s S(0, 0, pose held still), shape (F, latent).
+        allowed: what the pose's rates allow S to give, shape (F,).
         first: frame that the stepper begins with; those before it are at rest.
     """
 
     history: NDArray
     driven: NDArray
     held: NDArray
+    allowed: NDArray
     first: int
 
 
@@ -96,15 +102,15 @@ class SpringStepper:
     """
 
     def __init__(self, config: ModelConfig, parameters: Parameters, static: int) -> None:
-        alpha, beta, share = (parameters[f"integrator.{name}"] for name in ("alpha", "beta", "share"))
+        beta, share = (parameters[f"integrator.{name}"] for name in ("beta", "share"))
         first, *hidden, last = layers(parameters, "stepper")
         blocks = np.cumsum([config.latent] * 3 + [static])
         of_now, of_speed, of_away, of_static, self.of_rates = np.split(first.weights, blocks, axis=1)
         speed, away = VELOCITY * of_speed, DISTANCE * of_away
         self.bias, self.of_still = first.bias, np.hstack([of_now, of_static])
-        self.first = single(np.hstack([of_now - away * alpha, speed - away * beta]).T)
+        self.first = single(np.hstack([of_now - away, speed - away * beta]).T)
         self.later = [*hidden, Layer(single(REACH * last.rows))]
-        self.inertia = np.hstack([alpha, beta]).astype(np.float32)
+        self.beta = beta.astype(np.float32)
         self.stiffness = (config.stiffness / (1 + np.exp(-share))).astype(np.float32)
         self.config = config
 
@@ -118,19 +124,20 @@ class SpringStepper:
         still = self.of_still @ np.hstack([rest, static]).T + self.bias
         driven = np.ascontiguousarray((still + self.of_rates @ rates.T).T)
         held = np.ascontiguousarray(continued(self.later, still).T.clip(-REACH * MOST, REACH * MOST))
+        allowed = RATE_SHARE * np.linalg.norm(rates, axis=1)
         history = np.empty((len(rest) + 2, 2, rest.shape[1]), dtype=np.float32)
         history[:-2, 0] = rest
         if before is None:
             history[2:4, 1] = rest[:2]
-            return Course(history, driven, held, 2)
+            return Course(history, driven, held, allowed, 2)
         history[:2, 1] = before
-        return Course(history, driven, held, 0)
+        return Course(history, driven, held, allowed, 0)
 
     def rolled(self, course: Course) -> NDArray:
         """Return the latents of all frames (F, latent), written into `course`."""
         z, rest, start = course.history[2:, 1], course.history[:-2, 0], course.first
         while start < len(z):
-            self._advance(course.history[start:], course.driven[start:], course.held[start:])
+            self._advance(course, start)
             bad = lost(z[start:])
             if not bad.any():
                 break
@@ -139,17 +146,18 @@ class SpringStepper:
             z[first:start] = rest[first:start]
         return z
 
-    def _advance(self, history: NDArray, driven: NDArray, held: NDArray) -> None:
-        z = self.config.latent
+    def _advance(self, course: Course, start: int) -> None:
+        z, history = self.config.latent, course.history[start:]
         rooms = [Room(rows) for rows in (self.first, *(layer.rows for layer in self.later[:-1]))]
-        differences, terms = np.empty((2, z), np.float32), np.empty(2 * z, np.float32)
+        differences = np.empty((2, z), np.float32)
         along, pull, own = (np.empty(z, np.float32) for _ in range(3))
-        state, of_w, of_v = differences.reshape(-1), terms[:z], terms[z:]
+        state, (away, velocity) = differences.reshape(-1), differences
         sums, last = rooms[0].sums, self.later[-1].rows
         push, bound = Limit(self.config.push, (z,)), Limit(self.config.bound, (z,))
-        frames = zip(history[:-2], history[:-2, 0], history[1:-1, 1], history[2:, 1], driven, held)
+        poses = course.driven[start:], course.held[start:], course.allowed[start:].tolist()
+        frames = zip(history[:-2], history[:-2, 0], history[1:-1, 1], history[2:, 1], *poses)
         with np.errstate(over="ignore", invalid="ignore"):  # `rolled` looks for lost states
-            for past, rest, now, new, drive, calm in frames:
+            for past, rest, now, new, drive, calm, turning in frames:
                 np.subtract(now, past, differences)
                 np.dot(state, self.first, sums)
                 np.add(sums, drive, sums)
@@ -160,10 +168,14 @@ class SpringStepper:
                 np.dot(seen, last, own)
                 if not own.dot(own) < SAFE:
                     np.clip(own, -REACH * MOST, REACH * MOST, own)
-                np.multiply(self.inertia, state, terms)
-                np.add(of_w, of_v, along)
+                np.multiply(self.beta, velocity, along)
+                np.add(along, away, along)
                 np.multiply(self.stiffness, along, pull)
                 np.subtract(own, calm, own)
+                most = OWN_SHARE * (sqrt(pull.dot(pull)) + sqrt(velocity.dot(velocity))) + turning
+                size = sqrt(own.dot(own))
+                if size > most:
+                    np.multiply(own, most / size, own)
                 np.subtract(own, pull, own)
                 push(own)
                 np.add(own, along, own)

@@ -346,7 +346,6 @@ def test_held_poses_come_to_rest_where_the_initialiser_is(scene, toy_motion, toy
     bank = build_bank(clips, scene.character.skeleton, JOINTS, FPS, CPU)
     with torch.no_grad():
         model.stepper[-1].weight.zero_()
-        model.integrator.alpha.fill_(1.0)
         model.integrator.beta.fill_(0.5)
         model.integrator.share.fill_(3.0)
     spans = [range(30), range(30, 50)]

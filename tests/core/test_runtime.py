@@ -214,7 +214,7 @@ def test_garments_run_up_to_the_first_frame_as_in_a_bake(model, motion, fps):
 def test_lost_states_rest_for_a_while_as_in_a_bake(scene, toy_model, motion):
     model = toy_model(scene, scale=0.1, bound=0.0, push=0.0).eval()
     with torch.no_grad():
-        model.integrator.alpha.fill_(1.6)  # flies off
+        model.integrator.beta.fill_(1.6)  # flies off
     mine, theirs = (
         states_of(model, motion),
         np.concatenate([pose.weights for pose in garment_poses(model, motion, 30.0)]),
