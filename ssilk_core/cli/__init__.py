@@ -105,7 +105,7 @@ def parser() -> Parser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; return its exit code (0 well, 2 bad input, 3 not verified, 4 tasks failed, 130 stopped)."""
+    """Run the command line; return its exit code: 0, 2 bad input, 3 not verified, 4 tasks failed, 130 interrupted."""
     words = sys.argv[1:] if arguments is None else list(arguments)
     report: Reporter = JsonReporter() if "--json" in words else TextReporter()
     try:
