@@ -322,7 +322,6 @@ def dressed(request: BakeRequest) -> Dressed:
     Raises:
         SsilkError: a file is missing or does not fit the others, or an option has a value that is not allowed.
     """
-    from ssilk_usd.read_character import read_character
     from ssilk_usd.read_stage import open_stage
 
     from ssilk_core.checkpoint import load_model, network
@@ -336,10 +335,7 @@ def dressed(request: BakeRequest) -> Dressed:
     device, target = chosen_device(request.device), TARGETS[request.target]
     file = load_model(request.model)
     stage = open_stage(request.stage)
-    character = read_character(stage, root=request.root, garment=None)
-    skeleton = file.scene.character.skeleton
-    need_same_skeleton(character.skeleton, skeleton)
-    scene = replace(file.scene, character=replace(character, skeleton=skeleton))
+    scene = on_character(file, stage, request.root)
     model = None if request.plain else network(file, scene).to(device)
     deformer = _plain(scene) if model is None else model.deformer()
     provenance = {"model_sha256": sha256(request.model), "training": file.provenance.get("ssilk", "")}
@@ -374,6 +370,20 @@ def _beside(request: BakeRequest, output: Path) -> dict[str, str]:
         return {name: os.path.relpath(getattr(request, name), folder) for name in INPUTS}
     except ValueError:  # on another drive
         return {}
+
+
+def on_character(file: ModelFile, stage: Usd.Stage, root: str | None) -> Scene:
+    """Return a model's scene with the character of a stage; models keep of its body what the garment can touch.
+
+    Raises:
+        SsilkError: the stage's character is not the one that the model was trained with.
+    """
+    from ssilk_usd.read_character import read_character
+
+    character = read_character(stage, root=root, garment=None)
+    skeleton = file.scene.character.skeleton
+    need_same_skeleton(character.skeleton, skeleton)
+    return replace(file.scene, character=replace(character, skeleton=skeleton))
 
 
 def need_same_skeleton(found: Skeleton, trained: Skeleton) -> None:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -153,17 +153,13 @@ def _subjects(models: list[Opened], device: torch.device) -> list[Subject]:
 
 def _dressed(file: ModelFile, options: argparse.Namespace, device: torch.device) -> Dressed:
     """Put the garment of a model on the character of the stage."""
-    from ssilk_usd.read_character import read_character
     from ssilk_usd.read_stage import open_stage
 
     from ssilk_core.evaluation.methods import Dressed
 
-    from ._baking import need_same_skeleton
+    from ._baking import on_character
 
-    skeleton = file.scene.character.skeleton
-    character = read_character(open_stage(options.stage), root=options.root, garment=None)
-    need_same_skeleton(character.skeleton, skeleton)
-    scene = replace(file.scene, character=replace(character, skeleton=skeleton))
+    scene = on_character(file, open_stage(options.stage), options.root)
     return Dressed(scene, file.fabric, file.config.fps, device, exact=options.exact)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -71,21 +71,17 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
 def _subject(options: argparse.Namespace) -> Subject:
     """Load the model, its character and the motion."""
-    from ssilk_usd.read_character import read_character
     from ssilk_usd.read_motion import read_motion
     from ssilk_usd.read_stage import open_stage
 
     from ssilk_core.checkpoint import load_model
     from ssilk_core.stress.subject import FULL, QUICK, Subject
 
-    from ._baking import need_same_skeleton
+    from ._baking import on_character
 
     file = load_model(options.model)
-    skeleton = file.scene.character.skeleton
-    character = read_character(open_stage(str(options.stage)), root=options.root, garment=None)
-    need_same_skeleton(character.skeleton, skeleton)
-    scene = replace(file.scene, character=replace(character, skeleton=skeleton))
-    clip = read_motion(str(options.motion), skeleton) if options.motion else None
+    scene = on_character(file, open_stage(options.stage), options.root)
+    clip = read_motion(str(options.motion), scene.character.skeleton) if options.motion else None
     return Subject(file, scene, clip, QUICK if options.quick else FULL)
 
 

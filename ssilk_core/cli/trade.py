@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 import platform
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -102,6 +102,9 @@ class Bench:
         self.options, self.device = options, chosen_device(options.device)
         self.files: dict[Path, ModelFile] = {path: load_model(path) for path in options.models}
         first = next(iter(self.files.values()))
+        names = [path.stem for path in self.files]
+        need(len(set(names)) == len(names), ", ".join(map(str, self.files)), "several models have one name",
+             "points are told apart by the model's file name", "rename a file")  # fmt: skip
         for path, file in self.files.items():
             same = file.scene.garment.mesh.points.tobytes() == first.scene.garment.mesh.points.tobytes()
             need(same and file.config.fps == first.config.fps, str(path), "a model of another garment, or rate",
@@ -133,17 +136,13 @@ class Bench:
 
     def _dressed(self, file: ModelFile) -> Dressed:
         """Put a garment on the character of the stage."""
-        from ssilk_usd.read_character import read_character
         from ssilk_usd.read_stage import open_stage
 
         from ssilk_core.evaluation.methods import Dressed
 
-        from ._baking import need_same_skeleton
+        from ._baking import on_character
 
-        character = read_character(open_stage(self.options.stage), root=self.options.root, garment=None)
-        skeleton = file.scene.character.skeleton
-        need_same_skeleton(character.skeleton, skeleton)
-        scene = replace(file.scene, character=replace(character, skeleton=skeleton))
+        scene = on_character(file, open_stage(self.options.stage), self.options.root)
         return Dressed(scene, file.fabric, file.config.fps, self.device)
 
     def _reference(self, dressed: Dressed, reel: Reel) -> Method | None:

@@ -93,3 +93,10 @@ def test_garments_are_not_mixed(world, capsys):
     capsys.readouterr()
     assert run(TRADE.replace("trade model", "trade other.safetensors model")) == 2
     assert "a model of another garment, or rate" in capsys.readouterr().err
+
+
+def test_models_of_one_name_are_not_taken_for_each_other(world, capsys):
+    (world / "other").mkdir()
+    shutil.copy("model.safetensors", "other/model.safetensors")
+    assert run(TRADE.replace("trade model.safetensors", "trade model.safetensors other/model.safetensors")) == 2
+    assert "several models have one name" in capsys.readouterr().err
