@@ -68,11 +68,6 @@ def face_areas(points: Floats, faces: Ints) -> Floats:
     return 0.5 * np.linalg.norm(_face_crosses(points, faces), axis=-1)
 
 
-def face_normals(points: Floats, faces: Ints) -> Floats:
-    """Return unit triangle normals, shape (F, 3); zero for triangles without area."""
-    return _unit(_face_crosses(points, faces))
-
-
 def vertex_areas(points: Floats, faces: Ints) -> Floats:
     """Return a third of the area of the faces around each vertex [m2], shape (V,)."""
     thirds = np.repeat(face_areas(points, faces) / 3, 3)

@@ -40,9 +40,7 @@ from ssilk_core.evaluation.tally import Tally, against, figures
 from ssilk_core.fabrics import Fabric
 from ssilk_core.kinematics import motion_transforms, skin_points, skinning_matrices
 from ssilk_core.model.descriptors import GRAVITY
-from ssilk_core.training.bank import build_bank
-from ssilk_core.training.holding import rest_distance, spread_poses
-from ssilk_core.training.validation import Validator, roll_states
+from ssilk_core.training.validation import Validator
 
 FPS, JOINTS, CPU = 30.0, np.arange(3), torch.device("cpu")
 
@@ -338,26 +336,6 @@ def test_nothing_is_asked_for_nothing_is_computed(scene, dressed, motion, toy_mo
     assert [row.method for row in rows] == ["plain", "ssilk"]
     found = rows[1].figures
     assert (found.truth, found.poses, found.holds, found.loops) == (None, None, None, None)
-
-
-def test_held_poses_come_to_rest_where_the_initialiser_is(scene, toy_motion, toy_model):
-    """A damped spring without a stepper, wherever it starts; and without a spring nothing comes back."""
-    model, clips = toy_model(scene, bound=0.0), [toy_motion(scene, 30), toy_motion(scene, 20, speed=2.0)]
-    bank = build_bank(clips, scene.character.skeleton, JOINTS, FPS, CPU)
-    with torch.no_grad():
-        model.stepper[-1].weight.zero_()
-        model.integrator.beta.fill_(0.5)
-        model.integrator.share.fill_(3.0)
-    spans = [range(30), range(30, 50)]
-    states = roll_states(model, bank, spans, torch.tensor([0.0, -1, 0]))
-    frames, (before, now) = spread_poses(spans, states, 3)
-    assert frames.tolist() == [1, 15, 29, 31, 40, 49]
-    assert torch.equal(before[1], states[0][14]) and torch.equal(now[-1], states[1][19])
-    short, long = (rest_distance(model, bank, frames, (before, now + 0.5), seconds=s) for s in (0.1, 5.0))
-    assert short.shape == (6,) and (long < 1e-4).all() and (short > 10 * long).all()
-    with torch.no_grad():
-        model.integrator.share.fill_(-30.0)  # no spring: what is moved stays moved
-    assert (rest_distance(model, bank, frames, (now + 0.5, now + 0.5)) > 1e-3).all()
 
 
 def test_an_index_says_which_clips_are_in_which_split(tmp_path):

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from ssilk_core.assets import LOOSE, PINNED, TIGHT
 from ssilk_core.errors import SsilkError
-from ssilk_core.view.colours import class_colours, fabric_colour, heat_colours
+from ssilk_core.view.colours import fabric_colour
 from ssilk_core.view.surface import Geometry, Surface, vertex_normals
 
 TRIANGLE = np.eye(3)
@@ -51,21 +50,6 @@ def test_geometry_keeps_the_order_of_its_surfaces():
 def test_malformed_surfaces_are_named(points, faces, colour, message):
     with pytest.raises(SsilkError, match=rf"surface 'hem': .*{message}"):
         Surface("hem", points, np.array(faces), colour)
-
-
-def test_classes_are_black_red_and_green():
-    pinned, tight, loose = class_colours(np.array([PINNED, TIGHT, LOOSE]))
-    assert pinned.max() < 0.15
-    assert tight[0] > 2 * tight[1:].max()
-    assert loose[1] > 2 * loose[[0, 2]].max()
-
-
-def test_heat_darkens_steadily_and_ends_at_its_limit():
-    colours = heat_colours(np.array([-1.0, 0.0, 0.5, 1.0, 1.5, 2.0, 9.0]), limit=2.0)
-    np.testing.assert_array_equal(colours[0], colours[1])
-    np.testing.assert_array_equal(colours[-1], colours[-2])
-    luminance = colours[1:-1] @ [0.2126, 0.7152, 0.0722]
-    assert (np.diff(luminance) < 0).all()
 
 
 def test_neighbouring_garments_differ():
