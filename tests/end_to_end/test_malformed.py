@@ -741,8 +741,9 @@ def test_errors_are_events_for_machines(toy, monkeypatch, capsys):
         capsys.readouterr()
         assert main(shlex.split(command)) == 2
         out, err = capsys.readouterr()
-        (event,) = map(json.loads, out.splitlines())
+        *before, event = map(json.loads, out.splitlines())
         assert event["event"] == "failed" and event["error"].endswith(".") and not err
+        assert all(earlier["event"] == "started" for earlier in before)
 
 
 def test_one_frame_can_be_baked(toy, tmp_path, monkeypatch):
