@@ -130,7 +130,6 @@ def test_collisions_are_told_with_any_body(meter, scene):
     assert surface.inside == pytest.approx(float((distance < 0).double().mean()))
     assert surface.collision == pytest.approx(float(dressed.energy.collision_of(distance).mean()))
     assert surface.vertices == points.vertices == scene.character.merged_body().mesh.vertex_count
-    print("DBG", surface, points, few, float(distance.min()), float(distance.mean()))
     assert few.vertices == -(-points.vertices // 4) and few.collision != points.collision
     assert len(judging_table([surface, points, few]).splitlines()) == 5
 
