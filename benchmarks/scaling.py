@@ -124,7 +124,7 @@ class Case:
     alike: bool = True
 
 
-def launched(options: argparse.Namespace, processes: int, batches: list[str]) -> dict[str, Figures]:
+def launched(processes: int, batches: list[str]) -> dict[str, Figures]:
     """Measure batches with so many processes, started as 'torchrun' starts them."""
     launcher = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(processes)]
     with tempfile.TemporaryDirectory() as folder:
@@ -149,7 +149,7 @@ def measure_all(options: argparse.Namespace) -> list[Case]:
     measured: dict[tuple[str, int, str], Case] = {}
     for number in range(options.rounds):
         for processes, batches in plan(options).items():
-            for batch, found in launched(options, processes, batches).items():
+            for batch, found in launched(processes, batches).items():
                 print(f"round {number + 1}, processes {processes}, batch {batch}: {found}", flush=True)
                 for step, times in found["times"].items():
                     case = measured.setdefault((step, processes, batch), Case(step, processes, batch))
