@@ -164,6 +164,7 @@ PRESETS = {
                 rotated=0.3,
                 rate=6e-4,
                 final_rate=1e-4,
+                shape_rate=1.0,
                 rate_warmup=20,
                 average=0.98,
                 surface="vertices",
@@ -174,7 +175,7 @@ PRESETS = {
         Preset(
             name="preview",
             model=ModelConfig(),
-            train=TrainConfig(iterations=8_000, warm=0.3, validate_every=800),
+            train=TrainConfig(iterations=8_000, warm=0.3, shape_rate=1.0, validate_every=800),
         ),
         Preset(name="final", model=ModelConfig(), train=TrainConfig(average=0.9995)),
     )
