@@ -33,6 +33,13 @@ class Span:
         return cls(float(median), float(low), float(high), len(times))
 
 
+def now(device: torch.device) -> float:
+    """Return the time once a device has done its work [s]."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
 class Clock:
     """Measures work on one device.
 

@@ -12,12 +12,12 @@ with the nearest body points of the final states.
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
+from clock import now
 from reports import table, write_results
 from ssilk_usd.read_motion import read_motion
 from ssilk_usd.read_scene import read_scene
@@ -56,13 +56,6 @@ class Watched(Simulator):
         self.problems.append((start[..., :1], setting.picked(first)))
         self.solutions.append(solution)
         return solution
-
-
-def now(device: torch.device) -> float:
-    """Return the time once a device has done its work [s]."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    return time.perf_counter()
 
 
 def shots(motions: Sequence[Motion], count: int, frames: int, fps: float) -> list[Motion]:

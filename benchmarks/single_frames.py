@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
+from clock import now
 from torch import Tensor
 
 from ssilk_core.baselines.networks import Baseline
@@ -43,13 +43,13 @@ def _frame(network: Network, frame: int) -> tuple[float, float]:
     static, pose = bank.static_descriptor(index, direction), bank.dynamic_descriptor(index, direction)
     character, past = bank.character(index), [states[frame - 2 : frame - 1], states[frame - 1 : frame]]
     advance, decode = _parts(model, past, static, pose)
-    marks = [_now(static.device)]
+    marks = [now(static.device)]
     z = advance()
-    marks.append(_now(static.device))
+    marks.append(now(static.device))
     decode(z)
-    marks.append(_now(static.device))
+    marks.append(now(static.device))
     model.vertices(z, character)  # the network's end once more, then the rest
-    marks.append(_now(static.device))
+    marks.append(now(static.device))
     stepped, decoded, posed = (late - early for early, late in pairwise(marks))
     return stepped + decoded, stepped + posed
 
@@ -66,9 +66,3 @@ def _parts(
 
 def _spread(seconds: Tensor) -> tuple[float, float]:
     return float(seconds.median()), float(seconds.std())
-
-
-def _now(device: torch.device) -> float:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    return time.perf_counter()

@@ -3,9 +3,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
+
 import numpy as np
 
-from .assets import Deformer, Floats, GarmentPose, Ints, Motion, SkinWeights
+from .assets import Deformer, Floats, GarmentPose, Ints, Motion, ProxyRig, Scene, SkinWeights
+
+POSES_AT_ONCE = 256
 
 
 def matrix_from_quaternion(quaternions: Floats) -> Floats:
@@ -236,3 +241,16 @@ def deform(deformer: Deformer, motion: Motion, pose: GarmentPose) -> Floats:
     matrices = skinning_matrices(combined_transforms(deformer, motion, pose), scene.bind_transforms)
     canonical = scene.garment.mesh.points + np.einsum("fk,kvc->fvc", pose.weights.astype(np.float64), deformer.shapes)
     return skin_points(canonical, deformer.skin, matrices)
+
+
+def plain_deformer(scene: Scene) -> Deformer:
+    """Return a garment under plain skinning: no proxies, no blendshapes."""
+    none = ProxyRig(scene.rig.path, (), np.zeros(0, dtype=np.int32), np.zeros((0, 4, 4)), scene.plain_skin)
+    return Deformer(replace(scene, rig=none), scene.plain_skin, np.zeros((0, scene.garment.mesh.vertex_count, 3)))
+
+
+def plain_poses(frame_count: int) -> Iterator[GarmentPose]:
+    """Yield the poses of a `plain_deformer`, which hold nothing, some frames at a time."""
+    for start in range(0, frame_count, POSES_AT_ONCE):
+        frames = min(POSES_AT_ONCE, frame_count - start)
+        yield GarmentPose(start, np.zeros((frames, 0, 4)), np.zeros((frames, 0)))

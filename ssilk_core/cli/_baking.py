@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ssilk_core.assets import Deformer, Floats, GarmentPose, Motion, ProxyRig, Scene, Skeleton
+from ssilk_core.assets import Deformer, Floats, GarmentPose, Motion, Scene, Skeleton
 from ssilk_core.devices import chosen_device
 from ssilk_core.errors import VerificationError, need
 from ssilk_core.events import Message, Progress, Reporter, silent
 from ssilk_core.fabrics import Fabric
+from ssilk_core.kinematics import deform, plain_deformer, plain_poses, resample
 from ssilk_core.targets import TARGETS, Target, fitted
 
 from ._quality import lost
@@ -136,11 +137,8 @@ class Bake:
 
     def rollout(self) -> Iterator[GarmentPose]:
         """Yield the network's poses, some frames at a time."""
-        count = self.motion.frame_count
         if self.model is None:
-            for start in range(0, count, CHUNK):
-                frames = min(CHUNK, count - start)
-                yield GarmentPose(start, np.zeros((frames, 0, 4)), np.zeros((frames, 0)))
+            yield from plain_poses(self.motion.frame_count)
             return
         from ssilk_core.rollout import garment_poses
 
@@ -179,8 +177,6 @@ class Bake:
         return decode(self.model, self.motion, pose)
 
     def _fitted(self, pose: GarmentPose) -> Floats:
-        from ssilk_core.kinematics import deform
-
         return deform(self.deformer, self.motion, pose)
 
     @property
@@ -337,7 +333,7 @@ def dressed(request: BakeRequest) -> Dressed:
     stage = open_stage(request.stage)
     scene = on_character(file, stage, request.root)
     model = None if request.plain else network(file, scene).to(device)
-    deformer = _plain(scene) if model is None else model.deformer()
+    deformer = plain_deformer(scene) if model is None else model.deformer()
     provenance = {"model_sha256": sha256(request.model), "training": file.provenance.get("ssilk", "")}
     return Dressed(request, file, model, fitted(deformer, target), _units(stage, target), provenance)
 
@@ -407,14 +403,5 @@ def need_same_skeleton(found: Skeleton, trained: Skeleton) -> None:
 
 
 def _at_rate(motion: Motion, fps: float) -> Motion:
-    from ssilk_core.kinematics import resample
-
     need(0 < fps <= 10_000, "--fps", f"{fps:g} frames per second", "a positive rate is needed")
     return replace(resample(motion, fps), start=motion.start * fps / motion.fps)
-
-
-def _plain(scene: Scene) -> Deformer:
-    """Return the garment under plain skinning: no proxies, no shapes."""
-    none = ProxyRig(scene.rig.path, (), np.zeros(0, dtype=np.int32), np.zeros((0, 4, 4)), scene.plain_skin)
-    bare = replace(scene, rig=none)
-    return Deformer(bare, scene.plain_skin, np.zeros((0, scene.garment.mesh.vertex_count, 3)))

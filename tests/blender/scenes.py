@@ -111,3 +111,20 @@ def state_file(garment: Any) -> dict[str, Any]:
     from blender_addon.scene.models import job_of
 
     return json.loads((job_of(garment) / "state.json").read_text())
+
+
+def trained_skirt(bpy: ModuleType, skirt: Any, path: Path, python: str) -> Any:
+    """Return the skirt on an animated pillar, with a lively model, from a file that the first call makes."""
+    from blender_addon.scene.models import model_of
+
+    if not path.exists():
+        rig_and_animate(bpy, skirt)
+        bpy.ops.wm.save_as_mainfile(filepath=str(path))
+        assert bpy.ops.ssilk.find_motions() == {"FINISHED"}
+        skirt.ssilk.training.preset, skirt.ssilk.training.iterations = "draft", 4
+        assert bpy.ops.ssilk.train() == {"FINISHED"}
+        assert ended(skirt).state == "done"
+        enliven(python, model_of(skirt))
+        bpy.ops.wm.save_mainfile()
+    bpy.ops.wm.open_mainfile(filepath=str(path))
+    return bpy.data.objects["Skirt"]

@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
 from .conftest import activate
-from .scenes import decoded, ended, enliven, rig_and_animate, shown
+from .scenes import decoded, shown, trained_skirt
 from .test_panels import drawn
 
 EXACT = 2e-5  # [m]
@@ -26,19 +26,8 @@ def folder(tmp_path_factory) -> Path:
 @pytest.fixture
 def trained(ready, skirt, folder, ssilk_python):
     """The skirt on an animated pillar, with a model that moves it visibly."""
-    bpy, path = ready, folder / "trained.blend"
-    if not path.exists():
-        rig_and_animate(bpy, skirt)
-        bpy.ops.wm.save_as_mainfile(filepath=str(path))
-        assert bpy.ops.ssilk.find_motions() == {"FINISHED"}
-        skirt.ssilk.training.preset, skirt.ssilk.training.iterations = "draft", 4
-        assert bpy.ops.ssilk.train() == {"FINISHED"}
-        assert ended(skirt).state == "done"
-        enliven(ssilk_python, model_of(skirt))
-        bpy.ops.wm.save_mainfile()
-    bpy.ops.wm.open_mainfile(filepath=str(path))
-    garment = bpy.data.objects["Skirt"]
-    activate(bpy, garment)
+    garment = trained_skirt(ready, skirt, folder / "trained.blend", ssilk_python)
+    activate(ready, garment)
     return garment
 
 

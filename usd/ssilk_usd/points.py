@@ -5,26 +5,26 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from pxr import Sdf, Tf, Usd, UsdGeom, UsdSkel, Vt
+from pxr import Sdf, Usd, UsdGeom, UsdSkel, Vt
 
-from ssilk_core.assets import Deformer, Floats, GarmentPose, Motion, ProxyRig, Scene
-from ssilk_core.errors import fail, need
+from ssilk_core.assets import Floats, Motion, Scene
+from ssilk_core.errors import need
 from ssilk_core.files import replacing
+from ssilk_core.kinematics import plain_deformer, plain_poses
 
 from .author import extent_array
 from .export import need_layer_suffix
 from .garment_api import GarmentRecord
 from .read_mesh import is_garment
-from .read_stage import PRIMS, usd_reason
+from .read_stage import PRIMS
+from .samples import save
 from .shot import ShotSummary, write_shot
 from .units import StageUnits
 
 FRAMES_PER_SAVE = 128  # 5 MB of points in memory for a garment of 3,000 vertices
-POSES_AT_ONCE = 256
 
 
 class PointCache:
@@ -73,10 +73,7 @@ class PointCache:
 
     def save(self) -> None:
         """Write what is pending to the file."""
-        try:
-            self.layer.Save()
-        except Tf.ErrorException as error:
-            fail(str(self.path), f"writing failed ({usd_reason(error)})", "free some space or choose another output")
+        save(self.layer, self.path)
         self.unsaved_count = 0
 
 
@@ -111,9 +108,9 @@ def point_cache(
     with replacing(path) as temporary:
         shot = write_shot(
             temporary,
-            _plain(scene),
+            plain_deformer(scene),
             motion,
-            _no_poses(motion.frame_count),
+            plain_poses(motion.frame_count),
             units=units,
             start=motion.start if start is None else start,
             samples_per_frame=samples_per_frame,
@@ -128,18 +125,6 @@ def point_cache(
         need(missing == 0, str(path), f"{missing} of {motion.frame_count} frames have no points", "each needs some")
         cache.save()
         del cache  # the file is closed before it is renamed
-
-
-def _plain(scene: Scene) -> Deformer:
-    """Return the garment under plain skinning: no proxies, no shapes."""
-    none = ProxyRig(scene.rig.path, (), np.zeros(0, dtype=np.int32), np.zeros((0, 4, 4)), scene.plain_skin)
-    return Deformer(replace(scene, rig=none), scene.plain_skin, np.zeros((0, scene.garment.mesh.vertex_count, 3)))
-
-
-def _no_poses(frame_count: int) -> Iterator[GarmentPose]:
-    for start in range(0, frame_count, POSES_AT_ONCE):
-        frames = min(POSES_AT_ONCE, frame_count - start)
-        yield GarmentPose(start, np.zeros((frames, 0, 4)), np.zeros((frames, 0)))
 
 
 def _unbind(stage: Usd.Stage) -> Sdf.Path:

@@ -18,7 +18,7 @@ from ssilk_core.errors import need
 from ssilk_core.kinematics import world_transforms
 
 from .read_stage import location
-from .units import StageUnits
+from .units import StageUnits, scaling
 
 _RIGID_TOLERANCE = 1e-3
 _TILTED = 0.5  # cosine below which a skeleton's up axis is not the stage's
@@ -77,11 +77,11 @@ class SkelSource:
 
     def binds_to_core(self, bind: Floats) -> Floats:
         """Return bind transforms (..., 4, 4) in the core's bind space [m]."""
-        return self.bind_to_core @ bind @ _scale(1 / self.joint_scale)
+        return self.bind_to_core @ bind @ scaling(1 / self.joint_scale)
 
     def binds_from_core(self, bind: Floats) -> Floats:
         """Return the core's bind transforms (..., 4, 4) as the stage holds them."""
-        return np.linalg.inv(self.bind_to_core) @ bind @ _scale(self.joint_scale)
+        return np.linalg.inv(self.bind_to_core) @ bind @ scaling(self.joint_scale)
 
     @property
     def _bind_scale(self) -> float:
@@ -97,7 +97,7 @@ class SkelSource:
         matrix = self.bind[0] @ np.linalg.inv(rest[0])
         size = np.abs(self.bind[:, :3, 3]).max() + self._bind_scale
         agree = np.abs(matrix @ rest - self.bind).max() < _RIGID_TOLERANCE * size
-        return matrix if agree else _scale(self._bind_scale)
+        return matrix if agree else scaling(self._bind_scale)
 
     def _tilt(self) -> Floats:
         """Quarter turn (3, 3), in the stage's axes, that sets bind space upright; the identity if it is."""
@@ -126,7 +126,7 @@ def joints_to_core(local: Floats, parents: Ints, placement: Floats, units: Stage
     result[..., :3, 3] *= scale
     roots = np.flatnonzero(np.asarray(parents) < 0)
     world = units.matrix @ placement[..., None, :, :] @ local[..., roots, :, :]
-    result[..., roots, :, :] = world @ _scale(1 / scale)
+    result[..., roots, :, :] = world @ scaling(1 / scale)
     return result
 
 
@@ -152,7 +152,3 @@ def need_similarity(prim: Usd.Prim, matrices: Floats) -> Floats:
         "apply the scale and export again",
     )
     return matrices
-
-
-def _scale(factor: float) -> Floats:
-    return np.diag([factor, factor, factor, 1.0])

@@ -63,8 +63,9 @@ class StageUnits:
 
     def transforms_from_core(self, transforms: Floats) -> Floats:
         """Return rigid joint-to-world transforms [m], y up, shape (..., 4, 4), in the stage's units and axes."""
-        return np.linalg.inv(self.matrix) @ transforms @ _scale(self.meters_per_unit)
+        return np.linalg.inv(self.matrix) @ transforms @ scaling(self.meters_per_unit)
 
 
-def _scale(factor: float) -> Floats:
+def scaling(factor: float) -> Floats:
+    """Return the matrix (4, 4) that scales by one factor."""
     return np.diag([factor, factor, factor, 1.0])
