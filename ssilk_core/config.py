@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from .errors import need
 
 SURFACES = ("triangles", "vertices")
-SCHEMES = ("spring_verlet", "verlet", "direct", "direct_residual")
+SCHEMES = ("spring_verlet", "verlet", "direct", "direct_residual", "quasi_static")
 MOST = 1e9  # of anything that has no other bound
 
 
@@ -30,7 +30,7 @@ class ModelConfig:
         shapes: blendshapes K; zero leaves proxies alone to deform the garment.
         activations: what D gives for them, where it is more than K ("ssilk reduce"); zero for K itself.
         scheme: how z is integrated: "verlet" (Eq. 3), "direct" (Eq. 11), "direct_residual" (Eq. 12), or
-            "spring_verlet", Eq. 3 with a spring to the quasi-static state.
+            "spring_verlet", Eq. 3 with a spring to the quasi-static state, or "quasi_static", which is that state.
         bound: soft bound on each latent dimension; zero leaves the latents free, as the paper does.
         push: soft bound on what S and the spring add to each dimension in one step; zero for none.
         stiffness: largest spring constant of "spring_verlet", in (0, 1].

@@ -15,6 +15,7 @@ SCHEMES: dict[str, tuple[int, tuple[str, ...], bool]] = {
     "verlet": (2, ("alpha", "beta"), True),
     "direct": (2, (), True),
     "direct_residual": (2, (), True),
+    "quasi_static": (0, (), False),  # no stepper
 }
 
 
@@ -31,7 +32,7 @@ def parameter_shapes(scene: Scene, config: ModelConfig, joints: Ints) -> Shapes:
         **(reduced if config.activations else {}),
         **{f"integrator.{name}": (z,) for name in own},
         **_layers("initialiser", (static, *widths, z)),
-        **_layers("stepper", (seen * z + static + dynamic, *widths, z), bias),
+        **(_layers("stepper", (seen * z + static + dynamic, *widths, z), bias) if seen else {}),
         **_layers("output", (z, *widths, config.given + 6 * proxies)),
     }
 

@@ -160,9 +160,21 @@ class DirectResidual(Integrator):
         return now + stepper(torch.cat([before, now, pose], dim=1))
 
 
+class QuasiStatic(Integrator):
+    """z_t = P(theta_t): no stepper and no past, for garments with nothing loose, which P alone dresses as well."""
+
+    states = 0
+
+    def forward(self, stepper: nn.Module, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor) -> Tensor:
+        return rest  # within its bound already
+
+    advance = forward
+
+
 INTEGRATORS: dict[str, type[Integrator]] = {
     "spring_verlet": SpringVerlet,
     "verlet": Verlet,
     "direct": Direct,
     "direct_residual": DirectResidual,
+    "quasi_static": QuasiStatic,
 }

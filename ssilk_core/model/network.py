@@ -57,7 +57,8 @@ class GarmentModel(nn.Module):
         # Zero: training starts as pure Verlet integration.
         self.integrator = INTEGRATORS[config.scheme](config, dynamic)
         seen, bias = self.integrator.states * z + static + dynamic, not self.integrator.centred
-        self.stepper = mlp(seen, config.widths, z, generator, 0.0, bias)
+        has_stepper = self.integrator.states > 0
+        self.stepper = mlp(seen, config.widths, z, generator, 0.0, bias) if has_stepper else nn.Sequential()
         # Small: training starts as plain skinning.
         self.output = mlp(z, config.widths, self.decoder.output_count, generator, 0.01)
 
@@ -78,6 +79,8 @@ class GarmentModel(nn.Module):
             pose: their dynamic descriptors, shape (F, batch, D).
         """
         states = list(states)
+        if not self.integrator.states:
+            return [*states, *rest]
         for still, seen in zip(rest, pose):
             states.append(self.step(states[-2], states[-1], still, seen))
         return states

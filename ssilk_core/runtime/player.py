@@ -31,16 +31,17 @@ class Player:
     def __init__(self, file: ModelFile) -> None:
         scene, config = file.scene, file.config
         need(
-            config.scheme == "spring_verlet",
+            config.scheme in ("spring_verlet", "quasi_static"),
             scene.garment.mesh.path,
             f"the model's scheme is '{config.scheme}'",
-            "the runtime plays 'spring_verlet'",
+            "the runtime plays 'spring_verlet' and 'quasi_static'",
             "use 'ssilk bake'",
         )
         self.file, self.skeleton = file, scene.character.skeleton
         static, _ = descriptor_sizes(scene, file.joints)
         self.initialiser = layers(file.parameters, "initialiser")
-        self.stepper = SpringStepper(config, file.parameters, static)
+        steps = config.scheme == "spring_verlet"
+        self.stepper = SpringStepper(config, file.parameters, static) if steps else None
         self.decoder = Decoder(scene, file.parameters, config)
         self.kinematics = ProxyKinematics(scene.rig, self.skeleton.joint_count)
         self.tiles = tiles(scene, file.parameters)

@@ -84,10 +84,12 @@ class Take:
     def _roll(self) -> None:
         done, player = self.rolled, self.player
         driven = self.driven((done - self.before) // self.block)
-        past = self.latents[done - 2 : done] if done else None
-        course = player.stepper.prepared(player.at_rest(driven.static), driven.static, driven.rates, past)
+        latents = player.at_rest(driven.static)
+        if player.stepper:
+            past = self.latents[done - 2 : done] if done else None
+            latents = player.stepper.rolled(player.stepper.prepared(latents, driven.static, driven.rates, past))
         self.rolled = done + len(driven.static)
-        self.latents[done : self.rolled] = player.stepper.rolled(course)
+        self.latents[done : self.rolled] = latents
 
     def _driven(self, number: int) -> Drive:
         frames = self._frames(number)

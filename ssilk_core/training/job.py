@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ..assets import PINNED, Motion, Scene
+from ..assets import LOOSE, PINNED, Motion, Scene
 from ..config import ModelConfig, TrainConfig
 from ..errors import need
 from ..fabrics import Fabric
@@ -18,7 +18,9 @@ from .state import canonical, scene_digest
 
 @dataclass(frozen=True, kw_only=True)
 class TrainJob:
-    """Everything a training needs.
+    """Everything a training needs, cut down to what its scene requires.
+
+    Garments with nothing loose are quasi-static: a stepper learns nothing there that the initialiser does not know.
 
     Attributes:
         scene: character with its body, garment, rig.
@@ -39,6 +41,9 @@ class TrainJob:
     inputs: dict[str, str] | None = None
 
     def __post_init__(self) -> None:
+        if not (self.scene.classes == LOOSE).any():
+            object.__setattr__(self, "model", replace(self.model, scheme="quasi_static"))
+            object.__setattr__(self, "train", replace(self.train, carry=0, noise=0))  # nothing has a past to vary
         if not self.learns:
             object.__setattr__(self, "model", replace(self.model, latent=1, widths=(1,), shapes=1))
             least = replace(self.train, iterations=1, batch=1, warm_batch=1, resting=1, recombined=0)

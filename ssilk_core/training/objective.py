@@ -3,22 +3,18 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from ..assets import PINNED
 from ..energy import GarmentEnergy
-from ..energy.collision import PosedBody, nearest_planes
-from ..energy.nearest import BLOCK, compact_blocks
 from ..model.body import CollisionBody
+from ..model.contacts import Contacts, no_planes
 from ..model.descriptors import GRAVITY
 from ..model.network import GarmentModel
 from .bank import MotionBank
 from .windows import WindowSampler
 
 Terms = dict[str, Tensor]
-NOWHERE = 1e6  # [m] from a plane that is met by nothing
 
 
 class Objective:
@@ -39,12 +35,9 @@ class Objective:
     ) -> None:
         self.model, self.energy, self.bank = model, energy, bank
         self.surface = surface
-        scene, device = model.scene, bank.static.device
-        free = np.flatnonzero(scene.classes != PINNED)
-        self.body = body if len(free) else None
-        self.free = torch.as_tensor(free, device=device)
-        if self.body:
-            self.blocks = torch.as_tensor(compact_blocks(scene.garment.mesh.points[free], BLOCK), device=device)
+        self.body, device = body, bank.static.device
+        if body:
+            self.contacts = Contacts(model.scene, vertices=body.vertices, pinned=False, device=device)
         self.dt = 1 / model.config.fps
 
     def potential(self, x: Tensor, direction: Tensor, character: Tensor) -> Terms:
@@ -57,16 +50,8 @@ class Objective:
     def _planes(self, x: Tensor, character: Tensor) -> tuple[Tensor, Tensor]:
         """Return the plane that each vertex of x (V, 3, N) may meet: normals (V, 3, N) and offsets (V, N)."""
         if self.body is None:
-            return _no_planes(x)
-        return self.planes(x, self.body.posed(character, surface=self.surface))
-
-    def planes(self, x: Tensor, body: PosedBody) -> tuple[Tensor, Tensor]:
-        """Return the planes of a body that is near enough to be met; those of pinned vertices are far away."""
-        found = nearest_planes(x.index_select(0, self.free), body, self.blocks)
-        if len(self.free) == len(x):
-            return found
-        normal, offset = _no_planes(x)
-        return normal.index_copy_(0, self.free, found[0]), offset.index_copy_(0, self.free, found[1])
+            return no_planes(x)
+        return self.contacts.planes(x, self.body.posed(character, surface=self.surface))
 
     def static(self, frames: Tensor, direction: Tensor) -> Terms:
         """Return the terms of the initialiser's quasi-static states on single poses (Section 3.1)."""
@@ -94,7 +79,8 @@ class Objective:
         down = sampler.direction.repeat(length, 1)
         static = bank.static_descriptor(times, down)
         pose = torch.cat([static, bank.dynamic[times]], dim=1).reshape(length, batch, -1)
-        with torch.no_grad():  # the initialiser learns rest states from their own energy, not what helps later frames
+        # An initialiser with a stepper learns rest states from their own energy, not what helps later frames.
+        with torch.set_grad_enabled(not model.integrator.states):
             target = model.initial(static).reshape(length, batch, -1)
             start = torch.where(sampler.carried[None, :, None], sampler.latents, target[:2])
         with torch.set_grad_enabled(sampler.config.through_time):
@@ -122,11 +108,6 @@ class Objective:
             x, path[..., batch:], path[..., :-batch], root[:, 2 * batch :] - root[:, batch:-batch], self.dt
         )
         return dynamic, resting, torch.stack(z[-2:]).detach()
-
-
-def _no_planes(x: Tensor) -> tuple[Tensor, Tensor]:
-    """Return planes that no vertex of x (V, 3, N) meets."""
-    return x.new_zeros(x.shape), x.new_full((len(x), x.shape[2]), -NOWHERE)
 
 
 def total(terms: Terms) -> Tensor:

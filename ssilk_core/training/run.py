@@ -165,9 +165,11 @@ class Run:
                 if cuts := len(split_at_cuts(motion, most_turn=most_turn)) - 1:
                     found = "root or a joint jumps" if most_turn < inf else "root jumps"
                     self.report(Message(f"{motion.path}: the {found} {cuts} times; each span is used by itself."))
+        path = self.job.scene.garment.mesh.path
         if not self.job.learns:
-            path = self.job.scene.garment.mesh.path
             self.report(Message(f"{path}: every vertex is pinned to the skeleton; there is nothing to learn."))
+        elif self.job.model.scheme == "quasi_static":
+            self.report(Message(f"{path}: nothing is loose; the garment is quasi-static and gets no stepper."))
         detail = {**self.parts.detail(), "memory predicted [MiB]": self._memory() >> 20}
         self.report(Started("train", self.job.train.iterations, detail))
 

@@ -15,7 +15,7 @@ from ssilk_core.energy.collision import nearest_planes, signed_distance
 from ssilk_core.events import Event, Message
 from ssilk_core.fabrics import Fabric
 from ssilk_core.kinematics import deform, motion_transforms, skin_points, skinning_matrices
-from ssilk_core.rollout import garment_poses
+from ssilk_core.rollout import garment_poses, roll
 from ssilk_core.runtime import Player
 from ssilk_core.training.job import TrainJob
 from ssilk_core.training.parts import build_parts
@@ -111,3 +111,33 @@ def test_the_body_is_reached_by_what_is_free_alone(scene, toy_motion):
         reachable_body(classed(scene, classes), motions).vertices for classes in (half, np.full(len(half), TIGHT))
     )
     assert set(few) < set(all_of_it)
+
+
+def initialiser_learns_from_windows(job: TrainJob) -> bool:
+    parts = build_parts(job, CPU)
+    stepper = parts.stepper(job.train, 0)
+    frames, direction = stepper.sampler.poses(2)
+    dynamic, *_ = stepper.objective.window(stepper.sampler, stepper.sampler.noise(), frames, direction)
+    dynamic["stretch"].sum().backward()
+    gradient = parts.model.initialiser[0].weight.grad
+    return gradient is not None and bool(gradient.any())
+
+
+def test_a_garment_with_nothing_loose_has_no_stepper(scene, toy_motion, tmp_path):
+    """It is where its initialiser says, in training, in bakes and in the runtime, which is no matter of frames."""
+    tight, output = classed(scene, np.full(len(scene.classes), TIGHT)), tmp_path / "tight.safetensors"
+    asked, loose = (job_of(world, toy_motion(scene, 40), output) for world in (tight, scene))
+    assert asked.model.scheme == "quasi_static" and loose.model.scheme == "spring_verlet"
+    assert initialiser_learns_from_windows(asked) and not initialiser_learns_from_windows(loose)
+    done = train(replace(asked, train=replace(asked.train, warm=0.3, rate_warmup=2)), lambda event: None)
+    assert done.score.total < done.plain.total
+    file = load_model(output)
+    assert not [name for name in file.parameters if name.startswith(("stepper", "integrator"))]
+    model, motion = network(file, tight).eval(), toy_motion(scene, 30, speed=2.0)
+    whole = torch.cat([step.activation for step in roll(model, motion)], dim=1)
+    for frame in (0, 7, 29):
+        (alone,) = roll(model, motion.clip(frame, frame + 1))
+        torch.testing.assert_close(whole[:, frame : frame + 1], alone.activation, atol=1e-5, rtol=0)
+    (pose,) = garment_poses(model, motion, 30.0)
+    mine = Player(file).play(motion)
+    np.testing.assert_allclose(mine.vertices(11), deform(model.deformer(), motion, pose)[11], atol=1e-5)

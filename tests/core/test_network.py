@@ -10,7 +10,7 @@ import torch
 from ssilk_core.assets import GarmentPose, SkinWeights
 from ssilk_core.config import SCHEMES, ModelConfig
 from ssilk_core.model.network import GarmentModel, mlp, model_joints
-from ssilk_core.parameters import parameter_shapes
+from ssilk_core.parameters import descriptor_sizes, parameter_shapes
 
 
 def fresh(scene, **options) -> GarmentModel:
@@ -49,7 +49,7 @@ def test_the_seed_alone_decides_the_parameters(scene):
 def test_every_scheme_builds_and_steps(scene, scheme):
     model = fresh(scene, scheme=scheme)
     static = torch.randn(5, model.initialiser[0].in_features)
-    pose = torch.randn(5, model.stepper[0].in_features - model.integrator.states * 8)
+    pose = torch.randn(5, sum(descriptor_sizes(scene, model.joints)))
     rest = model.initial(static)
     assert model.step(rest, rest, rest, pose).shape == (5, 8)
 
