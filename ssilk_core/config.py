@@ -30,7 +30,7 @@ class ModelConfig:
         shapes: blendshapes K; zero leaves proxies alone to deform the garment.
         activations: what D gives for them, where it is more than K ("ssilk reduce"); zero for K itself.
         scheme: how z is integrated: "verlet" (Eq. 3), "direct" (Eq. 11), "direct_residual" (Eq. 12), or
-            "spring_verlet", Eq. 3 with a spring to the quasi-static state, or "quasi_static", which is that state.
+            "spring_verlet", which is Eq. 3 with a spring to the quasi-static state, or "quasi_static", that state.
         bound: soft bound on each latent dimension; zero leaves the latents free, as the paper does.
         push: soft bound on what S and the spring add to each dimension in one step; zero for none.
         stiffness: largest spring constant of "spring_verlet", in (0, 1].
@@ -82,6 +82,8 @@ class TrainConfig:
         kick: chance in each frame that a carried state is moved by noise; windows that begin anew always are.
         noise: standard deviation added to the first two latents of a window.
         noise_correlation: of the noise on the first latent with that on the second; 0 is the paper's.
+        regularity: weight [J] of the regularisation of the latents (Eq. 13); zero for none.
+        regularity_scale: distance that garments are to have whose latents are one apart, RMS [m].
         through_time: back-propagate through the whole window, as the paper does, or through each step by itself.
         warm_rate: Adam's step size in the warm start, decaying to a tenth.
         rate, final_rate: Adam's step size in training proper, after its warm-up and at the end (cosine in between).
@@ -105,6 +107,8 @@ class TrainConfig:
     kick: float = 0.03
     noise: float = 0.1
     noise_correlation: float = 0.99
+    regularity: float = 0.0
+    regularity_scale: float = 0.03
     through_time: bool = False
     warm_rate: float = 1e-3
     rate: float = 3e-4
@@ -128,6 +132,8 @@ class TrainConfig:
         _need_between(
             self, 0, MOST, "noise", "warm_rate", "rate", "final_rate", "rate_warmup", "skin_rate", "shape_rate"
         )
+        _need_between(self, 0, MOST, "regularity")
+        _need_between(self, 1e-9, MOST, "regularity_scale")
         _need_between(self, 0, 1000, "recombined")
         _need_between(self, 0, 2**63 - 1, "seed")
 

@@ -12,6 +12,7 @@ from ..model.contacts import Contacts, no_planes
 from ..model.descriptors import GRAVITY
 from ..model.network import GarmentModel
 from .bank import MotionBank
+from .regularity import irregularity
 from .windows import WindowSampler
 
 Terms = dict[str, Tensor]
@@ -107,6 +108,9 @@ class Objective:
         dynamic["inertia"], dynamic["drag"] = self.energy.kinetic(
             x, path[..., batch:], path[..., :-batch], root[:, 2 * batch :] - root[:, batch:-batch], self.dt
         )
+        if weight := sampler.config.regularity:
+            drawn, scale = torch.cat([rolled[-batch:], quiet]), sampler.config.regularity_scale
+            dynamic["regularity"] = weight * irregularity(model, self.energy.mass, drawn, scale)
         return dynamic, resting, torch.stack(z[-2:]).detach()
 
 
