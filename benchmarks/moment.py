@@ -102,7 +102,7 @@ class Moment:
 
     def planes(self, *, surface: bool = True) -> tuple[Tensor, Tensor]:
         body = self.body if surface else replace(self.body, rings=None)
-        return self.objective.planes(self.x, body)
+        return self.objective.contacts.planes(self.x, body)
 
     def update(self) -> Callable[[], Tensors]:
         """Return what gives the parameters known gradients, in one copy, and moves them."""

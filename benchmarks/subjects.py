@@ -55,9 +55,7 @@ class Subject:
         """Return a validator of this garment that holds one whole motion at the model's rate."""
         skeleton, fps = self.scene.character.skeleton, self.file.config.fps
         bank = build_bank([motion], skeleton, self.model.joints, fps, self.device)
-        return Validator(
-            bank, self.energy, self.body, self.scene.plain_skin, self.model.decoder.rest, fps, bank.frame_count
-        )
+        return Validator(bank, self.energy, self.body, self.scene, self.model.decoder.rest, fps, bank.frame_count)
 
     def frame_terms(self, motion: Motion, *, plain: bool = False) -> dict[str, Tensor]:
         """Return `Validator.frame_terms` over all frames of a motion, shape (N,)."""

@@ -38,7 +38,7 @@ def consecutive_blocks(count: int, size: int, device: torch.device) -> Tensor:
     )
 
 
-def nearest_vertex(x: Tensor, body: Tensor) -> Tensor:
+def nearest_vertex(x: Tensor, body: Tensor, allowed: Tensor | None = None) -> Tensor:
     """Return the index of the nearest body vertex by brute force; equal distances go to the lower index.
 
     All paths minimise |x - b|^2 / 2 - |x|^2 / 2 = [x, 1] . [-b, |b|^2 / 2], with coordinates centred on the body so
@@ -47,6 +47,7 @@ def nearest_vertex(x: Tensor, body: Tensor) -> Tensor:
     Args:
         x: garment positions, shape (V, 3, N).
         body: body positions, shape (B, 3, N).
+        allowed: how many body vertices each garment vertex may find, then these, shape (V, 1 + C); all by default.
 
     Returns:
         int64, shape (V, N).
@@ -56,20 +57,33 @@ def nearest_vertex(x: Tensor, body: Tensor) -> Tensor:
     half = 0.5 * (body * body).sum(1, keepdim=True)
     left = torch.cat([x, torch.ones_like(x[:, :1])], dim=1).permute(2, 1, 0).contiguous()
     right = torch.cat([-body, half], dim=1).permute(2, 1, 0).contiguous()
-    return _by_rows(left, right) if x.device.type == "cpu" else _by_products(left, right)
+    barred = _barred(allowed, len(body), x.dtype)
+    return _by_rows(left, right, barred) if x.device.type == "cpu" else _by_products(left, right, barred)
 
 
-def _by_rows(left: Tensor, right: Tensor) -> Tensor:
+def _barred(allowed: Tensor | None, count: int, dtype: torch.dtype) -> Tensor | None:
+    """Return what is added to the scores of garment vertices (V, B): infinity for body vertices not allowed."""
+    if allowed is None:
+        return None
+    barred = torch.full((len(allowed), count), torch.inf, dtype=dtype, device=allowed.device)
+    return barred.scatter_(1, allowed[:, 1:].long(), 0.0)
+
+
+def _by_rows(left: Tensor, right: Tensor, barred: Tensor | None) -> Tensor:
     # One buffer serves all frames, and numpy's argmin uses the processor's vector units.
     score = left.new_empty(left.shape[2], right.shape[2])
-    found = [torch.mm(a.T, b, out=score).numpy().argmin(-1) for a, b in zip(left, right)]
+    found = []
+    for a, b in zip(left, right):
+        torch.mm(a.T, b, out=score) if barred is None else torch.addmm(barred, a.T, b, out=score)
+        found.append(score.numpy().argmin(-1))
     return torch.from_numpy(np.stack(found, axis=1))
 
 
-def _by_products(left: Tensor, right: Tensor) -> Tensor:
+def _by_products(left: Tensor, right: Tensor, barred: Tensor | None) -> Tensor:
     step = max(1, SCORES // (left.shape[2] * right.shape[2]))
-    found = [
-        torch.bmm(left[i : i + step].transpose(1, 2), right[i : i + step]).argmin(-1)
-        for i in range(0, len(left), step)
-    ]
+    found = []
+    for i in range(0, len(left), step):
+        factors = left[i : i + step].transpose(1, 2), right[i : i + step]
+        score = torch.bmm(*factors) if barred is None else torch.baddbmm(barred[None], *factors)
+        found.append(score.argmin(-1))
     return torch.cat(found).T.contiguous()

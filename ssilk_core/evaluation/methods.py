@@ -20,6 +20,7 @@ from ..energy.stretch import deformation_gradient_operator
 from ..errors import need
 from ..fabrics import Fabric
 from ..model.body import CollisionBody
+from ..model.contacts import Contacts
 from ..model.descriptors import GRAVITY
 from ..model.skinning import Skinning
 from ..simulate import SimulationOptions, Simulator, simulate
@@ -71,6 +72,7 @@ class Dressed:
         self.columns = deformation_gradient_operator(mesh, device, torch.float32)
         skeleton = scene.character.skeleton
         self.body = CollisionBody(scene.character.merged_body(), skeleton.joint_count, device=device)
+        self.contacts = Contacts(scene, device=device)
         self.skin = Skinning(scene.plain_skin).to(device)
         self.rest = torch.tensor(mesh.points, dtype=torch.float32, device=device)
         self.weight = float(self.energy.mass.sum()) * GRAVITY * float(np.ptp(mesh.points[:, 1]))

@@ -59,7 +59,7 @@ def frame_energies(dressed: Dressed, reel: Reel, take: int, frames: range, path:
     x, character = path[..., -len(frames) :], reel.character(take, frames)
     body, joined = dressed.body.posed(character, exact=dressed.exact), path[..., -len(frames) - 2 :]
     down = x.new_tensor([0.0, -1.0, 0.0])
-    return energies(dressed.energy, x, dressed.plain(character), body, joined, dressed.fps, down)
+    return energies(dressed.energy, x, dressed.plain(character), dressed.contacts, body, joined, dressed.fps, down)
 
 
 class _Past:

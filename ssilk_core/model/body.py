@@ -17,10 +17,15 @@ from .skinning import Skinning
 
 
 class CollisionBody:
-    """Body vertices and normals under skinning matrices, for the vertices listed (all by default)."""
+    """Body vertices and normals under skinning matrices, for the vertices listed (all by default).
+
+    Attributes:
+        vertices: indices of those vertices in the body.
+    """
 
     def __init__(self, body: Body, joint_count: int, *, vertices: Ints | None = None, device: torch.device) -> None:
         chosen = np.arange(body.mesh.vertex_count) if vertices is None else vertices
+        self.vertices = chosen
         body.skin.check_joints(joint_count)
         normals = topology.vertex_normals(body.mesh.points, body.mesh.faces)[chosen]
 

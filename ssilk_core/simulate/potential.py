@@ -19,10 +19,10 @@ from torch import Tensor
 
 from ..assets import PINNED, Scene
 from ..energy import GarmentEnergy
-from ..energy.collision import PosedBody, nearest_planes
-from ..energy.nearest import BLOCK, compact_blocks
+from ..energy.collision import PosedBody
 from ..fabrics import Fabric
 from ..mesh import topology
+from ..model.contacts import Contacts
 from ..model.descriptors import GRAVITY
 from .blocks import BlockMatrix
 from .hessian import Hessian
@@ -89,7 +89,7 @@ class Potential:
         hinges = topology.hinges(mesh.faces) if fabric.bending else np.zeros((0, 4), dtype=np.int64)
         self.fabric, self.dtype = fabric, dtype
         self.mass: Tensor = energy.mass[:, None]
-        self.blocks = torch.as_tensor(compact_blocks(mesh.points, BLOCK), device=device)
+        self.contacts = Contacts(scene, device=device)
         self.membrane = Membrane(mesh, fabric, device, dtype)
         self.hinges = Hinges(hinges, energy, mesh.vertex_count) if len(hinges) else None
         free = np.flatnonzero((scene.classes != PINNED) & (topology.vertex_areas(mesh.points, mesh.faces) > 0))
@@ -97,10 +97,10 @@ class Potential:
         self._hessian = Hessian(self.membrane, self.hinges, hinges, free, mesh.vertex_count)
 
     def planes(self, x: Tensor, setting: Setting) -> Planes | None:
-        """Return the planes through the body points nearest to x."""
+        """Return the planes through the body points that x meets."""
         if setting.body is None:
             return None
-        normal, offset = nearest_planes(x.float(), setting.body, self.blocks)
+        normal, offset = self.contacts.planes(x.float(), setting.body)
         return Planes(normal.to(x.dtype), offset.to(x.dtype))
 
     def energy(self, x: Tensor, setting: Setting, planes: Planes | None) -> Tensor:

@@ -82,5 +82,5 @@ def build_parts(job: TrainJob, device: torch.device, team: Team = ALONE) -> Part
     # Validation looks at the whole body: what training leaves out must not go unnoticed.
     whole = CollisionBody(body, count, device=device)
     rest, frames = model.decoder.rest, job.train.valid_frames
-    validator = Validator(held, energy, whole, scene.plain_skin, rest, fps, frames, team)
+    validator = Validator(held, energy, whole, scene, rest, fps, frames, team)
     return Parts(model, bank, energy, touched, validator, len(reach.vertices), device, team)

@@ -10,10 +10,11 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from ..assets import SkinWeights
+from ..assets import Scene
 from ..energy import TERMS, GarmentEnergy
-from ..energy.collision import PosedBody, signed_distance
+from ..energy.collision import PosedBody
 from ..model.body import CollisionBody
+from ..model.contacts import Contacts
 from ..model.descriptors import GRAVITY
 from ..model.skinning import Skinning
 from .bank import MotionBank
@@ -60,14 +61,15 @@ class Validator:
         bank: MotionBank,
         energy: GarmentEnergy,
         body: CollisionBody,
-        plain: SkinWeights,
+        scene: Scene,
         rest: Tensor,
         fps: float,
         frames: int,
         team: Team = ALONE,
     ) -> None:
         self.bank, self.energy, self.body, self.fps, self.team = bank, energy, body, fps, team
-        self.plain = Skinning(plain).to(rest.device)
+        self.plain = Skinning(scene.plain_skin).to(rest.device)
+        self.contacts = Contacts(scene, vertices=body.vertices, device=rest.device)
         self.rest = rest
         self.clips = [
             range(int(start), min(int(stop), int(start) + frames)) for start, stop in zip(bank.starts, bank.stops)
@@ -123,31 +125,40 @@ class Validator:
                 still = model.vertices(quiet, character)
             joined = x if tail is None else torch.cat([tail, x], dim=-1)
             posed = self.body.posed(character)
-            terms = energies(self.energy, x, plain, posed, joined, self.fps, self.down)
+            terms = energies(self.energy, x, plain, self.contacts, posed, joined, self.fps, self.down)
             parts.append({**terms, "dynamics": ((x - still) ** 2).sum(1).mean(0)})
             tail = joined[..., -2:]
         return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
 
 def energies(
-    energy: GarmentEnergy, x: Tensor, plain: Tensor, body: PosedBody, joined: Tensor, fps: float, down: Tensor
+    energy: GarmentEnergy,
+    x: Tensor,
+    plain: Tensor,
+    contacts: Contacts,
+    body: PosedBody,
+    joined: Tensor,
+    fps: float,
+    down: Tensor,
 ) -> dict[str, Tensor]:
     """Return each of `TERMS` [J], and the share of vertices inside the body as "collisions", shape (N,).
+
+    The share counts what lies inside any part of the body, whichever part the vertex meets in the energy.
 
     Args:
         x, plain: positions (V, 3, N); gravity is that of `x` less that of `plain`.
         joined: `x` after up to two frames before it. Where two are lacking there is no inertia.
         down: direction of gravity, shape (3,).
     """
-    distance = signed_distance(x, body)
+    met, nearest = contacts.distances(x, body)
     inertia = energy.inertia(joined[..., 2:], 2 * joined[..., 1:-1] - joined[..., :-2], 1 / fps)
     return {
         "stretch": energy.stretch(x),
         "bending": energy.bending(x),
         "gravity": energy.gravity(x - plain, GRAVITY * down[:, None]),
         "inertia": torch.cat([inertia.new_zeros(x.shape[-1] - len(inertia)), inertia]),
-        "collision": energy.collision_of(distance),
-        "collisions": (distance < 0).double().mean(0),
+        "collision": energy.collision_of(met),
+        "collisions": (nearest < 0).double().mean(0),
     }
 
 

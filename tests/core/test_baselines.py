@@ -22,6 +22,7 @@ from ssilk_core.events import silent
 from ssilk_core.fabrics import Fabric
 from ssilk_core.kinematics import matrix_from_quaternion, motion_transforms, quaternion_from_matrix
 from ssilk_core.model.body import CollisionBody
+from ssilk_core.model.contacts import signed
 from ssilk_core.model.descriptors import GRAVITY, RATE_TIME
 from ssilk_core.model.network import GarmentModel
 from ssilk_core.training.bank import build_bank
@@ -184,7 +185,9 @@ def test_the_terms_of_a_window_are_those_of_its_frames(scene, motions, method, j
             "stretch": energy.stretch(x),
             "bending": energy.bending(x),
             "gravity": energy.gravity(x - character[0, :, 3], GRAVITY * down.T),
-            "collision": energy.collision(x, objective.body.posed(character)),
+            "collision": energy.collision_of(
+                signed(x, *objective.contacts.planes(x, objective.body.posed(character)))
+            ),
             "inertia": energy.inertia(x[..., 2:], 2 * x[..., 1:-1] - x[..., :-2], 1 / 30),
             "drag": energy.drag(x[..., 2:], x[..., 1:-1] + root[:, 2:] - root[:, 1:-1], 1 / 30),
         }
@@ -244,7 +247,7 @@ def test_a_short_training_lowers_the_energy_of_whole_clips(scene, motions, metho
     objective = stepper.objective
     body = CollisionBody(scene.character.merged_body(), 3, device=CPU)
     rest = objective.model.rest
-    validator = Validator(objective.bank, objective.energy, body, scene.plain_skin, rest, 30.0, 20)
+    validator = Validator(objective.bank, objective.energy, body, scene, rest, 30.0, 20)
     before, plain = validator.score(objective.model).total, validator.plain_score().total
     for iteration in range(60):
         stepper.run(iteration)

@@ -106,9 +106,7 @@ def test_energies_are_those_of_the_validation(scene, dressed, toy_motion, toy_mo
     clip = toy_motion(scene, 23)
     reel = reel_of(takes_of("clip", clip, FPS), dressed, JOINTS)
     network = Network(kind, model, reel)
-    validator = Validator(
-        network.reel.bank, dressed.energy, dressed.body, scene.plain_skin, dressed.rest, FPS, clip.frame_count
-    )
+    validator = Validator(network.reel.bank, dressed.energy, dressed.body, scene, dressed.rest, FPS, clip.frame_count)
     expected = validator.frame_terms(range(23), model)
     monkeypatch.setattr("ssilk_core.evaluation.record.DECODED_AT_ONCE", 9)
     found = recorded(dressed, reel, network, 0).values

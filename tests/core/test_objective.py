@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from ssilk_core.config import SCHEMES, TrainConfig
+from ssilk_core.model.contacts import signed
 from ssilk_core.model.descriptors import GRAVITY
 from ssilk_core.training.objective import Objective, total
 from ssilk_core.training.step import Stepper
@@ -40,7 +41,7 @@ def at_frame(objective: Objective, z: torch.Tensor, frame: torch.Tensor, down: t
         "stretch": energy.stretch(x),
         "bending": energy.bending(x),
         "gravity": energy.gravity(x - character[0, :, 3], GRAVITY * down.T),
-        "collision": energy.collision(x, objective.body.posed(character)),
+        "collision": energy.collision_of(signed(x, *objective.contacts.planes(x, objective.body.posed(character)))),
     }
     return x, terms
 

@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which part of the body each garment vertex can meet.
+
+The nearest body point does not know which side cloth came from: a sleeve that one bad step takes through the arm is
+pushed out on the other side, and stays there. What is loose may meet any part of the body. What is tight lies over
+one patch of it, as in the bind pose, and meets no other, so that it is always pushed back to its own side; nor is it
+caught between two parts of a body that passes through itself, as in an armpit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..assets import PINNED, TIGHT, Floats, Ints, Mesh, Scene
+from ..energy.collision import FAR, PosedBody, nearest_planes
+from ..energy.nearest import BLOCK, compact_blocks
+from ..mesh import topology
+
+EXTENT = 1 / 12  # radius of a patch along the body, as a share of the body's diagonal: half the girth of an upper arm
+MOST = 256  # vertices of a patch; of a finer body the patch is smaller
+SOURCES = 512  # vertices that distances along the body are found from at once
+NOWHERE = 1e6  # [m] from a plane that is met by nothing
+
+
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """Garment vertices `rows` that find the body in one way, with their blocks and what they may find."""
+
+    rows: Tensor
+    blocks: Tensor
+    allowed: Tensor | None
+
+
+class Contacts:
+    """Finds the plane of the body that each vertex of a garment meets.
+
+    Args:
+        vertices: the body vertices that are posed, all by default.
+        pinned: whether pinned vertices meet the body too. Nothing that is learned moves them.
+    """
+
+    def __init__(
+        self, scene: Scene, *, vertices: Ints | None = None, pinned: bool = True, device: torch.device
+    ) -> None:
+        body, garment = scene.character.merged_body().mesh, scene.garment.mesh
+        chosen = np.arange(body.vertex_count) if vertices is None else vertices
+        tight = np.flatnonzero(scene.classes == TIGHT)
+        patches = patches_beneath(garment.points[tight], body, chosen)
+        covered = patches[:, 0] > 0
+        elsewhere = np.ones(garment.vertex_count, dtype=bool) if pinned else scene.classes != PINNED
+        elsewhere[tight[covered]] = False
+
+        def group(rows: Ints, allowed: Ints | None) -> list[_Group]:
+            tables = rows, compact_blocks(garment.points[rows], BLOCK) if len(rows) else rows, allowed
+            made = [None if table is None else torch.as_tensor(table, device=device) for table in tables]
+            return [_Group(*made)] if len(rows) else []  # type: ignore[arg-type]
+
+        self._groups = [
+            *group(np.flatnonzero(elsewhere), None),
+            *group(tight[covered], patches[covered].astype(np.int32)),
+        ]
+
+    def planes(self, x: Tensor, body: PosedBody) -> tuple[Tensor, Tensor]:
+        """Return unit normals (V, 3, N) and offsets (V, N) of the planes that x (V, 3, N) meets, without gradients.
+
+        Planes of vertices that meet nothing are far below them.
+        """
+        if len(self._groups) == 1 and len(self._groups[0].rows) == len(x):
+            return nearest_planes(x, body, self._groups[0].blocks, self._groups[0].allowed)
+        normal, offset = no_planes(x)
+        for group in self._groups:
+            found = nearest_planes(x.index_select(0, group.rows), body, group.blocks, group.allowed)
+            normal.index_copy_(0, group.rows, found[0])
+            offset.index_copy_(0, group.rows, found[1])
+        return normal, offset
+
+    def distances(self, x: Tensor, body: PosedBody) -> tuple[Tensor, Tensor]:
+        """Return signed distances of x (V, 3, N) [m] to these planes and to the whole body, both (V, N)."""
+        met = signed(x, *self.planes(x, body))
+        nearest = met.clone()
+        for group in self._groups:
+            if group.allowed is not None:
+                part = x.index_select(0, group.rows)
+                nearest.index_copy_(0, group.rows, signed(part, *nearest_planes(part, body, group.blocks)))
+        return met, nearest
+
+
+def signed(x: Tensor, normal: Tensor, offset: Tensor) -> Tensor:
+    """Return signed distances of x (V, 3, N) to planes of normals (V, 3, N) and offsets (V, N) [m], (V, N)."""
+    return (normal * x).sum(1) - offset
+
+
+def no_planes(x: Tensor) -> tuple[Tensor, Tensor]:
+    """Return planes that no vertex of x (V, 3, N) meets."""
+    return x.new_zeros(x.shape), x.new_full((len(x), x.shape[2]), -NOWHERE)
+
+
+def patches_beneath(points: Floats, body: Mesh, chosen: Ints) -> Ints:
+    """Return the patch of a body that each of some points (T, 3) lies over, in the bind pose.
+
+    A patch is what lies within `EXTENT` along the body's edges of the vertex nearest to the point, and faces the
+    same half of space.
+
+    Returns:
+        How many vertices follow, then these as indices into `chosen`, the nearest first, filled up with it,
+        shape (T, 1 + C); no vertices for a point that lies over nothing.
+    """
+    from scipy.spatial import cKDTree
+
+    if not len(points) or not len(chosen):
+        return np.zeros((len(points), 2), dtype=np.int64)
+    distance, nearest = cKDTree(body.points[chosen]).query(points)
+    anchors, which = np.unique(nearest, return_inverse=True)
+    patches = _patches(body, chosen, anchors)[which]
+    patches[distance > FAR, 0] = 0
+    return patches
+
+
+def _patches(body: Mesh, chosen: Ints, anchors: Ints) -> Ints:
+    """Return the patch around each of the vertices `chosen[anchors]`, as `patches_beneath` does, (A, 1 + C)."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import dijkstra
+
+    pairs = topology.edges(body.faces)
+    lengths = np.linalg.norm(body.points[pairs[:, 1]] - body.points[pairs[:, 0]], axis=1)
+    graph = coo_matrix((lengths, (pairs[:, 0], pairs[:, 1])), shape=(body.vertex_count,) * 2)
+    normals = topology.vertex_normals(body.points, body.faces)[chosen]
+    extent = EXTENT * float(np.linalg.norm(np.ptp(body.points, axis=0)))
+    patches = []
+    for start in range(0, len(anchors), SOURCES):
+        part = anchors[start : start + SOURCES]
+        along = dijkstra(graph, directed=False, indices=chosen[part], limit=extent)[:, chosen]
+        along[normals[part] @ normals.T <= 0] = np.inf
+        along[np.arange(len(part)), part] = 0
+        order = np.argsort(along, axis=1, kind="stable")[:, :MOST]
+        within = np.isfinite(np.take_along_axis(along, order, axis=1))
+        filled = np.where(within, order, order[:, :1])
+        patches.append(
+            np.column_stack([within.sum(axis=1), filled, np.repeat(filled[:, :1], MOST - filled.shape[1], axis=1)])
+        )
+    found = np.concatenate(patches)
+    return found[:, : 1 + found[:, 0].max()]

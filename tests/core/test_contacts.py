@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tight cloth meets the patch of the body that it lies over, loose cloth the whole body, on every path."""
+
+import importlib.util
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from ssilk_core.assets import LOOSE, PINNED, TIGHT, Body, Character, Mesh, Scene, SkinWeights
+from ssilk_core.energy import collision, nearest
+from ssilk_core.energy.collision import PosedBody, nearest_planes
+from ssilk_core.energy.surface_point import triangle_rings
+from ssilk_core.model.body import CollisionBody
+from ssilk_core.model.contacts import Contacts, patches_beneath, signed
+
+CPU = torch.device("cpu")
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"  # on a CPU kernels run in Triton's interpreter
+KERNELS = pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="kernels need Triton")
+RADIUS, LENGTH = 0.05, 0.6  # of a limb along z [m]
+
+
+def limb() -> trimesh.Trimesh:
+    found = trimesh.creation.cylinder(radius=RADIUS, height=LENGTH, sections=16)
+    return found.subdivide_to_size(0.03)
+
+
+def on_limb(scene: Scene, at: np.ndarray, kind: int) -> tuple[Scene, CollisionBody]:
+    """The scene with a limb for a body that no joint but the first moves, and garment vertices `at` of one class."""
+    shape = limb()
+    weights = np.ones((len(shape.vertices), 1))
+    body = Body(
+        Mesh("/limb", shape.vertices, shape.faces), SkinWeights("/limb", weights.astype(np.int32) * 0, weights)
+    )
+    points = np.resize(at, scene.garment.mesh.points.shape)
+    garment = replace(
+        scene.garment,
+        mesh=replace(scene.garment.mesh, points=points),
+        classes=np.full(len(points), kind, dtype=scene.classes.dtype),
+    )
+    character = Character("/limb", scene.character.skeleton, (body,))
+    return replace(scene, character=character, garment=garment), CollisionBody(body, 3, device=CPU)
+
+
+def still(body: CollisionBody, **options: bool) -> PosedBody:
+    return body.posed(torch.eye(3, 4).expand(3, 3, 4)[..., None].contiguous(), **options)
+
+
+@pytest.mark.parametrize("options", [{}, {"exact": True}, {"surface": False}])
+@pytest.mark.parametrize("kind", [TIGHT, LOOSE])
+def test_tight_cloth_that_went_through_a_limb_is_sent_back(scene, kind, options):
+    """Pulled 7 cm through a limb of 5 cm radius, the far side is nearer; only what is loose goes there."""
+    dressed, body = on_limb(scene, np.array([RADIUS + 0.005, 0, 0.01]), kind)
+    x = torch.tensor(dressed.garment.mesh.points, dtype=torch.float32)[..., None]
+    pulled = x - torch.tensor([RADIUS + 0.025, 0, 0])[:, None]
+    contacts = Contacts(dressed, device=CPU)
+    normal, offset = contacts.planes(pulled, still(body, **options))
+    side = 1 if kind == TIGHT else -1
+    assert (side * normal[:, 0] > 0.5).all()
+    # The limb has 16 sides, so that its surface is up to 1 mm nearer to the axis than its radius.
+    expected = -(RADIUS + 0.02) if kind == TIGHT else -(RADIUS - 0.02)
+    distance = signed(pulled, normal, offset)
+    assert ((distance - expected).abs() < 0.03 if options.get("surface") is False else (distance < 0)).all()
+    met, whole = contacts.distances(pulled, still(body, **options))
+    assert torch.equal(met, distance)
+    np.testing.assert_allclose(whole, signed(pulled, *nearest_planes(pulled, still(body, **options))), atol=1e-6)
+
+
+def test_where_cloth_is_near_its_own_side_nothing_changes(scene):
+    """Within reach of its patch a tight vertex meets what a loose one meets."""
+    rng = np.random.default_rng(0)
+    turn = rng.uniform(0, 2 * np.pi, 40)
+    at = np.stack([(RADIUS + 0.004) * np.cos(turn), (RADIUS + 0.004) * np.sin(turn), rng.uniform(-0.2, 0.2, 40)], 1)
+    dressed, body = on_limb(scene, at, TIGHT)
+    x = torch.tensor(dressed.garment.mesh.points + 0.008 * rng.normal(size=dressed.garment.mesh.points.shape))
+    x = x.float()[..., None]
+    for options in ({}, {"exact": True}):
+        posed = still(body, **options)
+        for found, expected in zip(Contacts(dressed, device=CPU).planes(x, posed), nearest_planes(x, posed)):
+            np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_pinned_cloth_meets_nothing_unless_it_is_measured(scene):
+    dressed, body = on_limb(scene, np.array([0.0, 0, 0]), PINNED)
+    x = torch.tensor(dressed.garment.mesh.points, dtype=torch.float32)[..., None]
+    free, measured = (Contacts(dressed, pinned=pinned, device=CPU) for pinned in (False, True))
+    assert (signed(x, *free.planes(x, still(body))) > 1e5).all()
+    assert (measured.distances(x, still(body))[0] < 0).all()
+
+
+def test_tight_cloth_far_from_the_body_may_meet_all_of_it(scene):
+    """A patch says nothing of cloth that hangs a hand's breadth off: it has no side yet."""
+    assert (
+        patches_beneath(np.array([[RADIUS + 0.1, 0, 0]]), Mesh("/limb", *shape_of(limb())), np.arange(50))[0, 0] == 0
+    )
+    dressed, body = on_limb(scene, np.array([RADIUS + 0.1, 0, 0]), TIGHT)
+    x = torch.tensor(dressed.garment.mesh.points, dtype=torch.float32)[..., None]
+    pulled = x - torch.tensor([RADIUS + 0.12, 0, 0])[:, None]
+    assert (Contacts(dressed, device=CPU).planes(pulled, still(body))[0][:, 0] < -0.5).all()
+
+
+def shape_of(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
+    return np.array(mesh.vertices), np.array(mesh.faces)
+
+
+def test_a_patch_lies_around_its_point_faces_as_it_does_and_stays_on_its_limb():
+    """Two limbs side by side, 2 cm apart: a patch never takes vertices of the other one."""
+    other = limb()
+    other.apply_translation([0, 2 * RADIUS + 0.02, 0])
+    both = trimesh.util.concatenate([limb(), other])
+    points = np.array([[RADIUS + 0.01, 0, 0.05], [0, RADIUS + 0.005, -0.1]])
+    patches = patches_beneath(points, Mesh("/limbs", *shape_of(both)), np.arange(len(both.vertices)))
+    extent = np.linalg.norm(np.ptp(both.vertices, axis=0)) / 12
+    for point, (count, *row) in zip(points, patches):
+        found = row[:count]
+        assert len(set(found)) == count > 3 and set(row) == set(found)
+        assert found[0] == np.linalg.norm(both.vertices - point, axis=1).argmin()
+        assert max(found) < len(other.vertices)
+        assert (both.vertex_normals[found] @ both.vertex_normals[found[0]] > 0).all()
+        assert np.linalg.norm(both.vertices[found] - both.vertices[found[0]], axis=1).max() <= extent + 1e-9
+
+
+def test_patches_count_the_chosen_vertices_alone():
+    shape = limb()
+    chosen = np.flatnonzero(shape.vertices[:, 2] > -0.05)
+    body, point = Mesh("/limb", *shape_of(shape)), np.array([[RADIUS, 0, 0.1]])
+    (count, *row) = patches_beneath(point, body, chosen)[0]
+    (all_count, *all_row) = patches_beneath(point, body, np.arange(len(shape.vertices)))[0]
+    assert set(chosen[row[:count]]) == set(all_row[:all_count]) & set(chosen)
+    assert patches_beneath(point, body, np.zeros(0, dtype=int))[0, 0] == 0
+
+
+def lists(rng: np.random.Generator, vertices: int, body: int) -> torch.Tensor:
+    """Random lists of different lengths, filled up with their first entries."""
+    table = np.zeros((vertices, 8), dtype=np.int32)
+    for row in table:
+        count = rng.integers(1, 8)
+        found = rng.choice(body, count, replace=False)
+        row[:] = [count, *found, *[found[0]] * (7 - count)]
+    return torch.tensor(table)
+
+
+def chosen_by_hand(x: np.ndarray, body: np.ndarray, table: np.ndarray) -> np.ndarray:
+    found = np.zeros((len(x), x.shape[2]), dtype=int)
+    for v, (count, *row) in enumerate(table):
+        squares = ((x[v][None] - body[row[:count]]) ** 2).sum(1)
+        found[v] = np.array(row)[squares.argmin(0)]
+    return found
+
+
+@pytest.mark.parametrize("scores", [1 << 27, 100])
+def test_the_nearest_of_a_list_is_found_on_both_plain_paths(scores, monkeypatch):
+    rng = np.random.default_rng(3)
+    x, body = rng.normal(size=(33, 3, 5)), rng.normal(size=(20, 3, 5))
+    table = lists(rng, 33, 20)
+    expected = chosen_by_hand(x, body, table.numpy())
+    np.testing.assert_array_equal(nearest.nearest_vertex(torch.tensor(x), torch.tensor(body), table), expected)
+    monkeypatch.setattr(nearest, "SCORES", scores)
+    monkeypatch.setattr(nearest, "_by_rows", nearest._by_products)
+    np.testing.assert_array_equal(nearest.nearest_vertex(torch.tensor(x), torch.tensor(body), table), expected)
+
+
+@KERNELS
+def test_the_kernel_finds_the_nearest_of_a_list():
+    from ssilk_core.kernels.listed import listed_kernel
+
+    rng = np.random.default_rng(4)
+    x, body = rng.normal(size=(33, 3, 150)).astype(np.float32), rng.normal(size=(20, 3, 150)).astype(np.float32)
+    table = lists(rng, 33, 20)
+    found = listed_kernel(*(v.to(DEVICE) for v in (torch.tensor(x), torch.tensor(body), table)))
+    np.testing.assert_array_equal(found.cpu(), chosen_by_hand(x, body, table.numpy()))
+
+
+@KERNELS
+def test_kernels_find_the_planes_of_a_list_that_their_twins_find():
+    rng = np.random.default_rng(5)
+    mesh = trimesh.creation.icosphere(subdivisions=1, radius=0.1)
+    around = mesh.vertices + 0.003 * rng.normal(size=(3, *mesh.vertices.shape))
+    points, normals = (torch.tensor(v, dtype=torch.float32) for v in (around.transpose(1, 2, 0), mesh.vertex_normals))
+    body = PosedBody(points, normals[:, :, None].expand(-1, -1, 3), torch.as_tensor(triangle_rings(mesh.faces, 42)))
+    x = torch.tensor(mesh.sample(9, seed=1)[:, :, None] + 0.02 * rng.normal(size=(9, 3, 3)), dtype=torch.float32)
+    table = lists(rng, 9, 42)
+    expected = nearest_planes(x, body, allowed=table)
+    assert not torch.allclose(expected[0], nearest_planes(x, body)[0])
+    on_device = PosedBody(*(v.to(DEVICE) for v in (body.points, body.normals, body.rings)))
+    for value, twin in zip(collision._by_kernels(x.to(DEVICE), on_device, None, table.to(DEVICE)), expected):
+        np.testing.assert_allclose(value.cpu(), twin, atol=2e-6)
