@@ -50,6 +50,8 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--precision", choices=("float64", "float32"), default="float64",
                       help="of positions and energies (default float64)")  # fmt: skip
     verb.add_argument("--batch", type=int, default=64, help="motions that advance together (default 64)")
+    verb.add_argument("--sequence", type=int, metavar="FRAMES",
+                      help="start anew after so many, as 'ssilk evaluate --sequence' does; sequences advance together")  # fmt: skip
     verb.add_argument("--no-body", action="store_true", help="leave the body meshes out")
     verb.add_argument("--again", action="store_true", help="simulate what is there and current, too (folders)")
     verb.add_argument("--device", default="cpu", help="where it runs (default cpu)")
@@ -73,6 +75,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         fps=options.fps,
         substeps=options.substeps,
         batch=options.batch,
+        sequence=options.sequence,
         precision=options.precision,
         solver=SolverOptions(tolerance=options.tolerance),
         rest=SolverOptions(tolerance=options.tolerance, iterations=150),
@@ -205,6 +208,7 @@ def _provenance(options: argparse.Namespace, motion: Path) -> dict[str, str | fl
         "root": options.root or "",
         "contents": " ".join(content_hash(str(path))
                              for path in (options.stage, garment, split_location(str(motion))[0])),
+        "sequence": options.sequence or 0,
         **{name: getattr(options, name) for name in names},
         **{name: ", ".join(getattr(options, name)) for name in lists},
     }  # fmt: skip

@@ -39,13 +39,8 @@ def takes_of(clip: str, motion: Motion, fps: float, longest: int | None = None) 
 
     Frames are those of `ssilk simulate` at the same rate, so that a point cache of the clip lines up.
     """
-    found = []
-    for span in spans_of(motion, 0, fps, 1):
-        step = longest or span.frame_count
-        for start in range(0, span.frame_count, step):
-            part = span.motion.clip(start, start + step)
-            found.append(Take(clip, span.first + start, part))
-    return [take for take in found if take.frame_count >= SHORTEST]
+    spans = spans_of(motion, 0, fps, 1, longest)
+    return [Take(clip, span.first, span.motion) for span in spans if span.motion.frame_count >= SHORTEST]
 
 
 def _played(motion: Motion, fps: float, seconds: Floats) -> Motion:

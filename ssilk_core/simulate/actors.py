@@ -47,16 +47,16 @@ class Span:
         return (self.motion.frame_count - 1) // self.substeps + 1
 
 
-def spans_of(motion: Motion, shot: int, fps: float, substeps: int) -> list[Span]:
-    """Return the spans of a motion between its cuts, whose frames are those of a shot at `fps`."""
+def spans_of(motion: Motion, shot: int, fps: float, substeps: int, longest: int | None = None) -> list[Span]:
+    """Return the spans of a motion between its cuts, of `longest` frames at most, those of a shot at `fps`."""
     spans, first, source = [], 0, 0
     for part in split_at_cuts(motion):
         stop = frames_at(source + part.frame_count, motion.fps, fps)
-        count = (stop - first - 1) * substeps + 1
-        if count > 0:
-            position = (first + np.arange(count) / substeps) * motion.fps / fps - source
+        for start in range(first, stop, longest or max(1, stop - first)):
+            count = (min(stop, start + (longest or stop)) - start - 1) * substeps + 1
+            position = (start + np.arange(count) / substeps) * motion.fps / fps - source
             poses = sample_motion(part, position.clip(0, part.frame_count - 1))
-            spans.append(Span(shot, first, substeps, Motion(motion.path, fps * substeps, *poses)))
+            spans.append(Span(shot, start, substeps, Motion(motion.path, fps * substeps, *poses)))
         first, source = stop, source + part.frame_count
     return spans
 

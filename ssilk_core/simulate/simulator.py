@@ -36,6 +36,8 @@ class SimulationOptions:
         fps: frames per second; the default is what garments are trained at.
         substeps: steps in each frame.
         batch: shots that advance together.
+        sequence: frames after which a shot starts anew, as evaluations may; sequences then advance side by side, as
+            shots do. None for whole shots.
         precision: "float64" or "float32", of positions, energies and forces; linear systems are float32 in either.
         gravity: acceleration [m/s2].
         solver: of every step.
@@ -45,6 +47,7 @@ class SimulationOptions:
     fps: float = 30.0
     substeps: int = 1
     batch: int = 64
+    sequence: int | None = None
     precision: str = "float64"
     gravity: tuple[float, float, float] = (0.0, -GRAVITY, 0.0)
     solver: SolverOptions = field(default_factory=SolverOptions)
@@ -55,6 +58,8 @@ class SimulationOptions:
         need(0 < self.substeps <= MOST_SUBSTEPS, "simulation", f"substeps = {self.substeps}",
              f"1 to {MOST_SUBSTEPS} are allowed")  # fmt: skip
         need(self.batch > 0, "simulation", f"batch = {self.batch}", "at least 1 is needed")
+        need(self.sequence is None or self.sequence >= 1, "simulation", f"sequences of {self.sequence} frames",
+             "one at least is needed")  # fmt: skip
         need(self.precision in PRECISIONS, "simulation", f"precision '{self.precision}'", "it is float64 or float32")
         need(np.isfinite(self.gravity).all(), "simulation", f"gravity {self.gravity}", "it must be finite")
 
@@ -134,7 +139,8 @@ class Simulator:
     def frames(self, motions: Sequence[Motion]) -> Iterator[SimulatedFrame]:
         """Yield all frames of all shots: in order within a shot, batches of shots side by side."""
         options = self.options
-        spans = [s for shot, m in enumerate(motions) for s in spans_of(m, shot, options.fps, options.substeps)]
+        cut = (options.fps, options.substeps, options.sequence)
+        spans = [span for shot, motion in enumerate(motions) for span in spans_of(motion, shot, *cut)]
         spans.sort(key=lambda span: -span.motion.frame_count)
         for start in range(0, len(spans), options.batch):
             yield from self._advanced(spans[start : start + options.batch])
