@@ -37,11 +37,30 @@ class QualityOperator(ReportingOperator):
         return not reason
 
 
-class ShowHeat(QualityOperator, bpy.types.Operator):
+class MeasuringOperator(tasks.OutsideOperator):
+    """Base of operators that measure the garment a little at a time, in object mode."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        reason = tasks.busy() or unusable(context.object) or ("" if context.mode == "OBJECT" else "Go to Object Mode")
+        cls.poll_message_set(reason)
+        return not reason
+
+    def prepare(self, context: bpy.types.Context) -> Work:
+        self.garment, self.called = context.object.session_uid, context.object.name
+        return Work(f"Looking at '{self.called}'", lambda _: (), parent=bpy.app.tempdir, steps=self.steps(context))
+
+    def steps(self, context: bpy.types.Context) -> Iterator[float]:
+        """Measure, yielding the part that is done."""
+        raise NotImplementedError
+
+
+class ShowHeat(MeasuringOperator, bpy.types.Operator):
     """Colour the garment by penetration or stretch, frame by frame; in Solid shading, in this view"""
 
     bl_idname = "ssilk.show_heat"
     bl_label = "Show Heat"
+    undo = "Show Heat"
 
     kind: EnumProperty(name="Show", items=KINDS)
     deepest: FloatProperty(
@@ -56,14 +75,19 @@ class ShowHeat(QualityOperator, bpy.types.Operator):
         subtype="FACTOR",
     )
 
-    def apply(self, context: bpy.types.Context) -> str:
-        garment = context.object
+    def steps(self, context: bpy.types.Context) -> Iterator[float]:
+        self.frame = context.scene.frame_current
+        self.measured = yield from heat.measuring(
+            found_again(self.garment, self.called), self.kind, context.evaluated_depsgraph_get()
+        )
+
+    def finish(self, context: bpy.types.Context, work: Work) -> str:
         meters = context.scene.unit_settings.scale_length
         red = self.longest if self.kind == heat.STRETCH else self.deepest * meters
-        measured = heat.show(garment, self.kind, red, context.evaluated_depsgraph_get())
+        heat.show(found_again(self.garment, self.called), self.measured, red)
         if context.space_data and context.space_data.type == "VIEW_3D":
             context.space_data.shading.color_type = "VERTEX"
-        return f"'{garment.name}', frame {context.scene.frame_current}: {measured.told()}."
+        return f"'{self.called}', frame {self.frame}: {self.measured.told()}."
 
 
 class HideHeat(QualityOperator, bpy.types.Operator):
@@ -77,7 +101,7 @@ class HideHeat(QualityOperator, bpy.types.Operator):
         return ""
 
 
-class FindWorst(tasks.OutsideOperator, bpy.types.Operator):
+class FindWorst(MeasuringOperator, bpy.types.Operator):
     """Go through the scene's frames and mark those in which penetration or stretch is worst"""
 
     bl_idname = "ssilk.find_worst"
@@ -87,27 +111,17 @@ class FindWorst(tasks.OutsideOperator, bpy.types.Operator):
     kind: EnumProperty(name="Look For", items=KINDS)
     count: IntProperty(name="Markers", description="How many frames are marked at most", default=3, min=1, max=50)
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        reason = tasks.busy() or unusable(context.object) or ("" if context.mode == "OBJECT" else "Go to Object Mode")
-        cls.poll_message_set(reason)
-        return not reason
-
-    def prepare(self, context: bpy.types.Context) -> Work:
-        garment = context.object
-        self.garment, self.called, self.found = garment.session_uid, garment.name, []
-        heat.measure(garment, self.kind, context.evaluated_depsgraph_get())
-        return Work(f"Looking at '{garment.name}'", lambda _: (), parent=bpy.app.tempdir, steps=self.looks(context))
-
-    def looks(self, context: bpy.types.Context) -> Iterator[float]:
-        """Measure frame after frame; the timeline stands where it stood afterwards."""
+    def steps(self, context: bpy.types.Context) -> Iterator[float]:
         scene = context.scene
         before, frames = scene.frame_current, range(scene.frame_start, scene.frame_end + 1)
+        self.found = []
         try:
             for frame in frames:
                 scene.frame_set(frame)
                 garment = found_again(self.garment, self.called)
-                self.found.append(heat.measure(garment, self.kind, context.evaluated_depsgraph_get()))
+                steps = heat.measuring(garment, self.kind, context.evaluated_depsgraph_get())
+                done = len(self.found) / len(frames)
+                self.found.append((yield from heat.scaled(steps, done, 1 / len(frames))))
                 yield len(self.found) / len(frames)
         finally:
             scene.frame_set(before)

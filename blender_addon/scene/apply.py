@@ -71,10 +71,13 @@ def _give_weights(
     names = list(dict.fromkeys([*carriers, *proxy_names(armature, garment)]))
     made = np.zeros((len(rig.weights), len(names)), dtype=np.float32)
     np.add.at(made.T, [names.index(name) for name in carriers], rig.weights.T)
-    painted = read_groups(garment, garment.data, names)
-    total = painted.sum(axis=1, keepdims=True)
-    painted = np.divide(painted, total, out=made.copy(), where=total > 0)
-    write_groups(garment, np.where(repainted[:, None], painted, made), names, old)
+    kept = made
+    if repainted.any():
+        painted = read_groups(garment, garment.data, names)
+        total = painted.sum(axis=1, keepdims=True)
+        painted = np.divide(painted, total, out=made.copy(), where=total > 0)
+        kept = np.where(repainted[:, None], painted, made)
+    write_groups(garment, kept, names, old)
     remember_weights(armature, garment, made, names)
 
 

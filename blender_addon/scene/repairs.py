@@ -3,8 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 
 import bmesh
 import bpy
@@ -12,6 +11,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ..errors import need
+from .meshes import edited
 
 SAME_PLACE = 2e-6  # [m]; what ssilk takes to be one place
 Repair = Callable[[bmesh.types.BMesh, Sequence[int], float], None]
@@ -25,7 +25,10 @@ def repair_mesh(thing: bpy.types.Object, code: str, indices: Sequence[int]) -> N
     """
     need(not thing.data.library, f"'{thing.name}' is linked from another file; repair it there.")
     scale = bpy.context.scene.unit_settings.scale_length * max(map(abs, thing.matrix_world.to_scale()))
-    with _edited(thing.data) as mesh:
+    with edited(thing.data) as mesh:
+        for sequence in (mesh.verts, mesh.faces):
+            sequence.ensure_lookup_table()
+        mesh.normal_update()
         REPAIRS[code](mesh, indices, SAME_PLACE / scale)
 
 
@@ -69,20 +72,6 @@ def _coordinates(items: bpy.types.bpy_prop_collection) -> np.ndarray:
     points = np.empty(len(items) * 3, dtype=np.float32)
     items.foreach_get("co", points)
     return points.reshape(-1, 3)
-
-
-@contextmanager
-def _edited(mesh: bpy.types.Mesh) -> Iterator[bmesh.types.BMesh]:
-    edited = bmesh.new()
-    try:
-        edited.from_mesh(mesh)
-        for sequence in (edited.verts, edited.faces):
-            sequence.ensure_lookup_table()
-        yield edited
-        edited.to_mesh(mesh)
-    finally:
-        edited.free()
-    mesh.update()
 
 
 def _delete_vertices(mesh: bmesh.types.BMesh, indices: Sequence[int], _: float) -> None:

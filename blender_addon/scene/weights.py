@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import islice
 
 import bpy
 import numpy as np
 
 from ..contract.arrays import influences
+from .meshes import edited, opened
 
 PLAIN = "ssilk:plain:"  # begins the attributes that keep a garment's own weights, one for each bone
 
@@ -21,13 +23,28 @@ def read_groups(thing: bpy.types.Object, mesh: bpy.types.Mesh, names: Sequence[s
     """
     joints = {name: joint for joint, name in enumerate(names)}
     of_group = np.array([joints.get(group.name, -1) for group in thing.vertex_groups] or [-1])
-    found = [(vertex.index, element.group, element.weight) for vertex in mesh.vertices for element in vertex.groups]
-    rows, groups, weights = np.array(found).reshape(-1, 3).T
-    columns = of_group[groups.astype(int)]
-    matrix = np.zeros((len(mesh.vertices), len(names)), dtype=np.float32)
+    counts, groups, weights = _elements(mesh)
+    rows, columns = np.repeat(np.arange(len(counts)), counts), of_group[groups]
+    matrix = np.zeros((len(counts), len(names)), dtype=np.float32)
     used = columns >= 0
-    matrix[rows.astype(int)[used], columns[used]] = weights[used]
+    matrix[rows[used], columns[used]] = weights[used]
     return matrix
+
+
+def _elements(mesh: bpy.types.Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return how many groups each vertex is in, shape (V,), and one after another these groups and weights in them."""
+    counts: list[int] = []
+    groups: list[int] = []
+    weights: list[float] = []
+    with opened(mesh) as content:
+        layer = content.verts.layers.deform.active
+        for vertex in content.verts if layer else ():
+            element = vertex[layer]
+            counts.append(len(element))
+            groups += element.keys()
+            weights += element.values()
+    none = [0] * len(mesh.vertices)
+    return np.array(counts or none), np.array(groups, dtype=int), np.array(weights, dtype=np.float32)
 
 
 def write_groups(thing: bpy.types.Object, weights: np.ndarray, names: Sequence[str], gone: Sequence[str]) -> None:
@@ -43,11 +60,17 @@ def write_groups(thing: bpy.types.Object, weights: np.ndarray, names: Sequence[s
         if group:
             thing.vertex_groups.remove(group)
     indices, values = influences(weights)
-    groups = {int(joint): thing.vertex_groups.new(name=names[joint]) for joint in np.unique(indices[values > 0])}
-    for vertex, (row, shares) in enumerate(zip(indices.tolist(), values.tolist())):
-        for joint, share in zip(row, shares):
-            if share > 0:
-                groups[joint].add((vertex,), share, "REPLACE")
+    groups = np.zeros(len(names), dtype=int)
+    for joint in np.unique(indices[values > 0]):
+        groups[joint] = thing.vertex_groups.new(name=names[joint]).index
+    used = values > 0
+    elements = zip(groups[indices][used].tolist(), values[used].tolist())
+    with edited(thing.data) as content:
+        layer = content.verts.layers.deform.verify()
+        for vertex, count in zip(content.verts, used.sum(axis=1).tolist()):
+            element = vertex[layer]
+            for group, share in islice(elements, count):
+                element[group] = share
 
 
 def read_plain(mesh: bpy.types.Mesh, names: Sequence[str]) -> np.ndarray | None:
