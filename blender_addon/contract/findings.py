@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -19,10 +20,10 @@ class Finding:
     Attributes:
         severity: "error", "warning" or "info".
         code: its kind, such as "duplicate-vertices".
-        target: name of the object that it is about; empty for the character as a whole.
+        target: name of the object or the motion that it is about; empty for the character as a whole.
         found, why, fix: what was found, why it matters and what to do.
         fixable: whether all of it can be repaired without asking.
-        elements: what `indices` count: "vertices", "polygons", "joints" or nothing.
+        elements: what `indices` count: "vertices", "polygons", "joints", "frames" of the timeline, or nothing.
     """
 
     severity: str
@@ -36,24 +37,49 @@ class Finding:
     indices: tuple[int, ...] = ()
 
 
+@dataclass(frozen=True)
+class Clip:
+    """What people call a motion, and its first frame; None where its frames are not those of the timeline."""
+
+    name: str
+    start: int | None = None
+
+
 def read_findings(
-    documents: Sequence[Mapping[str, Any]], dressed: Dressed, prims: Mapping[str, str]
+    documents: Sequence[Mapping[str, Any]],
+    dressed: Dressed,
+    prims: Mapping[str, str],
+    clips: Mapping[str, Clip] = MappingProxyType({}),
 ) -> list[Finding]:
     """Return findings by object; those on several bodies as one come apart.
 
     Args:
         documents: the findings as `ssilk inspect --json` wrote them.
         prims: path of each mesh in the stage by the name of its object.
+        clips: the motions that were inspected, by the paths of their files.
     """
     found: list[Finding] = []
+    names = {prim: name for name, prim in prims.items()}
     for document in documents:
-        names = {prim: name for name, prim in prims.items()}
-        target = names.get(str(document["prim"]).rpartition(":")[2], "")
+        file, _, prim = str(document["prim"]).rpartition(":")
         kept = {key: document[key] for key in ("severity", "code", "found", "why", "fix", "fixable", "elements")}
-        finding = Finding(target=target, indices=tuple(document["indices"]), **kept)
-        bodies = not target and finding.elements in {"vertices", "faces"}
-        found += _by_body(finding, dressed) if bodies else [_on_polygons(finding, dressed)]
+        finding = Finding(target=names.get(prim, ""), indices=tuple(document["indices"]), **kept)
+        if file in clips:
+            found.append(_on_timeline(finding, clips[file]))
+        elif not finding.target and finding.elements in {"vertices", "faces"}:
+            found += _by_body(finding, dressed)
+        else:
+            found.append(_on_polygons(finding, dressed))
     return found
+
+
+def _on_timeline(finding: Finding, clip: Clip) -> Finding:
+    """Return a finding on a motion, with its frames as the timeline counts them."""
+    if finding.elements == "frames" and clip.start is not None:
+        finding = replace(finding, indices=tuple(clip.start + index for index in finding.indices))
+    elif finding.elements == "frames":
+        finding = replace(finding, elements="", indices=())
+    return replace(finding, target=clip.name)
 
 
 def polygons_of(counts: np.ndarray, triangles: Sequence[int]) -> tuple[int, ...]:

@@ -19,7 +19,7 @@ from ..scene.armature import read_joints
 from ..scene.baked import animated, apply_shot, need_bakeable, remove_bake
 from ..scene.garment import armature_of, unusable
 from ..scene.gather import character_joints, gather
-from ..scene.handover import STAGE, expose_usd, hand_over
+from ..scene.handover import STAGE, hand_over, loading_usd
 from ..scene.keys import has_keys, need_tracks
 from ..scene.models import model_of
 from ..scene.motions import TIMELINE, Source
@@ -98,7 +98,7 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
         """Sample the timeline, then write it."""
         _, armature = self.pair.objects()
         yield from sample(armature, self.character, [self.take])
-        expose_usd()
+        yield from loading_usd()
         from ..contract.motion import write_motion
 
         yield from write_motion(self.work.folder / MOTION, self.character, self.take.motion())
@@ -111,7 +111,7 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
         shutil.copyfile(folder / MOTION, inputs / MOTION)
         stage = self.model.parent / STAGE
         if self.dressed:
-            hand_over(self.dressed, garment, armature, inputs)
+            hand_over(self.dressed, self.pair, inputs)
             stage = inputs / STAGE
         self.shot = self.shot or folder / SHOT
         level = [] if self.quality == WHOLE else ["--quality", self.quality]

@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
 
-from ..contract.findings import read_findings
+from ..contract.findings import Clip, read_findings
 from ..errors import SetupError, need
 from ..outside.work import Work
 from ..preferences import interpreter, preferences
@@ -15,10 +16,12 @@ from ..preflight_properties import FindingItem, keep_findings, shown_finding, si
 from ..scene.armature import read_joints
 from ..scene.checks import SCALE, scene_findings
 from ..scene.garment import armature_of
-from ..scene.gather import gather
-from ..scene.handover import REPAIRED, hand_over, inspect_command
+from ..scene.gather import character_joints, gather
+from ..scene.handover import MOTIONS, REPAIRED, hand_over, inspect_command, loading_usd
+from ..scene.objects import Pair
 from ..scene.repairs import REPAIRS, apply_scale, push_points, repair_mesh
 from ..scene.selecting import select_bones, select_elements
+from ..scene.takes import Chosen
 from .reporting import ReportingOperator
 from .rig import RigOperator
 
@@ -26,27 +29,36 @@ PUSHED = ("penetration", "inside-margin")
 
 
 class InspectOperator(RigOperator):
-    """Base of operators that hand the garment to `ssilk inspect`."""
-
-    repaired = False
+    """Base of operators that hand the garment to `ssilk inspect`; subclasses give `words`."""
 
     def prepare(self, context: bpy.types.Context) -> Work:
         garment = context.object
-        self.dressed, armature = gather(garment), armature_of(garment)
-        python = interpreter(preferences(context))
+        self.pair, self.dressed = Pair.of(garment, armature_of(garment)), gather(garment)
+        self.python = interpreter(preferences(context))
+        return Work(
+            f"Inspecting '{garment.name}'", self.commands, parent=bpy.app.tempdir, steps=self.steps(),
+            rephrase=self.rephrase,
+        )  # fmt: skip
 
-        def commands(folder: Path) -> list[list[str]]:
-            self.handover = hand_over(self.dressed, garment, armature, folder)
-            return [inspect_command(python, folder, self.handover, repaired=self.repaired)]
+    def steps(self) -> Iterator[float]:
+        """Prepare what is written."""
+        return loading_usd()
 
-        return Work(f"Inspecting '{garment.name}'", commands, parent=bpy.app.tempdir, rephrase=self.rephrase)
+    def commands(self, folder: Path) -> list[list[str]]:
+        """Write what is inspected; return the command."""
+        self.handover = hand_over(self.dressed, self.pair, folder)
+        return [inspect_command(self.python, folder, self.handover, self.words(folder))]
+
+    def words(self, folder: Path) -> list[str]:
+        """Return what else `ssilk inspect` is told."""
+        raise NotImplementedError
 
     def explain(self, work: Work) -> str:
         return "" if "findings" in work.result else super().explain(work)
 
 
 class Inspect(InspectOperator, bpy.types.Operator):
-    """Look for what would spoil the training: on the mesh, on how the garment fits the body, and on its classes"""
+    """Look for what would spoil the training: on the mesh, its fit, its classes, and the motions that are chosen"""
 
     bl_idname = "ssilk.inspect"
     bl_label = "Inspect"
@@ -57,10 +69,22 @@ class Inspect(InspectOperator, bpy.types.Operator):
         keep_findings(context, garment.name, findings)
         for finding in findings:
             raise SetupError(f"'{finding.target}': {finding.found}; {finding.fix}.")
+        self.chosen, self.preset = Chosen.of(garment, armature_of(garment)), garment.ssilk.training.preset
         return super().prepare(context)
 
+    def steps(self) -> Iterator[float]:
+        _, armature = self.pair.objects()
+        yield from self.chosen.writing(armature, character_joints(self.dressed.joints), self.work.folder / MOTIONS)
+
+    def words(self, folder: Path) -> list[str]:
+        motions = [*(str(folder / MOTIONS / name) for name in self.chosen.names), *map(str, self.chosen.files)]
+        return ["--preset", self.preset, *(["--motion", *motions] if motions else [])]
+
     def finish(self, context: bpy.types.Context, work: Work) -> str:
-        findings = read_findings(work.result["findings"], self.dressed, self.handover.prims)
+        taken = [Clip(take.source.name, take.frames.start) for take in self.chosen.takes]
+        clips = dict(zip((str(work.folder / MOTIONS / name) for name in self.chosen.names), taken))
+        clips |= {str(path): Clip(path.name) for path in self.chosen.files}
+        findings = read_findings(work.result["findings"], self.dressed, self.handover.prims, clips)
         keep_findings(context, self.handover.name, findings)
         bad = sum(finding.severity != "info" for finding in findings)
         return (
@@ -69,7 +93,7 @@ class Inspect(InspectOperator, bpy.types.Operator):
 
 
 class SelectFinding(ReportingOperator, bpy.types.Operator):
-    """Select what the finding is about"""
+    """Select what the finding is about, or go to the first frame in question"""
 
     bl_idname = "ssilk.select_finding"
     bl_label = "Select"
@@ -79,11 +103,13 @@ class SelectFinding(ReportingOperator, bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         item = shown_finding(context)
         cls.poll_message_set("This finding is about nothing that can be selected")
-        return bool(item and item.indices and item.elements in {"vertices", "polygons", "joints"})
+        return bool(item and item.indices and item.elements in {"vertices", "polygons", "joints", "frames"})
 
     def apply(self, context: bpy.types.Context) -> str:
         item = shown_finding(context)
-        if item.elements == "joints":
+        if item.elements == "frames":
+            context.scene.frame_set(item.indices[0])
+        elif item.elements == "joints":
             garment = find_target(context.window_manager.ssilk_preflight.garment)
             armature = armature_of(garment)
             names = read_joints(armature, garment).names
@@ -126,12 +152,14 @@ class PushOut(InspectOperator, bpy.types.Operator):
     bl_idname = "ssilk.push_out"
     bl_label = "Push Out"
     undo = "Push Out of Body"
-    repaired = True
+
+    def words(self, folder: Path) -> list[str]:
+        return ["--fix", str(folder / REPAIRED)]
 
     def finish(self, context: bpy.types.Context, work: Work) -> str:
         from ..contract.read import read_points
 
-        garment, _ = self.handover.objects()
+        garment, _ = self.handover.pair.objects()
         points = read_points(work.folder / REPAIRED, self.handover.prims[self.handover.name])
         fits = len(points) == len(garment.data.vertices)
         need(fits, f"'{garment.name}' has other findings to fix first: vertices would be merged or removed.")

@@ -18,7 +18,8 @@ from ..scene.follower import is_linked, make_follower
 from ..scene.garment import armature_of, unusable
 from ..scene.gather import gather
 from ..scene.handmade import find_edits
-from ..scene.handover import Handover, hand_over, rig_command
+from ..scene.handover import Handover, hand_over, loading_usd, rig_command
+from ..scene.objects import Pair
 from . import tasks
 
 
@@ -37,18 +38,18 @@ class RigOperator(tasks.OutsideOperator):
     def begin(self, context: bpy.types.Context, title: str, *, classes: bool, options: tuple[str, ...]) -> Work:
         """Write the garment without its proxies, and start `ssilk rig`."""
         garment = context.object
-        dressed, armature = gather(garment, classes=classes, proxies=False), armature_of(garment)
-        python = interpreter(preferences(context))
+        dressed = gather(garment, classes=classes, proxies=False)
+        pair, python = Pair.of(garment, armature_of(garment)), interpreter(preferences(context))
 
         def commands(folder: Path) -> list[list[str]]:
-            self.handover = hand_over(dressed, garment, armature, folder)
+            self.handover = hand_over(dressed, pair, folder)
             return [rig_command(python, folder, self.handover, options)]
 
-        return Work(title, commands, parent=bpy.app.tempdir, rephrase=self.rephrase)
+        return Work(title, commands, parent=bpy.app.tempdir, steps=loading_usd(), rephrase=self.rephrase)
 
     def rephrase(self, sentence: str) -> str:
         """Return a sentence with names of objects in place of files and prims."""
-        return self.handover.in_blender_words(sentence)
+        return self.handover.in_blender_words(sentence) if self.handover else sentence
 
     def explain(self, work: Work) -> str:
         return self.rephrase(work.error)
@@ -65,7 +66,7 @@ class Classify(RigOperator, bpy.types.Operator):
         return self.begin(context, f"Classifying '{context.object.name}'", classes=False, options=("--proxies", "1"))
 
     def finish(self, context: bpy.types.Context, work: Work) -> str:
-        garment, _ = self.handover.objects()
+        garment, _ = self.handover.pair.objects()
         apply_classes(garment, self.handover.rig(work.folder))
         return f"'{garment.name}' is classified."
 
@@ -114,7 +115,7 @@ class GenerateRig(RigOperator, bpy.types.Operator):
         return self.begin(context, f"Rigging '{garment.name}'", classes=True, options=options)
 
     def finish(self, context: bpy.types.Context, work: Work) -> str:
-        garment, armature = self.handover.objects()
+        garment, armature = self.handover.pair.objects()
         rig = self.handover.rig(work.folder)
         if is_linked(armature) and rig.names:
             armature = make_follower(garment, armature)

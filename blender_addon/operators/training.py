@@ -13,7 +13,7 @@ import numpy as np
 from bpy.props import CollectionProperty, IntProperty, StringProperty
 
 from ..classes import LOOSE
-from ..contract.arrays import Dressed, Joints
+from ..contract.arrays import Dressed
 from ..contract.names import identifiers
 from ..errors import need
 from ..fabric_properties import fabric_options
@@ -24,15 +24,14 @@ from ..scene.baked import need_bakeable
 from ..scene.follower import leader_of
 from ..scene.garment import armature_of, unusable
 from ..scene.gather import character_joints, gather
-from ..scene.handover import STAGE, expose_usd, hand_over
+from ..scene.handover import MOTIONS, STAGE, hand_over
 from ..scene.models import job_of, relative
 from ..scene.motions import FILE, Source, sources
 from ..scene.objects import Pair
-from ..scene.sampling import Take, prepare_takes, sample
+from ..scene.takes import Chosen
 from . import tasks
 from .reporting import ReportingOperator
 
-MOTIONS = "motions"  # folder of the sampled motions, in that of the job
 LOOK = 1.0  # seconds between two looks at trainings
 begun: set[Path] = set()  # folders of trainings that this session of Blender began
 
@@ -132,29 +131,27 @@ class Train(tasks.OutsideOperator, bpy.types.Operator):
         armature, settings, folder = armature_of(garment), garment.ssilk.training, job_of(garment)
         running = folder and jobs.read_state(folder)
         need(not (running and running.alive), f"'{garment.name}' is being trained already; cancel that first.")
-        chosen = [item for item in settings.motions if item.use]
+        chosen = any(item.use for item in settings.motions)
         need(chosen, f"No motion is chosen for '{garment.name}'; find motions, or add files of motions.")
         self.dressed = gather(garment)
         need_trainable(garment, armature, self.dressed)
-        self.takes = prepare_takes(armature, [source_of(item) for item in chosen if item.kind != FILE])
-        self.files = [Path(bpy.path.abspath(item.name)) for item in chosen if item.kind == FILE]
+        self.chosen = Chosen.of(garment, armature)
         self.pair = Pair.of(garment, armature)
         title, steps = f"Sampling motions for '{garment.name}'", self.steps()
         return Work(title, lambda _: (), parent=bpy.app.tempdir, steps=steps)
 
     def steps(self) -> Iterator[float]:
-        """Sample the motions, then write them."""
+        """Sample the motions and write them."""
         _, armature = self.pair.objects()
-        joints = character_joints(self.dressed.joints)
-        yield from sample(armature, joints, self.takes)
-        yield from write_takes(self.work.folder / MOTIONS, joints, self.takes)
+        yield from self.chosen.writing(armature, character_joints(self.dressed.joints), self.work.folder / MOTIONS)
 
     def finish(self, context: bpy.types.Context, work: Work) -> str:
-        (garment, armature), name = self.pair.objects(), self.pair.name
+        (garment, _), name = self.pair.objects(), self.pair.name
         folder = jobs.create(Path(bpy.data.filepath).parent / "ssilk", identifiers([name])[0])
-        prim = hand_over(self.dressed, garment, armature, folder).prims[name]
+        prim = hand_over(self.dressed, self.pair, folder).prims[name]
         shutil.move(work.folder / MOTIONS, folder / MOTIONS)
-        command = train_command(garment, prim, self.takes, [beside(path, folder) for path in self.files])
+        files = [beside(path, folder) for path in self.chosen.files]
+        command = train_command(garment, prim, self.chosen.names, files)
         jobs.begin(interpreter(preferences(context)), folder, command)
         begun.add(folder)
         garment.ssilk.training.folder = relative(folder)
@@ -221,11 +218,6 @@ def add_motion(garment: bpy.types.Object, source: Source) -> bpy.types.PropertyG
     return item
 
 
-def source_of(item: bpy.types.PropertyGroup) -> Source:
-    """Return what an item of the list of motions stands for."""
-    return Source(item.kind, item.name, item.track)
-
-
 def need_trainable(garment: bpy.types.Object, armature: bpy.types.Object, dressed: Dressed) -> None:
     """Check that a garment is complete, and that Blender will show what is trained.
 
@@ -245,25 +237,10 @@ def need_trainable(garment: bpy.types.Object, armature: bpy.types.Object, dresse
     need_bakeable(garment, armature, dressed.joints)
 
 
-def write_takes(folder: Path, joints: Joints, takes: Sequence[Take]) -> Iterator[float]:
-    """Write sampled motions into a new folder, a file each, yielding the part of each that is done."""
-    expose_usd()
-    from ..contract.motion import write_motion
-
-    folder.mkdir()
-    for name, take in zip(file_names(takes), takes):
-        yield from write_motion(folder / name, joints, take.motion())
-
-
-def file_names(takes: Sequence[Take]) -> list[str]:
-    """Return a name for the file of each take."""
-    return [f"{name}.usdc" for name in identifiers(take.source.name for take in takes)]
-
-
-def train_command(garment: bpy.types.Object, prim: str, takes: Sequence[Take], files: Sequence[str]) -> list[str]:
+def train_command(garment: bpy.types.Object, prim: str, takes: Sequence[str], files: Sequence[str]) -> list[str]:
     """Return the arguments of the Python that has ssilk, for its folder of the job."""
     settings = garment.ssilk.training
-    motions = [*(f"{MOTIONS}/{name}" for name in file_names(takes)), *files]
+    motions = [*(f"{MOTIONS}/{name}" for name in takes), *files]
     budget = ["--set", f"iterations={settings.iterations}"] if settings.iterations else []
     return [
         "-m", "ssilk_core", "train", STAGE, "--garment", prim, "--motions", *motions, "-o", jobs.MODEL,

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,8 +13,11 @@ import bpy
 
 from ..contract.arrays import Dressed, Joints, Rig
 from ..errors import need
+from .objects import Pair
 
 STAGE, RIGGED, REPAIRED = "dressed.usdc", "rigged.usdc", "repaired.usdc"
+MOTIONS = "motions"  # folder of the sampled motions beside them
+USD = ("Tf", "Ar", "Sdf", "Usd", "UsdGeom", "UsdSkel")  # modules of `pxr`, the ones that others need first
 
 
 @dataclass(frozen=True)
@@ -21,29 +25,20 @@ class Handover:
     """What was given away: whose it was, and what its prims are called.
 
     Attributes:
-        garment, armature: session_uid of the objects; they may be deleted or renamed meanwhile.
         joints: the character's joints as they were written.
         prims: path of each mesh in the stage by the name of its object.
         stage: the file.
     """
 
-    garment: int
-    armature: int
-    name: str
+    pair: Pair
     joints: Joints
     prims: dict[str, str]
     stage: Path
 
-    def objects(self) -> tuple[bpy.types.Object, bpy.types.Object]:
-        """Return the garment and the armature.
-
-        Raises:
-            SetupError: one was deleted.
-        """
-        found = {thing.session_uid: thing for thing in bpy.context.scene.objects}
-        gone = [uid for uid in (self.garment, self.armature) if uid not in found]
-        need(not gone, f"'{self.name}' or its armature was deleted meanwhile; nothing was changed.")
-        return found[self.garment], found[self.armature]
+    @property
+    def name(self) -> str:
+        """The name that the garment had."""
+        return self.pair.name
 
     def rig(self, folder: Path) -> Rig:
         """Return what was made of it."""
@@ -58,14 +53,12 @@ class Handover:
         return sentence.replace(f"{self.stage}:", "").replace(str(self.stage), "the character")
 
 
-def hand_over(dressed: Dressed, garment: bpy.types.Object, armature: bpy.types.Object, folder: Path) -> Handover:
+def hand_over(dressed: Dressed, pair: Pair, folder: Path) -> Handover:
     """Write a dressed character into a folder."""
     expose_usd()
     from ..contract.write import write_stage
 
-    prims = write_stage(dressed, folder / STAGE)
-    uids = (garment.session_uid, armature.session_uid)
-    return Handover(*uids, garment.name, dressed.joints, prims, folder / STAGE)
+    return Handover(pair, dressed.joints, write_stage(dressed, folder / STAGE), folder / STAGE)
 
 
 def rig_command(python: str, folder: Path, handover: Handover, options: Sequence[str]) -> list[str]:
@@ -75,11 +68,22 @@ def rig_command(python: str, folder: Path, handover: Handover, options: Sequence
     return [python, "-m", "ssilk_core", "rig", stage, "--garment", prim, "-o", rigged, "--json", *options]
 
 
-def inspect_command(python: str, folder: Path, handover: Handover, *, repaired: bool) -> list[str]:
-    """Return the command that inspects what was handed over, and writes a repaired copy where that is asked for."""
-    fix = ["--fix", str(folder / REPAIRED)] if repaired else []
+def inspect_command(python: str, folder: Path, handover: Handover, options: Sequence[str]) -> list[str]:
+    """Return the command that inspects what was handed over."""
     prim = handover.prims[handover.name]
-    return [python, "-m", "ssilk_core", "inspect", str(folder / STAGE), "--garment", prim, "--json", *fix]
+    return [python, "-m", "ssilk_core", "inspect", str(folder / STAGE), "--garment", prim, "--json", *options]
+
+
+def loading_usd() -> Iterator[float]:
+    """Import Blender's own `pxr` module by module, yielding the part that is done: at once it takes 0.1 s.
+
+    Raises:
+        SetupError: as `expose_usd` does.
+    """
+    expose_usd()
+    for done, name in enumerate(USD):
+        yield done / len(USD)
+        importlib.import_module(f"pxr.{name}")
 
 
 def expose_usd() -> None:

@@ -14,9 +14,9 @@ def found_again(uid: int, name: str) -> bpy.types.Object:
     """Return the object with this session_uid.
 
     Raises:
-        SetupError: it was deleted; the sentence calls it `name`.
+        SetupError: it was deleted, though others may still refer to it; the sentence calls it `name`.
     """
-    thing = next((thing for thing in bpy.data.objects if thing.session_uid == uid), None)
+    thing = next((thing for thing in bpy.data.objects if thing.session_uid == uid and thing.users_scene), None)
     need(thing, f"'{name}' was deleted meanwhile; nothing was changed.")
     return thing
 

@@ -32,7 +32,7 @@ def read_groups(thing: bpy.types.Object, mesh: bpy.types.Mesh, names: Sequence[s
 
 
 def _elements(mesh: bpy.types.Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return how many groups each vertex is in, shape (V,), and one after another these groups and weights in them."""
+    """Return of how many groups each vertex is, shape (V,), and one after another these and its weights."""
     counts: list[int] = []
     groups: list[int] = []
     weights: list[float] = []

@@ -22,12 +22,13 @@ def stage(ready, skirt, ssilk_python, files) -> Path:  # noqa: F811
     """A stage of the skirt that `ssilk rig` wrote, under a path that is hard to spell."""
     from blender_addon.scene.gather import gather
     from blender_addon.scene.handover import hand_over
+    from blender_addon.scene.objects import Pair
 
     folder = files / "für Élise"
     rigged = folder / "rigged stage.usdc"
     if not rigged.exists():
         folder.mkdir()
-        given = hand_over(gather(skirt), skirt, ready.data.objects["Rig"], folder)
+        given = hand_over(gather(skirt), Pair.of(skirt, ready.data.objects["Rig"]), folder)
         command = [ssilk_python, "-m", "ssilk_core", "rig", str(given.stage), "-o", str(rigged), "--proxies", "5"]
         subprocess.run([*command, "--garment", given.prims["Skirt"]], check=True, capture_output=True, env={})
     ready.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)

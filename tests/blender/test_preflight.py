@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 
 from blender_addon.contract.arrays import Dressed, Joints, Shape
-from blender_addon.contract.findings import polygons_of, read_findings
+from blender_addon.contract.findings import Clip, polygons_of, read_findings
 
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
+from blender_addon.scene.keys import curves_of
+
 from .conftest import activate, add_mesh
+from .scenes import animate
 from .test_panels import drawn
 
 
@@ -44,6 +47,19 @@ def test_findings_on_several_bodies_come_apart():
         ("Hand", "vertices", (0, 4)),
         ("Hand", "polygons", (1,)),
         ("Shirt", "joints", (0,)),
+    ]
+
+
+def test_findings_on_motions_stand_on_the_timeline():
+    dressed = Dressed(1.0, Joints(("Root",), np.array([-1]), np.eye(4)[None]), (), shape("Shirt", [4], 4), None, None)
+    jump = {"severity": "warning", "code": "root-jumps", "found": "", "why": "", "fix": "", "fixable": False,
+            "elements": "frames", "indices": [7, 9]}  # fmt: skip
+    clips = {"/tmp/a:b/Walk.usdc": Clip("Walk", 100), "run.usdc": Clip("run.usdc")}
+    documents = [{**jump, "prim": f"{path}:/Motion"} for path in clips]
+    said = read_findings(documents, dressed, {}, clips)
+    assert [(finding.target, finding.elements, finding.indices) for finding in said] == [
+        ("Walk", "frames", (107, 109)),
+        ("run.usdc", "", ()),  # its frames are nowhere to go to
     ]
 
 
@@ -283,3 +299,27 @@ def test_two_bodies_are_told_apart(ready, skirt):
     items = [item for item in every if item.code == "body-not-watertight"]
     assert {item.target for item in items} == {"Pillar", "Prop"}
     assert [item.indices for item in items if item.target == "Prop"] == [[0, 1, 2]]
+
+
+def test_chosen_motions_are_inspected_and_gone_to(ready, skirt):
+    """An action in which the root jumps is found; one that is not chosen is not looked at."""
+    bpy = ready
+    assert bpy.ops.ssilk.classify() == {"FINISHED"}
+    armature = bpy.data.objects["Rig"]
+    animate(bpy, armature, "Calm", 0.1, 40)
+    action = animate(bpy, armature, "Leap", 0.1, 40, first=101)
+    for curve in curves_of(action):
+        if curve.data_path.endswith("location") and curve.array_index == 1:
+            for point in curve.keyframe_points:
+                point.interpolation = "CONSTANT"
+                point.co.y += 5.0 * (point.co.x > 120)
+    assert bpy.ops.ssilk.find_motions() == {"FINISHED"}
+    motions = {item.name: item for item in skirt.ssilk.training.motions}
+    motions["Leap"].use, motions["Calm"].use, motions["Timeline"].use = False, True, False
+    assert bpy.ops.ssilk.inspect() == {"FINISHED"}
+    assert "root-jumps" not in findings(bpy)
+    motions["Leap"].use = True
+    assert bpy.ops.ssilk.inspect() == {"FINISHED"}
+    item = show(bpy, "root-jumps")
+    assert (item.target, item.elements, item.indices) == ("Leap", "frames", [121])
+    assert bpy.ops.ssilk.select_finding() == {"FINISHED"} and bpy.context.scene.frame_current == 121
