@@ -12,21 +12,33 @@ from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
 from statistics import mean, stdev
-from typing import Any
+
+from records import Row, Settings, read_records, settings_of
 
 from ssilk_core.cli import main as ssilk
+from ssilk_core.errors import need
 
-Row = dict[str, Any]
+
+def measured(options: argparse.Namespace) -> tuple[list[Row], dict[str, Settings]]:
+    """Return the figures of all models, evaluated now or read from records, and the models' settings by name."""
+    if options.records:
+        return read_records(options.records)
+    rows = [{**row, "sequence": options.sequence} for row in evaluated(options)[0]]
+    return rows, {path.stem: settings_of(path) for path in options.models}
 
 
 def evaluated(options: argparse.Namespace, *, probes: bool = False) -> tuple[list[Row], str]:
     """Return the figures of 'ssilk evaluate' for all models, and its tables; stops and loops only for `probes`."""
+    need(options.models, options.table, "no model", "this is measured on models", "name files of 'ssilk train'")
+    for name in ("stage", "motions"):
+        need(getattr(options, name), options.table, f"no --{name}", "models are evaluated with it")
     named = ("stage", "motions", "index", "reference", "sequence", "device")
     given = [(f"--{name}", value) for name in named if (value := getattr(options, name)) is not None]
     words = [word for pair in given for word in pair]
     words += [
         f"--{name}" for name in ("exact", "minimum", "simulate-stops") if getattr(options, name.replace("-", "_"))
     ]
+    words += ["--clips", *options.clips] if options.clips else []
     words += ["--loop", options.loop] if probes else ["--stops", 0, "--loop", 0]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "figures.json"

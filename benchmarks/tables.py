@@ -8,15 +8,20 @@ MODELS are files, or folders of them: those of 'ssilk train' and baselines, whos
 one garment and method are taken as seeds, and shown as mean and standard deviation. SHOTS is what 'ssilk simulate'
 made of the clips, one folder for each garment.
 
+    record    figures of models into a file (--output), from which the tables are made where there are no models
     evaluate  all that 'ssilk evaluate' tells
     table1    every garment, split and method: total, collisions, excess over the simulator
     table2    the same of `inertia` and `flips`, beside the simulator
     table3    time of a single frame of one clip, in PyTorch
+    table4    weight of the regularisation of latents (Eq. 13)
     table5    batch, window and latent size, one changed at a time
     figure8   blendshapes alone, joints alone, and both
+    figure11  schemes of integration
     figure12  numbers of blendshapes, and of proxies
 
-Figure 10 is drawn by `long_rollout.py`, Figure 11 by `curves.py`.
+Records in place of models (`*.json`, or folders of them) need no stage and no motions: table1 takes totals from those
+of whole clips and the simulator from those of sequences. Figure 10 is drawn by `long_rollout.py`, the curves of
+Figure 11 by `curves.py`; `paper.py` trains and measures all that the tables need.
 """
 
 from __future__ import annotations
@@ -28,8 +33,9 @@ from statistics import mean
 from typing import Any
 
 import torch
+from records import with_truth, write_record
 from reports import table, write_results
-from seeds import Cell, cells, evaluated
+from seeds import Cell, cells, evaluated, measured
 from single_frames import frame_times
 from ssilk_usd.read_motion import read_motion
 from subjects import dressed_in
@@ -40,6 +46,7 @@ from ssilk_core.baselines.files import load_network
 from ssilk_core.checkpoint import ModelFile
 from ssilk_core.errors import SsilkError, need
 from ssilk_core.evaluation.methods import reel_of
+from ssilk_core.evaluation.run import SIMULATOR
 from ssilk_core.evaluation.splits import SPLITS
 from ssilk_core.evaluation.takes import takes_of
 
@@ -49,16 +56,23 @@ COLUMNS: dict[str, tuple[tuple[str, ...], str]] = {
     "excess [J]": (("truth", "excess"), ".4g"),
     "floats, of m g L": (("truth", "floats"), "+.1%"),
 }
+DYNAMICS: dict[str, tuple[tuple[str, ...], str]] = {
+    **COLUMNS,
+    "velocity off [m/s]": (("truth", "velocity"), ".3g"),
+    "acceleration off [m/s2]": (("truth", "acceleration"), ".3g"),
+}
 
 
-def methods_table(found: Mapping[tuple[str, str, str], Cell], splits: Sequence[str]) -> str:
+def methods_table(
+    found: Mapping[tuple[str, str, str], Cell], splits: Sequence[str], shown: Mapping[str, tuple] = COLUMNS
+) -> str:
     """Return a line for each garment and method, with columns for each split."""
-    names = [name for name, (path, _) in COLUMNS.items() if any(cell.values(path) for cell in found.values())]
+    names = [name for name, (path, _) in shown.items() if any(cell.values(path) for cell in found.values())]
     columns = [(split, name) for split in splits for name in names]
     rows = []
     for key in dict.fromkeys((garment, method) for garment, method, _ in found):
         lines = {split: found.get((*key, split), Cell([])) for split in splits}
-        rows.append([*key, *(lines[split].shown(*COLUMNS[name]) for split, name in columns)])
+        rows.append([*key, *(lines[split].shown(*shown[name]) for split, name in columns)])
     return table(["garment", "method", *(f"{split}: {name}" for split, name in columns)], rows)
 
 
@@ -86,16 +100,19 @@ def _shares(text: str, met: Sequence[bool]) -> list[str]:
 
 
 def table1(options: argparse.Namespace) -> tuple[str, Any]:
-    rows, _ = evaluated(options)
+    rows = with_truth(measured(options)[0])
     found = cells(rows)
     notes = "".join(f"\n- {line}" for line in verdicts(found))
     return methods_table(found, SPLITS) + notes + "\n", rows
 
 
 def table2(options: argparse.Namespace) -> tuple[str, Any]:
-    need(options.reference, "table2", "no --reference", "it shows the simulator, whose shots are needed")
-    rows = [row for row in evaluated(options)[0] if row["split"] != "valid"]
-    return methods_table(cells(rows), SPLITS[1:]), rows
+    simulated = [row for row in measured(options)[0] if row["figures"]["truth"] or row["method"] == SIMULATOR]
+    rows = [row for row in simulated if row["split"] != "valid"]
+    need(
+        rows, "table2", "no simulator among the figures", "its shots are needed", "give --reference, or records of it"
+    )
+    return methods_table(cells(rows), SPLITS[1:], DYNAMICS), rows
 
 
 def everything(options: argparse.Namespace) -> tuple[str, Any]:
@@ -121,6 +138,11 @@ def clip_of(options: argparse.Namespace, file: ModelFile) -> Motion:
     return read_motion(options.motions / f"{options.clip}.usdc", file.scene.character.skeleton)
 
 
+def record(options: argparse.Namespace) -> None:
+    need(options.output, "record", "no --output", "a file to write is needed")
+    write_record(options, evaluated(options)[0])
+
+
 MADE: dict[str, Callable[[argparse.Namespace], tuple[str, Any]]] = {
     "evaluate": everything, "table1": table1, "table2": table2, "table3": table3, **dict.fromkeys(SWEEPS, sweep),
 }  # fmt: skip
@@ -129,10 +151,13 @@ MADE: dict[str, Callable[[argparse.Namespace], tuple[str, Any]]] = {
 def parsed() -> argparse.Namespace:
     """Parse the command line, and find the models in folders."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("table", choices=sorted(MADE), help="what to make")
-    parser.add_argument("models", type=Path, nargs="+", metavar="MODELS", help="models, or folders of them")
-    parser.add_argument("--stage", type=Path, required=True, help="USD file with the character")
-    parser.add_argument("--motions", type=Path, required=True, metavar="FOLDER", help="folder of motion files")
+    parser.add_argument("table", choices=["record", *sorted(MADE)], help="what to make")
+    parser.add_argument(
+        "models", type=Path, nargs="+", metavar="MODELS", help="models or records, or folders of them"
+    )
+    parser.add_argument("--stage", type=Path, help="USD file with the character")
+    parser.add_argument("--motions", type=Path, metavar="FOLDER", help="folder of motion files")
+    parser.add_argument("--clips", nargs="+", default=[], metavar="NAME", help="only these clips")
     parser.add_argument("--index", type=Path, help="JSON list of clips with their splits and tags")
     parser.add_argument("--reference", type=Path, metavar="SHOTS", help="folder of the simulator's shots")
     parser.add_argument("--exact", action="store_true", help="collide with the whole body, as the simulator does")
@@ -145,10 +170,15 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--device", default="cpu", help="where everything runs (default cpu)")
     parser.add_argument("--threads", type=int, default=2, help="processor threads (default 2)")
     parser.add_argument("--name", help="of the result files (default: the table's)")
+    parser.add_argument("-o", "--output", type=Path, metavar="JSON", help="of record: the file to write")
     options = parser.parse_args()
     options.name = options.name or options.table
-    found = [sorted(path.glob("*.safetensors")) if path.is_dir() else [path] for path in options.models]
-    options.models = [path for paths in found for path in paths if not path.name.endswith(".resume.safetensors")]
+    found = [sorted(path.iterdir()) if path.is_dir() else [path] for path in options.models]
+    files = [path for paths in found for path in paths]
+    options.records = [path for path in files if path.suffix == ".json" and not path.name.endswith(".curve.json")]
+    options.models = [
+        path for path in files if path.suffix == ".safetensors" and not path.name.endswith(".resume.safetensors")
+    ]
     torch.set_num_threads(options.threads)
     return options
 
@@ -156,11 +186,13 @@ def parsed() -> argparse.Namespace:
 def main() -> None:
     options = parsed()
     try:
-        need(options.models, "MODELS", "no model in the folder", "'ssilk train' writes them")
-        markdown, measured = MADE[options.table](options)
+        need(options.models or options.records, "MODELS", "no model and no record", "'ssilk train' writes models")
+        if options.table == "record":
+            record(options)
+        else:
+            write_results(options, *MADE[options.table](options))
     except SsilkError as error:
         raise SystemExit(f"error: {error}") from error
-    write_results(options, markdown, measured)
 
 
 if __name__ == "__main__":

@@ -51,7 +51,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
                       help="of positions and energies (default float64)")  # fmt: skip
     verb.add_argument("--batch", type=int, default=64, help="motions that advance together (default 64)")
     verb.add_argument("--sequence", type=int, metavar="FRAMES",
-                      help="start anew after so many, as 'ssilk evaluate --sequence' does; sequences advance together")  # fmt: skip
+                      help="start anew after so many, as 'ssilk evaluate' may (default: never)")  # fmt: skip
     verb.add_argument("--no-body", action="store_true", help="leave the body meshes out")
     verb.add_argument("--again", action="store_true", help="simulate what is there and current, too (folders)")
     verb.add_argument("--device", default="cpu", help="where it runs (default cpu)")
