@@ -25,6 +25,7 @@ from ..scene.models import model_of
 from ..scene.motions import TIMELINE, Source
 from ..scene.objects import Pair
 from ..scene.sampling import need_company, prepare_takes, sample, scene_rate
+from ..scene.worn import is_worn
 from ..training_properties import RELATIVE
 from . import tasks
 from .reporting import ReportingOperator
@@ -145,7 +146,7 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
 
 
 class RemoveBake(ReportingOperator, bpy.types.Operator):
-    """Remove the keys and shape keys that were baked; the weights stay as trained"""
+    """Remove the keys and shape keys that were baked or played live, and give the garment its own weights back"""
 
     bl_idname = "ssilk.remove_bake"
     bl_label = "Remove Bake"
@@ -154,13 +155,14 @@ class RemoveBake(ReportingOperator, bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         reason = unusable(context.object) or ("" if context.mode == "OBJECT" else "Go to Object Mode")
-        if not reason and not has_keys(context.object):
+        if not reason and not (has_keys(context.object) or is_worn(context.object)):
             reason = f"Nothing was baked for '{context.object.name}'"
         cls.poll_message_set(reason)
         return not reason
 
     def apply(self, context: bpy.types.Context) -> str:
         garment = context.object
+        playing.stop(garment)
         remove_bake(garment, armature_of(garment))
         return f"What was baked for '{garment.name}' is gone."
 

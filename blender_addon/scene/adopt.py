@@ -12,11 +12,11 @@ import bpy
 
 from ..contract.arrays import Staged
 from ..errors import need
-from .armature import made_collection, proxy_names
+from .armature import MADE, made_collection, proxy_names
 from .garment import armature_of
-from .handmade import MADE, remember_bones, remember_weights
+from .handmade import remember_bones, remember_weights
 from .proxies import PALETTE
-from .weights import keep_plain, read_groups, read_plain
+from .weights import PLAIN, keep_weights, read_groups, read_kept
 
 
 def adopt(staged: Staged) -> bpy.types.Object:
@@ -36,8 +36,8 @@ def adopt(staged: Staged) -> bpy.types.Object:
         made_collection(armature.data, garment).assign(bone)
         bone.color.palette = PALETTE
     _remember(armature, garment)
-    if staged.plain is not None and read_plain(garment.data, staged.plain_joints) is None:
-        keep_plain(garment.data, staged.plain, staged.plain_joints)
+    if staged.plain is not None and read_kept(garment.data, PLAIN, staged.plain_joints) is None:
+        keep_weights(garment.data, PLAIN, staged.plain, staged.plain_joints)
     return garment
 
 

@@ -14,7 +14,8 @@ from .attributes import write_classes
 from .gather import own_weights
 from .handmade import find_edits, generated, remember_weights
 from .proxies import replace_proxies
-from .weights import keep_plain, read_groups, read_plain, write_groups
+from .weights import PLAIN, keep_weights, read_kept, write_groups
+from .worn import forget, own_groups
 
 
 def apply_classes(garment: bpy.types.Object, rig: Rig) -> None:
@@ -43,10 +44,10 @@ def apply_rig(
     lost = [name for name in joints.names if name not in armature.data.bones]
     need(not lost, f"'{armature.name}' lost {lost[:1]} while the rig was made; make it again.")
     old, names = proxy_names(armature, garment), joints.names
-    if not old and read_plain(garment.data, names) is None:
-        own = own_weights(garment, joints)
+    if not old and read_kept(garment.data, PLAIN, names) is None:
+        own = own_weights(armature, garment, joints)
         if own is not None:
-            keep_plain(garment.data, own, names)
+            keep_weights(garment.data, PLAIN, own, names)
     old += generated(armature, garment)  # groups stay behind where their bones were deleted
     edits = find_edits(armature, garment) if keep_edits else Edits.none(len(rig.classes))
     carriers = list(names)
@@ -73,10 +74,11 @@ def _give_weights(
     np.add.at(made.T, [names.index(name) for name in carriers], rig.weights.T)
     kept = made
     if repainted.any():
-        painted = read_groups(garment, garment.data, names)
+        painted = own_groups(armature, garment, names)
         total = painted.sum(axis=1, keepdims=True)
         painted = np.divide(painted, total, out=made.copy(), where=total > 0)
         kept = np.where(repainted[:, None], painted, made)
+    forget(garment)
     write_groups(garment, kept, names, old)
     remember_weights(armature, garment, made, names)
 

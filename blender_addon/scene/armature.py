@@ -7,7 +7,7 @@ if it is in the collection or descends from one that is; artists add, move, repa
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import bpy
@@ -18,6 +18,7 @@ from ..contract.arrays import Joints, orthonormal
 from ..errors import need
 
 OWNER = "ssilk_garment"  # custom property of a bone collection: the garment object
+MADE = "ssilk_made"  # custom property of a generated bone: its key; of the collection: the proxies by key
 UNEQUAL = 1e-3  # relative difference of scales that still counts as uniform
 
 
@@ -46,6 +47,12 @@ def read_joints(armature: bpy.types.Object, garment: bpy.types.Object) -> Joints
 def proxy_names(armature: bpy.types.Object, garment: bpy.types.Object) -> list[str]:
     """Return the names of a garment's proxies."""
     return [name for name, owner in owners_of(armature.data).items() if owner == garment]
+
+
+def keys_of(armature: bpy.types.Object, names: Sequence[str]) -> list[str]:
+    """Return the keys of bones, which generated ones carry along when they are renamed; else their names."""
+    bones = armature.data.bones
+    return [bones[name].get(MADE, name) if name in bones else name for name in names]
 
 
 def need_editable(armature: bpy.types.Object) -> None:

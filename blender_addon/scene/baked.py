@@ -12,9 +12,9 @@ from mathutils import Matrix
 from ..contract.arrays import Joints, Shot, to_parents
 from ..errors import need
 from .armature import proxy_names
-from .handmade import learn_weights
 from .keys import Channel, bake_keys, remove_keys
 from .shapes import need_relative, remove_shapes, rest_points, write_shapes
+from .worn import put_on, take_off
 
 MOVED = 1e-4  # how far rest points may be from those that were trained on, as a share of the garment's size
 TURNED = 1e-3  # how far the axes and places of bones may be
@@ -71,7 +71,7 @@ def wear(garment: bpy.types.Object, armature: bpy.types.Object, joints: Joints, 
     world = _moved_back(armature, joints, shot) @ np.array(garment.matrix_world)
     _need_same_points(garment, world, shot)
     shapes = write_shapes(garment, shot.offsets @ np.linalg.inv(world[:3, :3]).T, shot.shapes)
-    learn_weights(armature, garment, shot.weights, joints.names)
+    put_on(armature, garment, shot.weights, joints.names)
     _free(armature, joints.names[joints.character_count :])
     return shapes
 
@@ -87,9 +87,10 @@ def turns_from_rest(joints: Joints, rotations: np.ndarray) -> np.ndarray:
 
 
 def remove_bake(garment: bpy.types.Object, armature: bpy.types.Object) -> None:
-    """Remove what was baked for a garment; weights stay as trained."""
+    """Remove what was baked for a garment, and give it its own weights back. In object mode."""
     remove_keys(garment, animated(garment, armature))
     remove_shapes(garment)
+    take_off(armature, garment)
     _free(armature, proxy_names(armature, garment))
 
 

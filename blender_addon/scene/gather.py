@@ -14,7 +14,8 @@ from ..errors import need
 from .armature import read_joints
 from .attributes import current_classes
 from .garment import armature_of, bodies_of, need_plain_shape, shaping_modifiers
-from .weights import read_groups, read_plain
+from .weights import PLAIN, read_groups, read_kept
+from .worn import own_groups
 
 
 def gather(garment: bpy.types.Object, *, classes: bool = True, proxies: bool = True) -> Dressed:
@@ -32,10 +33,10 @@ def gather(garment: bpy.types.Object, *, classes: bool = True, proxies: bool = T
     joints = read_joints(armature, garment)
     own = joints if proxies else character_joints(joints)
     bodies = bodies_of(garment, armature)
-    plain = own_weights(garment, joints)
+    plain = own_weights(armature, garment, joints)
     weights = plain
     if proxies and joints.proxy_count:
-        weights = read_groups(garment, garment.data, joints.names)
+        weights = own_groups(armature, garment, joints.names)
     return Dressed(
         meters_per_unit=bpy.context.scene.unit_settings.scale_length,
         joints=own,
@@ -52,16 +53,16 @@ def character_joints(joints: Joints) -> Joints:
     return Joints(joints.names[:count], joints.parents[:count], joints.binds[:count])
 
 
-def own_weights(garment: bpy.types.Object, joints: Joints) -> np.ndarray | None:
+def own_weights(armature: bpy.types.Object, garment: bpy.types.Object, joints: Joints) -> np.ndarray | None:
     """Return the weights that the artist gave a garment over the character's joints; None without.
 
     Those kept beside a rig go first; a rig's own weights are nobody's.
     """
     names = joints.names[: joints.character_count]
-    kept = read_plain(garment.data, names)
+    kept = read_kept(garment.data, PLAIN, names)
     if kept is not None or joints.proxy_count:
         return kept
-    weights = read_groups(garment, garment.data, names)
+    weights = own_groups(armature, garment, names)
     bare = int(np.count_nonzero(~weights.any(axis=1)))
     if bare == len(weights):
         return None

@@ -2,25 +2,22 @@
 """What proxies and their weights were like when they were generated, and what an artist changed since.
 
 The bone collection remembers each proxy as it was, under a key that its bone carries along when it is renamed. Each
-vertex remembers one number, its weights times numbers that belong to the keys: linear in the weights, so that it
-stays right where a mesh is subdivided.
+vertex remembers the signature of its weights.
 """
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Sequence
 
 import bpy
 import numpy as np
 
 from ..contract.edits import Edits
-from .armature import collection_of, made_collection, proxy_names
-from .weights import read_groups, write_groups
+from .armature import MADE, collection_of, keys_of, made_collection, proxy_names
+from .weights import SAME_WEIGHTS, signature
+from .worn import own_groups
 
-MADE = "ssilk_made"  # custom property of the collection: the proxies by key; of a bone: its key
 SIGNATURE = "ssilk:made"  # attribute of points
-SAME_WEIGHTS = 1e-4
 SAME_PLACE = 1e-3  # of a bone's length
 
 
@@ -32,33 +29,12 @@ def remember_bones(
 
 
 def remember_weights(
-    armature: bpy.types.Object,
-    garment: bpy.types.Object,
-    weights: np.ndarray,
-    names: Sequence[str],
-    *,
-    repainted: np.ndarray | None = None,
-) -> None:
-    """Remember generated weights, shape (V, J), over joints with these names.
-
-    Args:
-        repainted: vertices (V,) whose weights are an artist's, whatever they are now.
-    """
-    attributes, bones = garment.data.attributes, armature.data.bones
-    attribute = attributes.get(SIGNATURE) or attributes.new(SIGNATURE, "FLOAT", "POINT")
-    numbers = _signature(weights, [bones[name].get(MADE, name) if name in bones else name for name in names])
-    if repainted is not None:
-        numbers[repainted] = np.inf  # which no weights have
-    attribute.data.foreach_set("value", numbers)
-
-
-def learn_weights(
     armature: bpy.types.Object, garment: bpy.types.Object, weights: np.ndarray, names: Sequence[str]
 ) -> None:
-    """Give a garment weights that were trained, shape (V, J); that is no repainting. In object mode."""
-    repainted = find_edits(armature, garment).repainted
-    write_groups(garment, weights, names, ())
-    remember_weights(armature, garment, weights, names, repainted=repainted)
+    """Remember generated weights, shape (V, J), over joints with these names."""
+    attributes = garment.data.attributes
+    attribute = attributes.get(SIGNATURE) or attributes.new(SIGNATURE, "FLOAT", "POINT")
+    attribute.data.foreach_set("value", signature(weights, keys_of(armature, names)))
 
 
 def generated(armature: bpy.types.Object, garment: bpy.types.Object) -> dict[str, dict[str, object]]:
@@ -85,7 +61,7 @@ def find_edits(armature: bpy.types.Object, garment: bpy.types.Object) -> Edits:
         changed=changed,
         added=tuple(bone.name for bone, key in zip(bones, keys) if not key),
         deleted=np.array([_place(armature, records[key]) for key in records if key not in present]).reshape(-1, 3),
-        repainted=_repainted(garment, {bone.name: key for bone, key in zip(bones, keys) if key}),
+        repainted=_repainted(armature, garment, {bone.name: key for bone, key in zip(bones, keys) if key}),
     )
 
 
@@ -117,17 +93,12 @@ def _same_parent(bone: bpy.types.Bone, records: dict[str, object], key: str, pre
     return bone.parent is not None and wanted == bone.parent.get(MADE, bone.parent.name)
 
 
-def _repainted(garment: bpy.types.Object, keys: dict[str, str]) -> np.ndarray:
+def _repainted(armature: bpy.types.Object, garment: bpy.types.Object, keys: dict[str, str]) -> np.ndarray:
     attribute = garment.data.attributes.get(SIGNATURE)
     now = np.zeros(len(garment.data.vertices), dtype=np.float32)
     if attribute is None:
         return now > 0
     attribute.data.foreach_get("value", now)
     names = [group.name for group in garment.vertex_groups]
-    weights = read_groups(garment, garment.data, names)
-    return np.abs(_signature(weights, [keys.get(name, name) for name in names]) - now) > SAME_WEIGHTS
-
-
-def _signature(weights: np.ndarray, keys: list[str]) -> np.ndarray:
-    """Return one number for each row of weights (V, J)."""
-    return (weights @ np.array([zlib.crc32(key.encode()) / 2**32 for key in keys])).astype(np.float32)
+    weights = own_groups(armature, garment, names)
+    return np.abs(signature(weights, [keys.get(name, name) for name in names]) - now) > SAME_WEIGHTS

@@ -9,8 +9,8 @@ from mathutils import Matrix, Vector
 
 from ..contract.arrays import Joints, Rig
 from ..contract.edits import Edits, takers
-from .armature import editing, made_collection, proxy_names
-from .handmade import MADE, remember_bones
+from .armature import MADE, editing, made_collection, proxy_names
+from .handmade import remember_bones
 
 PALETTE = "THEME04"
 ALONE = 0.05  # how long proxies are drawn that have none above

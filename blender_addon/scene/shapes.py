@@ -11,6 +11,7 @@ import numpy as np
 from ..errors import need
 
 PREFIX = "SSILK "  # begins the names of shape keys that were baked
+BASIS = "ssilk_basis"  # custom property of shape keys whose basis came with a bake
 
 
 def need_relative(garment: bpy.types.Object) -> None:
@@ -43,6 +44,7 @@ def write_shapes(garment: bpy.types.Object, offsets: np.ndarray, names: Sequence
         return names
     if not garment.data.shape_keys:
         garment.shape_key_add(name="Basis", from_mix=False)
+        garment.data.shape_keys[BASIS] = True
     blocks = garment.data.shape_keys.key_blocks
     for name in names:
         if name not in blocks:
@@ -56,10 +58,10 @@ def write_shapes(garment: bpy.types.Object, offsets: np.ndarray, names: Sequence
 
 
 def remove_shapes(garment: bpy.types.Object) -> None:
-    """Remove the shape keys that were baked, and the basis with them if nothing else is left."""
+    """Remove the shape keys that were baked, and the basis that came with them if nothing else is left."""
     _remove(garment, keep=())
     keys = garment.data.shape_keys
-    if keys and len(keys.key_blocks) == 1:
+    if keys and BASIS in keys.keys() and len(keys.key_blocks) == 1:  # noqa: SIM118 (no dictionary)
         garment.shape_key_clear()
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Sequence
 from itertools import islice
 
@@ -12,7 +13,8 @@ import numpy as np
 from ..contract.arrays import influences
 from .meshes import edited, opened
 
-PLAIN = "ssilk:plain:"  # begins the attributes that keep a garment's own weights, one for each bone
+PLAIN = "ssilk:plain:"  # begins the attributes that keep weights over the character's bones, beside a rig
+SAME_WEIGHTS = 1e-4  # difference of signatures
 
 
 def read_groups(thing: bpy.types.Object, mesh: bpy.types.Mesh, names: Sequence[str]) -> np.ndarray:
@@ -73,13 +75,13 @@ def write_groups(thing: bpy.types.Object, weights: np.ndarray, names: Sequence[s
                 element[group] = share
 
 
-def read_plain(mesh: bpy.types.Mesh, names: Sequence[str]) -> np.ndarray | None:
-    """Return the weights that were kept, shape (V, len(names)); None where there are none."""
+def read_kept(mesh: bpy.types.Mesh, prefix: str, names: Sequence[str]) -> np.ndarray | None:
+    """Return weights that were kept as attributes, shape (V, len(names)); None where there are none."""
     matrix = np.zeros((len(mesh.vertices), len(names)), dtype=np.float32)
-    kept = [attribute for attribute in mesh.attributes if attribute.name.startswith(PLAIN)]
+    kept = _kept(mesh, prefix)
     joints = {name: joint for joint, name in enumerate(names)}
     for attribute in kept:
-        joint = joints.get(attribute.name.removeprefix(PLAIN))
+        joint = joints.get(attribute.name.removeprefix(prefix))
         if joint is not None:
             column = np.empty(len(matrix), dtype=np.float32)
             attribute.data.foreach_get("value", column)
@@ -87,8 +89,26 @@ def read_plain(mesh: bpy.types.Mesh, names: Sequence[str]) -> np.ndarray | None:
     return matrix if kept else None
 
 
-def keep_plain(mesh: bpy.types.Mesh, weights: np.ndarray, names: Sequence[str]) -> None:
+def keep_weights(mesh: bpy.types.Mesh, prefix: str, weights: np.ndarray, names: Sequence[str]) -> None:
     """Keep weights, shape (V, len(names)), as attributes: they then survive edits of the mesh."""
     for joint in np.flatnonzero(weights.any(axis=0)):
-        attribute = mesh.attributes.new(f"{PLAIN}{names[joint]}", "FLOAT", "POINT")
+        attribute = mesh.attributes.new(f"{prefix}{names[joint]}", "FLOAT", "POINT")
         attribute.data.foreach_set("value", np.ascontiguousarray(weights[:, joint]))
+
+
+def forget_kept(mesh: bpy.types.Mesh, prefix: str) -> None:
+    """Remove weights that were kept."""
+    for name in [attribute.name for attribute in _kept(mesh, prefix)]:
+        mesh.attributes.remove(mesh.attributes[name])
+
+
+def _kept(mesh: bpy.types.Mesh, prefix: str) -> list[bpy.types.Attribute]:
+    return [attribute for attribute in mesh.attributes if attribute.name.startswith(prefix)]
+
+
+def signature(weights: np.ndarray, keys: Sequence[str]) -> np.ndarray:
+    """Return one number for each row of weights (V, J), of the joints that keys name.
+
+    It is linear in the weights, so that it stays right where a mesh is subdivided.
+    """
+    return (weights @ np.array([zlib.crc32(key.encode()) / 2**32 for key in keys])).astype(np.float32)

@@ -170,6 +170,26 @@ def test_baking_again_replaces_only_what_was_baked(ready, trained):
     assert not ready.ops.ssilk.remove_bake.poll()
 
 
+def test_removing_a_bake_leaves_the_garment_as_it_was(ready, trained):
+    from blender_addon.scene.weights import read_groups
+
+    def state() -> tuple:
+        names = [group.name for group in trained.vertex_groups]
+        return names, read_groups(trained, trained.data, sorted(names)).tolist(), [*trained.data.attributes.keys()]
+
+    before = state()
+    bake(ready, trained)
+    assert state() != before
+    assert ready.ops.ssilk.remove_bake() == {"FINISHED"}
+    assert sorted(state()[0]) == sorted(before[0]) and state()[1:] == before[1:]
+    assert not trained.data.shape_keys
+    trained.shape_key_add(name="Basis")
+    assert ready.ops.ssilk.play_live() == {"FINISHED"}
+    assert ready.ops.ssilk.remove_bake() == {"FINISHED"}
+    assert not trained.ssilk.live and state()[1:] == before[1:]
+    assert [key.name for key in trained.data.shape_keys.key_blocks] == ["Basis"]
+
+
 def test_garments_of_one_armature_are_baked_apart(bpy, skirt):
     from blender_addon.scene.keys import Channel, bake_keys, has_keys, remove_keys
 

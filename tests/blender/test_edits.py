@@ -190,22 +190,55 @@ def test_fewer_proxies_leave_an_edited_one_its_own(ready, rigged, edit):  # noqa
     np.testing.assert_allclose(weights_of(rigged).sum(axis=1), 1, atol=1e-6)
 
 
-def test_trained_weights_are_no_repainting_and_repainted_vertices_stay_known(ready, rigged):  # noqa: F811
-    from blender_addon.scene.handmade import learn_weights
+@pytest.fixture
+def dressed_up(ready, rigged):  # noqa: F811
+    """The skirt with weights of chance put on as trained ones, after its vertex 5 was repainted; both weights."""
+    from blender_addon.scene.worn import put_on
 
     armature, names = ready.data.objects["Rig"], [*BONES, *proxies_of(ready)]
     for group in rigged.vertex_groups:
         group.remove([5])
     rigged.vertex_groups["Hips"].add([5], 1.0, "REPLACE")
+    before = named_weights(rigged, names)
     learned = np.random.default_rng(0).dirichlet(np.ones(len(names)), len(rigged.data.vertices)).astype(np.float32)
-    learn_weights(armature, rigged, learned, names)
+    put_on(armature, rigged, learned, names)
+    return names, before, learned
+
+
+def named_weights(thing, names) -> np.ndarray:
+    columns = [thing.vertex_groups[name].index if name in thing.vertex_groups else -1 for name in names]
+    return np.pad(weights_of(thing), ((0, 0), (0, 1)))[:, columns]
+
+
+def test_trained_weights_are_no_repainting_and_repainted_vertices_stay_known(ready, rigged, dressed_up):  # noqa: F811
+    names, before, learned = dressed_up
+    np.testing.assert_allclose(named_weights(rigged, names), learned, atol=1e-6)
     found = edits_of(ready, rigged)
     assert (found.summary, np.flatnonzero(found.repainted).tolist()) == ("1 vertices repainted", [5])
     ready.ops.ssilk.generate_rig(proxies=6)
-    columns = [rigged.vertex_groups[name].index if name in rigged.vertex_groups else -1 for name in names]
-    row = np.pad(weights_of(rigged)[5], (0, 1))[columns]
-    np.testing.assert_allclose(row, learned[5], atol=1e-5)
+    np.testing.assert_allclose(named_weights(rigged, names)[5], before[5], atol=1e-5)
     assert np.count_nonzero(weights_of(rigged)[6]) < len(names)
+    assert not any(attribute.name.startswith(("ssilk:own", "ssilk:worn")) for attribute in rigged.data.attributes)
+
+
+def test_trained_weights_come_off_again_but_for_what_was_painted_on_them(ready, rigged, dressed_up):  # noqa: F811
+    from blender_addon.scene.gather import gather
+    from blender_addon.scene.worn import is_worn, put_on, take_off
+
+    names, before, learned = dressed_up
+    armature = ready.data.objects["Rig"]
+    np.testing.assert_allclose(gather(rigged).garment.weights, before, atol=1e-6)  # what is trained on
+    ready.data.armatures[armature.data.name].bones[names[-1]].name = "Renamed"
+    names[-1] = "Renamed"
+    for group in rigged.vertex_groups:
+        group.remove([9])
+    rigged.vertex_groups["Spine"].add([9], 1.0, "REPLACE")
+    put_on(armature, rigged, learned, names)  # once more, as by a second bake
+    take_off(armature, rigged)
+    wanted = before.copy()
+    wanted[9] = [name == "Spine" for name in names]
+    np.testing.assert_allclose(named_weights(rigged, names), wanted, atol=1e-6)
+    assert not is_worn(rigged) and np.flatnonzero(edits_of(ready, rigged).repainted).tolist() == [5, 9]
 
 
 def test_the_dialog_says_what_there_is_to_keep(ready, rigged, edit):  # noqa: F811
