@@ -23,6 +23,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from reports import table, write_results
 from ssilk_usd.read_character import read_character
@@ -201,20 +202,18 @@ def _cores(tasks: Sequence[Task], folder: Path, cores: Sequence[int]) -> dict[st
 
 
 def _soak(task: Task, folder: Path, bakes: int) -> dict[str, Any]:
-    """Bake one shot again and again; return memory and file handles at the start and at the end."""
-    wardrobe, seen = Wardrobe(), []
-    settled = max(bakes // 20, 1)
-    for count in range(bakes):
+    """Bake one shot again and again; return memory ten times, how it grows between, and file handles."""
+    wardrobe, step = Wardrobe(), max(bakes // 10, 1)
+    memory, handles = {}, {}
+    for count in range(1, bakes + 1):
         bake_task(task, folder / "soak", wardrobe, silent, again=True)
-        if count == settled or count == bakes - 1:
-            seen.append((resident(os.getpid()), len(os.listdir("/proc/self/fd"))))
-    (early, handles), (late, handles_late) = seen[0], seen[-1]
+        if count % step == 0:
+            memory[count], handles[count] = resident(os.getpid()), len(os.listdir("/proc/self/fd"))
+    slope = np.polyfit(list(memory), list(memory.values()), 1)[0] * 1024
     return {
-        "bakes of the soak": bakes,
-        f"memory after {settled} [MiB]": round(early),
-        "memory at the end [MiB]": round(late),
-        f"file handles after {settled}": handles,
-        "file handles at the end": handles_late,
+        **{f"memory after {count:,} bakes [MiB]": round(size, 1) for count, size in memory.items()},
+        "growth of memory in each bake, by least squares [KiB]": round(float(slope), 2),
+        "file handles, least and most": f"{min(handles.values())}, {max(handles.values())}",
     }
 
 

@@ -24,14 +24,29 @@ if TYPE_CHECKING:
 
 
 class Wardrobe:
-    """Garments on their characters, the last one kept: tasks of one model that follow each other load it once."""
+    """Garments on their characters, the last one kept: tasks of one model that follow each other load it once, and
+    write its asset once."""
 
     def __init__(self) -> None:
         self.open = lru_cache(maxsize=1)(dressed)
+        self.written: tuple[object, Asset] | None = None
 
     def dressed(self, task: Task) -> Dressed:
         """Return the garment of a task, ready for any motion."""
         return self.open(replace(BakeRequest.of(task), motion=""))
+
+    def asset(self, task: Task, layout: Layout, report: Reporter) -> Asset:
+        """Return the asset of a task, which is there as `_write_asset` leaves it."""
+        garment = self.dressed(task)
+        asked = (garment, task.body, layout.asset)
+        if self.written is None or self.written[0] != (asked, _digests(layout)):
+            asset = _write_asset(layout, garment, task, report)
+            self.written = ((asked, _digests(layout)), asset)
+        return self.written[1]
+
+
+def _digests(layout: Layout) -> list[str]:
+    return [sha256(path) for path in (layout.asset, layout.geometry) if path.is_file()]
 
 
 def layout_of(task: Task, folder: Path) -> Layout:
@@ -79,7 +94,7 @@ def bake_task(
     for path in _own(layout):
         remove_unfinished(path)
     bake = wardrobe.dressed(task).over(task.motion)
-    asset = write_asset(layout, bake, task, report)
+    asset = wardrobe.asset(task, layout, report)
     detail = _write_animation(layout, asset, bake, task, report)
     files = [layout.animation, layout.asset, layout.geometry, *([layout.points] if task.points else [])]
     written = {os.path.relpath(path, home): sha256(path) for path in files}
@@ -87,11 +102,13 @@ def bake_task(
     return {"layer": str(layout.animation), **detail}
 
 
-def write_asset(layout: Layout, bake: Bake | Dressed, task: Task, report: Reporter) -> Asset:
+def _write_asset(layout: Layout, garment: Dressed, task: Task, report: Reporter) -> Asset:
     """Write the asset of a task where it is not there already; warn of what layers above relied on."""
     from ssilk_usd import layers
 
-    written = layers.write_asset(layout, bake.deformer, bake.units, include_body=task.body, record=bake.record)
+    written = layers.write_asset(
+        layout, garment.deformer, garment.units, include_body=task.body, record=garment.record
+    )
     for change in written.changes:
         report(Message(f"{layout.asset}: {change}; check the layers that override it", "warning"))
     return written.asset

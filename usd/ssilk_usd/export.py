@@ -11,12 +11,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from pxr import Sdf, Tf
+from pxr import Sdf, Tf, Usd, UsdGeom
 
 from ssilk_core.errors import fail, need
 from ssilk_core.files import replacing
 
 from .read_stage import LAYER_SUFFIXES, usd_reason
+from .specs import free_when_closed
+from .units import StageUnits
 
 PACKED = "shot.usdc"  # the layer in a package
 ZIP_HEADER, EXTRA_HEADER, EXTRA_FIELD, ALIGNMENT = 30, 4, 0x1986, 64  # bytes, and the field that USD pads with
@@ -26,6 +28,23 @@ def need_layer_suffix(out: str | Path) -> None:
     """Raise `SsilkError` unless a name ends as a USD layer's does."""
     suffix, allowed = Path(out).suffix, ", ".join(LAYER_SUFFIXES)
     need(suffix in LAYER_SUFFIXES, str(out), f"the suffix is '{suffix}'", f"it is one of {allowed}")
+
+
+def new_stage(path: Path, units: StageUnits) -> Usd.Stage:
+    """Return a stage on a new layer at `path`, in some units; without a session layer, which would hold nothing."""
+    stage = Usd.Stage.Open(Sdf.Layer.CreateNew(str(path)), None)
+    UsdGeom.SetStageMetersPerUnit(stage, units.meters_per_unit)
+    UsdGeom.SetStageUpAxis(stage, units.up_axis)
+    return stage
+
+
+def save(layer: Sdf.Layer, name: str | Path) -> None:
+    """Write what is pending in a layer to its file; `name` is what messages call it."""
+    try:
+        layer.Save()
+    except Tf.ErrorException as error:
+        fail(str(name), f"writing failed ({usd_reason(error)})", "free some space or choose another output")
+    free_when_closed([layer])
 
 
 def export(layer: Sdf.Layer, out: str | Path) -> None:

@@ -24,11 +24,13 @@ from ssilk_core.assets import Deformer, Floats, GarmentPose, Motion
 from ssilk_core.files import replacing
 
 from .author import Asset, define_asset, extent_array
+from .export import new_stage, save
 from .garment_api import GarmentRecord
 from .layers_facts import asset_facts
 from .read_stage import open_stage
-from .samples import PATH_OP, Samples, kept_joints, root_path, save
+from .samples import PATH_OP, Samples, kept_joints, root_path
 from .shot import ShotSummary, TimeSpan, set_metadata, set_visibility, summary, write_samples
+from .specs import free_when_closed
 from .units import StageUnits
 
 DEFORMATION, QUALITY = "deformation", "quality"
@@ -88,24 +90,18 @@ def write_asset(
     before = asset_facts(layout.asset) if layout.asset.is_file() and layout.geometry.is_file() else None
     bodies = deformer.scene.character.bodies if include_body else ()
     with replacing(layout.geometry, keep_same=True) as temporary:
-        stage = _new_stage(temporary, units)
+        stage = new_stage(temporary, units)
         asset = define_asset(stage, deformer, bodies, units, name=layout.garment, record=record)
-        stage.Save()
+        save(stage.GetRootLayer(), layout.geometry)
         box = _extent(stage, asset)
         del stage
     with replacing(layout.asset, keep_same=True) as temporary:
-        stage = _new_stage(temporary, units)
+        stage = new_stage(temporary, units)
         _define_component(stage, asset, layout, box)
-        stage.Save()
+        free_when_closed(stage.GetUsedLayers())
+        save(stage.GetRootLayer(), layout.asset)
         del stage
     return WrittenAsset(asset, () if before is None else asset_facts(layout.asset).changes_since(before))
-
-
-def _new_stage(path: Path, units: StageUnits) -> Usd.Stage:
-    stage = Usd.Stage.Open(Sdf.Layer.CreateNew(str(path)))
-    UsdGeom.SetStageMetersPerUnit(stage, units.meters_per_unit)
-    UsdGeom.SetStageUpAxis(stage, units.up_axis)
-    return stage
 
 
 def _extent(stage: Usd.Stage, asset: Asset) -> Vt.Vec3fArray:
@@ -172,7 +168,7 @@ def write_animation(
     span = TimeSpan.of(motion, start, samples_per_frame)
     with replacing(path or layout.animation) as temporary:
         layer = Sdf.Layer.CreateNew(str(temporary))
-        stage = Usd.Stage.Open(layer)
+        stage = Usd.Stage.Open(layer, None)
         _define_animation(stage, asset, layout, kept_names(deformer, motion, lean))
         set_metadata(stage, span, units)
         if lean:
@@ -180,6 +176,7 @@ def write_animation(
         set_visibility(stage, asset.root, span, hidden)
         if points:
             _define_points(stage, asset, layout)
+        free_when_closed(stage.GetUsedLayers())
         del stage  # nobody has to hear of each sample
         samples = Samples(layer, asset, deformer, motion, units, start=start, step=span.step, lean=lean)
         write_samples(samples, poses, layout.animation, provenance)
@@ -235,7 +232,7 @@ def write_points(
     paths = root_path(deformer, motion) if lean else np.zeros((motion.frame_count, 3))
     with replacing(layout.points) as temporary:
         layer = Sdf.Layer.CreateNew(str(temporary))
-        stage = Usd.Stage.Open(layer)
+        stage = Usd.Stage.Open(layer, None)
         mesh = UsdGeom.Mesh(stage.OverridePrim(asset.garment))
         attributes = [mesh.CreatePointsAttr().GetPath(), mesh.CreateExtentAttr().GetPath()]
         set_metadata(stage, span, units)
@@ -258,16 +255,16 @@ def write_stage(garments: Sequence[Layout]) -> None:
     layers = [stage.GetRootLayer() for stage in stages]
     first = layers[0].pseudoRoot
     with replacing(layout.stage, keep_same=True) as temporary:
-        stage = Usd.Stage.Open(Sdf.Layer.CreateNew(str(temporary)))
+        stage = new_stage(temporary, StageUnits.of(stages[0]))
         shot = UsdGeom.Xform.Define(stage, "/Shot").GetPrim()
         stage.SetDefaultPrim(shot)
         Usd.ModelAPI(shot).SetKind(Kind.Tokens.assembly)
-        for name in ("metersPerUnit", "upAxis", "timeCodesPerSecond", "framesPerSecond"):
+        for name in ("timeCodesPerSecond", "framesPerSecond"):
             stage.SetMetadata(name, first.GetInfo(name))
         stage.SetStartTimeCode(min(layer.startTimeCode for layer in layers))
         stage.SetEndTimeCode(max(layer.endTimeCode for layer in layers))
         for garment in garments:
             prim = stage.DefinePrim(shot.GetPath().AppendChild(garment.garment))
             prim.GetReferences().AddReference(os.path.relpath(garment.animation, layout.stage.parent))
-        stage.Save()
+        save(stage.GetRootLayer(), layout.stage)
         del stage, shot

@@ -16,11 +16,10 @@ from ssilk_core.files import replacing
 from ssilk_core.kinematics import plain_deformer, plain_poses
 
 from .author import extent_array
-from .export import need_layer_suffix
+from .export import need_layer_suffix, save
 from .garment_api import GarmentRecord
 from .read_mesh import is_garment
 from .read_stage import PRIMS
-from .samples import save
 from .shot import ShotSummary, write_shot
 from .units import StageUnits
 
@@ -41,7 +40,7 @@ class PointCache:
         self.units, self.step, self.unsaved_count = units, 1 / samples_per_frame, 0
         self.written = np.zeros(self.frame_count, dtype=bool)
         self.layer = Sdf.Layer.FindOrOpen(str(path))
-        stage = Usd.Stage.Open(self.layer)
+        stage = Usd.Stage.Open(self.layer, None)
         self.garment, self.root = _unbind(stage), stage.GetDefaultPrim().GetPath()
 
     def write(self, frame: int, points: Floats) -> None:

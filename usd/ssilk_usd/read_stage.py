@@ -18,6 +18,7 @@ from ssilk_core.files import sha256
 
 from .garment_api import register_schema
 from .memory import MOST, bounded_memory
+from .specs import free_when_closed
 
 Reader = TypeVar("Reader", bound=Callable[..., Any])
 StageLike: TypeAlias = str | Path | Usd.Stage
@@ -74,6 +75,7 @@ def open_stage(source: StageLike) -> Usd.Stage:
         for error in stage.GetCompositionErrors()
         if isinstance(error, _MISSING)
     ]
+    free_when_closed(stage.GetUsedLayers())
     need(not missing, str(source), " and ".join(missing[:2]), "every layer must be found", "restore it or its path")
     return stage
 

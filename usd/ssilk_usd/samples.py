@@ -7,10 +7,10 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
-from pxr import Gf, Sdf, Tf, UsdSkel, Vt
+from pxr import Gf, Sdf, UsdSkel, Vt
 
 from ssilk_core.assets import Deformer, Floats, GarmentPose, Ints, Motion, SkinWeights
-from ssilk_core.errors import fail, need
+from ssilk_core.errors import need
 from ssilk_core.kinematics import (
     combined_transforms,
     local_transforms,
@@ -20,7 +20,7 @@ from ssilk_core.kinematics import (
 )
 
 from .author import Asset, extent_array, matrix_array, sorted_influences
-from .read_stage import usd_reason
+from .export import save
 from .units import StageUnits
 
 PATH_OP = "xformOp:translate:path"  # of the SkelRoot: where the character's root joint is
@@ -114,14 +114,6 @@ class Samples:
         """Write what is pending to the file; `name` is what messages call it."""
         save(self.layer, name)
         self.unsaved_count = 0
-
-
-def save(layer: Sdf.Layer, name: str | Path) -> None:
-    """Write what is pending in a layer to its file; `name` is what messages call it."""
-    try:
-        layer.Save()
-    except Tf.ErrorException as error:
-        fail(str(name), f"writing failed ({usd_reason(error)})", "free some space or choose another output")
 
 
 def _vectors(points: Floats) -> Iterator[Gf.Vec3d]:

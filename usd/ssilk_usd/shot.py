@@ -76,7 +76,7 @@ def write_shot(
     bodies = deformer.scene.character.bodies if include_body else ()
     with replacing(path) as temporary:
         layer = Sdf.Layer.CreateNew(str(temporary))
-        stage = Usd.Stage.Open(layer)
+        stage = Usd.Stage.Open(layer, None)
         asset = define_asset(stage, deformer, bodies, units, record=record)
         span = TimeSpan.of(motion, start, samples_per_frame)
         set_metadata(stage, span, units)

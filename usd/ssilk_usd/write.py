@@ -12,6 +12,7 @@ from ssilk_core.assets import Mesh, Motion, Skeleton
 from ssilk_core.files import replacing
 
 from .author import define_mesh, prim_names
+from .export import new_stage, save
 from .units import StageUnits
 
 CORE_UNITS = StageUnits(1.0, UsdGeom.Tokens.y)
@@ -20,17 +21,17 @@ CORE_UNITS = StageUnits(1.0, UsdGeom.Tokens.y)
 def write_garment(path: str | Path, mesh: Mesh) -> None:
     """Write a mesh as a file of its own, in metres and y up."""
     with replacing(path) as temporary:
-        stage = _new_stage(temporary)
+        stage = new_stage(temporary, CORE_UNITS)
         prim = define_mesh(stage, _root_path(mesh.path), mesh, CORE_UNITS).GetPrim()
         Usd.ModelAPI(prim).SetKind(Kind.Tokens.component)
         stage.SetDefaultPrim(prim)
-        stage.Save()
+        save(stage.GetRootLayer(), path)
 
 
 def write_motion(path: str | Path, motion: Motion, skeleton: Skeleton) -> None:
     """Write a motion as a SkelAnimation of its own, one time code for each frame, in metres and y up."""
     with replacing(path) as temporary:
-        stage = _new_stage(temporary)
+        stage = new_stage(temporary, CORE_UNITS)
         animation = UsdSkel.Animation.Define(stage, "/Animation")
         stage.SetDefaultPrim(animation.GetPrim())
         stage.SetTimeCodesPerSecond(motion.fps)
@@ -45,15 +46,7 @@ def write_motion(path: str | Path, motion: Motion, skeleton: Skeleton) -> None:
             imaginary_first = np.roll(motion.rotations[frame], -1, axis=1).astype(np.float32)
             rotations.Set(Vt.QuatfArray.FromNumpy(imaginary_first), time)
             translations.Set(Vt.Vec3fArray.FromNumpy(motion.translations[frame].astype(np.float32)), time)
-        stage.Save()
-
-
-def _new_stage(path: Path) -> Usd.Stage:
-    path.unlink()
-    stage = Usd.Stage.CreateNew(str(path))
-    UsdGeom.SetStageMetersPerUnit(stage, CORE_UNITS.meters_per_unit)
-    UsdGeom.SetStageUpAxis(stage, CORE_UNITS.up_axis)
-    return stage
+        save(stage.GetRootLayer(), path)
 
 
 def _root_path(name: str) -> str:
