@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
@@ -33,10 +34,10 @@ from .reporting import ReportingOperator
 WHOLE, HERO = "WHOLE", "hero"
 QUALITIES = [
     (WHOLE, "Whole", "All that the model has"),
-    ("crowd", "Crowd", "For many characters, far away: few shapes and proxies, three influences"),
+    ("crowd", "Crowd", "For many characters, far away: few shapes and proxies, four influences"),
     ("game", "Game", "For real time: some shapes and proxies, four influences"),
     ("film", "Film", "What cannot be told from the whole model"),
-    (HERO, "Hero", "The whole model, refined by a solver; to USD alone, as points"),
+    (HERO, "Hero", "Refined by a solver: points to USD alone; on the timeline bones and shape keys nearest to them"),
 ]
 INPUTS, MOTION, SHOT = "bake", "motion.usdc", "shot.usdc"  # folder of a bake's inputs beside the model; files
 
@@ -81,8 +82,6 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
     def prepare(self, context: bpy.types.Context) -> Work:
         garment = context.object
         need(self.to_timeline or self.to_usd, "Choose where to bake to: the timeline, USD, or both.")
-        refined = self.to_timeline and self.quality == HERO
-        need(not refined, "Hero refines points, which bones and shape keys cannot hold; bake it to USD alone.")
         self.model, armature = model_of(garment), armature_of(garment)
         joints = read_joints(armature, garment)
         need_bakeable(garment, armature, joints)
@@ -116,6 +115,8 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
             stage = inputs / STAGE
         self.shot = self.shot or folder / SHOT
         level = [] if self.quality == WHOLE else ["--quality", self.quality]
+        if self.quality == HERO and self.to_timeline:
+            level += ["--refined-output", "joints"]
         rate = ["--fps", repr(scene_rate())] if self.to_timeline else []  # a level may have fewer frames
         return [
             [
@@ -128,7 +129,7 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
     def finish(self, context: bpy.types.Context, work: Work) -> str:
         where = [self.put_on_timeline()] if self.to_timeline else []
         where += [str(self.shot)] if self.to_usd else []
-        return f"'{self.pair.name}' is baked: {' and '.join(where)}."
+        return f"'{self.pair.name}' is baked: {' and '.join(where)}{lost(work.result)}."
 
     def put_on_timeline(self) -> str:
         """Put keys in place of those baked before; return what was done."""
@@ -165,6 +166,14 @@ class RemoveBake(ReportingOperator, bpy.types.Operator):
         playing.stop(garment)
         remove_bake(garment, armature_of(garment))
         return f"What was baked for '{garment.name}' is gone."
+
+
+def lost(figures: Mapping[str, Any]) -> str:
+    """Return what bones and shape keys lose of a refined garment, in words; empty where nothing was put back."""
+    typical, most = (figures.get(f"joints lose, {which} [mm]") for which in ("RMS", "at most"))
+    if typical is None:
+        return ""
+    return f"; bones and shape keys miss the refined vertices by {typical:g} mm (RMS), {most:g} mm at most"
 
 
 def usd_path(garment: bpy.types.Object, chosen: str) -> Path:

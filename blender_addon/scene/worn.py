@@ -17,6 +17,7 @@ from .weights import SAME_WEIGHTS, forget_kept, keep_weights, read_groups, read_
 
 OWN = "ssilk:own:"  # begins the attributes that keep a garment's own weights, one for each joint
 WORN = "ssilk:worn"  # attribute of points: the signature of the trained weights
+SAME = 1e-6  # difference of weights
 
 
 def is_worn(garment: bpy.types.Object) -> bool:
@@ -26,6 +27,8 @@ def is_worn(garment: bpy.types.Object) -> bool:
 
 def put_on(armature: bpy.types.Object, garment: bpy.types.Object, weights: np.ndarray, names: Sequence[str]) -> None:
     """Give a garment trained weights, shape (V, J), over joints with these names. In object mode."""
+    if is_worn(garment) and np.allclose(read_groups(garment, garment.data, names), weights, atol=SAME):
+        return
     own = own_groups(armature, garment, names)
     keys = keys_of(armature, names)
     forget(garment)

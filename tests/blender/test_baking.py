@@ -73,7 +73,23 @@ def test_a_level_of_quality_leaves_shapes_out(ready, trained, tmp_path, ssilk_py
     plain = decoded(ssilk_python, model_of(trained), tmp_path, plain=True)
     assert 1e-4 < away < np.linalg.norm(whole - plain, axis=-1).max()
     assert len([key for key in trained.data.shape_keys.key_blocks if key.name.startswith("SSILK ")]) < 25
-    assert "bake it to USD alone" in refused(ready, trained, quality="hero")
+
+
+def test_hero_is_put_back_onto_bones_and_shape_keys(ready, trained, monkeypatch):
+    """It differs from the whole model, has all of its shapes, and the report says what was lost."""
+    from blender_addon.operators import baking
+
+    told, lost = [], baking.lost
+    monkeypatch.setattr(baking, "lost", lambda figures: told.append(lost(figures)) or told[-1])
+    ready.context.scene.frame_end = 6
+    bake(ready, trained)
+    whole, count = shown(ready, trained, range(1, 7)), len(trained.data.shape_keys.key_blocks)
+    bake(ready, trained, quality="hero")
+    assert np.abs(shown(ready, trained, range(1, 7)) - whole).max() > 1e-3
+    assert len(trained.data.shape_keys.key_blocks) == count
+    assert told[0] == ""
+    found = re.search(r"miss the refined vertices by (\S+) mm \(RMS\), (\S+) mm at most", told[1])
+    assert found and 0 < float(found[1]) < float(found[2])
 
 
 def test_a_reduced_model_leaves_its_proxies_at_rest(ready, trained, tmp_path, ssilk_python):
