@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -68,14 +69,22 @@ class Integrator(nn.Module, ABC):
             rest: the quasi-static state P(theta_t) of the pose at t.
             pose: dynamic descriptor at t.
         """
-        return self.bounded(self.advance(stepper, before, now, rest, pose))
+        return self.follow(stepper, before, now, self.known(stepper, rest, pose))
+
+    def known(self, stepper: nn.Module, rest: Tensor, pose: Tensor) -> tuple[Tensor, ...]:
+        """Return what steps need that no state decides, rows of any number of frames at once."""
+        return rest, pose
+
+    def follow(self, stepper: nn.Module, before: Tensor, now: Tensor, known: Sequence[Tensor]) -> Tensor:
+        """Return z_t, shape (batch, latent), from the two states before and what is `known` of the frame."""
+        return self.bounded(self.advance(stepper, before, now, *known))
 
     def bounded(self, z: Tensor) -> Tensor:
         """Return states within their bound."""
         return limited(z, self.config.bound)
 
     @abstractmethod
-    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor) -> Tensor: ...
+    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *known: Tensor) -> Tensor: ...
 
 
 class Verlet(Integrator):
@@ -90,7 +99,8 @@ class Verlet(Integrator):
         # 1 would turn noise on the first two states into a steady drift; 0.9 lets it die within a second.
         self.beta = nn.Parameter(torch.full((config.latent,), 0.9))
 
-    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor) -> Tensor:
+    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *known: Tensor) -> Tensor:
+        _, pose = known
         forward = self.alpha * now + self.beta * (now - before)
         return forward + limited(stepper(torch.cat([forward, now, pose], dim=1)), self.config.push)
 
@@ -133,31 +143,39 @@ class SpringVerlet(Integrator):
         self.beta = nn.Parameter(torch.full((config.latent,), 0.7))
         self.share = nn.Parameter(torch.logit(start / config.stiffness))
 
-    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor) -> Tensor:
+    def known(self, stepper: nn.Module, rest: Tensor, pose: Tensor) -> tuple[Tensor, ...]:
+        """Return the quasi-static state, the pose, what S would do to a garment at rest there, and |rates| / 20."""
+        static, rates = pose.tensor_split([pose.shape[1] - self.rates], dim=1)
+        nothing = torch.zeros_like(rest)
+        held = self._of(stepper, rest, nothing, nothing, static, torch.zeros_like(rates))
+        return rest, pose, held, self.rate_share * length(rates)
+
+    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *known: Tensor) -> Tensor:
+        rest, pose, held, roused = known
         velocity = now - before
         forward = now + self.beta * velocity
-        away, (static, rates) = rest - forward, pose.tensor_split([pose.shape[1] - self.rates], dim=1)
-        seen = torch.cat([now, self.velocity_scale * velocity, self.distance_scale * away, pose], dim=1)
-        nothing = torch.zeros_like(rest)
-        calm = torch.cat([rest, nothing, nothing, static, torch.zeros_like(rates)], dim=1)
-        moved, held = stepper(torch.cat([seen, calm])).clamp(-self.most, self.most).unflatten(0, (2, -1))
+        away = rest - forward
+        moved = self._of(stepper, now, self.velocity_scale * velocity, self.distance_scale * away, pose)
         spring = self.config.stiffness * torch.sigmoid(self.share) * away
-        allowed = self.own_share * (length(spring) + length(velocity)) + self.rate_share * length(rates)
+        allowed = self.own_share * (length(spring) + length(velocity)) + roused
         return forward + limited(spring + shortened(self.reach * (moved - held), allowed), self.config.push)
+
+    def _of(self, stepper: nn.Module, *seen: Tensor) -> Tensor:
+        return stepper(torch.cat(seen, dim=1)).clamp(-self.most, self.most)
 
 
 class Direct(Integrator):
     """z_t = S([z_{t-2}, z_{t-1}, pose]) (Eq. 11)."""
 
-    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor) -> Tensor:
-        return stepper(torch.cat([before, now, pose], dim=1))
+    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *known: Tensor) -> Tensor:
+        return stepper(torch.cat([before, now, known[1]], dim=1))
 
 
 class DirectResidual(Integrator):
     """z_t = z_{t-1} + S([z_{t-2}, z_{t-1}, pose]) (Eq. 12)."""
 
-    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor) -> Tensor:
-        return now + stepper(torch.cat([before, now, pose], dim=1))
+    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *known: Tensor) -> Tensor:
+        return now + stepper(torch.cat([before, now, known[1]], dim=1))
 
 
 class QuasiStatic(Integrator):
@@ -165,10 +183,11 @@ class QuasiStatic(Integrator):
 
     states = 0
 
-    def forward(self, stepper: nn.Module, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor) -> Tensor:
-        return rest  # within its bound already
+    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *known: Tensor) -> Tensor:
+        return known[0]
 
-    advance = forward
+    def follow(self, stepper: nn.Module, before: Tensor, now: Tensor, known: Sequence[Tensor]) -> Tensor:
+        return self.advance(stepper, before, now, *known)  # within its bound already
 
 
 INTEGRATORS: dict[str, type[Integrator]] = {

@@ -81,8 +81,9 @@ class GarmentModel(nn.Module):
         states = list(states)
         if not self.integrator.states:
             return [*states, *rest]
-        for still, seen in zip(rest, pose):
-            states.append(self.step(states[-2], states[-1], still, seen))
+        known = self.integrator.known(self.stepper, rest.flatten(0, 1), pose.flatten(0, 1))
+        for frame in zip(*(values.unflatten(0, rest.shape[:2]) for values in known)):
+            states.append(self.integrator.follow(self.stepper, states[-2], states[-1], frame))
         return states
 
     def pose(self, z: Tensor) -> tuple[Tensor, Tensor]:

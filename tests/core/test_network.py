@@ -54,6 +54,18 @@ def test_every_scheme_builds_and_steps(scene, scheme):
     assert model.step(rest, rest, rest, pose).shape == (5, 8)
 
 
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_rolling_windows_is_stepping_one_frame_after_the_other(scene, toy_model, scheme):
+    model = toy_model(scene, scheme=scheme)
+    pose = torch.randn(6, 3, sum(descriptor_sizes(scene, model.joints)), generator=torch.Generator().manual_seed(1))
+    rest = model.initial(pose[..., : model.initialiser[0].in_features].flatten(0, 1)).unflatten(0, (6, 3))
+    states = [rest[0], rest[0] + 0.1]
+    rolled = model.roll(states, rest, pose)
+    for still, seen in zip(rest, pose):
+        states.append(model.step(states[-2], states[-1], still, seen))
+    torch.testing.assert_close(torch.stack(rolled), torch.stack(states), rtol=1e-4, atol=1e-5)
+
+
 def test_network_pose_inverts_file_pose(scene, toy_model):
     model = toy_model(scene)
     with torch.no_grad():

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rollouts that are lost: the garment is put to rest, goes on, and it is said where."""
 
+from collections.abc import Container
 from dataclasses import replace
+from itertools import count
 
 import numpy as np
 import pytest
@@ -14,17 +16,15 @@ from ssilk_core.model.network import GarmentModel
 from ssilk_core.rollout import RECOVERY, garment_poses, roll, roll_blocks
 
 
-class Poisoned(torch.nn.Module):
-    """A stepper that gives NaN at its calls in `when`, counted from zero."""
+def poison(model: GarmentModel, when: Container[int]) -> None:
+    """Let a model lose its state at the steps in `when`, counted from zero."""
+    follow, steps = model.integrator.follow, count()
 
-    def __init__(self, stepper: torch.nn.Module, when: set[int]) -> None:
-        super().__init__()
-        self.stepper, self.when, self.calls = stepper, when, 0
+    def poisoned(*inputs: object) -> torch.Tensor:
+        given = follow(*inputs)
+        return given * torch.nan if next(steps) in when else given
 
-    def forward(self, seen: torch.Tensor) -> torch.Tensor:
-        given = self.stepper(seen)
-        self.calls += 1
-        return given * torch.nan if self.calls - 1 in self.when else given
+    model.integrator.follow = poisoned
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def test_a_lost_state_rests_and_the_rollout_goes_on(model, scene, toy_motion, ch
     """The twentieth step is frame 21: the first two frames are at rest."""
     motion = toy_motion(scene, 80)
     calm = torch.cat([step.activation for step in roll(model, motion, 100)], dim=1)
-    model.stepper = Poisoned(model.stepper, {19})
+    poison(model, {19})
     steps = list(roll(model, motion, chunk))
     frames, found = recovered(steps), torch.cat([step.activation for step in steps], dim=1)
     rests = frames[-1] - frames[0] + 1
@@ -53,7 +53,7 @@ def test_a_lost_state_rests_and_the_rollout_goes_on(model, scene, toy_motion, ch
 
 def test_a_rollout_that_is_always_lost_is_quasi_static(model, scene, toy_motion):
     motion = toy_motion(scene, 50)
-    model.stepper = Poisoned(model.stepper, set(range(10_000)))
+    poison(model, range(10_000))
     (step,) = roll(model, motion, 100)
     assert step.recovered[2:].all() and step.activation.isfinite().all()
     assert step.activation.diff(dim=1).abs().amax(dim=0).min() > 0  # it follows the poses
@@ -91,7 +91,7 @@ def test_blocks_give_what_the_whole_motion_gives(model, scene, toy_motion, size)
 def test_the_frames_that_are_told_are_those_that_differ(model, scene, toy_motion, source, target):
     motion = toy_motion(scene, 90, source)
     calm = list(garment_poses(model, motion, target))
-    model.stepper = Poisoned(model.stepper, {19})
+    poison(model, {19})
     told: list[range] = []
     lost = list(garment_poses(model, motion, target, on_recovery=told.append))
     moved = np.concatenate([np.abs(a.weights - b.weights).max(axis=1) for a, b in zip(calm, lost)])
