@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from .. import kernels
 from ..config import ModelConfig
 
 SMALLEST = 1e-12  # far below any length that counts; its square's inverse is finite in float32
@@ -149,6 +150,18 @@ class SpringVerlet(Integrator):
         nothing = torch.zeros_like(rest)
         held = self._of(stepper, rest, nothing, nothing, static, torch.zeros_like(rates))
         return rest, pose, held, self.rate_share * length(rates)
+
+    def follow(self, stepper: nn.Module, before: Tensor, now: Tensor, known: Sequence[Tensor]) -> Tensor:
+        fused = now.dtype == torch.float32 and kernels.available(now.device)
+        if torch.is_grad_enabled() or torch.compiler.is_compiling() or not fused:
+            return super().follow(stepper, before, now, known)
+        from ..kernels.spring import next_kernel, seen_kernel
+
+        rest, pose, held, roused = known
+        moved = stepper(seen_kernel(before, now, rest, pose, self.beta, (self.velocity_scale, self.distance_scale)))
+        stiffness, push, bound = self.config.stiffness, self.config.push, self.config.bound
+        limits = stiffness, self.most, self.reach, self.own_share, push, bound
+        return next_kernel((before, now), rest, (moved, held), roused, (self.beta, self.share), limits)
 
     def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *known: Tensor) -> Tensor:
         rest, pose, held, roused = known

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Integration schemes by hand numbers, and the bounds that hold by design."""
 
+import importlib.util
+
 import numpy as np
 import pytest
 import torch
@@ -230,3 +232,25 @@ def test_decoded_cloth_stays_within_reach_of_what_holds_it(scene, toy_motion, to
     anchor = (matrices[:, 1] @ np.append(upper, 1))[:, :3]
     loose = scene.classes == 2
     assert (np.linalg.norm(x - anchor[:, None], axis=2) <= radius + 1e-5)[:, loose].all()
+
+
+@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="kernels need Triton")
+@pytest.mark.parametrize("size, options", [(1.0, {}), (30.0, {}), (1.0, {"bound": 0.0, "push": 0.0}), (0.0, {})])
+@torch.no_grad()
+def test_the_kernels_step_as_their_twin_does(size, options, monkeypatch):
+    """States of a few sizes, so that each of the limits is met; one of them is lost."""
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    generator = torch.Generator().manual_seed(7)
+    scheme = integrator("spring_verlet", latent=5, **options)
+    scheme.rates = 2
+    scheme.beta.add_(0.1 * torch.randn(5, generator=generator))
+    stepper = nn.Linear(15 + 6, 5, bias=False)
+    before, now, rest = size * torch.randn(3, 9, 5, generator=generator)
+    now[4, 2] = torch.nan
+    pose = torch.randn(9, 6, generator=generator)
+    pose[:3, -2:] = 0
+    expected = scheme(stepper, before, now, rest, pose)
+    assert expected[4].isnan().any() and expected[:4].isfinite().all()
+    monkeypatch.setattr("ssilk_core.kernels.available", lambda device: True)
+    found = scheme.to(device)(stepper.to(device), *(v.to(device) for v in (before, now, rest, pose)))
+    torch.testing.assert_close(found.cpu(), expected, rtol=1e-5, atol=2e-6, equal_nan=True)
