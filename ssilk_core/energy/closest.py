@@ -4,7 +4,7 @@
 The nearest point may lie on a triangle that does not touch the nearest vertex. Training overlooks that, as `nearest`
 and `surface_point` do: where it happens the distance they find is larger, by millimetres on a coarse body, and jumps.
 A solver that moves vertices over such seams does not settle; here every triangle counts that can hold the nearest
-point, and the distance is continuous wherever the nearest point is unique.
+point, and the Euclidean distance is continuous, and smooth wherever the nearest point is unique.
 """
 
 from __future__ import annotations

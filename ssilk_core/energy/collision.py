@@ -15,6 +15,7 @@ from .surface_point import nearest_on_rings
 
 # Further than this from every body vertex [m], the tangent plane at the nearest vertex says all that is needed.
 FAR = 0.08
+TOUCHING = 1e-5  # [m] from the surface, within which single precision no longer tells the direction to it
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,8 +28,9 @@ class PosedBody:
         groups: the vertices in compact groups (`nearest.compact_blocks` of `nearest.GROUP`), int32; they make the
             search on a GPU fast, and change no result but which of several equally near vertices is meant.
         faces: triangles (F, 3); with them the nearest body point is that of the whole surface (`closest`), for
-            simulating and measuring. It differs from what training sees where a triangle away from the nearest
-            vertex is nearer than those around it.
+            simulating and measuring, and the distance is the Euclidean one. What training sees differs where a
+            triangle away from the nearest vertex is nearer than those around it, and by the cosine between the
+            interpolated normal and the direction to the surface.
         patches: the triangles in compact patches (`closest.patches_of`), int32; a GPU searches by them.
     """
 
@@ -61,6 +63,9 @@ def nearest_planes(
 ) -> tuple[Tensor, Tensor]:
     """Return unit normals n_b (V, 3, N) and offsets n_b . b (V, N) of the nearest body points b, without gradients.
 
+    Normals are interpolated, or with `body.faces` the directions from b: held still, as all take them, those are
+    the true gradient of the distance, and interpolated ones are not.
+
     Args:
         x: garment positions (V, 3, N).
         body: the body in the same frames.
@@ -79,7 +84,7 @@ def nearest_planes(
     square = ((x - point) ** 2).sum(1)
     if body.faces is not None:
         found = closest_on_faces(x, square.sqrt().where(square < FAR**2, -1), body.points, body.faces, allowed)
-        return _on_triangles(normal, offset, body, *found)
+        return _on_triangles(normal, offset, body, *found, x)
     return _on_triangles(normal, offset, body, *_around(x, index, square < FAR**2, body))
 
 
@@ -114,7 +119,8 @@ def _by_kernels(
 
     index = _nearest_vertex(x, body, blocks, allowed)
     if body.faces is not None and body.patches is not None:
-        return closest_kernel(x, index, body.points, body.normals, _in_blocks(x, blocks), body.patches, FAR)
+        reach = FAR, TOUCHING
+        return closest_kernel(x, index, body.points, body.normals, _in_blocks(x, blocks), body.patches, *reach)
     rings = index.new_zeros(len(body.points), 1) if body.rings is None else body.rings
     return surface_kernel(x, index, body.points, body.normals, rings, FAR)
 
@@ -129,16 +135,35 @@ def _around(x: Tensor, index: Tensor, near: Tensor, body: PosedBody) -> tuple[Te
 
 
 def _on_triangles(
-    normal: Tensor, offset: Tensor, body: PosedBody, row: Tensor, frame: Tensor, corners: Tensor, weights: Tensor
+    normal: Tensor,
+    offset: Tensor,
+    body: PosedBody,
+    row: Tensor,
+    frame: Tensor,
+    corners: Tensor,
+    weights: Tensor,
+    x: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Replace normals (V, 3, N) and offsets (V, N) by those of points on triangles, as `closest_on_faces` gives."""
+    """Replace normals (V, 3, N) and offsets (V, N) by those of points on triangles, as `closest_on_faces` gives.
+
+    Normals are the directions from these points to queries x (V, 3, N) where those are given.
+    """
     points, normals = body.points.transpose(0, 1).contiguous(), body.normals.transpose(0, 1).contiguous()
     point = (points[:, corners, frame] * weights).sum(1)
     found = (normals[:, corners, frame] * weights).sum(1)
     found = found / found.norm(dim=0).clamp_min(1e-8)
+    if x is not None:
+        found = _outward(x[row, :, frame].T - point, found)
     normal[row, :, frame] = found.T
     offset[row, frame] = (found * point).sum(0)
     return normal, offset
+
+
+def _outward(away: Tensor, normal: Tensor) -> Tensor:
+    """Return the unit directions of vectors away from the surface (3, M), turned to the side of its normals (3, M)."""
+    length = away.norm(dim=0)
+    side = torch.where((away * normal).sum(0) < 0, -1.0, 1.0)
+    return torch.where(length > TOUCHING, away * (side / length.clamp_min(TOUCHING)), normal)
 
 
 def collision_energy(distance: Tensor, stiffness: float, margin: float) -> Tensor:

@@ -21,9 +21,16 @@ WARPS = 2
 
 
 def closest_kernel(
-    x: Tensor, index: Tensor, points: Tensor, normals: Tensor, blocks: Tensor, patches: Tensor, far: float
+    x: Tensor,
+    index: Tensor,
+    points: Tensor,
+    normals: Tensor,
+    blocks: Tensor,
+    patches: Tensor,
+    far: float,
+    touching: float,
 ) -> tuple[Tensor, Tensor]:
-    """Return unit normals (V, 3, N) and offsets n . b (V, N) of the nearest body points b.
+    """Return unit normals (V, 3, N) and offsets n . b (V, N) of the nearest body points b, as `nearest_planes` does.
 
     Args:
         x: queries (V, 3, N); index: their nearest body vertices (V, N), int32.
@@ -31,6 +38,7 @@ def closest_kernel(
         blocks: the queries in compact blocks (`energy.nearest.compact_blocks`), int32.
         patches: corners of triangles in compact patches (`energy.closest.patches_of`), int32.
         far: further than this from its nearest vertex [m], a query keeps that as its nearest point.
+        touching: nearer than this to its nearest point [m], a query keeps the normal there.
     """
     vertices, _, frames = x.shape
     points, normals = points.contiguous(), normals.contiguous()
@@ -38,13 +46,13 @@ def closest_kernel(
     garment, body = by_frame(x, blocks), by_frame(points, patches)
     grid = (frames, triton.cdiv(len(blocks), RUN))
     _search[grid](*garment, *body, blocks, patches, index, points, normals, normal, offset, frames, len(blocks),
-                  len(patches), far * far, blocks.shape[1], CHUNK, RUN, num_warps=WARPS)  # fmt: skip
+                  len(patches), far * far, touching, blocks.shape[1], CHUNK, RUN, num_warps=WARPS)  # fmt: skip
     return normal, offset
 
 
 @triton.jit
 def _search(garment, garment_boxes, body, body_boxes, blocks, patches, index, points, normals, normal, offset,
-            frames, block_count, patch_count, far, block_v: tl.constexpr, chunk: tl.constexpr,
+            frames, block_count, patch_count, far, touching, block_v: tl.constexpr, chunk: tl.constexpr,
             run: tl.constexpr):  # fmt: skip
     frame = tl.program_id(0).to(tl.int64)
     garment += frame * 3 * block_count * block_v
@@ -71,6 +79,15 @@ def _search(garment, garment_boxes, body, body_boxes, blocks, patches, index, po
         nx, ny, nz = _mixed(normals + frame, frames, i, j, k, s, t)
         length = tl.maximum(tl.sqrt(dot(nx, ny, nz, nx, ny, nz)), 1e-8)
         nx, ny, nz = nx / length, ny / length, nz / length
+        ax, ay, az = x - bx, y - by, z - bz
+        away = tl.sqrt(dot(ax, ay, az, ax, ay, az))
+        side = tl.where(dot(ax, ay, az, nx, ny, nz) < 0, -1.0, 1.0) / tl.maximum(away, touching)
+        outward = near & (away > touching)
+        nx, ny, nz = (
+            tl.where(outward, side * ax, nx),
+            tl.where(outward, side * ay, ny),
+            tl.where(outward, side * az, nz),
+        )
         target = normal + vertex * 3 * frames + frame
         tl.store(target, nx)  # a vertex that fills up its block writes the same again
         tl.store(target + frames, ny)
