@@ -8,6 +8,7 @@ does. Interrupt with Ctrl-C: the best model and the state are kept, and --resume
 from __future__ import annotations
 
 import argparse
+from math import inf
 from pathlib import Path
 
 from ssilk_core.config import PRESETS, ModelConfig, TrainConfig, overridden, preset_named
@@ -39,6 +40,14 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--preset", choices=PRESETS, default="preview", help="schedule and size of the network (default preview)"
     )
+    verb.add_argument(
+        "--minutes",
+        type=float,
+        metavar="M",
+        help="wall time to fill in place of the preset's iterations, from when the scene is set up: a few steps are "
+        "timed, and the schedule is stretched or shrunk to as many as fit; the same seed then gives the same model "
+        "only where as many do",
+    )
     shared.add_fabric(verb)
     verb.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1, ... (default auto)")
     verb.add_argument("--resume", action="store_true", help="go on from the state beside the model")
@@ -66,6 +75,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         "it ends in .safetensors",
     )
     shared.check_output(options.output)
+    need(options.minutes is None or 0 < options.minutes < inf, "--minutes", f"{options.minutes}",
+         "a time is more than nothing")  # fmt: skip
     with joined(options.device) as (team, device), interruptible() as stop:
         report = report if team.first else silent
         trained = train(training_job(options, device, report), report, stop, team)
@@ -116,6 +127,7 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
         device=device,
         resume=options.resume,
         inputs={str(path): sha256(path) for path in sorted(files)},
+        minutes=options.minutes,
     )
 
 

@@ -27,6 +27,7 @@ class TrainJob:
         motions, held_out: what is trained on, and what is validated on.
         output: the model file to write; the run's other files lie beside it.
         inputs: hashes of the input files by name, for the provenance.
+        minutes: wall time to fill instead of the schedule's iterations; None for these. A resumed run may have more.
     """
 
     scene: Scene
@@ -39,6 +40,7 @@ class TrainJob:
     device: str = "auto"
     resume: bool = False
     inputs: dict[str, str] | None = None
+    minutes: float | None = None
 
     def __post_init__(self) -> None:
         if not (self.scene.classes == LOOSE).any():

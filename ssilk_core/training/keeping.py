@@ -65,6 +65,7 @@ class Keeper:
             {
                 **state.asked,
                 "iteration": state.iteration,
+                "planned": state.planned,
                 "lowered": [asdict(item) for item in state.lowered],
                 "seed": self.job.train.seed,
                 "ssilk": __version__,

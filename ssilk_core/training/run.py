@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
 from math import inf, isfinite
 from typing import NoReturn
 
@@ -22,6 +21,7 @@ from ..errors import fail, need
 from ..events import Checkpoint, Message, Progress, Reporter, Started
 from ..kinematics import split_at_cuts
 from .bank import MOST_TURN
+from .budget import fitting_iterations, shaped
 from .curve import Point, with_point
 from .job import TrainJob
 from .keeping import Keeper
@@ -54,16 +54,23 @@ class Run:
 
     Attributes:
         state: what changes while the run goes on.
+        plain: score of plain skinning.
+        scoring: how long a validation takes, about [s].
         saved: iteration of the state on disk.
     """
 
     def __init__(self, job: TrainJob, report: Reporter, team: Team = ALONE) -> None:
+        self._began = time.monotonic()
         self.job, self.report, self.device, self.team = job, report, chosen_device(job.device), team
         self.keeper, identity = Keeper(job, self.device, team), {**job.identity(), "processes": team.size}
         self.state, tensors = load_state(self.keeper.state, identity) if job.resume else (RunState(identity), None)
+        self._began -= self.state.seconds
         self.parts = build_parts(job, self.device, team)
         if not job.resume:
             self._fit()
+        self.plain, self.scoring = self._score_plain()
+        if job.minutes and job.learns and not job.resume:
+            self._plan(60 * job.minutes)
         self._build_stepper()
         self._announce()
         self.keeper.tidy()
@@ -74,15 +81,30 @@ class Run:
         self.keeper.save_curve(self.state, self.plain)
         self._since = self._saved_at = time.monotonic()
 
-    @cached_property
-    def plain(self) -> Score:
-        """Score of plain skinning."""
-        return self.parts.validator.plain_score()
-
     @property
     def config(self) -> TrainConfig:
-        """The schedule as it was asked for, with what had to be lowered."""
-        return self.state.lowered[-1].applied(self.job.train) if self.state.lowered else self.job.train
+        """The schedule as it was asked for, for the minutes that it has, with what had to be lowered."""
+        asked, state = self.job.train, self.state
+        config = shaped(asked, state.planned) if state.planned else asked
+        return state.lowered[-1].applied(config) if state.lowered else config
+
+    def _score_plain(self) -> tuple[Score, float]:
+        """Return the score of plain skinning, and how long that took [s]."""
+        began = time.monotonic()
+        return self.parts.validator.plain_score(), time.monotonic() - began
+
+    def _plan(self, seconds: float) -> None:
+        """Choose as many iterations as fit, by a few steps of a model that is put back afterwards."""
+        need(self.team.size == 1, str(self.job.output), "minutes for a team of processes", "its clocks differ",
+             "set the iterations instead (--set iterations=...)")  # fmt: skip
+        model, left = self.parts.model, seconds - (time.monotonic() - self._began)
+        before = {name: value.clone() for name, value in model.state_dict().items()}
+        stepper = self.parts.stepper(self.config, self.job.train.seed)
+        self.state.planned = fitting_iterations(stepper, self.config, left, self.scoring, str(self.job.output))
+        del stepper
+        self._empty_memory()
+        model.load_state_dict(before)
+        self.report(Message(f"{self.state.planned} iterations are planned for {seconds / 60:g} minutes"))
 
     def _build_stepper(self) -> None:
         seed = self.job.train.seed + len(self.state.lowered)  # so as not to draw the same windows once more
@@ -93,16 +115,19 @@ class Run:
     def _rebuild_stepper(self, tensors: dict[str, Tensor]) -> None:
         """Make a stepper of what was learned and of what is lowered now."""
         del self.stepper, self.watch
+        self._empty_memory()
+        self._build_stepper()
+        restore_learned(self.stepper, tensors)
+
+    def _empty_memory(self) -> None:
         gc.collect()
         if self.device.type == "cuda":
             torch.cuda.empty_cache()
-        self._build_stepper()
-        restore_learned(self.stepper, tensors)
 
     def _take_up(self, tensors: dict[str, Tensor]) -> None:
         restore(self.keeper.state, self.stepper, tensors, self.team.rank)
         self.saved, best = self.state.iteration, self.state.best
-        self.report(Message(f"resumed at iteration {self.state.iteration} of {self.job.train.iterations}"))
+        self.report(Message(f"resumed at iteration {self.state.iteration} of {self.config.iterations}"))
         if best and best.iteration == self.state.iteration:
             self._write_model(best.score)  # the run may have been killed before it was written
         elif best and not self.job.output.is_file():
@@ -171,7 +196,7 @@ class Run:
         elif self.job.model.scheme == "quasi_static":
             self.report(Message(f"{path}: nothing is loose; the garment is quasi-static and gets no stepper."))
         detail = {**self.parts.detail(), "memory predicted [MiB]": self._memory() >> 20}
-        self.report(Started("train", self.job.train.iterations, detail))
+        self.report(Started("train", self.config.iterations, detail))
 
     def step(self) -> None:
         """Do one iteration."""
@@ -180,7 +205,7 @@ class Run:
 
     def look(self, seconds_left: float) -> None:
         """Report how far training is, and look after steps that were undone."""
-        self.report(Progress(self.state.iteration, self.job.train.iterations, seconds_left, self._batch_terms()))
+        self.report(Progress(self.state.iteration, self.config.iterations, seconds_left, self._batch_terms()))
         if told := self.watch.look():
             self.report(Message(told, "warning"))
         if self.watch.hopeless:
@@ -193,7 +218,7 @@ class Run:
     @property
     def validation_due(self) -> bool:
         """Whether the schedule wants a validation now."""
-        config, iteration = self.job.train, self.state.iteration
+        config, iteration = self.config, self.state.iteration
         scheduled = iteration % config.validate_every == 0 or iteration == config.iterations
         return scheduled and iteration >= max(1, config.warm_iterations) and iteration != self.saved
 
@@ -215,6 +240,12 @@ class Run:
             self.keeper.save_curve(state, self.plain)
             if better:
                 self._write_model(score)
+
+    def end_early(self) -> None:
+        """End where the time is up, with a validation if what was learned since the last one deserves it."""
+        self.report(Message(f"time is up at iteration {self.state.iteration} of {self.config.iterations}"))
+        if self.state.iteration != self.saved and self.state.iteration >= self.config.warm_iterations:
+            self.validate()
 
     def _score(self) -> Score:
         found: list[Score] = []
@@ -264,6 +295,12 @@ class Run:
     def save_due(self) -> bool:
         """Whether enough time has gone by to save again."""
         return self._agreed(time.monotonic() - self._saved_at >= SAVE_EVERY)
+
+    @property
+    def out_of_time(self) -> bool:
+        """Whether the job's minutes are over, but for a last validation; training before a resumption counts."""
+        spent = time.monotonic() - self._began
+        return self.job.minutes is not None and spent + self.scoring > 60 * self.job.minutes
 
     def stops(self, stop: threading.Event) -> bool:
         """Return whether to stop here."""
@@ -320,17 +357,21 @@ def train(job: TrainJob, report: Reporter, stop: threading.Event | None = None, 
         SsilkError: the inputs or the memory do not suffice, or training diverged.
     """
     run = Run(job, report, team)
-    _loop(run, stop or threading.Event())
+    finished = _loop(run, stop or threading.Event())
     run.save()
     if run.state.undone:
         report(Message(f"{run.state.undone} steps in all were undone.", "warning"))
     score = run.kept()
-    return Trained(run.state.iteration >= job.train.iterations, run.state.iteration, score, run.plain)
+    return Trained(finished, run.state.iteration, score, run.plain)
 
 
-def _loop(run: Run, stop: threading.Event) -> None:
-    began, steps, total = time.monotonic(), 0, run.job.train.iterations
+def _loop(run: Run, stop: threading.Event) -> bool:
+    """Do iterations until all are done, or time is up, or somebody wants to stop; return whether it was not that."""
+    began, steps, total = time.monotonic(), 0, run.config.iterations
     while run.state.iteration < total and not run.stops(stop):
+        if run.out_of_time:
+            run.end_early()
+            return True
         run.step()
         steps += 1
         if run.state.iteration % EVERY == 0 or run.state.iteration == total or steps == 1:
@@ -339,3 +380,4 @@ def _loop(run: Run, stop: threading.Event) -> None:
             run.validate()
         elif run.save_due:
             run.save()
+    return run.state.iteration >= total

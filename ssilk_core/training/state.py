@@ -70,6 +70,7 @@ class RunState:
         lowered: what had to be lowered, in order; the last holds.
         undone: steps undone because something was not finite.
         seconds: as in `curve.Point`.
+        planned: iterations that fit into the job's minutes; zero for those of its schedule.
         curve: the validations.
     """
 
@@ -79,6 +80,7 @@ class RunState:
     lowered: list[Lowered] = field(default_factory=list)
     undone: int = 0
     seconds: float = 0.0
+    planned: int = 0
     curve: list[Point] = field(default_factory=list)
 
 

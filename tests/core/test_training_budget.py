@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trainings that have minutes instead of iterations."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from ssilk_core.config import TrainConfig
+from ssilk_core.errors import SsilkError
+from ssilk_core.events import Message, Started, silent
+from ssilk_core.training import budget
+from ssilk_core.training import run as training
+from ssilk_core.training.budget import fitting_iterations, shaped
+from ssilk_core.training.run import Run, train
+from ssilk_core.training.state import load_state, state_path
+from ssilk_core.training.step import learning_rate
+
+from .test_training_run import SHORT, job  # noqa: F401  (a fixture)
+
+PLAN = TrainConfig(iterations=1000, warm=0.3, rate_warmup=50, validate_every=100, average=0.998)
+
+
+@pytest.mark.parametrize("iterations", [50, 1000, 8000])
+def test_a_stretched_schedule_has_the_same_shape(iterations):
+    found, factor = shaped(PLAN, iterations), iterations / PLAN.iterations
+    assert found.iterations == iterations and found.warm_iterations == round(PLAN.warm_iterations * factor)
+    assert found.iterations // found.validate_every == 10
+    for share in (0.1, 0.4, 0.6, 0.9):
+        rates = [learning_rate(config, int(share * config.iterations)) for config in (found, PLAN)]
+        assert rates[0] == pytest.approx(rates[1], rel=0.02)
+    # What the running average still holds of the first parameters in the end.
+    assert found.average**iterations == pytest.approx(PLAN.average**1000, rel=1e-6)
+    assert shaped(replace(PLAN, average=0.0), iterations).average == 0
+
+
+class Clocked:
+    """A stepper that needs a given time for each step of a phase, by a clock of its own."""
+
+    device = torch.device("cpu")
+
+    def __init__(self, warm: float, proper: float) -> None:
+        self.times, self.now = (warm, proper), 0.0
+
+    def run(self, iteration: int) -> None:
+        self.now += self.times[iteration >= PLAN.warm_iterations]
+
+
+def planned(monkeypatch: pytest.MonkeyPatch, seconds: float, scoring: float = 0.0) -> int:
+    stepper = Clocked(0.1, 0.4)
+    monkeypatch.setattr(budget, "_clock", lambda device: stepper.now)
+    return fitting_iterations(stepper, PLAN, seconds, scoring, "cape.safetensors")  # type: ignore[arg-type]
+
+
+def test_as_many_iterations_are_planned_as_fit(monkeypatch):
+    each = 0.3 * 0.1 + 0.7 * 0.4
+    assert planned(monkeypatch, 600) == int(0.9 * 600 / each)
+    assert planned(monkeypatch, 600, scoring=10) == int((0.9 * 600 - 8 * 10) / each)
+    with pytest.raises(SsilkError, match=r"^cape.safetensors: 14 iterations fit into the minutes .* smaller preset"):
+        planned(monkeypatch, 5)
+
+
+def test_a_run_with_minutes_is_one_of_as_many_iterations(job, monkeypatch):  # noqa: F811
+    """Timing its steps leaves no trace in what is learned."""
+    real, said = training.fitting_iterations, []
+    monkeypatch.setattr(budget, "FEWEST", 1)
+    monkeypatch.setattr(training, "fitting_iterations", lambda *given: real(*given) * 0 + 11)
+    trained = train(job("minutes", minutes=5.0), said.append)
+    assert trained.finished and trained.iterations == 11
+    assert [event.total for event in said if isinstance(event, Started)] == [11]
+    assert any(
+        "11 iterations are planned for 5 minutes" in event.text for event in said if isinstance(event, Message)
+    )
+    plain = job("iterations", shaped(SHORT, 11))
+    train(plain, silent)
+    asked = job("minutes", minutes=5.0)
+    _, one = load_state(state_path(asked.output), asked.identity())
+    _, other = load_state(state_path(plain.output), plain.identity())
+    assert one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_a_run_ends_with_its_time_and_goes_on_with_more(job, monkeypatch):  # noqa: F811
+    monkeypatch.setattr(training, "fitting_iterations", lambda *_: 13)
+    with monkeypatch.context() as patch:
+        patch.setattr(Run, "out_of_time", property(lambda run: run.state.iteration == 8))
+        said: list = []
+        trained = train(job("early", minutes=1.0), said.append)
+    assert trained.finished and trained.iterations == 8
+    assert any(event.text == "time is up at iteration 8 of 13" for event in said if isinstance(event, Message))
+    state, _ = load_state(state_path(job("early").output), job("early").identity())
+    assert state.best and state.curve[-1].iteration == 8
+    assert train(job("early", minutes=9.0, resume=True), silent).iterations == 13
+
+
+def test_time_is_up_when_no_validation_fits_any_more(job, monkeypatch):  # noqa: F811
+    monkeypatch.setattr(training, "fitting_iterations", lambda *_: 13)
+    run = Run(job("clock", minutes=1.0), silent)
+    now = run._began
+    monkeypatch.setattr(training.time, "monotonic", lambda: now)
+    run.scoring = 10.0
+    for now, over in ((run._began + 49.0, False), (run._began + 51.0, True)):  # noqa: B007
+        assert run.out_of_time == over
+    assert not Run(job("endless"), silent).out_of_time
