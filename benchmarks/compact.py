@@ -27,9 +27,12 @@ from ssilk_usd.read_motion import read_motion
 from ssilk_usd.write import write_motion
 
 from ssilk_core.assets import Floats
+from ssilk_core.cli import main
 from ssilk_core.cli._layers import Wardrobe, bake_task, layout_of
 from ssilk_core.events import silent
 from ssilk_core.farm.tasks import Task
+from ssilk_core.kinematics import deform
+from ssilk_core.targets import TARGETS, capped
 
 SAMPLED = ("blendShapeWeights", "rotations")
 BITS = (16, 12, 10)
@@ -45,7 +48,7 @@ class Row:
     errors: Floats
 
 
-def main() -> None:
+def measure() -> None:
     """Measure and write the table."""
     options = _options()
     with tempfile.TemporaryDirectory() as name:
@@ -58,10 +61,10 @@ def main() -> None:
         bake_task(task, folder / "usd", wardrobe, silent)
         bake_task(replace(task, target="blender"), folder / "blender", wardrobe, silent)
         exact = np.stack(list(wardrobe.dressed(task).over(task.motion).vertices(silent)))
-        rows = list(_rows(task, folder, exact))
+        rows = [*_rows(task, folder, exact), *_targets(task, folder, exact), _heaviest(wardrobe, task, exact)]
     cache = exact.size * 4
     cells = [
-        [row.name, f"{row.size:,}", f"1 / {cache / row.size:.1f}", f"{1e3 * row.errors.max():.2g}",
+        [row.name, *_share(row.size, cache), f"{1e3 * row.errors.max():.2g}",
          f"{1e3 * row.errors.mean():.2g}"] for row in rows
     ]  # fmt: skip
     measured = [
@@ -111,6 +114,28 @@ def _rows(task: Task, folder: Path, exact: Floats) -> Iterator[Row]:
         yield Row(name=name, size=_deflated(rounded), errors=_errors(rounded, exact))
 
 
+def _targets(task: Task, folder: Path, exact: Floats) -> Iterator[Row]:
+    """Yield the shot as one file for each target, garment alone."""
+    for name, target in TARGETS.items():
+        path = folder / f"{name}{target.suffixes[0]}"
+        main(["bake", task.model, "--stage", task.stage, "--motion", task.motion, "--target", name, "--no-body",
+              "-o", str(path)])  # fmt: skip
+        yield Row(name=f"one file for {name}, garment alone", size=path.stat().st_size, errors=_errors(path, exact))
+
+
+def _share(size: int, cache: int) -> tuple[str, str]:
+    return (f"{size:,}", f"1 / {cache / size:.1f}") if size else ("", "")
+
+
+def _heaviest(wardrobe: Wardrobe, task: Task, exact: Floats) -> Row:
+    """Return what capping influences alone would cost: the heaviest of each vertex, with nothing learned."""
+    bake = wardrobe.dressed(task).over(task.motion)
+    deformer = capped(bake.deformer, TARGETS["game4"])
+    points = np.concatenate([deform(deformer, bake.motion, pose) for pose in bake.poses()])
+    errors = np.linalg.norm(points - exact, axis=-1)
+    return Row(name="for comparison: the 4 heaviest influences, nothing learned", size=0, errors=errors)
+
+
 def _errors(path: Path, exact: Floats) -> Floats:
     shot = Shot(path)
     played = np.stack([shot.garment_points(time) for time in shot.frame_times])
@@ -139,4 +164,4 @@ def _round(source: Path, target: Path, bits: int) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    measure()

@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from .assets import Body, Deformer, SkinWeights
+from .errors import need
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,19 +41,27 @@ TARGETS = {
 }
 
 
-def fitted(deformer: Deformer, target: Target) -> Deformer:
+def need_influences(found: int, name: str, model: str) -> None:
+    """Raise `SsilkError` where `found` joints move a vertex of a model, which are more than target `name` takes."""
+    most = TARGETS[name].influences
+    need(most is None or found <= most, model, f"{found} joints move a vertex", f"--target {name} takes {most}",
+         f"learn what fewer can do: 'ssilk reduce --influences {most}' with the motions of the shots")  # fmt: skip
+
+
+def capped(deformer: Deformer, target: Target) -> Deformer:
     """Return a garment and its character's bodies with each vertex moved by its heaviest influences alone.
 
-    What is left of a vertex's weights is scaled to a sum of one. Nothing changes where nothing is capped.
+    What is left of a vertex's weights is scaled to a sum of one, as exporters do it. A trained garment has no more
+    than its target takes by then (`need_influences`); what is capped are bodies, and plain skinning.
     """
     most = target.influences
     if most is None:
         return deformer
     scene = deformer.scene
-    bodies = tuple(Body(body.mesh, _capped(body.skin, most)) for body in scene.character.bodies)
+    bodies = tuple(Body(body.mesh, _heaviest(body.skin, most)) for body in scene.character.bodies)
     scene = replace(scene, character=replace(scene.character, bodies=bodies))
-    return replace(deformer, scene=scene, skin=_capped(deformer.skin, most))
+    return replace(deformer, scene=scene, skin=_heaviest(deformer.skin, most))
 
 
-def _capped(skin: SkinWeights, most: int) -> SkinWeights:
+def _heaviest(skin: SkinWeights, most: int) -> SkinWeights:
     return SkinWeights.from_dense(skin.path, skin.dense(int(skin.indices.max()) + 1), most)

@@ -18,7 +18,7 @@ from ssilk_core.errors import VerificationError, need
 from ssilk_core.events import Message, Progress, Reporter, silent
 from ssilk_core.fabrics import Fabric
 from ssilk_core.kinematics import deform, plain_deformer, plain_poses, resample
-from ssilk_core.targets import TARGETS, Target, fitted
+from ssilk_core.targets import TARGETS, Target, capped
 
 from ._quality import lost
 from ._refining import Refinement
@@ -99,6 +99,11 @@ class Bake:
     def target(self) -> Target:
         return TARGETS[self.request.target]
 
+    @property
+    def influences(self) -> int:
+        """Return how many joints move a vertex of the trained garment, at most; 0 under plain skinning."""
+        return 0 if self.model is None else self.model.scene.rig.skin.indices.shape[1]
+
     def carried(self, output: Path) -> dict[str, Any]:
         """Return what a file says of its origin; `recovered` fills as the poses go through."""
         refined = {"refined": self.refinement.figures} if self.refinement else {}
@@ -164,36 +169,17 @@ class Bake:
         yield from self.refinement.points
 
     def vertices(self, report: Reporter) -> Iterator[Floats]:
-        """Yield the garment's points (V, 3) [m] at each sample: the decoder's own, or as the target takes them."""
+        """Yield the garment's points (V, 3) [m] at each sample, as the decoder has them."""
         for pose in self.poses():
-            yield from self._fitted(pose) if self._departs else self._decoded(pose)
+            yield from self._decoded(pose)
             report(Progress(pose.start + pose.frame_count, self.motion.frame_count))
 
     def _decoded(self, pose: GarmentPose) -> Floats:
         if self.model is None:
-            return self._fitted(pose)
+            return deform(self.deformer, self.motion, pose)
         from ssilk_core.rollout import decode
 
         return decode(self.model, self.motion, pose)
-
-    def _fitted(self, pose: GarmentPose) -> Floats:
-        return deform(self.deformer, self.motion, pose)
-
-    @property
-    def _departs(self) -> bool:
-        """Return whether the target takes something else than what the decoder computes."""
-        return self.model is not None and self.target.influences is not None
-
-    def departure(self) -> dict[str, object]:
-        """Return how far the target's garment is from the decoder's own, where it takes another."""
-        if not self._departs:
-            return {}
-        away = [np.linalg.norm(self._fitted(pose) - self._decoded(pose), axis=-1) for pose in self.poses()]
-        errors = np.concatenate(away)
-        return {
-            f"largest error of {self.request.target} [m]": f"{errors.max():.3g}",
-            f"mean error of {self.request.target} [m]": f"{errors.mean():.3g}",
-        }
 
     def verify(self, path: Path, report: Reporter) -> dict[str, object]:
         """Check a written shot and compare it, re-skinned by UsdSkel, with the decoder; return figures.
@@ -226,8 +212,7 @@ class Bake:
                 f"{path}: vertex {found.vertex} at time code {found.time:g} is {found.worst:.3g} m from where the "
                 f"decoder has it; at most {found.bound:.3g} m is allowed."
             )
-        proof = {"largest error [m]": f"{found.worst:.3g}", "allowed [m]": f"{found.bound:.3g}"}
-        return {**proof, **(self.departure() if shot.is_skinned else {})}
+        return {"largest error [m]": f"{found.worst:.3g}", "allowed [m]": f"{found.bound:.3g}"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,7 +285,7 @@ def worn(file: ModelFile, like: GarmentModel, request: BakeRequest) -> tuple[Gar
 
     model = network(file, replace(file.scene, character=like.scene.character))
     model.to(chosen_device(request.device))
-    return model, fitted(model.deformer(), TARGETS[request.target])
+    return model, capped(model.deformer(), TARGETS[request.target])
 
 
 def open_bake(request: BakeRequest) -> Bake:
@@ -335,7 +320,7 @@ def dressed(request: BakeRequest) -> Dressed:
     model = None if request.plain else network(file, scene).to(device)
     deformer = plain_deformer(scene) if model is None else model.deformer()
     provenance = {"model_sha256": sha256(request.model), "training": file.provenance.get("ssilk", "")}
-    return Dressed(request, file, model, fitted(deformer, target), _units(stage, target), provenance)
+    return Dressed(request, file, model, capped(deformer, target), _units(stage, target), provenance)
 
 
 def _units(stage: Usd.Stage, target: Target) -> StageUnits:

@@ -15,6 +15,7 @@ from ssilk_core.events import Message, Reporter, silent
 from ssilk_core.farm.record import NAME, Record, is_current, read_record, task_key, write_record
 from ssilk_core.farm.tasks import Task
 from ssilk_core.files import remove_unfinished, replacing, sha256
+from ssilk_core.targets import need_influences
 
 from ._baking import Bake, BakeRequest, Dressed, dressed
 
@@ -94,6 +95,7 @@ def bake_task(
     for path in _own(layout):
         remove_unfinished(path)
     bake = wardrobe.dressed(task).over(task.motion)
+    need_influences(bake.influences, task.target, task.model)
     asset = wardrobe.asset(task, layout, report)
     detail = _write_animation(layout, asset, bake, task, report)
     files = [layout.animation, layout.asset, layout.geometry, *([layout.points] if task.points else [])]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bakes of some level of quality, or within a budget."""
+"""Bakes of some level of quality, within a budget, or of no more influences than their target takes."""
 
 from __future__ import annotations
 
@@ -20,18 +20,19 @@ from ssilk_core.reduction import Reducer
 from ._baking import Bake, open_bake
 from ._quality import level_size, spent
 
-EXCERPTS = 16, 64  # frames of a shot that are written to tell how large all of it becomes
+EXCERPT = 64  # frames of a shot that are written to tell how large all of it becomes
 
 
 def levelled(bake: Bake, options: argparse.Namespace, report: Reporter) -> Bake:
-    """Return a bake with as much of its garment kept, and as many frames, as the options ask for.
+    """Return a bake with as much of its garment kept, and as many frames, as the options and the target ask for.
 
-    What is kept is the best for this shot's own motion.
+    What is kept is the best for this shot's own motion: weights and blendshapes are fitted to it.
 
     Raises:
         SsilkError: nothing fits the budget, or plain skinning is baked.
     """
-    if not (options.quality or options.budget):
+    most = bake.target.influences or bake.influences
+    if not (options.quality or options.budget or bake.influences > most):
         return bake
     need(bake.model is not None, "--plain", "plain skinning has no level of quality", "--quality and --budget are "
          "about the network", "leave one of them out")  # fmt: skip
@@ -40,6 +41,7 @@ def levelled(bake: Bake, options: argparse.Namespace, report: Reporter) -> Bake:
         request = replace(request, fps=quality_named(options.quality).rate(bake.source.fps))
     reducer = Reducer(load_model(request.model), [bake.source])
     size = level_size(options.quality, reducer.whole)
+    size = replace(size, influences=min(size.influences, most))
     if options.budget:
         at_rate = open_bake(request)
 
@@ -53,7 +55,8 @@ def levelled(bake: Bake, options: argparse.Namespace, report: Reporter) -> Bake:
 
 def shot_bytes(bake: Bake, suffix: str, *, body: bool) -> ShotBytes:
     """Return about how large a shot becomes: two excerpts are written, of some frames and of more."""
-    few, many = (min(count * bake.request.samples, bake.motion.frame_count) for count in EXCERPTS)
+    many = min(EXCERPT * bake.request.samples, bake.motion.frame_count)
+    few = max(many // 4, 1)
     first, second = (_excerpt_bytes(bake, count, suffix, body) for count in (few, many))
     frame = (second - first) / max(many - few, 1)
     points = POINT * bake.deformer.scene.garment.mesh.vertex_count if bake.as_points else 0

@@ -16,7 +16,7 @@ from ssilk_core.farm.tasks import Task, plan
 from ssilk_core.files import need_writable
 from ssilk_core.setup.classes import ClassOptions
 from ssilk_core.setup.rig import RigOptions
-from ssilk_core.targets import TARGETS
+from ssilk_core.targets import TARGETS, need_influences
 
 INPUTS = ("model", "stage", "motion")  # what a shot is baked from
 
@@ -147,12 +147,17 @@ def layer_tasks(options: argparse.Namespace) -> list[Task]:
     """Return the tasks that the options of `add_bake` ask for, as layers.
 
     Raises:
-        SsilkError: the target takes no layers.
+        SsilkError: the target takes no layers, or fewer influences than a model has: all shots share its weights.
     """
-    suffixes = TARGETS[options.target].suffixes
-    need(".usdc" in suffixes, f"--target {options.target}", "layers", f"it takes {', '.join(suffixes)}",
+    from ssilk_core.checkpoint import load_model
+
+    target = TARGETS[options.target]
+    need(".usdc" in target.suffixes, f"--target {options.target}", "layers", f"it takes {', '.join(target.suffixes)}",
          "bake one garment over one motion into such a file")  # fmt: skip
-    return tasks_of(options)
+    tasks = tasks_of(options)
+    for model in sorted({task.model for task in tasks if target.influences and not task.plain}):
+        need_influences(load_model(model).scene.rig.skin.indices.shape[1], options.target, model)
+    return tasks
 
 
 def is_folder(output: Path) -> bool:
