@@ -15,7 +15,9 @@ from __future__ import annotations
 
 import argparse
 import gc
+import multiprocessing
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from importlib.metadata import version
@@ -107,20 +109,33 @@ def measure_parts(at: Moment, clock: Clock) -> dict[str, Figures]:
     return measured
 
 
+def measure_case(size: Size, variants: list[str], device: torch.device, options: argparse.Namespace) -> Figures:
+    """Return what `measure` does of each variant, and the rates of the device."""
+    torch.set_num_threads(options.threads)
+    with torch.cuda.stream(side_stream(device)):
+        clock = Clock(device, options.seconds)
+        rates = asdict(Rates.measured(clock, device))
+        return {"rates": rates, **{variant: measure(size, variant, clock, device) for variant in variants}}
+
+
 def measure_all(options: argparse.Namespace) -> Figures:
-    """Measure every case in every variant that the device has, and write what is known after each."""
+    """Measure every case in every variant that the device has, and write what is known after each.
+
+    Each case has a process of its own, so that nothing of one is left when the next begins.
+    """
     device = chosen_device(options.device)
-    clock = Clock(device, options.seconds)
-    rates = Rates.measured(clock, device)
     variants = [PLAIN, KERNELS] if kernels.available(device) else [PLAIN]
-    measured: Figures = {"triton": version("triton") if KERNELS in variants else None}
-    measured |= {"rates": asdict(rates), "cases": {}}
-    for name, size in cases(options).items():
-        case = {variant: measure(size, variant, clock, device) for variant in variants}
-        measured["cases"][name] = {"size": asdict(size), **case}
-        steps = (f"{kind} {figures['steps'][WINDOWS]['median']:.3g} ms" for kind, figures in case.items())
-        print(f"{name}: a step {', '.join(steps)}", flush=True)
-        save_results(options, tables(measured), measured)
+    measured: Figures = {"triton": version("triton") if KERNELS in variants else None, "cases": {}}
+    spawned = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=spawned, max_tasks_per_child=1) as processes:
+        for name, size in cases(options).items():
+            case = processes.submit(measure_case, size, variants, device, options).result()
+            rates = case.pop("rates")
+            measured.setdefault("rates", rates)
+            measured["cases"][name] = {"size": asdict(size), **case}
+            steps = (f"{kind} {figures['steps'][WINDOWS]['median']:.3g} ms" for kind, figures in case.items())
+            print(f"{name}: a step {', '.join(steps)}", flush=True)
+            save_results(options, tables(measured), measured)
     return measured
 
 
@@ -135,9 +150,7 @@ def main() -> None:
     parser.add_argument("--no-default-batch", dest="default_batch", action="store_false",
                         help="leave out the batch that training has by default")  # fmt: skip
     options = parser.parse_args()
-    torch.set_num_threads(options.threads)
-    with torch.cuda.stream(side_stream(chosen_device(options.device))):
-        measured = measure_all(options)
+    measured = measure_all(options)
     write_results(options, tables(measured), measured)
 
 
