@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import bpy
-from bpy.props import BoolProperty, CollectionProperty, EnumProperty, IntProperty, StringProperty
+from bpy.props import BoolProperty, CollectionProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
 from .scene.motions import KINDS
 
@@ -37,6 +37,14 @@ class TrainingSettings(bpy.types.PropertyGroup):
         default=0,
         min=0,
         max=10_000_000,
+    )
+    minutes: FloatProperty(
+        name="Minutes",
+        description="Wall time to fill with as many steps as fit, in place of the preset's; zero for these",
+        default=0.0,
+        min=0.0,
+        soft_max=600.0,
+        precision=1,
     )
     folder: StringProperty(
         name="Folder",

@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import bpy
+import numpy as np
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
 
+from ..contract.arrays import Joints
 from ..errors import SetupError, need
 from ..outside.work import Work
 from ..preferences import interpreter, preferences, unready
@@ -92,7 +94,10 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
         self.shot = usd_path(garment, self.filepath) if self.to_usd else None
         self.python = interpreter(preferences(context))
         self.character = character_joints(joints)
-        return Work(f"Baking '{garment.name}'", self.commands, parent=bpy.app.tempdir, steps=self.steps())
+        closing = self.closing() if self.to_timeline else None
+        return Work(
+            f"Baking '{garment.name}'", self.commands, parent=bpy.app.tempdir, steps=self.steps(), closing=closing
+        )
 
     def steps(self) -> Iterator[float]:
         """Sample the timeline, then write it."""
@@ -126,6 +131,22 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
             ]
         ]  # fmt: skip
 
+    def closing(self) -> Iterator[float]:
+        """Read what was baked; writing it takes long enough by itself."""
+        from ..contract.shot import read_shot
+
+        self.joints = self.bakeable_joints()
+        self.baked = read_shot(self.shot, self.joints)
+        yield 1.0
+
+    def bakeable_joints(self) -> Joints:
+        """Return the joints as they are by now; raise `SetupError` where nothing can be baked onto them any more."""
+        garment, armature = self.pair.objects()
+        joints = read_joints(armature, garment)
+        need_bakeable(garment, armature, joints)
+        need_tracks(animated(garment, armature))
+        return joints
+
     def finish(self, context: bpy.types.Context, work: Work) -> str:
         where = [self.put_on_timeline()] if self.to_timeline else []
         where += [str(self.shot)] if self.to_usd else []
@@ -133,16 +154,14 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
 
     def put_on_timeline(self) -> str:
         """Put keys in place of those baked before; return what was done."""
-        from ..contract.shot import read_shot
-
         garment, armature = self.pair.objects()
-        joints = read_joints(armature, garment)
-        need_bakeable(garment, armature, joints)
-        need_tracks(animated(garment, armature))
-        shot = read_shot(self.shot, joints)
+        joints, read = self.bakeable_joints(), self.joints
+        same = joints.names == read.names and np.array_equal(joints.parents, read.parents)
+        need(same, f"Bones of '{armature.name}' were changed while '{garment.name}' was baked; bake it again.")
         playing.stop(garment)
-        apply_shot(garment, armature, joints, shot)
-        still = f" ({shot.left_out} proxies are not in it and stay at rest)" if shot.left_out else ""
+        apply_shot(garment, armature, joints, self.baked)
+        left = self.baked.left_out
+        still = f" ({left} proxies are not in it and stay at rest)" if left else ""
         return f"frames {self.take.frames[0]} to {self.take.frames[-1]}{still}"
 
 
@@ -170,7 +189,7 @@ class RemoveBake(ReportingOperator, bpy.types.Operator):
 
 def lost(figures: Mapping[str, Any]) -> str:
     """Return what bones and shape keys lose of a refined garment, in words; empty where nothing was put back."""
-    typical, most = (figures.get(f"joints lose, {which} [mm]") for which in ("RMS", "at most"))
+    typical, most = (figures.get(f"refined: joints lose, {which} [mm]") for which in ("RMS", "at most"))
     if typical is None:
         return ""
     return f"; bones and shape keys miss the refined vertices by {typical:g} mm (RMS), {most:g} mm at most"

@@ -20,6 +20,7 @@ from ..fabric_properties import fabric_options
 from ..outside import jobs
 from ..outside.work import Work
 from ..preferences import interpreter, preferences, unready
+from ..scene import playing
 from ..scene.baked import need_bakeable
 from ..scene.follower import leader_of
 from ..scene.garment import armature_of, unusable
@@ -133,6 +134,8 @@ class Train(tasks.OutsideOperator, bpy.types.Operator):
         need(not (running and running.alive), f"'{garment.name}' is being trained already; cancel that first.")
         chosen = any(item.use for item in settings.motions)
         need(chosen, f"No motion is chosen for '{garment.name}'; find motions, or add files of motions.")
+        both = settings.iterations and settings.minutes
+        need(not both, f"'{garment.name}' has a budget in iterations and in minutes; set one of them to zero.")
         self.dressed = gather(garment)
         need_trainable(garment, armature, self.dressed)
         self.chosen = Chosen.of(garment, armature)
@@ -242,6 +245,7 @@ def train_command(garment: bpy.types.Object, prim: str, takes: Sequence[str], fi
     settings = garment.ssilk.training
     motions = [*(f"{MOTIONS}/{name}" for name in takes), *files]
     budget = ["--set", f"iterations={settings.iterations}"] if settings.iterations else []
+    budget += ["--minutes", f"{settings.minutes:g}"] if settings.minutes else []
     return [
         "-m", "ssilk_core", "train", STAGE, "--garment", prim, "--motions", *motions, "-o", jobs.MODEL,
         "--preset", settings.preset, *budget, *fabric_options(garment.ssilk.fabric), "--json",
@@ -257,12 +261,13 @@ def beside(path: Path, folder: Path) -> str:
 
 
 def watch() -> float:
-    """Draw panels again where a training went on; return when to look next [s]."""
+    """Draw panels again where a training went on, and play by its new model; return when to look next [s]."""
     from ..panels.training import changed
 
     garments = [thing for thing in bpy.data.objects if thing.type == "MESH" and thing.ssilk.training.folder]
     if sum(changed(garment) for garment in garments):  # all are asked, so that none is drawn for once more
         tasks.redraw(bpy.context)
+    playing.take_up_models()
     return LOOK
 
 

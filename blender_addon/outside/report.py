@@ -48,7 +48,9 @@ def findings(state: JobState, curve: Mapping[str, Any], *, moves: bool) -> list[
     if moves:
         found.append(dynamics(score["dynamics"]))
     if state.checkpoint is not None:
-        found.append((f"Best model: from iteration {state.checkpoint}; bake to see it on your shot", False))
+        found.append(
+            (f"Best model: from iteration {state.checkpoint}; play it live or bake it to see it on your shot", False)
+        )
     return found
 
 

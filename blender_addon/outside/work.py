@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A piece of work: steps in Blender, then commands outside it one after another; progress, and how it ended."""
+"""A piece of work: steps in Blender, commands outside it, and steps again; progress, and how it ended."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SLICE = 0.04  # seconds that Blender waits for steps at a time
 
 
 class Work:
-    """Steps, then commands in a temporary folder of their own, which goes with `close`.
+    """Steps, then commands one after another in a temporary folder of their own, which goes with `close`, then steps.
 
     Attributes:
         title: what is being done, for people.
@@ -36,6 +36,7 @@ class Work:
         *,
         parent: str = "",
         steps: Iterator[float] | None = None,
+        closing: Iterator[float] | None = None,
         rephrase: Callable[[str], str] = str,
     ) -> None:
         """Prepare the steps; without any prepare the commands, given the temporary folder, and start the first one.
@@ -44,6 +45,7 @@ class Work:
             commands: writes what the commands read, and returns them; the folder goes if it raises.
             parent: where the folder is made; the system's place for temporary files when empty.
             steps: are done in this process first, for a moment in each `poll`; they yield the part that is done.
+            closing: are done likewise once all commands have succeeded.
             rephrase: turns messages into words for people, without the folder's paths.
         """
         self.title, self.text, self.error = title, "", ""
@@ -54,7 +56,7 @@ class Work:
         self.folder = Path(self._temporary.name)
         self._process: Process | None = None
         self._commands, self._waiting = commands, list[Command]()
-        self._steps, self._rephrase = steps, rephrase
+        self._steps, self._closing, self._rephrase = steps, closing, rephrase
         try:
             if steps is None:
                 self._begin()
@@ -74,7 +76,7 @@ class Work:
         if running:
             return False
         self._end(self._process)
-        return self._process is None
+        return self._process is None and self._steps is None
 
     def cancel(self) -> None:
         """Ask the running command to stop; `poll` says when it has."""
@@ -90,22 +92,22 @@ class Work:
         self._temporary.cleanup()
 
     def _step(self, steps: Iterator[float]) -> None:
-        """Do steps for a moment; after the last one start the commands."""
-        until = time.monotonic() + SLICE
+        """Do steps for a moment; after the last one start the commands, unless these have been."""
+        until, first = time.monotonic() + SLICE, steps is not self._closing
         try:
             need(not self.cancelled, f"{self.title} was cancelled.")
             for self.fraction in steps:
                 if time.monotonic() >= until:
                     return
             self._steps = self.fraction = None
-            self._begin()
+            if first:
+                self._begin()
         except SetupError as error:
             self._steps, self.error = None, str(error)
 
     def _begin(self) -> None:
         self._waiting = list(self._commands(self.folder))
-        if self._waiting:
-            self._start_next()
+        self._go_on()
 
     def _hear(self, event: Event) -> None:
         self.text = self._rephrase(event.text) or self.text
@@ -122,10 +124,14 @@ class Work:
         elif process.exit_code:
             reason = process.complaint or f"the command ended with code {process.exit_code}"
             self.error = self.error or f"{self.title} failed: {reason}"
-        elif self._waiting:
-            self._start_next()
+        else:
+            self._go_on()
 
-    def _start_next(self) -> None:
+    def _go_on(self) -> None:
+        """Start the next command; after the last one do the closing steps."""
+        if not self._waiting:
+            self._steps = self._closing
+            return
         command = self._waiting.pop(0)
         try:
             self._process = Process(command, self.folder)

@@ -76,7 +76,9 @@ class TrainingPanel(Panel, bpy.types.Panel):
         settings, folder = garment.ssilk.training, job_of(garment)
         draw_motions(layout, garment)
         layout.prop(settings, "preset")
-        layout.prop(settings, "iterations")
+        row = layout.row(align=True)
+        row.prop(settings, "iterations")
+        row.prop(settings, "minutes")
         layout.operator("ssilk.train", icon="PLAY")
         state = folder and read_state(folder)
         if state:

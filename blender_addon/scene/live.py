@@ -40,16 +40,15 @@ class Live:
         stale: whether the armature does something else by now than what was read.
 
     Raises:
-        SetupError: the model cannot be read, or is of another garment or other bones.
+        SetupError: bones or the garment do not deform as ssilk has it.
     """
 
     def __init__(self, garment: bpy.types.Object, model: Path) -> None:
         armature = armature_of(garment)
         self.joints = read_joints(armature, garment)
         need_bakeable(garment, armature, self.joints)
-        self.trained = Trained(model, self.joints, bpy.context.scene.unit_settings.scale_length)
-        self.shapes = wear(garment, armature, self.joints, self.trained.shot())
         self.things = tuple((thing.name, thing.session_uid) for thing in (garment, armature))
+        self.model, self.trained, self._written = model, None, 0.0
         self.playback, self.first, self.placed = None, 0, np.zeros((0, 0, 4, 4))
         self.done: float | None = None
         self.stale = False
@@ -57,13 +56,22 @@ class Live:
 
     def refresh(self) -> None:
         """Read the motion anew; what was read goes on being played until that is done."""
-        garment, armature = self.objects()
+        _, armature = self.objects()
         (take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
-        self._steps = self._reading(garment, armature, take)
+        self._steps = self._reading(take)
         self.done, self.stale = 0.0, False
 
+    @property
+    def renewed(self) -> bool:
+        """Whether the model was written since it was read, as by a training that goes on."""
+        return self.model.is_file() and self.model.stat().st_mtime != self._written
+
     def read(self) -> bool:
-        """Read a little of the motion; return whether there is more."""
+        """Read a little of the model, then of the motion; return whether there is more.
+
+        Raises:
+            SetupError: the model cannot be read, or is of another garment or other bones.
+        """
         self.done = next(self._steps, None)
         return self.done is not None
 
@@ -71,6 +79,11 @@ class Live:
         """Return the garment and its armature; raise `SetupError` if one was deleted."""
         garment, armature = (_found(name, uid) for name, uid in self.things)
         return garment, armature
+
+    def ready(self) -> bool:
+        """Return whether the garment may be given other shapes and weights now."""
+        garment, _ = self.objects()
+        return garment.mode == "OBJECT"
 
     def is_in(self, scene: bpy.types.Scene) -> bool:
         """Return whether a scene holds the garment; motions are read in one that does not."""
@@ -101,16 +114,32 @@ class Live:
         lost += [name for name in self.shapes if not keys or name not in keys.key_blocks]
         need(not lost, f"'{lost[0] if lost else ''}' was deleted while '{garment.name}' was played; play it again.")
 
-    def _reading(self, garment: bpy.types.Object, armature: bpy.types.Object, take: Take) -> Iterator[float]:
+    def _reading(self, take: Take) -> Iterator[float]:
         """Read the motion, then roll over it, so that scrubbing waits for nothing; yield the part that is done."""
+        if self.renewed:
+            yield from self._dressing()
+        _, armature = self.objects()
         yield from (READING * done for done in sample(armature, character_joints(self.joints), [take]))
-        need_company(garment, armature, take)
+        need_company(*self.objects(), take)
         placed = np.array(take.worlds)
         playback = self.trained.player.play(self._motion(placed), pre_roll=PRE_ROLL, block=BLOCK)
         for frame in range(0, len(placed), BLOCK):
             playback.pose(frame)
             yield READING + (1 - READING) * frame / len(placed)
         self.first, self.placed, self.playback = take.frames.start, placed, playback
+
+    def _dressing(self) -> Iterator[float]:
+        """Read the model and give the garment its shapes and weights; it is held until it is played by them."""
+        self._written = self.model.stat().st_mtime
+        trained = Trained(self.model, self.joints, bpy.context.scene.unit_settings.scale_length)
+        yield 0.0
+        shot = trained.shot()
+        yield 0.0
+        garment, armature = self.objects()
+        need(self.ready(), f"'{garment.name}' left Object Mode while its model was read; play it again.")
+        self.shapes = wear(garment, armature, self.joints, shot)
+        self.trained, self.playback = trained, None
+        yield 0.0
 
     def _take_notice(self, armature: bpy.types.Object, index: int) -> None:
         """Go on from a pose that is not the one that was read."""

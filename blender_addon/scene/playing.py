@@ -58,6 +58,14 @@ def refresh(garment: bpy.types.Object) -> None:
     _read_soon(0.0)
 
 
+def take_up_models() -> None:
+    """Play trainings by the models that they have reached meanwhile."""
+    for uid, played in list(_played.items()):
+        if played.renewed and played.done is None and _attempt(uid, played.ready):
+            _attempt(uid, played.refresh)
+            _read_soon(0.0)
+
+
 def start_listening() -> None:
     """Have Blender call what is here."""
     for handlers, function in _handlers():

@@ -90,11 +90,13 @@ WORDS = {
     # Preflight
     "Preflight": "Vorprüfung",
     "Inspect": "Prüfen",
-    "Look for what would spoil the training: on the mesh, on how the garment fits the body, and on its classes": (
-        "Suchen, was das Training verdirbt: am Netz, am Sitz auf dem Körper und an den Klassen"
+    "Look for what would spoil the training: on the mesh, its fit, its classes, and the motions that are chosen": (
+        "Suchen, was das Training verdirbt: am Netz, am Sitz, an den Klassen und an den gewählten Bewegungen"
     ),
     "Select": "Auswählen",
-    "Select what the finding is about": "Auswählen, worum es in dem Befund geht",
+    "Select what the finding is about, or go to the first frame in question": (
+        "Auswählen, worum es in dem Befund geht, oder zum ersten fraglichen Bild gehen"
+    ),
     "Fix": "Beheben",
     "Repair what was found, where that needs no decision; look again afterwards": (
         "Beheben, was gefunden wurde, wo nichts zu entscheiden ist; danach neu prüfen"
@@ -216,6 +218,10 @@ WORDS = {
     "The paper's schedule, after about an hour on a GPU": "Wie im Artikel, nach etwa einer Stunde auf einer GPU",
     "Iterations": "Schritte",
     "Optimiser steps; zero for as many as the preset has": "Schritte des Optimierers; null: so viele wie die Vorgabe",
+    "Minutes": "Minuten",
+    "Wall time to fill with as many steps as fit, in place of the preset's; zero for these": (
+        "Zeit, die mit so vielen Schritten gefüllt wird, wie hineinpassen, statt denen der Vorgabe; null: diese"
+    ),
     "Folder": "Ordner",
     "Folder of the garment's training, relative to the blend file": (
         "Ordner des Trainings dieses Kleidungsstücks, relativ zur Blend-Datei"
@@ -253,12 +259,12 @@ WORDS = {
         "Für Echtzeit: einige Formen und Stellvertreter, vier Einflüsse"
     ),
     "Crowd": "Menge",
-    "For many characters, far away: few shapes and proxies, three influences": (
-        "Für viele Figuren in der Ferne: wenige Formen und Stellvertreter, drei Einflüsse"
+    "For many characters, far away: few shapes and proxies, four influences": (
+        "Für viele Figuren in der Ferne: wenige Formen und Stellvertreter, vier Einflüsse"
     ),
     "Hero": "Hauptfigur",
-    "The whole model, refined by a solver; to USD alone, as points": (
-        "Das ganze Modell, von einem Löser verfeinert; nur nach USD, als Punkte"
+    "Refined by a solver: points to USD alone; on the timeline bones and shape keys nearest to them": (
+        "Von einem Löser verfeinert: nur nach USD Punkte; auf der Zeitleiste nächste Knochen und Formschlüssel"
     ),
     "To USD": "Nach USD",
     "Write a UsdSkel shot, with the body": "Einen UsdSkel-Shot schreiben, mit dem Körper",
@@ -267,8 +273,8 @@ WORDS = {
         "Wie lange das Kleidungsstück sich in der ersten Pose setzt, vor dem ersten Bild"
     ),
     "Remove Bake": "Gebackenes entfernen",
-    "Remove the keys and shape keys that were baked; the weights stay as trained": (
-        "Gebackene Schlüsselbilder und Formschlüssel entfernen; die Gewichte bleiben wie trainiert"
+    "Remove the keys and shape keys that were baked or played live, and give the garment its own weights back": (
+        "Gebackene oder live gespielte Schlüsselbilder und Formschlüssel entfernen, eigene Gewichte zurückgeben"
     ),
     "Live Playback": "Live-Wiedergabe",
     "Play Live": "Live spielen",

@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
 from .conftest import activate
-from .scenes import decoded, shown, trained_skirt
+from .scenes import decoded, enliven, shown, trained_skirt
 from .test_panels import drawn
 
 EXACT = 2e-5  # [m]
@@ -84,6 +84,25 @@ def test_scrubbing_shows_the_same_bits_as_playing(ready, trained):
     ready.ops.ssilk.play_live()
     for frame in order:
         np.testing.assert_array_equal(shown(ready, trained, [int(frame)])[0], played[frame - 1])
+
+
+def test_a_model_that_a_training_renews_is_taken_up(ready, trained, ssilk_python, tmp_path):
+    from blender_addon.operators.training import watch
+
+    model = tmp_path / "renewed.safetensors"
+    model.write_bytes(model_of(trained).read_bytes())
+    trained.ssilk.model = str(model)
+    ready.ops.ssilk.play_live()
+    before = shown(ready, trained, FRAMES)
+    watch()
+    np.testing.assert_array_equal(shown(ready, trained, FRAMES), before)
+    enliven(ssilk_python, model)  # once more, so that shapes and weights become others
+    watch()
+    after = shown(ready, trained, FRAMES)
+    assert np.abs(after - before).max() > 1e-3
+    ready.ops.ssilk.stop_live()
+    ready.ops.ssilk.play_live()
+    np.testing.assert_allclose(shown(ready, trained, FRAMES), after, atol=1e-6)
 
 
 def test_outside_the_range_the_garment_is_held(ready, trained):

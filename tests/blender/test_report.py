@@ -43,7 +43,7 @@ def test_validations_say_what_is_learned():
         ("40% less energy than plain skinning", False),
         ("1.23% of the vertices inside the body", False),
         ("Dynamics are being learned: 23 mm of motion of its own", False),
-        ("Best model: from iteration 5; bake to see it on your shot", False),
+        ("Best model: from iteration 5; play it live or bake it to see it on your shot", False),
     ]
     stiff = {**CURVE, "points": [{"iteration": 5, "validation": {**SCORE, "total": 1.5, "dynamics": 0.0019}}]}
     told = findings(running, stiff, moves=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Work that begins with steps in Blender's own process, a little at a time."""
+"""Work that begins or ends with steps in Blender's own process, a little at a time."""
 
 from __future__ import annotations
 
@@ -44,6 +44,18 @@ def test_work_may_consist_of_steps_alone():
     while not work.poll():
         pass
     assert (done, work.error) == ([0, 1, 2], "")
+    work.close()
+
+
+@pytest.mark.parametrize("program", ["print('hello')", "raise SystemExit(3)", None])
+def test_closing_steps_follow_commands_that_succeeded(program):
+    done: list[int] = []
+    commands = [[sys.executable, "-c", program]] if program else []
+    work = Work("Testing", lambda _: done.append(9) or commands, steps=steps(done), closing=steps(done))
+    while not work.poll():
+        time.sleep(0.01)
+    failed = bool(program) and "SystemExit" in program
+    assert done == [0, 1, 2, 9, *([] if failed else [0, 1, 2])] and bool(work.error) == failed
     work.close()
 
 

@@ -107,6 +107,19 @@ def test_motions_are_found_and_choices_stay(ready, rigged):
     assert listed(rigged) == [("TIMELINE", "Timeline", False), ("ACTION", "Spin Ö", False), ("STRIP", "Spin Ö", True)]
 
 
+def test_a_budget_is_in_minutes_or_in_iterations(ready, rigged):
+    from blender_addon.operators.training import train_command
+
+    settings = rigged.ssilk.training
+    choose(ready, rigged, "Walk")
+    assert "--minutes" not in train_command(rigged, "/Skirt", [], [])
+    settings.minutes = 2.5
+    assert "a budget in iterations and in minutes" in refused(ready)
+    settings.iterations = 0
+    words = train_command(rigged, "/Skirt", [], [])
+    assert words[words.index("--minutes") + 1] == "2.5" and "--set" not in words
+
+
 def test_files_are_listed_once_by_paths_from_the_blend_file(ready, rigged, folder):
     (folder / "clip ä.usdc").touch()
     for _ in range(2):
