@@ -20,7 +20,7 @@ from ..preferences import interpreter, preferences, unready
 from ..scene import playing
 from ..scene.armature import read_joints
 from ..scene.baked import animated, apply_shot, need_bakeable, remove_bake
-from ..scene.garment import armature_of, unusable
+from ..scene.garment import armature_of, unusable_here
 from ..scene.gather import character_joints, gather
 from ..scene.handover import STAGE, hand_over, loading_usd
 from ..scene.keys import has_keys, need_tracks
@@ -71,11 +71,8 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
     )
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        reason = tasks.busy() or unusable(context.object) or unready(context)
-        reason = reason or ("" if context.mode == "OBJECT" else "Go to Object Mode")
-        cls.poll_message_set(reason)
-        return not reason
+    def refusal(cls, context: bpy.types.Context) -> str:
+        return tasks.busy() or unusable_here(context) or unready(context)
 
     def invoke(self, context: bpy.types.Context, _: bpy.types.Event) -> set[str]:
         """Ask for the options."""
@@ -173,12 +170,11 @@ class RemoveBake(ReportingOperator, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        reason = unusable(context.object) or ("" if context.mode == "OBJECT" else "Go to Object Mode")
-        if not reason and not (has_keys(context.object) or is_worn(context.object)):
-            reason = f"Nothing was baked for '{context.object.name}'"
-        cls.poll_message_set(reason)
-        return not reason
+    def refusal(cls, context: bpy.types.Context) -> str:
+        if reason := unusable_here(context):
+            return reason
+        baked = has_keys(context.object) or is_worn(context.object)
+        return "" if baked else f"Nothing was baked for '{context.object.name}'"
 
     def apply(self, context: bpy.types.Context) -> str:
         garment = context.object

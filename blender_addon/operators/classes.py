@@ -28,12 +28,9 @@ class ClassOperator(ReportingOperator):
     bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        reason = unusable(context.object)
-        if not reason and context.mode not in {"OBJECT", "PAINT_VERTEX"}:
-            reason = "Go to Object Mode or Vertex Paint"
-        cls.poll_message_set(reason)
-        return not reason
+    def refusal(cls, context: bpy.types.Context) -> str:
+        there = context.mode in {"OBJECT", "PAINT_VERTEX"}
+        return unusable(context.object) or ("" if there else "Go to Object Mode or Vertex Paint")
 
 
 class PaintClasses(ClassOperator, bpy.types.Operator):
@@ -87,12 +84,10 @@ class BrushClass(ReportingOperator, bpy.types.Operator):
     value: EnumProperty(name="Class", items=CHOICES)
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        reason = "" if context.mode == "PAINT_VERTEX" else "Choose Paint Classes first"
-        if not reason and context.tool_settings.vertex_paint.brush is None:
-            reason = "Choose a brush first"
-        cls.poll_message_set(reason)
-        return not reason
+    def refusal(cls, context: bpy.types.Context) -> str:
+        if context.mode != "PAINT_VERTEX":
+            return "Choose Paint Classes first"
+        return "" if context.tool_settings.vertex_paint.brush else "Choose a brush first"
 
     def apply(self, context: bpy.types.Context) -> str:
         choose_color(context, palette.COLORS[VALUES[self.value]])

@@ -23,9 +23,8 @@ class CheckPython(tasks.OutsideOperator, bpy.types.Operator):
     bl_label = "Check Python"
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        cls.poll_message_set(tasks.busy() or "Choose a Python first")
-        return not tasks.busy() and bool(preferences(context).python)
+    def refusal(cls, context: bpy.types.Context) -> str:
+        return tasks.busy() or ("" if preferences(context).python else "Choose a Python first")
 
     def prepare(self, context: bpy.types.Context) -> Work:
         return ask(interpreter(preferences(context)))
@@ -39,11 +38,6 @@ class FindPython(tasks.OutsideOperator, bpy.types.Operator):
 
     bl_idname = "ssilk.find_python"
     bl_label = "Find Python"
-
-    @classmethod
-    def poll(cls, _: bpy.types.Context) -> bool:
-        cls.poll_message_set(tasks.busy())
-        return not tasks.busy()
 
     def prepare(self, context: bpy.types.Context) -> Work:
         found = pythons.find(places())
@@ -62,14 +56,12 @@ class CreateEnvironment(tasks.OutsideOperator, bpy.types.Operator):
     bl_label = "Create Environment for SSILK"
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        reason = tasks.busy()
+    def refusal(cls, context: bpy.types.Context) -> str:
         if not bpy.app.online_access:
-            reason = "Blender may not go online; allow it in the preferences under System, Network"
-        elif not source(context):
-            reason = reason or "Choose a wheel or a project folder of ssilk to install from"
-        cls.poll_message_set(reason)
-        return not reason
+            return "Blender may not go online; allow it in the preferences under System, Network"
+        return tasks.busy() or (
+            "" if source(context) else "Choose a wheel or a project folder of ssilk to install from"
+        )
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Ask first."""

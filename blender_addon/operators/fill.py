@@ -23,12 +23,8 @@ class FillClass(ReportingOperator, bpy.types.Operator):
     value: EnumProperty(name="Class", items=CHOICES)
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        reason = unusable(context.object)
-        if not reason and context.mode != "EDIT_MESH":
-            reason = "Select vertices in Edit Mode"
-        cls.poll_message_set(reason)
-        return not reason
+    def refusal(cls, context: bpy.types.Context) -> str:
+        return unusable(context.object) or ("" if context.mode == "EDIT_MESH" else "Select vertices in Edit Mode")
 
     def apply(self, context: bpy.types.Context) -> str:
         thing = context.object

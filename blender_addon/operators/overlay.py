@@ -6,19 +6,19 @@ from __future__ import annotations
 import bpy
 
 from .. import overlay
+from .reporting import RefusingOperator
 from .tasks import redraw
 
 
-class ToggleOverlay(bpy.types.Operator):
+class ToggleOverlay(RefusingOperator, bpy.types.Operator):
     """Show the classes of all garments over them in 3D views, in any mode; the file is not touched"""
 
     bl_idname = "ssilk.toggle_overlay"
     bl_label = "Class Overlay"
 
     @classmethod
-    def poll(cls, _: bpy.types.Context) -> bool:
-        cls.poll_message_set("There is no window to draw in")
-        return not bpy.app.background
+    def refusal(cls, _: bpy.types.Context) -> str:
+        return "There is no window to draw in" if bpy.app.background else ""
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         if overlay.shown():

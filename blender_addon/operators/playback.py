@@ -7,7 +7,7 @@ import bpy
 
 from ..errors import need
 from ..scene import playing
-from ..scene.garment import unusable
+from ..scene.garment import unusable, unusable_here
 from ..scene.models import model_of
 from .reporting import ReportingOperator
 
@@ -20,12 +20,10 @@ class PlayLive(ReportingOperator, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        reason = unusable(context.object) or ("" if context.mode == "OBJECT" else "Go to Object Mode")
-        if not reason and playing.live(context.object):
-            reason = f"'{context.object.name}' is played already"
-        cls.poll_message_set(reason)
-        return not reason
+    def refusal(cls, context: bpy.types.Context) -> str:
+        if reason := unusable_here(context):
+            return reason
+        return f"'{context.object.name}' is played already" if playing.live(context.object) else ""
 
     def apply(self, context: bpy.types.Context) -> str:
         playing.play(context.object)
@@ -37,12 +35,10 @@ class LiveOperator(ReportingOperator):
     """Base of operators on a garment that is played."""
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        reason = unusable(context.object)
-        if not reason and not playing.live(context.object):
-            reason = f"'{context.object.name}' is not played"
-        cls.poll_message_set(reason)
-        return not reason
+    def refusal(cls, context: bpy.types.Context) -> str:
+        if reason := unusable(context.object):
+            return reason
+        return "" if playing.live(context.object) else f"'{context.object.name}' is not played"
 
 
 class StopLive(LiveOperator, bpy.types.Operator):

@@ -100,10 +100,10 @@ class SelectFinding(ReportingOperator, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def refusal(cls, context: bpy.types.Context) -> str:
         item = shown_finding(context)
-        cls.poll_message_set("This finding is about nothing that can be selected")
-        return bool(item and item.indices and item.elements in {"vertices", "polygons", "joints", "frames"})
+        known = item and item.indices and item.elements in {"vertices", "polygons", "joints", "frames"}
+        return "" if known else "This finding is about nothing that can be selected"
 
     def apply(self, context: bpy.types.Context) -> str:
         item = shown_finding(context)
@@ -127,10 +127,9 @@ class FixFinding(ReportingOperator, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def refusal(cls, context: bpy.types.Context) -> str:
         item = shown_finding(context)
-        cls.poll_message_set("This finding needs your decision")
-        return bool(item and fixer(item) == cls.bl_idname)
+        return "" if item and fixer(item) == cls.bl_idname else "This finding needs your decision"
 
     def apply(self, context: bpy.types.Context) -> str:
         item = shown_finding(context)

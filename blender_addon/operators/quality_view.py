@@ -12,7 +12,7 @@ from bpy.props import EnumProperty, FloatProperty, IntProperty
 from ..heat import worst_frames
 from ..outside.work import Work
 from ..scene import beside, heat
-from ..scene.garment import unusable
+from ..scene.garment import unusable_here
 from ..scene.objects import found_again
 from . import tasks
 from .reporting import ReportingOperator
@@ -31,20 +31,16 @@ class QualityOperator(ReportingOperator):
     bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        reason = unusable(context.object) or ("" if context.mode == "OBJECT" else "Go to Object Mode")
-        cls.poll_message_set(reason)
-        return not reason
+    def refusal(cls, context: bpy.types.Context) -> str:
+        return unusable_here(context)
 
 
 class MeasuringOperator(tasks.OutsideOperator):
     """Base of operators that measure the garment a little at a time, in object mode."""
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        reason = tasks.busy() or unusable(context.object) or ("" if context.mode == "OBJECT" else "Go to Object Mode")
-        cls.poll_message_set(reason)
-        return not reason
+    def refusal(cls, context: bpy.types.Context) -> str:
+        return tasks.busy() or unusable_here(context)
 
     def prepare(self, context: bpy.types.Context) -> Work:
         self.garment, self.called = context.object.session_uid, context.object.name

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators that tell what they did, or in one sentence why they could not."""
+"""Operators that tell what they did, or in one sentence why they could not or cannot now."""
 
 from __future__ import annotations
 
@@ -8,7 +8,23 @@ import bpy
 from ..errors import SetupError
 
 
-class ReportingOperator:
+class RefusingOperator:
+    """Base of operators that say why they cannot be used now; subclasses give `refusal`."""
+
+    @classmethod
+    def refusal(cls, context: bpy.types.Context) -> str:
+        """Return why this cannot be done now; empty if it can."""
+        return ""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Return whether this can be done now; the tooltip says why not."""
+        reason = cls.refusal(context)
+        cls.poll_message_set(reason)
+        return not reason
+
+
+class ReportingOperator(RefusingOperator):
     """Base of operators that do their work at once; subclasses give `apply`."""
 
     def apply(self, context: bpy.types.Context) -> str:

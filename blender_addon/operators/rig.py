@@ -15,7 +15,7 @@ from ..scene.apply import apply_classes, apply_rig
 from ..scene.armature import need_editable, proxy_names
 from ..scene.attributes import current_classes
 from ..scene.follower import is_linked, make_follower
-from ..scene.garment import armature_of, unusable
+from ..scene.garment import armature_of, unusable_here
 from ..scene.gather import gather
 from ..scene.handmade import find_edits
 from ..scene.handover import Handover, hand_over, loading_usd, rig_command
@@ -29,11 +29,8 @@ class RigOperator(tasks.OutsideOperator):
     handover: Handover | None = None
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        reason = tasks.busy() or unusable(context.object) or unready(context)
-        reason = reason or ("" if context.mode == "OBJECT" else "Go to Object Mode")
-        cls.poll_message_set(reason)
-        return not reason
+    def refusal(cls, context: bpy.types.Context) -> str:
+        return tasks.busy() or unusable_here(context) or unready(context)
 
     def begin(self, context: bpy.types.Context, title: str, *, classes: bool, options: tuple[str, ...]) -> Work:
         """Write the garment without its proxies, and start `ssilk rig`."""

@@ -10,6 +10,7 @@ from bpy.props import StringProperty
 
 from ..errors import need
 from ..scene.adopt import adopt
+from ..scene.garment import not_in_object_mode
 from ..scene.handover import expose_usd
 from .reporting import ReportingOperator
 
@@ -25,9 +26,8 @@ class StageOperator(ReportingOperator):
     )
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        cls.poll_message_set("Go to Object Mode")
-        return context.mode == "OBJECT"
+    def refusal(cls, context: bpy.types.Context) -> str:
+        return not_in_object_mode(context)
 
     def invoke(self, context: bpy.types.Context, _: bpy.types.Event) -> set[str]:
         """Ask for the file."""

@@ -9,12 +9,13 @@ import bpy
 
 from ..errors import SetupError
 from ..outside.work import Work
+from .reporting import RefusingOperator
 
 INTERVAL = 0.1  # seconds between two looks at a running work
 current: Work | None = None
 
 
-class OutsideOperator:
+class OutsideOperator(RefusingOperator):
     """Base of operators whose work runs outside.
 
     Subclasses give `prepare`, which returns the work, and `finish`, which takes its result and returns a sentence.
@@ -24,6 +25,10 @@ class OutsideOperator:
     undo = ""
     work: Work | None = None
     timer: bpy.types.Timer | None = None
+
+    @classmethod
+    def refusal(cls, context: bpy.types.Context) -> str:
+        return busy()
 
     def prepare(self, context: bpy.types.Context) -> Work:
         """Check everything and start the work; raise `SetupError` if it cannot."""
@@ -128,16 +133,15 @@ def redraw(context: bpy.types.Context) -> None:
                 area.tag_redraw()
 
 
-class CancelWork(bpy.types.Operator):
+class CancelWork(RefusingOperator, bpy.types.Operator):
     """Stop what runs outside Blender"""
 
     bl_idname = "ssilk.cancel"
     bl_label = "Cancel"
 
     @classmethod
-    def poll(cls, _: bpy.types.Context) -> bool:
-        cls.poll_message_set("Nothing runs")
-        return current is not None
+    def refusal(cls, _: bpy.types.Context) -> str:
+        return "" if current else "Nothing runs"
 
     def execute(self, _: bpy.types.Context) -> set[str]:
         current.cancel()

@@ -23,7 +23,7 @@ from ..preferences import interpreter, preferences, unready
 from ..scene import playing
 from ..scene.baked import need_bakeable
 from ..scene.follower import leader_of
-from ..scene.garment import armature_of, unusable
+from ..scene.garment import armature_of, unusable, unusable_here
 from ..scene.gather import character_joints, gather
 from ..scene.handover import MOTIONS, STAGE, hand_over
 from ..scene.models import job_of, relative
@@ -43,10 +43,8 @@ class MotionOperator(ReportingOperator):
     bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        reason = unusable(context.object)
-        cls.poll_message_set(reason)
-        return not reason
+    def refusal(cls, context: bpy.types.Context) -> str:
+        return unusable(context.object)
 
 
 class FindMotions(MotionOperator, bpy.types.Operator):
@@ -118,14 +116,9 @@ class Train(tasks.OutsideOperator, bpy.types.Operator):
     undo = "Train"
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        reason = tasks.busy() or unusable(context.object) or unready(context)
-        if not reason and context.mode != "OBJECT":
-            reason = "Go to Object Mode"
-        if not reason and not bpy.data.filepath:
-            reason = "Save the file first; the training lies beside it"
-        cls.poll_message_set(reason)
-        return not reason
+    def refusal(cls, context: bpy.types.Context) -> str:
+        saved = "" if bpy.data.filepath else "Save the file first; the training lies beside it"
+        return tasks.busy() or unusable_here(context) or unready(context) or saved
 
     def prepare(self, context: bpy.types.Context) -> Work:
         garment = context.object
@@ -165,17 +158,15 @@ class JobOperator(ReportingOperator):
     """Base of operators on the garment's training."""
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        reason = unusable(context.object)
-        if not reason:
-            folder = job_of(context.object)
-            state = folder and jobs.read_state(folder)
-            reason = cls.refusal(context, state) if state else f"'{context.object.name}' is not being trained"
-        cls.poll_message_set(reason)
-        return not reason
+    def refusal(cls, context: bpy.types.Context) -> str:
+        if reason := unusable(context.object):
+            return reason
+        folder = job_of(context.object)
+        state = folder and jobs.read_state(folder)
+        return cls.refused(context, state) if state else f"'{context.object.name}' is not being trained"
 
     @classmethod
-    def refusal(cls, context: bpy.types.Context, state: jobs.JobState) -> str:
+    def refused(cls, context: bpy.types.Context, state: jobs.JobState) -> str:
         """Return why nothing can be done with a training in this state; empty if something can."""
         raise NotImplementedError
 
@@ -187,7 +178,7 @@ class CancelTraining(JobOperator, bpy.types.Operator):
     bl_label = "Cancel Training"
 
     @classmethod
-    def refusal(cls, context: bpy.types.Context, state: jobs.JobState) -> str:
+    def refused(cls, context: bpy.types.Context, state: jobs.JobState) -> str:
         return "" if state.alive else f"The training of '{context.object.name}' has ended"
 
     def apply(self, context: bpy.types.Context) -> str:
@@ -202,7 +193,7 @@ class ResumeTraining(JobOperator, bpy.types.Operator):
     bl_label = "Resume Training"
 
     @classmethod
-    def refusal(cls, context: bpy.types.Context, state: jobs.JobState) -> str:
+    def refused(cls, context: bpy.types.Context, state: jobs.JobState) -> str:
         if state.alive or state.state == "done":
             return f"The training of '{context.object.name}' {'still runs' if state.alive else 'is complete'}"
         return unready(context)

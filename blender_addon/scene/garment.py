@@ -28,6 +28,16 @@ def unusable(thing: bpy.types.Object | None) -> str:
     return ""
 
 
+def not_in_object_mode(context: bpy.types.Context) -> str:
+    """Return what to do to be in object mode; empty there."""
+    return "" if context.mode == "OBJECT" else "Go to Object Mode"
+
+
+def unusable_here(context: bpy.types.Context) -> str:
+    """Return why the active object cannot be worked on as a garment in object mode; empty if it can."""
+    return unusable(context.object) or not_in_object_mode(context)
+
+
 def is_garment(thing: bpy.types.Object) -> bool:
     """Return whether an object has vertex classes, or an armature chosen for it."""
     return thing.type == "MESH" and (ATTRIBUTE in thing.data.attributes or thing.ssilk.armature is not None)
