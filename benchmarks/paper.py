@@ -122,6 +122,7 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--sweep-seconds", type=float, default=45.0, help="of steps, for the sweeps (default 45)")
     parser.add_argument("--frames", type=int, default=64, help="of a simulated sequence (default 64)")
     parser.add_argument("--batch", type=int, default=96, help="sequences simulated together (default 96)")
+    parser.add_argument("--iterations", type=int, default=50, help="of the solver in each frame (default 50)")
     parser.add_argument("--clips", nargs="+", default=(), metavar="NAME", help="only these held-out clips")
     parser.add_argument("--until", type=float, default=3600.0, metavar="S", help="begin nothing that ends later")
     parser.add_argument("--list", action="store_true", help="list the jobs with predicted times, and run none")
@@ -143,6 +144,7 @@ def planned(options: argparse.Namespace) -> Plan:
         sweep_seconds=options.sweep_seconds,
         frames=options.frames,
         batch=options.batch,
+        iterations=options.iterations,
         clips=options.clips,
         rehearse=options.rehearse,
     )

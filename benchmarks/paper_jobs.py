@@ -75,7 +75,7 @@ class Plan:
         stages: folder of rigged stages called as `GARMENTS`, and "cape_proxies_8" and so on.
         motions, index: clips and their splits.
         seconds, sweep_seconds: of steps, for each training of Table 1 and of the sweeps.
-        frames: of a simulated sequence; batch: of them together.
+        frames: of a simulated sequence; batch: of them together; iterations: of the solver in each.
         clips: only these of the held-out clips; all if none is named.
         rehearse: trainings of four small steps.
     """
@@ -91,6 +91,7 @@ class Plan:
     sweep_seconds: float = 45.0
     frames: int = 64
     batch: int = 96
+    iterations: int = 50
     clips: Sequence[str] = ()
     rehearse: bool = False
 
@@ -181,7 +182,8 @@ def simulation(plan: Plan, garment: str) -> Job:
     clips = plan.files("held")
     command = (
         *SSILK, "simulate", str(plan.stage(garment)), "--motion", *clips, "-o", str(output), "--sequence",
-        str(plan.frames), "--batch", str(plan.batch), "--no-body", "--device", plan.device,
+        str(plan.frames), "--batch", str(plan.batch), "--iterations", str(plan.iterations), "--no-body",
+        "--device", plan.device,
     )  # fmt: skip
     outputs = tuple(output / f"{Path(clip).stem}.usdc" for clip in clips)
     return Job(f"{garment}_simulated", outputs, command, START + FRAME * plan.held_frames())

@@ -55,23 +55,25 @@ def write_record(options: argparse.Namespace, rows: Sequence[Row]) -> None:
         temporary.write_text(json.dumps(document, indent=1) + "\n")
 
 
-def read_records(paths: Sequence[Path]) -> tuple[list[Row], dict[str, Settings]]:
-    """Return the rows of several records, each with its "sequence", and the settings of all models by name.
+def read_records(paths: Sequence[Path]) -> tuple[list[Row], dict[str, Settings], str]:
+    """Return the rows of records, each with its "sequence", the settings of all models by name, and the hardware.
 
     Raises:
         SsilkError: a file is no record.
     """
     rows: list[Row] = []
     models: dict[str, Settings] = {}
+    hardware: dict[str, None] = {}
     for path in paths:
         try:
             document = json.loads(path.read_text())
             rows += [{**row, "sequence": document["sequence"]} for row in document["rows"]]
             models |= document["models"]
+            hardware[document["hardware"]] = None
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             fail(str(path), f"no record ({type(error).__name__}: {error})", "'tables.py record' writes them")
     need(rows, ", ".join(map(str, paths)), "no figures in these records", "'tables.py record' writes them")
-    return rows, models
+    return rows, models, ", ".join(hardware)
 
 
 def with_truth(rows: Sequence[Row]) -> list[Row]:

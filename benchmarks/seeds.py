@@ -22,7 +22,8 @@ from ssilk_core.errors import need
 def measured(options: argparse.Namespace) -> tuple[list[Row], dict[str, Settings]]:
     """Return the figures of all models, evaluated now or read from records, and the models' settings by name."""
     if options.records:
-        return read_records(options.records)
+        rows, models, options.hardware = read_records(options.records)
+        return rows, models
     rows = [{**row, "sequence": options.sequence} for row in evaluated(options)[0]]
     return rows, {path.stem: settings_of(path) for path in options.models}
 

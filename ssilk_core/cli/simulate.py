@@ -47,6 +47,8 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--substeps", type=int, default=1, help="steps in each frame (default 1)")
     verb.add_argument("--tolerance", type=float, default=1e-2, metavar="G",
                       help="accelerations that may be out of balance, in units of g (default 0.01)")  # fmt: skip
+    verb.add_argument("--iterations", type=int, default=100, metavar="N",
+                      help="of the solver in each step, at most (default 100)")  # fmt: skip
     verb.add_argument("--precision", choices=("float64", "float32"), default="float64",
                       help="of positions and energies (default float64)")  # fmt: skip
     verb.add_argument("--batch", type=int, default=64, help="motions that advance together (default 64)")
@@ -77,7 +79,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         batch=options.batch,
         sequence=options.sequence,
         precision=options.precision,
-        solver=SolverOptions(tolerance=options.tolerance),
+        solver=SolverOptions(tolerance=options.tolerance, iterations=options.iterations),
         rest=SolverOptions(tolerance=options.tolerance, iterations=150),
     )
     motions = [read_motion(str(path), scene.character.skeleton) for path in options.motion]
@@ -199,7 +201,7 @@ def _provenance(options: argparse.Namespace, motion: Path) -> dict[str, str | fl
     from ssilk_usd.read_stage import content_hash, split_location
 
     garment, _ = shared.wardrobe(options)
-    names = ("fabric", "fps", "substeps", "tolerance", "precision", "proxies", "no_body")
+    names = ("fabric", "fps", "substeps", "tolerance", "iterations", "precision", "proxies", "no_body")
     lists = ("material", "body", "classes", "rig")
     return {
         "stage": str(options.stage),

@@ -15,6 +15,8 @@ from .blocks import BlockMatrix, BlockPattern
 from .hinges import Hinges
 from .membrane import Membrane, outer
 
+HELD = 1e6  # times as stiff
+
 
 class Hessian:
     """Assembles the positive Hessian over the vertices `free` (U,), in float32; positions are (V, 3, N).
@@ -60,12 +62,13 @@ class Hessian:
         parts = [np.concatenate(part) for part in (rows, sources, products)]
         return self.pattern.summation(parts[0], parts[1], parts[2], 4 * count)
 
-    def __call__(self, x: Tensor, weight: Tensor, pushed: Tensor | None) -> BlockMatrix:
+    def __call__(self, x: Tensor, weight: Tensor, pushed: Tensor | None, held: Tensor | None = None) -> BlockMatrix:
         """Return the Hessian at x.
 
         Args:
             weight: stiffness of each free vertex alike in all directions [N/m], shape (U, 1).
             pushed: vectors whose outer product is added at each free vertex, shape (U, 3, N), or None.
+            held: free vertices that are made so stiff that a solution leaves them alone, shape (U, N), or None.
         """
         blocks = self.sum_faces(self.membrane.stiffness(x))
         if self.hinges:
@@ -75,4 +78,6 @@ class Hessian:
         diagonal += weight[:, None, None] * torch.eye(3, device=x.device)[:, :, None]
         if pushed is not None:
             diagonal += outer(pushed, pushed)
+        if held is not None:
+            diagonal *= torch.where(held, HELD, 1.0)[:, None, None]
         return BlockMatrix(self.pattern, blocks)

@@ -3,8 +3,12 @@
 
 Each iteration solves with the positive Hessian to a tenth of the residual, then halves the step until the energy has
 fallen enough. The nearest points of the body are found anew for every state, those of the line search included: the
-energy of a frame never rises, and more iterations never end higher. In gradient and Hessian they hold still, as in
-training; where that misleads so much that no step lowers the energy, the frame stays where it is.
+energy of a frame never rises, and more iterations never end higher. In gradient and Hessian they hold still.
+
+Between two parts of the body, or where these pass through each other, the nearest point jumps: the energy has a
+crease or a step there, and no gradient tells. One vertex on it would keep its whole garment from moving on. Where no
+step lowers the energy, the vertices whose energy rises at once as their planes do not tell are held for the rest of
+the search, and the others go on; a frame that has none stays where it is.
 """
 
 from __future__ import annotations
@@ -20,6 +24,7 @@ from .potential import Planes, Potential, Setting
 SUFFICIENT = 1e-4  # share of the slope that a step has to gain
 HALVINGS = 12
 REDUCTION = 0.1  # of the residual by each linear solution
+SPOILING = 0.1  # share of the slope that a vertex on a crease takes away, from which on it is held
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +56,7 @@ class Solution:
     Attributes:
         x: positions [m], shape (V, 3, N).
         energy: with the nearest body points of x [J], shape (N,).
-        imbalance: what `SolverOptions.tolerance` bounds, shape (N,).
+        imbalance: what `SolverOptions.tolerance` bounds, of vertices that are not held, shape (N,).
         iterations: of Newton's method, shape (N,).
         inner: iterations of conjugate gradients, each for all frames that were still at work.
     """
@@ -118,7 +123,11 @@ def minimise_from(potential: Potential, start: Tensor, setting: Setting, options
 
 
 class _Search:
-    """Newton's method under way: the frames still at work, and where every frame has come to."""
+    """Newton's method under way: the frames still at work, and where every frame has come to.
+
+    Attributes:
+        held: vertices that stay where they are, shape (V, N).
+    """
 
     gradient: Tensor
     imbalance: Tensor
@@ -132,6 +141,7 @@ class _Search:
              "positions, body and time step must be finite", "look for NaN in stage and motion")  # fmt: skip
         self.at_work = torch.arange(len(energy), device=start.device)
         self.moving = torch.ones_like(energy, dtype=torch.bool)
+        self.held = torch.zeros_like(start[:, 0], dtype=torch.bool)
         self._look()
         iterations = torch.zeros_like(self.at_work)
         self.solution = Solution(start.clone(), energy.clone(), self.imbalance.clone(), iterations, 0)
@@ -141,20 +151,32 @@ class _Search:
         kept = (self.moving & (self.imbalance > self.options.tolerance)).nonzero()[:, 0]
         if 0 < len(kept) < len(self.at_work):
             self.state, self.setting = self.state.picked(kept), self.setting.picked(kept)
-            self.gradient, self.at_work = self.gradient[..., kept], self.at_work[kept]
+            self.gradient, self.held = self.gradient[..., kept], self.held[:, kept]
+            self.at_work = self.at_work[kept]
         return len(kept) > 0
 
     def advance(self) -> None:
         """Make one step."""
         potential, setting = self.potential, self.setting
-        step, count = newton_step(potential, self.state, setting, self.gradient, self.options.inner)
+        step, count = newton_step(potential, self.state, setting, self.gradient, self.options.inner, self.held)
         self.state, self.moving = line_search(potential, self.state, setting, self.gradient, step)
+        self._hold((~self.moving).nonzero()[:, 0], step)
         self._look()
         self._keep(count)
 
+    def _hold(self, stuck: Tensor, step: Tensor) -> None:
+        """Hold what keeps frames from moving (their indices); those of which that frees the others go on."""
+        if len(stuck) and self.state.planes:
+            gradient, step = self.gradient[..., stuck], step[..., stuck]
+            setting = self.setting.picked(stuck)
+            found = spoiling(self.potential, self.state.picked(stuck), setting, gradient, step) & ~self.held[:, stuck]
+            self.held[:, stuck] |= found
+            self.moving[stuck] = found.any(0)
+
     def _look(self) -> None:
         """Find the forces out of balance in the states that the search stands at."""
-        self.gradient = self.potential.gradient(self.state.x, self.setting, self.state.planes)
+        gradient = self.potential.gradient(self.state.x, self.setting, self.state.planes)
+        self.gradient = gradient.masked_fill(self.held[:, None], 0)
         self.imbalance = self.potential.imbalance(self.gradient)
 
     def _keep(self, inner: int) -> None:
@@ -167,14 +189,14 @@ class _Search:
 
 
 def newton_step(
-    potential: Potential, state: State, setting: Setting, gradient: Tensor, inner: int
+    potential: Potential, state: State, setting: Setting, gradient: Tensor, inner: int, held: Tensor | None = None
 ) -> tuple[Tensor, int]:
-    """Return a direction of descent (V, 3, N), zero in pinned vertices, and the iterations that it took."""
+    """Return a direction of descent (V, 3, N), zero in pinned and `held` (V, N) vertices, and iterations it took."""
     right = -gradient[potential.free].float()
-    z, count = potential.hessian(state.x, setting, state.planes).solve(right, REDUCTION, inner)
+    z, count = potential.hessian(state.x, setting, state.planes, held).solve(right, REDUCTION, inner)
     step = torch.zeros_like(state.x)
     step[potential.free] = z.to(step.dtype)
-    return step, count
+    return step if held is None else step.masked_fill(held[:, None], 0), count
 
 
 def line_search(
@@ -197,3 +219,12 @@ def line_search(
         left, length = left[~fallen], length / 2
     moved[left] = False
     return found, moved
+
+
+def spoiling(potential: Potential, state: State, setting: Setting, gradient: Tensor, step: Tensor) -> Tensor:
+    """Return the vertices (V, N) whose collision, within the least step, costs much more than their planes tell."""
+    least = 0.5 ** (HALVINGS - 1)
+    slope = (gradient * step).sum((0, 1)).abs()
+    x = state.x + least * step
+    told, found = potential.collision(x, state.planes), potential.collision(x, potential.planes(x, setting))
+    return found - told > SPOILING * least * slope

@@ -110,9 +110,13 @@ class Potential:
             total = total + self.hinges.energy(x)
         for weight, target in self._anchors(setting):
             total = total + (0.5 * weight * ((x - target) ** 2).sum(1)).sum(0)
-        if planes:
-            total = total + self.fabric.collision * (self._depth(x, planes) ** 2).sum(0)
-        return total
+        return total + self.collision(x, planes).sum(0)
+
+    def collision(self, x: Tensor, planes: Planes | None) -> Tensor:
+        """Return the energy of each vertex that meets the body [J], shape (V, N)."""
+        if planes is None:
+            return torch.zeros_like(x[:, 0])
+        return self.fabric.collision * self._depth(x, planes) ** 2
 
     def gradient(self, x: Tensor, setting: Setting, planes: Planes | None) -> Tensor:
         """Return the gradient [N] in all vertices, shape (V, 3, N)."""
@@ -125,15 +129,19 @@ class Potential:
             total += 2 * self.fabric.collision * self._depth(x, planes)[:, None] * planes.normal
         return total
 
-    def hessian(self, x: Tensor, setting: Setting, planes: Planes | None) -> BlockMatrix:
-        """Return the Hessian over the free vertices, made positive semi-definite, in float32."""
+    def hessian(self, x: Tensor, setting: Setting, planes: Planes | None, held: Tensor | None = None) -> BlockMatrix:
+        """Return the Hessian over the free vertices, made positive semi-definite, in float32; `held` ones are stiff.
+
+        Args:
+            held: vertices that are not to move, shape (V, N); none by default.
+        """
         still = [] if setting.predicted is not None else [(self.mass / setting.dt**2, None)]
         weight = sum((weight for weight, _ in [*self._anchors(setting), *still]), torch.zeros_like(self.mass))
         pushed = None
         if planes:
             inside = (self._depth(x, planes) < 0)[:, None]
             pushed = (2 * self.fabric.collision) ** 0.5 * (planes.normal * inside)[self.free].float()
-        return self._hessian(x, weight[self.free].float(), pushed)
+        return self._hessian(x, weight[self.free].float(), pushed, None if held is None else held[self.free])
 
     def imbalance(self, gradient: Tensor) -> Tensor:
         """Return the RMS acceleration, over the free mass, that a gradient (V, 3, N) leaves, in units of g: (N,)."""

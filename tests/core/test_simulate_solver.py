@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +19,7 @@ from ssilk_core.energy.stretch import stretch_density
 from ssilk_core.errors import SsilkError
 from ssilk_core.fabrics import Fabric
 from ssilk_core.model.body import CollisionBody
+from ssilk_core.simulate import newton
 from ssilk_core.simulate.conjugate import inverse_blocks, solve
 from ssilk_core.simulate.hinges import Hinges
 from ssilk_core.simulate.membrane import Membrane, outer, positive
@@ -239,6 +241,35 @@ def test_pinned_vertices_stay_and_the_solution_is_in_balance(potential: Potentia
     assert (found.imbalance <= 1e-3).all() and (force < 3e-3).all()
     before = potential.energy(x, setting, potential.planes(x, setting))
     assert (found.energy < before).all()
+
+
+def creased(potential: Potential, vertex: int, at: float) -> Callable[[torch.Tensor, Setting], Planes]:
+    """What finds planes where one vertex stands between two walls that both push it, 1 cm deep in either."""
+
+    def planes(x: torch.Tensor, setting: Setting) -> Planes:
+        normal, offset = torch.zeros_like(x), torch.full_like(x[:, 0], -1e6)
+        side = torch.where(
+            x[vertex, 0] < at, -1.0, 1.0
+        ).double()  # pushed over the middle, where the other one pushes
+        normal[vertex, 0] = -side
+        offset[vertex] = -side * at + 0.01
+        return Planes(normal, offset)
+
+    return planes
+
+
+def test_a_vertex_on_a_crease_does_not_keep_the_others_from_coming_to_rest(
+    monkeypatch, potential: Potential, scene: Scene
+) -> None:
+    x, setting = moving(scene, 2)
+    vertex = int(potential.free[len(potential.free) // 2])
+    monkeypatch.setattr(potential, "planes", creased(potential, vertex, float(x[vertex, 0, 0])))
+    options = SolverOptions(tolerance=1e-3)
+    found = minimise_from(potential, x, setting, options)
+    assert (found.imbalance <= 1e-3).all()
+    monkeypatch.setattr(newton, "SPOILING", torch.inf)
+    stuck = minimise_from(potential, x, setting, options)
+    assert (stuck.imbalance[0] > 1) and found.energy[0] <= stuck.energy[0]
 
 
 def test_states_that_are_not_finite_are_refused(potential: Potential, scene: Scene) -> None:
