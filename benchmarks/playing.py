@@ -59,6 +59,7 @@ def spans(count: int, size: int) -> Iterator[slice]:
 def with_numpy(player: Player, motion: Motion) -> Laps:
     """Play a motion at the model's rate as `runtime.Playback` does; return the time of each part [s]."""
     watch, before = Stopwatch(), None
+    assert player.stepper is not None
     for frames in spans(motion.frame_count, BLOCK):
         seen = min(frames.start, 2)
         given = drive(motion.clip(frames.start - seen, frames.stop), player.skeleton, player.file.joints, seen)

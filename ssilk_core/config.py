@@ -12,6 +12,13 @@ SURFACES = ("triangles", "vertices")
 SCHEMES = ("spring_verlet", "verlet", "direct", "direct_residual", "quasi_static")
 MOST = 1e9  # of anything that has no other bound
 
+# Of "spring_verlet", as `model.integrators.SpringVerlet` explains them, for all that play it.
+VELOCITY_SCALE, DISTANCE_SCALE, REACH = 10.0, 3.0, 0.1
+MOST_GIVEN = 100.0  # of what S gives; far beyond what a push lets through, and finite
+OWN_SHARE, RATE_SHARE = 0.5, 0.05
+LOST = 1e3  # of a latent: trained ones stay below ten, and no decoder knows what this means
+RECOVERY = 15  # frames at rest after a lost state, half a second of the usual rate
+
 
 def _need_between(config: object, low: float, high: float, *names: str) -> None:
     """Raise `SsilkError` unless each of these settings lies between two numbers, themselves included."""

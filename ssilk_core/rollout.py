@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from .assets import Floats, GarmentPose, Motion
+from .config import LOST, RECOVERY
 from .errors import need
 from .kinematics import frames_at, motion_transforms, resample, run_up, skinning_matrices, split_at_cuts
 from .model.descriptors import gravity_features, pose_features
@@ -21,10 +22,8 @@ from .sampling import sample_pose
 CHUNK = 256  # frames decoded at once
 HISTORY = 2  # frames before a chunk that its descriptors look back on
 DOWN = (0.0, -1.0, 0.0)
-LOST = 1e3  # of a latent: trained ones stay below ten, and no decoder knows what this means
 STILL = 1e-7  # [rad, m] by which a character may move and count as holding still
 CALM = 3e-5  # by which a latent may still move in a frame and count as at rest
-RECOVERY = 15  # frames at rest after a lost state, half a second of the usual rate
 
 OnRecovery = Callable[[range], None]
 

@@ -12,12 +12,12 @@ from torch import Tensor
 
 from ..assets import Motion
 from ..errors import need
-from ..kinematics import motion_transforms, skinning_matrices
+from ..kinematics import motion_transforms, skinning_matrices, split_at_cuts
 from .descriptors import gravity_features, pose_features
 from .network import GarmentModel
 
 DOWN = (0.0, -1.0, 0.0)
-RESTING = 2  # frames at rest that a shot begins with
+RESTING = 2  # frames at rest with which a shot begins, or goes on after a cut
 WARM_UP = 3  # calls before a graph is captured, in which libraries settle what they will do
 
 
@@ -29,17 +29,19 @@ class Driven:
         rest: quasi-static latents, shape (F, N, latent); pose: dynamic descriptors, shape (F, N, D).
         character: skinning matrices about each root, shape (F, J, 3, 4, N).
         origins: where each root is [m], shape (F, 3, N), float64.
+        begins: frames with which a shot begins, or goes on after a cut: the garment is at rest, shape (F, N, 1).
     """
 
     rest: Tensor
     pose: Tensor
     character: Tensor
     origins: Tensor
+    begins: Tensor
 
 
 @torch.no_grad()
 def driven(model: GarmentModel, motions: Sequence[Motion]) -> Driven:
-    """Return what motions without cuts say, on the model's device; the shorter ones hold their last pose.
+    """Return what motions say, on the model's device; the shorter ones hold their last pose.
 
     Raises:
         SsilkError: a motion is not at the model's rate.
@@ -48,16 +50,16 @@ def driven(model: GarmentModel, motions: Sequence[Motion]) -> Driven:
     for motion in motions:
         need(abs(motion.fps - fps) < 1e-6, motion.path, f"{motion.fps:g} frames per second",
              f"the model steps at {fps:g}")  # fmt: skip
-    parts = [_driven(model, motion) for motion in motions]
-    rest, pose, character, origins = (
+    shots = [[_driven(model, span) for span in split_at_cuts(motion)] for motion in motions]
+    parts = [map(torch.cat, zip(*spans)) for spans in shots]
+    return Driven(*(
         torch.stack([part[[*range(len(part)), *[-1] * (frames - len(part))]] for part in group], dim=axis)
-        for group, axis in zip(zip(*parts), (1, 1, -1, -1))
-    )
-    return Driven(rest, pose, character, origins)
+        for group, axis in zip(zip(*parts), (1, 1, -1, -1, 1))
+    ))  # fmt: skip
 
 
-def _driven(model: GarmentModel, motion: Motion) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return quasi-static latents, descriptors, matrices and origins of one motion, frames first."""
+def _driven(model: GarmentModel, motion: Motion) -> tuple[Tensor, ...]:
+    """Return what `Driven` holds of one motion without cuts, frames first."""
     skeleton, parameter = model.scene.character.skeleton, next(model.parameters())
     world = motion_transforms(motion, skeleton.parents)
     features = pose_features(motion, skeleton, model.joints, world)
@@ -71,7 +73,8 @@ def _driven(model: GarmentModel, motion: Motion) -> tuple[Tensor, Tensor, Tensor
     static = torch.cat([tensor(features.static), gravity], dim=1)
     matrices = tensor(skinning_matrices(world, skeleton.bind_transforms)[:, :, :3])
     pose = torch.cat([static, tensor(features.dynamic)], dim=1)
-    return model.initial(static), pose, matrices, torch.as_tensor(origins).to(parameter.device)
+    begins = torch.arange(motion.frame_count, device=parameter.device)[:, None] < RESTING
+    return model.initial(static), pose, matrices, torch.as_tensor(origins).to(parameter.device), begins
 
 
 class BatchPlayer:
@@ -87,7 +90,7 @@ class BatchPlayer:
         self.model, self.vertices = model, vertices
         self.rest, self.pose, self.character = like.rest[0].clone(), like.pose[0].clone(), like.character[0].clone()
         self.before, self.now = self.rest.clone(), self.rest.clone()
-        self.begins = torch.ones((), dtype=torch.bool, device=self.rest.device)
+        self.begins = torch.ones_like(like.begins[0])
         self.network = torch.compile(self._network, dynamic=False) if self.rest.is_cuda else self._network
         self.advance = self._captured() if self.rest.is_cuda else self._advance
 
@@ -102,9 +105,8 @@ class BatchPlayer:
     @torch.no_grad()
     def step(self, shots: Driven, frame: int) -> Tensor:
         """Return what `play` yields of a frame, the one after the last that was asked for, or the first."""
-        self.begins.fill_(frame < RESTING)
-        for own, given in zip((self.rest, self.pose, self.character), (shots.rest, shots.pose, shots.character)):
-            own.copy_(given[frame])
+        for name in ("rest", "pose", "character", "begins"):
+            getattr(self, name).copy_(getattr(shots, name)[frame])
         return self.advance()
 
     def _network(self) -> tuple[Tensor, Tensor]:

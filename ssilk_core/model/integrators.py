@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from .. import kernels
-from ..config import ModelConfig
+from ..config import DISTANCE_SCALE, MOST_GIVEN, OWN_SHARE, RATE_SHARE, REACH, VELOCITY_SCALE, ModelConfig
 
 SMALLEST = 1e-12  # far below any length that counts; its square's inverse is finite in float32
 
@@ -132,9 +132,8 @@ class SpringVerlet(Integrator):
     states = 3
     centred = True
     slowest = 0.01
-    most = 100.0  # of what S gives; far beyond what a push lets through, and finite
-    velocity_scale, distance_scale, reach = 10.0, 3.0, 0.1
-    own_share, rate_share = 0.5, 0.05
+    velocity_scale, distance_scale, reach = VELOCITY_SCALE, DISTANCE_SCALE, REACH
+    most, own_share, rate_share = MOST_GIVEN, OWN_SHARE, RATE_SHARE
 
     def __init__(self, config: ModelConfig, rates: int = 0) -> None:
         super().__init__(config, rates)

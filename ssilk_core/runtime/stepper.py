@@ -17,13 +17,21 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from ..config import ModelConfig
+from ..config import (
+    DISTANCE_SCALE,
+    LOST,
+    MOST_GIVEN,
+    OWN_SHARE,
+    RATE_SHARE,
+    REACH,
+    RECOVERY,
+    VELOCITY_SCALE,
+    ModelConfig,
+)
 from .networks import Layer, Parameters, continued, layers, single
 
-VELOCITY, DISTANCE, REACH, MOST = 10.0, 3.0, 0.1, 100.0  # the constants of SpringVerlet
-OWN_SHARE, RATE_SHARE = 0.5, 0.05
-SAFE = (REACH * MOST) ** 2  # no entry of a vector with a smaller square passes REACH * MOST
-LOST, RECOVERY = 1e3, 15  # those of `rollout`: a latent beyond is lost, and this many frames rest after it
+GIVEN = REACH * MOST_GIVEN  # the most that S gives
+SAFE = GIVEN**2  # no entry of a vector with a smaller square passes it
 
 
 def lost(states: NDArray) -> NDArray:
@@ -106,7 +114,7 @@ class SpringStepper:
         first, *hidden, last = layers(parameters, "stepper")
         blocks = np.cumsum([config.latent] * 3 + [static])
         of_now, of_speed, of_away, of_static, self.of_rates = np.split(first.weights, blocks, axis=1)
-        speed, away = VELOCITY * of_speed, DISTANCE * of_away
+        speed, away = VELOCITY_SCALE * of_speed, DISTANCE_SCALE * of_away
         self.bias, self.of_still = first.bias, np.hstack([of_now, of_static])
         self.first = single(np.hstack([of_now - away, speed - away * beta]).T)
         self.later = [*hidden, Layer(single(REACH * last.rows))]
@@ -123,7 +131,7 @@ class SpringStepper:
         """
         still = self.of_still @ np.hstack([rest, static]).T + self.bias
         driven = np.ascontiguousarray((still + self.of_rates @ rates.T).T)
-        held = np.ascontiguousarray(continued(self.later, still).T.clip(-REACH * MOST, REACH * MOST))
+        held = np.ascontiguousarray(continued(self.later, still).T.clip(-GIVEN, GIVEN))
         allowed = RATE_SHARE * np.linalg.norm(rates, axis=1)
         history = np.empty((len(rest) + 2, 2, rest.shape[1]), dtype=np.float32)
         history[:-2, 0] = rest
@@ -167,7 +175,7 @@ class SpringStepper:
                     seen = room.activate()
                 np.dot(seen, last, own)
                 if not own.dot(own) < SAFE:
-                    np.clip(own, -REACH * MOST, REACH * MOST, own)
+                    np.clip(own, -GIVEN, GIVEN, own)
                 np.multiply(self.beta, velocity, along)
                 np.add(along, away, along)
                 np.multiply(self.stiffness, along, pull)

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from ssilk_core.errors import SsilkError
+from ssilk_core.kinematics import split_at_cuts
 from ssilk_core.model.batch import BatchPlayer, driven
 from ssilk_core.rollout import decode, garment_poses, roll
 
@@ -23,10 +24,11 @@ def model(request, scene, toy_model):
 
 @pytest.fixture
 def motions(scene, toy_motion):
-    """Three shots, two of them shorter and one backwards."""
+    """Four shots: two of them shorter, one backwards, and one with a cut."""
     motion = toy_motion(scene, 25)
     back = replace(motion, rotations=motion.rotations[::-1], translations=motion.translations[::-1] + [80.0, 0, 5])
-    return [motion, motion.clip(5, 12), back]
+    jumps = motion.translations + [0.0, 0.0, 40.0] * (np.arange(25) >= 9)[:, None, None]
+    return [motion, motion.clip(5, 12), back, replace(motion, translations=jumps)]
 
 
 def test_vertices_are_those_of_each_shot_alone(model, motions):
@@ -46,7 +48,8 @@ def test_the_network_alone_gives_what_the_decoder_takes(model, motions):
     outputs = torch.stack([each.clone() for each in player.play(shots)], dim=1)
     for mine, motion in zip(outputs, motions):
         activation, _ = model.decoder.activations(mine[: motion.frame_count])
-        torch.testing.assert_close(activation, next(roll(model, motion)).activation, atol=1e-5, rtol=0)
+        alone = torch.cat([next(roll(model, span)).activation for span in split_at_cuts(motion)], dim=1)
+        torch.testing.assert_close(activation, alone, atol=1e-5, rtol=0)
 
 
 def test_a_motion_of_another_rate_is_refused(model, motions):
