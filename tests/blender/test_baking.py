@@ -191,7 +191,7 @@ def test_removing_a_bake_leaves_the_garment_as_it_was(ready, trained):
 
     def state() -> tuple:
         names = [group.name for group in trained.vertex_groups]
-        return names, read_groups(trained, trained.data, sorted(names)).tolist(), [*trained.data.attributes.keys()]
+        return names, read_groups(trained, trained.data, sorted(names)).tolist(), sorted(trained.data.attributes.keys())
 
     before = state()
     bake(ready, trained)

@@ -353,7 +353,7 @@ def test_a_garment_deleted_meanwhile_is_told(ready, skirt, monkeypatch):
 
     original = rig.Classify.finish
     monkeypatch.setattr(rig.Classify, "finish", gone)
-    with pytest.raises(RuntimeError, match="'Skirt' or its armature was deleted meanwhile"):
+    with pytest.raises(RuntimeError, match="'Skirt' was deleted meanwhile"):
         ready.ops.ssilk.classify()
 
 
