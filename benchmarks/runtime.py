@@ -7,7 +7,9 @@
 As in the paper's Table 3, the networks, the kinematics, and blendshapes with skinning are told apart; besides, what
 depends on the character's poses alone, which a player computes for blocks of frames. Each repeat plays a whole clip,
 the ways in turn; times are processor times of a repeat divided by its frames. "Frame by frame" is how the papers run
-PyTorch; "in chunks" is what `ssilk bake` does. How cost grows with mesh and network is measured on a synthetic cloak.
+PyTorch; "in chunks" is what `ssilk bake` does. Levels of quality are those of `ssilk reduce --quality` for this clip.
+"Products alone" are the products of a frame's matrices without anything between them, the least that its network can
+take while weights are single precision. How cost grows with mesh and network is measured on a synthetic cloak.
 """
 
 from __future__ import annotations
@@ -17,6 +19,8 @@ import json
 import os
 import subprocess
 import tempfile
+import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -28,12 +32,14 @@ from ssilk_usd.read_motion import read_motion
 from subjects import arguments, open_subject, parsed
 
 from ssilk_core.assets import PINNED, Motion, Scene
-from ssilk_core.checkpoint import model_file
+from ssilk_core.checkpoint import ModelFile, model_file
 from ssilk_core.config import ModelConfig
 from ssilk_core.errors import need
 from ssilk_core.fabrics import Fabric
 from ssilk_core.kinematics import motion_transforms, resample, skin_points, skinning_matrices
 from ssilk_core.model.network import GarmentModel
+from ssilk_core.quality import QUALITIES
+from ssilk_core.reduction import Reducer
 from ssilk_core.runtime import Player
 
 VERTICES = (500, 2_500, 10_000, 30_000, 100_000)
@@ -49,6 +55,46 @@ def times_table(found: Times) -> str:
         for row in (*PARTS, *TOTALS)
     ]
     return table(("µs per frame: median (95th percentile)", *found), rows)
+
+
+def levels(file: ModelFile, motion: Motion, repeats: int) -> tuple[dict[str, Times], str]:
+    """Measure the whole model and its levels of quality with numpy; return times, and a table with what they lose."""
+    reducer, found, rows = Reducer(file, [motion]), {}, []
+    for level in ("", *QUALITIES):
+        reduced = reducer.reduced(QUALITIES[level].size.within(reducer.whole) if level else reducer.whole)
+        way = partial(with_numpy, Player(reduced.file))
+        found[level or "whole"] = measured({"numpy": way}, motion, repeats)
+        taken = found[level or "whole"]["numpy"]
+        shown = [f"{taken[row][0]:.1f}" for row in ("+ kinematics", SKINNING, "full, poses included")]
+        rows.append([level or "whole", *shown, f"{1e3 * reduced.rms:.2f}", f"{1e3 * reduced.largest:.1f}"])
+    header = ("level", "network and kinematics", SKINNING, "full", "loses [mm RMS]", "at most [mm]")
+    return found, table(header, rows)
+
+
+def products(player: Player) -> tuple[dict[str, float], str]:
+    """Return the medians [us] per frame of the products of matrices of stepper and decoder alone, and a sentence."""
+    stepper, decoder = player.stepper, player.decoder.layers
+    assert stepper is not None
+    steps = [(np.ones(len(rows), np.float32), rows, np.empty(rows.shape[1], np.float32))
+             for rows in (stepper.first, *(layer.rows for layer in stepper.later))]  # fmt: skip
+    blocks = [(layer.weights, np.ones((layer.weights.shape[1], BLOCK), np.float32)) for layer in decoder]
+    ways = {"latents": lambda: [np.dot(*each) for each in steps],
+            "decoder": lambda: [weights @ seen for weights, seen in blocks]}  # fmt: skip
+    found = {name: _median(way) / (1 if name == "latents" else BLOCK) for name, way in ways.items()}
+    size = sum(rows.nbytes for _, rows, _ in steps) / 1e6
+    text = f"Products alone: latents {found['latents']:.1f} µs ({size:.1f} MB of weights for each frame), decoder "
+    return found, text + f"{found['decoder']:.1f} µs (in blocks of {BLOCK} frames)\n"
+
+
+def _median(way: Callable[[], object]) -> float:
+    """Return the median processor time [us] of a call, in tens."""
+    taken = []
+    for _ in range(100):
+        start = time.process_time()
+        for _ in range(10):
+            way()
+        taken.append(1e5 * (time.process_time() - start))
+    return float(np.median(taken))
 
 
 def cloth(scene: Scene, motion: Motion, python: str) -> dict[str, list[float]]:
@@ -150,6 +196,11 @@ def garment(path: Path, options: argparse.Namespace) -> tuple[str, dict[str, Tim
     text = f"{path.stem}: {scene.garment.mesh.vertex_count:,} vertices, K = {config.shapes}, "
     text += f"{scene.rig.proxy_count} proxies, {scene.character.skeleton.joint_count} joints, "
     text += f"{motion.frame_count} frames of {options.clip}\n\n{times_table(found[path.stem])}\n"
+    least, sentence = products(Player(subject.file))
+    by_level, level_table = levels(subject.file, motion, options.repeats)
+    found.update({f"{path.stem}, {level}": times for level, times in by_level.items()})
+    found[f"{path.stem}, products alone"] = {"numpy": {name: [value, value] for name, value in least.items()}}
+    text += f"{sentence}\nLevels of quality, µs per frame with numpy\n\n{level_table}\n"
     if options.bpy:
         taken = {**cloth(scene, motion, options.bpy), **live(path, options.bpy)}
         found[f"{path.stem}, Blender"] = {"Blender": taken}
@@ -169,6 +220,7 @@ def main() -> None:
     meshes, networks = mesh_growth(max(3, options.repeats // 8)), network_growth(options.repeats)
     text += f"µs per frame of a synthetic cloak, by vertices\n\n{mesh_table(meshes)}\n"
     text += f"µs per frame of 2,500 vertices with numpy, by latents and widths\n\n{network_table(networks)}"
+    text += f"\nLoad of the machine meanwhile: {os.getloadavg()[2]:.1f} on {os.cpu_count()} cores.\n"
     write_results(options, text, {"models": found, "meshes": meshes, "networks": networks})
 
 

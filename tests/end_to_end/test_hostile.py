@@ -12,10 +12,11 @@ import subprocess
 import sys
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from pxr import Sdf, Usd, UsdGeom
+from pxr import Sdf, Usd, UsdGeom, Vt
 from ssilk_usd.memory import bounded_memory
 from ssilk_usd.read_character import read_character
 from ssilk_usd.read_motion import read_motion
@@ -163,7 +164,7 @@ def test_hostile_stages_are_refused(files, tmp_path, monkeypatch, name):
 
 
 def test_arrays_that_declare_a_thousand_million_elements_take_no_memory(files, tmp_path):
-    """Found by damaging counts: USD took 4 GB and 12 s for each."""
+    """Found by damaging counts: USD took 4 GB and 12 s for each, and 2 GB where zeros of 1.6 GB are declared."""
     content = (files / "rigged.usdc").read_bytes()
     stage = Usd.Stage.Open(str(files / "rigged.usdc"))
     count = len(UsdGeom.Mesh(stage.GetPrimAtPath("/Hero/Body")).GetPointsAttr().Get())
@@ -172,9 +173,9 @@ def test_arrays_that_declare_a_thousand_million_elements_take_no_memory(files, t
         found.append(at)
         at = content.find(struct.pack("<Q", count), at + 1)
     assert found
-    for at in found:
-        path = tmp_path / f"{at}.usdc"
-        path.write_bytes(content[:at] + struct.pack("<Q", 10**9) + content[at + 8 :])
+    for at, declared in [*((at, 10**9) for at in found), (found[0], 4 * 10**8)]:
+        path = tmp_path / f"{at}_{declared}.usdc"
+        path.write_bytes(content[:at] + struct.pack("<Q", declared) + content[at + 8 :])
         code = (
             "import sys\n"
             "from ssilk_usd.read_scene import read_scene\n"
@@ -191,9 +192,25 @@ def test_arrays_that_declare_a_thousand_million_elements_take_no_memory(files, t
 
 def test_the_bound_on_memory_ends_with_the_reading():
     before = resource.getrlimit(resource.RLIMIT_DATA)
-    with pytest.raises(MemoryError), bounded_memory(1 << 28):
+    with pytest.raises(MemoryError), bounded_memory(0.25):
         bytearray(1 << 30)
     assert resource.getrlimit(resource.RLIMIT_DATA) == before and len(bytearray(1 << 20)) == 1 << 20
+
+
+def test_who_reads_larger_files_can_allow_it(files, tmp_path, monkeypatch):
+    stage = Usd.Stage.Open(Sdf.Layer.OpenAsAnonymous(str(files / "rigged.usdc")))
+    zeros = Vt.IntArray.FromNumpy(np.zeros(60_000_000, np.int32))  # 240 MB in memory, less than one in the file
+    UsdGeom.Mesh(stage.GetPrimAtPath("/Hero/Body")).GetFaceVertexIndicesAttr().Set(zeros)
+    stage.GetRootLayer().Export(str(tmp_path / "large.usdc"))
+    monkeypatch.setenv("SSILK_READ_GIB", "0.05")
+    with pytest.raises(SsilkError, match=r"of arrays that fit into 0.05 GiB \(SSILK_READ_GIB\)"):
+        read_scene(tmp_path / "large.usdc")
+    monkeypatch.delenv("SSILK_READ_GIB")
+    with pytest.raises(SsilkError, match="60000000"):  # it is read, and makes no sense
+        read_scene(tmp_path / "large.usdc")
+    monkeypatch.setenv("SSILK_READ_GIB", "much")
+    with pytest.raises(SsilkError, match="SSILK_READ_GIB: 'much'; a number of GiB is needed"):
+        read_scene(files / "rigged.usdc")
 
 
 @pytest.mark.parametrize("name", ["a pipe", "a device", "a folder"])

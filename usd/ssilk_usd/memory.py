@@ -3,19 +3,34 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-MOST = 3 << 30  # bytes; a character of a million vertices takes a fifth of it
+from ssilk_core.errors import need
+
+VARIABLE, USUAL = "SSILK_READ_GIB", 1.0  # GiB; a character of a million vertices takes 0.6
+STACK = 8 << 20  # bytes of each thread that USD may start meanwhile
+
+
+def allowed_gib() -> float:
+    """Return how many GiB reading may take, as the environment says it, or the usual amount."""
+    text = os.environ.get(VARIABLE, str(USUAL))
+    try:
+        allowed = float(text)
+    except ValueError:
+        allowed = 0.0
+    need(0 < allowed < 1e6, VARIABLE, f"'{text}'", "a number of GiB is needed", "correct it in the environment")
+    return allowed
 
 
 @contextmanager
-def bounded_memory(most: int = MOST) -> Iterator[None]:
-    """Let this process take at most `most` bytes more than it has; USD and numpy then refuse what does not fit.
+def bounded_memory(gib: float | None = None) -> Iterator[None]:
+    """Let this process take so much more than it has, or `allowed_gib`; USD and numpy then refuse what does not fit.
 
-    Where the system knows no such bound (all but Linux), and within another one, nothing changes.
+    Where the system knows no such bound (all but Linux), and within a smaller one, nothing changes.
     """
     if not sys.platform.startswith("linux"):
         yield
@@ -25,6 +40,7 @@ def bounded_memory(most: int = MOST) -> Iterator[None]:
     # Addresses (RLIMIT_AS) would be the wrong bound: USD's threads reserve some for each core of a machine.
     soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
     pages = int(Path("/proc/self/statm").read_text().split()[5])
+    most = int((gib or allowed_gib()) * 2**30) + STACK * (os.cpu_count() or 1)
     bound = pages * resource.getpagesize() + most
     if soft != resource.RLIM_INFINITY and soft <= bound:
         yield

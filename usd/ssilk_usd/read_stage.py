@@ -17,7 +17,7 @@ from ssilk_core.errors import fail, need
 from ssilk_core.files import sha256
 
 from .garment_api import register_schema
-from .memory import MOST, bounded_memory
+from .memory import VARIABLE, allowed_gib, bounded_memory
 from .specs import free_when_closed
 
 Reader = TypeVar("Reader", bound=Callable[..., Any])
@@ -28,6 +28,7 @@ EARLIEST = Usd.TimeCode.EarliestTime()
 # Instance proxies are read too: a referenced character may be instanceable.
 PRIMS = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
 register_schema()  # before the first stage is opened: USD lists its schemas once
+_ALLOWED = f"a whole .usd, .usda, .usdc or .usdz file is needed, of arrays that fit into {{:g}} GiB ({VARIABLE})"
 _MISSING = (Pcp.ErrorInvalidAssetPath, Pcp.ErrorInvalidSublayerPath, Pcp.ErrorUnresolvedPrimPath)
 
 
@@ -41,12 +42,11 @@ def needs_whole_files(read: Reader) -> Reader:
                 return read(source, *args, **options)
         except MemoryError:
             where = stage_name(source) if isinstance(source, Usd.Stage) else str(source)
-            fail(where, "it declares arrays that do not fit into memory", f"reading takes at most {MOST >> 30} GiB")
+            fail(where, "it declares arrays that do not fit into memory", _ALLOWED.format(allowed_gib()))
         except (Tf.ErrorException, UnicodeDecodeError) as error:
             where = stage_name(source) if isinstance(source, Usd.Stage) else str(source)
             reason = usd_reason(error) if isinstance(error, Tf.ErrorException) else "it holds text that is no UTF-8"
-            allowed = "a whole .usd, .usda, .usdc or .usdz file is needed"
-            fail(where, f"it cannot be read as USD ({reason})", allowed)
+            fail(where, f"it cannot be read as USD ({reason})", _ALLOWED.format(allowed_gib()))
 
     return cast(Reader, reader)
 
