@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from ssilk_core.assets import Floats, Motion, Scene
     from ssilk_core.simulate import SimulationOptions
+    from ssilk_core.simulate.simulator import SimulatedFrame
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -146,7 +147,7 @@ def _written(
         caches = _Caches(stack, options, shots, scene, played)
         for done, frame in enumerate(simulator.frames(motions), start=1):
             caches.write(frame.shot, frame.number, frame.points)
-            figures.add(frame.imbalance, frame.iterations)
+            figures.add(frame)
             report(Progress(done, total, (time.monotonic() - start) / done * (total - done)))
     return figures.of_all(total, time.monotonic() - start)
 
@@ -220,11 +221,12 @@ class _Figures:
     """What a simulation came to."""
 
     def __init__(self, tolerance: float) -> None:
-        self.tolerance, self.solved, self.iterations = tolerance, 0, 0
+        self.tolerance, self.solved, self.iterations, self.held = tolerance, 0, 0, 0
 
-    def add(self, imbalance: float, iterations: int) -> None:
-        self.solved += imbalance <= self.tolerance
-        self.iterations += iterations
+    def add(self, frame: SimulatedFrame) -> None:
+        self.solved += frame.imbalance <= self.tolerance
+        self.iterations += frame.iterations
+        self.held += frame.held
 
     def of_all(self, frames: int, seconds: float) -> dict[str, object]:
         """Return figures to show."""
@@ -232,5 +234,6 @@ class _Figures:
             "frames": frames,
             "within the tolerance": f"{self.solved / frames:.1%}",
             "iterations a frame": round(self.iterations / frames, 1),
+            "vertices held a frame": round(self.held / frames, 1),
             "seconds a frame": float(f"{seconds / frames:.3g}"),
         }

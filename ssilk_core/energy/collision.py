@@ -160,7 +160,7 @@ def _on_triangles(
 
 
 def _outward(away: Tensor, normal: Tensor) -> Tensor:
-    """Return the unit directions of vectors away from the surface (3, M), on the side that its normals (3, M) show."""
+    """Return unit directions of vectors (3, M) away from the surface, to the side that its normals (3, M) show."""
     length = away.norm(dim=0)
     side = torch.where((away * normal).sum(0) < 0, -1.0, 1.0)
     return torch.where(length > TOUCHING, away * (side / length.clamp_min(TOUCHING)), normal)

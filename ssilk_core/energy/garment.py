@@ -129,9 +129,11 @@ class GarmentEnergy:
 def _hinge_shapes(mesh: Mesh, hinges: Ints) -> Floats:
     """Return l^2 / (8 (A_1 + A_2)) of each hinge at rest, with its edge's length and the areas beside it, (H,).
 
-    Faces count as high as a `SLIVER`th of the edge at least.
+    Faces count as high as a `SLIVER`th of the edge at least. The angle turns with the inverse of a face's height:
+    hinges of lower ones are so much softer that no vertex is held more stiffly than by the slimmest clean triangle.
     """
     x0, x1, left, right = (mesh.points[hinges[:, i]] for i in range(4))
     squared = np.sum((x1 - x0) ** 2, axis=1)
     doubled = [np.linalg.norm(np.cross(x1 - x0, tip - x0), axis=1) for tip in (left, right)]
-    return squared / (4 * sum(np.maximum(each, squared / SLIVER) for each in doubled))
+    slim = np.minimum(1.0, SLIVER * np.minimum(*doubled) / np.maximum(squared, np.finfo(float).tiny))
+    return slim**2 * squared / (4 * sum(np.maximum(each, squared / SLIVER) for each in doubled))

@@ -58,6 +58,7 @@ class Solution:
         energy: with the nearest body points of x [J], shape (N,).
         imbalance: what `SolverOptions.tolerance` bounds, of vertices that are not held, shape (N,).
         iterations: of Newton's method, shape (N,).
+        held: how many vertices are held, shape (N,).
         inner: iterations of conjugate gradients, each for all frames that were still at work.
     """
 
@@ -65,6 +66,7 @@ class Solution:
     energy: Tensor
     imbalance: Tensor
     iterations: Tensor
+    held: Tensor
     inner: int
 
 
@@ -144,7 +146,8 @@ class _Search:
         self.held = torch.zeros_like(start[:, 0], dtype=torch.bool)
         self._look()
         iterations = torch.zeros_like(self.at_work)
-        self.solution = Solution(start.clone(), energy.clone(), self.imbalance.clone(), iterations, 0)
+        found = start.clone(), energy.clone(), self.imbalance.clone()
+        self.solution = Solution(*found, iterations, iterations.clone(), 0)
 
     def narrowed(self) -> bool:
         """Leave out frames that are solved or that no step improves; return whether any is left."""
@@ -185,6 +188,7 @@ class _Search:
         found.x[..., rows], found.energy[rows] = self.state.x, self.state.energy
         found.imbalance[rows] = self.imbalance
         found.iterations[rows] += 1
+        found.held[rows] = self.held.sum(0)
         self.solution = replace(found, inner=found.inner + inner)
 
 

@@ -72,7 +72,7 @@ class SimulatedFrame:
         shot, number: which shot, and which of its frames.
         points: garment vertices in the world [m], float64, shape (V, 3).
         energy: what was minimised [J], heights counted from the character's root.
-        imbalance, iterations: of `newton.Solution`, in the last step of the frame.
+        imbalance, iterations, held: of `newton.Solution`, in the last step of the frame.
     """
 
     shot: int
@@ -81,6 +81,7 @@ class SimulatedFrame:
     energy: float
     imbalance: float
     iterations: int
+    held: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,9 +201,11 @@ class Simulator:
 
 def _frames(spans: Sequence[Span], frame: int, world: Tensor, solution: Solution) -> Iterator[SimulatedFrame]:
     points = world.permute(2, 0, 1).cpu().numpy()
-    figures = [values.tolist() for values in (solution.energy, solution.imbalance, solution.iterations)]
-    for span, x, energy, imbalance, iterations in zip(spans, points, *figures):
-        yield SimulatedFrame(span.shot, span.first + frame, x, energy, imbalance, iterations)
+    figures = [
+        values.tolist() for values in (solution.energy, solution.imbalance, solution.iterations, solution.held)
+    ]
+    for span, x, *found in zip(spans, points, *figures):
+        yield SimulatedFrame(span.shot, span.first + frame, x, *found)
 
 
 def simulate(

@@ -100,3 +100,17 @@ def test_without_hinges_or_stiffness_bending_is_zero_for_each_frame():
     assert single.bending(x[:3]).tolist() == [0, 0]
     limp = GarmentEnergy(Mesh("/fold", fold(0), FACES), Fabric("limp", bending=0.0), dtype=torch.float64)
     assert limp.bending(x).tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("height", [1 / 60, 1e-3, 1e-5])
+def test_a_sliver_bends_no_more_stiffly_than_the_slimmest_clean_triangle(height):
+    def force(height: float) -> float:
+        """What moves the tip of a face back that is so high over the hinge, for each metre out of the plane [N/m]."""
+        points, lift = fold(0.0), 1e-9
+        points[3] = [-height, 0, 0.5]
+        energy = GarmentEnergy(Mesh("/sliver", points, FACES), FABRIC, dtype=torch.float64)
+        x = tensor(points + lift * np.array([[0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 1, 0]])).requires_grad_(True)
+        (gradient,) = torch.autograd.grad(energy.bending(x).sum(), x)
+        return float(gradient[3].norm()) / lift
+
+    assert 0 < force(height) <= 1.05 * force(1 / 50)
