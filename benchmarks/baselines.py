@@ -37,7 +37,6 @@ def parser() -> argparse.ArgumentParser:
     train.add_arguments(found)
     found.set_defaults(preset="final")
     found.add_argument("--iterations", type=int, help="steps to train for (default: those of the preset)")
-    found.add_argument("--minutes", type=float, default=math.inf, help="time for all steps, instead of a number")
     found.add_argument("--judged", type=int, default=2, help="last poses of a window with energies (default 2)")
     found.add_argument("--mixed", type=float, default=0.0, help="NCS: share of windows with mixed motion (default 0)")
     return found
@@ -54,7 +53,7 @@ def asked(options: argparse.Namespace, report: TextReporter) -> BaselineJob:
         config=BaselineConfig(method=network, fps=base.model.fps),
         judged=options.judged,
         mixed=options.mixed,
-        seconds=60 * options.minutes,
+        seconds=math.inf if options.minutes is None else 60 * options.minutes,
     )
 
 
