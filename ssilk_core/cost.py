@@ -26,6 +26,7 @@ from .runtime import Player
 from .runtime.playback import BLOCK
 
 POINT = 12  # bytes of a vertex in a point cache
+TILED = ("decoder.shapes", "decoder.skin_offset")  # parameters that playing holds as `runtime.skinning.tiles` alone
 SECONDS, FEWEST = 0.6, 3  # to measure for at least, and passes over the motion
 
 
@@ -94,8 +95,8 @@ def _weights(file: ModelFile, network: str) -> int:
 
 
 def memory(player: Player) -> int:
-    """Return the bytes that playing holds for good: parameters, and what skinning makes of them."""
-    parameters = (value.size * 4 for name, value in player.file.parameters.items() if "decoder.s" not in name)
+    """Return the bytes that playing holds for good: parameters, and what skinning makes of blendshapes and weights."""
+    parameters = (value.size * 4 for name, value in player.file.parameters.items() if name not in TILED)
     tiles = (tile.shapes.nbytes + tile.weights.nbytes + tile.joints.nbytes for tile in player.tiles)
     return sum(parameters) + sum(tiles)
 

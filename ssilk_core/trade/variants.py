@@ -85,5 +85,5 @@ def _levels(base: Variant, refined: bool) -> Iterator[Variant]:
     for level in QUALITIES.values():
         if refined or not level.refine:
             kept, fps = level.size.within(base.size), level.rate(base.fps)
-            packed = replace(base, swept="level", precision="int16")  # as 'ssilk reduce' writes models
-            yield replace(packed, name=level.name, size=kept, fps=fps, refine=level.refine)
+            reduced = replace(base, swept="level", precision="int16")  # as 'ssilk reduce' writes models
+            yield replace(reduced, name=level.name, size=kept, fps=fps, refine=level.refine)
