@@ -95,7 +95,7 @@ def _weights(file: ModelFile, network: str) -> int:
 
 
 def memory(player: Player) -> int:
-    """Return the bytes that playing holds for good: parameters, and what skinning makes of blendshapes and weights."""
+    """Return the bytes that playing holds for good: parameters, and what skinning makes of shapes and weights."""
     parameters = (value.size * 4 for name, value in player.file.parameters.items() if name not in TILED)
     tiles = (tile.shapes.nbytes + tile.weights.nbytes + tile.joints.nbytes for tile in player.tiles)
     return sum(parameters) + sum(tiles)
