@@ -17,9 +17,9 @@ STEP = {
     "cape": 4.2,
     "hooded_dress": 4.9,
     "fringe_skirt": 4.6,
-    "tshirt": 4.0,
-    "long_sleeve": 3.0,
-    "pants": 2.8,
+    "tshirt": 3.2,
+    "long_sleeve": 2.4,
+    "pants": 2.1,
 }  # [ms]
 BASELINE_STEP = 8.5  # [ms]
 START, VALIDATION, EVALUATION, FRAME = 25.0, 1.5, 3.0, 0.05  # [s]; the last: of the simulator, a frame of a shot
@@ -28,9 +28,9 @@ RECIPES = {
     "cape": ("shape_rate=1",),
     "hooded_dress": ("shape_rate=1",),
     "fringe_skirt": ("shape_rate=1",),
-    "tshirt": ("shape_rate=0.1", "shapes=96"),
-    "long_sleeve": ("shape_rate=0.1", "shapes=96"),
-    "pants": ("shapes=96",),
+    "tshirt": ("shapes=256",),
+    "long_sleeve": ("shapes=256",),
+    "pants": ("shapes=256",),
 }
 SWEEPS: dict[str, dict[str, tuple[str, ...]]] = {
     "table4": {"regularity": ("0.001", "0.01")},
