@@ -81,7 +81,7 @@ def work(queue: Queue, plan: Plan, gpu: int | None) -> None:
     """Run jobs on one GPU until there is none left."""
     while not queue.is_over:
         if job := queue.take():
-            queue.ended(job, _run(without_models(plan, job), plan.folder, gpu))
+            queue.ended(job, _run(without_models(job), plan.folder, gpu))
         else:
             time.sleep(WAIT)
 

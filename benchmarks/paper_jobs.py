@@ -235,7 +235,7 @@ def _timings(plan: Plan, models: Sequence[Job]) -> Job:
     return Job("table3", (output,), command, START + 4 * len(models), needs)
 
 
-def without_models(plan: Plan, job: Job) -> Job:
+def without_models(job: Job) -> Job:
     """Return a job of models with only those that are there: what is missing has failed or was not wanted."""
     gone = {str(path) for path in job.needs if path.suffix == ".safetensors" and not path.is_file()}
     return replace(job, command=tuple(word for word in job.command if word not in gone))

@@ -35,7 +35,9 @@ def settings_of(path: Path) -> Settings:
     file, _ = load_network(path)
     told = file.provenance
     found = {"baseline": told[KEY]["method"]} if KEY in told else {name: of(file) for name, of in SETTINGS.items()}
-    trained = {"iterations": told["train"]["iterations"], "kept at": told["iteration"], "on": told["device"]}
+    trained = {
+        "iterations": told["train"].get("iterations"), "kept at": told.get("iteration"), "on": told.get("device"),
+    }  # fmt: skip
     curve = curve_path(path)
     points = json.loads(curve.read_text())["points"] if curve.is_file() else []
     last = {"steps": points[-1]["iteration"], "seconds": points[-1]["seconds"]} if points else {}

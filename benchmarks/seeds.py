@@ -31,6 +31,8 @@ def measured(options: argparse.Namespace) -> tuple[list[Row], dict[str, Settings
 def evaluated(options: argparse.Namespace, *, probes: bool = False) -> tuple[list[Row], str]:
     """Return the figures of 'ssilk evaluate' for all models, and its tables; stops and loops only for `probes`."""
     need(options.models, options.table, "no model", "this is measured on models", "name files of 'ssilk train'")
+    names = [path.stem for path in options.models]
+    need(len(set(names)) == len(names), options.table, "several models of one name", "figures go by their names")
     for name in ("stage", "motions"):
         need(getattr(options, name), options.table, f"no --{name}", "models are evaluated with it")
     named = ("stage", "motions", "index", "reference", "sequence", "device")

@@ -46,7 +46,7 @@ def alone(told: Mapping[str, Settings], name: str) -> dict[Any, list[str]]:
     """Return the models by the value of one setting, those whose other settings are what most models have."""
     if name == "decoder":
         return _decoders(told)
-    others = [other for other in SETTINGS if other != name]
+    others = [other for other in next(iter(told.values())) if other != name]
     usual = {other: mode(settings[other] for settings in told.values()) for other in others}
     found: dict[Any, list[str]] = {}
     for model, settings in told.items():

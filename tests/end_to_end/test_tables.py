@@ -72,6 +72,33 @@ def test_methods_stand_side_by_side_and_seeds_together(made, world):
     assert "- ssilk's total is lower than ncs*'s in" in (world / "table1.md").read_text()
 
 
+def test_tables_of_records_are_those_of_their_models(made, world):
+    lines, _ = made(f"table1 models ncs.safetensors {WORLD}")
+    swept, _ = made(f"table5 models {WORLD}")
+    sys.argv = ["tables.py", *shlex.split(f"record models ncs.safetensors {WORLD} -o records/all.json")]
+    import tables
+
+    tables.main()
+    sys.argv = ["tables.py", *shlex.split(f"record models {WORLD} -o skirts.json")]
+    tables.main()
+    assert made("table1 records")[0] == lines
+    assert made("table5 skirts.json")[0] == swept
+    assert "cpu" in json.loads((world / "table5.json").read_text())["hardware"]
+
+
+def test_totals_are_of_whole_clips_and_the_simulator_of_sequences():
+    from records import with_truth
+
+    def row(sequence: int | None, total: float, truth: dict | None, method: str = "ssilk (a)") -> dict:
+        figures = {"total": total, "truth": truth}
+        return {"model": "x/a.safetensors", "garment": "Cape", "method": method, "split": "valid",
+                "sequence": sequence, "figures": figures}  # fmt: skip
+
+    found = with_truth([row(None, 1.0, None), row(64, 2.0, {"excess": 0.5}, "ssilk")])
+    assert [item["figures"] for item in found] == [{"total": 1.0, "truth": {"excess": 0.5}}]
+    assert with_truth([row(64, 2.0, {"excess": 0.5})])[0]["figures"]["total"] == 2.0
+
+
 def test_everything_is_what_evaluate_tells(made, world):
     _, figures = made(f"evaluate models/2.safetensors {WORLD} --loop 1")
     assert (world / "evaluate.md").read_text().count("| garment |") == 4  # energies, motion, stops, loops
@@ -104,9 +131,10 @@ def test_single_frames_are_timed(made):
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        ("table2 models", "no --reference"),
-        ("table5 ncs.safetensors", "ncs.safetensors is a baseline"),
-        ("table1 clips", "no model in the folder"),
+        ("table2 models", "no simulator among the figures"),
+        ("record models", "no --output"),
+        ("table5 ncs.safetensors", "ncs is a baseline"),
+        ("table1 clips", "no model and no record"),
         ("table3 nothing.safetensors", "no such model file"),
     ],
 )

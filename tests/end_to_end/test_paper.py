@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The queue behind the paper's tables: order, needs, failures and time; and that its commands can be understood."""
+
+from __future__ import annotations
+
+import json
+import threading
+from pathlib import Path
+
+import pytest
+
+from ssilk_core.cli import parser
+
+PYTHON = "python"
+
+
+@pytest.fixture
+def paper(monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "benchmarks")
+    import paper
+
+    return paper
+
+
+@pytest.fixture
+def plan(paper, tmp_path):
+    clips = [("walk", "train", []), ("jump", "valid", ["inertia"]), ("flip", "flips", [])]
+    index = [{"clip": c, "split": s, "tags": tags, "frames": 120, "fps": 60} for c, s, tags in clips]
+    (tmp_path / "index.json").write_text(json.dumps(index))
+    return paper.Plan(folder=tmp_path, stages=tmp_path, motions=tmp_path, index=tmp_path / "index.json", device="cpu")
+
+
+def writing(paper, folder: Path, name: str, needs: tuple[str, ...] = (), code: str = "", seconds: float = 1.0):
+    """A job that writes the time at which it runs, unless its code ends it before."""
+    output = folder / name
+    script = f"import pathlib, time\n{code}\npathlib.Path({str(output)!r}).write_text(str(time.time()))"
+    return paper.Job(name, (output,), (PYTHON, "-c", script), seconds, tuple(folder / need for need in needs))
+
+
+def run(paper, plan, jobs: list, until: float = 100.0, workers: int = 2):
+    queue = paper.Queue([job for job in jobs if not job.is_done], until)
+    threads = [threading.Thread(target=paper.work, args=(queue, plan, None)) for _ in range(workers)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+    return queue
+
+
+def test_a_job_waits_for_what_it_needs_even_if_that_fails(paper, plan, tmp_path, capfd):
+    jobs = [
+        writing(paper, tmp_path, "last", ("first", "broken")),
+        writing(paper, tmp_path, "first", code="time.sleep(0.3)"),
+        writing(paper, tmp_path, "broken", code="raise SystemExit('no luck')"),
+    ]
+    queue = run(paper, plan, jobs)
+    assert queue.failed == ["broken"] and not queue.left
+    assert float((tmp_path / "first").read_text()) < float((tmp_path / "last").read_text())
+    assert "broken: FAILED with code 1" in (told := capfd.readouterr().out) and "no luck" in told
+
+
+def test_what_is_done_is_not_done_again_and_what_takes_too_long_is_not_begun(paper, plan, tmp_path):
+    (tmp_path / "old").write_text("old")
+    jobs = [
+        writing(paper, tmp_path, "old"),
+        writing(paper, tmp_path, "long", seconds=500.0),
+        writing(paper, tmp_path, "after", ("long",)),
+        writing(paper, tmp_path, "short"),
+    ]
+    queue = run(paper, plan, jobs)
+    assert (tmp_path / "old").read_text() == "old" and (tmp_path / "short").is_file()
+    assert [job.name for job in queue.left] == ["long", "after"] and not queue.failed
+
+
+def test_every_command_is_understood_and_every_need_is_made(paper, plan):
+    found = paper.jobs(plan)
+    outputs = {path for job in found for path in job.outputs}
+    assert len({job.name for job in found}) == len(found) and all(set(job.needs) <= outputs for job in found)
+    verbs = parser()
+    for job in found:
+        if job.command[:3] == (PYTHON, "-m", "ssilk_core"):
+            assert verbs.parse_args(job.command[3:]).verb in ("train", "simulate")
+    trained = [job for job in found if job.name.startswith("cape_") and job.command[3] == "train"]
+    assert len(trained) == 3 and len({job.command[-1] for job in trained}) == 1  # seeds differ in nothing else
+
+
+def test_only_models_that_are_there_are_measured(paper, plan, tmp_path):
+    from paper_jobs import without_models
+
+    job = next(job for job in paper.jobs(plan) if job.name == "pants_sequences")
+    plan.model("pants_ncs").parent.mkdir()
+    plan.model("pants_ncs").touch()
+    kept = [word for word in without_models(job).command if word.endswith(".safetensors")]
+    assert kept == [str(plan.model("pants_ncs"))]
