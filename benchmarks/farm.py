@@ -14,6 +14,8 @@ import argparse
 import os
 import random
 import signal
+import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -39,7 +41,7 @@ from ssilk_core.farm.tasks import Task, plan
 from ssilk_core.files import sha256
 
 PERIOD = 10.0  # seconds from one kill to the next; a worker takes a few to start
-PARTS = ("cluster", "cores", "soak")
+PARTS = ("cluster", "cores", "start", "soak")
 SHARE = 25  # shots that are compared byte by byte
 
 
@@ -107,6 +109,8 @@ def main() -> None:
             measured["cluster"] = _on_cluster(tasks, folder)
         if "cores" in options.parts:
             measured["cores"] = _cores(tasks[: options.scaling], folder, options.cores)
+        if "start" in options.parts:
+            measured["start"] = _start(tasks[0], folder)
         if "soak" in options.parts:
             measured["soak"] = _soak(tasks[0], folder, options.soak)
     rows = [[name, value] for part in measured.values() for name, value in part.items()]
@@ -201,6 +205,22 @@ def _cores(tasks: Sequence[Task], folder: Path, cores: Sequence[int]) -> dict[st
     return {**rates, "load of the machine meanwhile": round(os.getloadavg()[1], 1)}
 
 
+def _start(task: Task, folder: Path) -> dict[str, Any]:
+    """Return what a process takes before its first shot, and for a shot then [s]."""
+    words = "import torch, ssilk_usd.shot, ssilk_usd.check, ssilk_core.cli._layers"
+    wardrobe, taken = Wardrobe(), [time.perf_counter()]
+    for work in (
+        lambda: subprocess.run([sys.executable, "-c", words], check=True),
+        lambda: wardrobe.dressed(task),
+        lambda: bake_task(task, folder / "first", wardrobe, silent),
+        lambda: bake_task(task, folder / "first", wardrobe, silent, again=True),
+    ):
+        work()
+        taken.append(time.perf_counter())
+    names = ("to start Python", "to load model and character", "for the first shot, with its asset", "for another")
+    return {f"seconds {name}": round(float(each), 2) for name, each in zip(names, np.diff(taken))}
+
+
 def _soak(task: Task, folder: Path, bakes: int) -> dict[str, Any]:
     """Bake one shot again and again; return memory ten times, how it grows between, and file handles."""
     wardrobe, step = Wardrobe(), max(bakes // 10, 1)
@@ -209,10 +229,10 @@ def _soak(task: Task, folder: Path, bakes: int) -> dict[str, Any]:
         bake_task(task, folder / "soak", wardrobe, silent, again=True)
         if count % step == 0:
             memory[count], handles[count] = resident(os.getpid()), len(os.listdir("/proc/self/fd"))
-    slope = np.polyfit(list(memory), list(memory.values()), 1)[0] * 1024
+    slope = np.polyfit(list(memory)[1:], list(memory.values())[1:], 1)[0] * 1024  # once everything is warm
     return {
         **{f"memory after {count:,} bakes [MiB]": round(size, 1) for count, size in memory.items()},
-        "growth of memory in each bake, by least squares [KiB]": round(float(slope), 2),
+        "growth of memory in each bake after the first fifth, by least squares [KiB]": round(float(slope), 2),
         "file handles, least and most": f"{min(handles.values())}, {max(handles.values())}",
     }
 

@@ -15,7 +15,6 @@ from .tasks import Task
 
 Bake = Callable[[Task, Path], dict[str, object]]
 RETRIES = 10  # of a task whose worker died
-CALLS = 500  # of a worker, which then makes place for another: USD keeps some 10 kB of each bake
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ def run_on_cluster(
     except (ConnectionError, RuntimeError, ValueError) as error:
         fail("--cluster", f"no cluster at {address} ({str(error).splitlines()[0]})", "start one with 'ray start'")
     try:
-        worker = ray.remote(num_cpus=1, num_gpus=int(gpu), max_retries=RETRIES, max_calls=CALLS)
+        worker = ray.remote(num_cpus=1, num_gpus=int(gpu), max_retries=RETRIES)
         remote = worker(_outcome)
         pending = {remote.remote(bake, task, folder.absolute()): task for task in tasks}
         while pending:

@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What stands in the documents for others to copy: commands that are understood, USD that is read, tests that are."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from pxr import Sdf
+
+from ssilk_core.cli import parser
+
+ROOT = Path(__file__).parents[2]
+DOCUMENTS = ("docs/pipeline.md", "docs/farm.md")
+
+
+def blocks(document: str, language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", (ROOT / document).read_text(), flags=re.DOTALL)
+
+
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_commands_are_understood(document):
+    lines = [line for block in blocks(document, "sh") for line in block.splitlines() if line.startswith("ssilk ")]
+    assert lines
+    for line in lines:
+        words = shlex.split(
+            line.replace(" ...", " m.safetensors --stage s.usdc --motion w.usdc -o out"), comments=True
+        )
+        assert parser().parse_args(words[1:]).verb == words[1]
+
+
+def test_layers_of_artists_are_read():
+    (text,) = blocks("docs/pipeline.md", "usda")
+    layer = Sdf.Layer.CreateAnonymous(".usda")
+    assert layer.ImportFromString(text)
+    assert layer.ListTimeSamplesForPath("/Shot/cape/Animation.blendShapeWeights") == [12]
+
+
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_each_promise_has_its_test(document):
+    text = (ROOT / document).read_text().partition("## Promises")[2]
+    functions = "\n".join(path.read_text() for path in (ROOT / "tests").rglob("test_*.py"))
+    named = re.findall(r"\btest_\w+(?!\w*\.py)\b", text)
+    assert named
+    missing = [
+        name for name in named if f"def {name}(" not in functions and not list(ROOT.rglob(f"tests/**/{name}.py"))
+    ]
+    assert not missing
