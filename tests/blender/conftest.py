@@ -91,6 +91,48 @@ def skirt(bpy: ModuleType) -> Any:
     return garment
 
 
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder whose name is not easy, for what several tests of a module open; it fills as they ask for it."""
+    return tmp_path_factory.mktemp("scenes of größe")
+
+
+@pytest.fixture
+def classified(ready: ModuleType, skirt: Any, folder: Path) -> Any:
+    """The skirt with automatic classes."""
+    if not opened(ready, folder / "classified.blend"):
+        assert ready.ops.ssilk.classify() == {"FINISHED"}
+        ready.ops.wm.save_as_mainfile(filepath=str(folder / "classified.blend"))
+    return ready.data.objects["Skirt"]
+
+
+@pytest.fixture
+def rigged(ready: ModuleType, classified: Any, folder: Path) -> Any:
+    """The skirt, classified and rigged with six proxies."""
+    if not opened(ready, folder / "rigged.blend"):
+        assert ready.ops.ssilk.generate_rig(proxies=6) == {"FINISHED"}
+        ready.ops.wm.save_as_mainfile(filepath=str(folder / "rigged.blend"))
+    return ready.data.objects["Skirt"]
+
+
+@pytest.fixture
+def trained(ready: ModuleType, skirt: Any, folder: Path, ssilk_python: str) -> Any:
+    """The skirt on an animated pillar, active, with a model that moves it visibly."""
+    from .scenes import train_skirt
+
+    if not opened(ready, folder / "trained.blend"):
+        train_skirt(ready, skirt, folder / "trained.blend", ssilk_python)
+    activate(ready, ready.data.objects["Skirt"])
+    return ready.data.objects["Skirt"]
+
+
+def opened(bpy: ModuleType, path: Path) -> bool:
+    """Open a file if it is there; return whether it is."""
+    if path.exists():
+        bpy.ops.wm.open_mainfile(filepath=str(path))
+    return path.exists()
+
+
 def add_armature(bpy: ModuleType) -> Any:
     armature = bpy.data.objects.new("Rig", bpy.data.armatures.new("Rig"))
     bpy.context.collection.objects.link(armature)

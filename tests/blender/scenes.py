@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from .conftest import activate
+from .conftest import BONES, activate
 
 LIVELY = """
 import sys
@@ -113,18 +113,28 @@ def state_file(garment: Any) -> dict[str, Any]:
     return json.loads((job_of(garment) / "state.json").read_text())
 
 
-def trained_skirt(bpy: ModuleType, skirt: Any, path: Path, python: str) -> Any:
-    """Return the skirt on an animated pillar, with a lively model, from a file that the first call makes."""
+def train_skirt(bpy: ModuleType, skirt: Any, path: Path, python: str) -> None:
+    """Train the skirt for a moment on its pillar, make its model lively, and save the file."""
     from blender_addon.scene.models import model_of
 
-    if not path.exists():
-        rig_and_animate(bpy, skirt)
-        bpy.ops.wm.save_as_mainfile(filepath=str(path))
-        assert bpy.ops.ssilk.find_motions() == {"FINISHED"}
-        skirt.ssilk.training.preset, skirt.ssilk.training.iterations = "draft", 4
-        assert bpy.ops.ssilk.train() == {"FINISHED"}
-        assert ended(skirt).state == "done"
-        enliven(python, model_of(skirt))
-        bpy.ops.wm.save_mainfile()
-    bpy.ops.wm.open_mainfile(filepath=str(path))
-    return bpy.data.objects["Skirt"]
+    rig_and_animate(bpy, skirt)
+    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    assert bpy.ops.ssilk.find_motions() == {"FINISHED"}
+    skirt.ssilk.training.preset, skirt.ssilk.training.iterations = "draft", 4
+    assert bpy.ops.ssilk.train() == {"FINISHED"}
+    assert ended(skirt).state == "done"
+    enliven(python, model_of(skirt))
+    bpy.ops.wm.save_mainfile()
+
+
+def weights_of(thing: Any) -> np.ndarray:
+    """Return the weights of a mesh in all of its vertex groups, shape (V, groups)."""
+    matrix = np.zeros((len(thing.data.vertices), len(thing.vertex_groups)))
+    for vertex in thing.data.vertices:
+        for element in vertex.groups:
+            matrix[vertex.index, element.group] = element.weight
+    return matrix
+
+
+def proxies_of(bpy: ModuleType) -> list[str]:
+    return [bone.name for bone in bpy.data.objects["Rig"].data.bones if bone.name not in BONES]

@@ -5,36 +5,19 @@ from __future__ import annotations
 
 import re
 import subprocess
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
+from blender_addon.scene.models import model_of
+
 from .conftest import ROOT, activate
-from .scenes import decoded, shown, trained_skirt
+from .scenes import decoded, shown
 
 EXACT = 1e-5  # [m]
 FRAMES = range(1, 41)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
-    """A folder whose name is not easy, for what several tests open."""
-    return tmp_path_factory.mktemp("shots of größe")
-
-
-@pytest.fixture
-def trained(ready, skirt, folder, ssilk_python):
-    """The skirt on an animated pillar, with a model that moves it visibly."""
-    return trained_skirt(ready, skirt, folder / "trained.blend", ssilk_python)
-
-
-def model_of(garment) -> Path:
-    from blender_addon.scene.models import model_of
-
-    return model_of(garment)
 
 
 def bake(bpy, garment, **options) -> None:
@@ -191,7 +174,11 @@ def test_removing_a_bake_leaves_the_garment_as_it_was(ready, trained):
 
     def state() -> tuple:
         names = [group.name for group in trained.vertex_groups]
-        return names, read_groups(trained, trained.data, sorted(names)).tolist(), sorted(trained.data.attributes.keys())
+        return (
+            names,
+            read_groups(trained, trained.data, sorted(names)).tolist(),
+            sorted(trained.data.attributes.keys()),
+        )
 
     before = state()
     bake(ready, trained)
@@ -257,8 +244,6 @@ def test_shapes_go_in_the_objects_own_space(ready, trained, tmp_path, ssilk_pyth
 
 
 def test_usd_lies_beside_the_blend_file(ready, trained, folder, ssilk_python):
-    from blender_addon.scene.models import model_of
-
     bake(ready, trained, to_timeline=False, to_usd=True)
     assert not strips(ready.data.objects["Rig"], trained)
     shot = folder / "Skirt.usdc"
@@ -345,9 +330,7 @@ def remove(bpy, thing) -> None:
 
 
 def test_an_unsaved_file_can_bake_to_its_timeline_but_not_beside_itself(ready, trained):
-    from blender_addon.scene.models import model_of as path_of
-
-    trained.ssilk.model = str(path_of(trained))
+    trained.ssilk.model = str(model_of(trained))
     ready.ops.wm.save_as_mainfile(filepath=ready.data.filepath, copy=True)
     from blender_addon.operators.baking import usd_path
 

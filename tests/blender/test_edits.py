@@ -9,11 +9,11 @@ import pytest
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
 from .conftest import BONES, activate
-from .test_rigging import classified, files, proxies_of, rigged, weights_of  # noqa: F401
+from .scenes import proxies_of, weights_of
 
 
 @pytest.fixture
-def edit(ready, rigged):  # noqa: F811
+def edit(ready, rigged):
     """A function that changes edit bones by hand, and leaves the garment active."""
 
     def run(change):
@@ -41,18 +41,18 @@ def parents(bpy) -> dict[str, str]:
     return {bone.name: bone.parent.name for bone in bpy.data.objects["Rig"].data.bones if bone.parent}
 
 
-def test_a_fresh_rig_has_no_edits(ready, rigged):  # noqa: F811
+def test_a_fresh_rig_has_no_edits(ready, rigged):
     assert edits_of(ready, rigged).summary == ""
 
 
-def test_the_same_again_is_the_same(ready, rigged):  # noqa: F811
+def test_the_same_again_is_the_same(ready, rigged):
     places, weights = heads(ready), weights_of(rigged)
     ready.ops.ssilk.generate_rig(proxies=6)
     assert (heads(ready), edits_of(ready, rigged).summary) == (places, "")
     np.testing.assert_array_equal(weights_of(rigged), weights)
 
 
-def test_what_was_moved_stays_where_it_is(ready, rigged, edit):  # noqa: F811
+def test_what_was_moved_stays_where_it_is(ready, rigged, edit):
     name = proxies_of(ready)[2]
     weights = weights_of(rigged)
 
@@ -71,7 +71,7 @@ def test_what_was_moved_stays_where_it_is(ready, rigged, edit):  # noqa: F811
     assert heads(ready) != moved
 
 
-def test_renaming_is_no_edit_but_stays_with_what_was_moved(ready, rigged, edit):  # noqa: F811
+def test_renaming_is_no_edit_but_stays_with_what_was_moved(ready, rigged, edit):
     first, second = proxies_of(ready)[:2]
 
     def rename(bones):
@@ -87,7 +87,7 @@ def test_renaming_is_no_edit_but_stays_with_what_was_moved(ready, rigged, edit):
     assert len(proxies_of(ready)) == 6
 
 
-def test_what_was_added_stays(ready, rigged, edit):  # noqa: F811
+def test_what_was_added_stays(ready, rigged, edit):
     above = proxies_of(ready)[1]
 
     def add(bones):
@@ -107,7 +107,7 @@ def test_what_was_added_stays(ready, rigged, edit):  # noqa: F811
     assert edits_of(ready, rigged).summary == "1 added, 2 vertices repainted"
 
 
-def test_what_was_deleted_is_not_made_again(ready, rigged, edit):  # noqa: F811
+def test_what_was_deleted_is_not_made_again(ready, rigged, edit):
     leaf = next(name for name in proxies_of(ready) if name not in parents(ready).values())
     edit(lambda bones: bones.remove(bones[leaf]))
     assert edits_of(ready, rigged).summary == "1 deleted"
@@ -119,7 +119,7 @@ def test_what_was_deleted_is_not_made_again(ready, rigged, edit):  # noqa: F811
         np.testing.assert_allclose(weights_of(rigged).sum(axis=1), 1, atol=1e-6)
 
 
-def test_deleting_a_root_changes_nothing_on_those_below(ready, rigged, edit):  # noqa: F811
+def test_deleting_a_root_changes_nothing_on_those_below(ready, rigged, edit):
     root = next(name for name in proxies_of(ready) if parents(ready)[name] in BONES)
     below = [name for name, above in parents(ready).items() if above == root]
     edit(lambda bones: bones.remove(bones[root]))
@@ -128,7 +128,7 @@ def test_deleting_a_root_changes_nothing_on_those_below(ready, rigged, edit):  #
     assert all(parents(ready)[name] in BONES for name in below)
 
 
-def test_what_was_reparented_stays_so(ready, rigged, edit):  # noqa: F811
+def test_what_was_reparented_stays_so(ready, rigged, edit):
     second = proxies_of(ready)[1]
 
     def reparent(bones):
@@ -141,7 +141,7 @@ def test_what_was_reparented_stays_so(ready, rigged, edit):  # noqa: F811
     assert len(proxies_of(ready)) == 6
 
 
-def test_a_copy_of_a_proxy_is_an_addition(ready, rigged, edit):  # noqa: F811
+def test_a_copy_of_a_proxy_is_an_addition(ready, rigged, edit):
     name = proxies_of(ready)[0]
 
     def copy(bones):
@@ -153,7 +153,7 @@ def test_a_copy_of_a_proxy_is_an_addition(ready, rigged, edit):  # noqa: F811
     assert edits_of(ready, rigged).added == ("Copy",)
 
 
-def test_repainted_weights_stay(ready, rigged):  # noqa: F811
+def test_repainted_weights_stay(ready, rigged):
     name = next(name for name in proxies_of(ready) if name in rigged.vertex_groups)
     for group in rigged.vertex_groups:
         group.remove([5, 6])
@@ -167,7 +167,7 @@ def test_repainted_weights_stay(ready, rigged):  # noqa: F811
     assert edits_of(ready, rigged).summary == "2 vertices repainted"
 
 
-def test_subdividing_is_no_repainting(ready, rigged):  # noqa: F811
+def test_subdividing_is_no_repainting(ready, rigged):
     ready.ops.object.mode_set(mode="EDIT")
     ready.ops.mesh.select_all(action="SELECT")
     ready.ops.mesh.subdivide(number_cuts=1)
@@ -176,7 +176,7 @@ def test_subdividing_is_no_repainting(ready, rigged):  # noqa: F811
     assert edits_of(ready, rigged).summary == ""
 
 
-def test_fewer_proxies_leave_an_edited_one_its_own(ready, rigged, edit):  # noqa: F811
+def test_fewer_proxies_leave_an_edited_one_its_own(ready, rigged, edit):
     """Where no new proxy is near, a moved one stays beside the new ones, as if it had been added."""
     name = proxies_of(ready)[-1]
 
@@ -191,7 +191,7 @@ def test_fewer_proxies_leave_an_edited_one_its_own(ready, rigged, edit):  # noqa
 
 
 @pytest.fixture
-def dressed_up(ready, rigged):  # noqa: F811
+def dressed_up(ready, rigged):
     """The skirt with weights of chance put on as trained ones, after its vertex 5 was repainted; both weights."""
     from blender_addon.scene.worn import put_on
 
@@ -210,7 +210,7 @@ def named_weights(thing, names) -> np.ndarray:
     return np.pad(weights_of(thing), ((0, 0), (0, 1)))[:, columns]
 
 
-def test_trained_weights_are_no_repainting_and_repainted_vertices_stay_known(ready, rigged, dressed_up):  # noqa: F811
+def test_trained_weights_are_no_repainting_and_repainted_vertices_stay_known(ready, rigged, dressed_up):
     names, before, learned = dressed_up
     np.testing.assert_allclose(named_weights(rigged, names), learned, atol=1e-6)
     found = edits_of(ready, rigged)
@@ -221,7 +221,7 @@ def test_trained_weights_are_no_repainting_and_repainted_vertices_stay_known(rea
     assert not any(attribute.name.startswith(("ssilk:own", "ssilk:worn")) for attribute in rigged.data.attributes)
 
 
-def test_trained_weights_come_off_again_but_for_what_was_painted_on_them(ready, rigged, dressed_up):  # noqa: F811
+def test_trained_weights_come_off_again_but_for_what_was_painted_on_them(ready, rigged, dressed_up):
     from blender_addon.scene.gather import gather
     from blender_addon.scene.worn import is_worn, put_on, take_off
 
@@ -241,7 +241,7 @@ def test_trained_weights_come_off_again_but_for_what_was_painted_on_them(ready, 
     assert not is_worn(rigged) and np.flatnonzero(edits_of(ready, rigged).repainted).tolist() == [5, 9]
 
 
-def test_the_dialog_says_what_there_is_to_keep(ready, rigged, edit):  # noqa: F811
+def test_the_dialog_says_what_there_is_to_keep(ready, rigged, edit):
     from blender_addon.operators.rig import edits_line
 
     assert edits_line(rigged) == "By hand: nothing"

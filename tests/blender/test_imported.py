@@ -12,22 +12,21 @@ import pytest
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
 from .conftest import BONES, ROOT, activate
-from .test_rigging import contract_of, files, weights_of  # noqa: F401
+from .scenes import weights_of
+from .test_rigging import contract_of
 
 SHARED = ROOT.parent / "shared" / "data"
 
 
 @pytest.fixture
-def stage(ready, skirt, ssilk_python, files) -> Path:  # noqa: F811
+def stage(ready, skirt, ssilk_python, folder) -> Path:
     """A stage of the skirt that `ssilk rig` wrote, under a path that is hard to spell."""
     from blender_addon.scene.gather import gather
     from blender_addon.scene.handover import hand_over
     from blender_addon.scene.objects import Pair
 
-    folder = files / "für Élise"
     rigged = folder / "rigged stage.usdc"
     if not rigged.exists():
-        folder.mkdir()
         given = hand_over(gather(skirt), Pair.of(skirt, ready.data.objects["Rig"]), folder)
         command = [ssilk_python, "-m", "ssilk_core", "rig", str(given.stage), "-o", str(rigged), "--proxies", "5"]
         subprocess.run([*command, "--garment", given.prims["Skirt"]], check=True, capture_output=True, env={})

@@ -3,38 +3,19 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
+from blender_addon.scene.models import model_of
+
 from .conftest import activate
-from .scenes import decoded, enliven, shown, trained_skirt
+from .scenes import decoded, enliven, shown
 from .test_panels import drawn
 
 EXACT = 2e-5  # [m]
 FRAMES = range(1, 41)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
-    return tmp_path_factory.mktemp("live")
-
-
-@pytest.fixture
-def trained(ready, skirt, folder, ssilk_python):
-    """The skirt on an animated pillar, with a model that moves it visibly."""
-    garment = trained_skirt(ready, skirt, folder / "trained.blend", ssilk_python)
-    activate(ready, garment)
-    return garment
-
-
-def model_of(garment) -> Path:
-    from blender_addon.scene.models import model_of
-
-    return model_of(garment)
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ import pytest
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
 from .conftest import BONES, activate, add_armature
+from .scenes import proxies_of, weights_of
 
 READ = """
 import json, sys
@@ -28,48 +29,6 @@ print(json.dumps({
     "weights": rig and rig.skin.dense(character.skeleton.joint_count + rig.proxy_count).tolist(),
 }))
 """
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory) -> Path:
-    """A folder for what several tests open; it fills as they ask for it."""
-    return tmp_path_factory.mktemp("scenes")
-
-
-@pytest.fixture
-def classified(ready, skirt, files):
-    """The skirt with automatic classes."""
-    if not opened(ready, files / "classified.blend"):
-        assert ready.ops.ssilk.classify() == {"FINISHED"}
-        ready.ops.wm.save_as_mainfile(filepath=str(files / "classified.blend"))
-    return ready.data.objects["Skirt"]
-
-
-@pytest.fixture
-def rigged(ready, classified, files):
-    """The skirt, classified and rigged with six proxies."""
-    if not opened(ready, files / "rigged.blend"):
-        assert ready.ops.ssilk.generate_rig(proxies=6) == {"FINISHED"}
-        ready.ops.wm.save_as_mainfile(filepath=str(files / "rigged.blend"))
-    return ready.data.objects["Skirt"]
-
-
-def opened(bpy, path: Path) -> bool:
-    if path.exists():
-        bpy.ops.wm.open_mainfile(filepath=str(path))
-    return path.exists()
-
-
-def weights_of(thing) -> np.ndarray:
-    matrix = np.zeros((len(thing.data.vertices), len(thing.vertex_groups)))
-    for vertex in thing.data.vertices:
-        for element in vertex.groups:
-            matrix[vertex.index, element.group] = element.weight
-    return matrix
-
-
-def proxies_of(bpy) -> list[str]:
-    return [bone.name for bone in bpy.data.objects["Rig"].data.bones if bone.name not in BONES]
 
 
 def test_hem_is_loose_and_waist_is_not(classified):

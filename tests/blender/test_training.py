@@ -12,6 +12,8 @@ import pytest
 
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
+from blender_addon.scene.models import job_of
+
 from .conftest import BONES, activate
 from .scenes import ended, rig_and_animate
 
@@ -30,11 +32,6 @@ print(json.dumps({"fps": motion.fps, "start": motion.start, "worlds": worlds.tol
 """
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
-    return tmp_path_factory.mktemp("trainings of größe")
-
-
 @pytest.fixture
 def rigged(ready, skirt, folder):
     """The skirt with proxies on an animated pillar, in a saved file."""
@@ -47,12 +44,6 @@ def rigged(ready, skirt, folder):
     activate(ready, garment)
     garment.ssilk.training.preset, garment.ssilk.training.iterations = "draft", 4
     return garment
-
-
-def job_of(garment) -> Path:
-    from blender_addon.scene.models import job_of
-
-    return job_of(garment)
 
 
 def choose(bpy, garment, *names: str) -> None:
