@@ -131,6 +131,7 @@ def test_moved_turned_and_scaled_objects_make_no_difference(bpy, dressed):
     for thing, scale in ((pillar, (2, 0.5, 1)), (dressed, (-1.5, 1, 3))):
         points = np.array([vertex.co for vertex in thing.data.vertices])
         thing.data.vertices.foreach_set("co", (points / scale).astype(np.float32).reshape(-1))
+        thing.data.update()
         thing.scale = scale
     bpy.context.view_layer.update()
     np.testing.assert_allclose(depths(bpy, dressed), before, atol=2e-5)
