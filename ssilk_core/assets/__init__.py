@@ -1,0 +1,23 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The world as arrays: skeleton, character, garment, proxy rig, motion, and the scene they make.
+
+Every class is a frozen dataclass, validated when built; arrays are made read-only. Conventions, everywhere
+inside the core: metres, y up, gravity along -y, column vectors (``x_world = T @ x_joint``), quaternions as
+(w, x, y, z), triangles counter-clockwise seen from outside. Readers convert to this, writers convert back.
+"""
+
+from .arrays import UP, Floats, Ints
+from .character import Body, Character
+from .deformer import Deformer, GarmentPose
+from .garment import CLASS_NAMES, LOOSE, PINNED, TIGHT, Garment
+from .mesh import Mesh
+from .motion import Motion
+from .rig import ProxyRig
+from .scene import Scene
+from .skeleton import Skeleton, check_rigid
+from .skin import SkinWeights
+
+__all__ = [
+    "CLASS_NAMES", "LOOSE", "PINNED", "TIGHT", "UP", "Body", "Character", "Deformer", "Floats", "Garment",
+    "GarmentPose", "Ints", "Mesh", "Motion", "ProxyRig", "Scene", "Skeleton", "SkinWeights", "check_rigid",
+]  # fmt: skip

@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Arrays of assets: their types, made read-only, checked."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import need
+
+UP = np.array([0.0, 1.0, 0.0])
+
+Floats = NDArray[np.floating]
+Ints = NDArray[np.integer]
+
+
+def frozen(array: object, dtype: type) -> NDArray:
+    """Return a read-only copy in one piece of memory."""
+    copy: NDArray = np.array(array, dtype=dtype, order="C")
+    copy.flags.writeable = False
+    return copy
+
+
+def assign(instance: object, **values: object) -> None:
+    """Set fields of a frozen dataclass while it is built."""
+    for name, value in values.items():
+        object.__setattr__(instance, name, value)
+
+
+def need_finite(array: NDArray, where: str, what: str) -> None:
+    """Raise `SsilkError` where rows hold NaN or infinity."""
+    bad = np.flatnonzero(~np.isfinite(array).all(axis=tuple(range(1, array.ndim))))
+    need(
+        len(bad) == 0,
+        where,
+        f"{len(bad)} of {len(array)} {what} hold NaN or infinity, first number {bad[0] if len(bad) else 0}",
+        "all must be finite",
+        "repair or re-export the source",
+    )

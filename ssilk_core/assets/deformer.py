@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A trained garment as any UsdSkel reader sees it, and its frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import need
+from .arrays import Floats, assign, frozen
+from .scene import Scene
+from .skin import SkinWeights
+
+
+@dataclass(frozen=True, eq=False)
+class Deformer:
+    """A trained garment as any UsdSkel reader sees it: rest points, blendshapes, weights (Eqs. 5 and 8).
+
+    Attributes:
+        scene: the garment, its character and its rig.
+        skin: trained weights over the combined joints.
+        shapes: blendshape offsets in rest space [m], shape (K, V, 3); zero rows for pinned vertices.
+    """
+
+    scene: Scene
+    skin: SkinWeights
+    shapes: Floats
+
+    def __post_init__(self) -> None:
+        assign(self, shapes=frozen(self.shapes, np.float32))
+        count = self.scene.garment.mesh.vertex_count
+        need(
+            self.shapes.ndim == 3 and self.shapes.shape[1:] == (count, 3),
+            self.scene.garment.mesh.path,
+            f"blendshapes of shape {self.shapes.shape}",
+            f"(shapes, {count}, 3) is needed",
+        )
+        self.skin.check_joints(len(self.scene.joint_names))
+
+    @property
+    def shape_count(self) -> int:
+        return len(self.shapes)
+
+
+@dataclass(frozen=True, eq=False)
+class GarmentPose:
+    """Some consecutive frames of a garment: what the network says and what a shot stores (Eq. 7).
+
+    Attributes:
+        start: index of the first frame within the shot.
+        rotations: local rotations of the proxies, (w, x, y, z), relative to their parents, shape (F, P, 4).
+        weights: blendshape weights in [0, 1], shape (F, K).
+    """
+
+    start: int
+    rotations: Floats
+    weights: Floats
+
+    def __post_init__(self) -> None:
+        assign(self, rotations=frozen(self.rotations, np.float64), weights=frozen(self.weights, np.float32))
+
+    @property
+    def frame_count(self) -> int:
+        return len(self.weights)

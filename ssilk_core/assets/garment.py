@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A garment, its plain skinning and its vertex classes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import need
+from .arrays import Ints, assign, frozen
+from .mesh import Mesh
+from .skin import SkinWeights
+
+PINNED, TIGHT, LOOSE = 0, 1, 2
+CLASS_NAMES = ("pinned", "tight", "loose")
+
+
+@dataclass(frozen=True, eq=False)
+class Garment:
+    """A garment mesh fitted to the character's bind pose.
+
+    Attributes:
+        mesh: the garment at rest; its rest shape for the energies.
+        skin: weights onto the character's joints ("plain skinning"), or None when none are authored.
+        classes: PINNED, TIGHT or LOOSE for each vertex, shape (V,), or None when none are authored.
+    """
+
+    mesh: Mesh
+    skin: SkinWeights | None = None
+    classes: Ints | None = None
+
+    def __post_init__(self) -> None:
+        count = self.mesh.vertex_count
+        if self.skin is not None:
+            need(
+                self.skin.vertex_count == count,
+                self.mesh.path,
+                f"{self.skin.vertex_count} weight rows for {count} points",
+                "one row for each point is needed",
+            )
+        if self.classes is not None:
+            classes = frozen(self.classes, np.int8)
+            assign(self, classes=classes)
+            need(
+                classes.shape == (count,),
+                self.mesh.path,
+                f"{classes.size} vertex classes for {count} points",
+                "primvars:ssilk:class needs one value for each point",
+                "paint the classes again",
+            )
+            bad = int(np.count_nonzero((classes < PINNED) | (classes > LOOSE)))
+            need(
+                bad == 0,
+                self.mesh.path,
+                f"{bad} vertex classes are not 0, 1 or 2",
+                "pinned is 0, tight is 1, loose is 2",
+                "paint the classes again",
+            )

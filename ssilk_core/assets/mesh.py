@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Triangle meshes at the bind pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import need
+from .arrays import Floats, Ints, assign, frozen, need_finite
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A triangle mesh at the bind pose, in world space.
+
+    Attributes:
+        path: prim path (and file), for messages and for writing back.
+        points: positions [m], shape (V, 3).
+        faces: triangles, shape (F, 3).
+        polygon_counts, polygon_indices: the faces as they were authored (n-gons), for writing back;
+            the triangles themselves when left out.
+        uvs: texture coordinates per polygon corner, shape (len(polygon_indices), 2), or None.
+    """
+
+    path: str
+    points: Floats
+    faces: Ints
+    polygon_counts: Ints | None = None
+    polygon_indices: Ints | None = None
+    uvs: Floats | None = None
+
+    def __post_init__(self) -> None:
+        assign(self, points=frozen(self.points, np.float64), faces=frozen(self.faces, np.int64))
+        self._check_triangles()
+        counts = np.full(len(self.faces), 3) if self.polygon_counts is None else self.polygon_counts
+        indices = self.faces.reshape(-1) if self.polygon_indices is None else self.polygon_indices
+        uvs = None if self.uvs is None else frozen(self.uvs, np.float32)
+        assign(self, polygon_counts=frozen(counts, np.int32), polygon_indices=frozen(indices, np.int32), uvs=uvs)
+        self._check_polygons(int(np.sum(counts)))
+
+    def _check_triangles(self) -> None:
+        points, faces = self.points, self.faces
+        need(
+            points.ndim == 2 and points.shape[-1] == 3 and len(points) > 0,
+            self.path,
+            "the mesh has no points",
+            "a mesh needs points and faces",
+        )
+        need(
+            faces.ndim == 2 and faces.shape[-1] == 3 and len(faces) > 0,
+            self.path,
+            "the mesh has no faces",
+            "a mesh needs points and faces",
+        )
+        need_finite(points, self.path, "points")
+        bad = int(np.count_nonzero((faces < 0) | (faces >= len(points))))
+        need(
+            bad == 0,
+            self.path,
+            f"{bad} face indices lie outside 0 to {len(points) - 1}",
+            "an index names a point of the mesh",
+            "re-export the mesh",
+        )
+
+    def _check_polygons(self, count: int) -> None:
+        corners, uvs, last = self.indices_of_corners, self.uvs, len(self.points) - 1
+        need(
+            count == len(corners) and bool(((corners >= 0) & (corners <= last)).all()),
+            self.path,
+            "the polygons do not fit their points",
+            f"counts that add up to {len(corners)} corners, and indices from 0 to {last}, are needed",
+            "re-export the mesh",
+        )
+        need(
+            uvs is None or uvs.shape == (len(corners), 2),
+            self.path,
+            "texture coordinates do not match the face corners",
+            "one (u, v) for each corner is needed",
+        )
+
+    @property
+    def indices_of_corners(self) -> Ints:
+        assert self.polygon_indices is not None
+        return self.polygon_indices
+
+    @property
+    def vertex_count(self) -> int:
+        return len(self.points)
