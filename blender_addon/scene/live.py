@@ -64,7 +64,7 @@ class Live:
     @property
     def renewed(self) -> bool:
         """Whether the model was written since it was read, as by a training that goes on."""
-        return self.model.is_file() and self.model.stat().st_mtime != self._written
+        return _written(self.model) not in (0.0, self._written)
 
     def read(self) -> bool:
         """Read a little of the model, then of the motion; return whether there is more.
@@ -116,7 +116,7 @@ class Live:
 
     def _reading(self, take: Take) -> Iterator[float]:
         """Read the motion, then roll over it, so that scrubbing waits for nothing; yield the part that is done."""
-        if self.renewed:
+        if self.trained is None or self.renewed:
             yield from self._dressing()
         _, armature = self.objects()
         yield from (READING * done for done in sample(armature, character_joints(self.joints), [take]))
@@ -130,7 +130,7 @@ class Live:
 
     def _dressing(self) -> Iterator[float]:
         """Read the model and give the garment its shapes and weights; it is held until it is played by them."""
-        self._written = self.model.stat().st_mtime
+        self._written = _written(self.model)
         trained = Trained(self.model, self.joints, bpy.context.scene.unit_settings.scale_length)
         yield 0.0
         shot = trained.shot()
@@ -158,6 +158,11 @@ class Live:
         rotations = kinematics.quaternion_from_matrix(local[..., :3, :3])
         fps = scene.render.fps / scene.render.fps_base
         return core("assets").Motion("the timeline", fps, rotations, local[..., :3, 3])
+
+
+def _written(path: Path) -> float:
+    """Return when a file was written; zero where there is none."""
+    return path.stat().st_mtime if path.is_file() else 0.0
 
 
 def _found(name: str, uid: int) -> bpy.types.Object:

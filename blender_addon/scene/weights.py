@@ -46,7 +46,7 @@ def _elements(mesh: bpy.types.Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]
             groups += element.keys()
             weights += element.values()
     none = [0] * len(mesh.vertices)
-    return np.array(counts or none), np.array(groups, dtype=int), np.array(weights, dtype=np.float32)
+    return np.array(counts or none, dtype=int), np.array(groups, dtype=int), np.array(weights, dtype=np.float32)
 
 
 def write_groups(thing: bpy.types.Object, weights: np.ndarray, names: Sequence[str], gone: Sequence[str]) -> None:

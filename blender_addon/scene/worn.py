@@ -47,7 +47,8 @@ def own_groups(armature: bpy.types.Object, garment: bpy.types.Object, names: Seq
     worn = np.empty(len(found), dtype=np.float32)
     garment.data.attributes[WORN].data.foreach_get("value", worn)
     untouched = np.abs(signature(found, keys) - worn) <= SAME_WEIGHTS
-    found[untouched] = read_kept(garment.data, OWN, keys)[untouched]
+    kept = read_kept(garment.data, OWN, keys)
+    found[untouched] = 0.0 if kept is None else kept[untouched]  # none: it had no weights at all
     return found[:, : len(names)]
 
 

@@ -241,6 +241,45 @@ def test_trained_weights_come_off_again_but_for_what_was_painted_on_them(ready, 
     assert not is_worn(rigged) and np.flatnonzero(edits_of(ready, rigged).repainted).tolist() == [5, 9]
 
 
+def test_a_garment_without_weights_of_its_own_has_none_again(ready, skirt):
+    from blender_addon.scene.worn import is_worn, own_groups, put_on, take_off
+
+    armature, weights = ready.data.objects["Rig"], np.full((len(skirt.data.vertices), 3), 1 / 3, dtype=np.float32)
+    put_on(armature, skirt, weights, BONES)
+    assert len(skirt.vertex_groups) == 3 and not own_groups(armature, skirt, BONES).any()
+    take_off(armature, skirt)
+    assert not skirt.vertex_groups and not is_worn(skirt)
+
+
+def test_writing_weights_leaves_shape_keys_and_attributes_alone(ready, skirt):
+    from blender_addon.scene.weights import read_groups, write_groups
+
+    skirt.shape_key_add(name="Basis")
+    longer = skirt.shape_key_add(name="Longer", from_mix=False)
+    for point in longer.data:
+        point.co.z -= 0.1
+    skirt.active_shape_key_index = 1
+    skirt.vertex_groups.new(name="Pin").add([3, 4], 0.5, "REPLACE")
+    skirt.data.attributes.new("mine", "INT", "FACE").data[2].value = 7
+
+    def state() -> tuple:
+        keys = [[tuple(point.co) for point in key.data] for key in skirt.data.shape_keys.key_blocks]
+        places = [tuple(vertex.co) for vertex in skirt.data.vertices]
+        return (
+            keys,
+            places,
+            read_groups(skirt, skirt.data, ["Pin"]).tolist(),
+            skirt.data.attributes["mine"].data[2].value,
+        )
+
+    before = state()
+    weights = np.random.default_rng(1).dirichlet(np.ones(3), len(skirt.data.vertices)).astype(np.float32)
+    for _ in range(2):
+        write_groups(skirt, weights, BONES, ())
+        np.testing.assert_array_equal(read_groups(skirt, skirt.data, BONES), weights)
+    assert state() == before
+
+
 def test_the_dialog_says_what_there_is_to_keep(ready, rigged, edit):
     from blender_addon.operators.rig import edits_line
 
