@@ -69,13 +69,16 @@ def save_model(path: str | Path, model: ModelFile, *, pack: bool = False) -> Non
     """
     from safetensors.numpy import save
 
-    scene, skeleton, mesh, rig = (
-        model.scene,
-        model.scene.character.skeleton,
-        model.scene.garment.mesh,
-        model.scene.rig,
-    )
-    tensors = {
+    arrays = {name: narrowest(np.ascontiguousarray(value)) for name, value in _tensors(model).items()}
+    with replacing(path) as temporary:
+        temporary.write_bytes(save(_packed(arrays) if pack else arrays, {"ssilk": json.dumps(_document(model))}))
+
+
+def _tensors(model: ModelFile) -> dict[str, Any]:
+    """Return a model's tensors as a file names them."""
+    scene = model.scene
+    skeleton, mesh, rig = scene.character.skeleton, scene.garment.mesh, scene.rig
+    return {
         "scene.skeleton.parents": skeleton.parents,
         "scene.skeleton.bind_transforms": skeleton.bind_transforms,
         "scene.skeleton.rest_transforms": skeleton.rest_transforms,
@@ -94,7 +97,12 @@ def save_model(path: str | Path, model: ModelFile, *, pack: bool = False) -> Non
         **({} if mesh.uvs is None else {"scene.mesh.uvs": mesh.uvs}),
         **{f"model.{name}": value for name, value in model.parameters.items()},
     }
-    document = {
+
+
+def _document(model: ModelFile) -> dict[str, Any]:
+    """Return what a model's header says."""
+    skeleton, mesh, rig = model.scene.character.skeleton, model.scene.garment.mesh, model.scene.rig
+    return {
         "format": FORMAT,
         "ssilk": __version__,
         "joint_names": skeleton.joint_names,
@@ -104,9 +112,6 @@ def save_model(path: str | Path, model: ModelFile, *, pack: bool = False) -> Non
         "fabric": asdict(model.fabric),
         "provenance": model.provenance,
     }
-    arrays = {name: narrowest(np.ascontiguousarray(value)) for name, value in tensors.items()}
-    with replacing(path) as temporary:
-        temporary.write_bytes(save(_packed(arrays) if pack else arrays, {"ssilk": json.dumps(document)}))
 
 
 def _packed(tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -187,6 +192,27 @@ def _need_types(values: Mapping[Any, object], likes: Mapping[Any, object]) -> No
 
 
 def _model_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> ModelFile:
+    scene = _scene_of(tensors, document)
+    joints, skeleton = tensors["joints"], scene.character.skeleton
+    need(
+        joints.ndim == 1 and np.isin(joints, np.arange(skeleton.joint_count)).all(),
+        skeleton.path,
+        f"descriptors of joints {joints.tolist()}",
+        f"they lie in 0 to {skeleton.joint_count - 1}",
+        "train again",
+    )
+    return ModelFile(
+        scene,
+        ModelConfig(**document["config"]),
+        Fabric(**document["fabric"]),
+        joints.astype(np.int64),
+        _parameters(tensors, scene.garment.mesh.path),
+        document["provenance"],
+    )
+
+
+def _scene_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Scene:
+    """Return the garment, its rig and the skeleton of a file."""
     paths = document["paths"]
 
     def skin(name: str, path: str) -> SkinWeights:
@@ -215,23 +241,7 @@ def _model_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Model
         skin("rig", paths["rig"]),
     )
     garment = Garment(mesh, skin("plain", paths["garment"]), tensors["scene.classes"])
-    parameters = _parameters(tensors, paths["garment"])
-    joints = tensors["joints"]
-    need(
-        joints.ndim == 1 and np.isin(joints, np.arange(skeleton.joint_count)).all(),
-        skeleton.path,
-        f"descriptors of joints {joints.tolist()}",
-        f"they lie in 0 to {skeleton.joint_count - 1}",
-        "train again",
-    )
-    return ModelFile(
-        Scene(Character(paths["skeleton"], skeleton, ()), garment, rig),
-        ModelConfig(**document["config"]),
-        Fabric(**document["fabric"]),
-        joints.astype(np.int64),
-        parameters,
-        document["provenance"],
-    )
+    return Scene(Character(paths["skeleton"], skeleton, ()), garment, rig)
 
 
 def _parameters(tensors: dict[str, np.ndarray], where: str) -> dict[str, np.ndarray]:

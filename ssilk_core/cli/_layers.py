@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ssilk_core.errors import need
 from ssilk_core.events import Message, Reporter, silent
@@ -121,18 +121,14 @@ def _write_animation(layout: Layout, asset: Asset, bake: Bake, task: Task, repor
     from ssilk_usd import layers
 
     refined = bake.refine(report)
+    common: dict[str, Any] = {
+        "units": bake.units,
+        "start": bake.start,
+        "samples_per_frame": task.samples,
+        "lean": bake.target.lean,
+    }
     if task.points:
-        layers.write_points(
-            layout,
-            asset,
-            bake.points(silent),
-            bake.deformer,
-            bake.motion,
-            units=bake.units,
-            start=bake.start,
-            samples_per_frame=task.samples,
-            lean=bake.target.lean,
-        )
+        layers.write_points(layout, asset, bake.points(silent), bake.deformer, bake.motion, **common)
     with replacing(layout.animation) as unproven:
         summary = layers.write_animation(
             layout,
@@ -140,10 +136,7 @@ def _write_animation(layout: Layout, asset: Asset, bake: Bake, task: Task, repor
             bake.deformer,
             bake.motion,
             bake.poses(),
-            units=bake.units,
-            start=bake.start,
-            samples_per_frame=task.samples,
-            lean=bake.target.lean,
+            **common,
             hidden=bake.hidden,
             provenance=bake.carried(layout.animation),
             path=unproven,

@@ -68,28 +68,14 @@ def _bake_layers(options: argparse.Namespace, report: Reporter) -> int:
 
 
 def _bake_file(options: argparse.Namespace, report: Reporter) -> int:
-    from ssilk_usd.export import packaged
-    from ssilk_usd.read_stage import split_location
-
     from ._baking import open_bake
     from ._level import levelled
 
-    tasks, suffixes = tasks_of(options), TARGETS[options.target].suffixes
-    need(len(tasks) == 1 and not options.points, str(options.output), "one file", "it holds one garment in one shot "
-         "and no point cache", "name a folder")  # fmt: skip
-    need(options.output.suffix in suffixes, str(options.output), f"the suffix is '{options.output.suffix}'",
-         f"{options.target} takes {', '.join(suffixes)}")  # fmt: skip
-    (task,) = tasks
-    check_output(options.output, task.model, task.stage, split_location(task.motion)[0])
+    task = _one_task(options)
     bake = levelled(open_bake(_request(task, options)), options, report)
     report(Started("bake", bake.motion.frame_count, {"output": str(options.output)}))
     refined = bake.refine(report)
-    with replacing(options.output) as unproven:
-        with packaged(unproven) as layer:
-            summary = _write(layer, bake, task, options.output)
-        if not task.verify:
-            report(Message("not verified, as asked", "warning"))
-        proof = bake.verify(unproven, report) if task.verify else {}
+    summary, proof = _write_proven(bake, task, options.output, report)
     detail: dict[str, object] = {
         "shot": str(options.output),
         "frames": summary.frame_count,
@@ -105,6 +91,32 @@ def _bake_file(options: argparse.Namespace, report: Reporter) -> int:
     }
     report(Result("bake", detail))
     return EXIT_OK
+
+
+def _one_task(options: argparse.Namespace) -> Task:
+    """Return the only task; raise `SsilkError` where there are more, or the file cannot be what is asked for."""
+    from ssilk_usd.read_stage import split_location
+
+    tasks, suffixes = tasks_of(options), TARGETS[options.target].suffixes
+    need(len(tasks) == 1 and not options.points, str(options.output), "one file", "it holds one garment in one shot "
+         "and no point cache", "name a folder")  # fmt: skip
+    need(options.output.suffix in suffixes, str(options.output), f"the suffix is '{options.output.suffix}'",
+         f"{options.target} takes {', '.join(suffixes)}")  # fmt: skip
+    (task,) = tasks
+    check_output(options.output, task.model, task.stage, split_location(task.motion)[0])
+    return task
+
+
+def _write_proven(bake: Bake, task: Task, output: Path, report: Reporter) -> tuple[ShotSummary, dict[str, object]]:
+    """Write a file that appears once it is proven; return what it holds, and figures."""
+    from ssilk_usd.export import packaged
+
+    with replacing(output) as unproven:
+        with packaged(unproven) as layer:
+            summary = _write(layer, bake, task, output)
+        if not task.verify:
+            report(Message("not verified, as asked", "warning"))
+        return summary, bake.verify(unproven, report) if task.verify else {}
 
 
 def _request(task: Task, options: argparse.Namespace) -> BakeRequest:

@@ -95,6 +95,11 @@ def add_bake(verb: argparse.ArgumentParser) -> None:
         help="run-up to the first pose and after each cut, so that the garment has settled (default 0)",
     )
     verb.add_argument("--root", metavar="PRIM", help="SkelRoot of the models that name none")
+    _add_output(verb)
+
+
+def _add_output(verb: argparse.ArgumentParser) -> None:
+    """Add the options that say what becomes of the garment, and what is written with it."""
     verb.add_argument("--plain", action="store_true", help="bake plain skinning instead of the network")
     verb.add_argument("--points", action="store_true", help="write point caches as well (folders)")
     verb.add_argument(

@@ -20,6 +20,7 @@ from ssilk_usd.play import Shot
 
 from ssilk_core.cli import main
 from ssilk_core.cli._baking import BakeRequest, open_bake
+from ssilk_core.cli._level import shot_bytes
 from ssilk_core.files import sha256
 from ssilk_core.kinematics import deform
 from ssilk_core.targets import TARGETS, capped
@@ -406,3 +407,10 @@ def test_the_manifest_is_of_the_inputs_contents_not_of_their_places(copy):
     assert main(shlex.split(f"{words} -o layers")) == 0
     assert json.loads(Path("layers/shots/walk/skirt/bake.json").read_text()) == record
     assert hashlib.sha256(anim().read_bytes()).hexdigest() == record["files"]["anim.usdc"]
+
+
+def test_each_frame_of_a_short_shot_takes_bytes(copy):
+    """Of 12 frames no two excerpts of 16 and 64 can be told apart."""
+    bake = open_bake(BakeRequest(model="skirt.safetensors", stage="rigged.usda", motion="walk.usda"))
+    taken = shot_bytes(bake, ".usdc", body=False)
+    assert taken.frame > 4 * 20 and taken.asset > 1000
