@@ -33,7 +33,7 @@ def patches_of(points: Floats, faces: Ints) -> Ints:
 
 
 def closest_on_faces(
-    x: Tensor, reach: Tensor, points: Tensor, faces: Tensor, allowed: Tensor | None = None
+    x: Tensor, reach: Tensor, points: Tensor, faces: Tensor, listed: Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the nearest points of triangles to all queries that have one within reach, Q of them.
 
@@ -42,38 +42,28 @@ def closest_on_faces(
         reach: distance that each nearest point is known to be within [m], shape (V, N); negative: not asked.
         points: corners of the triangles, shape (B, 3, N).
         faces: triangles, shape (F, 3).
-        allowed: how many body vertices follow, then these, one of which a query's triangles have, shape (V, 1 + C);
-            any triangles by default.
+        listed: the triangles that each row of queries may find, filled up by -1, shape (V, L); any by default.
 
     Returns:
         Row and frame of each query (Q,), body vertices at the corners of its triangle and barycentric coordinates,
         both (3, Q).
     """
     scores = SCORES * (ON_GPU if x.is_cuda else 1)
-    frames = max(1, scores // (len(x) * len(faces)))
-    touched = None if allowed is None else _touched(allowed, len(points), faces)
+    frames = max(1, scores // (len(x) * (len(faces) if listed is None else listed.shape[1])))
     parts = [
-        _closest(x, reach, points, faces, touched, at, min(at + frames, x.shape[2]))
+        _closest(x, reach, points, faces, listed, at, min(at + frames, x.shape[2]))
         for at in range(0, x.shape[2], frames)
     ]
     row, frame, corners, weights = (torch.cat(part, dim=-1) for part in zip(*parts))
     return row, frame, corners, weights
 
 
-def _touched(allowed: Tensor, count: int, faces: Tensor) -> Tensor:
-    """Return which faces have a corner that is allowed, shape (V, F)."""
-    mask = torch.zeros(len(allowed), count, dtype=torch.bool, device=faces.device).scatter_(
-        1, allowed[:, 1:].long(), True
-    )
-    return mask[:, faces[:, 0]] | mask[:, faces[:, 1]] | mask[:, faces[:, 2]]
-
-
 def _closest(
-    x: Tensor, reach: Tensor, points: Tensor, faces: Tensor, touched: Tensor | None, start: int, stop: int
+    x: Tensor, reach: Tensor, points: Tensor, faces: Tensor, listed: Tensor | None, start: int, stop: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return what `closest_on_faces` does, in frames `start` to `stop`."""
-    within = _within_reach(x[..., start:stop], reach[:, start:stop], points[..., start:stop], faces)
-    frame, row, face = (within if touched is None else within & touched).nonzero(as_tuple=True)
+    part = x[..., start:stop], reach[:, start:stop], points[..., start:stop], faces
+    frame, row, face = _within_reach(*part) if listed is None else _listed_within_reach(*part, listed)
     frame = frame + start
     corners = faces[face].T
     origin, second, third = (points[corner, :, frame].T for corner in corners)
@@ -91,19 +81,37 @@ def _closest(
     return row[winner], frame[winner], corners[:, winner], torch.stack([1 - s - t, s, t])[:, winner]
 
 
-def _within_reach(x: Tensor, reach: Tensor, points: Tensor, faces: Tensor) -> Tensor:
-    """Return whether a triangle's bounding sphere comes within reach of a query, shape (N, V, F).
+def _listed_within_reach(
+    x: Tensor, reach: Tensor, points: Tensor, faces: Tensor, listed: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what `_within_reach` does, of the faces listed for each query, shape (V, L)."""
+    centre, radius = _spheres(points, faces)
+    apart = sum((x[:, None, axis] - centre[:, axis][listed]).square() for axis in range(3))  # (V, L, N)
+    within = apart <= ((radius[:, 0][listed] + reach[:, None]) * (1 + 1e-6)).square()
+    asked = (reach >= 0)[:, None] & (listed >= 0)[..., None]
+    row, place, frame = (within & asked).nonzero(as_tuple=True)
+    return frame, row, listed[row, place]
+
+
+def _spheres(points: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
+    """Return centres (F, 3, N) and radii (F, 1, N) of spheres around triangles."""
+    corners = points[faces]
+    centre = corners.mean(1)
+    return centre, (corners - centre[:, None]).norm(dim=2).amax(1)[:, None]
+
+
+def _within_reach(x: Tensor, reach: Tensor, points: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return frame, row and face of all pairs whose triangle's bounding sphere comes within reach, (M,) each.
 
     |x - c| <= r + u, squared and spread out, is one product of matrices: [-2 x, -2 u, |x|^2 - u^2, 1] with
     [c, r, 1, |c|^2 - r^2].
     """
-    corners = points[faces]
-    centre = corners.mean(1)
-    radius = (corners - centre[:, None]).norm(dim=2).amax(1)[:, None]
+    centre, radius = _spheres(points, faces)
     asked, reach = (reach >= 0)[:, None], reach[:, None]
     squares, about = (x * x).sum(1, keepdim=True), (centre * centre).sum(1, keepdim=True)
     left = [-2 * x, -2 * reach, (squares - reach**2).where(asked, torch.inf), torch.ones_like(reach)]
     right = [centre, radius, torch.ones_like(radius), about - radius**2]
     scores = torch.cat(left, dim=1).permute(2, 0, 1) @ torch.cat(right, dim=1).permute(2, 1, 0)
     rounding = 16 * torch.finfo(x.dtype).eps * about.amax()
-    return scores <= rounding
+    frame, row, face = (scores <= rounding).nonzero(as_tuple=True)
+    return frame, row, face

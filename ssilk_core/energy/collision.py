@@ -57,9 +57,22 @@ def signed_distance(x: Tensor, body: PosedBody, blocks: Tensor | None = None) ->
     return (normal * x).sum(1) - offset
 
 
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """What garment vertices may find of a body instead of all of it.
+
+    Attributes:
+        vertices: how many, then these, the nearest of which has the nearest point, int32 (V, 1 + C).
+        faces: triangles that have one of them for a corner, filled up by -1, shape (V, L).
+    """
+
+    vertices: Tensor
+    faces: Tensor
+
+
 @torch.no_grad()
 def nearest_planes(
-    x: Tensor, body: PosedBody, blocks: Tensor | None = None, allowed: Tensor | None = None
+    x: Tensor, body: PosedBody, blocks: Tensor | None = None, patches: Patches | None = None
 ) -> tuple[Tensor, Tensor]:
     """Return unit normals n_b (V, 3, N) and offsets n_b . b (V, N) of the nearest body points b, without gradients.
 
@@ -71,35 +84,35 @@ def nearest_planes(
         body: the body in the same frames.
         blocks: garment vertices in compact blocks (`nearest.compact_blocks` of `nearest.BLOCK`), int32; they make
             the search on a GPU fast, and change no result.
-        allowed: how many body vertices each garment vertex may find, then these, int32 (V, 1 + C). It finds points
-            of their triangles; of the whole body by default.
+        patches: what each garment vertex may find; all by default.
     """
-    if x.dtype == torch.float32 and kernels.available(x.device) and _have_kernel(body, allowed):
-        return _by_kernels(x, body, blocks, allowed)
-    index = _nearest_vertex(x, body, blocks, allowed).long()
+    if x.dtype == torch.float32 and kernels.available(x.device) and _have_kernel(body, patches):
+        return _by_kernels(x, body, blocks, patches)
+    index = _nearest_vertex(x, body, blocks, patches).long()
     normal, point = gather_frames(body.normals, index), gather_frames(body.points, index)
     offset = (normal * point).sum(1)
     if body.faces is None and body.rings is None:
         return normal, offset
     square = ((x - point) ** 2).sum(1)
     if body.faces is not None:
-        found = closest_on_faces(x, square.sqrt().where(square < FAR**2, -1), body.points, body.faces, allowed)
+        listed = patches.faces if patches else None
+        found = closest_on_faces(x, square.sqrt().where(square < FAR**2, -1), body.points, body.faces, listed)
         return _on_triangles(normal, offset, body, *found, x)
     return _on_triangles(normal, offset, body, *_around(x, index, square < FAR**2, body))
 
 
-def _have_kernel(body: PosedBody, allowed: Tensor | None) -> bool:
-    return body.faces is None or (body.patches is not None and allowed is None)
+def _have_kernel(body: PosedBody, patches: Patches | None) -> bool:
+    return body.faces is None or (body.patches is not None and patches is None)
 
 
-def _nearest_vertex(x: Tensor, body: PosedBody, blocks: Tensor | None, allowed: Tensor | None) -> Tensor:
+def _nearest_vertex(x: Tensor, body: PosedBody, blocks: Tensor | None, patches: Patches | None) -> Tensor:
     """Return the index of the nearest body vertex (V, N), int32 from the kernels and int64 elsewhere."""
     if x.dtype != torch.float32 or not kernels.available(x.device):
-        return nearest_vertex(x, body.points, allowed)
-    if allowed is not None:
+        return nearest_vertex(x, body.points, patches.vertices if patches else None)
+    if patches is not None:
         from ..kernels.listed import listed_kernel
 
-        return listed_kernel(x, body.points, allowed)
+        return listed_kernel(x, body.points, patches.vertices)
     from ..kernels.nearest import nearest_kernel
 
     groups = consecutive_blocks(len(body.points), GROUP, x.device) if body.groups is None else body.groups
@@ -112,12 +125,12 @@ def _in_blocks(x: Tensor, blocks: Tensor | None) -> Tensor:
 
 
 def _by_kernels(
-    x: Tensor, body: PosedBody, blocks: Tensor | None, allowed: Tensor | None = None
+    x: Tensor, body: PosedBody, blocks: Tensor | None, patches: Patches | None = None
 ) -> tuple[Tensor, Tensor]:
     from ..kernels.closest import closest_kernel
     from ..kernels.surface import surface_kernel
 
-    index = _nearest_vertex(x, body, blocks, allowed)
+    index = _nearest_vertex(x, body, blocks, patches)
     if body.faces is not None and body.patches is not None:
         reach = FAR, TOUCHING
         return closest_kernel(x, index, body.points, body.normals, _in_blocks(x, blocks), body.patches, *reach)

@@ -7,13 +7,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..assets import Body, Ints, SkinWeights
+from ..assets import Body, Ints, Mesh, SkinWeights
 from ..energy.closest import patches_of
 from ..energy.collision import PosedBody
 from ..energy.nearest import GROUP, compact_blocks
 from ..energy.surface_point import triangle_rings
 from ..mesh import topology
 from .skinning import Skinning
+
+
+def faces_among(mesh: Mesh, chosen: Ints) -> Ints:
+    """Return the faces that have all corners among `chosen` vertices, in their numbering, shape (F, 3)."""
+    place = np.full(mesh.vertex_count, -1)
+    place[chosen] = np.arange(len(chosen))
+    faces = place[mesh.faces]
+    return faces[(faces >= 0).all(axis=1)]
 
 
 class CollisionBody:
@@ -32,10 +40,7 @@ class CollisionBody:
         def tensor(values: np.ndarray) -> Tensor:
             return torch.as_tensor(values, dtype=torch.float32, device=device)
 
-        place = np.full(body.mesh.vertex_count, -1)
-        place[chosen] = np.arange(len(chosen))
-        faces = place[body.mesh.faces]
-        faces = faces[(faces >= 0).all(axis=1)]
+        faces = faces_among(body.mesh, chosen)
         rings = triangle_rings(faces, len(chosen))
         self.faces = torch.as_tensor(faces, device=device)
         self.patches = torch.as_tensor(patches_of(body.mesh.points[chosen], faces), device=device)

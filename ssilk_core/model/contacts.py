@@ -16,9 +16,10 @@ import torch
 from torch import Tensor
 
 from ..assets import PINNED, TIGHT, Floats, Ints, Mesh, Scene
-from ..energy.collision import FAR, PosedBody, nearest_planes
+from ..energy.collision import FAR, Patches, PosedBody, nearest_planes
 from ..energy.nearest import BLOCK, compact_blocks
 from ..mesh import topology
+from .body import faces_among
 
 EXTENT = 1 / 12  # radius of a patch along the body, as a share of the body's diagonal: half the girth of an upper arm
 MOST = 256  # vertices of a patch; of a finer body the patch is smaller
@@ -32,7 +33,7 @@ class _Group:
 
     rows: Tensor
     blocks: Tensor
-    allowed: Tensor | None
+    patches: Patches | None
 
 
 class Contacts:
@@ -54,15 +55,17 @@ class Contacts:
         elsewhere = np.ones(garment.vertex_count, dtype=bool) if pinned else scene.classes != PINNED
         elsewhere[tight[covered]] = False
 
-        def group(rows: Ints, allowed: Ints | None) -> list[_Group]:
-            tables = rows, compact_blocks(garment.points[rows], BLOCK) if len(rows) else rows, allowed
-            made = [None if table is None else torch.as_tensor(table, device=device) for table in tables]
-            return [_Group(*made)] if len(rows) else []  # type: ignore[arg-type]
+        def tensor(values: Ints) -> Tensor:
+            return torch.as_tensor(values, device=device)
 
-        self._groups = [
-            *group(np.flatnonzero(elsewhere), None),
-            *group(tight[covered], patches[covered].astype(np.int32)),
-        ]
+        def group(rows: Ints, found: Patches | None = None) -> _Group:
+            return _Group(tensor(rows), tensor(compact_blocks(garment.points[rows], BLOCK)), found)
+
+        self._groups = [group(np.flatnonzero(elsewhere))] if elsewhere.any() else []
+        if covered.any():
+            vertices = patches[covered]
+            faces = faces_around(vertices, faces_among(body, chosen), len(chosen))
+            self._groups.append(group(tight[covered], Patches(tensor(vertices.astype(np.int32)), tensor(faces))))
 
     def planes(self, x: Tensor, body: PosedBody) -> tuple[Tensor, Tensor]:
         """Return unit normals (V, 3, N) and offsets (V, N) of the planes that x (V, 3, N) meets, without gradients.
@@ -70,10 +73,10 @@ class Contacts:
         Planes of vertices that meet nothing are far below them.
         """
         if len(self._groups) == 1 and len(self._groups[0].rows) == len(x):
-            return nearest_planes(x, body, self._groups[0].blocks, self._groups[0].allowed)
+            return nearest_planes(x, body, self._groups[0].blocks, self._groups[0].patches)
         normal, offset = no_planes(x)
         for group in self._groups:
-            found = nearest_planes(x.index_select(0, group.rows), body, group.blocks, group.allowed)
+            found = nearest_planes(x.index_select(0, group.rows), body, group.blocks, group.patches)
             normal.index_copy_(0, group.rows, found[0])
             offset.index_copy_(0, group.rows, found[1])
         return normal, offset
@@ -83,7 +86,7 @@ class Contacts:
         met = signed(x, *self.planes(x, body))
         nearest = met.clone()
         for group in self._groups:
-            if group.allowed is not None:
+            if group.patches is not None:
                 part = x.index_select(0, group.rows)
                 nearest.index_copy_(0, group.rows, signed(part, *nearest_planes(part, body, group.blocks)))
         return met, nearest
@@ -144,3 +147,16 @@ def _patches(body: Mesh, chosen: Ints, anchors: Ints) -> Ints:
         )
     found = np.concatenate(patches)
     return found[:, : 1 + found[:, 0].max()]
+
+
+def faces_around(patches: Ints, faces: Ints, count: int) -> Ints:
+    """Return the faces with a corner in each patch (T, 1 + C) of `count` vertices, filled up by -1, shape (T, L)."""
+    owner = np.repeat(np.arange(len(faces)), 3)[np.argsort(faces.reshape(-1), kind="stable")]
+    ends = np.cumsum(np.bincount(faces.reshape(-1), minlength=count))
+    around = np.split(owner, ends[:-1])
+    kinds, which = np.unique(patches, axis=0, return_inverse=True)
+    found = [np.unique(np.concatenate([around[vertex] for vertex in row[:size]])) for size, *row in kinds.tolist()]
+    table = np.full((len(found), max(1, *map(len, found))), -1)
+    for row, own in zip(table, found):
+        row[: len(own)] = own
+    return table[which.reshape(-1)]

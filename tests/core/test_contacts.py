@@ -11,10 +11,10 @@ import trimesh
 
 from ssilk_core.assets import LOOSE, PINNED, TIGHT, Body, Character, Mesh, Scene, SkinWeights
 from ssilk_core.energy import collision, nearest
-from ssilk_core.energy.collision import PosedBody, nearest_planes
+from ssilk_core.energy.collision import Patches, PosedBody, nearest_planes
 from ssilk_core.energy.surface_point import triangle_rings
 from ssilk_core.model.body import CollisionBody
-from ssilk_core.model.contacts import Contacts, patches_beneath, signed
+from ssilk_core.model.contacts import Contacts, faces_around, patches_beneath, signed
 
 CPU = torch.device("cpu")
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"  # on a CPU kernels run in Triton's interpreter
@@ -182,8 +182,22 @@ def test_kernels_find_the_planes_of_a_list_that_their_twins_find():
     body = PosedBody(points, normals[:, :, None].expand(-1, -1, 3), torch.as_tensor(triangle_rings(mesh.faces, 42)))
     x = torch.tensor(mesh.sample(9, seed=1)[:, :, None] + 0.02 * rng.normal(size=(9, 3, 3)), dtype=torch.float32)
     table = lists(rng, 9, 42)
-    expected = nearest_planes(x, body, allowed=table)
+    patches = Patches(table, torch.zeros(0))
+    expected = nearest_planes(x, body, patches=patches)
     assert not torch.allclose(expected[0], nearest_planes(x, body)[0])
     on_device = PosedBody(*(v.to(DEVICE) for v in (body.points, body.normals, body.rings)))
-    for value, twin in zip(collision._by_kernels(x.to(DEVICE), on_device, None, table.to(DEVICE)), expected):
+    for value, twin in zip(
+        collision._by_kernels(x.to(DEVICE), on_device, None, Patches(table.to(DEVICE), patches.faces)), expected
+    ):
         np.testing.assert_allclose(value.cpu(), twin, atol=2e-6)
+
+
+def test_the_faces_around_a_patch_are_those_with_a_corner_in_it():
+    shape = limb()
+    rng, count = np.random.default_rng(6), len(shape.vertices)
+    table = lists(rng, 9, count).numpy()
+    found = faces_around(table, shape.faces, count)
+    for (size, *row), faces in zip(table, found):
+        assert set(faces) - {-1} == set(np.flatnonzero(np.isin(shape.faces, row[:size]).any(axis=1)))
+    alone = faces_around(np.array([[1, count, count]]), shape.faces, count + 1)
+    assert (alone == -1).all()
