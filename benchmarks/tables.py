@@ -50,22 +50,23 @@ from ssilk_core.evaluation.run import SIMULATOR
 from ssilk_core.evaluation.splits import SPLITS
 from ssilk_core.evaluation.takes import takes_of
 
-COLUMNS: dict[str, tuple[tuple[str, ...], str]] = {
+Columns = Mapping[str, tuple[tuple[str, ...], str]]
+"""The path to a figure, and the form that it is shown in, by the heading."""
+
+COLUMNS: Columns = {
     "L_tot [J]": (("total",), ".4g"),
     "collisions": (("collisions",), ".2%"),
     "excess [J]": (("truth", "excess"), ".4g"),
     "floats, of m g L": (("truth", "floats"), "+.1%"),
 }
-DYNAMICS: dict[str, tuple[tuple[str, ...], str]] = {
+DYNAMICS: Columns = {
     **COLUMNS,
     "velocity off [m/s]": (("truth", "velocity"), ".3g"),
     "acceleration off [m/s2]": (("truth", "acceleration"), ".3g"),
 }
 
 
-def methods_table(
-    found: Mapping[tuple[str, str, str], Cell], splits: Sequence[str], shown: Mapping[str, tuple] = COLUMNS
-) -> str:
+def methods_table(found: Mapping[tuple[str, str, str], Cell], splits: Sequence[str], shown: Columns = COLUMNS) -> str:
     """Return a line for each garment and method, with columns for each split."""
     names = [name for name, (path, _) in shown.items() if any(cell.values(path) for cell in found.values())]
     columns = [(split, name) for split in splits for name in names]
