@@ -51,7 +51,9 @@ class FrameNetwork(nn.Module):
         weights = (activation.T + 1) / 2
         if model.decoder.has_constant:
             weights = torch.cat([weights, torch.ones_like(z[:, :1])], dim=1)
-        local = self.above.mT @ rotations.permute(3, 0, 1, 2) @ self.own
+        # Rotations of no proxies come of nothing: engines refuse to load what reshapes them.
+        turned = rotations.permute(3, 0, 1, 2) if len(self.own) else z.new_zeros(z.shape[0], 0, 3, 3)
+        local = self.above.mT @ turned @ self.own
         return z, weights.clamp(0, 1), local
 
 

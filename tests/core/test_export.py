@@ -6,15 +6,21 @@ from __future__ import annotations
 import io
 import json
 from contextlib import redirect_stdout
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
+from ssilk_core.assets import TIGHT, ProxyRig, Scene
 from ssilk_core.checkpoint import model_file, save_model
 from ssilk_core.cli import main
+from ssilk_core.config import ModelConfig
 from ssilk_core.fabrics import FABRICS
 from ssilk_core.kinematics import matrix_from_quaternion
 from ssilk_core.model.batch import driven
+from ssilk_core.model.export import export_onnx
+from ssilk_core.model.network import GarmentModel
 from ssilk_core.parameters import descriptor_sizes
 from ssilk_core.rollout import garment_poses
 
@@ -70,6 +76,23 @@ def test_every_frame_is_what_a_shot_stores(exported, model, scene, toy_motion, c
         np.testing.assert_allclose(weights[:, shot], expected.weights, atol=2e-5)
         np.testing.assert_allclose(rotations[:, shot], matrix_from_quaternion(expected.rotations), atol=2e-5)
     assert np.ptp(weights, axis=0).max() > 0.01
+
+
+def test_a_tight_garment_without_proxies_or_stepper_is_exported(scene, toy_motion, tmp_path):
+    garment = replace(scene.garment, classes=np.full(len(scene.classes), TIGHT))
+    none = ProxyRig("/none", (), np.zeros(0, dtype=np.int32), np.zeros((0, 4, 4)), scene.plain_skin)
+    tight = Scene(scene.character, garment, none)
+    config = ModelConfig(latent=8, widths=(16,), shapes=4, scheme="quasi_static")
+    model = GarmentModel(tight, config, np.arange(tight.character.skeleton.joint_count)).eval()
+    with torch.no_grad():
+        model.output[-1].weight.normal_(generator=torch.Generator().manual_seed(1))
+    export_onnx(model, tmp_path / "tight.onnx")
+    session = onnxruntime.InferenceSession(tmp_path / "tight.onnx", providers=["CPUExecutionProvider"])
+    motion = toy_motion(tight, FRAMES)
+    weights, rotations = played(session, model, driven(model, [motion]))
+    (expected,) = garment_poses(model, motion, motion.fps)
+    np.testing.assert_allclose(weights[:, 0], expected.weights, atol=2e-5)
+    assert rotations.shape == (FRAMES, 1, 0, 3, 3) and np.ptp(weights[..., :4], axis=0).max() > 0.01
 
 
 def test_what_goes_in_and_comes_out_is_told(exported, model):
