@@ -59,7 +59,9 @@ class JobState:
 
     @property
     def fraction(self) -> float:
-        """The part that is done, in [0, 1]."""
+        """The part that is done, in [0, 1]; all of it where the time was up before the last iteration."""
+        if self.state == "done":
+            return 1.0
         return self.done / self.total if self.total else 0.0
 
     @property

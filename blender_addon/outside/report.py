@@ -11,7 +11,7 @@ from .jobs import JobState
 NO_DYNAMICS = 2e-3  # [m]; a garment that moves less of its own has learned no dynamics, as ssilk has it
 
 ENDED = {
-    "done": "Trained for {total} iterations",
+    "done": "Trained for {done} iterations",
     "stopped": "Stopped at {done} of {total}; it can be resumed",
     "lost": "Ended without a word at {done} of {total}, perhaps with the machine; resume it",
     "waiting": "Waits until the trainings before it have ended",

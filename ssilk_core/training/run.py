@@ -205,11 +205,14 @@ class Run:
 
     def look(self, seconds_left: float) -> None:
         """Report how far training is, and look after steps that were undone."""
-        self.report(Progress(self.state.iteration, self.config.iterations, seconds_left, self._batch_terms()))
+        self._report_progress(seconds_left)
         if told := self.watch.look():
             self.report(Message(told, "warning"))
         if self.watch.hopeless:
             self._recover(f"more than half of the last {SPAN} steps were undone", self.watch.culprits)
+
+    def _report_progress(self, seconds_left: float) -> None:
+        self.report(Progress(self.state.iteration, self.config.iterations, seconds_left, self._batch_terms()))
 
     def _batch_terms(self) -> dict[str, float]:
         """Return energies of the last batch [J]; this waits for the device."""
@@ -243,6 +246,7 @@ class Run:
 
     def end_early(self) -> None:
         """End where the time is up, with a validation if what was learned since the last one deserves it."""
+        self._report_progress(0.0)
         self.report(Message(f"time is up at iteration {self.state.iteration} of {self.config.iterations}"))
         if self.state.iteration != self.saved and self.state.iteration >= self.config.warm_iterations:
             self.validate()

@@ -68,6 +68,7 @@ def test_state_is_what_the_training_said(folder):
     jobs.begin(sys.executable, folder, ["-c", SAYS])
     state = until(folder, "done")
     assert (state.done, state.total, state.checkpoint, state.fraction) == (4, 4, 4, 1.0)
+    assert jobs.JobState("done", 3, 4).fraction == 1.0 and jobs.JobState("running", 3, 4).fraction == 0.75
     assert (state.text, state.error, state.seconds_left, state.alive) == ("validation at 4", "", None, False)
     assert state.terms == {"stretch": 0.25, "bending": None}
     assert [done for done, _ in state.curve] == [1, 2, 3, 4]

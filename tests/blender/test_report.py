@@ -28,6 +28,7 @@ CURVE = {"plain": {"total": 1.0}, "points": [{"iteration": 5, "validation": SCOR
         (JobState("running", 120, 500, 185.2), "Iteration 120 of 500, 3 min 05 s left"),
         (JobState("running", 1, 500), "Iteration 1 of 500"),
         (JobState("done", 500, 500), "Trained for 500 iterations"),
+        (JobState("done", 420, 500), "Trained for 420 iterations"),
         (JobState("stopped", 120, 500), "Stopped at 120 of 500; it can be resumed"),
         (JobState("lost", 3, 9), "Ended without a word at 3 of 9, perhaps with the machine; resume it"),
         (JobState("failed", error="clip.usdc: no joints."), "clip.usdc: no joints."),

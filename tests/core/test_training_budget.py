@@ -10,7 +10,7 @@ import torch
 
 from ssilk_core.config import TrainConfig
 from ssilk_core.errors import SsilkError
-from ssilk_core.events import Message, Started, silent
+from ssilk_core.events import Message, Progress, Started, silent
 from ssilk_core.training import budget
 from ssilk_core.training import run as training
 from ssilk_core.training.budget import fitting_iterations, shaped
@@ -89,6 +89,7 @@ def test_a_run_ends_with_its_time_and_goes_on_with_more(job, monkeypatch):  # no
         trained = train(job("early", minutes=1.0), said.append)
     assert trained.finished and trained.iterations == 8
     assert any(event.text == "time is up at iteration 8 of 13" for event in said if isinstance(event, Message))
+    assert [event.done for event in said if isinstance(event, Progress)][-1] == 8
     state, _ = load_state(state_path(job("early").output), job("early").identity())
     assert state.best and state.curve[-1].iteration == 8
     assert train(job("early", minutes=9.0, resume=True), silent).iterations == 13
