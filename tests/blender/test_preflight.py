@@ -54,7 +54,7 @@ def test_findings_on_motions_stand_on_the_timeline():
     dressed = Dressed(1.0, Joints(("Root",), np.array([-1]), np.eye(4)[None]), (), shape("Shirt", [4], 4), None, None)
     jump = {"severity": "warning", "code": "root-jumps", "found": "", "why": "", "fix": "", "fixable": False,
             "elements": "frames", "indices": [7, 9]}  # fmt: skip
-    clips = {"/tmp/a:b/Walk.usdc": Clip("Walk", 100), "run.usdc": Clip("run.usdc")}
+    clips = {"/takes/a:b/Walk.usdc": Clip("Walk", 100), "run.usdc": Clip("run.usdc")}
     documents = [{**jump, "prim": f"{path}:/Motion"} for path in clips]
     said = read_findings(documents, dressed, {}, clips)
     assert [(finding.target, finding.elements, finding.indices) for finding in said] == [
