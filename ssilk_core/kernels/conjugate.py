@@ -141,10 +141,10 @@ def _descend(z, residual, y, step, image, inverse, product, enough, along, left,
              block_u: tl.constexpr, block_n: tl.constexpr):  # fmt: skip
     u, n, inside, own = _tile(rows, frames, block_u, block_n)
     before = tl.load(product + n, mask=n < frames, other=0.0)
-    slope = tl.maximum(_summed(along, parts, frames, n, block_n), TINY)
-    # A frame that has converged takes no more steps: rounding could spoil what it has.
-    moves = before > tl.load(enough + n, mask=n < frames, other=0.0)
-    rate = tl.where(moves, before / slope, 0.0)[None, :]
+    curvature = _summed(along, parts, frames, n, block_n)
+    # A frame that has converged takes no more steps, nor does one of an indefinite matrix: as in `conjugate.solve`.
+    moves = (before > tl.load(enough + n, mask=n < frames, other=0.0)) & (curvature > 0)
+    rate = tl.where(moves, before / tl.maximum(curvature, TINY), 0.0)[None, :]
     zx, zy, zz = _load3(z + own, frames, inside)
     sx, sy, sz = _load3(step + own, frames, inside)
     _store3(z + own, frames, inside, zx + rate * sx, zy + rate * sy, zz + rate * sz)

@@ -8,14 +8,22 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+ROUNDING = 4  # units in the last place that sums of element blocks may be off by
 CHECK_EVERY = 8  # iterations between looks at the residuals, which halt a GPU
 
 
 def inverse_blocks(blocks: Tensor) -> Tensor:
-    """Return the inverses of symmetric positive definite blocks (..., 3, 3), by cofactors."""
-    a, b, c = blocks.unbind(-2)
+    """Return the inverses of symmetric positive definite blocks (..., 3, 3), by cofactors in float64.
+
+    The determinants of blocks at slivers overflow in single precision. Rounding may have left such blocks indefinite:
+    what it may have taken is added first.
+    """
+    wide, eye = blocks.double(), torch.eye(3, dtype=torch.float64, device=blocks.device)
+    largest = wide.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None]
+    a, b, c = (wide + ROUNDING * torch.finfo(blocks.dtype).eps * largest * eye).unbind(-2)
     cofactors = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], dim=-1)
-    return cofactors / (a * cofactors[..., 0]).sum(-1)[..., None, None].clamp_min(torch.finfo(blocks.dtype).tiny)
+    determinant = (a * cofactors[..., 0]).sum(-1)[..., None, None].clamp_min(torch.finfo(torch.float64).tiny)
+    return (cofactors / determinant).to(blocks.dtype)
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
@@ -49,7 +57,9 @@ def solve(
     for done in range(1, iterations + 1):
         image = multiply(step)
         # A frame that has converged takes no more steps: rounding could spoil what it has.
-        rate = torch.where(product > enough, product / dot(step, image).clamp_min(tiny), 0)
+        # Neither does one whose matrix rounding has left indefinite: it keeps the way down that it has.
+        curvature = dot(step, image)
+        rate = torch.where((product > enough) & (curvature > 0), product / curvature.clamp_min(tiny), 0)
         z, residual = z + rate * step, residual - rate * image
         y = precondition(residual)
         before, product = product, dot(residual, y)

@@ -163,6 +163,19 @@ def test_blocks_are_inverted() -> None:
     torch.testing.assert_close(inverse_blocks(blocks), torch.linalg.inv(blocks))
 
 
+def test_blocks_at_slivers_are_inverted_in_single_precision() -> None:
+    axes = torch.linalg.qr(torch.randn(50, 3, 3, generator=torch.Generator().manual_seed(3)).double())[0]
+    blocks = axes @ torch.diag(torch.tensor([1e13, 1e9, 1.0]).double()) @ axes.transpose(1, 2)
+    found = torch.linalg.eigvalsh(inverse_blocks(blocks.float()).double())
+    assert found.isfinite().all() and (found > 0).all()
+
+
+def test_a_matrix_that_rounding_left_indefinite_keeps_what_it_has_found() -> None:
+    matrix, right = torch.diag(torch.tensor([4.0, 1.0, -1e-3])), torch.tensor([[[1.0, 1.0, 1.0]]])
+    z, _ = solve(lambda v: v @ matrix, lambda r: r, right, 1e-6, iterations=50)
+    assert z.isfinite().all() and (z * right).sum() > 0
+
+
 def test_conjugate_gradients_solve_each_frame_by_itself() -> None:
     generator = torch.Generator().manual_seed(4)
     roots = torch.randn(3, 12, 12, generator=generator).double()
