@@ -217,7 +217,8 @@ def _start(task: Task, folder: Path) -> dict[str, Any]:
     ):
         work()
         taken.append(time.perf_counter())
-    names = ("to start Python", "to load model and character", "for the first shot, with its asset", "for another")
+    names = ("to start Python and its modules", "to load the model and its character",
+             "for the first shot, its asset included", "for another shot")  # fmt: skip
     return {f"seconds {name}": round(float(each), 2) for name, each in zip(names, np.diff(taken))}
 
 
