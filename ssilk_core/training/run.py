@@ -301,10 +301,10 @@ class Run:
         return self._agreed(time.monotonic() - self._saved_at >= SAVE_EVERY)
 
     @property
-    def out_of_time(self) -> bool:
-        """Whether the job's minutes are over, but for a last validation; training before a resumption counts."""
+    def time_left(self) -> float:
+        """How long the job may go on before a last validation [s]; training before a resumption counts."""
         spent = time.monotonic() - self._began
-        return self.job.minutes is not None and spent + self.scoring > 60 * self.job.minutes
+        return inf if self.job.minutes is None else 60 * self.job.minutes - spent - self.scoring
 
     def stops(self, stop: threading.Event) -> bool:
         """Return whether to stop here."""
@@ -373,13 +373,13 @@ def _loop(run: Run, stop: threading.Event) -> bool:
     """Do iterations until all are done, or time is up, or somebody wants to stop; return whether it was not that."""
     began, steps, total = time.monotonic(), 0, run.config.iterations
     while run.state.iteration < total and not run.stops(stop):
-        if run.out_of_time:
+        if run.time_left <= 0:
             run.end_early()
             return True
         run.step()
         steps += 1
         if run.state.iteration % EVERY == 0 or run.state.iteration == total or steps == 1:
-            run.look((time.monotonic() - began) / steps * (total - run.state.iteration))
+            run.look(min((time.monotonic() - began) / steps * (total - run.state.iteration), max(0.0, run.time_left)))
         if run.validation_due:
             run.validate()
         elif run.save_due:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import inf
 
 import pytest
 import torch
@@ -84,12 +85,13 @@ def test_a_run_with_minutes_is_one_of_as_many_iterations(job, monkeypatch):  # n
 def test_a_run_ends_with_its_time_and_goes_on_with_more(job, monkeypatch):  # noqa: F811
     monkeypatch.setattr(training, "fitting_iterations", lambda *_: 13)
     with monkeypatch.context() as patch:
-        patch.setattr(Run, "out_of_time", property(lambda run: run.state.iteration == 8))
+        patch.setattr(Run, "time_left", property(lambda run: 8.0 - run.state.iteration))
         said: list = []
         trained = train(job("early", minutes=1.0), said.append)
     assert trained.finished and trained.iterations == 8
     assert any(event.text == "time is up at iteration 8 of 13" for event in said if isinstance(event, Message))
-    assert [event.done for event in said if isinstance(event, Progress)][-1] == 8
+    progress = [event for event in said if isinstance(event, Progress)]
+    assert progress[-1].done == 8 and all(event.seconds_left <= 8 - event.done for event in progress)
     state, _ = load_state(state_path(job("early").output), job("early").identity())
     assert state.best and state.curve[-1].iteration == 8
     assert train(job("early", minutes=9.0, resume=True), silent).iterations == 13
@@ -101,6 +103,7 @@ def test_time_is_up_when_no_validation_fits_any_more(job, monkeypatch):  # noqa:
     now = run._began
     monkeypatch.setattr(training.time, "monotonic", lambda: now)
     run.scoring = 10.0
-    for now, over in ((run._began + 49.0, False), (run._began + 51.0, True)):  # noqa: B007
-        assert run.out_of_time == over
-    assert not Run(job("endless"), silent).out_of_time
+    for spent in (49.0, 51.0):
+        now = run._began + spent
+        assert run.time_left == pytest.approx(50.0 - spent)
+    assert Run(job("endless"), silent).time_left == inf
