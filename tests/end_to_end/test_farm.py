@@ -16,9 +16,13 @@ from pathlib import Path
 
 import pytest
 from pxr import Sdf
+from ssilk_usd import layers as layers_of_usd
 
 from ssilk_core.cli import farm as farm_verb
 from ssilk_core.cli import main
+from ssilk_core.cli._layers import Wardrobe, bake_task
+from ssilk_core.events import silent
+from ssilk_core.farm.job import read_job
 from ssilk_core.files import sha256
 
 BIN = Path(sys.executable).parent
@@ -106,6 +110,23 @@ def test_bad_input_fails_its_task_alone_and_what_is_done_stays_done(farm, capsys
     before = Path("out/shots/a/model/anim.usdc").stat().st_mtime_ns
     assert task() == 0 and task("--check") == 0
     assert Path("out/shots/a/model/anim.usdc").stat().st_mtime_ns == before
+
+
+def test_a_chunk_writes_its_asset_once_while_it_stays_as_it_was(farm, monkeypatch):
+    written, write = [], layers_of_usd.write_asset
+
+    def counted(layout, *args, **options):
+        written.append(layout.shot)
+        return write(layout, *args, **options)
+
+    monkeypatch.setattr(layers_of_usd, "write_asset", counted)
+    assert task() == 0 and written == ["a"]
+    wardrobe, job = Wardrobe(), read_job(Path("bundle/job.json"))
+    bake_task(job[0], Path("out"), wardrobe, silent, again=True)
+    whole = sha256("out/assets/model/geometry.usdc")
+    Path("out/assets/model/geometry.usdc").write_bytes(b"")
+    bake_task(job[1], Path("out"), wardrobe, silent, again=True)
+    assert written == ["a", "a", "b"] and sha256("out/assets/model/geometry.usdc") == whole
 
 
 @pytest.mark.parametrize(("damage", "code"), [("missing", 3), ("changed", 3), ("half", 3)])

@@ -21,12 +21,13 @@ import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from ssilk_core.assets import Deformer, Floats, GarmentPose, Motion
+from ssilk_core.errors import SsilkError
 from ssilk_core.files import replacing
 
 from .author import Asset, define_asset, extent_array
 from .export import new_stage, save
 from .garment_api import GarmentRecord
-from .layers_facts import asset_facts
+from .layers_facts import AssetFacts, asset_facts
 from .read_stage import open_stage
 from .samples import PATH_OP, Samples, kept_joints, root_path
 from .shot import ShotSummary, TimeSpan, set_metadata, set_visibility, summary, write_samples
@@ -87,7 +88,7 @@ def write_asset(
     Raises:
         SsilkError: as `author.define_asset` does, or a file cannot be written.
     """
-    before = asset_facts(layout.asset) if layout.asset.is_file() and layout.geometry.is_file() else None
+    before, unknown = _facts_before(layout)
     bodies = deformer.scene.character.bodies if include_body else ()
     with replacing(layout.geometry, keep_same=True) as temporary:
         stage = new_stage(temporary, units)
@@ -101,7 +102,17 @@ def write_asset(
         free_when_closed(stage.GetUsedLayers())
         save(stage.GetRootLayer(), layout.asset)
         del stage
-    return WrittenAsset(asset, () if before is None else asset_facts(layout.asset).changes_since(before))
+    return WrittenAsset(asset, unknown if before is None else asset_facts(layout.asset).changes_since(before))
+
+
+def _facts_before(layout: Layout) -> tuple[AssetFacts | None, tuple[str, ...]]:
+    """Return the facts of the asset that is there; None without one, or, with a sentence, where it is damaged."""
+    if not (layout.asset.is_file() and layout.geometry.is_file()):
+        return None, ()
+    try:
+        return asset_facts(layout.asset), ()
+    except SsilkError as error:
+        return None, (f"what was there could not be read and is written anew ({str(error).rstrip('.')})",)
 
 
 def _extent(stage: Usd.Stage, asset: Asset) -> Vt.Vec3fArray:
