@@ -24,6 +24,7 @@ from .potential import Planes, Potential, Setting
 SUFFICIENT = 1e-4  # share of the slope that a step has to gain
 HALVINGS = 12
 REDUCTION = 0.1  # of the residual by each linear solution
+REACH = 0.1  # of the garment's size, by which a step moves a vertex at most: stiff systems are solved badly
 SPOILING = 0.1  # share of the slope that a vertex on a crease takes away, from which on it is held
 
 
@@ -200,7 +201,10 @@ def newton_step(
     z, count = potential.hessian(state.x, setting, state.planes, held).solve(right, REDUCTION, inner)
     step = torch.zeros_like(state.x)
     step[potential.free] = z.to(step.dtype)
-    return step if held is None else step.masked_fill(held[:, None], 0), count
+    if held is not None:
+        step = step.masked_fill(held[:, None], 0)
+    longest = step.norm(dim=1).amax(0).clamp_min(torch.finfo(step.dtype).tiny)
+    return step * (REACH * potential.size / longest).clamp(max=1), count
 
 
 def line_search(

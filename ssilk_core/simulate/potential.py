@@ -76,6 +76,7 @@ class Potential:
 
     Attributes:
         free: indices of the vertices that move: all with mass that are not pinned, shape (U,).
+        size: diagonal of the garment's box at rest [m].
 
     Args:
         dtype: of positions, energies and gradients; Hessians are float32.
@@ -89,6 +90,7 @@ class Potential:
         hinges = topology.hinges(mesh.faces) if fabric.bending else np.zeros((0, 4), dtype=np.int64)
         self.fabric, self.dtype = fabric, dtype
         self.mass: Tensor = energy.mass[:, None]
+        self.size = float(np.linalg.norm(np.ptp(mesh.points, axis=0)))
         self.contacts = Contacts(scene, device=device)
         self.membrane = Membrane(mesh, fabric, device, dtype)
         self.hinges = Hinges(hinges, energy, mesh.vertex_count) if len(hinges) else None

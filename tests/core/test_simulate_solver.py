@@ -203,6 +203,15 @@ def test_a_line_search_accepts_no_worse_state(potential: Potential, scene: Scene
     assert (found.energy[:2] < state.energy[:2]).all() and found.energy[2] == state.energy[2]
 
 
+def test_no_step_is_longer_than_a_tenth_of_the_garment(potential: Potential, scene: Scene) -> None:
+    x, setting = moving(scene, 2)
+    state = State.at(potential, x, setting)
+    gradient = potential.gradient(x, setting, state.planes) * torch.tensor([1e-6, 1e9], dtype=torch.float64)
+    step, _ = newton_step(potential, state, setting, gradient, 50)
+    short, long = step.norm(dim=1).amax(0).tolist()
+    assert 0 < short < 1e-3 < long == pytest.approx(0.1 * np.linalg.norm(np.ptp(scene.garment.mesh.points, axis=0)))
+
+
 def test_more_iterations_never_end_higher(potential: Potential, scene: Scene) -> None:
     x, setting = moving(scene, 4)
     budgets = [SolverOptions(tolerance=1e-9, iterations=n) for n in (1, 2, 3, 4, 6, 8, 12, 16)]
