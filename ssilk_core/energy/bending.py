@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from math import pi
+
 import torch
 from torch import Tensor
 
@@ -42,4 +44,13 @@ def bending_energy(angle: Tensor, rest_angle: Tensor, stiffness: Tensor) -> Tens
 
     `stiffness` is k_b l^2 / (8 (A_1 + A_2)) of the rest shape, shape (H, 1), as `rest_angle`.
     """
-    return stiffness * (angle - rest_angle) ** 2
+    return stiffness * bent(angle, rest_angle) ** 2
+
+
+def bent(angle: Tensor, rest_angle: Tensor) -> Tensor:
+    """Return how far a hinge is turned from its rest, the shorter way round, in [-pi, pi].
+
+    An angle jumps from pi to -pi where a hinge that is folded flat goes on: the energy must not.
+    """
+    change = angle - rest_angle
+    return change - 2 * pi * torch.round(change.detach() / (2 * pi))

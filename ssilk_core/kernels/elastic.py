@@ -187,6 +187,7 @@ def _bending(x, hinges, numbers, slope, shares, count, frames, chunk: tl.constex
         angle = tl.where(collapsed, 0.0, _atan2(sine, tl.where(collapsed, 1.0, cosine)))
         stiffness = tl.load(numbers + hinge * 2)
         change = angle - tl.load(numbers + hinge * 2 + 1)
+        change -= tl.where(change > 3.14159265, 6.28318531, 0.0) - tl.where(change < -3.14159265, 6.28318531, 0.0)
         total += stiffness * change * change
         tl.store(slope + hinge * frames + n, tl.where(collapsed, 0.0, 2 * stiffness * change), mask=inside)
     tl.store(shares + part * frames + n, total, mask=inside)

@@ -43,6 +43,15 @@ def test_one_hinge_costs_the_square_of_its_signed_change(rest, angle):
     assert float(energy.bending(tensor(fold(angle)))) == pytest.approx(expected, abs=1e-18)
 
 
+@pytest.mark.parametrize("rest", [0.5, -0.5])
+def test_a_hinge_folded_flat_goes_on_without_a_jump(rest):
+    energy = GarmentEnergy(Mesh("/fold", fold(rest), FACES), FABRIC, dtype=torch.float64)
+    angles = np.linspace(np.pi - 0.8, np.pi + 0.8, 41)
+    found = energy.bending(tensor(*(fold(angle) for angle in angles))).numpy()
+    away = np.minimum(np.abs(angles - rest), 2 * np.pi - np.abs(angles - rest))
+    np.testing.assert_allclose(found, BENDING / 8 * away**2, rtol=1e-9)
+
+
 def test_a_fold_pushed_through_flat_costs_more_than_flat():
     energy = GarmentEnergy(Mesh("/fold", fold(0.5), FACES), FABRIC, dtype=torch.float64)
     kept, flat, flipped = energy.bending(tensor(fold(0.5), fold(0), fold(-0.5))).tolist()
