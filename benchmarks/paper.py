@@ -3,6 +3,7 @@
 
     python benchmarks/paper.py OUT --stages STAGES --motions FOLDER --index FOLDER/index.json --gpus 4 --until 570
     python benchmarks/tables.py table1 OUT/records
+    python benchmarks/tables.py table5 OUT/sweeps
 
 STAGES holds the rigged garments of `paper_jobs.GARMENTS`, and the cape with other numbers of proxies. What a job
 writes tells that it is done: the same command once more goes on with what is missing. No job begins that would, as

@@ -195,7 +195,8 @@ def records(plan: Plan, name: str, garment: str, needs: Sequence[Job], simulated
     asked = ("--stage", str(plan.stage(garment)), "--motions", str(plan.motions), "--index", str(plan.index))
     begun = (PYTHON, "benchmarks/tables.py", "record", *map(str, outputs), *asked)
     begun += ("--device", plan.device, *(("--clips", *(Path(c).stem for c in clips)) if plan.rehearse else ()))
-    output = plan.folder / "records" / f"{name}_whole.json"
+    kind = "sweeps" if name == "sweeps" else "records"  # apart: a changed setting is no other seed of Table 1
+    output = plan.folder / kind / f"{name}_whole.json"
     seconds = START + EVALUATION * len(needs)
     yield Job(f"{name}_whole", (output,), (*begun, "-o", str(output)), seconds, outputs)
     if simulated:
