@@ -43,13 +43,19 @@ class TrainJob:
     minutes: float | None = None
 
     def __post_init__(self) -> None:
-        if not (self.scene.classes == LOOSE).any():
+        if not self.has_loose:
             object.__setattr__(self, "model", replace(self.model, scheme="quasi_static"))
-            object.__setattr__(self, "train", replace(self.train, carry=0, noise=0))  # nothing has a past to vary
+        if self.model.scheme == "quasi_static":  # nothing has a past to vary
+            object.__setattr__(self, "train", replace(self.train, carry=0, noise=0))
         if not self.learns:
             object.__setattr__(self, "model", replace(self.model, latent=1, widths=(1,), shapes=1))
             least = replace(self.train, iterations=1, batch=1, warm_batch=1, resting=1, recombined=0)
             object.__setattr__(self, "train", least)
+
+    @property
+    def has_loose(self) -> bool:
+        """Whether anything of the garment is loose."""
+        return bool((self.scene.classes == LOOSE).any())
 
     @property
     def learns(self) -> bool:

@@ -61,6 +61,8 @@ class Run:
 
     def __init__(self, job: TrainJob, report: Reporter, team: Team = ALONE) -> None:
         self._began = time.monotonic()
+        need(team.size == 1 or job.minutes is None, str(job.output), "minutes for a team of processes",
+             "its clocks differ", "set the iterations instead (--set iterations=...)")  # fmt: skip
         self.job, self.report, self.device, self.team = job, report, chosen_device(job.device), team
         self.keeper, identity = Keeper(job, self.device, team), {**job.identity(), "processes": team.size}
         self.state, tensors = load_state(self.keeper.state, identity) if job.resume else (RunState(identity), None)
@@ -95,8 +97,6 @@ class Run:
 
     def _plan(self, seconds: float) -> None:
         """Choose as many iterations as fit, by a few steps of a model that is put back afterwards."""
-        need(self.team.size == 1, str(self.job.output), "minutes for a team of processes", "its clocks differ",
-             "set the iterations instead (--set iterations=...)")  # fmt: skip
         model, left = self.parts.model, seconds - (time.monotonic() - self._began)
         before = {name: value.clone() for name, value in model.state_dict().items()}
         stepper = self.parts.stepper(self.config, self.job.train.seed)
@@ -194,7 +194,8 @@ class Run:
         if not self.job.learns:
             self.report(Message(f"{path}: every vertex is pinned to the skeleton; there is nothing to learn."))
         elif self.job.model.scheme == "quasi_static":
-            self.report(Message(f"{path}: nothing is loose; the garment is quasi-static and gets no stepper."))
+            reason = "" if self.job.has_loose else "nothing is loose; "
+            self.report(Message(f"{path}: {reason}the garment is quasi-static and gets no stepper."))
         detail = {**self.parts.detail(), "memory predicted [MiB]": self._memory() >> 20}
         self.report(Started("train", self.config.iterations, detail))
 

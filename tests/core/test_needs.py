@@ -128,6 +128,8 @@ def test_a_garment_with_nothing_loose_has_no_stepper(scene, toy_motion, tmp_path
     tight, output = classed(scene, np.full(len(scene.classes), TIGHT)), tmp_path / "tight.safetensors"
     asked, loose = (job_of(world, toy_motion(scene, 40), output) for world in (tight, scene))
     assert asked.model.scheme == "quasi_static" and loose.model.scheme == "spring_verlet"
+    chosen = replace(loose, model=replace(loose.model, scheme="quasi_static"))
+    assert [(job.train.carry, job.train.noise) for job in (asked, chosen)] == [(0, 0)] * 2 and loose.train.noise > 0
     assert initialiser_learns_from_windows(asked) and not initialiser_learns_from_windows(loose)
     done = train(replace(asked, train=replace(asked.train, warm=0.3, rate_warmup=2)), lambda event: None)
     assert done.score.total < done.plain.total

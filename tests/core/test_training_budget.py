@@ -15,6 +15,7 @@ from ssilk_core.events import Message, Progress, Started, silent
 from ssilk_core.training import budget
 from ssilk_core.training import run as training
 from ssilk_core.training.budget import fitting_iterations, shaped
+from ssilk_core.training.parallel import Team
 from ssilk_core.training.run import Run, train
 from ssilk_core.training.state import load_state, state_path
 from ssilk_core.training.step import learning_rate
@@ -95,6 +96,13 @@ def test_a_run_ends_with_its_time_and_goes_on_with_more(job, monkeypatch):  # no
     state, _ = load_state(state_path(job("early").output), job("early").identity())
     assert state.best and state.curve[-1].iteration == 8
     assert train(job("early", minutes=9.0, resume=True), silent).iterations == 13
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_a_team_has_no_minutes(job, resume):  # noqa: F811
+    """Each process would end by a clock of its own, and the others wait for it."""
+    with pytest.raises(SsilkError, match="minutes for a team of processes; its clocks differ; set the iterations"):
+        Run(job("team", minutes=1.0, resume=resume), silent, Team(0, 2))
 
 
 def test_time_is_up_when_no_validation_fits_any_more(job, monkeypatch):  # noqa: F811
