@@ -24,6 +24,7 @@ from .body import faces_among
 EXTENT = 1 / 12  # radius of a patch along the body, as a share of the body's diagonal: half the girth of an upper arm
 MOST = 256  # vertices of a patch; of a finer body the patch is smaller
 SOURCES = 512  # vertices that distances along the body are found from at once
+SAME_PLACE = 1e-6  # [m] that vertices at the same place are apart at most
 NOWHERE = 1e6  # [m] from a plane that is met by nothing
 
 
@@ -106,7 +107,7 @@ def patches_beneath(points: Floats, body: Mesh, chosen: Ints) -> Ints:
     """Return the patch of a body that each of some points (T, 3) lies over, in the bind pose.
 
     A patch is what lies within `EXTENT` along the body's edges of the vertex nearest to the point, and faces the
-    same half of space.
+    same half of space. Vertices at the same place count as joined: bodies are split at seams, or come in parts.
 
     Returns:
         How many vertices follow, then these as indices into `chosen`, the nearest first, filled up with it,
@@ -127,8 +128,10 @@ def _patches(body: Mesh, chosen: Ints, anchors: Ints) -> Ints:
     """Return the patch around each of the vertices `chosen[anchors]`, as `patches_beneath` does, (A, 1 + C)."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import dijkstra
+    from scipy.spatial import cKDTree
 
-    pairs = topology.edges(body.faces)
+    joined = cKDTree(body.points).query_pairs(SAME_PLACE, output_type="ndarray")
+    pairs = np.unique(np.concatenate([topology.edges(body.faces), joined]), axis=0)
     lengths = np.linalg.norm(body.points[pairs[:, 1]] - body.points[pairs[:, 0]], axis=1)
     graph = coo_matrix((lengths, (pairs[:, 0], pairs[:, 1])), shape=(body.vertex_count,) * 2)
     normals = topology.vertex_normals(body.points, body.faces)[chosen]

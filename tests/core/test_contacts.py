@@ -122,6 +122,24 @@ def test_a_patch_lies_around_its_point_faces_as_it_does_and_stays_on_its_limb():
         assert np.linalg.norm(both.vertices[found] - both.vertices[found[0]], axis=1).max() <= extent + 1e-9
 
 
+def test_a_patch_goes_on_where_the_body_is_split():
+    """At seams of texture coordinates every vertex stands twice, with no edge between."""
+    shape = limb()
+    half = shape.triangles_center[:, 2] > 0.05
+    upper, lower = (shape.submesh([np.flatnonzero(part)], append=True) for part in (half, ~half))
+    split = trimesh.util.concatenate([upper, lower])
+    assert len(split.vertices) > len(shape.vertices)
+    point = np.array([[RADIUS + 0.005, 0, 0.08]])
+    (whole,), (found,) = (
+        patches_beneath(point, Mesh("/limb", *shape_of(each)), np.arange(len(each.vertices)))
+        for each in (shape, split)
+    )
+    places = [
+        set(map(tuple, each.vertices[row[1 : 1 + row[0]]].round(6))) for each, row in ((shape, whole), (split, found))
+    ]
+    assert places[0] == places[1] and min(z for _, _, z in places[1]) < 0.04
+
+
 def test_patches_count_the_chosen_vertices_alone():
     shape = limb()
     chosen = np.flatnonzero(shape.vertices[:, 2] > -0.05)
