@@ -46,10 +46,11 @@ class Minima:
         return (self.simulator.potential.mass * ((self.x - x) * self.simulator.gravity).sum(1)).sum(0)
 
     def inside(self, x: Tensor) -> Tensor:
-        """Return the share of vertices inside the body, shape (N,)."""
-        planes = self.simulator.potential.planes(x, self.simulator.setting(self.poses, None))
-        assert planes is not None
-        return (planes.distance(x) < 0).double().mean(0)
+        """Return the share of vertices inside any part of the body, shape (N,)."""
+        body = self.simulator.setting(self.poses, None).body
+        assert body is not None
+        _, nearest = self.simulator.potential.contacts.distances(x.float(), body)
+        return (nearest < 0).double().mean(0)
 
     def distance(self) -> Tensor:
         """Return the RMS distance over the mass of the starts from the minima [m], shape (N,)."""

@@ -66,7 +66,7 @@ class Change:
 
     Attributes:
         before, after: energy of the network's state and of the refined one, with the same past [J].
-        inside_before, inside_after: share of the vertices inside the body.
+        inside_before, inside_after: share of the vertices inside what they meet of the body (`model.contacts`).
         moved: RMS distance over the mass [m].
         imbalance: of `newton.Solution`.
     """

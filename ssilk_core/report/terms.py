@@ -28,7 +28,8 @@ class TermsMeter:
         garment: at rest; body: at rest, all meshes as one, or None.
         fps: frames per second of what is given.
         values: by name, one for each frame: energies [J], and the share of vertices inside the body [%]. Gravity
-            counts heights over the body's middle, from what they are at rest.
+            counts heights over the body's middle, from what they are at rest. A shot does not tell what of its
+            garment is tight: all of it meets the whole body here, where training lets tight cloth meet one patch.
     """
 
     garment: Mesh

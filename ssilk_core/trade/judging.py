@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from ..energy.collision import signed_distance
 from ..evaluation.methods import Dressed, Method, Reel
 from ..model.body import CollisionBody
+from ..model.contacts import Contacts
 
 BODIES = (("triangles", True, 1), ("vertices", False, 1), ("every 4th vertex", False, 4))
 FRAMES = 64  # that are judged
@@ -27,7 +27,8 @@ class Judged:
     Attributes:
         body: what the nearest point is looked for on; vertices: of it.
         milliseconds: of a frame, to pose the body and find the garment's distances from it.
-        collision: energy [J]; inside: share of the garment's vertices inside the body.
+        collision: energy [J], of tight vertices with the part of the body that they lie over.
+        inside: share of the garment's vertices inside any part of the body.
     """
 
     body: str
@@ -47,9 +48,10 @@ def judged(dressed: Dressed, reel: Reel, method: Method) -> list[Judged]:
     for name, surface, every in BODIES:
         chosen = np.arange(0, whole.mesh.vertex_count, every)
         body = CollisionBody(whole, joints, vertices=chosen, device=dressed.device)
+        contacts = Contacts(dressed.scene, vertices=chosen, device=dressed.device)
         begun = time.perf_counter()
-        distance = signed_distance(x, body.posed(character, surface=surface))
-        inside, energy = float((distance < 0).double().mean()), float(dressed.energy.collision_of(distance).mean())
+        met, nearest = contacts.distances(x, body.posed(character, surface=surface))
+        inside, energy = float((nearest < 0).double().mean()), float(dressed.energy.collision_of(met).mean())
         each = 1000 * (time.perf_counter() - begun) / len(frames)
         found.append(Judged(name, len(chosen), each, energy, inside))
     return found

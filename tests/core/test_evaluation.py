@@ -225,6 +225,8 @@ def test_minima_are_where_forces_balance(dressed, motion):
     found = minima(dressed.simulator, takes, last_frames(Plain(dressed, reel), takes))
     np.testing.assert_allclose(found.start, found.poses.plain, atol=1e-6)
     assert (found.imbalance < 0.01).all() and (found.over() > 0.01).all() and (found.distance() > 0.01).all()
+    middle = dressed.simulator.setting(found.poses, None).body.points.double().mean(0)
+    assert (found.inside(0 * found.x + middle) == 1).all() and (found.inside(found.x + 100) == 0).all()
     lifted = found.x + torch.tensor([0.3, 0.1, -0.2], dtype=torch.float64)[:, None]
     mass = float(dressed.energy.mass.sum())
     np.testing.assert_allclose(found.floats(lifted), mass * GRAVITY * 0.1, rtol=1e-6)

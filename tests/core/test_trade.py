@@ -12,7 +12,6 @@ import torch
 
 from ssilk_core.checkpoint import model_file
 from ssilk_core.cost import ShotBytes, model_bytes
-from ssilk_core.energy.collision import signed_distance
 from ssilk_core.errors import SsilkError
 from ssilk_core.evaluation.methods import Dressed, Network, reel_of
 from ssilk_core.evaluation.record import recorded
@@ -126,9 +125,9 @@ def test_collisions_are_told_with_any_body(meter, scene):
     dressed = Dressed(scene, fabric, FPS, torch.device("cpu"))
     surface, points, few = judged(dressed, meter.reel, meter.whole)
     body = dressed.body.posed(meter.reel.character(0, range(50)))
-    distance = signed_distance(meter.whole.vertices(0, range(50)), body)
-    assert surface.inside == pytest.approx(float((distance < 0).double().mean()))
-    assert surface.collision == pytest.approx(float(dressed.energy.collision_of(distance).mean()))
+    met, nearest = dressed.contacts.distances(meter.whole.vertices(0, range(50)), body)
+    assert surface.inside == pytest.approx(float((nearest < 0).double().mean()))
+    assert surface.collision == pytest.approx(float(dressed.energy.collision_of(met).mean()))
     assert surface.vertices == points.vertices == scene.character.merged_body().mesh.vertex_count
     assert few.vertices == -(-points.vertices // 4) and few.collision != points.collision
     assert len(judging_table([surface, points, few]).splitlines()) == 5
