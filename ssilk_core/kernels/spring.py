@@ -85,8 +85,9 @@ def _next(before, now, rest, moved, held, roused, beta, share, state, stiffness,
     spring = constant * (_rows(rest, row, latent, at, here) - forward)
     added = reach * (_clamped(_rows(moved, row, latent, at, here), most) - _rows(held, row, latent, at, here))
     allowed = own_share * (_length(spring) + _length(velocity)) + tl.load(roused + row)
-    longest = allowed / tl.maximum(_length(added), 1e-12)
-    added *= tl.where(longest > 1, 1.0, longest)  # unlike a minimum this passes NaN on
+    size = _length(added)
+    longest = allowed / tl.where(size < 1e-12, 1e-12, size)
+    added *= tl.where(longest > 1, 1.0, longest)  # unlike a maximum and a minimum these pass NaN on
     tl.store(state + row * latent + at, _limited(forward + _limited(spring + added, push), bound), mask=here)
 
 

@@ -253,4 +253,9 @@ def test_the_kernels_step_as_their_twin_does(size, options, monkeypatch):
     assert expected[4].isnan().any() and expected[:4].isfinite().all()
     monkeypatch.setattr("ssilk_core.kernels.available", lambda device: True)
     found = scheme.to(device)(stepper.to(device), *(v.to(device) for v in (before, now, rest, pose)))
+    lost = scheme(
+        lambda seen: seen[:, :5] * seen.new_tensor([1, 1, torch.nan, 1, 1]),
+        *(v.to(device) for v in (rest, rest, rest, pose)),
+    )
+    assert lost.isnan().all()  # of what S gives one dimension is lost, which has no length
     torch.testing.assert_close(found.cpu(), expected, rtol=1e-5, atol=2e-6, equal_nan=True)
