@@ -9,6 +9,7 @@ import bpy
 import numpy as np
 from bpy.props import EnumProperty, FloatProperty, IntProperty
 
+from .. import overlay
 from ..heat import worst_frames
 from ..outside.work import Work
 from ..scene import beside, heat
@@ -81,6 +82,7 @@ class ShowHeat(MeasuringOperator, bpy.types.Operator):
         meters = context.scene.unit_settings.scale_length
         red = self.longest if self.kind == heat.STRETCH else self.deepest * meters
         heat.show(found_again(self.garment, self.called), self.measured, red)
+        overlay.hide()  # classes would tint the heat
         if context.space_data and context.space_data.type == "VIEW_3D":
             context.space_data.shading.color_type = "VERTEX"
         return f"'{self.called}', frame {self.frame}: {self.measured.told()}."
@@ -94,6 +96,9 @@ class HideHeat(QualityOperator, bpy.types.Operator):
 
     def apply(self, context: bpy.types.Context) -> str:
         heat.hide(context.object)
+        view = context.space_data
+        if view and view.type == "VIEW_3D" and view.shading.color_type == "VERTEX":
+            view.shading.color_type = "MATERIAL"  # other attributes, classes say, would be shown in place of the heat
         return ""
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import bpy
 import numpy as np
 
+from ..classes import COLOR_ATTRIBUTE
 from .armature import read_joints
 from .garment import armature_of
 from .heat import hide
@@ -53,6 +54,13 @@ def take_away(shown: bpy.types.Object) -> None:
     bpy.data.objects.remove(shown)
 
 
+def _clear_classes(mesh: bpy.types.Mesh) -> None:
+    """Remove the colours of classes: beside a heat map they would be read as heat."""
+    colors = mesh.color_attributes
+    if COLOR_ATTRIBUTE in colors:
+        colors.remove(colors[COLOR_ATTRIBUTE])
+
+
 def _clear_shapes(copy: bpy.types.Object) -> None:
     keys = copy.data.shape_keys
     if keys is None:
@@ -70,6 +78,7 @@ def _plain_copy(garment: bpy.types.Object, trained: Trained) -> bpy.types.Object
     copy[OWNER] = garment
     copy.ssilk.live = False
     hide(copy)  # the heat of the garment is not its own
+    _clear_classes(copy.data)
     _clear_shapes(copy)
     copy.vertex_groups.clear()
     skin, names = trained.player.file.scene.plain_skin, trained.joints.names

@@ -167,6 +167,15 @@ def test_heat_is_shown_follows_frames_and_goes(bpy, dressed):
     assert "SSILK Heat" not in dressed.data.color_attributes and not dressed.ssilk.heat
 
 
+def test_heat_is_not_tinted_by_the_overlay_of_classes(bpy, dressed, monkeypatch):
+    from blender_addon import overlay
+
+    hidden = []
+    monkeypatch.setattr(overlay, "hide", lambda: hidden.append(True))
+    assert bpy.ops.ssilk.show_heat(kind="STRETCH") == {"FINISHED"}
+    assert hidden
+
+
 def test_the_panel_offers_to_hide_what_is_shown(bpy, dressed):
     from blender_addon.panels.quality import QualityPanel
 
@@ -222,6 +231,7 @@ def test_plain_skinning_stands_beside_and_goes(ready, skirt, ssilk_python, tmp_p
     rig_and_animate(bpy, skirt)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "beside.blend"))
     assert bpy.ops.ssilk.find_motions() == {"FINISHED"}
+    bpy.ops.ssilk.show_classes()
     skirt.ssilk.training.preset, skirt.ssilk.training.iterations = "draft", 2
     assert bpy.ops.ssilk.train() == {"FINISHED"}
     assert ended(skirt).state == "done"
@@ -232,6 +242,7 @@ def test_plain_skinning_stands_beside_and_goes(ready, skirt, ssilk_python, tmp_p
     assert bpy.ops.ssilk.toggle_plain() == {"FINISHED"}
     copy = bpy.data.objects["Skirt plain"]
     assert not copy.ssilk.live and not copy.ssilk.heat and "SSILK Heat" not in copy.data.attributes
+    assert not copy.data.color_attributes and "SSILK Classes" in skirt.data.color_attributes
     assert skirt.ssilk.live and skirt.ssilk.heat and "SSILK Heat" in skirt.data.attributes
     depsgraph = bpy.context.evaluated_depsgraph_get()
     (found,) = [
