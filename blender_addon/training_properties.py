@@ -14,7 +14,7 @@ RELATIVE = {"ANIMATABLE", "PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= 
 PRESETS = [
     ("draft", "Draft", "A first look, after minutes on any machine"),
     ("preview", "Preview", "Nearly the final quality, after minutes on a GPU"),
-    ("final", "Final", "The paper's schedule, after about an hour on a GPU"),
+    ("final", "Final", "The paper's schedule, after a quarter of an hour on a fast GPU"),
 ]
 
 

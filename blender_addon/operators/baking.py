@@ -14,11 +14,13 @@ import numpy as np
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
 
 from ..contract.arrays import Joints
+from ..core import core
 from ..errors import SetupError, need
 from ..outside.work import Work
 from ..preferences import interpreter, preferences, unready
 from ..scene import playing
 from ..scene.armature import read_joints
+from ..scene.attributes import current_classes
 from ..scene.baked import animated, apply_shot, need_bakeable, remove_bake
 from ..scene.garment import armature_of, unusable_here
 from ..scene.gather import character_joints, gather
@@ -134,6 +136,8 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
 
         self.joints = self.bakeable_joints()
         self.baked = read_shot(self.shot, self.joints)
+        yield 0.5
+        self.reclassed = reclassed(self.pair.objects()[0], self.model)
         yield 1.0
 
     def bakeable_joints(self) -> Joints:
@@ -159,7 +163,7 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
         apply_shot(garment, armature, joints, self.baked)
         left = self.baked.left_out
         still = f" ({left} proxies are not in it and stay at rest)" if left else ""
-        return f"frames {self.take.frames[0]} to {self.take.frames[-1]}{still}"
+        return f"frames {self.take.frames[0]} to {self.take.frames[-1]}{still}{self.reclassed}"
 
 
 class RemoveBake(ReportingOperator, bpy.types.Operator):
@@ -189,6 +193,17 @@ def lost(figures: Mapping[str, Any]) -> str:
     if typical is None:
         return ""
     return f"; bones and shape keys miss the refined vertices by {typical:g} mm (RMS), {most:g} mm at most"
+
+
+def reclassed(garment: bpy.types.Object, model: Path) -> str:
+    """Return in words that a garment has other classes than its model; empty where not, or where none can be read."""
+    try:
+        trained, classes = core("checkpoint").load_model(model).scene.classes, current_classes(garment.data)
+    except (core("errors").SsilkError, SetupError):
+        return ""
+    if classes is None or np.array_equal(trained, classes):
+        return ""
+    return " (as it was trained: classes were changed since, which take a new rig and a new training)"
 
 
 def usd_path(garment: bpy.types.Object, chosen: str) -> Path:

@@ -64,7 +64,8 @@ class FindMotions(MotionOperator, bpy.types.Operator):
         for source in (*found, *(Source(FILE, path) for path in files)):
             key = (source.kind, source.name, source.track)
             add_motion(garment, source).use = used.get(key, source.kind != "TIMELINE" or len(found) == 1)
-        return f"'{armature.name}' has {len(found) - 1} motions besides the timeline."
+        count = len(found) - 1
+        return f"'{armature.name}' has {count} motion{'' if count == 1 else 's'} besides the timeline."
 
 
 class AddMotionFiles(MotionOperator, bpy.types.Operator):

@@ -61,7 +61,7 @@ def dynamics(moved: float) -> tuple[str, bool]:
         moved: how far the garment is from hanging still, in the mean [m].
     """
     if moved < NO_DYNAMICS:
-        return ("Nothing dynamic is being learned: check that the motions move", True)
+        return ("Nothing dynamic is learned yet: train longer, or check that the motions move", True)
     return (f"Dynamics are being learned: {moved * 1000:.0f} mm of motion of its own", False)
 
 

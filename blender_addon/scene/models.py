@@ -24,7 +24,7 @@ def model_of(garment: bpy.types.Object) -> Path:
         SetupError: there is none.
     """
     job, chosen = job_of(garment), garment.ssilk.model
-    need(chosen or job, f"'{garment.name}' has no trained model; train it, or choose a model in the Training panel.")
+    need(chosen or job, f"'{garment.name}' has no trained model; train it, or choose a model in the Baking panel.")
     path = Path(bpy.path.abspath(chosen)) if chosen else job / MODEL
     todo = "choose another" if chosen else "wait for the training's first validation, or resume it"
     need(path.is_file(), f"'{garment.name}' has no model at {path}; {todo}.")

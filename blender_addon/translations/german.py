@@ -215,7 +215,9 @@ WORDS = {
     "Preview": "Vorschau",
     "Nearly the final quality, after minutes on a GPU": "Fast die endgültige Qualität, nach Minuten auf einer GPU",
     "Final": "Endgültig",
-    "The paper's schedule, after about an hour on a GPU": "Wie im Artikel, nach etwa einer Stunde auf einer GPU",
+    "The paper's schedule, after a quarter of an hour on a fast GPU": (
+        "Wie im Artikel, nach einer Viertelstunde auf einer schnellen GPU"
+    ),
     "Iterations": "Schritte",
     "Optimiser steps; zero for as many as the preset has": "Schritte des Optimierers; null: so viele wie die Vorgabe",
     "Minutes": "Minuten",

@@ -307,6 +307,15 @@ def test_what_cannot_be_baked_is_named(ready, trained, harm, told):
     assert not trained.data.shape_keys
 
 
+def test_classes_that_were_changed_since_the_training_are_told(ready, trained, capfd):
+    assert ready.ops.ssilk.bake() == {"FINISHED"}
+    assert "as it was trained" not in capfd.readouterr().out
+    classes = trained.data.attributes["ssilk:class"].data
+    classes[0].value = 2 - classes[0].value
+    assert ready.ops.ssilk.bake() == {"FINISHED"}
+    assert "as it was trained: classes were changed since" in capfd.readouterr().out
+
+
 def test_another_file_than_a_model_fails_in_one_sentence(ready, trained, folder):
     (folder / "broken.safetensors").write_bytes(b"no model")
     trained.ssilk.model = "//broken.safetensors"

@@ -49,7 +49,7 @@ def test_validations_say_what_is_learned():
     stiff = {**CURVE, "points": [{"iteration": 5, "validation": {**SCORE, "total": 1.5, "dynamics": 0.0019}}]}
     told = findings(running, stiff, moves=True)
     assert ("50% more energy than plain skinning", True) in told
-    assert ("Nothing dynamic is being learned: check that the motions move", True) in told
+    assert ("Nothing dynamic is learned yet: train longer, or check that the motions move", True) in told
     assert not any("ynamic" in text for text, _ in findings(running, stiff, moves=False))
     assert findings(running, {}, moves=True)[0][0].startswith("No validation yet")
     assert findings(JobState("stopped"), {}, moves=True) == []
