@@ -39,9 +39,9 @@ def draw_motions(layout: bpy.types.UILayout, garment: bpy.types.Object) -> None:
         row.prop(item, "use", text=name, icon=ICONS[item.kind])
         if item.kind == FILE:
             row.operator("ssilk.remove_motion", text="", icon="X").index = index
-    row = layout.row(align=True)
-    row.operator("ssilk.find_motions", icon="FILE_REFRESH")
-    row.operator("ssilk.add_motion_files", icon="FILE_FOLDER")
+    column = layout.column(align=True)  # side by side their German names would be cut
+    column.operator("ssilk.find_motions", icon="FILE_REFRESH")
+    column.operator("ssilk.add_motion_files", icon="FILE_FOLDER")
 
 
 def draw_state(layout: bpy.types.UILayout, folder: Path, state: JobState, *, moves: bool) -> None:
@@ -76,9 +76,9 @@ class TrainingPanel(Panel, bpy.types.Panel):
         settings, folder = garment.ssilk.training, job_of(garment)
         draw_motions(layout, garment)
         layout.prop(settings, "preset")
-        row = layout.row(align=True)
-        row.prop(settings, "iterations")
-        row.prop(settings, "minutes")
+        column = layout.column(align=True)
+        column.prop(settings, "iterations")
+        column.prop(settings, "minutes")
         layout.operator("ssilk.train", icon="PLAY")
         state = folder and read_state(folder)
         if state:

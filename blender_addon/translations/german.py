@@ -180,6 +180,7 @@ WORDS = {
     "Import a dressed character that `ssilk rig` wrote, with its proxies and its frame rate": (
         "Eine bekleidete Figur importieren, die `ssilk rig` schrieb, mit Stellvertretern und Bildrate"
     ),
+    "USD file that ssilk wrote": "USD-Datei, die ssilk schrieb",
     # Training
     "Training": "Training",
     "How the garment is trained": "Wie das Kleidungsstück trainiert wird",
@@ -270,6 +271,10 @@ WORDS = {
     ),
     "To USD": "Nach USD",
     "Write a UsdSkel shot, with the body": "Einen UsdSkel-Shot schreiben, mit dem Körper",
+    "USD File": "USD-Datei",
+    "Shot to write; named like the garment, beside the blend file, when empty": (
+        "Shot, der geschrieben wird; leer: wie das Kleidungsstück benannt, neben der Blend-Datei"
+    ),
     "Pre-Roll": "Vorlauf",
     "How long the garment settles in the first pose before the first frame": (
         "Wie lange das Kleidungsstück sich in der ersten Pose setzt, vor dem ersten Bild"

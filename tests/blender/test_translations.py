@@ -12,7 +12,7 @@ pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-b
 
 from .conftest import ROOT
 
-UNSEEN = {"directory", "files", "index", "filepath", "filter_glob"}  # set by the file browser and by buttons
+UNSEEN = {"directory", "files", "index", "filter_glob"}  # set by the file browser and by buttons
 NAMES = {"", "Baraff-Witkin", "St. Venant-Kirchhoff", "Python", "SSILK"}  # the same in every language
 
 
