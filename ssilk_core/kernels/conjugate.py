@@ -158,7 +158,8 @@ def _descend(z, residual, y, step, image, inverse, product, enough, along, left,
     zx, zy, zz = _load3(block + 6 * frames, frames, inside)
     px, py, pz = xx * rx + xy * ry + xz * rz, yx * rx + yy * ry + yz * rz, zx * rx + zy * ry + zz * rz
     _store3(y + own, frames, inside, px, py, pz)
-    tl.store(left + tl.program_id(0) * frames + n, tl.sum(px * rx + py * ry + pz * rz, axis=0), mask=n < frames)
+    now = tl.where(moves, tl.sum(px * rx + py * ry + pz * rz, axis=0), 0.0)
+    tl.store(left + tl.program_id(0) * frames + n, now, mask=n < frames)
 
 
 @triton.jit

@@ -57,12 +57,14 @@ def solve(
     for done in range(1, iterations + 1):
         image = multiply(step)
         # A frame that has converged takes no more steps: rounding could spoil what it has.
-        # Neither does one whose matrix rounding has left indefinite: it keeps the way down that it has.
+        # Neither does one whose matrix rounding has left indefinite: it keeps the way down that it has. From then on
+        # their product is zero, so that they end.
         curvature = dot(step, image)
-        rate = torch.where((product > enough) & (curvature > 0), product / curvature.clamp_min(tiny), 0)
+        moves = (product > enough) & (curvature > 0)
+        rate = torch.where(moves, product / curvature.clamp_min(tiny), 0)
         z, residual = z + rate * step, residual - rate * image
         y = precondition(residual)
-        before, product = product, dot(residual, y)
+        before, product = product, torch.where(moves, dot(residual, y), 0)
         step = y + product / before.clamp_min(tiny) * step
         if done % CHECK_EVERY == 0 and not bool((product > enough).any()):
             break

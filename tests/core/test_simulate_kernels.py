@@ -47,6 +47,7 @@ def test_the_kernel_stops_where_the_plain_twin_does(monkeypatch) -> None:
     matrix = random_matrix(25, 5)
     right = torch.randn(matrix.pattern.count, 3, 5, generator=torch.Generator().manual_seed(2)).to(DEVICE)
     right[..., 2] = 0  # a frame that is solved from the start
+    matrix.blocks[matrix.pattern.count :, ..., 3] *= 40  # and one that is indefinite
     for reduction, iterations in ((0.1, 200), (1e-9, 5)):
         expected, count = matrix.solve(right, reduction, iterations)
         found, steps = by_kernel(matrix, right, reduction, iterations)

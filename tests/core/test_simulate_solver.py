@@ -20,7 +20,7 @@ from ssilk_core.errors import SsilkError
 from ssilk_core.fabrics import Fabric
 from ssilk_core.model.body import CollisionBody
 from ssilk_core.simulate import newton
-from ssilk_core.simulate.conjugate import inverse_blocks, solve
+from ssilk_core.simulate.conjugate import CHECK_EVERY, inverse_blocks, solve
 from ssilk_core.simulate.hinges import Hinges
 from ssilk_core.simulate.membrane import Membrane, outer, positive
 from ssilk_core.simulate.newton import SolverOptions, State, line_search, minimise_from, newton_step
@@ -172,8 +172,10 @@ def test_blocks_at_slivers_are_inverted_in_single_precision() -> None:
 
 def test_a_matrix_that_rounding_left_indefinite_keeps_what_it_has_found() -> None:
     matrix, right = torch.diag(torch.tensor([4.0, 1.0, -1e-3])), torch.tensor([[[1.0, 1.0, 1.0]]])
-    z, _ = solve(lambda v: v @ matrix, lambda r: r, right, 1e-6, iterations=50)
-    assert z.isfinite().all() and (z * right).sum() > 0
+    z, count = solve(lambda v: v @ matrix, lambda r: r, right, 1e-6, iterations=50)
+    assert count == CHECK_EVERY and z.isfinite().all() and (z * right).sum() > 0
+    before, _ = solve(lambda v: v @ matrix, lambda r: r, right, 1e-6, iterations=2)
+    assert torch.equal(z, before)  # the third direction is the one that curves down
 
 
 def test_conjugate_gradients_solve_each_frame_by_itself() -> None:
