@@ -51,9 +51,13 @@ def gather_frames(values: Tensor, index: Tensor) -> Tensor:
     return values.gather(0, index[:, None, :].expand(-1, 3, -1))
 
 
-def signed_distance(x: Tensor, body: PosedBody, blocks: Tensor | None = None) -> Tensor:
+def signed_distance(x: Tensor, body: PosedBody) -> Tensor:
     """Distance along the normal of the nearest body point b [m], n_b . (x - b), shape (V, N); its gradient is n_b."""
-    normal, offset = nearest_planes(x, body, blocks)
+    return signed(x, *nearest_planes(x, body))
+
+
+def signed(x: Tensor, normal: Tensor, offset: Tensor) -> Tensor:
+    """Return signed distances of x (V, 3, N) to planes of normals (V, 3, N) and offsets (V, N) [m], (V, N)."""
     return (normal * x).sum(1) - offset
 
 

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ..assets import PINNED, TIGHT, Floats, Ints, Mesh, Scene
-from ..energy.collision import FAR, Patches, PosedBody, nearest_planes
+from ..energy.collision import FAR, Patches, PosedBody, nearest_planes, signed
 from ..energy.nearest import BLOCK, compact_blocks
 from ..mesh import topology
 from .body import faces_among
@@ -91,11 +91,6 @@ class Contacts:
                 part = x.index_select(0, group.rows)
                 nearest.index_copy_(0, group.rows, signed(part, *nearest_planes(part, body, group.blocks)))
         return met, nearest
-
-
-def signed(x: Tensor, normal: Tensor, offset: Tensor) -> Tensor:
-    """Return signed distances of x (V, 3, N) to planes of normals (V, 3, N) and offsets (V, N) [m], (V, N)."""
-    return (normal * x).sum(1) - offset
 
 
 def no_planes(x: Tensor) -> tuple[Tensor, Tensor]:

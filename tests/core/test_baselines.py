@@ -17,12 +17,12 @@ from ssilk_core.baselines.training import BaselineObjective, BaselineStepper
 from ssilk_core.checkpoint import load_model, model_file, save_model
 from ssilk_core.config import ModelConfig, TrainConfig
 from ssilk_core.energy import GarmentEnergy
+from ssilk_core.energy.collision import signed
 from ssilk_core.errors import SsilkError
 from ssilk_core.events import silent
 from ssilk_core.fabrics import Fabric
 from ssilk_core.kinematics import matrix_from_quaternion, motion_transforms, quaternion_from_matrix
 from ssilk_core.model.body import CollisionBody
-from ssilk_core.model.contacts import signed
 from ssilk_core.model.descriptors import GRAVITY, RATE_TIME
 from ssilk_core.model.network import GarmentModel
 from ssilk_core.training.bank import build_bank

@@ -11,10 +11,10 @@ import trimesh
 
 from ssilk_core.assets import LOOSE, PINNED, TIGHT, Body, Character, Mesh, Scene, SkinWeights
 from ssilk_core.energy import collision, nearest
-from ssilk_core.energy.collision import Patches, PosedBody, nearest_planes
+from ssilk_core.energy.collision import Patches, PosedBody, nearest_planes, signed
 from ssilk_core.energy.surface_point import triangle_rings
 from ssilk_core.model.body import CollisionBody
-from ssilk_core.model.contacts import Contacts, faces_around, patches_beneath, signed
+from ssilk_core.model.contacts import Contacts, faces_around, patches_beneath
 
 CPU = torch.device("cpu")
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"  # on a CPU kernels run in Triton's interpreter

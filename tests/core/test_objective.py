@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from ssilk_core.config import SCHEMES, TrainConfig
-from ssilk_core.model.contacts import signed
+from ssilk_core.energy.collision import signed
 from ssilk_core.model.descriptors import GRAVITY
 from ssilk_core.training.objective import Objective, total
 from ssilk_core.training.step import Stepper
