@@ -47,7 +47,7 @@ def draw_motions(layout: bpy.types.UILayout, garment: bpy.types.Object) -> None:
 def draw_state(layout: bpy.types.UILayout, folder: Path, state: JobState, *, moves: bool) -> None:
     """Draw how far a training is, what it found, and its energies."""
     row = layout.row(align=True)
-    row.progress(factor=state.fraction, text=f"{state.done} of {state.total}")
+    row.progress(factor=state.fraction, text=f"{state.done} of {state.total}" if state.total else "")
     if state.alive:
         row.operator("ssilk.cancel_training", text="", icon="CANCEL")
     elif state.state != "done":
