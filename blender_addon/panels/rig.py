@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import bpy
 
+from ..classes import counts
 from ..errors import SetupError
 from ..scene.armature import proxy_names
+from ..scene.attributes import read_classes
 from ..scene.garment import armature_of, unusable
 from .base import Panel, draw_text
 
@@ -15,10 +17,14 @@ def rig_line(garment: bpy.types.Object) -> str:
     """Return one line about a garment's proxies, or why it can have none."""
     try:
         armature = armature_of(garment)
+        if count := len(proxy_names(armature, garment)):
+            return f"{count} proxies on '{armature.name}'"
+        classes = read_classes(garment.data)
     except SetupError as error:
         return str(error)
-    count = len(proxy_names(armature, garment))
-    return f"{count} proxies on '{armature.name}'" if count else f"No proxies yet on '{armature.name}'"
+    if classes is not None and not counts(classes)[2]:
+        return "Nothing is loose: no proxies"
+    return f"No proxies yet on '{armature.name}'"
 
 
 class RigPanel(Panel, bpy.types.Panel):

@@ -27,5 +27,6 @@ def verdict(iteration: int, score: Score, plain: Score, moves: bool) -> Message:
         f"({terms}), collisions {score.collisions:.2%}, motion of its own {score.dynamics * 1000:.0f} mm"
     )
     if score.dynamics < NO_DYNAMICS and moves:
-        return Message(f"{text}; nothing dynamic is being learned: check that the motions move", "warning")
+        advice = "nothing dynamic is being learned: train longer, or check that the motions move"
+        return Message(f"{text}; {advice}", "warning")
     return Message(text)

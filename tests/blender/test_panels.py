@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
@@ -89,8 +90,11 @@ def test_broken_classes_are_told_and_drawn_around(bpy, skirt):
 
 def test_the_rig_is_told_or_why_there_is_none(bpy, skirt):
     from blender_addon.panels import RigPanel
+    from blender_addon.scene.attributes import write_classes
 
     assert drawn(RigPanel, bpy.context)[0] == "No proxies yet on 'Rig'"
+    write_classes(skirt.data, np.ones(len(skirt.data.vertices), dtype=np.int32))
+    assert drawn(RigPanel, bpy.context)[0] == "Nothing is loose: no proxies"
     bpy.data.objects.remove(bpy.data.objects["Rig"])
     assert drawn(RigPanel, bpy.context)[0].startswith("There is no armature for 'Skirt'")
 
