@@ -45,9 +45,9 @@ class Run:
         """Return the lowest total so far [J], shape (points,)."""
         return np.minimum.accumulate(self.values["total"])
 
-    def best_by(self, seconds: float) -> float | None:
-        """Return the lowest total that was seen within a time; None before the first validation."""
-        seen = self.best[self.seconds <= seconds]
+    def best_by(self, *, seconds: float = np.inf, iterations: float = np.inf) -> float | None:
+        """Return the lowest total that was seen by then; None before the first validation."""
+        seen = self.best[(self.seconds <= seconds) & (self.iterations <= iterations)]
         return float(seen[-1]) if len(seen) else None
 
     def reached(self, total: float) -> int | None:
@@ -101,18 +101,18 @@ def draw(path: Path, runs: list[Run]) -> None:
 
 
 def compare(runs: list[Run], totals: list[float]) -> str:
-    """Return a table of what runs reach in equal time, and when they reach the totals [J]."""
+    """Return a table of what runs reach in equal time and iterations, and when they reach the totals [J]."""
     shared = min(float(run.seconds[-1]) for run in runs)
-    times = [shared / 4, shared / 2, shared]
+    times, iterations = [shared / 4, shared / 2, shared], min(int(run.iterations[-1]) for run in runs)
     header = ["run", "iterations", "time", "best total [J]", "plain skinning [J]"]
     header += [f"best within {format_seconds(time)}" for time in times]
-    header += [f"time (iterations) to {total:.4g} J" for total in totals]
-    return table(header, [_line(run, times, totals) for run in runs])
+    header += [f"best within {iterations} iterations", *(f"time (iterations) to {total:.4g} J" for total in totals)]
+    return table(header, [_line(run, times, iterations, totals) for run in runs])
 
 
-def _line(run: Run, times: list[float], totals: list[float]) -> list[str]:
+def _line(run: Run, times: list[float], iterations: int, totals: list[float]) -> list[str]:
     begun = [run.name, str(run.iterations[-1]), format_seconds(run.seconds[-1])]
-    best = [run.best_by(time) for time in times]
+    best = [*(run.best_by(seconds=time) for time in times), run.best_by(iterations=iterations)]
     arrivals = [run.reached(total) for total in totals]
     return [
         *begun,
