@@ -157,7 +157,7 @@ def listed(found: Sequence[Job], workers: int) -> str:
     left = sum(job.seconds for job in found if not job.is_done)
     return (
         table(("job", "predicted [s]", ""), rows)
-        + f"\n{left:.0f} s left, {left / workers:.0f} s on {workers} GPUs.\n"
+        + f"\n{left:.0f} s left, {left / workers:.0f} s for {workers} jobs side by side.\n"
     )
 
 
@@ -169,7 +169,7 @@ def main() -> int:
     except SsilkError as error:
         raise SystemExit(f"error: {error}") from error
     if options.list:
-        print(listed(found, max(1, options.gpus)))
+        print(listed(found, max(1, options.gpus) * options.per_gpu))
         return 0
     queue = Queue([job for job in found if not job.is_done], options.until)
     gpus: list[int | None] = [*range(options.gpus)] or [None]
