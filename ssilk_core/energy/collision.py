@@ -90,7 +90,7 @@ def nearest_planes(
             the search on a GPU fast, and change no result.
         patches: what each garment vertex may find; all by default.
     """
-    if x.dtype == torch.float32 and kernels.available(x.device) and _have_kernel(body, patches):
+    if kernels.serve(x) and _have_kernel(body, patches):
         return _by_kernels(x, body, blocks, patches)
     index = _nearest_vertex(x, body, blocks, patches).long()
     normal, point = gather_frames(body.normals, index), gather_frames(body.points, index)
@@ -111,7 +111,7 @@ def _have_kernel(body: PosedBody, patches: Patches | None) -> bool:
 
 def _nearest_vertex(x: Tensor, body: PosedBody, blocks: Tensor | None, patches: Patches | None) -> Tensor:
     """Return the index of the nearest body vertex (V, N), int32 from the kernels and int64 elsewhere."""
-    if x.dtype != torch.float32 or not kernels.available(x.device):
+    if not kernels.serve(x):
         return nearest_vertex(x, body.points, patches.vertices if patches else None)
     if patches is not None:
         from ..kernels.listed import listed_kernel

@@ -85,7 +85,7 @@ class GarmentEnergy:
 
     def elastic(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Return stretch and bending; this and the next two use fused kernels where there are any."""
-        if not self._fused(x):
+        if not kernels.serve(x):
             return self.stretch(x), self.bending(x)
         from ..kernels.elastic import elastic_kernel
 
@@ -99,7 +99,7 @@ class GarmentEnergy:
         Neither the planes, unit normals (V, 3, N) and offsets (V, N), nor `root` carry a gradient.
         """
         normal, offset, root = normal.detach(), offset.detach(), root.detach()
-        if not self._fused(x):
+        if not kernels.serve(x):
             return self.gravity(x - root, gravity), self.collision_of((normal * x).sum(1) - offset)
         from ..kernels.pointwise import potential_kernel
 
@@ -114,16 +114,13 @@ class GarmentEnergy:
             last, before: positions one and two frames ago (V, 3, M).
             shift: how far the air went since (3, M), with the character's root.
         """
-        if not self._fused(x):
+        if not kernels.serve(x):
             moving = x[..., : last.shape[-1]]
             return self.inertia(moving, 2 * last - before, dt), self.drag(moving, last + shift, dt)
         from ..kernels.pointwise import kinetic_kernel
 
         weights = 1 / (dt * dt), self.fabric.drag / self.fabric.density / dt
         return kinetic_kernel(x, self.mass, last, before, shift, *weights)
-
-    def _fused(self, x: Tensor) -> bool:
-        return x.dtype == torch.float32 and kernels.available(x.device)
 
 
 def _hinge_shapes(mesh: Mesh, hinges: Ints) -> Floats:

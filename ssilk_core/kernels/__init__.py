@@ -9,8 +9,14 @@ from __future__ import annotations
 import importlib.util
 
 import torch
+from torch import Tensor
 
 
 def available(device: torch.device) -> bool:
     """Return whether the kernels serve a device: CUDA with Triton installed. The one place that chooses."""
     return device.type == "cuda" and importlib.util.find_spec("triton") is not None
+
+
+def serve(x: Tensor) -> bool:
+    """Return whether the kernels serve a tensor: single precision on such a device."""
+    return x.dtype == torch.float32 and available(x.device)

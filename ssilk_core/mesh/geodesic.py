@@ -8,12 +8,16 @@ here run along the cloth, and are infinite between islands.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ssilk_core.assets import Floats, Ints
 from ssilk_core.mesh.topology import components, edge_keys, edge_use, edges, half_edges
+
+if TYPE_CHECKING:
+    from scipy.sparse import coo_matrix
 
 
 def distances(points: Floats, faces: Ints, sources: Ints) -> Floats:
@@ -95,6 +99,14 @@ def farthest_points(
         nearest = np.minimum(nearest, rows[-1])
         sampled()
     return np.array(samples), np.array(rows)
+
+
+def edge_graph(points: Floats, pairs: Ints) -> coo_matrix:
+    """Return the lengths [m] of edges between points (V, 3), each once in `pairs` (E, 2), as a matrix (V, V)."""
+    from scipy.sparse import coo_matrix
+
+    lengths = np.linalg.norm(points[pairs[:, 1]] - points[pairs[:, 0]], axis=1)
+    return coo_matrix((lengths, (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
 
 
 def submesh(faces: Ints, mask: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -19,6 +19,7 @@ from ..assets import PINNED, TIGHT, Floats, Ints, Mesh, Scene
 from ..energy.collision import FAR, Patches, PosedBody, nearest_planes, signed
 from ..energy.nearest import BLOCK, compact_blocks
 from ..mesh import topology
+from ..mesh.geodesic import edge_graph
 from .body import faces_among
 
 EXTENT = 1 / 12  # radius of a patch along the body, as a share of the body's diagonal: half the girth of an upper arm
@@ -121,14 +122,12 @@ def patches_beneath(points: Floats, body: Mesh, chosen: Ints) -> Ints:
 
 def _patches(body: Mesh, chosen: Ints, anchors: Ints) -> Ints:
     """Return the patch around each of the vertices `chosen[anchors]`, as `patches_beneath` does, (A, 1 + C)."""
-    from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import dijkstra
     from scipy.spatial import cKDTree
 
     joined = cKDTree(body.points).query_pairs(SAME_PLACE, output_type="ndarray")
     pairs = np.unique(np.concatenate([topology.edges(body.faces), joined]), axis=0)
-    lengths = np.linalg.norm(body.points[pairs[:, 1]] - body.points[pairs[:, 0]], axis=1)
-    graph = coo_matrix((lengths, (pairs[:, 0], pairs[:, 1])), shape=(body.vertex_count,) * 2)
+    graph = edge_graph(body.points, pairs)
     normals = topology.vertex_normals(body.points, body.faces)[chosen]
     extent = EXTENT * float(np.linalg.norm(np.ptp(body.points, axis=0)))
     patches = []
@@ -139,10 +138,7 @@ def _patches(body: Mesh, chosen: Ints, anchors: Ints) -> Ints:
         along[np.arange(len(part)), part] = 0
         order = np.argsort(along, axis=1, kind="stable")[:, :MOST]
         within = np.isfinite(np.take_along_axis(along, order, axis=1))
-        filled = np.where(within, order, order[:, :1])
-        patches.append(
-            np.column_stack([within.sum(axis=1), filled, np.repeat(filled[:, :1], MOST - filled.shape[1], axis=1)])
-        )
+        patches.append(np.column_stack([within.sum(axis=1), np.where(within, order, order[:, :1])]))
     found = np.concatenate(patches)
     return found[:, : 1 + found[:, 0].max()]
 

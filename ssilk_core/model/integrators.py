@@ -151,8 +151,7 @@ class SpringVerlet(Integrator):
         return rest, pose, held, self.rate_share * length(rates)
 
     def follow(self, stepper: nn.Module, before: Tensor, now: Tensor, known: Sequence[Tensor]) -> Tensor:
-        fused = now.dtype == torch.float32 and kernels.available(now.device)
-        if torch.is_grad_enabled() or torch.compiler.is_compiling() or not fused:
+        if torch.is_grad_enabled() or torch.compiler.is_compiling() or not kernels.serve(now):
             return super().follow(stepper, before, now, known)
         from ..kernels.spring import next_kernel, seen_kernel
 

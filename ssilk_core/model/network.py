@@ -79,8 +79,6 @@ class GarmentModel(nn.Module):
             pose: their dynamic descriptors, shape (F, batch, D).
         """
         states = list(states)
-        if not self.integrator.states:
-            return [*states, *rest]
         known = self.integrator.known(self.stepper, rest.flatten(0, 1), pose.flatten(0, 1))
         for frame in zip(*(values.unflatten(0, rest.shape[:2]) for values in known)):
             states.append(self.integrator.follow(self.stepper, states[-2], states[-1], frame))

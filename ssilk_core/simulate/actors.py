@@ -52,8 +52,9 @@ def spans_of(motion: Motion, shot: int, fps: float, substeps: int, longest: int 
     spans, first, source = [], 0, 0
     for part in split_at_cuts(motion):
         stop = frames_at(source + part.frame_count, motion.fps, fps)
-        for start in range(first, stop, longest or max(1, stop - first)):
-            count = (min(stop, start + (longest or stop)) - start - 1) * substeps + 1
+        most = longest or max(1, stop - first)
+        for start in range(first, stop, most):
+            count = (min(most, stop - start) - 1) * substeps + 1
             position = (start + np.arange(count) / substeps) * motion.fps / fps - source
             poses = sample_motion(part, position.clip(0, part.frame_count - 1))
             spans.append(Span(shot, start, substeps, Motion(motion.path, fps * substeps, *poses)))

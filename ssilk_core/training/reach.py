@@ -11,6 +11,7 @@ import numpy as np
 from ..assets import LOOSE, TIGHT, Floats, Ints, Motion, Scene
 from ..kinematics import motion_transforms, skin_points, skinning_matrices
 from ..mesh import topology
+from ..mesh.geodesic import edge_graph
 
 SLACK = 0.08  # [m] play that blendshapes and stretch add to the geometric reach
 POSES = 200  # poses that the reach is measured on
@@ -56,16 +57,13 @@ def _tethers(scene: Scene) -> tuple[Ints, Floats]:
 
     Edge paths are used, which are never shorter than the geodesic: the reach errs on the safe side.
     """
-    from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import dijkstra
 
     mesh = scene.garment.mesh
     held, loose = np.flatnonzero(scene.classes != LOOSE), np.flatnonzero(scene.classes == LOOSE)
     if not len(held) or not len(loose):
         return np.zeros(0, dtype=int), np.zeros(0)
-    pairs = topology.edges(mesh.faces)
-    lengths = np.linalg.norm(mesh.points[pairs[:, 1]] - mesh.points[pairs[:, 0]], axis=1)
-    graph = coo_matrix((lengths, (pairs[:, 0], pairs[:, 1])), shape=(mesh.vertex_count,) * 2)
+    graph = edge_graph(mesh.points, topology.edges(mesh.faces))
     distance, _, source = dijkstra(graph, directed=False, indices=held, min_only=True, return_predecessors=True)
     tied = loose[np.isfinite(distance[loose])]
     anchors, group = np.unique(source[tied], return_inverse=True)
