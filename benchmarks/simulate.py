@@ -102,19 +102,19 @@ def by_lbfgs(potential: Potential, start: Tensor, setting: Setting, iterations: 
     free, best, lowest = potential.free, start, torch.inf
     moved = start[free].clone().requires_grad_(True)
     for _ in range(max(1, iterations // ROUND)):
-        planes = potential.planes(start.index_copy(0, free, moved.detach()), setting)
+        met = potential.met(start.index_copy(0, free, moved.detach()), setting)
         search = torch.optim.LBFGS([moved], max_iter=min(ROUND, iterations), history_size=20, tolerance_grad=1e-9,
                                    tolerance_change=1e-14, line_search_fn="strong_wolfe")  # fmt: skip
 
-        def evaluate(search: torch.optim.Optimizer = search, planes: Any = planes) -> Tensor:
+        def evaluate(search: torch.optim.Optimizer = search, met: Any = met) -> Tensor:
             search.zero_grad()
-            value = potential.energy(start.index_copy(0, free, moved), setting, planes).sum()
+            value = potential.energy(start.index_copy(0, free, moved), setting, met).sum()
             value.backward()
             return value
 
         search.step(evaluate)
         x = start.index_copy(0, free, moved.detach())
-        energy = float(potential.energy(x, setting, potential.planes(x, setting)))
+        energy = float(potential.energy(x, setting, potential.met(x, setting)))
         best, lowest = (x, energy) if energy < lowest else (best, lowest)
     return best
 
@@ -127,9 +127,9 @@ def lbfgs_figures(simulator: Watched, iterations: int, frames: int) -> dict[str,
     seconds = (now(potential.free.device) - begun) / len(problems)
     energy, imbalance = [], []
     for x, (_, setting) in zip(states, problems):
-        planes = potential.planes(x, setting)
-        energy.append(float(potential.energy(x, setting, planes)))
-        imbalance.append(float(potential.imbalance(potential.gradient(x, setting, planes))))
+        met = potential.met(x, setting)
+        energy.append(float(potential.energy(x, setting, met)))
+        imbalance.append(float(potential.imbalance(potential.gradient(x, setting, met))))
     tolerance = simulator.options.solver.tolerance
     return {
         "shots": 1,

@@ -48,8 +48,7 @@ def closest_on_faces(
         Row and frame of each query (Q,), body vertices at the corners of its triangle and barycentric coordinates,
         both (3, Q).
     """
-    scores = SCORES * (ON_GPU if x.is_cuda else 1)
-    frames = max(1, scores // (len(x) * (len(faces) if listed is None else listed.shape[1])))
+    frames = frames_at_once(x, faces, listed)
     parts = [
         _closest(x, reach, points, faces, listed, at, min(at + frames, x.shape[2]))
         for at in range(0, x.shape[2], frames)
@@ -58,12 +57,18 @@ def closest_on_faces(
     return row, frame, corners, weights
 
 
+def frames_at_once(x: Tensor, faces: Tensor, listed: Tensor | None) -> int:
+    """Return how many frames of such queries are looked at together."""
+    scores = SCORES * (ON_GPU if x.is_cuda else 1)
+    return max(1, scores // (len(x) * (len(faces) if listed is None else listed.shape[1])))
+
+
 def _closest(
     x: Tensor, reach: Tensor, points: Tensor, faces: Tensor, listed: Tensor | None, start: int, stop: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return what `closest_on_faces` does, in frames `start` to `stop`."""
-    part = x[..., start:stop], reach[:, start:stop], points[..., start:stop], faces
-    frame, row, face = _within_reach(*part) if listed is None else _listed_within_reach(*part, listed)
+    part = x[..., start:stop], reach[:, start:stop], points[..., start:stop]
+    row, frame, face = pairs_within_reach(*part, faces, listed)
     frame = frame + start
     corners = faces[face].T
     origin, second, third = (points[corner, :, frame].T for corner in corners)
@@ -79,6 +84,18 @@ def _closest(
     )
     winner = first[first < len(pair)]
     return row[winner], frame[winner], corners[:, winner], torch.stack([1 - s - t, s, t])[:, winner]
+
+
+def pairs_within_reach(
+    x: Tensor, reach: Tensor, points: Tensor, faces: Tensor, listed: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return row, frame and face of all pairs of a query and a triangle whose sphere is within reach, (M,) each.
+
+    Arguments are those of `closest_on_faces`. All frames are looked at together.
+    """
+    find = _within_reach if listed is None else _listed_within_reach
+    frame, row, face = find(x, reach, points, faces, *(() if listed is None else (listed,)))
+    return row, frame, face
 
 
 def _listed_within_reach(

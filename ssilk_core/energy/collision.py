@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from .. import kernels
-from .closest import closest_on_faces
+from .closest import closest_on_faces, frames_at_once
 from .nearest import BLOCK, GROUP, consecutive_blocks, nearest_vertex
+from .rounded import SHARPNESS, Rounded, rounded_distance
 from .surface_point import nearest_on_rings
 
 # Further than this from every body vertex [m], the tangent plane at the nearest vertex says all that is needed.
@@ -92,17 +93,58 @@ def nearest_planes(
     """
     if kernels.serve(x) and _have_kernel(body, patches):
         return _by_kernels(x, body, blocks, patches)
-    index = _nearest_vertex(x, body, blocks, patches).long()
-    normal, point = gather_frames(body.normals, index), gather_frames(body.points, index)
-    offset = (normal * point).sum(1)
-    if body.faces is None and body.rings is None:
-        return normal, offset
-    square = ((x - point) ** 2).sum(1)
+    index, normal, offset, reach = _at_vertices(x, body, blocks, patches)
     if body.faces is not None:
         listed = patches.faces if patches else None
-        found = closest_on_faces(x, square.sqrt().where(square < FAR**2, -1), body.points, body.faces, listed)
+        found = closest_on_faces(x, reach, body.points, body.faces, listed)
         return _on_triangles(normal, offset, body, *found, x)
-    return _on_triangles(normal, offset, body, *_around(x, index, square < FAR**2, body))
+    if body.rings is None:
+        return normal, offset
+    return _on_triangles(normal, offset, body, *_around(x, index, reach >= 0, body))
+
+
+@torch.no_grad()
+def rounded_planes(
+    x: Tensor, body: PosedBody, blocks: Tensor | None = None, patches: Patches | None = None
+) -> Rounded:
+    """Return the rounded distances of x to the body's whole surface; arguments are those of `nearest_planes`.
+
+    A body without `faces` is not rounded, nor are points `FAR` from it.
+    """
+    single = x.float()
+    if body.faces is None:
+        normal, offset = nearest_planes(single, body, blocks, patches)
+        return Rounded(normal, offset, normal.new_zeros(len(x), 3, *x.shape[1:]))
+    listed = patches.faces if patches else None
+    if kernels.serve(single):
+        from ..kernels.rounded import rounded_kernel
+
+        index = _nearest_vertex(single, body, blocks, patches)
+        reach = FAR, TOUCHING, SHARPNESS
+        return rounded_kernel(single, index, body.points, body.normals, body.faces, listed, *reach)
+    _, *plane, reach = _at_vertices(single, body, blocks, patches)
+    plane = Rounded(*(values.to(x.dtype) for values in plane), x.new_zeros(len(x), 3, *x.shape[1:]))
+    many = frames_at_once(x, body.faces, listed)
+    for frames in torch.arange(x.shape[2], device=x.device).split(many):
+        part = x[..., frames], reach[:, frames], body.points[..., frames], body.normals[..., frames]
+        found, rounded = rounded_distance(*part, body.faces, TOUCHING, listed)
+        plane.normal[..., frames] = rounded.normal.where(found[:, None], plane.normal[..., frames])
+        plane.offset[..., frames] = rounded.offset.where(found, plane.offset[..., frames])
+        plane.bend[..., frames] = rounded.bend
+    return plane
+
+
+def _at_vertices(
+    x: Tensor, body: PosedBody, blocks: Tensor | None, patches: Patches | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the index of the nearest body vertices (V, N), their normals and offsets, and how far they are.
+
+    The distances [m] (V, N) are -1 from `FAR` on.
+    """
+    index = _nearest_vertex(x, body, blocks, patches).long()
+    normal, point = gather_frames(body.normals, index), gather_frames(body.points, index)
+    square = ((x - point) ** 2).sum(1)
+    return index, normal, (normal * point).sum(1), square.sqrt().where(square < FAR**2, -1)
 
 
 def _have_kernel(body: PosedBody, patches: Patches | None) -> bool:

@@ -38,7 +38,7 @@ class Minima:
     def over(self) -> Tensor:
         """Return the energy of the starts over that of the minima [J], shape (N,)."""
         potential, setting = self.simulator.potential, self.simulator.setting(self.poses, None)
-        start, lowest = (potential.energy(x, setting, potential.planes(x, setting)) for x in (self.start, self.x))
+        start, lowest = (potential.energy(x, setting, potential.met(x, setting)) for x in (self.start, self.x))
         return start - lowest
 
     def floats(self, x: Tensor) -> Tensor:

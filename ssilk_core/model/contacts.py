@@ -16,8 +16,9 @@ import torch
 from torch import Tensor
 
 from ..assets import PINNED, TIGHT, Floats, Ints, Mesh, Scene
-from ..energy.collision import FAR, Patches, PosedBody, nearest_planes, signed
+from ..energy.collision import FAR, Patches, PosedBody, nearest_planes, rounded_planes, signed
 from ..energy.nearest import BLOCK, compact_blocks
+from ..energy.rounded import Rounded
 from ..mesh import topology
 from ..mesh.geodesic import edge_graph
 from .body import faces_among
@@ -82,6 +83,17 @@ class Contacts:
             normal.index_copy_(0, group.rows, found[0])
             offset.index_copy_(0, group.rows, found[1])
         return normal, offset
+
+    def rounded(self, x: Tensor, body: PosedBody) -> Rounded:
+        """Return rounded distances of x (V, 3, N) to what it meets, as `planes` does, in the precision of x."""
+        normal, offset = no_planes(x)
+        met = Rounded(normal, offset, x.new_zeros(len(x), 3, *x.shape[1:]))
+        for group in self._groups:
+            found = rounded_planes(x.index_select(0, group.rows), body, group.blocks, group.patches)
+            met.normal.index_copy_(0, group.rows, found.normal.to(x.dtype))
+            met.offset.index_copy_(0, group.rows, found.offset.to(x.dtype))
+            met.bend.index_copy_(0, group.rows, found.bend.to(x.dtype))
+        return met
 
     def distances(self, x: Tensor, body: PosedBody) -> tuple[Tensor, Tensor]:
         """Return signed distances of x (V, 3, N) [m] to these planes and to the whole body, both (V, N)."""

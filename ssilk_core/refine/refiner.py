@@ -190,11 +190,11 @@ class Refiner:
         mass = self.potential.mass
         after = State.at(self.potential, (refined - root).to(before.x.dtype), setting)
         inside = [
-            (state.planes.distance(state.x) < 0).double().mean(0) if state.planes else torch.zeros_like(state.energy)
+            (state.met.distance(state.x) < 0).double().mean(0) if state.met else torch.zeros_like(state.energy)
             for state in (before, after)
         ]
         moved = ((mass * ((after.x - before.x) ** 2).sum(1)).sum(0) / mass.sum()).sqrt()
-        imbalance = self.potential.imbalance(self.potential.gradient(after.x, setting, after.planes))
+        imbalance = self.potential.imbalance(self.potential.gradient(after.x, setting, after.met))
         figures = torch.stack([before.energy, after.energy, *inside, moved, imbalance], dim=1).tolist()
         for points, values in zip(refined.permute(2, 0, 1).cpu().numpy(), figures):
             yield RefinedFrame(points, Change(*values))

@@ -62,22 +62,30 @@ class Hessian:
         parts = [np.concatenate(part) for part in (rows, sources, products)]
         return self.pattern.summation(parts[0], parts[1], parts[2], 4 * count)
 
-    def __call__(self, x: Tensor, weight: Tensor, pushed: Tensor | None, held: Tensor | None = None) -> BlockMatrix:
+    def __call__(
+        self,
+        x: Tensor,
+        weight: Tensor,
+        contact: Tensor | None,
+        held: Tensor | None = None,
+        whole: Tensor | None = None,
+    ) -> BlockMatrix:
         """Return the Hessian at x.
 
         Args:
             weight: stiffness of each free vertex alike in all directions [N/m], shape (U, 1).
-            pushed: vectors whose outer product is added at each free vertex, shape (U, 3, N), or None.
+            contact: added at each free vertex, shape (U, 3, 3, N), or None.
             held: free vertices that are made so stiff that a solution leaves them alone, shape (U, N), or None.
+            whole: of `Membrane.stiffness`.
         """
-        blocks = self.sum_faces(self.membrane.stiffness(x))
+        blocks = self.sum_faces(self.membrane.stiffness(x, whole))
         if self.hinges:
             slopes = self.hinges.slopes(x)
             blocks += self.sum_hinges(outer(slopes[self.left], slopes[self.right]))
         diagonal = blocks[: self.free_count]
         diagonal += weight[:, None, None] * torch.eye(3, device=x.device)[:, :, None]
-        if pushed is not None:
-            diagonal += outer(pushed, pushed)
+        if contact is not None:
+            diagonal += contact.float()
         if held is not None:
             diagonal *= torch.where(held, HELD, 1.0)[:, None, None]
         return BlockMatrix(self.pattern, blocks)

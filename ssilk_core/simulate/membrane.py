@@ -43,10 +43,18 @@ class Membrane:
         stress = torch.cat([uu * w_u + uv * w_v, uv * w_u + vv * w_v])
         return adjoint(self.operator, stress)
 
-    def stiffness(self, x: Tensor) -> Tensor:
-        """Return the positive Hessian in the columns of F [J], float32; blocks uu, uv, vu, vv: (4 F, 3, 3, N)."""
+    def stiffness(self, x: Tensor, whole: Tensor | None = None) -> Tensor:
+        """Return the positive Hessian in the columns of F [J], float32; blocks uu, uv, vu, vv: (4 F, 3, 3, N).
+
+        Args:
+            whole: frames that get the Hessian itself, which compression may make indefinite, shape (N,).
+        """
         w_u, w_v = self.operator(x).float().chunk(2)
-        uu, uv, vv = (s[:, None, None] for s in positive(*tension(w_u, w_v, self.fabric)))
+        tensions = tension(w_u, w_v, self.fabric)
+        clamped = positive(*tensions)
+        if whole is not None:
+            clamped = tuple(own.where(whole, other) for own, other in zip(tensions, clamped, strict=True))
+        uu, uv, vv = (s[:, None, None] for s in clamped)
         a, b, c, d = material(w_u, w_v, self.fabric)
         identity = torch.eye(3, device=x.device)[:, :, None]
         own_u, own_v, mixed = outer(w_u, w_u), outer(w_v, w_v), outer(w_u, w_v)

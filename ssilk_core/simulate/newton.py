@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Projected Newton with conjugate gradients, many frames at once.
+"""Newton's method with conjugate gradients, many frames at once.
 
-Each iteration solves with the positive Hessian to a tenth of the residual, then halves the step until the energy has
-fallen enough. The nearest points of the body are found anew for every state, those of the line search included: the
-energy of a frame never rises, and more iterations never end higher. In gradient and Hessian they hold still.
+Each iteration solves with the Hessian to a tenth of the residual, then halves the step until the energy has fallen
+enough. The distances to the body are found anew for every state, those of the line search included: the energy of a
+frame never rises, and more iterations never end higher. Far from balance the Hessian is made positive; near it the
+whole one is tried, for cloth that is about to buckle gives way much faster under it, and left for some iterations
+where it did not lead down.
 
-Between two parts of the body, or where these pass through each other, the nearest point jumps: the energy has a
-crease or a step there, and no gradient tells. One vertex on it would keep its whole garment from moving on. Where no
-step lowers the energy, the vertices whose energy rises at once as their planes do not tell are held for the rest of
-the search, and the others go on; a frame that has none stays where it is.
+Where parts of a body pass through each other, the nearest surface changes sides and the energy has a step: no
+gradient tells. One vertex before it would keep its whole garment from moving on. Where only a small part of a step
+lowers the energy, the vertices that cost more than they should in a larger one are held, and the others go on. Once
+these are in balance, all are let go and tried once more.
 """
 
 from __future__ import annotations
@@ -18,14 +20,19 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from ..energy.rounded import Rounded
 from ..errors import need
-from .potential import Planes, Potential, Setting
+from .potential import Potential, Setting
 
 SUFFICIENT = 1e-4  # share of the slope that a step has to gain
 HALVINGS = 12
 REDUCTION = 0.1  # of the residual by each linear solution
 REACH = 0.1  # of the garment's size, by which a step moves a vertex at most: stiff systems are solved badly
-SPOILING = 0.1  # share of the slope that a vertex on a crease takes away, from which on it is held
+CREEPING = 0.25  # of a step: where not even this is possible, what stands in the way is held
+SPOILING = 0.1  # share of the fall expected that a vertex takes away, from which on it stands in the way
+NEAR = 2.0  # [g] out of balance, from which on the whole Hessian is tried
+PATIENCE = 4  # iterations without it, after a step that it led to was cut to less than GOOD
+GOOD = 0.25
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,34 +84,34 @@ class State:
 
     Attributes:
         x: positions [m], shape (V, 3, N).
-        planes: through the body points nearest to them.
+        met: their distances to the body.
         energy: [J], shape (N,).
     """
 
     x: Tensor
-    planes: Planes | None
+    met: Rounded | None
     energy: Tensor
 
     @classmethod
     def at(cls, potential: Potential, x: Tensor, setting: Setting) -> State:
         """Return the state of positions (V, 3, N)."""
-        planes = potential.planes(x, setting)
-        return cls(x, planes, potential.energy(x, setting, planes))
+        met = potential.met(x, setting)
+        return cls(x, met, potential.energy(x, setting, met))
 
     def tensors(self) -> list[Tensor]:
         """Return all that it holds, frames last."""
-        return [self.x, self.energy, *([self.planes.normal, self.planes.offset] if self.planes else [])]
+        return [self.x, self.energy, *([self.met.normal, self.met.offset, self.met.bend] if self.met else [])]
 
     def picked(self, frames: Tensor) -> State:
         """Return the state of some of the frames, indices (M,)."""
-        return State(self.x[..., frames], self.planes and self.planes.picked(frames), self.energy[frames])
+        return State(self.x[..., frames], self.met and self.met.picked(frames), self.energy[frames])
 
     def replaced(self, frames: Tensor, other: State) -> State:
         """Return the state with some of the frames, indices (M,), from another."""
-        x, energy, *planes = (
+        x, energy, *met = (
             own.index_copy(-1, frames, new) for own, new in zip(self.tensors(), other.tensors(), strict=True)
         )
-        return State(x, Planes(*planes) if planes else None, energy)
+        return State(x, Rounded(*met) if met else None, energy)
 
 
 @torch.no_grad()
@@ -130,6 +137,8 @@ class _Search:
 
     Attributes:
         held: vertices that stay where they are, shape (V, N).
+        waiting: iterations that frames go on without the whole Hessian, shape (N,).
+        released: frames whose held vertices have been let go, shape (N,).
     """
 
     gradient: Tensor
@@ -145,6 +154,7 @@ class _Search:
         self.at_work = torch.arange(len(energy), device=start.device)
         self.moving = torch.ones_like(energy, dtype=torch.bool)
         self.held = torch.zeros_like(start[:, 0], dtype=torch.bool)
+        self.waiting, self.released = torch.zeros_like(self.at_work), torch.zeros_like(self.moving)
         self._look()
         iterations = torch.zeros_like(self.at_work)
         found = start.clone(), energy.clone(), self.imbalance.clone()
@@ -152,34 +162,39 @@ class _Search:
 
     def narrowed(self) -> bool:
         """Leave out frames that are solved or that no step improves; return whether any is left."""
+        self._release()
         kept = (self.moving & (self.imbalance > self.options.tolerance)).nonzero()[:, 0]
         if 0 < len(kept) < len(self.at_work):
             self.state, self.setting = self.state.picked(kept), self.setting.picked(kept)
-            self.gradient, self.held = self.gradient[..., kept], self.held[:, kept]
-            self.at_work = self.at_work[kept]
+            for name in ("gradient", "held", "at_work", "imbalance", "waiting", "released"):
+                setattr(self, name, getattr(self, name)[..., kept])
         return len(kept) > 0
 
     def advance(self) -> None:
         """Make one step."""
-        potential, setting = self.potential, self.setting
-        step, count = newton_step(potential, self.state, setting, self.gradient, self.options.inner, self.held)
-        self.state, self.moving = line_search(potential, self.state, setting, self.gradient, step)
-        self._hold((~self.moving).nonzero()[:, 0], step)
+        potential, setting, gradient = self.potential, self.setting, self.gradient
+        whole = (self.imbalance < NEAR) & (self.waiting <= 0)
+        step, count = newton_step(potential, self.state, setting, gradient, self.options.inner, self.held, whole)
+        self.state, length, in_the_way = line_search(potential, self.state, setting, gradient, step)
+        misled = whole & (length == 0)
+        self.waiting = torch.where(whole & (length < GOOD), PATIENCE, self.waiting - 1)
+        new = in_the_way & ~self.held & ~misled
+        self.held |= new
+        self.moving = (length > 0) | new.any(0) | misled
         self._look()
         self._keep(count)
 
-    def _hold(self, stuck: Tensor, step: Tensor) -> None:
-        """Hold what keeps frames from moving (their indices); those of which that frees the others go on."""
-        if len(stuck) and self.state.planes:
-            gradient, step = self.gradient[..., stuck], step[..., stuck]
-            setting = self.setting.picked(stuck)
-            found = spoiling(self.potential, self.state.picked(stuck), setting, gradient, step) & ~self.held[:, stuck]
-            self.held[:, stuck] |= found
-            self.moving[stuck] = found.any(0)
+    def _release(self) -> None:
+        """Let go, once, of what frames hold that are in balance otherwise."""
+        again = (self.imbalance <= self.options.tolerance) & ~self.released & self.held.any(0)
+        if bool(again.any()):
+            self.held &= ~again
+            self.released |= again
+            self._look()
 
     def _look(self) -> None:
         """Find the forces out of balance in the states that the search stands at."""
-        gradient = self.potential.gradient(self.state.x, self.setting, self.state.planes)
+        gradient = self.potential.gradient(self.state.x, self.setting, self.state.met)
         self.gradient = gradient.masked_fill(self.held[:, None], 0)
         self.imbalance = self.potential.imbalance(self.gradient)
 
@@ -194,11 +209,20 @@ class _Search:
 
 
 def newton_step(
-    potential: Potential, state: State, setting: Setting, gradient: Tensor, inner: int, held: Tensor | None = None
+    potential: Potential,
+    state: State,
+    setting: Setting,
+    gradient: Tensor,
+    inner: int,
+    held: Tensor | None = None,
+    whole: Tensor | None = None,
 ) -> tuple[Tensor, int]:
-    """Return a direction of descent (V, 3, N), zero in pinned and `held` (V, N) vertices, and iterations it took."""
+    """Return a direction (V, 3, N), zero in pinned and `held` (V, N) vertices, and the iterations it took.
+
+    Along it the energy falls, but for frames (N,) whose `whole` Hessian is used: those may have no step at all.
+    """
     right = -gradient[potential.free].float()
-    z, count = potential.hessian(state.x, setting, state.planes, held).solve(right, REDUCTION, inner)
+    z, count = potential.hessian(state.x, setting, state.met, held, whole).solve(right, REDUCTION, inner)
     step = torch.zeros_like(state.x)
     step[potential.free] = z.to(step.dtype)
     if held is not None:
@@ -209,14 +233,15 @@ def newton_step(
 
 def line_search(
     potential: Potential, state: State, setting: Setting, gradient: Tensor, step: Tensor
-) -> tuple[State, Tensor]:
+) -> tuple[State, Tensor, Tensor]:
     """Return where the largest of 1, 1/2, 1/4 ... of a step takes each frame so that its energy falls enough.
 
-    A frame whose energy falls with none of them stays. Also returned: which frames have moved, shape (N,).
+    A frame whose energy falls with none of them stays. Also returned: which part of the step it was, 0 for those,
+    shape (N,), and the vertices that stood in the way of more where it was little, shape (V, N).
     """
     slope = (gradient * step).sum((0, 1))
     found, left, length = state, (slope < 0).nonzero()[:, 0], 1.0
-    moved = slope < 0
+    lengths, in_the_way = torch.zeros_like(slope), torch.zeros_like(step[:, 0], dtype=torch.bool)
     for _ in range(HALVINGS):
         if not len(left):
             break
@@ -224,15 +249,17 @@ def line_search(
         fallen = trial.energy <= (state.energy + SUFFICIENT * length * slope)[left]
         rows = fallen.nonzero()[:, 0]
         found = found.replaced(left[rows], trial.picked(rows))
+        lengths[left[rows]] = length
+        if length <= CREEPING:
+            cost = spoiling(potential, state.picked(left), trial, length * step[..., left])
+            in_the_way[:, left] |= (cost > SPOILING * length * slope[left].abs()) & ~fallen
         left, length = left[~fallen], length / 2
-    moved[left] = False
-    return found, moved
+    return found, lengths, in_the_way
 
 
-def spoiling(potential: Potential, state: State, setting: Setting, gradient: Tensor, step: Tensor) -> Tensor:
-    """Return the vertices (V, N) whose collision, within the least step, costs much more than their planes tell."""
-    least = 0.5 ** (HALVINGS - 1)
-    slope = (gradient * step).sum((0, 1)).abs()
-    x = state.x + least * step
-    told, found = potential.collision(x, state.planes), potential.collision(x, potential.planes(x, setting))
-    return found - told > SPOILING * least * slope
+def spoiling(potential: Potential, state: State, trial: State, moved: Tensor) -> Tensor:
+    """Return what the collision of each vertex costs more in a trial than was to be expected [J], shape (V, N)."""
+    if state.met is None:
+        return torch.zeros_like(moved[:, 0])
+    expected = potential.collision_at(state.met.expected(trial.x, moved))
+    return potential.collision(trial.x, trial.met) - expected

@@ -5,8 +5,8 @@ Implicit Euler with time step dt is the minimum of
 
     stretch + bending + gravity + collision + m/(2 dt^2) |x - (2 x' - x'')|^2 + drag a/(2 dt) |x - carried|^2
 
-(`energy.GarmentEnergy`); a quasi-static state leaves the last two out. The nearest body points are those of the
-whole surface, found anew for every state; in gradient and Hessian they hold still, as in training.
+(`energy.GarmentEnergy`); a quasi-static state leaves the last two out. The distance to the body is that to its whole
+surface, rounded on its creases (`energy.rounded`), so that a minimum has a gradient of zero.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from torch import Tensor
 
 from ..assets import PINNED, Scene
 from ..energy import GarmentEnergy
-from ..energy.collision import PosedBody
+from ..energy.collision import PosedBody, collision_energy
+from ..energy.rounded import Rounded
 from ..fabrics import Fabric
 from ..mesh import topology
 from ..model.contacts import Contacts
@@ -27,7 +28,7 @@ from ..model.descriptors import GRAVITY
 from .blocks import BlockMatrix
 from .hessian import Hessian
 from .hinges import Hinges
-from .membrane import Membrane
+from .membrane import Membrane, outer
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,22 +54,6 @@ class Setting:
         body = self.body and self.body.picked(frames)
         predicted, carried = (v if v is None else v[..., frames] for v in (self.predicted, self.carried))
         return Setting(body, self.gravity[..., frames], predicted, carried, self.dt)
-
-
-@dataclass(frozen=True, eq=False)
-class Planes:
-    """Planes through the body points b nearest to vertices: unit normals n (V, 3, N) and offsets n . b (V, N) [m]."""
-
-    normal: Tensor
-    offset: Tensor
-
-    def distance(self, x: Tensor) -> Tensor:
-        """Return signed distances [m], shape (V, N)."""
-        return (self.normal * x).sum(1) - self.offset
-
-    def picked(self, frames: Tensor) -> Planes:
-        """Return the planes of some of the frames, indices (M,)."""
-        return Planes(self.normal[..., frames], self.offset[..., frames])
 
 
 class Potential:
@@ -98,52 +83,61 @@ class Potential:
         self.free = torch.as_tensor(free, device=device)
         self._hessian = Hessian(self.membrane, self.hinges, hinges, free, mesh.vertex_count)
 
-    def planes(self, x: Tensor, setting: Setting) -> Planes | None:
-        """Return the planes through the body points that x meets."""
-        if setting.body is None:
-            return None
-        normal, offset = self.contacts.planes(x.float(), setting.body)
-        return Planes(normal.to(x.dtype), offset.to(x.dtype))
+    def met(self, x: Tensor, setting: Setting) -> Rounded | None:
+        """Return the distances of x to the body, to second order."""
+        return None if setting.body is None else self.contacts.rounded(x, setting.body)
 
-    def energy(self, x: Tensor, setting: Setting, planes: Planes | None) -> Tensor:
-        """Return the energy [J] of each frame, shape (N,)."""
+    def energy(self, x: Tensor, setting: Setting, met: Rounded | None) -> Tensor:
+        """Return the energy [J] of each frame, shape (N,), with the distances that x has by `met`."""
         total = self.membrane.energy(x) - (self.mass * (x * setting.gravity).sum(1)).sum(0)
         if self.hinges:
             total = total + self.hinges.energy(x)
         for weight, target in self._anchors(setting):
             total = total + (0.5 * weight * ((x - target) ** 2).sum(1)).sum(0)
-        return total + self.collision(x, planes).sum(0)
+        return total + self.collision(x, met).sum(0)
 
-    def collision(self, x: Tensor, planes: Planes | None) -> Tensor:
+    def collision(self, x: Tensor, met: Rounded | None) -> Tensor:
         """Return the energy of each vertex that meets the body [J], shape (V, N)."""
-        if planes is None:
-            return torch.zeros_like(x[:, 0])
-        return self.fabric.collision * self._depth(x, planes) ** 2
+        return torch.zeros_like(x[:, 0]) if met is None else self.collision_at(met.distance(x))
 
-    def gradient(self, x: Tensor, setting: Setting, planes: Planes | None) -> Tensor:
+    def collision_at(self, distance: Tensor) -> Tensor:
+        """Return the energy of vertices so far from the body [J], shape (V, N)."""
+        return collision_energy(distance, self.fabric.collision, self.fabric.margin)
+
+    def gradient(self, x: Tensor, setting: Setting, met: Rounded | None) -> Tensor:
         """Return the gradient [N] in all vertices, shape (V, 3, N)."""
         total = self.membrane.gradient(x) - self.mass[:, None] * setting.gravity
         if self.hinges:
             total += self.hinges.gradient(x)
         for weight, target in self._anchors(setting):
             total += weight[:, None] * (x - target)
-        if planes:
-            total += 2 * self.fabric.collision * self._depth(x, planes)[:, None] * planes.normal
+        if met:
+            total -= self._push(x, met)[:, None] * met.normal
         return total
 
-    def hessian(self, x: Tensor, setting: Setting, planes: Planes | None, held: Tensor | None = None) -> BlockMatrix:
-        """Return the Hessian over the free vertices, made positive semi-definite, in float32; `held` ones are stiff.
+    def hessian(
+        self,
+        x: Tensor,
+        setting: Setting,
+        met: Rounded | None,
+        held: Tensor | None = None,
+        whole: Tensor | None = None,
+    ) -> BlockMatrix:
+        """Return the Hessian over the free vertices, made positive semi-definite, in float32.
 
         Args:
-            held: vertices that are not to move, shape (V, N); none by default.
+            held: vertices that are made too stiff to move, shape (V, N); none by default.
+            whole: frames whose membrane keeps what compression takes from its Hessian, shape (N,); none by default.
         """
         still = [] if setting.predicted is not None else [(self.mass / setting.dt**2, None)]
         weight = sum((weight for weight, _ in [*self._anchors(setting), *still]), torch.zeros_like(self.mass))
-        pushed = None
-        if planes:
-            inside = (self._depth(x, planes) < 0)[:, None]
-            pushed = (2 * self.fabric.collision) ** 0.5 * (planes.normal * inside)[self.free].float()
-        return self._hessian(x, weight[self.free].float(), pushed, None if held is None else held[self.free])
+        contact = None
+        if met:
+            push, normal = self._push(x, met)[self.free], met.normal[self.free]
+            stiffness = 2 * self.fabric.collision * (push > 0)
+            contact = stiffness[:, None, None] * outer(normal, normal) + push[:, None, None] * met.bend[self.free]
+        held = None if held is None else held[self.free]
+        return self._hessian(x, weight[self.free].float(), contact, held, whole)
 
     def imbalance(self, gradient: Tensor) -> Tensor:
         """Return the RMS acceleration, over the free mass, that a gradient (V, 3, N) leaves, in units of g: (N,)."""
@@ -159,6 +153,6 @@ class Potential:
             found.append((self.fabric.drag / self.fabric.density * self.mass / setting.dt, setting.carried))
         return found
 
-    def _depth(self, x: Tensor, planes: Planes) -> Tensor:
-        """Return how far each vertex is beyond the margin, negative there, else zero [m], shape (V, N)."""
-        return (planes.distance(x) - self.fabric.margin).clamp_max(0)
+    def _push(self, x: Tensor, met: Rounded) -> Tensor:
+        """Return the force along the gradient of the distance on each vertex within the margin [N], shape (V, N)."""
+        return 2 * self.fabric.collision * (self.fabric.margin - met.distance(x)).clamp_min(0)

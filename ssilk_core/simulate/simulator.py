@@ -191,7 +191,7 @@ class Simulator:
     def best(self, starts: Sequence[Tensor], setting: Setting) -> Tensor:
         """Return for each frame the start of least energy."""
         potential = self.potential
-        energies = [potential.energy(x, setting, potential.planes(x, setting)) for x in starts]
+        energies = [potential.energy(x, setting, potential.met(x, setting)) for x in starts]
         chosen = torch.stack(energies).nan_to_num(nan=torch.inf).argmin(0)
         best = starts[0]
         for number, start in enumerate(starts[1:], start=1):

@@ -253,7 +253,7 @@ def test_a_quasi_static_pose_hangs_lower_than_plain_skinning(scene, toy_motion) 
     at = simulator.actors.posed(poses.rotations, poses.translations)
     setting = Setting(at.body, simulator.gravity.expand(3, 3))
     x = torch.as_tensor(points.transpose(1, 2, 0)) - at.root
-    energies = [simulator.potential.energy(y, setting, simulator.potential.planes(y, setting)) for y in (x, at.plain)]
+    energies = [simulator.potential.energy(y, setting, simulator.potential.met(y, setting)) for y in (x, at.plain)]
     assert (energies[0] < energies[1]).all()
 
 

@@ -15,6 +15,7 @@ from ssilk_core.assets import Scene
 from ssilk_core.energy import GarmentEnergy
 from ssilk_core.energy.bending import dihedral_angles
 from ssilk_core.energy.collision import PosedBody
+from ssilk_core.energy.rounded import Rounded
 from ssilk_core.energy.stretch import stretch_density
 from ssilk_core.errors import SsilkError
 from ssilk_core.fabrics import Fabric
@@ -24,7 +25,7 @@ from ssilk_core.simulate.conjugate import CHECK_EVERY, inverse_blocks, solve
 from ssilk_core.simulate.hinges import Hinges
 from ssilk_core.simulate.membrane import Membrane, outer, positive
 from ssilk_core.simulate.newton import SolverOptions, State, line_search, minimise_from, newton_step
-from ssilk_core.simulate.potential import Planes, Potential, Setting
+from ssilk_core.simulate.potential import Potential, Setting
 
 CPU = torch.device("cpu")
 DOWN = torch.tensor([[0.0], [-9.81], [0.0]], dtype=torch.float64)
@@ -70,16 +71,16 @@ def test_the_energy_is_that_of_training(potential: Potential, scene: Scene) -> N
         energy.collision(x, body),
     ]
     assert min(float(term.abs().min()) for term in terms) > 0
-    found = potential.energy(x, setting, potential.planes(x, setting))
+    found = potential.energy(x, setting, potential.met(x, setting))
     torch.testing.assert_close(found, sum(terms), rtol=1e-6, atol=1e-9)
 
 
 def test_the_gradient_is_that_of_autograd(potential: Potential, scene: Scene) -> None:
     x, setting = moving(scene)
-    planes = potential.planes(x, setting)
+    met = potential.met(x, setting)
     at = x.clone().requires_grad_(True)
-    (expected,) = torch.autograd.grad(potential.energy(at, setting, planes).sum(), at)
-    torch.testing.assert_close(potential.gradient(x, setting, planes), expected, rtol=1e-9, atol=1e-11)
+    (expected,) = torch.autograd.grad(potential.energy(at, setting, met).sum(), at)
+    torch.testing.assert_close(potential.gradient(x, setting, met), expected, rtol=1e-9, atol=1e-11)
 
 
 def test_the_membrane_has_the_hessian_of_autograd_where_it_is_stretched(scene: Scene) -> None:
@@ -110,9 +111,9 @@ def test_two_by_two_matrices_lose_their_negative_eigenvalues_only() -> None:
     torch.testing.assert_close(torch.stack([uu, uv, uv, vv], -1).reshape(-1, 2, 2), expected)
 
 
-def dense_hessian(potential: Potential, x: torch.Tensor, setting: Setting, planes: Planes | None) -> torch.Tensor:
+def dense_hessian(potential: Potential, x: torch.Tensor, setting: Setting, met: Rounded | None) -> torch.Tensor:
     """The positive Hessian (U, 3, U, 3) of the first frame, from its products with unit vectors."""
-    matrix, count = potential.hessian(x, setting, planes), len(potential.free)
+    matrix, count = potential.hessian(x, setting, met), len(potential.free)
     units = torch.eye(3 * count).reshape(-1, count, 3)
     return torch.stack([(matrix @ unit[None])[0] for unit in units]).reshape(count, 3, count, 3)
 
@@ -121,7 +122,7 @@ def test_the_assembled_hessian_is_the_gauss_newton_hessian(potential: Potential,
     """Against the same parts summed densely: faces through the operator, hinges through autograd's angle."""
     x, setting = moving(scene, 1)
     x = x * 1.15  # stretched everywhere
-    planes = potential.planes(x, setting)
+    met = potential.met(x, setting)
     count, free = len(x), potential.free
     weights = potential.membrane.operator.matrix.to_dense().double()
     faces = weights.shape[0] // 2
@@ -133,13 +134,13 @@ def test_the_assembled_hessian_is_the_gauss_newton_hessian(potential: Potential,
     )[:, :, :, 0] * (2 * potential.hinges.stiffness[:, :, None]).sqrt()  # fmt: skip
     expected += torch.einsum("hia,hjb->iajb", slopes, slopes)
     inertia = potential.mass[:, 0] * (900 + potential.fabric.drag / potential.fabric.density * 30)
-    push = (planes.distance(x)[:, 0] < potential.fabric.margin) * 2 * potential.fabric.collision
-    n = planes.normal[..., 0]
+    push = (met.distance(x)[:, 0] < potential.fabric.margin) * 2 * potential.fabric.collision
+    n = met.normal[..., 0]
     own = inertia[:, None, None] * torch.eye(3) + push[:, None, None] * n[:, :, None] * n[:, None]
     for v in range(count):
         expected[v, :, v] += own[v]
     assert (push > 0).any()
-    found = dense_hessian(potential, x, setting, planes)
+    found = dense_hessian(potential, x, setting, met)
     torch.testing.assert_close(found, expected[free][:, :, free].float(), rtol=1e-3, atol=2e-3)
 
 
@@ -151,7 +152,7 @@ def test_no_hessian_has_a_negative_eigenvalue(potential: Potential, scene: Scene
     _, setting = moving(scene, 1)
     still = replace(setting, predicted=None, carried=None, dt=1e9)
     squeezed = 0.7 * crumpled(scene, 1, 0.01)
-    matrix = dense_hessian(potential, squeezed, still, potential.planes(squeezed, still))
+    matrix = dense_hessian(potential, squeezed, still, potential.met(squeezed, still))
     side = 3 * len(potential.free)
     values = torch.linalg.eigvalsh(matrix.reshape(side, side).double())
     assert values[0] > -1e-6 * values[-1]
@@ -193,13 +194,14 @@ def test_conjugate_gradients_solve_each_frame_by_itself() -> None:
 def test_a_line_search_accepts_no_worse_state(potential: Potential, scene: Scene) -> None:
     x, setting = moving(scene, 3)
     state = State.at(potential, x, setting)
-    gradient = potential.gradient(x, setting, state.planes)
+    gradient = potential.gradient(x, setting, state.met)
     step, _ = newton_step(potential, state, setting, gradient, 50)
     wild = step * torch.tensor([1.0, 300.0, -1.0], dtype=torch.float64)
-    found, moved = line_search(potential, state, setting, gradient, wild)
-    assert moved.tolist() == [True, True, False]  # uphill, no step is good enough
+    found, length, _ = line_search(potential, state, setting, gradient, wild)
+    assert (length > 0).tolist() == [True, True, False]  # uphill, no step is good enough
     share = (found.x - x).abs().sum((0, 1)) / wild.abs().sum((0, 1))
     assert 0 < share[1] < 1 and share[2] == 0
+    torch.testing.assert_close(share, length, rtol=1e-9, atol=1e-12)
     fresh = State.at(potential, found.x, setting)  # the energy is that of the body points nearest to where it ends
     torch.testing.assert_close(found.energy, fresh.energy, rtol=1e-12, atol=0)
     assert (found.energy[:2] < state.energy[:2]).all() and found.energy[2] == state.energy[2]
@@ -208,7 +210,7 @@ def test_a_line_search_accepts_no_worse_state(potential: Potential, scene: Scene
 def test_no_step_is_longer_than_a_tenth_of_the_garment(potential: Potential, scene: Scene) -> None:
     x, setting = moving(scene, 2)
     state = State.at(potential, x, setting)
-    gradient = potential.gradient(x, setting, state.planes) * torch.tensor([1e-6, 1e9], dtype=torch.float64)
+    gradient = potential.gradient(x, setting, state.met) * torch.tensor([1e-6, 1e9], dtype=torch.float64)
     step, _ = newton_step(potential, state, setting, gradient, 50)
     short, long = step.norm(dim=1).amax(0).tolist()
     assert 0 < short < 1e-3 < long == pytest.approx(0.1 * np.linalg.norm(np.ptp(scene.garment.mesh.points, axis=0)))
@@ -260,26 +262,26 @@ def test_pinned_vertices_stay_and_the_solution_is_in_balance(potential: Potentia
     found = minimise_from(potential, x, setting, SolverOptions(tolerance=1e-3))
     pinned = scene.classes == 0
     assert torch.equal(found.x[pinned], x[pinned])
-    gradient = potential.gradient(found.x, setting, potential.planes(found.x, setting))[potential.free]
+    gradient = potential.gradient(found.x, setting, potential.met(found.x, setting))[potential.free]
     force = (gradient.norm(dim=1) / potential.mass[potential.free] / 9.81).square().mean(0).sqrt()
     assert (found.imbalance <= 1e-3).all() and (force < 3e-3).all()
-    before = potential.energy(x, setting, potential.planes(x, setting))
+    before = potential.energy(x, setting, potential.met(x, setting))
     assert (found.energy < before).all()
 
 
-def creased(potential: Potential, vertex: int, at: float) -> Callable[[torch.Tensor, Setting], Planes]:
-    """What finds planes where one vertex stands between two walls that both push it, 1 cm deep in either."""
+def creased(potential: Potential, vertex: int, at: float) -> Callable[[torch.Tensor, Setting], Rounded]:
+    """What finds distances where one vertex stands between two walls that both push it, 1 cm deep in either."""
 
-    def planes(x: torch.Tensor, setting: Setting) -> Planes:
+    def met(x: torch.Tensor, setting: Setting) -> Rounded:
         normal, offset = torch.zeros_like(x), torch.full_like(x[:, 0], -1e6)
         side = torch.where(
             x[vertex, 0] < at, -1.0, 1.0
         ).double()  # pushed over the middle, where the other one pushes
         normal[vertex, 0] = -side
         offset[vertex] = -side * at + 0.01
-        return Planes(normal, offset)
+        return Rounded(normal, offset, x.new_zeros(len(x), 3, *x.shape[1:]))
 
-    return planes
+    return met
 
 
 def test_a_vertex_on_a_crease_does_not_keep_the_others_from_coming_to_rest(
@@ -287,7 +289,7 @@ def test_a_vertex_on_a_crease_does_not_keep_the_others_from_coming_to_rest(
 ) -> None:
     x, setting = moving(scene, 2)
     vertex = int(potential.free[len(potential.free) // 2])
-    monkeypatch.setattr(potential, "planes", creased(potential, vertex, float(x[vertex, 0, 0])))
+    monkeypatch.setattr(potential, "met", creased(potential, vertex, float(x[vertex, 0, 0])))
     options = SolverOptions(tolerance=1e-3)
     found = minimise_from(potential, x, setting, options)
     assert (found.imbalance <= 1e-3).all()

@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The rounded distance to a body's surface; `energy.rounded` holds the plain twin.
+
+A program owns one garment vertex in a block of frames and looks at its triangles one after another. Sums over them
+are kept relative to the nearest so far, so that one pass is enough.
+"""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from ..energy.rounded import ON_EDGE, Rounded
+from .surface import _clamped, _closest
+from .vectors import dot, load3
+
+BLOCK = 32  # frames of one program
+TINY = tl.constexpr(1e-30)
+
+
+def rounded_kernel(
+    x: Tensor,
+    index: Tensor,
+    points: Tensor,
+    normals: Tensor,
+    faces: Tensor,
+    listed: Tensor | None,
+    far: float,
+    touching: float,
+    sharpness: float,
+) -> Rounded:
+    """Return rounded distances, as `energy.rounded.rounded_distance` does, and planes of vertices `far` away.
+
+    Args:
+        x: queries (V, 3, N); index: their nearest body vertices (V, N), int32.
+        points, normals: of the body (B, 3, N).
+        faces: triangles (F, 3).
+        listed: those that each query may find, filled up by -1, shape (V, L); any by default.
+    """
+    x, points, normals = x.contiguous(), points.contiguous(), normals.contiguous()
+    vertices, _, frames = x.shape
+    assert points.numel() < 1 << 31  # body vertices are addressed by 32 bits
+    faces = faces.int().contiguous()
+    table = faces.new_zeros(1) if listed is None else listed.int().contiguous()
+    width = len(faces) if listed is None else listed.shape[1]
+    normal, offset = torch.empty_like(x), x.new_empty(vertices, frames)
+    bend = x.new_empty(vertices, 3, 3, frames)
+    grid = (vertices, triton.cdiv(frames, BLOCK))
+    _rounded[grid](x, index, points, normals, faces, table, normal, offset, bend, frames, width, far * far, touching,
+                   sharpness, ON_EDGE, listed is not None, BLOCK, num_warps=1)  # fmt: skip
+    return Rounded(normal, offset, bend)
+
+
+@triton.jit
+def _rounded(x, index, points, normals, faces, table, normal, offset, bend, frames, width, far, touching, sharpness,
+             on_edge, listed: tl.constexpr, block: tl.constexpr):  # fmt: skip
+    v = tl.program_id(0).to(tl.int64)
+    n = tl.program_id(1) * block + tl.arange(0, block)
+    inside = n < frames
+    first = tl.load(index + v * frames + n, mask=inside, other=0)
+    qx, qy, qz = load3(x + v * 3 * frames, frames, n, inside)
+    ox, oy, oz = load3(points + first * 3 * frames, frames, n, inside)
+    mx, my, mz = load3(normals + first * 3 * frames, frames, n, inside)
+    square = dot(qx - ox, qy - oy, qz - oz, qx - ox, qy - oy, qz - oz)
+    near = inside & (square < far)
+    zero = tl.zeros_like(qx)
+    best = zero + 1e30
+    i_best, j_best, k_best, s_best, t_best = first, first, first, zero, zero
+    wx, wy, wz = zero, zero, zero  # away from the nearest
+    total, gx, gy, gz, hx, hy, hz = zero, zero, zero, zero, zero, zero, zero
+    xx, xy, xz, yy, yz, zz = zero, zero, zero, zero, zero, zero
+    for place in range(tl.where(tl.max(near.to(tl.int32), axis=0) > 0, width, 0)):
+        face = place
+        if listed:
+            face = tl.load(table + v * width + place)
+        there = near & (zero + face >= 0)
+        face = tl.maximum(face, 0)
+        i, j, k = tl.load(faces + 3 * face), tl.load(faces + 3 * face + 1), tl.load(faces + 3 * face + 2)
+        ax, ay, az = load3(points + i * 3 * frames, frames, n, there)
+        bx, by, bz = load3(points + j * 3 * frames, frames, n, there)
+        cx, cy, cz = load3(points + k * 3 * frames, frames, n, there)
+        bx, by, bz, cx, cy, cz = bx - ax, by - ay, bz - az, cx - ax, cy - ay, cz - az
+        px, py, pz = qx - ax, qy - ay, qz - az
+        s, t, value = _closest(px, py, pz, bx, by, bz, cx, cy, cz)
+        along, length = dot(bx, by, bz, px, py, pz), dot(bx, by, bz, bx, by, bz)
+        alone = _clamped(along, length)
+        other = alone * (alone * length - 2 * along)
+        s, t = tl.where(other < value, alone, s), tl.where(other < value, 0.0, t)
+        px, py, pz = px - s * bx - t * cx, py - s * by - t * cy, pz - s * bz - t * cz
+        r = tl.maximum(tl.sqrt(dot(px, py, pz, px, py, pz)), TINY)
+        px, py, pz = px / r, py / r, pz / r
+        closer = there & (r < best)
+        shrink = tl.where(closer, tl.exp2(sharpness * tl.log2(r / best)), 1.0)
+        ratio = tl.where(closer, 1.0, best / r)
+        weight = tl.where(there, tl.exp2(sharpness * tl.log2(ratio)), 0.0)
+        best = tl.where(closer, r, best)
+        i_best, j_best, k_best = tl.where(closer, i, i_best), tl.where(closer, j, j_best), tl.where(closer, k, k_best)
+        s_best, t_best = tl.where(closer, s, s_best), tl.where(closer, t, t_best)
+        wx, wy, wz = tl.where(closer, px, wx), tl.where(closer, py, wy), tl.where(closer, pz, wz)
+        total = total * shrink + weight
+        hx, hy, hz = hx * shrink + weight * px, hy * shrink + weight * py, hz * shrink + weight * pz
+        xx, xy, xz = xx * shrink + weight * px * px, xy * shrink + weight * px * py, xz * shrink + weight * px * pz
+        yy, yz, zz = yy * shrink + weight * py * py, yz * shrink + weight * py * pz, zz * shrink + weight * pz * pz
+        weight = weight / r
+        gx, gy, gz = gx * shrink + weight * px, gy * shrink + weight * py, gz * shrink + weight * pz
+    found = near & (best < 1e29)
+    total = tl.where(found, total, 1.0)
+    distance = best * tl.exp2(-tl.log2(total) / sharpness)
+    hx, hy, hz = hx / total, hy / total, hz / total
+    scale = (sharpness + 1) / tl.maximum(distance, TINY)
+    xx, xy, xz = (xx / total - hx * hx) * scale, (xy / total - hx * hy) * scale, (xz / total - hx * hz) * scale
+    yy, yz, zz = (yy / total - hy * hy) * scale, (yz / total - hy * hz) * scale, (zz / total - hz * hz) * scale
+    scale = distance / total
+    gx, gy, gz = gx * scale, gy * scale, gz * scale
+
+    nx, ny, nz = _mixed(normals, frames, i_best, j_best, k_best, s_best, t_best, n, inside)
+    length = tl.maximum(tl.sqrt(dot(nx, ny, nz, nx, ny, nz)), 1e-8)
+    nx, ny, nz = nx / length, ny / length, nz / length
+    within = found & (dot(wx, wy, wz, nx, ny, nz) < 0)
+    sign = tl.where(within, -1.0, 1.0)
+    touches = found & (best <= touching)
+    gx, gy, gz = tl.where(touches, nx, sign * gx), tl.where(touches, ny, sign * gy), tl.where(touches, nz, sign * gz)
+    distance = sign * tl.where(touches, best, distance)
+    gx, gy, gz = tl.where(found, gx, mx), tl.where(found, gy, my), tl.where(found, gz, mz)
+    far_off = dot(mx, my, mz, ox, oy, oz)
+    tl.store(normal + v * 3 * frames + n, gx, mask=inside)
+    tl.store(normal + v * 3 * frames + frames + n, gy, mask=inside)
+    tl.store(normal + v * 3 * frames + 2 * frames + n, gz, mask=inside)
+    flat = tl.where(found, dot(gx, gy, gz, qx, qy, qz) - distance, far_off)
+    tl.store(offset + v * frames + n, flat, mask=inside)
+
+    # Inside, the nearest edge or corner: (1 - u u' - e e') / r.
+    r_best = 1 - s_best - t_best
+    none_i, none_j, none_k = r_best <= on_edge, s_best <= on_edge, t_best <= on_edge
+    many = none_i.to(tl.int32) + none_j.to(tl.int32) + none_k.to(tl.int32)
+    from_, to = (
+        tl.where(none_i, j_best, tl.where(none_j, k_best, i_best)),
+        tl.where(none_i, k_best, tl.where(none_j, i_best, j_best)),
+    )
+    ax, ay, az = load3(points + from_ * 3 * frames, frames, n, inside)
+    bx, by, bz = load3(points + to * 3 * frames, frames, n, inside)
+    ex, ey, ez = bx - ax, by - ay, bz - az
+    length = tl.maximum(tl.sqrt(dot(ex, ey, ez, ex, ey, ez)), TINY)
+    one = tl.where(many == 1, 1.0, 0.0) / length
+    ex, ey, ez = ex * one, ey * one, ez * one
+    scale = tl.where(many > 0, 1.0, 0.0) / best
+    use, out = found & ~touches, bend + v * 9 * frames + n
+    xx = tl.where(use, tl.where(within, (1 - wx * wx - ex * ex) * scale, xx), 0.0)
+    yy = tl.where(use, tl.where(within, (1 - wy * wy - ey * ey) * scale, yy), 0.0)
+    zz = tl.where(use, tl.where(within, (1 - wz * wz - ez * ez) * scale, zz), 0.0)
+    xy = tl.where(use, tl.where(within, (-wx * wy - ex * ey) * scale, xy), 0.0)
+    xz = tl.where(use, tl.where(within, (-wx * wz - ex * ez) * scale, xz), 0.0)
+    yz = tl.where(use, tl.where(within, (-wy * wz - ey * ez) * scale, yz), 0.0)
+    tl.store(out, xx, mask=inside)
+    tl.store(out + frames, xy, mask=inside)
+    tl.store(out + 2 * frames, xz, mask=inside)
+    tl.store(out + 3 * frames, xy, mask=inside)
+    tl.store(out + 4 * frames, yy, mask=inside)
+    tl.store(out + 5 * frames, yz, mask=inside)
+    tl.store(out + 6 * frames, xz, mask=inside)
+    tl.store(out + 7 * frames, yz, mask=inside)
+    tl.store(out + 8 * frames, zz, mask=inside)
+
+
+@triton.jit
+def _mixed(values, frames, i, j, k, s, t, n, inside):
+    """(1 - s - t) of vertex i, s of j and t of k."""
+    ix, iy, iz = load3(values + i * 3 * frames, frames, n, inside)
+    jx, jy, jz = load3(values + j * 3 * frames, frames, n, inside)
+    kx, ky, kz = load3(values + k * 3 * frames, frames, n, inside)
+    r = 1 - s - t
+    return r * ix + s * jx + t * kx, r * iy + s * jy + t * ky, r * iz + s * jz + t * kz

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The rounded distance against closed forms, finite differences and the Euclidean one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from ssilk_core.energy import closest, collision
+from ssilk_core.energy.collision import TOUCHING, Patches, PosedBody, nearest_planes, rounded_planes, signed
+from ssilk_core.energy.rounded import SHARPNESS
+
+DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def body_of(*meshes: trimesh.Trimesh) -> PosedBody:
+    """The same triangles in several frames, one mesh for each."""
+    points = np.stack([mesh.vertices for mesh in meshes], axis=-1)
+    normals = np.stack([mesh.vertex_normals for mesh in meshes], axis=-1)
+    points, normals = (torch.as_tensor(v.copy(), dtype=torch.float32, device=DEVICE) for v in (points, normals))
+    return PosedBody(points, normals, faces=torch.as_tensor(np.array(meshes[0].faces), device=DEVICE))
+
+
+def fold(angle: float, width: float = 0.06) -> trimesh.Trimesh:
+    """Two walls that meet at z = 0 with so much air [rad] between them, about the plane x = 0."""
+    half = 0.5 * angle
+    left, right = (width * np.array([side * np.sin(half), 0, np.cos(half)]) for side in (-1, 1))
+    corners = [np.array([0, y, 0]) + wall for y in (-0.05, 0.05) for wall in (0 * left, left, right)]
+    return trimesh.Trimesh(corners, [[0, 3, 4], [0, 4, 1], [0, 2, 5], [0, 5, 3]], process=False)
+
+
+def rounded(x: torch.Tensor, body: PosedBody) -> torch.Tensor:
+    return rounded_planes(x, body).distance(x)
+
+
+def test_over_one_plane_it_is_the_distance() -> None:
+    body = body_of(trimesh.creation.box((0.1, 0.02, 0.1)))
+    height = torch.tensor([0.03, 0.004, 1e-3, 2e-5, 3e-6, -1e-3, -4e-3])
+    x = torch.zeros(7, 3, 1)
+    x[:, 0, 0], x[:, 1, 0], x[:, 2, 0] = 0.02, 0.01 + height, -0.01  # away from the diagonal, where two are as near
+    found = rounded_planes(x.to(DEVICE), body)
+    torch.testing.assert_close(found.distance(x.to(DEVICE))[:, 0].cpu(), height, rtol=1e-5, atol=2e-8)
+    expected = torch.tensor([0.0, 1.0, 0.0]).expand(7, 3)
+    beyond = height.abs() > TOUCHING
+    torch.testing.assert_close(found.normal[..., 0].cpu()[beyond], expected[beyond], rtol=0, atol=3e-4)
+    assert found.bend.abs().max() < 1e-3
+
+
+@pytest.mark.parametrize("angle", [0.5, 1.5, 2.6])
+def test_between_two_walls_it_is_the_norm_of_their_distances(angle: float) -> None:
+    body = body_of(fold(angle))
+    x = torch.zeros(9, 3, 1)
+    x[:, 0, 0], x[:, 1, 0], x[:, 2, 0] = 1e-3 * torch.linspace(-1, 1, 9), 0.01, 0.012
+    wall = x[:, 2, 0] * np.sin(angle / 2) + torch.tensor([[-1.0], [1.0]]) * x[:, 0, 0] * np.cos(angle / 2)
+    # Each wall has two triangles, of which the point is over one.
+    expected = (wall.double() ** -SHARPNESS).sum(0) ** (-1 / SHARPNESS)
+    torch.testing.assert_close(rounded(x.to(DEVICE), body)[:, 0].cpu(), expected.float(), rtol=1e-5, atol=0)
+    middle = rounded_planes(x.to(DEVICE), body).normal[4, :, 0].cpu()
+    shorter = float(np.sin(angle / 2)) * 2 ** (-1 / SHARPNESS)  # the walls push against each other across the fold
+    torch.testing.assert_close(middle, torch.tensor([0.0, 0.0, shorter]), rtol=0, atol=1e-4)
+
+
+def near(mesh: trimesh.Trimesh, reach: float, count: int = 600) -> torch.Tensor:
+    generator = np.random.default_rng(4)
+    points, faces = trimesh.sample.sample_surface(mesh, count, seed=4)
+    away = generator.uniform(-reach, reach, (count, 1))
+    return torch.as_tensor(points + away * mesh.face_normals[faces] + 0.3 * reach * generator.normal(size=(count, 3)))
+
+
+def test_it_lies_little_below_the_euclidean_distance() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
+    body, x = body_of(ball), near(ball, 0.02)[..., None].float().to(DEVICE)
+    exact, found = signed(x, *nearest_planes(x, body)), rounded(x, body)
+    apart = (exact.abs() - found.abs()) / exact.abs()
+    assert (exact.abs() > TOUCHING).all() and torch.equal(exact > 0, found > 0)
+    assert apart.min() > -2e-4 and 1e-3 < apart.max() < np.log(6) / SHARPNESS + 1e-4
+
+
+def in_the_fold(count: int) -> torch.Tensor:
+    """Points about the middle of the air between two walls, where the distance is rounded."""
+    x, generator = torch.zeros(count, 3, 1, dtype=torch.float64), torch.Generator().manual_seed(2)
+    x[:, 2, 0] = 0.004 + 0.01 * torch.rand(count, generator=generator)
+    x[:, 0, 0] = 0.02 * x[:, 2, 0] * torch.randn(count, generator=generator)
+    x[:, 1, 0] = 0.01 * torch.randn(count, generator=generator)
+    return x
+
+
+def differences(x: torch.Tensor, body: PosedBody, step: float = 1e-6) -> tuple[torch.Tensor, torch.Tensor]:
+    """First differences of the distance (V, 3) and of its gradient (V, 3, 3), in float64 on a processor."""
+    moves = step * torch.eye(3, dtype=torch.float64)[:, None, :, None]
+    sides = [(rounded_planes(x + move, body), rounded_planes(x - move, body)) for move in moves]
+    first = [(up.distance(x + m) - down.distance(x - m)) / (2 * step) for m, (up, down) in zip(moves, sides)]
+    second = [(up.normal - down.normal) / (2 * step) for up, down in sides]
+    return torch.cat(first, dim=1), torch.cat(second, dim=2)
+
+
+@pytest.mark.skipif(DEVICE.type != "cpu", reason="float64 is for processors")
+def test_gradient_and_bend_are_the_derivatives() -> None:
+    x, body = in_the_fold(300), body_of(fold(1.5))
+    found = rounded_planes(x, body)
+    first, second = differences(x, body)
+    torch.testing.assert_close(found.normal[..., 0], first, rtol=0, atol=1e-4)
+    torch.testing.assert_close(found.bend[..., 0], -second, rtol=2e-2, atol=0.05 * float(second.abs().max()))
+    assert found.bend[..., 0].norm(dim=(1, 2)).median() > 100
+
+
+@pytest.mark.skipif(DEVICE.type != "cpu", reason="float64 is for processors")
+def test_inside_it_bends_about_the_nearest_edge() -> None:
+    body = body_of(fold(1.5))
+    x = torch.tensor([[1e-3, 0.02, -5e-3], [-2e-3, -0.03, -8e-3]], dtype=torch.float64)[..., None]
+    found = rounded_planes(x, body)
+    radius = x[:, [0, 2], 0].norm(dim=1)
+    torch.testing.assert_close(-found.distance(x)[:, 0], radius * 2 ** (-1 / SHARPNESS), rtol=1e-6, atol=0)
+    for bend, at, r in zip(found.bend[..., 0], x[..., 0], radius):
+        around = torch.tensor([at[2], 0.0, -at[0]], dtype=torch.float64) / r
+        torch.testing.assert_close(bend, around[:, None] * around / r, rtol=1e-5, atol=1e-4)
+
+
+def test_only_listed_triangles_are_found_and_all_frames_are_alike() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
+    other = ball.copy().apply_scale([1.1, 0.9, 1.0])
+    x = near(ball, 0.01, 40)[..., None].float().repeat(1, 1, 2).to(DEVICE)
+    body = body_of(ball, other)
+    vertices = torch.arange(60, device=DEVICE).int()
+    table = torch.cat([torch.tensor([60], device=DEVICE).int(), vertices]).repeat(40, 1)
+    faces = torch.full((40, 100), -1, device=DEVICE)
+    faces[:, :80] = torch.arange(80, device=DEVICE)
+    found = rounded_planes(x, body, patches=Patches(table, faces))
+    part = replace(body, faces=body.faces[:80])
+    expected = rounded_planes(x, part, patches=Patches(table, faces[:, :80]))
+    torch.testing.assert_close(found.distance(x), expected.distance(x), rtol=0, atol=1e-7)
+    alone = rounded_planes(x[..., 1:], body_of(other), patches=Patches(table, faces))
+    torch.testing.assert_close(found.normal[..., 1:], alone.normal, rtol=0, atol=1e-6)
+
+
+def test_frames_looked_at_in_turn_give_the_same(monkeypatch) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=1, radius=0.1)
+    body, x = body_of(ball, ball, ball), near(ball, 0.01, 50)[..., None].float().repeat(1, 1, 3).to(DEVICE)
+    together = rounded_planes(x, body)
+    monkeypatch.setattr(closest, "SCORES", 1)
+    assert torch.equal(rounded_planes(x, body).bend, together.bend)
+
+
+@pytest.mark.parametrize("listed", [False, True])
+def test_the_kernel_finds_what_its_plain_twin_does(monkeypatch, listed: bool) -> None:
+    pytest.importorskip("triton")
+    from ssilk_core.kernels.rounded import rounded_kernel
+
+    walls = fold(1.2)
+    ball = trimesh.util.concatenate([walls, trimesh.creation.icosahedron().apply_scale(0.05)])
+    far_off, within = torch.tensor([[0.0, 0.0, 0.9]]).double(), in_the_fold(5)[..., 0]
+    x = torch.cat([near(ball, 0.01, 4), near(walls, 0.004, 4), within, far_off])
+    x = torch.stack([x, 1.01 * x], dim=-1).float().to(DEVICE)
+    body = body_of(ball, ball.copy().apply_scale([1.0, 1.05, 0.95]))
+    patches = None
+    if listed:
+        count = len(body.points)
+        vertices = torch.arange(-1, count, device=DEVICE).int().repeat(len(x), 1)
+        vertices[:, 0] = count
+        faces = torch.arange(len(body.faces), device=DEVICE).repeat(len(x), 1)
+        faces[::2, -9:] = -1
+        patches = Patches(vertices, faces)
+    with monkeypatch.context() as plain:
+        plain.setattr(collision.kernels, "serve", lambda x: False)
+        expected = rounded_planes(x, body, patches=patches)
+        index = collision._nearest_vertex(x, body, None, patches).int()
+    found = rounded_kernel(x, index, body.points, body.normals, body.faces, patches and patches.faces,
+                           collision.FAR, TOUCHING, SHARPNESS)  # fmt: skip
+    torch.testing.assert_close(found.distance(x), expected.distance(x), rtol=0, atol=1e-6)
+    sure = expected.distance(x).abs() > 1e-3  # nearer, rounding decides about weights and directions
+    apart = (found.normal - expected.normal).norm(dim=1)[sure]
+    assert apart.max() < 2e-2 and apart.quantile(0.9) < 1e-3
+    bends, scale = (found.bend - expected.bend).norm(dim=(1, 2))[sure], expected.bend.norm(dim=(1, 2))[sure]
+    assert (bends <= 0.05 * scale + 20).all() and scale.max() > 1000
