@@ -12,7 +12,7 @@ from ssilk_core.evaluation.splits import read_index, splits_of
 
 GARMENTS = ("cape", "hooded_dress", "fringe_skirt", "tshirt", "long_sleeve", "pants")
 BASELINES = ("ncs", "ncs*", "snug")
-TABLES = ("table1", "seeds", "table4", "table5", "figure11", "figure12", "table3")  # in order of worth
+TABLES = ("table1", "equal", "seeds", "table4", "table5", "figure11", "figure12", "table3")  # in order of worth
 STEP = {
     "cape": 4.2,
     "hooded_dress": 4.9,
@@ -159,6 +159,7 @@ def trainings(plan: Plan) -> dict[str, list[Training]]:
     """Return the trainings of each table: those of the cape's sweeps begin with one that changes nothing."""
     methods = ("ssilk", *BASELINES)
     found = {"table1": [Training(f"{g}_{_stem(m)}", g, m) for g in plan.garments for m in methods]}
+    found["equal"] = [Training(f"{g}_equal", g) for g in plan.garments]
     found["seeds"] = [Training(f"cape_{_stem(m)}_seed{n}", "cape", m, seed=n) for n in (1, 2) for m in methods]
     for table, sweep in SWEEPS.items():
         found[table] = [Training("sweep_usual", "cape"), *(_changed(n, v) for n, vs in sweep.items() for v in vs)]
@@ -189,13 +190,17 @@ def simulation(plan: Plan, garment: str) -> Job:
     return Job(f"{garment}_simulated", outputs, command, START + FRAME * plan.held_frames())
 
 
-def records(plan: Plan, name: str, garment: str, needs: Sequence[Job], simulated: Job | None) -> Iterator[Job]:
-    """Yield what measures models: on whole clips, and in sequences beside the simulator where that has played."""
+def records(
+    plan: Plan, name: str, garment: str, needs: Sequence[Job], simulated: Job | None = None, kind: str = "records"
+) -> Iterator[Job]:
+    """Yield what measures models: on whole clips, and in sequences beside the simulator where that has played.
+
+    Those of another `kind` are kept apart: a changed setting is no other seed of Table 1.
+    """
     clips, outputs = plan.files("held"), tuple(path for job in needs for path in job.outputs)
     asked = ("--stage", str(plan.stage(garment)), "--motions", str(plan.motions), "--index", str(plan.index))
     begun = (PYTHON, "benchmarks/tables.py", "record", *map(str, outputs), *asked)
     begun += ("--device", plan.device, *(("--clips", *(Path(c).stem for c in clips)) if plan.rehearse else ()))
-    kind = "sweeps" if name == "sweeps" else "records"  # apart: a changed setting is no other seed of Table 1
     output = plan.folder / kind / f"{name}_whole.json"
     seconds = START + EVALUATION * len(needs)
     yield Job(f"{name}_whole", (output,), (*begun, "-o", str(output)), seconds, outputs)
@@ -218,8 +223,14 @@ def jobs(plan: Plan) -> list[Job]:
     for garment in plan.garments:
         own = [job for job in first if job.name.startswith(garment)]
         found += records(plan, garment, garment, own, simulated.get(garment)) if own else []
+    # As many iterations as the baselines have had in their time.
+    equal = {t.garment: t.job(plan, plan.seconds * STEP[t.garment] / BASELINE_STEP) for t in asked.get("equal", [])}
+    found += equal.values()
+    for garment, job in equal.items():
+        own = [other for other in first if other.name in {f"{garment}_{_stem(m)}" for m in BASELINES}]
+        found += records(plan, f"{garment}_equal", garment, [job, *own], kind="equal")
     found += swept
-    found += records(plan, "sweeps", "cape", swept, None) if swept else []
+    found += records(plan, "sweeps", "cape", swept, kind="sweeps") if swept else []
     if "table3" in plan.tables:
         found.append(_timings(plan, [job for job in first if job.name.startswith("cape") and "seed" not in job.name]))
     return found

@@ -102,7 +102,7 @@ def _listed_within_reach(
     x: Tensor, reach: Tensor, points: Tensor, faces: Tensor, listed: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return what `_within_reach` does, of the faces listed for each query, shape (V, L)."""
-    centre, radius = _spheres(points, faces)
+    centre, radius = bounding_spheres(points, faces)
     apart = sum((x[:, None, axis] - centre[:, axis][listed]).square() for axis in range(3))  # (V, L, N)
     within = apart <= ((radius[:, 0][listed] + reach[:, None]) * (1 + 1e-6)).square()
     asked = (reach >= 0)[:, None] & (listed >= 0)[..., None]
@@ -110,7 +110,7 @@ def _listed_within_reach(
     return frame, row, listed[row, place]
 
 
-def _spheres(points: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
+def bounding_spheres(points: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
     """Return centres (F, 3, N) and radii (F, 1, N) of spheres around triangles."""
     corners = points[faces]
     centre = corners.mean(1)
@@ -123,7 +123,7 @@ def _within_reach(x: Tensor, reach: Tensor, points: Tensor, faces: Tensor) -> tu
     |x - c| <= r + u, squared and spread out, is one product of matrices: [-2 x, -2 u, |x|^2 - u^2, 1] with
     [c, r, 1, |c|^2 - r^2].
     """
-    centre, radius = _spheres(points, faces)
+    centre, radius = bounding_spheres(points, faces)
     asked, reach = (reach >= 0)[:, None], reach[:, None]
     squares, about = (x * x).sum(1, keepdim=True), (centre * centre).sum(1, keepdim=True)
     left = [-2 * x, -2 * reach, (squares - reach**2).where(asked, torch.inf), torch.ones_like(reach)]

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The rounded distance to a body's surface; `energy.rounded` holds the plain twin.
 
-A program owns one garment vertex in a block of frames and looks at its triangles one after another. Sums over them
-are kept relative to the nearest so far, so that one pass is enough.
+A program owns one garment vertex in a block of frames and looks at its triangles one after another, closely at those
+whose bounding sphere is within reach in any of the frames. Sums over them are kept relative to the nearest so far, so
+that one pass is enough.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from ..energy.rounded import ON_EDGE, Rounded
+from ..energy.closest import bounding_spheres
+from ..energy.rounded import ON_EDGE, SLACK, Rounded
 from .surface import _clamped, _closest
 from .vectors import dot, load3
 
@@ -42,20 +44,22 @@ def rounded_kernel(
     x, points, normals = x.contiguous(), points.contiguous(), normals.contiguous()
     vertices, _, frames = x.shape
     assert points.numel() < 1 << 31  # body vertices are addressed by 32 bits
+    centre, radius = bounding_spheres(points, faces.long())
+    spheres = torch.cat([centre, radius], dim=1).contiguous()
     faces = faces.int().contiguous()
     table = faces.new_zeros(1) if listed is None else listed.int().contiguous()
     width = len(faces) if listed is None else listed.shape[1]
     normal, offset = torch.empty_like(x), x.new_empty(vertices, frames)
     bend = x.new_empty(vertices, 3, 3, frames)
     grid = (vertices, triton.cdiv(frames, BLOCK))
-    _rounded[grid](x, index, points, normals, faces, table, normal, offset, bend, frames, width, far * far, touching,
-                   sharpness, ON_EDGE, listed is not None, BLOCK, num_warps=1)  # fmt: skip
+    _rounded[grid](x, index, points, normals, faces, spheres, table, normal, offset, bend, frames, width, far * far,
+                   touching, sharpness, ON_EDGE, 1 + SLACK, listed is not None, BLOCK, num_warps=1)  # fmt: skip
     return Rounded(normal, offset, bend)
 
 
 @triton.jit
-def _rounded(x, index, points, normals, faces, table, normal, offset, bend, frames, width, far, touching, sharpness,
-             on_edge, listed: tl.constexpr, block: tl.constexpr):  # fmt: skip
+def _rounded(x, index, points, normals, faces, spheres, table, normal, offset, bend, frames, width, far, touching,
+             sharpness, on_edge, slack, listed: tl.constexpr, block: tl.constexpr):  # fmt: skip
     v = tl.program_id(0).to(tl.int64)
     n = tl.program_id(1) * block + tl.arange(0, block)
     inside = n < frames
@@ -65,6 +69,7 @@ def _rounded(x, index, points, normals, faces, table, normal, offset, bend, fram
     mx, my, mz = load3(normals + first * 3 * frames, frames, n, inside)
     square = dot(qx - ox, qy - oy, qz - oz, qx - ox, qy - oy, qz - oz)
     near = inside & (square < far)
+    reach = tl.sqrt(square) * slack * 1.000001  # the nearest vertex is not nearer than the nearest point
     zero = tl.zeros_like(qx)
     best = zero + 1e30
     i_best, j_best, k_best, s_best, t_best = first, first, first, zero, zero
@@ -77,34 +82,41 @@ def _rounded(x, index, points, normals, faces, table, normal, offset, bend, fram
             face = tl.load(table + v * width + place)
         there = near & (zero + face >= 0)
         face = tl.maximum(face, 0)
-        i, j, k = tl.load(faces + 3 * face), tl.load(faces + 3 * face + 1), tl.load(faces + 3 * face + 2)
-        ax, ay, az = load3(points + i * 3 * frames, frames, n, there)
-        bx, by, bz = load3(points + j * 3 * frames, frames, n, there)
-        cx, cy, cz = load3(points + k * 3 * frames, frames, n, there)
-        bx, by, bz, cx, cy, cz = bx - ax, by - ay, bz - az, cx - ax, cy - ay, cz - az
-        px, py, pz = qx - ax, qy - ay, qz - az
-        s, t, value = _closest(px, py, pz, bx, by, bz, cx, cy, cz)
-        along, length = dot(bx, by, bz, px, py, pz), dot(bx, by, bz, bx, by, bz)
-        alone = _clamped(along, length)
-        other = alone * (alone * length - 2 * along)
-        s, t = tl.where(other < value, alone, s), tl.where(other < value, 0.0, t)
-        px, py, pz = px - s * bx - t * cx, py - s * by - t * cy, pz - s * bz - t * cz
-        r = tl.maximum(tl.sqrt(dot(px, py, pz, px, py, pz)), TINY)
-        px, py, pz = px / r, py / r, pz / r
-        closer = there & (r < best)
-        shrink = tl.where(closer, tl.exp2(sharpness * tl.log2(r / best)), 1.0)
-        ratio = tl.where(closer, 1.0, best / r)
-        weight = tl.where(there, tl.exp2(sharpness * tl.log2(ratio)), 0.0)
-        best = tl.where(closer, r, best)
-        i_best, j_best, k_best = tl.where(closer, i, i_best), tl.where(closer, j, j_best), tl.where(closer, k, k_best)
-        s_best, t_best = tl.where(closer, s, s_best), tl.where(closer, t, t_best)
-        wx, wy, wz = tl.where(closer, px, wx), tl.where(closer, py, wy), tl.where(closer, pz, wz)
-        total = total * shrink + weight
-        hx, hy, hz = hx * shrink + weight * px, hy * shrink + weight * py, hz * shrink + weight * pz
-        xx, xy, xz = xx * shrink + weight * px * px, xy * shrink + weight * px * py, xz * shrink + weight * px * pz
-        yy, yz, zz = yy * shrink + weight * py * py, yz * shrink + weight * py * pz, zz * shrink + weight * pz * pz
-        weight = weight / r
-        gx, gy, gz = gx * shrink + weight * px, gy * shrink + weight * py, gz * shrink + weight * pz
+        ball = spheres + face.to(tl.int64) * 4 * frames
+        ax, ay, az = load3(ball, frames, n, there)
+        apart = reach + tl.load(ball + 3 * frames + n, mask=there, other=0.0)
+        there = there & (dot(qx - ax, qy - ay, qz - az, qx - ax, qy - ay, qz - az) <= apart * apart)
+        if tl.max(there.to(tl.int32), axis=0) > 0:
+            i, j, k = tl.load(faces + 3 * face), tl.load(faces + 3 * face + 1), tl.load(faces + 3 * face + 2)
+            ax, ay, az = load3(points + i * 3 * frames, frames, n, there)
+            bx, by, bz = load3(points + j * 3 * frames, frames, n, there)
+            cx, cy, cz = load3(points + k * 3 * frames, frames, n, there)
+            bx, by, bz, cx, cy, cz = bx - ax, by - ay, bz - az, cx - ax, cy - ay, cz - az
+            px, py, pz = qx - ax, qy - ay, qz - az
+            s, t, value = _closest(px, py, pz, bx, by, bz, cx, cy, cz)
+            along, length = dot(bx, by, bz, px, py, pz), dot(bx, by, bz, bx, by, bz)
+            alone = _clamped(along, length)
+            other = alone * (alone * length - 2 * along)
+            s, t = tl.where(other < value, alone, s), tl.where(other < value, 0.0, t)
+            px, py, pz = px - s * bx - t * cx, py - s * by - t * cy, pz - s * bz - t * cz
+            r = tl.maximum(tl.sqrt(dot(px, py, pz, px, py, pz)), TINY)
+            px, py, pz = px / r, py / r, pz / r
+            closer = there & (r < best)
+            shrink = tl.exp2(sharpness * tl.log2(tl.where(closer, r / best, 1.0)))
+            weight = tl.exp2(sharpness * tl.log2(tl.where(closer, 1.0, best / r)))
+            weight = tl.where(there, weight, 0.0)
+            best = tl.where(closer, r, best)
+            i_best, j_best = tl.where(closer, i, i_best), tl.where(closer, j, j_best)
+            k_best = tl.where(closer, k, k_best)
+            s_best, t_best = tl.where(closer, s, s_best), tl.where(closer, t, t_best)
+            wx, wy, wz = tl.where(closer, px, wx), tl.where(closer, py, wy), tl.where(closer, pz, wz)
+            total = total * shrink + weight
+            hx, hy, hz = hx * shrink + weight * px, hy * shrink + weight * py, hz * shrink + weight * pz
+            xx, xy = xx * shrink + weight * px * px, xy * shrink + weight * px * py
+            xz, yy = xz * shrink + weight * px * pz, yy * shrink + weight * py * py
+            yz, zz = yz * shrink + weight * py * pz, zz * shrink + weight * pz * pz
+            weight = weight / r
+            gx, gy, gz = gx * shrink + weight * px, gy * shrink + weight * py, gz * shrink + weight * pz
     found = near & (best < 1e29)
     total = tl.where(found, total, 1.0)
     distance = best * tl.exp2(-tl.log2(total) / sharpness)
