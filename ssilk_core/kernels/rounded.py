@@ -35,6 +35,8 @@ def rounded_kernel(
 ) -> Rounded:
     """Return rounded distances, as `energy.rounded.rounded_distance` does, and planes of vertices `far` away.
 
+    Offsets are float64: how far a vertex is from its plane is known better than where both are.
+
     Args:
         x: queries (V, 3, N); index: their nearest body vertices (V, N), int32.
         points, normals: of the body (B, 3, N).
@@ -49,16 +51,16 @@ def rounded_kernel(
     faces = faces.int().contiguous()
     table = faces.new_zeros(1) if listed is None else listed.int().contiguous()
     width = len(faces) if listed is None else listed.shape[1]
-    normal, offset = torch.empty_like(x), x.new_empty(vertices, frames)
+    normal, distance = torch.empty_like(x), x.new_empty(vertices, frames)
     bend = x.new_empty(vertices, 3, 3, frames)
     grid = (vertices, triton.cdiv(frames, BLOCK))
-    _rounded[grid](x, index, points, normals, faces, spheres, table, normal, offset, bend, frames, width, far * far,
+    _rounded[grid](x, index, points, normals, faces, spheres, table, normal, distance, bend, frames, width, far * far,
                    touching, sharpness, ON_EDGE, 1 + SLACK, listed is not None, BLOCK, num_warps=1)  # fmt: skip
-    return Rounded(normal, offset, bend)
+    return Rounded(normal, (normal.double() * x.double()).sum(1) - distance.double(), bend)
 
 
 @triton.jit
-def _rounded(x, index, points, normals, faces, spheres, table, normal, offset, bend, frames, width, far, touching,
+def _rounded(x, index, points, normals, faces, spheres, table, normal, distances, bend, frames, width, far, touching,
              sharpness, on_edge, slack, listed: tl.constexpr, block: tl.constexpr):  # fmt: skip
     v = tl.program_id(0).to(tl.int64)
     n = tl.program_id(1) * block + tl.arange(0, block)
@@ -136,12 +138,11 @@ def _rounded(x, index, points, normals, faces, spheres, table, normal, offset, b
     gx, gy, gz = tl.where(touches, nx, sign * gx), tl.where(touches, ny, sign * gy), tl.where(touches, nz, sign * gz)
     distance = sign * tl.where(touches, best, distance)
     gx, gy, gz = tl.where(found, gx, mx), tl.where(found, gy, my), tl.where(found, gz, mz)
-    far_off = dot(mx, my, mz, ox, oy, oz)
+    far_off = dot(mx, my, mz, qx - ox, qy - oy, qz - oz)
     tl.store(normal + v * 3 * frames + n, gx, mask=inside)
     tl.store(normal + v * 3 * frames + frames + n, gy, mask=inside)
     tl.store(normal + v * 3 * frames + 2 * frames + n, gz, mask=inside)
-    flat = tl.where(found, dot(gx, gy, gz, qx, qy, qz) - distance, far_off)
-    tl.store(offset + v * frames + n, flat, mask=inside)
+    tl.store(distances + v * frames + n, tl.where(found, distance, far_off), mask=inside)
 
     # Inside, the nearest edge or corner: (1 - u u' - e e') / r.
     r_best = 1 - s_best - t_best
