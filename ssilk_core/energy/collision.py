@@ -16,6 +16,7 @@ from .surface_point import nearest_on_rings
 
 # Further than this from every body vertex [m], the tangent plane at the nearest vertex says all that is needed.
 FAR = 0.08
+HELD_PAIRS = 4  # times as much is kept of a pair of vertex and triangle to round as to find the nearest
 TOUCHING = 1e-5  # [m] from the surface, within which single precision no longer tells the direction to it
 
 
@@ -107,14 +108,16 @@ def nearest_planes(
 def rounded_planes(
     x: Tensor, body: PosedBody, blocks: Tensor | None = None, patches: Patches | None = None
 ) -> Rounded:
-    """Return the rounded distances of x to the body's whole surface; arguments are those of `nearest_planes`.
+    """Return the rounded distances of x to the body's surface; arguments are those of `nearest_planes`.
 
     A body without `faces` is not rounded, nor are points `FAR` from it.
     """
     single = x.float()
-    if body.faces is None:
-        normal, offset = nearest_planes(single, body, blocks, patches)
-        return Rounded(normal, offset, normal.new_zeros(len(x), 3, *x.shape[1:]))
+    flat = single.new_zeros(len(x), 3, *x.shape[1:])
+    if not x.numel():
+        return Rounded(x, x[:, 0], flat)
+    if body.faces is None or not len(body.faces):
+        return Rounded(*nearest_planes(single, replace(body, faces=None), blocks, patches), flat)
     listed = patches.faces if patches else None
     if kernels.serve(single):
         from ..kernels.rounded import rounded_kernel
@@ -123,14 +126,14 @@ def rounded_planes(
         reach = FAR, TOUCHING, SHARPNESS
         return rounded_kernel(single, index, body.points, body.normals, body.faces, listed, *reach)
     _, *plane, reach = _at_vertices(single, body, blocks, patches)
-    plane = Rounded(*(values.to(x.dtype) for values in plane), x.new_zeros(len(x), 3, *x.shape[1:]))
-    many = frames_at_once(x, body.faces, listed)
+    plane = Rounded(*(values.to(x.dtype) for values in plane), flat)
+    many = max(1, frames_at_once(x, body.faces, listed) // HELD_PAIRS)
     for frames in torch.arange(x.shape[2], device=x.device).split(many):
         part = x[..., frames], reach[:, frames], body.points[..., frames], body.normals[..., frames]
         found, rounded = rounded_distance(*part, body.faces, TOUCHING, listed)
         plane.normal[..., frames] = rounded.normal.where(found[:, None], plane.normal[..., frames])
         plane.offset[..., frames] = rounded.offset.where(found, plane.offset[..., frames])
-        plane.bend[..., frames] = rounded.bend
+        plane.curvature[..., frames] = rounded.curvature
     return plane
 
 

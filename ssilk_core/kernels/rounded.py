@@ -15,8 +15,8 @@ from torch import Tensor
 
 from ..energy.closest import bounding_spheres
 from ..energy.rounded import ON_EDGE, SLACK, Rounded
-from .surface import _clamped, _closest
-from .vectors import dot, load3
+from .surface import _clamped, _closest, _mixed
+from .vectors import dot, load3, store3
 
 BLOCK = 32  # frames of one program
 TINY = tl.constexpr(1e-30)
@@ -52,16 +52,17 @@ def rounded_kernel(
     table = faces.new_zeros(1) if listed is None else listed.int().contiguous()
     width = len(faces) if listed is None else listed.shape[1]
     normal, distance = torch.empty_like(x), x.new_empty(vertices, frames)
-    bend = x.new_empty(vertices, 3, 3, frames)
+    curvature = x.new_empty(vertices, 3, 3, frames)
     grid = (vertices, triton.cdiv(frames, BLOCK))
-    _rounded[grid](x, index, points, normals, faces, spheres, table, normal, distance, bend, frames, width, far * far,
-                   touching, sharpness, ON_EDGE, 1 + SLACK, listed is not None, BLOCK, num_warps=1)  # fmt: skip
-    return Rounded(normal, (normal.double() * x.double()).sum(1) - distance.double(), bend)
+    _rounded[grid](x, index, points, normals, faces, spheres, table, normal, distance, curvature, frames, width,
+                   far * far, touching, sharpness, ON_EDGE, 1 + SLACK, listed is not None, BLOCK,
+                   num_warps=1)  # fmt: skip
+    return Rounded(normal, (normal.double() * x.double()).sum(1) - distance.double(), curvature)
 
 
 @triton.jit
-def _rounded(x, index, points, normals, faces, spheres, table, normal, distances, bend, frames, width, far, touching,
-             sharpness, on_edge, slack, listed: tl.constexpr, block: tl.constexpr):  # fmt: skip
+def _rounded(x, index, points, normals, faces, spheres, table, normal, distances, curvature, frames, width, far,
+             touching, sharpness, on_edge, slack, listed: tl.constexpr, block: tl.constexpr):  # fmt: skip
     v = tl.program_id(0).to(tl.int64)
     n = tl.program_id(1) * block + tl.arange(0, block)
     inside = n < frames
@@ -129,7 +130,7 @@ def _rounded(x, index, points, normals, faces, spheres, table, normal, distances
     scale = distance / total
     gx, gy, gz = gx * scale, gy * scale, gz * scale
 
-    nx, ny, nz = _mixed(normals, frames, i_best, j_best, k_best, s_best, t_best, n, inside)
+    nx, ny, nz = _mixed(normals, frames, i_best, j_best, k_best, s_best, t_best, n, inside, inside)
     length = tl.maximum(tl.sqrt(dot(nx, ny, nz, nx, ny, nz)), 1e-8)
     nx, ny, nz = nx / length, ny / length, nz / length
     within = found & (dot(wx, wy, wz, nx, ny, nz) < 0)
@@ -139,9 +140,7 @@ def _rounded(x, index, points, normals, faces, spheres, table, normal, distances
     distance = sign * tl.where(touches, best, distance)
     gx, gy, gz = tl.where(found, gx, mx), tl.where(found, gy, my), tl.where(found, gz, mz)
     far_off = dot(mx, my, mz, qx - ox, qy - oy, qz - oz)
-    tl.store(normal + v * 3 * frames + n, gx, mask=inside)
-    tl.store(normal + v * 3 * frames + frames + n, gy, mask=inside)
-    tl.store(normal + v * 3 * frames + 2 * frames + n, gz, mask=inside)
+    store3(normal + v * 3 * frames, frames, n, inside, gx, gy, gz)
     tl.store(distances + v * frames + n, tl.where(found, distance, far_off), mask=inside)
 
     # Inside, the nearest edge or corner: (1 - u u' - e e') / r.
@@ -159,29 +158,13 @@ def _rounded(x, index, points, normals, faces, spheres, table, normal, distances
     one = tl.where(many == 1, 1.0, 0.0) / length
     ex, ey, ez = ex * one, ey * one, ez * one
     scale = tl.where(many > 0, 1.0, 0.0) / best
-    use, out = found & ~touches, bend + v * 9 * frames + n
+    use, out = found & ~touches, curvature + v * 9 * frames
     xx = tl.where(use, tl.where(within, (1 - wx * wx - ex * ex) * scale, xx), 0.0)
     yy = tl.where(use, tl.where(within, (1 - wy * wy - ey * ey) * scale, yy), 0.0)
     zz = tl.where(use, tl.where(within, (1 - wz * wz - ez * ez) * scale, zz), 0.0)
     xy = tl.where(use, tl.where(within, (-wx * wy - ex * ey) * scale, xy), 0.0)
     xz = tl.where(use, tl.where(within, (-wx * wz - ex * ez) * scale, xz), 0.0)
     yz = tl.where(use, tl.where(within, (-wy * wz - ey * ez) * scale, yz), 0.0)
-    tl.store(out, xx, mask=inside)
-    tl.store(out + frames, xy, mask=inside)
-    tl.store(out + 2 * frames, xz, mask=inside)
-    tl.store(out + 3 * frames, xy, mask=inside)
-    tl.store(out + 4 * frames, yy, mask=inside)
-    tl.store(out + 5 * frames, yz, mask=inside)
-    tl.store(out + 6 * frames, xz, mask=inside)
-    tl.store(out + 7 * frames, yz, mask=inside)
-    tl.store(out + 8 * frames, zz, mask=inside)
-
-
-@triton.jit
-def _mixed(values, frames, i, j, k, s, t, n, inside):
-    """(1 - s - t) of vertex i, s of j and t of k."""
-    ix, iy, iz = load3(values + i * 3 * frames, frames, n, inside)
-    jx, jy, jz = load3(values + j * 3 * frames, frames, n, inside)
-    kx, ky, kz = load3(values + k * 3 * frames, frames, n, inside)
-    r = 1 - s - t
-    return r * ix + s * jx + t * kx, r * iy + s * jy + t * ky, r * iz + s * jz + t * kz
+    store3(out, frames, n, inside, xx, xy, xz)
+    store3(out + 3 * frames, frames, n, inside, xy, yy, yz)
+    store3(out + 6 * frames, frames, n, inside, xz, yz, zz)

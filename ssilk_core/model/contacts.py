@@ -87,12 +87,12 @@ class Contacts:
     def rounded(self, x: Tensor, body: PosedBody) -> Rounded:
         """Return rounded distances of x (V, 3, N) to what it meets, as `planes` does, in the precision of x."""
         normal, offset = no_planes(x)
-        met = Rounded(normal, offset, x.new_zeros(len(x), 3, *x.shape[1:]))
+        met = Rounded(normal, offset, x.new_zeros(len(x), 3, *x.shape[1:], dtype=torch.float32))
         for group in self._groups:
             found = rounded_planes(x.index_select(0, group.rows), body, group.blocks, group.patches)
             met.normal.index_copy_(0, group.rows, found.normal.to(x.dtype))
             met.offset.index_copy_(0, group.rows, found.offset.to(x.dtype))
-            met.bend.index_copy_(0, group.rows, found.bend.to(x.dtype))
+            met.curvature.index_copy_(0, group.rows, found.curvature)
         return met
 
     def distances(self, x: Tensor, body: PosedBody) -> tuple[Tensor, Tensor]:

@@ -68,7 +68,7 @@ class Change:
         before, after: energy of the network's state and of the refined one, with the same past [J].
         inside_before, inside_after: share of the vertices inside what they meet of the body (`model.contacts`).
         moved: RMS distance over the mass [m].
-        imbalance: of `newton.Solution`.
+        imbalance: RMS acceleration that forces out of balance would give the free mass [g], held vertices included.
     """
 
     before: float

@@ -13,17 +13,31 @@ CHECK_EVERY = 8  # iterations between looks at the residuals, which halt a GPU
 
 
 def inverse_blocks(blocks: Tensor) -> Tensor:
-    """Return the inverses of symmetric positive definite blocks (..., 3, 3), by cofactors in float64.
+    """Return the inverses of symmetric blocks (..., 3, 3), positive definite, by cofactors in float64.
 
     The determinants of blocks at slivers overflow in single precision. Rounding may have left such blocks indefinite:
-    what it may have taken is added first.
+    what it may have taken is added first. To a block that is indefinite by itself its norm is added, which leaves it
+    definite.
     """
     wide, eye = blocks.double(), torch.eye(3, dtype=torch.float64, device=blocks.device)
     largest = wide.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None]
-    a, b, c = (wide + ROUNDING * torch.finfo(blocks.dtype).eps * largest * eye).unbind(-2)
+    wide = wide + ROUNDING * torch.finfo(blocks.dtype).eps * largest.abs() * eye
+    wide = wide + torch.where(_definite(wide), 0, wide.square().sum((-2, -1)).sqrt())[..., None, None] * eye
+    cofactors, determinant = _cofactors(wide)
+    return (cofactors / determinant.clamp_min(torch.finfo(torch.float64).tiny)[..., None, None]).to(blocks.dtype)
+
+
+def _cofactors(blocks: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the cofactors of symmetric blocks (..., 3, 3) and their determinants (...)."""
+    a, b, c = blocks.unbind(-2)
     cofactors = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], dim=-1)
-    determinant = (a * cofactors[..., 0]).sum(-1)[..., None, None].clamp_min(torch.finfo(torch.float64).tiny)
-    return (cofactors / determinant).to(blocks.dtype)
+    return cofactors, (a * cofactors[..., 0]).sum(-1)
+
+
+def _definite(blocks: Tensor) -> Tensor:
+    """Return which symmetric blocks (..., 3, 3) are positive definite, by their leading minors, shape (...)."""
+    cofactors, determinant = _cofactors(blocks)
+    return (blocks[..., 0, 0] > 0) & (cofactors[..., 2, 2] > 0) & (determinant > 0)
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:

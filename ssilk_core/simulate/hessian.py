@@ -19,7 +19,7 @@ HELD = 1e6  # times as stiff
 
 
 class Hessian:
-    """Assembles the positive Hessian over the vertices `free` (U,), in float32; positions are (V, 3, N).
+    """Assembles the Hessian over the vertices `free` (U,), in float32; positions are (V, 3, N).
 
     Args:
         corners: vertices of the hinges, shape (H, 4).
@@ -87,5 +87,8 @@ class Hessian:
         if contact is not None:
             diagonal += contact.float()
         if held is not None:
-            diagonal *= torch.where(held, HELD, 1.0)[:, None, None]
+            stiff = (
+                HELD * diagonal.square().sum((1, 2)).sqrt()[:, None, None] * torch.eye(3, device=x.device)[..., None]
+            )
+            diagonal.copy_(torch.where(held[:, None, None], stiff, diagonal))
         return BlockMatrix(self.pattern, blocks)

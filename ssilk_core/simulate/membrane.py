@@ -44,7 +44,7 @@ class Membrane:
         return adjoint(self.operator, stress)
 
     def stiffness(self, x: Tensor, whole: Tensor | None = None) -> Tensor:
-        """Return the positive Hessian in the columns of F [J], float32; blocks uu, uv, vu, vv: (4 F, 3, 3, N).
+        """Return the Hessian in the columns of F [J], made positive, float32; blocks uu, uv, vu, vv: (4 F, 3, 3, N).
 
         Args:
             whole: frames that get the Hessian itself, which compression may make indefinite, shape (N,).

@@ -4,8 +4,8 @@
 Each iteration solves with the Hessian to a tenth of the residual, then halves the step until the energy has fallen
 enough. The distances to the body are found anew for every state, those of the line search included: the energy of a
 frame never rises, and more iterations never end higher. Far from balance the Hessian is made positive; near it the
-whole one is tried, for cloth that is about to buckle gives way much faster under it, and left for some iterations
-where it did not lead down.
+membrane's own is tried, for cloth that is about to buckle gives way much faster under it, and left for some
+iterations where it did not lead down.
 
 Where parts of a body pass through each other, the nearest surface changes sides and the energy has a step: no
 gradient tells. One vertex before it would keep its whole garment from moving on. Where only a small part of a step
@@ -31,8 +31,8 @@ REACH = 0.1  # of the garment's size, by which a step moves a vertex at most: st
 CREEPING = 0.25  # of a step: where not even this is possible, what stands in the way is held
 SPOILING = 0.1  # share of the fall expected that a vertex takes away, from which on it stands in the way
 NEAR = 2.0  # [g] out of balance, from which on the whole Hessian is tried
-PATIENCE = 4  # iterations without it, after a step that it led to was cut to less than GOOD
-GOOD = 0.25
+GOOD = 0.25  # of a step: where less of one is possible, the whole Hessian has misled
+PATIENCE = 4  # iterations without it from then on
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +100,7 @@ class State:
 
     def tensors(self) -> list[Tensor]:
         """Return all that it holds, frames last."""
-        return [self.x, self.energy, *([self.met.normal, self.met.offset, self.met.bend] if self.met else [])]
+        return [self.x, self.energy, *([self.met.normal, self.met.offset, self.met.curvature] if self.met else [])]
 
     def picked(self, frames: Tensor) -> State:
         """Return the state of some of the frames, indices (M,)."""
@@ -176,13 +176,16 @@ class _Search:
         whole = (self.imbalance < NEAR) & (self.waiting <= 0)
         step, count = newton_step(potential, self.state, setting, gradient, self.options.inner, self.held, whole)
         self.state, length, in_the_way = line_search(potential, self.state, setting, gradient, step)
-        misled = whole & (length == 0)
-        self.waiting = torch.where(whole & (length < GOOD), PATIENCE, self.waiting - 1)
+        misled = whole & (length < GOOD)
+        self.waiting = torch.where(misled, PATIENCE, self.waiting - 1)
         new = in_the_way & ~self.held & ~misled
         self.held |= new
         self.moving = (length > 0) | new.any(0) | misled
         self._look()
-        self._keep(count)
+        self._write()
+        found = self.solution
+        found.iterations[self.at_work] += 1
+        self.solution = replace(found, inner=found.inner + count)
 
     def _release(self) -> None:
         """Let go, once, of what frames hold that are in balance otherwise."""
@@ -191,6 +194,7 @@ class _Search:
             self.held &= ~again
             self.released |= again
             self._look()
+            self._write()
 
     def _look(self) -> None:
         """Find the forces out of balance in the states that the search stands at."""
@@ -198,14 +202,11 @@ class _Search:
         self.gradient = gradient.masked_fill(self.held[:, None], 0)
         self.imbalance = self.potential.imbalance(self.gradient)
 
-    def _keep(self, inner: int) -> None:
+    def _write(self) -> None:
         """Write down where the frames at work have come to."""
         found, rows = self.solution, self.at_work
         found.x[..., rows], found.energy[rows] = self.state.x, self.state.energy
-        found.imbalance[rows] = self.imbalance
-        found.iterations[rows] += 1
-        found.held[rows] = self.held.sum(0)
-        self.solution = replace(found, inner=found.inner + inner)
+        found.imbalance[rows], found.held[rows] = self.imbalance, self.held.sum(0)
 
 
 def newton_step(
@@ -248,8 +249,9 @@ def line_search(
         trial = State.at(potential, (state.x + length * step)[..., left], setting.picked(left))
         fallen = trial.energy <= (state.energy + SUFFICIENT * length * slope)[left]
         rows = fallen.nonzero()[:, 0]
-        found = found.replaced(left[rows], trial.picked(rows))
-        lengths[left[rows]] = length
+        if len(rows):
+            found = found.replaced(left[rows], trial.picked(rows))
+            lengths[left[rows]] = length
         if length <= CREEPING:
             cost = spoiling(potential, state.picked(left), trial, length * step[..., left])
             in_the_way[:, left] |= (cost > SPOILING * length * slope[left].abs()) & ~fallen

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a frame minimises: the training energy, with its gradient and a positive Hessian.
+"""What a frame minimises: the training energy, with its gradient and Hessian.
 
 Implicit Euler with time step dt is the minimum of
 
     stretch + bending + gravity + collision + m/(2 dt^2) |x - (2 x' - x'')|^2 + drag a/(2 dt) |x - carried|^2
 
-(`energy.GarmentEnergy`); a quasi-static state leaves the last two out. The distance to the body is that to its whole
-surface, rounded on its creases (`energy.rounded`), so that a minimum has a gradient of zero.
+(`energy.GarmentEnergy`); a quasi-static state leaves the last two out. The distance to the body is that to the whole
+surface a vertex may meet, and not to the triangles around the nearest vertex alone, as in training; it is rounded on
+its creases (`energy.rounded`), so that minima there have a gradient of zero.
 """
 
 from __future__ import annotations
@@ -123,11 +124,12 @@ class Potential:
         held: Tensor | None = None,
         whole: Tensor | None = None,
     ) -> BlockMatrix:
-        """Return the Hessian over the free vertices, made positive semi-definite, in float32.
+        """Return the Hessian over the free vertices, in float32, its parts made positive semi-definite.
 
         Args:
             held: vertices that are made too stiff to move, shape (V, N); none by default.
-            whole: frames whose membrane keeps what compression takes from its Hessian, shape (N,); none by default.
+            whole: frames whose membrane keeps what compression takes from its Hessian, which may make it indefinite,
+                shape (N,); none by default.
         """
         still = [] if setting.predicted is not None else [(self.mass / setting.dt**2, None)]
         weight = sum((weight for weight, _ in [*self._anchors(setting), *still]), torch.zeros_like(self.mass))
@@ -135,7 +137,9 @@ class Potential:
         if met:
             push, normal = self._push(x, met)[self.free], met.normal[self.free]
             stiffness = 2 * self.fabric.collision * (push > 0)
-            contact = stiffness[:, None, None] * outer(normal, normal) + push[:, None, None] * met.bend[self.free]
+            contact = (
+                stiffness[:, None, None] * outer(normal, normal) + push[:, None, None] * met.curvature[self.free]
+            )
         held = None if held is None else held[self.free]
         return self._hessian(x, weight[self.free].float(), contact, held, whole)
 

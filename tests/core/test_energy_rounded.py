@@ -47,7 +47,7 @@ def test_over_one_plane_it_is_the_distance() -> None:
     expected = torch.tensor([0.0, 1.0, 0.0]).expand(7, 3)
     beyond = height.abs() > TOUCHING
     torch.testing.assert_close(found.normal[..., 0].cpu()[beyond], expected[beyond], rtol=0, atol=1e-3)
-    assert found.bend.abs().max() < 1e-3
+    assert found.curvature.abs().max() < 1e-3
 
 
 @pytest.mark.parametrize("angle", [0.5, 1.5, 2.6])
@@ -104,8 +104,34 @@ def test_gradient_and_bend_are_the_derivatives() -> None:
     found = rounded_planes(x, body)
     first, second = differences(x, body)
     torch.testing.assert_close(found.normal[..., 0], first, rtol=0, atol=1e-4)
-    torch.testing.assert_close(found.bend[..., 0], -second, rtol=2e-2, atol=0.05 * float(second.abs().max()))
-    assert found.bend[..., 0].norm(dim=(1, 2)).median() > 100
+    torch.testing.assert_close(
+        found.curvature[..., 0].double(), -second, rtol=2e-2, atol=0.05 * float(second.abs().max())
+    )
+    assert found.curvature[..., 0].norm(dim=(1, 2)).median() > 100
+
+
+@pytest.mark.skipif(DEVICE.type != "cpu", reason="float64 is for processors")
+def test_small_moves_are_expected_to_second_order_and_large_ones_within_what_moves_can() -> None:
+    x, body = in_the_fold(300), body_of(fold(1.5))
+    found = rounded_planes(x, body)
+    away = torch.randn(x.shape, generator=torch.Generator().manual_seed(6)).double()
+    away = away / away.norm(dim=1, keepdim=True)
+    here = found.distance(x)
+    for length, share in ((1e-5, 0.1), (3e-5, 0.4)):
+        true = rounded(x + length * away, body)
+        first, second = found.distance(x + length * away), found.expected(x + length * away, length * away)
+        assert (second - true).abs().mean() < share * (first - true).abs().mean()
+    for length in (1e-3, 1e-2):
+        fall = here - found.expected(x + length * away, length * away)
+        assert fall.max() <= length * (1 + 1e-6) and (fall > 0.9 * length).any()
+
+
+def test_nothing_to_look_at_is_no_error() -> None:
+    body = body_of(fold(1.5))
+    assert rounded_planes(torch.zeros(4, 3, 0, device=DEVICE), replace(body, points=body.points[..., :0],
+                          normals=body.normals[..., :0])).curvature.shape == (4, 3, 3, 0)  # fmt: skip
+    bare = replace(body, faces=body.faces[:0])
+    assert rounded_planes(torch.ones(4, 3, 1, device=DEVICE), bare).curvature.abs().max() == 0
 
 
 @pytest.mark.skipif(DEVICE.type != "cpu", reason="float64 is for processors")
@@ -115,9 +141,9 @@ def test_inside_it_bends_about_the_nearest_edge() -> None:
     found = rounded_planes(x, body)
     radius = x[:, [0, 2], 0].norm(dim=1)
     torch.testing.assert_close(-found.distance(x)[:, 0], radius * 2 ** (-1 / SHARPNESS), rtol=1e-6, atol=0)
-    for bend, at, r in zip(found.bend[..., 0], x[..., 0], radius):
+    for curvature, at, r in zip(found.curvature[..., 0], x[..., 0], radius):
         around = torch.tensor([at[2], 0.0, -at[0]], dtype=torch.float64) / r
-        torch.testing.assert_close(bend, around[:, None] * around / r, rtol=1e-5, atol=1e-4)
+        torch.testing.assert_close(curvature.double(), around[:, None] * around / r, rtol=1e-5, atol=1e-4)
 
 
 def test_only_listed_triangles_are_found_and_all_frames_are_alike() -> None:
@@ -142,7 +168,7 @@ def test_frames_looked_at_in_turn_give_the_same(monkeypatch) -> None:
     body, x = body_of(ball, ball, ball), near(ball, 0.01, 50)[..., None].float().repeat(1, 1, 3).to(DEVICE)
     together = rounded_planes(x, body)
     monkeypatch.setattr(closest, "SCORES", 1)
-    assert torch.equal(rounded_planes(x, body).bend, together.bend)
+    assert torch.equal(rounded_planes(x, body).curvature, together.curvature)
 
 
 @pytest.mark.parametrize("listed", [False, True])
@@ -174,5 +200,8 @@ def test_the_kernel_finds_what_its_plain_twin_does(monkeypatch, listed: bool) ->
     sure = expected.distance(x).abs() > 1e-3  # nearer, rounding decides about weights and directions
     apart = (found.normal - expected.normal).norm(dim=1)[sure]
     assert apart.max() < 2e-2 and apart.quantile(0.9) < 1e-3
-    bends, scale = (found.bend - expected.bend).norm(dim=(1, 2))[sure], expected.bend.norm(dim=(1, 2))[sure]
-    assert (bends <= 0.05 * scale + 20).all() and scale.max() > 1000
+    curvatures, scale = (
+        (found.curvature - expected.curvature).norm(dim=(1, 2))[sure],
+        expected.curvature.norm(dim=(1, 2))[sure],
+    )
+    assert (curvatures <= 0.05 * scale + 20).all() and scale.max() > 1000

@@ -11,7 +11,7 @@ import pytest
 import torch
 from scipy.optimize import minimize
 
-from ssilk_core.assets import Scene
+from ssilk_core.assets import LOOSE, PINNED, Scene
 from ssilk_core.energy import GarmentEnergy
 from ssilk_core.energy.bending import dihedral_angles
 from ssilk_core.energy.collision import PosedBody
@@ -83,6 +83,49 @@ def test_the_gradient_is_that_of_autograd(potential: Potential, scene: Scene) ->
     torch.testing.assert_close(potential.gradient(x, setting, met), expected, rtol=1e-9, atol=1e-11)
 
 
+def in_the_fold(scene: Scene) -> tuple[Potential, torch.Tensor, Setting]:
+    """A strip that stands, crumpled, between two walls that press on its vertices from both sides."""
+    walls = torch.tensor([[0.0, 0, 0], [-0.06, 0, 0.06], [0.06, 0, 0.06]])
+    points = torch.cat([walls + torch.tensor([0, y, 0]) for y in torch.arange(0.0, 2.0, 0.05)])
+    rows = 3 * torch.arange(39)[:, None]
+    faces = torch.cat([rows + torch.tensor(f) for f in ([0, 3, 4], [0, 4, 1], [0, 2, 5], [0, 5, 3])])
+    normals = torch.tensor([[0.0, 0, 1], [0.7, 0, 0.7], [-0.7, 0, 0.7]]).repeat(40, 1)
+    body = PosedBody(points[..., None], normals[..., None], faces=faces)
+    classes = np.where(scene.classes == PINNED, PINNED, LOOSE)  # tight cloth would meet its patch of the ball alone
+    loose = replace(scene, garment=replace(scene.garment, classes=classes))
+    potential = Potential(loose, replace(FABRICS["stvk"], margin=0.02), device=CPU)
+    generator = torch.Generator().manual_seed(8)
+    x = torch.as_tensor(scene.garment.mesh.points.copy())[:, :, None]
+    x[:, 2] = 0.012 + 0.003 * torch.rand(len(x), 1, generator=generator)
+    x[:, 0] = 1e-4 * torch.randn(len(x), 1, generator=generator)
+    return potential, x, Setting(body, DOWN, x, x, 1 / 30)
+
+
+def test_on_a_crease_the_hessian_of_contact_is_the_derivative_of_its_force(scene: Scene) -> None:
+    potential, x, setting = in_the_fold(scene)
+    with_body = dense_hessian(potential, x, setting, potential.met(x, setting))
+    alone = dense_hessian(potential, x, setting, None)
+    contact, free, step = (with_body - alone).double(), potential.free, 1e-7
+
+    def force(x: torch.Tensor) -> torch.Tensor:
+        touched, none = (potential.gradient(x, setting, met) for met in (potential.met(x, setting), None))
+        return (touched - none)[free, :, 0]
+
+    own = contact[torch.arange(len(free)), :, torch.arange(len(free))]
+    for axis in range(3):
+        move = step * torch.eye(3).double()[axis][:, None]
+        difference = (force(x + move) - force(x - move)) / (2 * step)
+        torch.testing.assert_close(own[:, axis], difference, rtol=0.1, atol=0.1 * float(own.abs().max()))
+    assert own[:, 0, 0].median() > 10 * potential.fabric.collision  # the crease is far stiffer than one wall
+
+
+def test_taut_cloth_in_a_fold_comes_to_rest_on_the_crease(scene: Scene) -> None:
+    potential, x, setting = in_the_fold(scene)
+    pressed = replace(setting, predicted=x - torch.tensor([0, 0, 0.005]).double()[:, None])
+    found = minimise_from(potential, x, pressed, SolverOptions(tolerance=1e-3))
+    assert (found.imbalance <= 1e-3).all() and not found.held.any()
+
+
 def test_the_membrane_has_the_hessian_of_autograd_where_it_is_stretched(scene: Scene) -> None:
     # Under tension nothing is clamped, so the positive Hessian is the Hessian.
     for fabric in FABRICS.values():
@@ -100,6 +143,19 @@ def test_the_membrane_has_the_hessian_of_autograd_where_it_is_stretched(scene: S
         blocks = membrane.stiffness(columns[:, :, None])[..., 0].reshape(2, 2, 3, 3)
         found = blocks.permute(0, 2, 1, 3).reshape(6, 6)
         torch.testing.assert_close(found, expected.float(), rtol=1e-5, atol=1e-4)
+
+
+def test_the_whole_hessian_of_the_membrane_is_that_of_autograd_under_compression_too() -> None:
+    """Frame 0 asks for it, frame 1 for the positive one."""
+    fabric = FABRICS["stvk"]
+    columns = torch.tensor([[0.8, 0.1, 0.0], [0.05, 0.7, 0.1]]).double()
+    membrane = Membrane.__new__(Membrane)
+    membrane.fabric, membrane.operator, membrane.area = fabric, lambda x: x, torch.ones(1, 1)
+    expected = torch.autograd.functional.hessian(lambda f: stretch_density(f[:, :, None], fabric).sum(), columns)
+    blocks = membrane.stiffness(columns[:, :, None].repeat(1, 1, 2), torch.tensor([True, False]))
+    found = blocks.reshape(2, 2, 3, 3, 2).permute(4, 0, 2, 1, 3).reshape(2, 6, 6)
+    torch.testing.assert_close(found[0], expected.reshape(6, 6).float(), rtol=1e-5, atol=1e-4)
+    assert torch.linalg.eigvalsh(found[0])[0] < -1 and torch.linalg.eigvalsh(found[1])[0] > -1e-4
 
 
 def test_two_by_two_matrices_lose_their_negative_eigenvalues_only() -> None:
@@ -162,6 +218,25 @@ def test_blocks_are_inverted() -> None:
     roots = torch.randn(40, 3, 3, generator=torch.Generator().manual_seed(3)).double()
     blocks = roots @ roots.transpose(1, 2) + 0.1 * torch.eye(3)
     torch.testing.assert_close(inverse_blocks(blocks), torch.linalg.inv(blocks))
+
+
+def test_indefinite_blocks_have_definite_inverses() -> None:
+    axes = torch.linalg.qr(torch.randn(60, 3, 3, generator=torch.Generator().manual_seed(3)).double())[0]
+    for values in ([-1.0, 2.0, 3.0], [-1.0, -2.0, 3.0], [-1.0, -2.0, -3.0]):
+        blocks = axes @ torch.diag(torch.tensor(values).double()) @ axes.transpose(1, 2)
+        found = torch.linalg.eigvalsh(inverse_blocks(blocks.float()).double())
+        assert found.isfinite().all() and (found > 0.01).all()
+
+
+def test_under_compression_the_whole_hessian_gives_finite_steps(potential: Potential, scene: Scene) -> None:
+    x, setting = moving(scene, 3)
+    squeezed, held = 0.3 * x, torch.zeros_like(x[:, 0], dtype=torch.bool)
+    held[potential.free[::5]] = True
+    state = State.at(potential, squeezed, setting)
+    gradient = potential.gradient(squeezed, setting, state.met)
+    step, _ = newton_step(potential, state, setting, gradient, 50, held, torch.tensor([True, True, False]))
+    assert step.isfinite().all() and step[potential.free[::5]].abs().max() == 0
+    assert (step[..., 2] * gradient[..., 2]).sum() < 0
 
 
 def test_blocks_at_slivers_are_inverted_in_single_precision() -> None:
@@ -279,7 +354,8 @@ def creased(potential: Potential, vertex: int, at: float) -> Callable[[torch.Ten
         ).double()  # pushed over the middle, where the other one pushes
         normal[vertex, 0] = -side
         offset[vertex] = -side * at + 0.01
-        return Rounded(normal, offset, x.new_zeros(len(x), 3, *x.shape[1:]))
+        curvature = 1e4 * torch.eye(3)[None, :, :, None].repeat(len(x), 1, 1, x.shape[2])  # as on a crease
+        return Rounded(normal, offset, curvature)
 
     return met
 
@@ -296,6 +372,39 @@ def test_a_vertex_on_a_crease_does_not_keep_the_others_from_coming_to_rest(
     monkeypatch.setattr(newton, "SPOILING", torch.inf)
     stuck = minimise_from(potential, x, setting, options)
     assert (stuck.imbalance[0] > 1) and found.energy[0] <= stuck.energy[0]
+
+
+def test_held_vertices_are_let_go_once_when_the_rest_is_in_balance(potential: Potential, scene: Scene) -> None:
+    x, setting = moving(scene, 2)
+    start = minimise_from(potential, x, setting, SolverOptions(tolerance=1e-5)).x
+    vertex = int(potential.free[-1])
+    start[vertex, 1] += 2e-3
+    search = newton._Search(potential, start, setting, SolverOptions(tolerance=1e9))
+    search.held[vertex] = torch.tensor([True, False])
+    assert not search.narrowed() and not search.held.any() and search.released.tolist() == [True, False]
+    assert torch.equal(search.solution.imbalance, search.imbalance) and not search.solution.held.any()
+    assert (search.imbalance > 0.1).all()  # what was held counts again
+    search.held[vertex] = True
+    search.narrowed()
+    assert search.held[vertex].tolist() == [True, False]
+
+
+def test_a_frame_that_the_whole_hessian_misleads_goes_on_without_it(
+    monkeypatch, potential: Potential, scene: Scene
+) -> None:
+    x, setting = moving(scene, 2)
+    asked = []
+
+    def misleading(potential, state, setting, gradient, inner, held=None, whole=None):
+        step, count = newton_step(potential, state, setting, gradient, inner, held)
+        asked.append(whole)
+        return torch.where(whole, 0.0, step), count  # as where the first direction already curves down
+
+    monkeypatch.setattr(newton, "newton_step", misleading)
+    found = minimise_from(potential, x, setting, SolverOptions(tolerance=1e-3))
+    tried = torch.stack([whole[0] for whole in asked if len(whole) == 2])
+    assert (found.imbalance <= 1e-3).all() and tried.any()
+    assert not (tried[1:] & tried[:-1]).any()  # it waits before it tries again
 
 
 def test_states_that_are_not_finite_are_refused(potential: Potential, scene: Scene) -> None:
