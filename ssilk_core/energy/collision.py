@@ -123,10 +123,10 @@ def rounded_planes(
         from ..kernels.rounded import rounded_kernel
 
         index = _nearest_vertex(single, body, blocks, patches)
-        reach = FAR, TOUCHING, SHARPNESS
-        return rounded_kernel(single, index, body.points, body.normals, body.faces, listed, *reach)
-    _, *plane, reach = _at_vertices(single, body, blocks, patches)
-    plane = Rounded(*(values.to(x.dtype) for values in plane), flat)
+        limits = FAR, TOUCHING, SHARPNESS
+        return rounded_kernel(single, index, body.points, body.normals, body.faces, listed, *limits)
+    _, normal, offset, reach = _at_vertices(single, body, blocks, patches)
+    plane = Rounded(normal.to(x.dtype), offset.to(x.dtype), flat)
     many = max(1, frames_at_once(x, body.faces, listed) // HELD_PAIRS)
     for frames in torch.arange(x.shape[2], device=x.device).split(many):
         part = x[..., frames], reach[:, frames], body.points[..., frames], body.normals[..., frames]

@@ -52,9 +52,9 @@ class Membrane:
         w_u, w_v = self.operator(x).float().chunk(2)
         tensions = tension(w_u, w_v, self.fabric)
         clamped = positive(*tensions)
-        if whole is not None:
-            clamped = tuple(own.where(whole, other) for own, other in zip(tensions, clamped, strict=True))
-        uu, uv, vv = (s[:, None, None] for s in clamped)
+        if whole is None:
+            whole = torch.zeros_like(clamped[0][0], dtype=torch.bool)
+        uu, uv, vv = (torch.where(whole, own, other)[:, None, None] for own, other in zip(tensions, clamped))
         a, b, c, d = material(w_u, w_v, self.fabric)
         identity = torch.eye(3, device=x.device)[:, :, None]
         own_u, own_v, mixed = outer(w_u, w_u), outer(w_v, w_v), outer(w_u, w_v)
