@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from .. import kernels
-from .closest import closest_on_faces, frames_at_once
+from .closest import bounding_spheres, closest_on_faces, frames_at_once
 from .nearest import BLOCK, GROUP, consecutive_blocks, nearest_vertex
-from .rounded import SHARPNESS, Rounded, rounded_distance
+from .rounded import ON_EDGE, SHARPNESS, SLACK, Rounded, rounded_distance
 from .surface_point import nearest_on_rings
 
 # Further than this from every body vertex [m], the tangent plane at the nearest vertex says all that is needed.
@@ -120,11 +120,7 @@ def rounded_planes(
         return Rounded(*nearest_planes(single, replace(body, faces=None), blocks, patches), flat)
     listed = patches.faces if patches else None
     if kernels.serve(single):
-        from ..kernels.rounded import rounded_kernel
-
-        index = _nearest_vertex(single, body, blocks, patches)
-        limits = FAR, TOUCHING, SHARPNESS
-        return rounded_kernel(single, index, body.points, body.normals, body.faces, listed, *limits)
+        return _rounded_by_kernel(single, body, blocks, patches)
     _, normal, offset, reach = _at_vertices(single, body, blocks, patches)
     plane = Rounded(normal.to(x.dtype), offset.to(x.dtype), flat)
     many = max(1, frames_at_once(x, body.faces, listed) // HELD_PAIRS)
@@ -135,6 +131,20 @@ def rounded_planes(
         plane.offset[..., frames] = rounded.offset.where(found, plane.offset[..., frames])
         plane.curvature[..., frames] = rounded.curvature
     return plane
+
+
+def _rounded_by_kernel(x: Tensor, body: PosedBody, blocks: Tensor | None, patches: Patches | None) -> Rounded:
+    """Return what `rounded_planes` does; offsets are float64, for distances are known better than positions."""
+    from ..kernels.rounded import rounded_kernel
+
+    assert body.faces is not None
+    index = _nearest_vertex(x, body, blocks, patches).int()
+    surface = body.points, body.normals, body.faces, torch.cat(bounding_spheres(body.points, body.faces), dim=1)
+    normal, distance, curvature = rounded_kernel(
+        x, index, *surface, patches.faces if patches else None,
+        far=FAR, touching=TOUCHING, sharpness=SHARPNESS, slack=SLACK, on_edge=ON_EDGE,
+    )  # fmt: skip
+    return Rounded(normal, (normal.double() * x.double()).sum(1) - distance.double(), curvature)
 
 
 def _at_vertices(

@@ -13,8 +13,6 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from ..energy.closest import bounding_spheres
-from ..energy.rounded import ON_EDGE, SLACK, Rounded
 from .surface import _clamped, _closest, _mixed
 from .vectors import dot, load3, store3
 
@@ -28,36 +26,39 @@ def rounded_kernel(
     points: Tensor,
     normals: Tensor,
     faces: Tensor,
+    spheres: Tensor,
     listed: Tensor | None,
+    *,
     far: float,
     touching: float,
     sharpness: float,
-) -> Rounded:
-    """Return rounded distances, as `energy.rounded.rounded_distance` does, and planes of vertices `far` away.
+    slack: float,
+    on_edge: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return gradients (V, 3, N), rounded distances (V, N) and their curvature (V, 3, 3, N).
 
-    Offsets are float64: how far a vertex is from its plane is known better than where both are.
+    They are those of `energy.rounded.rounded_distance`, which has the constants, and of the nearest vertex's plane
+    for vertices `far` from it.
 
     Args:
         x: queries (V, 3, N); index: their nearest body vertices (V, N), int32.
         points, normals: of the body (B, 3, N).
-        faces: triangles (F, 3).
+        faces: triangles (F, 3), and `spheres` around them: centre and radius, (F, 4, N).
         listed: those that each query may find, filled up by -1, shape (V, L); any by default.
     """
     x, points, normals = x.contiguous(), points.contiguous(), normals.contiguous()
     vertices, _, frames = x.shape
     assert points.numel() < 1 << 31  # body vertices are addressed by 32 bits
-    centre, radius = bounding_spheres(points, faces.long())
-    spheres = torch.cat([centre, radius], dim=1).contiguous()
-    faces = faces.int().contiguous()
+    faces, spheres = faces.int().contiguous(), spheres.contiguous()
     table = faces.new_zeros(1) if listed is None else listed.int().contiguous()
     width = len(faces) if listed is None else listed.shape[1]
     normal, distance = torch.empty_like(x), x.new_empty(vertices, frames)
     curvature = x.new_empty(vertices, 3, 3, frames)
     grid = (vertices, triton.cdiv(frames, BLOCK))
     _rounded[grid](x, index, points, normals, faces, spheres, table, normal, distance, curvature, frames, width,
-                   far * far, touching, sharpness, ON_EDGE, 1 + SLACK, listed is not None, BLOCK,
+                   far * far, touching, sharpness, on_edge, 1 + slack, listed is not None, BLOCK,
                    num_warps=1)  # fmt: skip
-    return Rounded(normal, (normal.double() * x.double()).sum(1) - distance.double(), curvature)
+    return normal, distance, curvature
 
 
 @triton.jit

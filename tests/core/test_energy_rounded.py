@@ -174,8 +174,6 @@ def test_frames_looked_at_in_turn_give_the_same(monkeypatch) -> None:
 @pytest.mark.parametrize("listed", [False, True])
 def test_the_kernel_finds_what_its_plain_twin_does(monkeypatch, listed: bool) -> None:
     pytest.importorskip("triton")
-    from ssilk_core.kernels.rounded import rounded_kernel
-
     walls = fold(1.2)
     ball = trimesh.util.concatenate([walls, trimesh.creation.icosahedron().apply_scale(0.05)])
     far_off, within = torch.tensor([[0.0, 0.0, 0.9]]).double(), in_the_fold(5)[..., 0]
@@ -193,9 +191,7 @@ def test_the_kernel_finds_what_its_plain_twin_does(monkeypatch, listed: bool) ->
     with monkeypatch.context() as plain:
         plain.setattr(collision.kernels, "serve", lambda x: False)
         expected = rounded_planes(x, body, patches=patches)
-        index = collision._nearest_vertex(x, body, None, patches).int()
-    found = rounded_kernel(x, index, body.points, body.normals, body.faces, patches and patches.faces,
-                           collision.FAR, TOUCHING, SHARPNESS)  # fmt: skip
+        found = collision._rounded_by_kernel(x, body, None, patches)
     torch.testing.assert_close(found.distance(x.double()), expected.distance(x.double()), rtol=0, atol=3e-7)
     sure = expected.distance(x).abs() > 1e-3  # nearer, rounding decides about weights and directions
     apart = (found.normal - expected.normal).norm(dim=1)[sure]

@@ -80,8 +80,20 @@ def test_every_command_is_understood_and_every_need_is_made(paper, plan):
     for job in found:
         if job.command[:3] == (PYTHON, "-m", "ssilk_core"):
             assert verbs.parse_args(job.command[3:]).verb in ("train", "simulate")
-    trained = [job for job in found if job.name.startswith("cape_") and job.command[3] == "train"]
+    trained = [job for job in found if job.name.startswith("cape_ssilk") and job.command[3] == "train"]
     assert len(trained) == 3 and len({job.command[-1] for job in trained}) == 1  # seeds differ in nothing else
+
+
+def test_equal_iterations_are_as_many_as_the_baselines_have(paper, plan):
+    found = {job.name: job for job in paper.jobs(plan)}
+
+    def iterations(name: str) -> str:
+        return next(word for word in found[name].command if word.startswith("iterations="))
+
+    assert iterations("pants_equal") == iterations("pants_ncs") != iterations("pants_ssilk")
+    measured = found["pants_equal_whole"]
+    assert {path.stem for path in measured.needs} == {"pants_equal", "pants_ncs", "pants_ncs_star", "pants_snug"}
+    assert measured.outputs[0].parent not in {path.parent for path in found["pants_whole"].outputs}
 
 
 def test_only_models_that_are_there_are_measured(paper, plan, tmp_path):
