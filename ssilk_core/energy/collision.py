@@ -29,8 +29,8 @@ class PosedBody:
             the nearest vertex.
         groups: the vertices in compact groups (`nearest.compact_blocks` of `nearest.GROUP`), int32; they make the
             search on a GPU fast, and change no result but which of several equally near vertices is meant.
-        faces: triangles (F, 3); with them the nearest body point is that of the whole surface (`closest`), for
-            simulating, rounded, and measuring, and the distance is the Euclidean one. Training's differs where a
+        faces: triangles (F, 3); with them the nearest body point is that of the whole surface (`closest`), and the
+            distance the Euclidean one, for measuring, and rounded for simulating. Training's differs where a
             triangle away from the nearest vertex is nearer than those around it, and by the cosine between the
             interpolated normal and the direction to the surface.
         patches: the triangles in compact patches (`closest.patches_of`), int32; a GPU searches by them.

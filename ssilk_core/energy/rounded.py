@@ -84,47 +84,62 @@ def rounded_distance(
     rows, frames = reach.shape
     row, frame, face = pairs_within_reach(x.float(), reach * (1 + SLACK), points, faces, listed)
     query, corners = row * frames + frame, faces[face].T
-    a, b, c = (points[corner, :, frame].T.to(x.dtype) for corner in corners)
-    p = x[row, :, frame].T - a
-    s, t, _ = closest_in_triangle(p, b - a, c - a)
-    away = p - s * (b - a) - t * (c - a)
-    r = away.norm(dim=0).clamp_min(torch.finfo(x.dtype).tiny)
-    away = away / r
+    positions = torch.stack([points[corner, :, frame].T.to(x.dtype) for corner in corners])
+    r, away, weights = _nearest_points(x[row, :, frame].T, positions)
     nearest = r.new_full((rows * frames,), torch.inf).scatter_reduce(0, query, r, "amin")
-    winner = _first(query, r <= nearest[query], len(nearest))
-    found = winner < len(query)
+    best = _first(query, r <= nearest[query], len(nearest))
+    found = best < len(query)
+    best, nearest = best[found], nearest[found]
+    place = torch.cumsum(found, 0)[query] - 1  # of each pair's query among those found
+    distance, gradient, closing = _norm(r, away, place, nearest)
 
-    def total(values: Tensor) -> Tensor:
-        flat = values.reshape(values.shape[:-1].numel(), len(query))
-        sums = flat.new_zeros(len(flat), rows * frames).index_add_(1, query, flat)
-        return sums.reshape(*values.shape[:-1], -1)[..., found]
-
-    weight = (nearest[query] / r) ** SHARPNESS
-    nearest, sums = nearest[found], total(weight)
-    distance = nearest * sums ** (-1 / SHARPNESS)
-    mean = total(weight * away) / sums
-    square = total(weight * away[:, None] * away) / sums
-    gradient = total(weight / r * away) * (distance / sums)
-    closing = (square - mean[:, None] * mean) * ((SHARPNESS + 1) / distance)
-
-    best, weights = winner[found], torch.stack([1 - s - t, s, t])
     normal = (normals[corners[:, best], :, frame[best]].permute(2, 0, 1) * weights[:, best]).sum(1)
     normal = normal / normal.norm(dim=0).clamp_min(1e-8)
-    inside = (away[:, best] * normal).sum(0) < 0
+    inside, touches = (away[:, best] * normal).sum(0) < 0, nearest <= touching
     sign = torch.where(inside, -1.0, 1.0)
-    touches = nearest <= touching
-    gradient = torch.where(touches, normal, sign * gradient)
-    curvature = torch.where(inside, edge_curvature(away, r, weights, torch.stack([a, b, c]), best), closing)
-    curvature = torch.where(touches, 0, curvature)
     distance = sign * torch.where(touches, nearest, distance)
+    gradient = torch.where(touches, normal, sign * gradient)
+    turning = edge_curvature(away[:, best], r[best], weights[:, best], positions[..., best])
+    curvature = torch.where(touches, 0, torch.where(inside, turning, closing))
     offset = (gradient * x.permute(1, 0, 2).reshape(3, -1)[:, found]).sum(0) - distance
+    found = found.reshape(rows, frames)
+    return found, Rounded(*(_spread(values, found) for values in (gradient, offset, curvature.float())))
 
-    def spread(values: Tensor) -> Tensor:
-        full = values.new_zeros(*values.shape[:-1], rows * frames)
-        full[..., found] = values
-        return full.reshape(*values.shape[:-1], rows, frames).movedim(-2, 0)
 
-    return found.reshape(rows, frames), Rounded(spread(gradient), spread(offset), spread(curvature.float()))
+def _nearest_points(x: Tensor, positions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return distances (Q,) of queries (3, Q) to triangles (3, 3, Q: corner, axis), directions away, barycentrics."""
+    origin, e1, e2 = positions[0], positions[1] - positions[0], positions[2] - positions[0]
+    s, t, _ = closest_in_triangle(x - origin, e1, e2)
+    away = x - origin - s * e1 - t * e2
+    r = away.norm(dim=0).clamp_min(torch.finfo(x.dtype).tiny)
+    return r, away / r, torch.stack([1 - s - t, s, t])
+
+
+def _norm(r: Tensor, away: Tensor, place: Tensor, nearest: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the norm (M,) of the distances r (Q,) of each query, its gradient (3, M), and how its planes close in.
+
+    Args:
+        away: directions, shape (3, Q).
+        place: the query of each pair, shape (Q,); nearest: their least distances, shape (M,).
+    """
+
+    def total(values: Tensor) -> Tensor:
+        flat = values.reshape(values.shape[:-1].numel(), len(r))
+        return flat.new_zeros(len(flat), len(nearest)).index_add_(1, place, flat).reshape(*values.shape[:-1], -1)
+
+    weight = (nearest[place] / r) ** SHARPNESS
+    sums = total(weight)
+    distance = nearest * sums ** (-1 / SHARPNESS)
+    mean, square = total(weight * away) / sums, total(weight * away[:, None] * away) / sums
+    closing = (square - mean[:, None] * mean) * ((SHARPNESS + 1) / distance)
+    return distance, total(weight / r * away) * (distance / sums), closing
+
+
+def _spread(values: Tensor, found: Tensor) -> Tensor:
+    """Return values (..., M) of the queries found (V, N), and zero for the others, shape (V, ..., N)."""
+    full = values.new_zeros(*values.shape[:-1], *found.shape)
+    full[..., found] = values
+    return full.movedim(-2, 0)
 
 
 def _first(query: Tensor, chosen: Tensor, count: int) -> Tensor:
@@ -134,22 +149,18 @@ def _first(query: Tensor, chosen: Tensor, count: int) -> Tensor:
     return start.scatter_reduce(0, query, pair.where(chosen, len(pair)), "amin")
 
 
-def edge_curvature(away: Tensor, r: Tensor, weights: Tensor, corners: Tensor, best: Tensor) -> Tensor:
-    """Return the second derivative of the distance to the nearest edge or corner, zero within a face [1/m].
+def edge_curvature(away: Tensor, r: Tensor, weights: Tensor, positions: Tensor) -> Tensor:
+    """Return the second derivative of the distance to an edge or a corner, zero within a face [1/m], (3, 3, M).
 
     Across the direction away from it, and for an edge not along that: (1 - u u' - e e') / r.
 
     Args:
-        away, r: directions from the nearest points, and distances of all pairs, (3, Q) and (Q,).
-        weights: barycentric coordinates of the nearest points, (3, Q).
-        corners: of the triangles, (3, 3, Q): corner, axis, pair.
-        best: the pairs that are asked about, (M,).
-
-    Returns:
-        Shape (3, 3, M).
+        away, r: directions from the nearest points, and distances, (3, M) and (M,).
+        weights: barycentric coordinates of the nearest points, (3, M).
+        positions: of the triangles' corners, (3, 3, M): corner, axis.
     """
-    away, r, corners, none = away[:, best], r[best], corners[..., best], weights[:, best] <= ON_EDGE
-    opposite = corners.roll(-1, 0) - corners.roll(-2, 0)  # the edge on which a corner has no share
+    none = weights <= ON_EDGE
+    opposite = positions.roll(-1, 0) - positions.roll(-2, 0)  # the edge on which a corner has no share
     edge = (opposite * (none & (none.sum(0) == 1))[:, None]).sum(0)
     edge = edge / edge.norm(dim=0).clamp_min(torch.finfo(r.dtype).tiny)
     across = torch.eye(3, dtype=r.dtype, device=r.device)[:, :, None] - away[:, None] * away - edge[:, None] * edge
