@@ -82,6 +82,24 @@ def test_where_cloth_is_near_its_own_side_nothing_changes(scene):
             np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_rounded_distances_are_those_of_the_planes_that_tight_and_loose_cloth_meet(scene, dtype):
+    """Pulled through the limb, every other vertex tight: each by its own side, to the two per cent of rounding."""
+    dressed, body = on_limb(scene, np.array([RADIUS + 0.005, 0, 0.01]), TIGHT)
+    classes = np.where(np.arange(len(dressed.classes)) % 2, TIGHT, LOOSE).astype(dressed.classes.dtype)
+    dressed = replace(dressed, garment=replace(dressed.garment, classes=classes))
+    x = torch.tensor(dressed.garment.mesh.points, dtype=dtype)[..., None]
+    pulled = x - torch.tensor([RADIUS + 0.025, 0, 0])[:, None].to(dtype)
+    contacts, posed = Contacts(dressed, device=CPU), still(body, exact=True)
+    found, met = contacts.rounded(pulled, posed), signed(pulled.float(), *contacts.planes(pulled.float(), posed))
+    assert found.normal.dtype == found.offset.dtype == dtype and found.curvature.dtype == torch.float32
+    torch.testing.assert_close(found.distance(pulled).float(), met, rtol=0.03, atol=1e-6)
+    assert (met[1::2] < -RADIUS).all() and (met[::2] > -RADIUS).all()
+    pinned = replace(dressed, garment=replace(dressed.garment, classes=np.full_like(classes, PINNED)))
+    nowhere = Contacts(pinned, pinned=False, device=CPU).rounded(pulled, posed)
+    assert (nowhere.distance(pulled) > 1e5).all() and nowhere.curvature.abs().max() == 0
+
+
 def test_pinned_cloth_meets_nothing_unless_it_is_measured(scene):
     dressed, body = on_limb(scene, np.array([0.0, 0, 0]), PINNED)
     x = torch.tensor(dressed.garment.mesh.points, dtype=torch.float32)[..., None]

@@ -201,3 +201,18 @@ def test_the_kernel_finds_what_its_plain_twin_does(monkeypatch, listed: bool) ->
         expected.curvature.norm(dim=(1, 2))[sure],
     )
     assert (curvatures <= 0.05 * scale + 20).all() and scale.max() > 1000
+
+
+def test_the_kernel_serves_more_frames_than_a_block_some_of_them_far_off(monkeypatch) -> None:
+    pytest.importorskip("triton")
+    walls, frames = fold(1.2), 40
+    body = body_of(*[walls] * frames)
+    x = in_the_fold(3).repeat(1, 1, frames).float().to(DEVICE)
+    x[:, 2, ::3] += 0.5
+    with monkeypatch.context() as plain:
+        plain.setattr(collision.kernels, "serve", lambda x: False)
+        expected = rounded_planes(x, body)
+        found = collision._rounded_by_kernel(x, body, None, None)
+    torch.testing.assert_close(found.distance(x.double()), expected.distance(x.double()), rtol=0, atol=3e-7)
+    assert torch.equal(found.curvature[..., ::3], torch.zeros_like(found.curvature[..., ::3]))
+    assert (found.curvature[..., 1::3].norm(dim=(1, 2)) > 0).any()
