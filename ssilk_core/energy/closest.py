@@ -76,14 +76,23 @@ def _closest(
     s, t, value = closest_in_triangle(p, second - origin, third - origin)
     squares = (p * p).sum(0) + value
     query = row * x.shape[2] + frame
-    best = squares.new_full((x[:, 0].numel(),), torch.inf).scatter_reduce(0, query, squares, "amin")
-    pair = torch.arange(len(query), device=x.device)
-    # Of several equally near triangles the first: results are the same in every run.
-    first = pair.new_full(best.shape, len(pair)).scatter_reduce(
-        0, query, pair.where(squares <= best[query], len(pair)), "amin"
-    )
-    winner = first[first < len(pair)]
+    _, first = least_of_each(query, squares, x[:, 0].numel())
+    winner = first[first < len(query)]
     return row[winner], frame[winner], corners[:, winner], torch.stack([1 - s - t, s, t])[:, winner]
+
+
+def least_of_each(query: Tensor, values: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Return the least value of each query and where it stands, both (count,); infinity and Q where there is none.
+
+    Of several that are equal it is the first: results are the same in every run.
+
+    Args:
+        query: which query each value is of, shape (Q,); values: shape (Q,).
+    """
+    least = values.new_full((count,), torch.inf).scatter_reduce(0, query, values, "amin")
+    place = torch.arange(len(query), device=query.device)
+    chosen = place.where(values <= least[query], len(place))
+    return least, place.new_full((count,), len(place)).scatter_reduce(0, query, chosen, "amin")
 
 
 def pairs_within_reach(
@@ -93,9 +102,9 @@ def pairs_within_reach(
 
     Arguments are those of `closest_on_faces`. All frames are looked at together.
     """
-    find = _within_reach if listed is None else _listed_within_reach
-    frame, row, face = find(x, reach, points, faces, *(() if listed is None else (listed,)))
-    return row, frame, face
+    if listed is None:
+        return _within_reach(x, reach, points, faces)
+    return _listed_within_reach(x, reach, points, faces, listed)
 
 
 def _listed_within_reach(
@@ -107,7 +116,7 @@ def _listed_within_reach(
     within = apart <= ((radius[:, 0][listed] + reach[:, None]) * (1 + 1e-6)).square()
     asked = (reach >= 0)[:, None] & (listed >= 0)[..., None]
     row, place, frame = (within & asked).nonzero(as_tuple=True)
-    return frame, row, listed[row, place]
+    return row, frame, listed[row, place]
 
 
 def bounding_spheres(points: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
@@ -118,7 +127,7 @@ def bounding_spheres(points: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _within_reach(x: Tensor, reach: Tensor, points: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return frame, row and face of all pairs whose triangle's bounding sphere comes within reach, (M,) each.
+    """Return row, frame and face of all pairs whose triangle's bounding sphere comes within reach, (M,) each.
 
     |x - c| <= r + u, squared and spread out, is one product of matrices: [-2 x, -2 u, |x|^2 - u^2, 1] with
     [c, r, 1, |c|^2 - r^2].
@@ -131,4 +140,4 @@ def _within_reach(x: Tensor, reach: Tensor, points: Tensor, faces: Tensor) -> tu
     scores = torch.cat(left, dim=1).permute(2, 0, 1) @ torch.cat(right, dim=1).permute(2, 1, 0)
     rounding = 16 * torch.finfo(x.dtype).eps * about.amax()
     frame, row, face = (scores <= rounding).nonzero(as_tuple=True)
-    return frame, row, face
+    return row, frame, face

@@ -108,7 +108,7 @@ def nearest_planes(
 def rounded_planes(
     x: Tensor, body: PosedBody, blocks: Tensor | None = None, patches: Patches | None = None
 ) -> Rounded:
-    """Return the rounded distances of x to the body's surface; arguments are those of `nearest_planes`.
+    """Return the rounded distances of x to the body's surface, in its precision, as `nearest_planes` is asked.
 
     A body without `faces` is not rounded, nor are points `FAR` from it.
     """
@@ -117,12 +117,11 @@ def rounded_planes(
     if not x.numel():
         return Rounded(x, x[:, 0], flat)
     if body.faces is None or not len(body.faces):
-        return Rounded(*nearest_planes(single, replace(body, faces=None), blocks, patches), flat)
-    listed = patches.faces if patches else None
+        return Rounded(*nearest_planes(single, replace(body, faces=None), blocks, patches), flat).to(x.dtype)
     if kernels.serve(single):
-        return _rounded_by_kernel(single, body, blocks, patches)
+        return _rounded_by_kernel(single, body, blocks, patches).to(x.dtype)
     _, normal, offset, reach = _at_vertices(single, body, blocks, patches)
-    plane = Rounded(normal.to(x.dtype), offset.to(x.dtype), flat)
+    plane, listed = Rounded(normal, offset, flat).to(x.dtype), patches.faces if patches else None
     many = max(1, frames_at_once(x, body.faces, listed) // HELD_PAIRS)
     for frames in torch.arange(x.shape[2], device=x.device).split(many):
         part = x[..., frames], reach[:, frames], body.points[..., frames], body.normals[..., frames]

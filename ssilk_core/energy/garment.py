@@ -14,7 +14,7 @@ from ..kernels.corners import elastic_tables
 from ..mesh import topology
 from ..mesh.topology import SLIVER
 from .bending import bending_energy, dihedral_angles
-from .collision import PosedBody, collision_energy, signed_distance
+from .collision import PosedBody, collision_energy, signed, signed_distance
 from .operators import difference_operator
 from .stretch import column_weights, deformation_gradient_operator, stretch_density, stretched_areas
 
@@ -100,7 +100,7 @@ class GarmentEnergy:
         """
         normal, offset, root = normal.detach(), offset.detach(), root.detach()
         if not kernels.serve(x):
-            return self.gravity(x - root, gravity), self.collision_of((normal * x).sum(1) - offset)
+            return self.gravity(x - root, gravity), self.collision_of(signed(x, normal, offset))
         from ..kernels.pointwise import potential_kernel
 
         return potential_kernel(

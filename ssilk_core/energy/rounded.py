@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .closest import pairs_within_reach
+from .closest import least_of_each, pairs_within_reach
 from .surface_point import closest_in_triangle
 
 SHARPNESS = 100.0
@@ -57,9 +57,17 @@ class Rounded:
         bent = 0.5 * (moved[:, None] * self.curvature * moved[:, :, None]).sum((1, 2))
         return torch.maximum(distance - bent, least)
 
+    def tensors(self) -> list[Tensor]:
+        """Return all that it holds, frames last."""
+        return [self.normal, self.offset, self.curvature]
+
     def picked(self, frames: Tensor) -> Rounded:
         """Return those of some of the frames, indices (M,)."""
-        return Rounded(self.normal[..., frames], self.offset[..., frames], self.curvature[..., frames])
+        return Rounded(*(values[..., frames] for values in self.tensors()))
+
+    def to(self, dtype: torch.dtype) -> Rounded:
+        """Return the planes in a precision; the curvature stays float32."""
+        return Rounded(self.normal.to(dtype), self.offset.to(dtype), self.curvature)
 
 
 def rounded_distance(
@@ -86,8 +94,7 @@ def rounded_distance(
     query, corners = row * frames + frame, faces[face].T
     positions = torch.stack([points[corner, :, frame].T.to(x.dtype) for corner in corners])
     r, away, weights = _nearest_points(x[row, :, frame].T, positions)
-    nearest = r.new_full((rows * frames,), torch.inf).scatter_reduce(0, query, r, "amin")
-    best = _first(query, r <= nearest[query], len(nearest))
+    nearest, best = least_of_each(query, r, rows * frames)
     found = best < len(query)
     best, nearest = best[found], nearest[found]
     place = torch.cumsum(found, 0)[query] - 1  # of each pair's query among those found
@@ -140,13 +147,6 @@ def _spread(values: Tensor, found: Tensor) -> Tensor:
     full = values.new_zeros(*values.shape[:-1], *found.shape)
     full[..., found] = values
     return full.movedim(-2, 0)
-
-
-def _first(query: Tensor, chosen: Tensor, count: int) -> Tensor:
-    """Return the first chosen pair of each query, or the number of pairs: results are the same in every run."""
-    pair = torch.arange(len(query), device=query.device)
-    start = pair.new_full((count,), len(pair))
-    return start.scatter_reduce(0, query, pair.where(chosen, len(pair)), "amin")
 
 
 def edge_curvature(away: Tensor, r: Tensor, weights: Tensor, positions: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ import triton.language as tl
 from torch import Tensor
 
 from .nearest import CHUNK, RUN, SAFE, _gaps, _three, by_frame
-from .surface import _clamped, _closest
+from .surface import _closest_alone
 from .vectors import dot
 
 LANES = tl.constexpr(8)  # triangles of a patch; their corners are four rows of a table, of which the last fills up
@@ -132,12 +132,8 @@ def _on_patch(x, y, z, corner, stride):
     wx, wy, wz = _three(corner + 2 * LANES, stride)
     px, py, pz = x[:, None] - ax, y[:, None] - ay, z[:, None] - az
     ux, uy, uz, wx, wy, wz = ux - ax, uy - ay, uz - az, wx - ax, wy - ay, wz - az
-    s, t, e = _closest(px, py, pz, ux, uy, uz, wx, wy, wz)
-    along, length = dot(ux, uy, uz, px, py, pz), dot(ux, uy, uz, ux, uy, uz)
-    alone = _clamped(along, length)
-    value = alone * (alone * length - 2 * along)
-    s, t = tl.where(value < e, alone, s), tl.where(value < e, 0.0, t)
-    return s, t, dot(px, py, pz, px, py, pz) + tl.minimum(value, e)
+    s, t, e = _closest_alone(px, py, pz, ux, uy, uz, wx, wy, wz)
+    return s, t, dot(px, py, pz, px, py, pz) + e
 
 
 @triton.jit

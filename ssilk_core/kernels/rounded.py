@@ -13,7 +13,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from .surface import _clamped, _closest, _mixed
+from .surface import _closest_alone, _mixed
 from .vectors import dot, load3, store3
 
 BLOCK = 32  # frames of one program
@@ -97,11 +97,7 @@ def _rounded(x, index, points, normals, faces, spheres, table, normal, distances
             cx, cy, cz = load3(points + k * 3 * frames, frames, n, there)
             bx, by, bz, cx, cy, cz = bx - ax, by - ay, bz - az, cx - ax, cy - ay, cz - az
             px, py, pz = qx - ax, qy - ay, qz - az
-            s, t, value = _closest(px, py, pz, bx, by, bz, cx, cy, cz)
-            along, length = dot(bx, by, bz, px, py, pz), dot(bx, by, bz, bx, by, bz)
-            alone = _clamped(along, length)
-            other = alone * (alone * length - 2 * along)
-            s, t = tl.where(other < value, alone, s), tl.where(other < value, 0.0, t)
+            s, t, _ = _closest_alone(px, py, pz, bx, by, bz, cx, cy, cz)
             px, py, pz = px - s * bx - t * cx, py - s * by - t * cy, pz - s * bz - t * cz
             r = tl.maximum(tl.sqrt(dot(px, py, pz, px, py, pz)), TINY)
             px, py, pz = px / r, py / r, pz / r
@@ -145,20 +141,8 @@ def _rounded(x, index, points, normals, faces, spheres, table, normal, distances
     tl.store(distances + v * frames + n, tl.where(found, distance, far_off), mask=inside)
 
     # Inside, the nearest edge or corner: (1 - u u' - e e') / r.
-    r_best = 1 - s_best - t_best
-    none_i, none_j, none_k = r_best <= on_edge, s_best <= on_edge, t_best <= on_edge
-    many = none_i.to(tl.int32) + none_j.to(tl.int32) + none_k.to(tl.int32)
-    from_, to = (
-        tl.where(none_i, j_best, tl.where(none_j, k_best, i_best)),
-        tl.where(none_i, k_best, tl.where(none_j, i_best, j_best)),
-    )
-    ax, ay, az = load3(points + from_ * 3 * frames, frames, n, inside)
-    bx, by, bz = load3(points + to * 3 * frames, frames, n, inside)
-    ex, ey, ez = bx - ax, by - ay, bz - az
-    length = tl.maximum(tl.sqrt(dot(ex, ey, ez, ex, ey, ez)), TINY)
-    one = tl.where(many == 1, 1.0, 0.0) / length
-    ex, ey, ez = ex * one, ey * one, ez * one
-    scale = tl.where(many > 0, 1.0, 0.0) / best
+    ex, ey, ez, bends = _edge(points, frames, i_best, j_best, k_best, s_best, t_best, on_edge, n, inside)
+    scale = tl.where(bends, 1.0, 0.0) / best
     use, out = found & ~touches, curvature + v * 9 * frames
     xx = tl.where(use, tl.where(within, (1 - wx * wx - ex * ex) * scale, xx), 0.0)
     yy = tl.where(use, tl.where(within, (1 - wy * wy - ey * ey) * scale, yy), 0.0)
@@ -169,3 +153,17 @@ def _rounded(x, index, points, normals, faces, spheres, table, normal, distances
     store3(out, frames, n, inside, xx, xy, xz)
     store3(out + 3 * frames, frames, n, inside, xy, yy, yz)
     store3(out + 6 * frames, frames, n, inside, xz, yz, zz)
+
+
+@triton.jit
+def _edge(points, frames, i, j, k, s, t, on_edge, n, inside):
+    """The direction of the edge that a point is on, zero on a corner or within, and whether it is on either."""
+    none_i, none_j, none_k = 1 - s - t <= on_edge, s <= on_edge, t <= on_edge
+    many = none_i.to(tl.int32) + none_j.to(tl.int32) + none_k.to(tl.int32)
+    start = tl.where(none_i, j, tl.where(none_j, k, i))
+    stop = tl.where(none_i, k, tl.where(none_j, i, j))
+    ax, ay, az = load3(points + start * 3 * frames, frames, n, inside)
+    bx, by, bz = load3(points + stop * 3 * frames, frames, n, inside)
+    ex, ey, ez = bx - ax, by - ay, bz - az
+    one = tl.where(many == 1, 1.0, 0.0) / tl.maximum(tl.sqrt(dot(ex, ey, ez, ex, ey, ez)), TINY)
+    return ex * one, ey * one, ez * one, many > 0

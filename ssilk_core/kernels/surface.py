@@ -93,6 +93,16 @@ def _closest(px, py, pz, ux, uy, uz, wx, wy, wz):
 
 
 @triton.jit
+def _closest_alone(px, py, pz, ux, uy, uz, wx, wy, wz):
+    """As `_closest`, for a triangle that comes after no other: the edge along u counts too."""
+    s, t, e = _closest(px, py, pz, ux, uy, uz, wx, wy, wz)
+    along, length = dot(ux, uy, uz, px, py, pz), dot(ux, uy, uz, ux, uy, uz)
+    alone = _clamped(along, length)
+    value = alone * (alone * length - 2 * along)
+    return tl.where(value < e, alone, s), tl.where(value < e, 0.0, t), tl.minimum(value, e)
+
+
+@triton.jit
 def _clamped(part, whole):
     return tl.minimum(tl.maximum(part / tl.maximum(whole, TINY), 0.0), 1.0)
 

@@ -9,7 +9,9 @@ caught between two parts of a body that passes through itself, as in an armpit.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -75,25 +77,36 @@ class Contacts:
 
         Planes of vertices that meet nothing are far below them.
         """
-        if len(self._groups) == 1 and len(self._groups[0].rows) == len(x):
-            return nearest_planes(x, body, self._groups[0].blocks, self._groups[0].patches)
-        normal, offset = no_planes(x)
-        for group in self._groups:
-            found = nearest_planes(x.index_select(0, group.rows), body, group.blocks, group.patches)
-            normal.index_copy_(0, group.rows, found[0])
-            offset.index_copy_(0, group.rows, found[1])
+        normal, offset = self._of_groups(x, body, nearest_planes, no_planes)
         return normal, offset
 
     def rounded(self, x: Tensor, body: PosedBody) -> Rounded:
         """Return rounded distances of x (V, 3, N) to what it meets, as `planes` does, in the precision of x."""
-        normal, offset = no_planes(x)
-        met = Rounded(normal, offset, x.new_zeros(len(x), 3, *x.shape[1:], dtype=torch.float32))
+
+        def find(*asked: Any) -> Sequence[Tensor]:
+            return rounded_planes(*asked).tensors()
+
+        def nothing(x: Tensor) -> Sequence[Tensor]:
+            return *no_planes(x), x.new_zeros(len(x), 3, *x.shape[1:], dtype=torch.float32)
+
+        return Rounded(*self._of_groups(x, body, find, nothing))
+
+    def _of_groups(
+        self,
+        x: Tensor,
+        body: PosedBody,
+        find: Callable[..., Sequence[Tensor]],
+        nothing: Callable[[Tensor], Sequence[Tensor]],
+    ) -> Sequence[Tensor]:
+        """Return what each group finds, with `nothing` for vertices that are in none; vertices first in all of it."""
+        if len(self._groups) == 1 and len(self._groups[0].rows) == len(x):
+            return find(x, body, self._groups[0].blocks, self._groups[0].patches)
+        gathered = nothing(x)
         for group in self._groups:
-            found = rounded_planes(x.index_select(0, group.rows), body, group.blocks, group.patches)
-            met.normal.index_copy_(0, group.rows, found.normal.to(x.dtype))
-            met.offset.index_copy_(0, group.rows, found.offset.to(x.dtype))
-            met.curvature.index_copy_(0, group.rows, found.curvature)
-        return met
+            found = find(x.index_select(0, group.rows), body, group.blocks, group.patches)
+            for whole, part in zip(gathered, found, strict=True):
+                whole.index_copy_(0, group.rows, part)
+        return gathered
 
     def distances(self, x: Tensor, body: PosedBody) -> tuple[Tensor, Tensor]:
         """Return signed distances of x (V, 3, N) [m] to these planes and to the whole body, both (V, N)."""

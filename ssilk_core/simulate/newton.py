@@ -100,7 +100,7 @@ class State:
 
     def tensors(self) -> list[Tensor]:
         """Return all that it holds, frames last."""
-        return [self.x, self.energy, *([self.met.normal, self.met.offset, self.met.curvature] if self.met else [])]
+        return [self.x, self.energy, *(self.met.tensors() if self.met else [])]
 
     def picked(self, frames: Tensor) -> State:
         """Return the state of some of the frames, indices (M,)."""
