@@ -21,7 +21,7 @@ from plots import COLOURS, Panel, canvas, save
 from reports import RESULTS, table, write_results
 
 from ssilk_core.energy import TERMS
-from ssilk_core.errors import need
+from ssilk_core.errors import fail
 from ssilk_core.events import format_seconds
 from ssilk_core.training.curve import curve_path
 
@@ -64,12 +64,12 @@ def read_run(text: str) -> Run:
     """
     name, _, model = text.rpartition("=")
     path = curve_path(model)
-    need(
-        path.is_file(), str(path), "no such file", "'ssilk train' writes it beside the model", "name a trained model"
-    )
+    if not path.is_file():
+        fail(str(path), "no such file", "'ssilk train' writes it beside the model", "name a trained model")
     document = json.loads(path.read_text())
     points = document["points"]
-    need(points, str(path), "the curve has no point yet", "one validation at least is needed", "train longer")
+    if not points:
+        fail(str(path), "the curve has no point yet", "one validation at least is needed", "train longer")
     values = {key: np.array([point["validation"][key] for point in points]) for key in PANELS}
     iterations, seconds = (np.array([point[key] for point in points]) for key in ("iteration", "seconds"))
     return Run(name or Path(model).stem, iterations, seconds, values, document["plain"]["total"])
@@ -131,9 +131,8 @@ def main() -> None:
     )
     parser.add_argument("--name", default="curves", help="of the result files (default curves)")
     options = parser.parse_args()
-    need(
-        len(options.runs) <= len(COLOURS), "curves", f"{len(options.runs)} runs", f"{len(COLOURS)} can be told apart"
-    )
+    if not len(options.runs) <= len(COLOURS):
+        fail("curves", f"{len(options.runs)} runs", f"{len(COLOURS)} can be told apart")
     runs = [read_run(text) for text in options.runs]
     totals = options.totals or [max(float(run.best[-1]) for run in runs)]
     draw(RESULTS / f"{options.name}.png", runs)

@@ -27,7 +27,7 @@ from torch import Tensor
 from ssilk_core.assets import Motion
 from ssilk_core.checkpoint import ModelFile, network, save_model
 from ssilk_core.energy import TERMS
-from ssilk_core.errors import need
+from ssilk_core.errors import fail
 from ssilk_core.evaluation.splits import chosen, read_index
 from ssilk_core.evaluation.takes import back_and_forth
 from ssilk_core.packing import packed, unpacked
@@ -236,7 +236,8 @@ def held_out(options: Namespace, subject: Subject, splits: Sequence[str]) -> lis
     """Read the clips of some splits of the index."""
     index = read_index(options.index)
     names = dict.fromkeys(name for split in splits for name in chosen(index, split))
-    need(names, str(options.index), f"no clip of {' or '.join(splits)}", "these are the held-out clips")
+    if not names:
+        fail(str(options.index), f"no clip of {' or '.join(splits)}", "these are the held-out clips")
     return [clip_of(options, name, subject) for name in names]
 
 

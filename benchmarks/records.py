@@ -12,7 +12,7 @@ from typing import Any
 from ssilk_core.baselines.files import KEY, load_network
 from ssilk_core.checkpoint import ModelFile
 from ssilk_core.devices import chosen_device, device_name
-from ssilk_core.errors import fail, need
+from ssilk_core.errors import fail
 from ssilk_core.files import replacing
 from ssilk_core.training.curve import curve_path
 
@@ -74,7 +74,8 @@ def read_records(paths: Sequence[Path]) -> tuple[list[Row], dict[str, Settings],
             hardware[document["hardware"]] = None
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             fail(str(path), f"no record ({type(error).__name__}: {error})", "'tables.py record' writes them")
-    need(rows, ", ".join(map(str, paths)), "no figures in these records", "'tables.py record' writes them")
+    if not rows:
+        fail(", ".join(map(str, paths)), "no figures in these records", "'tables.py record' writes them")
     return rows, models, ", ".join(hardware)
 
 

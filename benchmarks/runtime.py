@@ -34,7 +34,7 @@ from subjects import arguments, open_subject, parsed
 from ssilk_core.assets import PINNED, Motion, Scene
 from ssilk_core.checkpoint import ModelFile, model_file
 from ssilk_core.config import ModelConfig
-from ssilk_core.errors import need
+from ssilk_core.errors import fail
 from ssilk_core.fabrics import Fabric
 from ssilk_core.kinematics import motion_transforms, resample, skin_points, skinning_matrices
 from ssilk_core.model.network import GarmentModel
@@ -115,7 +115,8 @@ def cloth(scene: Scene, motion: Motion, python: str) -> dict[str, list[float]]:
         )
         subprocess.run([python, str(CLOTH), str(shot), str(times)], check=True)
         found = json.loads(times.read_text())
-    need(found["moved"] > 0.01, python, f"Blender's cloth moved by {found['moved']:.3g} m", "it must move")
+    if not found["moved"] > 0.01:
+        fail(python, f"Blender's cloth moved by {found['moved']:.3g} m", "it must move")
     without = np.median(found["without"])
     return {
         "cloth modifier": spread(np.array(found["with"][1:]) - without),
@@ -182,8 +183,13 @@ def options_of_run() -> argparse.Namespace:
     parser.add_argument("--bpy", help="Python with the bpy module, to time Blender's cloth too")
     options = parsed(parser)
     threads = os.environ.get("OMP_NUM_THREADS")
-    need(threads == "1" and options.threads == 1, "benchmarks/runtime.py", f"OMP_NUM_THREADS={threads}, --threads "
-         f"{options.threads}", "one thread is measured", "set both to 1")  # fmt: skip
+    if not (threads == "1" and options.threads == 1):
+        fail(
+            "benchmarks/runtime.py",
+            f"OMP_NUM_THREADS={threads}, --threads {options.threads}",
+            "one thread is measured",
+            "set both to 1",
+        )
     return options
 
 

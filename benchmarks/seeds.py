@@ -16,7 +16,7 @@ from statistics import mean, stdev
 from records import Row, Settings, read_records, settings_of
 
 from ssilk_core.cli import main as ssilk
-from ssilk_core.errors import need
+from ssilk_core.errors import fail
 
 
 def measured(options: argparse.Namespace) -> tuple[list[Row], dict[str, Settings]]:
@@ -30,11 +30,14 @@ def measured(options: argparse.Namespace) -> tuple[list[Row], dict[str, Settings
 
 def evaluated(options: argparse.Namespace, *, probes: bool = False) -> tuple[list[Row], str]:
     """Return the figures of 'ssilk evaluate' for all models, and its tables; stops and loops only for `probes`."""
-    need(options.models, options.table, "no model", "this is measured on models", "name files of 'ssilk train'")
+    if not options.models:
+        fail(options.table, "no model", "this is measured on models", "name files of 'ssilk train'")
     names = [path.stem for path in options.models]
-    need(len(set(names)) == len(names), options.table, "several models of one name", "figures go by their names")
+    if len(set(names)) != len(names):
+        fail(options.table, "several models of one name", "figures go by their names")
     for name in ("stage", "motions"):
-        need(getattr(options, name), options.table, f"no --{name}", "models are evaluated with it")
+        if not getattr(options, name):
+            fail(options.table, f"no --{name}", "models are evaluated with it")
     named = ("stage", "motions", "index", "reference", "sequence", "device")
     given = [(f"--{name}", value) for name in named if (value := getattr(options, name)) is not None]
     words = [word for pair in given for word in pair]

@@ -18,7 +18,7 @@ from ssilk_core.assets import Motion, Scene
 from ssilk_core.checkpoint import ModelFile, load_model, network
 from ssilk_core.devices import chosen_device
 from ssilk_core.energy import GarmentEnergy
-from ssilk_core.errors import need
+from ssilk_core.errors import fail
 from ssilk_core.evaluation.methods import Dressed
 from ssilk_core.model.body import CollisionBody
 from ssilk_core.model.network import GarmentModel
@@ -75,8 +75,8 @@ def dressed_in(file: ModelFile, stage: Path, device: str) -> Dressed:
     """Put the garment of a model or a baseline on the character of a stage."""
     skeleton = file.scene.character.skeleton
     character = read_character(open_stage(stage), root=None, garment=None)
-    need(character.skeleton.joint_names == skeleton.joint_names, str(stage), "its joints are not the model's",
-         "a model is measured on the character it was trained with")  # fmt: skip
+    if character.skeleton.joint_names != skeleton.joint_names:
+        fail(str(stage), "its joints are not the model's", "a model is measured on the character it was trained with")
     scene = replace(file.scene, character=replace(character, skeleton=skeleton))
     return Dressed(scene, file.fabric, file.config.fps, chosen_device(device))
 

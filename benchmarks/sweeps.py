@@ -15,7 +15,7 @@ from records import SETTINGS, Settings
 from reports import RESULTS, table
 from seeds import Cell, measured
 
-from ssilk_core.errors import need
+from ssilk_core.errors import fail
 from ssilk_core.evaluation.splits import SPLITS
 
 SWEEPS = {
@@ -36,9 +36,11 @@ def swept(options: argparse.Namespace, told: Mapping[str, Settings]) -> dict[str
         SsilkError: models of several garments, or baselines.
     """
     odd = next((name for name, settings in told.items() if "baseline" in settings), "")
-    need(not odd, options.table, f"{odd} is a baseline", "all are models of 'ssilk train'")
+    if odd:
+        fail(options.table, f"{odd} is a baseline", "all are models of 'ssilk train'")
     garments = {settings["garment"] for settings in told.values()}
-    need(len(garments) == 1, options.table, f"models of {', '.join(sorted(garments))}", "all are of one garment")
+    if len(garments) != 1:
+        fail(options.table, f"models of {', '.join(sorted(garments))}", "all are of one garment")
     return {model: {name: settings[name] for name in SETTINGS} for model, settings in told.items()}
 
 

@@ -44,7 +44,7 @@ from sweeps import SWEEPS, sweep
 from ssilk_core.assets import Motion
 from ssilk_core.baselines.files import load_network
 from ssilk_core.checkpoint import ModelFile
-from ssilk_core.errors import SsilkError, need
+from ssilk_core.errors import SsilkError, fail
 from ssilk_core.evaluation.methods import reel_of
 from ssilk_core.evaluation.run import SIMULATOR
 from ssilk_core.evaluation.splits import SPLITS
@@ -110,9 +110,8 @@ def table1(options: argparse.Namespace) -> tuple[str, Any]:
 def table2(options: argparse.Namespace) -> tuple[str, Any]:
     simulated = [row for row in measured(options)[0] if row["figures"]["truth"] or row["method"] == SIMULATOR]
     rows = [row for row in simulated if row["split"] != "valid"]
-    need(
-        rows, "table2", "no simulator among the figures", "its shots are needed", "give --reference, or records of it"
-    )
+    if not rows:
+        fail("table2", "no simulator among the figures", "its shots are needed", "give --reference, or records of it")
     return methods_table(cells(rows), SPLITS[1:], DYNAMICS), rows
 
 
@@ -140,7 +139,8 @@ def clip_of(options: argparse.Namespace, file: ModelFile) -> Motion:
 
 
 def record(options: argparse.Namespace) -> None:
-    need(options.output, "record", "no --output", "a file to write is needed")
+    if not options.output:
+        fail("record", "no --output", "a file to write is needed")
     write_record(options, evaluated(options)[0])
 
 
@@ -187,7 +187,8 @@ def parsed() -> argparse.Namespace:
 def main() -> None:
     options = parsed()
     try:
-        need(options.models or options.records, "MODELS", "no model and no record", "'ssilk train' writes models")
+        if not (options.models or options.records):
+            fail("MODELS", "no model and no record", "'ssilk train' writes models")
         if options.table == "record":
             record(options)
         else:

@@ -3,6 +3,6 @@
 
 import sys
 
-from ssilk_core.cli import main
+from .cli import main
 
 sys.exit(main())

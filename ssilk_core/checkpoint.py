@@ -19,7 +19,7 @@ import numpy as np
 from . import __version__
 from .assets import Character, Garment, Mesh, ProxyRig, Scene, Skeleton, SkinWeights
 from .config import ModelConfig
-from .errors import SsilkError, need
+from .errors import SsilkError, fail
 from .fabrics import Fabric
 from .files import replacing
 from .packing import narrowest, packed, unpacked
@@ -152,7 +152,8 @@ def load_model(path: str | Path, shapes: Callable[[ModelFile], Shapes] | None = 
 
 
 def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    need(path.is_file(), str(path), "there is no such model file", "a file written by 'ssilk train' is needed")
+    if not path.is_file():
+        fail(str(path), "there is no such model file", "a file written by 'ssilk train' is needed")
     try:
         tensors, words = read_tensors(path)
     except ValueError as error:
@@ -162,13 +163,15 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
             "file again."
         ) from error
     header = words.get("ssilk", "")
-    need(header, str(path), "a safetensors file without SSILK's header", "a file written by 'ssilk train' is needed")
+    if not header:
+        fail(str(path), "a safetensors file without SSILK's header", "a file written by 'ssilk train' is needed")
     try:
         document = json.loads(header)
     except (TypeError, ValueError, RecursionError) as error:
         raise SsilkError(f"{path}: the model's header is damaged ({error}); train again.") from error
     found = document.get("format") if isinstance(document, dict) else None
-    need(found == FORMAT, str(path), f"model format {found}", f"this version reads format {FORMAT}", "train it again")
+    if found != FORMAT:
+        fail(str(path), f"model format {found}", f"this version reads format {FORMAT}", "train it again")
     return tensors, document
 
 
@@ -194,13 +197,13 @@ def _need_types(values: Mapping[Any, object], likes: Mapping[Any, object]) -> No
 def _model_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> ModelFile:
     scene = _scene_of(tensors, document)
     joints, skeleton = tensors["joints"], scene.character.skeleton
-    need(
-        joints.ndim == 1 and np.isin(joints, np.arange(skeleton.joint_count)).all(),
-        skeleton.path,
-        f"descriptors of joints {joints.tolist()}",
-        f"they lie in 0 to {skeleton.joint_count - 1}",
-        "train again",
-    )
+    if not (joints.ndim == 1 and np.isin(joints, np.arange(skeleton.joint_count)).all()):
+        fail(
+            skeleton.path,
+            f"descriptors of joints {joints.tolist()}",
+            f"they lie in 0 to {skeleton.joint_count - 1}",
+            "train again",
+        )
     return ModelFile(
         scene,
         ModelConfig(**document["config"]),
@@ -251,7 +254,8 @@ def _parameters(tensors: dict[str, np.ndarray], where: str) -> dict[str, np.ndar
         if value.dtype.kind == "i":
             stored[name] = unpacked(value, tensors[f"scale.{name}"])
         finite = np.isfinite(stored[name]).all()
-        need(finite, where, f"parameter '{name[6:]}' holds NaN or infinity", "all are finite", "train again")
+        if not finite:
+            fail(where, f"parameter '{name[6:]}' holds NaN or infinity", "all are finite", "train again")
     return {name[6:]: value for name, value in stored.items()}
 
 
@@ -263,13 +267,13 @@ def _need_fit(model: ModelFile, expected: Shapes) -> None:
     """Raise `SsilkError` unless the parameters have the shapes that the header implies."""
     found = {name: value.shape for name, value in model.parameters.items()}
     odd = next((name for name in {**expected, **found} if expected.get(name) != found.get(name)), "")
-    need(
-        not odd,
-        f"parameter '{odd}'",
-        f"the model's parameters do not fit its header: shape {found.get(odd)}",
-        f"{expected.get(odd)} is needed",
-        "train again",
-    )
+    if odd:
+        fail(
+            f"parameter '{odd}'",
+            f"the model's parameters do not fit its header: shape {found.get(odd)}",
+            f"{expected.get(odd)} is needed",
+            "train again",
+        )
 
 
 def model_file(model: GarmentModel, fabric: Fabric, provenance: dict[str, Any]) -> ModelFile:

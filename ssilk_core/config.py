@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
-from .errors import need
+from .errors import fail
 
 SURFACES = ("triangles", "vertices")
 SCHEMES = ("spring_verlet", "verlet", "direct", "direct_residual", "quasi_static")
@@ -24,7 +24,8 @@ def _need_between(config: object, low: float, high: float, *names: str) -> None:
     """Raise `SsilkError` unless each of these settings lies between two numbers, themselves included."""
     for name in names:
         value = getattr(config, name)
-        need(low <= value <= high, f"setting '{name}'", f"{value:g}", f"it lies between {low:g} and {high:g}")
+        if not low <= value <= high:
+            fail(f"setting '{name}'", f"{value:g}", f"it lies between {low:g} and {high:g}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,13 +57,10 @@ class ModelConfig:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "widths", tuple(self.widths))
-        need(
-            self.scheme in SCHEMES,
-            "model",
-            f"integration scheme '{self.scheme}'",
-            f"it is one of {', '.join(SCHEMES)}",
-        )
-        need(min(self.widths) > 0, "model", f"widths = {self.widths}", "each is at least 1")
+        if self.scheme not in SCHEMES:
+            fail("model", f"integration scheme '{self.scheme}'", f"it is one of {', '.join(SCHEMES)}")
+        if not min(self.widths) > 0:
+            fail("model", f"widths = {self.widths}", "each is at least 1")
         _need_between(self, 1, MOST, "latent", "fps")
         _need_between(self, 0, MOST, "shapes", "activations", "bound", "push")
         _need_between(self, 1e-6, 1, "stiffness")
@@ -130,8 +128,10 @@ class TrainConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        need(self.surface in SURFACES, "training", f"surface '{self.surface}'", f"it is one of {', '.join(SURFACES)}")
-        need(self.window >= 3, "training", f"a window of {self.window} poses", "inertia needs at least 3")
+        if self.surface not in SURFACES:
+            fail("training", f"surface '{self.surface}'", f"it is one of {', '.join(SURFACES)}")
+        if not self.window >= 3:
+            fail("training", f"a window of {self.window} poses", "inertia needs at least 3")
         _need_between(self, 1, MOST, "iterations", "batch", "warm_batch", "resting", "validate_every")
         _need_between(self, 3, MOST, "valid_frames")
         _need_between(self, 0, 1, "carry", "rotated", "noise_correlation", "kick")
@@ -197,7 +197,8 @@ PRESETS = {
 
 def preset_named(name: str) -> Preset:
     """Return a preset; raise `SsilkError` for an unknown name."""
-    need(name in PRESETS, f"preset '{name}'", "no such preset", f"it is one of {', '.join(PRESETS)}")
+    if name not in PRESETS:
+        fail(f"preset '{name}'", "no such preset", f"it is one of {', '.join(PRESETS)}")
     return PRESETS[name]
 
 
@@ -220,14 +221,14 @@ def overridden(config: Config, assignments: list[str]) -> Config:
     changes: dict[str, Any] = {}
     for assignment in assignments:
         name, _, text = assignment.partition("=")
-        need(name in types, f"option '{assignment}'", "no such setting", f"settings are {', '.join(types)}")
+        if name not in types:
+            fail(f"option '{assignment}'", "no such setting", f"settings are {', '.join(types)}")
         try:
             changes[name] = (
                 tuple(int(n) for n in text.split(",")) if types[name] is tuple else _converted(types[name], text)
             )
         except (ValueError, KeyError):
-            need(
-                False,
+            fail(
                 f"option '{assignment}'",
                 f"'{text}' is not a value for '{name}'",
                 f"a value of type {types[name].__name__} is needed",

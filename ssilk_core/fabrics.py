@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-from .errors import need
+from .errors import fail
 
 STRETCH_MODELS = ("stvk", "baraff_witkin")
 
@@ -39,22 +39,18 @@ class Fabric:
     drag: float = 0.3
 
     def __post_init__(self) -> None:
-        need(
-            self.stretch_model in STRETCH_MODELS,
-            f"fabric '{self.name}'",
-            f"stretch model '{self.stretch_model}'",
-            f"it is one of {', '.join(STRETCH_MODELS)}",
-        )
+        if self.stretch_model not in STRETCH_MODELS:
+            fail(
+                f"fabric '{self.name}'",
+                f"stretch model '{self.stretch_model}'",
+                f"it is one of {', '.join(STRETCH_MODELS)}",
+            )
         for item in fields(self):
             value = getattr(self, item.name)
-            if isinstance(value, (int, float)):
-                need(
-                    0 <= value < float("inf"),
-                    f"fabric '{self.name}'",
-                    f"{item.name} = {value}",
-                    "it must be finite and not negative",
-                )
-        need(self.density > 0, f"fabric '{self.name}'", "a density of zero", "it must be positive")
+            if isinstance(value, (int, float)) and not 0 <= value < float("inf"):
+                fail(f"fabric '{self.name}'", f"{item.name} = {value}", "it must be finite and not negative")
+        if not self.density > 0:
+            fail(f"fabric '{self.name}'", "a density of zero", "it must be positive")
 
 
 # Areal densities are common mid-weight values of each cloth. Stiffness is scaled from the neutral default
@@ -75,5 +71,6 @@ FABRICS: dict[str, Fabric] = {
 
 def fabric_named(name: str) -> Fabric:
     """Return a preset; raise `SsilkError` for an unknown name."""
-    need(name in FABRICS, f"fabric '{name}'", "no such preset", f"it is one of {', '.join(FABRICS)}")
+    if name not in FABRICS:
+        fail(f"fabric '{name}'", "no such preset", f"it is one of {', '.join(FABRICS)}")
     return FABRICS[name]

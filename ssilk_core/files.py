@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from .errors import SsilkError, fail, need
+from .errors import SsilkError, fail
 
 WRITABLE = "choose an output folder that exists and that you may write to"
 UNFINISHED = ".{}.partial-"  # how temporary names begin, the stem of the target in place of the braces
@@ -77,7 +77,8 @@ def need_writable(target: str | Path) -> None:
         SsilkError: `target` is a folder, or its folder cannot be made or written to.
     """
     target = Path(target)
-    need(not target.is_dir(), str(target), "this is a folder", "a file is written", "add a file name")
+    if target.is_dir():
+        fail(str(target), "this is a folder", "a file is written", "add a file name")
     folder = next(above for above in target.absolute().parents if above.exists())
     try:
         with tempfile.TemporaryFile(dir=folder):

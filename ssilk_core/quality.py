@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from itertools import product
 
 from .checkpoint import ModelFile
-from .errors import fail, need
+from .errors import fail
 from .reduction import Reduced, Reducer, Size
 
 ALL = 1_000_000  # more than any garment has
@@ -56,7 +56,8 @@ QUALITIES = {
 
 def quality_named(name: str) -> Quality:
     """Return a level; raise `SsilkError` for an unknown name."""
-    need(name in QUALITIES, f"quality '{name}'", "no such level", f"it is one of {', '.join(QUALITIES)}")
+    if name not in QUALITIES:
+        fail(f"quality '{name}'", "no such level", f"it is one of {', '.join(QUALITIES)}")
     return QUALITIES[name]
 
 

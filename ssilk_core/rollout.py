@@ -13,7 +13,7 @@ from torch import Tensor
 
 from .assets import Floats, GarmentPose, Motion
 from .config import LOST, RECOVERY
-from .errors import need
+from .errors import fail
 from .kinematics import frames_at, motion_transforms, resample, run_up, skinning_matrices, split_at_cuts
 from .model.descriptors import gravity_features, pose_features
 from .model.network import GarmentModel
@@ -73,8 +73,8 @@ def roll_blocks(model: GarmentModel, blocks: Iterable[Motion]) -> Iterator[Step]
     past: Motion | None = None
     state: list[Tensor] = []
     for block in blocks:
-        need(abs(block.fps - fps) < 1e-6, block.path, f"{block.fps:g} frames per second",
-             f"the model steps at {fps:g}")  # fmt: skip
+        if not abs(block.fps - fps) < 1e-6:
+            fail(block.path, f"{block.fps:g} frames per second", f"the model steps at {fps:g}")
         seen = block if past is None else _following(past, block)
         if _is_calm(seen, state):
             states = [state[-1]] * HISTORY

@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from .assets import Body, Deformer, SkinWeights
-from .errors import need
+from .errors import fail
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,8 +44,13 @@ TARGETS = {
 def need_influences(found: int, name: str, model: str) -> None:
     """Raise `SsilkError` where `found` joints move a vertex of a model, which are more than target `name` takes."""
     most = TARGETS[name].influences
-    need(most is None or found <= most, model, f"{found} joints move a vertex", f"--target {name} takes {most}",
-         f"learn what fewer can do: 'ssilk reduce --influences {most}' with the motions of the shots")  # fmt: skip
+    if not (most is None or found <= most):
+        fail(
+            model,
+            f"{found} joints move a vertex",
+            f"--target {name} takes {most}",
+            f"learn what fewer can do: 'ssilk reduce --influences {most}' with the motions of the shots",
+        )
 
 
 def capped(deformer: Deformer, target: Target) -> Deformer:

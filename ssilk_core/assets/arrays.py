@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import need
+from ..errors import fail
 
 UP = np.array([0.0, 1.0, 0.0])
 
@@ -30,10 +30,10 @@ def assign(instance: object, **values: object) -> None:
 def need_finite(array: NDArray, where: str, what: str) -> None:
     """Raise `SsilkError` where rows hold NaN or infinity."""
     bad = np.flatnonzero(~np.isfinite(array).all(axis=tuple(range(1, array.ndim))))
-    need(
-        len(bad) == 0,
-        where,
-        f"{len(bad)} of {len(array)} {what} hold NaN or infinity, first number {bad[0] if len(bad) else 0}",
-        "all must be finite",
-        "repair or re-export the source",
-    )
+    if len(bad) != 0:
+        fail(
+            where,
+            f"{len(bad)} of {len(array)} {what} hold NaN or infinity, first number {bad[0] if len(bad) else 0}",
+            "all must be finite",
+            "repair or re-export the source",
+        )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import need
+from ..errors import fail
 from .arrays import assign
 from .mesh import Mesh
 from .skeleton import Skeleton
@@ -23,13 +23,13 @@ class Body:
     skin: SkinWeights
 
     def __post_init__(self) -> None:
-        need(
-            self.skin.vertex_count == self.mesh.vertex_count,
-            self.mesh.path,
-            f"{self.skin.vertex_count} weight rows for {self.mesh.vertex_count} points",
-            "one row for each point is needed",
-            "bind the mesh again",
-        )
+        if self.skin.vertex_count != self.mesh.vertex_count:
+            fail(
+                self.mesh.path,
+                f"{self.skin.vertex_count} weight rows for {self.mesh.vertex_count} points",
+                "one row for each point is needed",
+                "bind the mesh again",
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,13 +51,13 @@ class Character:
         Raises:
             SsilkError: the character has no body mesh.
         """
-        need(
-            self.bodies,
-            self.path,
-            "the character has no skinned body mesh",
-            "a garment collides with at least one",
-            "bind a mesh to the skeleton, or name it with --body",
-        )
+        if not self.bodies:
+            fail(
+                self.path,
+                "the character has no skinned body mesh",
+                "a garment collides with at least one",
+                "bind a mesh to the skeleton, or name it with --body",
+            )
         if len(self.bodies) == 1:
             return self.bodies[0]
         offsets = np.cumsum([0] + [body.mesh.vertex_count for body in self.bodies])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import need
+from ..errors import fail
 from .arrays import Floats, assign, frozen
 from .scene import Scene
 from .skin import SkinWeights
@@ -30,12 +30,12 @@ class Deformer:
     def __post_init__(self) -> None:
         assign(self, shapes=frozen(self.shapes, np.float32))
         count = self.scene.garment.mesh.vertex_count
-        need(
-            self.shapes.ndim == 3 and self.shapes.shape[1:] == (count, 3),
-            self.scene.garment.mesh.path,
-            f"blendshapes of shape {self.shapes.shape}",
-            f"(shapes, {count}, 3) is needed",
-        )
+        if not (self.shapes.ndim == 3 and self.shapes.shape[1:] == (count, 3)):
+            fail(
+                self.scene.garment.mesh.path,
+                f"blendshapes of shape {self.shapes.shape}",
+                f"(shapes, {count}, 3) is needed",
+            )
         self.skin.check_joints(len(self.scene.joint_names))
 
     @property

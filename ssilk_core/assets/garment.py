@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import need
+from ..errors import fail
 from .arrays import Ints, assign, frozen
 from .mesh import Mesh
 from .skin import SkinWeights
@@ -32,9 +32,8 @@ class Garment:
 
     def __post_init__(self) -> None:
         count = self.mesh.vertex_count
-        if self.skin is not None:
-            need(
-                self.skin.vertex_count == count,
+        if self.skin is not None and self.skin.vertex_count != count:
+            fail(
                 self.mesh.path,
                 f"{self.skin.vertex_count} weight rows for {count} points",
                 "one row for each point is needed",
@@ -42,18 +41,18 @@ class Garment:
         if self.classes is not None:
             classes = frozen(self.classes, np.int8)
             assign(self, classes=classes)
-            need(
-                classes.shape == (count,),
-                self.mesh.path,
-                f"{classes.size} vertex classes for {count} points",
-                "primvars:ssilk:class needs one value for each point",
-                "paint the classes again",
-            )
+            if classes.shape != (count,):
+                fail(
+                    self.mesh.path,
+                    f"{classes.size} vertex classes for {count} points",
+                    "primvars:ssilk:class needs one value for each point",
+                    "paint the classes again",
+                )
             bad = int(np.count_nonzero((classes < PINNED) | (classes > LOOSE)))
-            need(
-                bad == 0,
-                self.mesh.path,
-                f"{bad} vertex classes are not 0, 1 or 2",
-                "pinned is 0, tight is 1, loose is 2",
-                "paint the classes again",
-            )
+            if bad != 0:
+                fail(
+                    self.mesh.path,
+                    f"{bad} vertex classes are not 0, 1 or 2",
+                    "pinned is 0, tight is 1, loose is 2",
+                    "paint the classes again",
+                )

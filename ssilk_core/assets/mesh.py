@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import need
+from ..errors import fail
 from .arrays import Floats, Ints, assign, frozen, need_finite
 
 
@@ -42,43 +42,33 @@ class Mesh:
 
     def _check_triangles(self) -> None:
         points, faces = self.points, self.faces
-        need(
-            points.ndim == 2 and points.shape[-1] == 3 and len(points) > 0,
-            self.path,
-            "the mesh has no points",
-            "a mesh needs points and faces",
-        )
-        need(
-            faces.ndim == 2 and faces.shape[-1] == 3 and len(faces) > 0,
-            self.path,
-            "the mesh has no faces",
-            "a mesh needs points and faces",
-        )
+        if not (points.ndim == 2 and points.shape[-1] == 3 and len(points) > 0):
+            fail(self.path, "the mesh has no points", "a mesh needs points and faces")
+        if not (faces.ndim == 2 and faces.shape[-1] == 3 and len(faces) > 0):
+            fail(self.path, "the mesh has no faces", "a mesh needs points and faces")
         need_finite(points, self.path, "points")
         bad = int(np.count_nonzero((faces < 0) | (faces >= len(points))))
-        need(
-            bad == 0,
-            self.path,
-            f"{bad} face indices lie outside 0 to {len(points) - 1}",
-            "an index names a point of the mesh",
-            "re-export the mesh",
-        )
+        if bad != 0:
+            fail(
+                self.path,
+                f"{bad} face indices lie outside 0 to {len(points) - 1}",
+                "an index names a point of the mesh",
+                "re-export the mesh",
+            )
 
     def _check_polygons(self, count: int) -> None:
         corners, uvs, last = self.indices_of_corners, self.uvs, len(self.points) - 1
-        need(
-            count == len(corners) and bool(((corners >= 0) & (corners <= last)).all()),
-            self.path,
-            "the polygons do not fit their points",
-            f"counts that add up to {len(corners)} corners, and indices from 0 to {last}, are needed",
-            "re-export the mesh",
-        )
-        need(
-            uvs is None or uvs.shape == (len(corners), 2),
-            self.path,
-            "texture coordinates do not match the face corners",
-            "one (u, v) for each corner is needed",
-        )
+        if not (count == len(corners) and bool(((corners >= 0) & (corners <= last)).all())):
+            fail(
+                self.path,
+                "the polygons do not fit their points",
+                f"counts that add up to {len(corners)} corners, and indices from 0 to {last}, are needed",
+                "re-export the mesh",
+            )
+        if not (uvs is None or uvs.shape == (len(corners), 2)):
+            fail(
+                self.path, "texture coordinates do not match the face corners", "one (u, v) for each corner is needed"
+            )
 
     @property
     def indices_of_corners(self) -> Ints:

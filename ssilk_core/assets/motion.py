@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..errors import need
+from ..errors import fail
 from .arrays import Floats, assign, frozen, need_finite
 
 
@@ -31,23 +31,21 @@ class Motion:
 
     def __post_init__(self) -> None:
         rotations, translations = frozen(self.rotations, np.float64), frozen(self.translations, np.float64)
-        need(
-            np.isfinite(self.fps) and self.fps > 0,
-            self.path,
-            f"a rate of {self.fps} frames per second",
-            "the rate must be positive",
-        )
-        need(
-            rotations.ndim == 3 and rotations.shape[-1] == 4 and translations.shape == (*rotations.shape[:2], 3),
-            self.path,
-            f"rotations of shape {rotations.shape} and translations of shape {translations.shape}",
-            "(frames, joints, 4) and (frames, joints, 3) are needed",
-        )
-        need(len(rotations) > 0, self.path, "the motion has no frames", "at least one is needed")
+        if not (np.isfinite(self.fps) and self.fps > 0):
+            fail(self.path, f"a rate of {self.fps} frames per second", "the rate must be positive")
+        if not (rotations.ndim == 3 and rotations.shape[-1] == 4 and translations.shape == (*rotations.shape[:2], 3)):
+            fail(
+                self.path,
+                f"rotations of shape {rotations.shape} and translations of shape {translations.shape}",
+                "(frames, joints, 4) and (frames, joints, 3) are needed",
+            )
+        if not len(rotations) > 0:
+            fail(self.path, "the motion has no frames", "at least one is needed")
         need_finite(rotations, self.path, "frames of rotations")
         need_finite(translations, self.path, "frames of translations")
         norms = np.linalg.norm(rotations, axis=-1, keepdims=True)
-        need(norms.min() > 1e-6, self.path, "a rotation is the zero quaternion", "rotations are unit quaternions")
+        if not norms.min() > 1e-6:
+            fail(self.path, "a rotation is the zero quaternion", "rotations are unit quaternions")
         assign(self, rotations=frozen(rotations / norms, np.float64), translations=translations)
 
     @property

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import need
+from ..errors import fail
 from .arrays import Floats, Ints, assign, frozen
 from .skeleton import check_rigid
 from .skin import SkinWeights
@@ -40,18 +40,14 @@ class ProxyRig:
             parents=frozen(self.parents, np.int32),
             bind_transforms=frozen(np.reshape(self.bind_transforms, (-1, 4, 4)), np.float64),
         )
-        need(
-            self.parents.shape == (self.proxy_count,),
-            self.path,
-            f"{len(self.parents)} parents for {self.proxy_count} proxy joints",
-            "one for each is needed",
-        )
-        need(
-            len(set(self.joint_names)) == self.proxy_count,
-            self.path,
-            "proxy joint names repeat",
-            "each needs its own name",
-        )
+        if self.parents.shape != (self.proxy_count,):
+            fail(
+                self.path,
+                f"{len(self.parents)} parents for {self.proxy_count} proxy joints",
+                "one for each is needed",
+            )
+        if len(set(self.joint_names)) != self.proxy_count:
+            fail(self.path, "proxy joint names repeat", "each needs its own name")
         if self.proxy_count:
             check_rigid(self.bind_transforms, self.path, "bind transform", self.joint_names)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..errors import need
+from ..errors import fail
 from .arrays import Floats, Ints, assign, frozen
 from .character import Character
 from .garment import Garment
@@ -42,39 +42,29 @@ class Scene:
 
     def _check_garment(self) -> None:
         where = self.garment.mesh.path
-        need(
-            self.garment.skin is not None,
-            where,
-            "the garment has no skinning weights",
-            "weights are needed",
-            "run 'ssilk rig' on it",
-        )
-        need(
-            self.garment.classes is not None,
-            where,
-            "the garment has no vertex classes",
-            "classes are needed",
-            "run 'ssilk rig' on it",
-        )
+        if self.garment.skin is None:
+            fail(where, "the garment has no skinning weights", "weights are needed", "run 'ssilk rig' on it")
+        if self.garment.classes is None:
+            fail(where, "the garment has no vertex classes", "classes are needed", "run 'ssilk rig' on it")
         self.plain_skin.check_joints(self.character.skeleton.joint_count)
 
     def _check_rig(self) -> None:
         rig, joints = self.rig, self.character.skeleton.joint_count
         rig.skin.check_joints(joints + rig.proxy_count)
-        need(
-            rig.skin.vertex_count == self.garment.mesh.vertex_count,
-            rig.path,
-            f"{rig.skin.vertex_count} rig weight rows for {self.garment.mesh.vertex_count} points",
-            "one row for each point is needed",
-            "generate the rig again",
-        )
+        if rig.skin.vertex_count != self.garment.mesh.vertex_count:
+            fail(
+                rig.path,
+                f"{rig.skin.vertex_count} rig weight rows for {self.garment.mesh.vertex_count} points",
+                "one row for each point is needed",
+                "generate the rig again",
+            )
         late = np.flatnonzero(rig.parents >= joints + np.arange(rig.proxy_count))
-        need(
-            late.size == 0 and (rig.parents >= 0).all(),
-            rig.path,
-            "a proxy joint stands before its parent or has none",
-            "each proxy hangs from an earlier joint",
-        )
+        if not (late.size == 0 and (rig.parents >= 0).all()):
+            fail(
+                rig.path,
+                "a proxy joint stands before its parent or has none",
+                "each proxy hangs from an earlier joint",
+            )
 
     @property
     def plain_skin(self) -> SkinWeights:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import need
+from ..errors import fail
 from .arrays import Floats, Ints, assign, frozen, need_finite
 
 
@@ -31,8 +31,10 @@ class Skeleton:
 
     def __post_init__(self) -> None:
         count = len(self.joint_names)
-        need(count > 0, self.path, "the skeleton has no joints", "at least one is needed")
-        need(len(set(self.joint_names)) == count, self.path, "joint names repeat", "each joint needs its own name")
+        if not count > 0:
+            fail(self.path, "the skeleton has no joints", "at least one is needed")
+        if len(set(self.joint_names)) != count:
+            fail(self.path, "joint names repeat", "each joint needs its own name")
         assign(
             self,
             joint_names=tuple(self.joint_names),
@@ -40,20 +42,16 @@ class Skeleton:
             bind_transforms=frozen(self.bind_transforms, np.float64),
             rest_transforms=frozen(self.rest_transforms, np.float64),
         )
-        need(
-            self.parents.shape == (count,),
-            self.path,
-            f"{len(self.parents)} parents for {count} joints",
-            "one parent for each joint is needed",
-        )
+        if self.parents.shape != (count,):
+            fail(self.path, f"{len(self.parents)} parents for {count} joints", "one parent for each joint is needed")
         bad = np.flatnonzero((self.parents >= np.arange(count)) | (self.parents < -1))
-        need(
-            bad.size == 0,
-            self.path,
-            f"joint '{self.joint_names[bad[0]] if bad.size else ''}' stands before its parent",
-            "parents come first and a joint is never its own ancestor",
-            "reorder the joints",
-        )
+        if bad.size != 0:
+            fail(
+                self.path,
+                f"joint '{self.joint_names[bad[0]] if bad.size else ''}' stands before its parent",
+                "parents come first and a joint is never its own ancestor",
+                "reorder the joints",
+            )
         check_rigid(self.bind_transforms, self.path, "bind transform", self.joint_names)
         check_rigid(self.rest_transforms, self.path, "rest transform", self.joint_names)
 
@@ -64,20 +62,20 @@ class Skeleton:
 
 def check_rigid(transforms: Floats, where: str, what: str, names: tuple[str, ...]) -> None:
     """Raise `SsilkError` unless every (4, 4) matrix is a proper rotation and a translation (to 1e-3)."""
-    need(
-        transforms.shape == (len(names), 4, 4),
-        where,
-        f"{what}s of shape {transforms.shape}",
-        f"({len(names)}, 4, 4) is needed, one matrix for each joint",
-    )
+    if transforms.shape != (len(names), 4, 4):
+        fail(
+            where,
+            f"{what}s of shape {transforms.shape}",
+            f"({len(names)}, 4, 4) is needed, one matrix for each joint",
+        )
     need_finite(transforms, where, f"{what}s")
     linear = transforms[:, :3, :3]
     error = np.abs(linear @ linear.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     bad = np.flatnonzero((error > 1e-3) | (np.linalg.det(linear) < 0))
-    need(
-        bad.size == 0,
-        where,
-        f"the {what} of joint '{names[bad[0]] if bad.size else ''}' scales, shears or mirrors",
-        "joints may rotate and move only",
-        "apply the scale to the rig and export again",
-    )
+    if bad.size != 0:
+        fail(
+            where,
+            f"the {what} of joint '{names[bad[0]] if bad.size else ''}' scales, shears or mirrors",
+            "joints may rotate and move only",
+            "apply the scale to the rig and export again",
+        )

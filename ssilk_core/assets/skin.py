@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import need
+from ..errors import fail
 from .arrays import Floats, Ints, assign, frozen, need_finite
 
 
@@ -21,30 +21,30 @@ class SkinWeights:
 
     def __post_init__(self) -> None:
         assign(self, indices=frozen(self.indices, np.int32), weights=frozen(self.weights, np.float64))
-        need(
-            self.indices.ndim == 2 and self.indices.shape == self.weights.shape,
-            self.path,
-            f"joint indices of shape {self.indices.shape} and weights of shape {self.weights.shape}",
-            "both need the shape (vertices, influences)",
-        )
+        if not (self.indices.ndim == 2 and self.indices.shape == self.weights.shape):
+            fail(
+                self.path,
+                f"joint indices of shape {self.indices.shape} and weights of shape {self.weights.shape}",
+                "both need the shape (vertices, influences)",
+            )
         need_finite(self.weights, self.path, "weight rows")
         negative = int(np.count_nonzero(self.weights < 0))
-        need(
-            negative == 0,
-            self.path,
-            f"{negative} skinning weights are negative",
-            "weights lie in [0, 1]",
-            "normalise the weights and export again",
-        )
+        if negative != 0:
+            fail(
+                self.path,
+                f"{negative} skinning weights are negative",
+                "weights lie in [0, 1]",
+                "normalise the weights and export again",
+            )
         sums = self.weights.sum(axis=1)
         empty = int(np.count_nonzero(sums <= 1e-8))
-        need(
-            empty == 0,
-            self.path,
-            f"{empty} vertices have no skinning weight",
-            "each vertex needs at least one",
-            "bind or paint these vertices, or leave the weights out so that they are transferred from the body",
-        )
+        if empty != 0:
+            fail(
+                self.path,
+                f"{empty} vertices have no skinning weight",
+                "each vertex needs at least one",
+                "bind or paint these vertices, or leave the weights out so that they are transferred from the body",
+            )
         assign(self, weights=frozen(self.weights / sums[:, None], np.float64))
 
     @property
@@ -54,13 +54,13 @@ class SkinWeights:
     def check_joints(self, joint_count: int) -> None:
         """Raise `SsilkError` when an index points past the joints."""
         bad = int(np.count_nonzero((self.indices < 0) | (self.indices >= joint_count)))
-        need(
-            bad == 0,
-            self.path,
-            f"{bad} joint indices lie outside 0 to {joint_count - 1}",
-            "an index names a joint of the skeleton",
-            "bind the mesh again",
-        )
+        if bad != 0:
+            fail(
+                self.path,
+                f"{bad} joint indices lie outside 0 to {joint_count - 1}",
+                "an index names a joint of the skeleton",
+                "bind the mesh again",
+            )
 
     def dense(self, joint_count: int) -> Floats:
         """Return the weights as a dense float64 matrix, shape (vertices, joints)."""

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from ..assets import PINNED, Ints, Scene
-from ..errors import need
+from ..errors import fail
 from ..model.skinning import Skinning
 from .descriptors import MOVING, ROOT, STILL, split_features
 
@@ -30,12 +30,8 @@ class BaselineConfig:
     fps: float = 30.0
 
     def __post_init__(self) -> None:
-        need(
-            self.method in METHODS,
-            f"baseline '{self.method}'",
-            "no such method",
-            f"it is one of {', '.join(METHODS)}",
-        )
+        if self.method not in METHODS:
+            fail(f"baseline '{self.method}'", "no such method", f"it is one of {', '.join(METHODS)}")
 
 
 class Baseline(nn.Module, ABC):

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from ..devices import chosen_device
-from ..errors import need
+from ..errors import fail
 from ..events import Checkpoint, Message, Progress, Reporter, Started
 from ..training.curve import Point, with_point
 from ..training.job import TrainJob
@@ -127,8 +127,13 @@ class BaselineRun:
         state, base = self.state, self.job.base
         score = self.validator.score(self.stepper.averaged)
         broken = " and ".join(not_finite(score))
-        need(not broken, str(base.output), f"{broken} not finite at iteration {state.iteration}",
-             "the best model before it is kept", "train again with smaller steps (--set rate=...)")  # fmt: skip
+        if broken:
+            fail(
+                str(base.output),
+                f"{broken} not finite at iteration {state.iteration}",
+                "the best model before it is kept",
+                "train again with smaller steps (--set rate=...)",
+            )
         self.report(verdict(state.iteration, score, self.plain, base.scene.rig.proxy_count > 0))
         finite = {name: value for name, value in self.batch.items() if math.isfinite(value)}
         state.curve = with_point(state.curve, Point(state.iteration, state.seconds, finite, score))

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from ..config import TrainConfig
 from ..energy import GarmentEnergy
-from ..errors import need
+from ..errors import fail
 from ..model.body import CollisionBody
 from ..training.objective import Objective, Terms, total
 from ..training.step import Stepper
@@ -43,9 +43,11 @@ class BaselineObjective(Objective):
     ) -> None:
         super().__init__(model, energy, body, bank, surface)  # type: ignore[arg-type]
         self.judged, self.mixed = judged, mixed
-        need(0 <= mixed < 1, "training", f"a share of {mixed:g} windows mixed", "it lies between 0 and 1")
+        if not 0 <= mixed < 1:
+            fail("training", f"a share of {mixed:g} windows mixed", "it lies between 0 and 1")
         where = f"baseline '{model.config.method}'"
-        need(not mixed or isinstance(model, NCS), where, "mixed windows", "only NCS tells motion from pose")
+        if not (not mixed or isinstance(model, NCS)):
+            fail(where, "mixed windows", "only NCS tells motion from pose")
 
     def rolled(self, sampler: WindowSampler) -> Terms:
         """Return every term of the judged frames of each slot's window, in order of time, (judged * batch,)."""
@@ -87,12 +89,12 @@ class BaselineStepper(Stepper):
     averaged: Baseline  # type: ignore[assignment]
 
     def __init__(self, objective: BaselineObjective, config: TrainConfig, generator: torch.Generator) -> None:
-        need(
-            config.window >= objective.judged + 2,
-            "training",
-            f"a window of {config.window} poses of which {objective.judged} are judged",
-            "inertia needs two before them",
-        )
+        if not config.window >= objective.judged + 2:
+            fail(
+                "training",
+                f"a window of {config.window} poses of which {objective.judged} are judged",
+                "inertia needs two before them",
+            )
         sampler = WindowSampler(objective.bank, config, 0, generator)  # no state goes from window to window
         super().__init__(objective.model, objective, sampler, config)  # type: ignore[arg-type]
         for module in self.averaged.modules():

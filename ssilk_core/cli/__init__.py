@@ -8,10 +8,9 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
-from ssilk_core import __version__
-from ssilk_core.errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, SsilkError, fail
-from ssilk_core.events import Failed, JsonReporter, Reporter, TextReporter
-
+from .. import __version__
+from ..errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, SsilkError, fail
+from ..events import Failed, JsonReporter, Reporter, TextReporter
 from . import (
     bake,
     demo,

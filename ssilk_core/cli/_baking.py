@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ssilk_core.assets import Deformer, Floats, GarmentPose, Motion, Scene, Skeleton
-from ssilk_core.devices import chosen_device
-from ssilk_core.errors import VerificationError, need
-from ssilk_core.events import Message, Progress, Reporter, silent
-from ssilk_core.fabrics import Fabric
-from ssilk_core.kinematics import deform, plain_deformer, plain_poses, resample
-from ssilk_core.targets import TARGETS, Target, capped
-
+from ..assets import Deformer, Floats, GarmentPose, Motion, Scene, Skeleton
+from ..devices import chosen_device
+from ..errors import VerificationError, fail
+from ..events import Message, Progress, Reporter, silent
+from ..fabrics import Fabric
+from ..kinematics import deform, plain_deformer, plain_poses, resample
+from ..targets import TARGETS, Target, capped
 from ._quality import lost
 from ._refining import Refinement
 from .options import INPUTS
@@ -29,9 +28,9 @@ if TYPE_CHECKING:
     from ssilk_usd.garment_api import GarmentRecord
     from ssilk_usd.units import StageUnits
 
-    from ssilk_core.checkpoint import ModelFile
-    from ssilk_core.farm.tasks import Task
-    from ssilk_core.model.network import GarmentModel
+    from ..checkpoint import ModelFile
+    from ..farm.tasks import Task
+    from ..model.network import GarmentModel
 
 CHUNK = 256  # frames in memory at once
 MOST_SAMPLES = 64  # in each frame
@@ -145,7 +144,7 @@ class Bake:
         if self.model is None:
             yield from plain_poses(self.motion.frame_count)
             return
-        from ssilk_core.rollout import garment_poses
+        from ..rollout import garment_poses
 
         self.recovered.clear()
         rate, pre_roll = self.motion.fps, self.request.pre_roll
@@ -177,7 +176,7 @@ class Bake:
     def _decoded(self, pose: GarmentPose) -> Floats:
         if self.model is None:
             return deform(self.deformer, self.motion, pose)
-        from ssilk_core.rollout import decode
+        from ..rollout import decode
 
         return decode(self.model, self.motion, pose)
 
@@ -236,7 +235,7 @@ class Dressed:
         from ssilk_usd.read_stage import split_location
         from ssilk_usd.read_visibility import read_hidden
 
-        from ssilk_core.files import sha256
+        from ..files import sha256
 
         request = replace(self.request, motion=motion)
         source = read_motion(motion, self.file.scene.character.skeleton, root=request.root)
@@ -264,7 +263,7 @@ class Dressed:
 
     def _cut(self, motion: Motion) -> Dressed:
         """Return the garment with as much kept as the request says: what is best for this motion."""
-        from ssilk_core.reduction import Reducer, Size
+        from ..reduction import Reducer, Size
 
         reducer = Reducer(self.file, [motion])
         found = reducer.reduced(Size.of(self.request.keep))
@@ -281,7 +280,7 @@ class Dressed:
 
 def worn(file: ModelFile, like: GarmentModel, request: BakeRequest) -> tuple[GarmentModel, Deformer]:
     """Return a model's network on the character of another of the same garment, and what its target takes."""
-    from ssilk_core.checkpoint import network
+    from ..checkpoint import network
 
     model = network(file, replace(file.scene, character=like.scene.character))
     model.to(chosen_device(request.device))
@@ -305,14 +304,15 @@ def dressed(request: BakeRequest) -> Dressed:
     """
     from ssilk_usd.read_stage import open_stage
 
-    from ssilk_core.checkpoint import load_model, network
-    from ssilk_core.files import sha256
+    from ..checkpoint import load_model, network
+    from ..files import sha256
 
-    need(request.target in TARGETS, "--target", f"'{request.target}'", f"it is one of {', '.join(TARGETS)}")
-    need(1 <= request.samples <= MOST_SAMPLES, "--samples-per-frame", f"{request.samples} samples in each frame",
-         f"1 to {MOST_SAMPLES} are allowed")  # fmt: skip
-    need(0 <= request.pre_roll <= MOST_PRE_ROLL, "--pre-roll", f"{request.pre_roll:g} seconds",
-         f"0 to {MOST_PRE_ROLL:g} are allowed")  # fmt: skip
+    if request.target not in TARGETS:
+        fail("--target", f"'{request.target}'", f"it is one of {', '.join(TARGETS)}")
+    if not 1 <= request.samples <= MOST_SAMPLES:
+        fail("--samples-per-frame", f"{request.samples} samples in each frame", f"1 to {MOST_SAMPLES} are allowed")
+    if not 0 <= request.pre_roll <= MOST_PRE_ROLL:
+        fail("--pre-roll", f"{request.pre_roll:g} seconds", f"0 to {MOST_PRE_ROLL:g} are allowed")
     device, target = chosen_device(request.device), TARGETS[request.target]
     file = load_model(request.model)
     stage = open_stage(request.stage)
@@ -371,22 +371,34 @@ def need_same_skeleton(found: Skeleton, trained: Skeleton) -> None:
     """Raise `SsilkError` unless a skeleton has the joints of the model, with its bind transforms."""
     allowed, todo = "a model bakes on the character it was trained with", "train on this character"
     missing = sorted(set(trained.joint_names) - set(found.joint_names))
-    need(not missing, found.path, f"{len(missing)} of the model's joints are missing ({', '.join(missing[:3])})",
-         allowed, todo)  # fmt: skip
+    if missing:
+        fail(
+            found.path, f"{len(missing)} of the model's joints are missing ({', '.join(missing[:3])})", allowed, todo
+        )
     same = found.joint_names == trained.joint_names
-    need(same, found.path, "its joints are more than the model's, or in another order", allowed, todo)
+    if not same:
+        fail(found.path, "its joints are more than the model's, or in another order", allowed, todo)
     away = np.linalg.norm((found.bind_transforms - trained.bind_transforms)[:, :3, 3], axis=1)
     joint = int(away.argmax())
-    need(away[joint] < BIND_TOLERANCE, found.path,
-         f"joint '{found.joint_names[joint]}' is bound {away[joint]:.3g} m from where the model has it",
-         allowed, todo)  # fmt: skip
+    if not away[joint] < BIND_TOLERANCE:
+        fail(
+            found.path,
+            f"joint '{found.joint_names[joint]}' is bound {away[joint]:.3g} m from where the model has it",
+            allowed,
+            todo,
+        )
     turned = np.abs((found.bind_transforms - trained.bind_transforms)[:, :3, :3]).max(axis=(1, 2))
     joint = int(turned.argmax())
-    need(turned[joint] < BIND_TOLERANCE, found.path,
-         f"joint '{found.joint_names[joint]}' is bound at another rotation than the model has it",
-         allowed, todo)  # fmt: skip
+    if not turned[joint] < BIND_TOLERANCE:
+        fail(
+            found.path,
+            f"joint '{found.joint_names[joint]}' is bound at another rotation than the model has it",
+            allowed,
+            todo,
+        )
 
 
 def _at_rate(motion: Motion, fps: float) -> Motion:
-    need(0 < fps <= 10_000, "--fps", f"{fps:g} frames per second", "a positive rate is needed")
+    if not 0 < fps <= 10_000:
+        fail("--fps", f"{fps:g} frames per second", "a positive rate is needed")
     return replace(resample(motion, fps), start=motion.start * fps / motion.fps)

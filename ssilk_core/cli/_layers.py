@@ -10,13 +10,12 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ssilk_core.errors import need
-from ssilk_core.events import Message, Reporter, silent
-from ssilk_core.farm.record import NAME, Record, is_current, read_record, task_key, write_record
-from ssilk_core.farm.tasks import Task
-from ssilk_core.files import remove_unfinished, replacing, sha256
-from ssilk_core.targets import need_influences
-
+from ..errors import fail
+from ..events import Message, Reporter, silent
+from ..farm.record import NAME, Record, is_current, read_record, task_key, write_record
+from ..farm.tasks import Task
+from ..files import remove_unfinished, replacing, sha256
+from ..targets import need_influences
 from ._baking import Bake, BakeRequest, Dressed, dressed
 
 if TYPE_CHECKING:
@@ -65,7 +64,8 @@ def key_of(task: Task) -> str:
     """
     from ssilk_usd.read_stage import content_hash, split_location
 
-    need(Path(task.model).is_file(), task.model, "there is no such model file", "a file of 'ssilk train' is needed")
+    if not Path(task.model).is_file():
+        fail(task.model, "there is no such model file", "a file of 'ssilk train' is needed")
     contents = {
         "model": sha256(task.model),
         "stage": content_hash(task.stage),

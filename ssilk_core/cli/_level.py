@@ -9,14 +9,13 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from ssilk_core.assets import GarmentPose
-from ssilk_core.checkpoint import ModelFile, load_model
-from ssilk_core.cost import POINT, ShotBytes
-from ssilk_core.errors import need
-from ssilk_core.events import Reporter
-from ssilk_core.quality import quality_named
-from ssilk_core.reduction import Reducer
-
+from ..assets import GarmentPose
+from ..checkpoint import ModelFile, load_model
+from ..cost import POINT, ShotBytes
+from ..errors import fail
+from ..events import Reporter
+from ..quality import quality_named
+from ..reduction import Reducer
 from ._baking import Bake, open_bake
 from ._quality import level_size, spent
 
@@ -34,8 +33,13 @@ def levelled(bake: Bake, options: argparse.Namespace, report: Reporter) -> Bake:
     most = bake.target.influences or bake.influences
     if not (options.quality or options.budget or bake.influences > most):
         return bake
-    need(bake.model is not None, "--plain", "plain skinning has no level of quality", "--quality and --budget are "
-         "about the network", "leave one of them out")  # fmt: skip
+    if bake.model is None:
+        fail(
+            "--plain",
+            "plain skinning has no level of quality",
+            "--quality and --budget are about the network",
+            "leave one of them out",
+        )
     request = bake.request
     if options.quality and request.fps is None:
         request = replace(request, fps=quality_named(options.quality).rate(bake.source.fps))

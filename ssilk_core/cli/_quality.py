@@ -7,14 +7,14 @@ import argparse
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from ssilk_core.events import Message, Reporter
-from ssilk_core.quality import QUALITIES, best_within, budget_of, in_units, quality_named
-from ssilk_core.reduction import Size
+from ..events import Message, Reporter
+from ..quality import QUALITIES, best_within, budget_of, in_units, quality_named
+from ..reduction import Size
 
 if TYPE_CHECKING:
-    from ssilk_core.assets import Motion
-    from ssilk_core.checkpoint import ModelFile
-    from ssilk_core.reduction import Reduced, Reducer
+    from ..assets import Motion
+    from ..checkpoint import ModelFile
+    from ..reduction import Reduced, Reducer
 
 NUMBERS = ("shapes", "joints", "influences")
 
@@ -59,8 +59,8 @@ def spent(
     Raises:
         SsilkError: nothing fits, or the text is no budget.
     """
-    from ssilk_core.cost import play_time
-    from ssilk_core.runtime import Player
+    from ..cost import play_time
+    from ..runtime import Player
 
     budget = budget_of(text)
 

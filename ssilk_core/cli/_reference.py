@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ssilk_core.assets import Floats
-from ssilk_core.errors import need
+from ..assets import Floats
+from ..errors import fail
 
 if TYPE_CHECKING:
     from ssilk_usd.play import Shot
@@ -33,7 +33,8 @@ class References:
         """
         from ssilk_usd.read_stage import LAYER_SUFFIXES
 
-        need(folder.is_dir(), str(folder), "there is no such folder", "one with shots of 'ssilk simulate' is needed")
+        if not folder.is_dir():
+            fail(str(folder), "there is no such folder", "one with shots of 'ssilk simulate' is needed")
         within = folder / garment if (folder / garment).is_dir() else folder
         self._paths = {path.stem: path for path in sorted(within.iterdir()) if path.suffix in LAYER_SUFFIXES}
         self.vertex_count, self.fps = vertex_count, fps
@@ -51,12 +52,16 @@ class References:
         """
         shot, path = self._shot(clip), str(self._paths[clip])
         count = len(shot.frame_times)
-        need(
-            frames.stop <= count, path, f"{count} frames", f"the clip has {frames.stop} or more", "simulate it again"
-        )
+        if not frames.stop <= count:
+            fail(path, f"{count} frames", f"the clip has {frames.stop} or more", "simulate it again")
         points = np.stack([shot.garment_points(shot.frame_times[frame]) for frame in frames])
-        need(points.shape[1] == self.vertex_count, path, f"a garment of {points.shape[1]} vertices",
-             f"the model's has {self.vertex_count}", "simulate the model's garment")  # fmt: skip
+        if points.shape[1] != self.vertex_count:
+            fail(
+                path,
+                f"a garment of {points.shape[1]} vertices",
+                f"the model's has {self.vertex_count}",
+                "simulate the model's garment",
+            )
         return points
 
     def _opened(self, clip: str) -> Shot:
@@ -64,6 +69,11 @@ class References:
 
         path = self._paths[clip]
         shot = Shot(path)
-        need(abs(shot.fps - self.fps) < 1e-6, str(path), f"{shot.fps:g} frames per second",
-             f"the model steps at {self.fps:g}", f"simulate with --fps {self.fps:g}")  # fmt: skip
+        if not abs(shot.fps - self.fps) < 1e-6:
+            fail(
+                str(path),
+                f"{shot.fps:g} frames per second",
+                f"the model steps at {self.fps:g}",
+                f"simulate with --fps {self.fps:g}",
+            )
         return shot

@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ssilk_core.assets import Floats, GarmentPose
-from ssilk_core.devices import chosen_device
-from ssilk_core.errors import VerificationError, need
-from ssilk_core.events import Progress, Reporter, silent
+from ..assets import Floats, GarmentPose
+from ..devices import chosen_device
+from ..errors import VerificationError, fail
+from ..events import Progress, Reporter, silent
 
 if TYPE_CHECKING:
-    from ssilk_core.refine import Refiner
-
+    from ..refine import Refiner
     from ._baking import Bake
 
 OUTPUTS = ("points", "joints")
@@ -35,10 +34,15 @@ class Refinement:
 
     def __init__(self, bake: Bake) -> None:
         request = bake.request
-        need(request.refined in OUTPUTS, "--refined-output", f"'{request.refined}'", f"it is one of {OUTPUTS}")
-        need(bake.model is not None or request.refined == "points", "--plain", "plain skinning has no proxies and no "
-             "blendshapes to put refined vertices back onto", "they can be written as points",
-             "use --refined-output points")  # fmt: skip
+        if request.refined not in OUTPUTS:
+            fail("--refined-output", f"'{request.refined}'", f"it is one of {OUTPUTS}")
+        if not (bake.model is not None or request.refined == "points"):
+            fail(
+                "--plain",
+                "plain skinning has no proxies and no blendshapes to put refined vertices back onto",
+                "they can be written as points",
+                "use --refined-output points",
+            )
         self.bake = bake
         self.points: list[Floats] = []
         self.poses: list[GarmentPose] = []
@@ -48,7 +52,7 @@ class Refinement:
         """Refine all frames, unless that is done."""
         if self.figures:
             return
-        from ssilk_core.refine import Summary
+        from ..refine import Summary
 
         summary, bake = Summary(), self.bake
         for frame in self._refiner().frames(bake.motion, bake.rolled(silent)):
@@ -60,7 +64,7 @@ class Refinement:
         self.figures.update({"iterations": bake.request.refine, **rounded, **lost})
 
     def _refiner(self) -> Refiner:
-        from ssilk_core.refine import RefineOptions, Refiner
+        from ..refine import RefineOptions, Refiner
 
         bake = self.bake
         options = RefineOptions(iterations=bake.request.refine, feedback=bake.request.feedback)
@@ -69,8 +73,8 @@ class Refinement:
 
     def _put_back(self) -> dict[str, float]:
         """Fit poses to the points; return what that loses, in mm."""
-        from ssilk_core.energy import GarmentEnergy
-        from ssilk_core.refine import Refitter
+        from ..energy import GarmentEnergy
+        from ..refine import Refitter
 
         bake = self.bake
         assert bake.model is not None

@@ -21,20 +21,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ssilk_core.errors import EXIT_OK, need
-from ssilk_core.events import Message, Reporter, Result, Started, silent
-from ssilk_core.files import replacing
-from ssilk_core.quality import quality_named
-from ssilk_core.targets import TARGETS
-
+from ..errors import EXIT_OK, fail
+from ..events import Message, Reporter, Result, Started, silent
+from ..files import replacing
+from ..quality import quality_named
+from ..targets import TARGETS
 from ._quality import add_level
 from .options import add_bake, check_output, is_folder, layer_tasks, tasks_of
 
 if TYPE_CHECKING:
     from ssilk_usd.shot import ShotSummary
 
-    from ssilk_core.farm.tasks import Task
-
+    from ..farm.tasks import Task
     from ._baking import Bake, BakeRequest
 
 
@@ -50,8 +48,13 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Bake and verify."""
     if is_folder(options.output):
-        need(not (options.quality or options.budget), str(options.output), "a level of quality for layers",
-             "their assets are the same for all shots", "bake models that 'ssilk reduce' made")  # fmt: skip
+        if options.quality or options.budget:
+            fail(
+                str(options.output),
+                "a level of quality for layers",
+                "their assets are the same for all shots",
+                "bake models that 'ssilk reduce' made",
+            )
         return _bake_layers(options, report)
     return _bake_file(options, report)
 
@@ -98,10 +101,14 @@ def _one_task(options: argparse.Namespace) -> Task:
     from ssilk_usd.read_stage import split_location
 
     tasks, suffixes = tasks_of(options), TARGETS[options.target].suffixes
-    need(len(tasks) == 1 and not options.points, str(options.output), "one file", "it holds one garment in one shot "
-         "and no point cache", "name a folder")  # fmt: skip
-    need(options.output.suffix in suffixes, str(options.output), f"the suffix is '{options.output.suffix}'",
-         f"{options.target} takes {', '.join(suffixes)}")  # fmt: skip
+    if not (len(tasks) == 1 and not options.points):
+        fail(str(options.output), "one file", "it holds one garment in one shot and no point cache", "name a folder")
+    if options.output.suffix not in suffixes:
+        fail(
+            str(options.output),
+            f"the suffix is '{options.output.suffix}'",
+            f"{options.target} takes {', '.join(suffixes)}",
+        )
     (task,) = tasks
     check_output(options.output, task.model, task.stage, split_location(task.motion)[0])
     return task
@@ -125,9 +132,13 @@ def _request(task: Task, options: argparse.Namespace) -> BakeRequest:
 
     level = quality_named(options.quality).refine if options.quality else 0
     request = replace(BakeRequest.of(task), refine=task.refine or level)
-    need(not (options.budget and request.refine and request.refined == "points"), "--budget", "a budget for points",
-         "every vertex is stored at every frame, whatever is kept of the model", "use --refined-output joints, or "
-         "leave the budget out")  # fmt: skip
+    if options.budget and request.refine and request.refined == "points":
+        fail(
+            "--budget",
+            "a budget for points",
+            "every vertex is stored at every frame, whatever is kept of the model",
+            "use --refined-output joints, or leave the budget out",
+        )
     return request
 
 

@@ -12,11 +12,11 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ssilk_core.errors import EXIT_OK
-from ssilk_core.events import Message, Reporter, Result
+from ..errors import EXIT_OK
+from ..events import Message, Reporter, Result
 
 if TYPE_CHECKING:
-    from ssilk_core.assets import Mesh
+    from ..assets import Mesh
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -34,8 +34,8 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Make the inputs, then run the commands; the first that fails ends the demo with its exit code."""
-    from ssilk_core.cli import main
-    from ssilk_core.demo.shipped import open_shipped, origin
+    from ..cli import main
+    from ..demo.shipped import open_shipped, origin
 
     wardrobe = _make_inputs(options.out, report)
     shipped = open_shipped(options.garment, wardrobe[options.garment])
@@ -53,7 +53,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
 def _shipped(options: argparse.Namespace) -> list[list[str]]:
     """Return the commands that bake and film the shipped model; its body is the character, its file the garment."""
-    from ssilk_core.demo.shipped import shipped_path
+    from ..demo.shipped import shipped_path
 
     shots = _shots(options)
     bake = ["bake", str(shipped_path(options.garment)), "--stage", str(_body())]
@@ -111,8 +111,8 @@ def _make_inputs(out: Path, report: Reporter) -> dict[str, Mesh]:
     from ssilk_usd.read_character import read_character
     from ssilk_usd.write import write_garment, write_motion
 
-    from ssilk_core.demo.garments import GARMENTS, build_garment
-    from ssilk_core.demo.motions import demo_shot, training_motions
+    from ..demo.garments import GARMENTS, build_garment
+    from ..demo.motions import demo_shot, training_motions
 
     character = read_character(_body())
     wardrobe = {name: build_garment(name, character).mesh for name in GARMENTS}

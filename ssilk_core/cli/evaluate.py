@@ -17,20 +17,19 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ssilk_core.errors import EXIT_OK, need
-from ssilk_core.events import Reporter, Result, Started, finite
-from ssilk_core.files import replacing
-
+from ..errors import EXIT_OK, fail
+from ..events import Reporter, Result, Started, finite
+from ..files import replacing
 from . import options as shared
 
 if TYPE_CHECKING:
     import torch
 
-    from ssilk_core.baselines.networks import Baseline
-    from ssilk_core.checkpoint import ModelFile
-    from ssilk_core.evaluation.methods import Dressed
-    from ssilk_core.evaluation.run import EvaluationOptions, Playlist, Row, Subject
-    from ssilk_core.model.network import GarmentModel
+    from ..baselines.networks import Baseline
+    from ..checkpoint import ModelFile
+    from ..evaluation.methods import Dressed
+    from ..evaluation.run import EvaluationOptions, Playlist, Row, Subject
+    from ..model.network import GarmentModel
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -63,13 +62,14 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Evaluate; return 0."""
-    from ssilk_core.baselines.files import load_network
-    from ssilk_core.devices import chosen_device
-    from ssilk_core.evaluation.run import evaluate
-    from ssilk_core.evaluation.tables import tables
+    from ..baselines.files import load_network
+    from ..devices import chosen_device
+    from ..evaluation.run import evaluate
+    from ..evaluation.tables import tables
 
     if options.output:
-        need(options.output.suffix == ".json", str(options.output), "not a name for figures", "it ends in .json")
+        if options.output.suffix != ".json":
+            fail(str(options.output), "not a name for figures", "it ends in .json")
         shared.check_output(options.output, *options.models, options.index)
     asked = _asked(options)
     device = chosen_device(options.device)
@@ -93,7 +93,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
 
 def _asked(options: argparse.Namespace) -> EvaluationOptions:
-    from ssilk_core.evaluation.run import EvaluationOptions
+    from ..evaluation.run import EvaluationOptions
 
     return EvaluationOptions(
         sequence=options.sequence,
@@ -116,7 +116,7 @@ class Opened:
     @property
     def method(self) -> str:
         """What the network is: "ssilk", "snug", "ncs", or "ncs*" where it was trained with rotations."""
-        from ssilk_core.baselines.files import KEY
+        from ..baselines.files import KEY
 
         told = self.file.provenance
         if KEY not in told:
@@ -141,7 +141,7 @@ def _by_garment(opened: Iterable[Opened]) -> list[list[Opened]]:
 
 def _subjects(models: list[Opened], device: torch.device) -> list[Subject]:
     """Return the networks of one garment, called after their files where several are of one method."""
-    from ssilk_core.evaluation.run import Subject
+    from ..evaluation.run import Subject
 
     methods = [one.method for one in models]
     names = [
@@ -155,8 +155,7 @@ def _dressed(file: ModelFile, options: argparse.Namespace, device: torch.device)
     """Put the garment of a model on the character of the stage."""
     from ssilk_usd.read_stage import open_stage
 
-    from ssilk_core.evaluation.methods import Dressed
-
+    from ..evaluation.methods import Dressed
     from ._baking import on_character
 
     scene = on_character(file, open_stage(options.stage), options.root)
@@ -167,8 +166,7 @@ def _playlist(options: argparse.Namespace, dressed: Dressed) -> Playlist:
     """Read the clips that are asked for, and what there is to compare with."""
     from ssilk_usd.read_motion import read_motion, read_motions
 
-    from ssilk_core.evaluation.run import Playlist
-
+    from ..evaluation.run import Playlist
     from ._reference import References
 
     skeleton = dressed.scene.character.skeleton
@@ -191,17 +189,23 @@ def _splits(options: argparse.Namespace) -> tuple[dict[str, list[str]], dict[str
     """Return the names of clips by split, their files, and the motions of the training."""
     from ssilk_usd.read_motion import motion_files
 
-    from ssilk_core.evaluation.splits import chosen, read_index, splits_of
+    from ..evaluation.splits import chosen, read_index, splits_of
 
     folder: Path = options.motions
-    need(folder.is_dir(), str(folder), "there is no such folder", "one of motion files is needed")
+    if not folder.is_dir():
+        fail(str(folder), "there is no such folder", "one of motion files is needed")
     files = {path.stem: path for path in motion_files([folder])}
     index = read_index(options.index) if options.index else []
     splits = splits_of(index, options.clips) if options.index else {"all": options.clips or list(files)}
-    need(splits, str(options.index), "no clip of valid, inertia or flips is chosen", "one at least is needed")
+    if not splits:
+        fail(str(options.index), "no clip of valid, inertia or flips is chosen", "one at least is needed")
     missing = sorted({name for names in splits.values() for name in names} - files.keys())
-    need(not missing, str(folder), f"{len(missing)} clips are missing ({', '.join(missing[:3])})",
-         f"it holds {', '.join(list(files)[:3])} and so on")  # fmt: skip
+    if missing:
+        fail(
+            str(folder),
+            f"{len(missing)} clips are missing ({', '.join(missing[:3])})",
+            f"it holds {', '.join(list(files)[:3])} and so on",
+        )
     single = {name: [name] for names in splits.values() for name in names} if options.by_clip else {}
     seen = options.trained_on or [files[name] for name in chosen(index, "train") if name in files]
     return splits | single, files, seen
@@ -213,9 +217,9 @@ def _write(
     """Write the figures with where they come from."""
     import torch
 
-    from ssilk_core import __version__
-    from ssilk_core.devices import chosen_device, device_name
-    from ssilk_core.files import sha256
+    from .. import __version__
+    from ..devices import chosen_device, device_name
+    from ..files import sha256
 
     document = {
         "units": "SI",

@@ -12,9 +12,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ssilk_core.errors import EXIT_OK, need
-from ssilk_core.events import Reporter, Result
-
+from ..errors import EXIT_OK, fail
+from ..events import Reporter, Result
 from . import options as shared
 
 
@@ -26,12 +25,13 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Write the network; say what goes in and comes out."""
-    from ssilk_core.checkpoint import load_model, network
-    from ssilk_core.model.export import export_onnx
-    from ssilk_core.parameters import descriptor_sizes
+    from ..checkpoint import load_model, network
+    from ..model.export import export_onnx
+    from ..parameters import descriptor_sizes
 
     output: Path = options.output
-    need(output.suffix == ".onnx", str(output), f"a file that ends in '{output.suffix}'", "ONNX files end in .onnx")
+    if output.suffix != ".onnx":
+        fail(str(output), f"a file that ends in '{output.suffix}'", "ONNX files end in .onnx")
     shared.check_output(output, options.model)
     file = load_model(options.model)
     model = network(file)

@@ -14,16 +14,14 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ssilk_core.errors import EXIT_OK, EXIT_TASKS, need
-from ssilk_core.events import Failed, Garment, Progress, Reporter, Result, Started, silent
-from ssilk_core.farm.openjd import TEMPLATE, BundleOptions, write_bundle
-from ssilk_core.farm.tasks import Task
-
+from ..errors import EXIT_OK, EXIT_TASKS, fail
+from ..events import Failed, Garment, Progress, Reporter, Result, Started, silent
+from ..farm.openjd import TEMPLATE, BundleOptions, write_bundle
+from ..farm.tasks import Task
 from .options import add_bake, layer_tasks
 
 if TYPE_CHECKING:
-    from ssilk_core.farm.cluster import Outcome
-
+    from ..farm.cluster import Outcome
     from ._layers import Wardrobe
 
 
@@ -56,8 +54,10 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     tasks = [_absolute(task) for task in layer_tasks(options)]
     if options.bundle:
         return _write(tasks, options, report)
-    need((options.cores or 1) > 0, "--cores", str(options.cores), "a positive number is needed")
-    need(options.output, "--cluster", "no folder for the layers", "-o names one")
+    if not (options.cores or 1) > 0:
+        fail("--cores", str(options.cores), "a positive number is needed")
+    if not options.output:
+        fail("--cluster", "no folder for the layers", "-o names one")
     return _run(tasks, options, report)
 
 
@@ -74,8 +74,10 @@ def _absolute(task: Task) -> Task:
 
 def _write(tasks: Sequence[Task], options: argparse.Namespace, report: Reporter) -> int:
     for name in ("chunk", "memory", "timeout"):
-        need(getattr(options, name) > 0, f"--{name}", str(getattr(options, name)), "a positive number is needed")
-    need(options.seconds >= 0, "--seconds", str(options.seconds), "no negative number is allowed")
+        if not getattr(options, name) > 0:
+            fail(f"--{name}", str(getattr(options, name)), "a positive number is needed")
+    if not options.seconds >= 0:
+        fail("--seconds", str(options.seconds), "no negative number is allowed")
     chosen = BundleOptions(**{name: getattr(options, name) for name in BundleOptions.__dataclass_fields__})
     write_bundle(options.bundle, tasks, options.output, chosen)
     output = f" -p Output={options.output.absolute()}" if options.output else ""
@@ -90,8 +92,7 @@ def _write(tasks: Sequence[Task], options: argparse.Namespace, report: Reporter)
 
 
 def _run(tasks: Sequence[Task], options: argparse.Namespace, report: Reporter) -> int:
-    from ssilk_core.farm.cluster import run_on_cluster
-
+    from ..farm.cluster import run_on_cluster
     from ._layers import clear, write_stages
 
     report(Started("farm", len(tasks), {"output": str(options.output)}))

@@ -12,18 +12,17 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ssilk_core.config import PRESETS, preset_named
-from ssilk_core.errors import EXIT_BAD_INPUT, EXIT_OK, need
-from ssilk_core.events import Reporter, Result, silent
-from ssilk_core.files import replacing
-
+from ..config import PRESETS, preset_named
+from ..errors import EXIT_BAD_INPUT, EXIT_OK, fail
+from ..events import Reporter, Result, silent
+from ..files import replacing
 from . import options as shared
 
 if TYPE_CHECKING:
     from ssilk_usd.units import StageUnits
 
-    from ssilk_core.preflight.inspection import Inspected
-    from ssilk_core.preflight.units import FileUnits
+    from ..preflight.inspection import Inspected
+    from ..preflight.units import FileUnits
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -45,8 +44,8 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Inspect; return 0, or 2 when there are errors."""
-    from ssilk_core.preflight.inspection import inspect
-    from ssilk_core.preflight.table import format_findings
+    from ..preflight.inspection import inspect
+    from ..preflight.table import format_findings
 
     world, repaired = _world(options, report), None
     if options.fix:
@@ -69,8 +68,8 @@ def _world(options: argparse.Namespace, report: Reporter) -> Inspected:
     from ssilk_usd.read_motion import read_motions
     from ssilk_usd.repair import repair_lock
 
-    from ssilk_core.preflight.inspection import Inspected
-    from ssilk_core.preflight.motion import MotionFile
+    from ..preflight.inspection import Inspected
+    from ..preflight.motion import MotionFile
 
     character, garment, rig = shared.read(options, report)
     file, prim = shared.wardrobe(options)
@@ -85,7 +84,7 @@ def _world(options: argparse.Namespace, report: Reporter) -> Inspected:
 def _units(path: Path) -> FileUnits:
     from ssilk_usd.facts import stage_facts
 
-    from ssilk_core.preflight.units import FileUnits
+    from ..preflight.units import FileUnits
 
     facts = stage_facts(path)
     return FileUnits(
@@ -97,12 +96,12 @@ def _fix(options: argparse.Namespace, world: Inspected) -> list[str]:
     """Write the repaired copy; return what was repaired."""
     from ssilk_usd.repair import write_repaired, write_with_units
 
-    from ssilk_core.preflight.repair import plan_repair
+    from ..preflight.repair import plan_repair
 
     file, prim = shared.wardrobe(options)
     units, stated = _corrected_units(world)
-    need(not (options.fix.exists() and options.fix.samefile(file)), str(options.fix), "this is the file to repair",
-         "--fix writes a copy", "name another file")  # fmt: skip
+    if options.fix.exists() and options.fix.samefile(file):
+        fail(str(options.fix), "this is the file to repair", "--fix writes a copy", "name another file")
     shared.check_output(options.fix, options.stage)
     with replacing(options.fix) as half_done:
         # Units first: everything else is measured in them.
@@ -117,8 +116,8 @@ def _corrected_units(world: Inspected) -> tuple[StageUnits, list[str]]:
     """Return what the garment's file should state, and in words what it did not."""
     from ssilk_usd.units import StageUnits
 
-    from ssilk_core.preflight.fit import misplacement
-    from ssilk_core.preflight.units import misread
+    from ..preflight.fit import misplacement
+    from ..preflight.units import misread
 
     body, old = world.character.merged_body().mesh, world.wardrobe
     units = old.corrected(misread(body) if world.stage == old else misplacement(world.garment.mesh, body))

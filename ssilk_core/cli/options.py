@@ -8,20 +8,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ssilk_core.config import overridden
-from ssilk_core.errors import need
-from ssilk_core.events import Reporter
-from ssilk_core.fabrics import FABRICS, Fabric, fabric_named
-from ssilk_core.farm.tasks import Task, plan
-from ssilk_core.files import need_writable
-from ssilk_core.setup.classes import ClassOptions
-from ssilk_core.setup.rig import RigOptions
-from ssilk_core.targets import TARGETS, need_influences
+from ..config import overridden
+from ..errors import fail
+from ..events import Reporter
+from ..fabrics import FABRICS, Fabric, fabric_named
+from ..farm.tasks import Task, plan
+from ..files import need_writable
+from ..setup.classes import ClassOptions
+from ..setup.rig import RigOptions
+from ..targets import TARGETS, need_influences
 
 INPUTS = ("model", "stage", "motion")  # what a shot is baked from
 
 if TYPE_CHECKING:
-    from ssilk_core.assets import Character, Garment, ProxyRig, Scene
+    from ..assets import Character, Garment, ProxyRig, Scene
 
 
 def add_scene(verb: argparse.ArgumentParser) -> None:
@@ -154,11 +154,16 @@ def layer_tasks(options: argparse.Namespace) -> list[Task]:
     Raises:
         SsilkError: the target takes no layers, or fewer influences than a model has: all shots share its weights.
     """
-    from ssilk_core.checkpoint import load_model
+    from ..checkpoint import load_model
 
     target = TARGETS[options.target]
-    need(".usdc" in target.suffixes, f"--target {options.target}", "layers", f"it takes {', '.join(target.suffixes)}",
-         "bake one garment over one motion into such a file")  # fmt: skip
+    if ".usdc" not in target.suffixes:
+        fail(
+            f"--target {options.target}",
+            "layers",
+            f"it takes {', '.join(target.suffixes)}",
+            "bake one garment over one motion into such a file",
+        )
     tasks = tasks_of(options)
     for model in sorted({task.model for task in tasks if target.influences and not task.plain}):
         need_influences(load_model(model).scene.rig.skin.indices.shape[1], options.target, model)
@@ -186,22 +191,22 @@ def check_output(output: Path, *inputs: Path | str | None) -> None:
     """
     need_writable(output)
     same = output.exists() and any(Path(path).exists() and output.samefile(path) for path in inputs if path)
-    need(not same, str(output), "the output is also an input", "inputs are never overwritten", "name another file")
+    if same:
+        fail(str(output), "the output is also an input", "inputs are never overwritten", "name another file")
 
 
 def read(options: argparse.Namespace, report: Reporter) -> tuple[Character, Garment, ProxyRig | None]:
     """Read the character, the garment and its authored rig, as the options of `add_scene` say."""
     from ssilk_usd.read_scene import read_scene
 
-    need(
-        options.stage.exists(), str(options.stage), "there is no such file", "a USD stage with a character is needed"
-    )
+    if not options.stage.exists():
+        fail(str(options.stage), "there is no such file", "a USD stage with a character is needed")
     return read_scene(options.stage, root=options.root, bodies=options.body, garment=options.garment, report=report)
 
 
 def load_scene(options: argparse.Namespace, report: Reporter, *, anew: bool = False) -> Scene:
     """Read and prepare a scene; what is missing (weights, classes, rig) is made and announced."""
-    from ssilk_core.setup.prepare import prepare_scene
+    from ..setup.prepare import prepare_scene
 
     character, garment, rig = read(options, report)
     if anew:

@@ -15,16 +15,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ssilk_core.errors import EXIT_OK, need
-from ssilk_core.events import Reporter, Result
-
+from ..errors import EXIT_OK, fail
+from ..events import Reporter, Result
 from . import options as shared
 from ._quality import NUMBERS, add_level, level_size, lost, spent
 
 if TYPE_CHECKING:
-    from ssilk_core.assets import Motion
-    from ssilk_core.checkpoint import ModelFile
-    from ssilk_core.reduction import Reduced, Reducer
+    from ..assets import Motion
+    from ..checkpoint import ModelFile
+    from ..reduction import Reduced, Reducer
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -44,11 +43,11 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     """Reduce and write."""
     from ssilk_usd.read_motion import motion_files
 
-    from ssilk_core.checkpoint import load_model, save_model
-    from ssilk_core.reduction import Reducer
+    from ..checkpoint import load_model, save_model
+    from ..reduction import Reducer
 
-    need(options.output.suffix == ".safetensors", str(options.output), "not a name for a model",
-         "it ends in .safetensors")  # fmt: skip
+    if options.output.suffix != ".safetensors":
+        fail(str(options.output), "not a name for a model", "it ends in .safetensors")
     shared.check_output(options.output, options.model, *motion_files(options.motions))
     file = load_model(options.model)
     motions = _motions(file, options)
@@ -70,14 +69,19 @@ def _motions(file: ModelFile, options: argparse.Namespace) -> list[Motion]:
 
     known = file.provenance.get("motions", {})
     there = [path for path in known if Path(split_location(path)[0]).is_file()]
-    need(options.motions or there, str(options.model), "the motions of its training are not where they were",
-         "some are needed to tell what is missed least", "name motion files or folders with --motions")  # fmt: skip
+    if not (options.motions or there):
+        fail(
+            str(options.model),
+            "the motions of its training are not where they were",
+            "some are needed to tell what is missed least",
+            "name motion files or folders with --motions",
+        )
     return read_motions(options.motions or there, file.scene.character.skeleton)
 
 
 def _chosen(options: argparse.Namespace, reducer: Reducer, motions: list[Motion], report: Reporter) -> Reduced:
     """Return the model that the options ask for."""
-    from ssilk_core.cost import model_bytes
+    from ..cost import model_bytes
 
     named = {name: value for name in NUMBERS if (value := getattr(options, name)) is not None}
     size = replace(level_size(options.quality, reducer.whole), **named)

@@ -14,17 +14,16 @@ from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ssilk_core.errors import EXIT_OK, need
-from ssilk_core.events import Reporter, Result, Started
-from ssilk_core.fabrics import Fabric
-from ssilk_core.files import replacing
-
+from ..errors import EXIT_OK, fail
+from ..events import Reporter, Result, Started
+from ..fabrics import Fabric
+from ..files import replacing
 from .options import check_output
 
 if TYPE_CHECKING:
     from ssilk_usd.garment_api import GarmentRecord
 
-    from ssilk_core.report.page import Section
+    from ..report.page import Section
 
 MODEL = ".safetensors"
 
@@ -43,8 +42,8 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Measure, draw and write."""
-    from ssilk_core.report.figures import section_of
-    from ssilk_core.report.page import page
+    from ..report.figures import section_of
+    from ..report.page import page
 
     _check(options)
     given = [section_of(path) for path in options.figures]
@@ -58,13 +57,15 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
 
 def _check(options: argparse.Namespace) -> None:
-    need(options.output.suffix == ".html", str(options.output), "not a name for a page", "it ends in .html")
+    if options.output.suffix != ".html":
+        fail(str(options.output), "not a name for a page", "it ends in .html")
     check_output(options.output, options.subject, *options.figures)
-    need(options.subject.is_file(), str(options.subject), "there is no such file", "a model or a shot is needed")
-    need(bool(options.stage) == bool(options.motion), "report", "one of --stage and --motion",
-         "a model is shown on both, or on neither")  # fmt: skip
-    need(options.subject.suffix == MODEL or not options.stage, str(options.subject), "--stage for a shot",
-         "shots hold their character")  # fmt: skip
+    if not options.subject.is_file():
+        fail(str(options.subject), "there is no such file", "a model or a shot is needed")
+    if bool(options.stage) != bool(options.motion):
+        fail("report", "one of --stage and --motion", "a model is shown on both, or on neither")
+    if not (options.subject.suffix == MODEL or not options.stage):
+        fail(str(options.subject), "--stage for a shot", "shots hold their character")
 
 
 def _shot(path: Path, report: Reporter) -> list[Section]:
@@ -73,8 +74,8 @@ def _shot(path: Path, report: Reporter) -> list[Section]:
     from ssilk_usd.provenance import read_provenance
     from ssilk_usd.read_shot import read_parts
 
-    from ssilk_core.report.page import Section, facts
-    from ssilk_core.report.shots import Dressed, shot_sections
+    from ..report.page import Section, facts
+    from ..report.shots import Dressed, shot_sections
 
     shot = Shot(path)
     parts = read_parts(shot)
@@ -84,8 +85,10 @@ def _shot(path: Path, report: Reporter) -> list[Section]:
         for index, (mesh, part) in enumerate(zip(shot.meshes, parts))
         if mesh.is_garment
     ]
-    need(garments, str(path), "no mesh is marked as a garment", "one at least is needed", "see 'ssilk rig'")
-    need(shot.frame_times, str(path), "the shot has no frames", "one at least is needed")
+    if not garments:
+        fail(str(path), "no mesh is marked as a garment", "one at least is needed", "see 'ssilk rig'")
+    if not shot.frame_times:
+        fail(str(path), "the shot has no frames", "one at least is needed")
     bodies = {index: part.mesh for index, part in enumerate(parts) if not shot.meshes[index].is_garment}
     sections = shot_sections(shot, garments, bodies, report)
     records = {str(part.mesh.path): asdict(part.record) for part in parts if part.record}
@@ -103,9 +106,9 @@ def _fabric(record: GarmentRecord | None) -> Fabric:
 
 def _model(options: argparse.Namespace, report: Reporter) -> list[Section]:
     """Return the sections of a model, its provenance last."""
-    from ssilk_core.checkpoint import load_model
-    from ssilk_core.report.figures import learning_of
-    from ssilk_core.report.page import Section, facts
+    from ..checkpoint import load_model
+    from ..report.figures import learning_of
+    from ..report.page import Section, facts
 
     path: Path = options.subject
     file = load_model(path)

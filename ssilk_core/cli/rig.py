@@ -10,9 +10,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ssilk_core.errors import EXIT_OK
-from ssilk_core.events import Reporter, Result, Started
-
+from ..errors import EXIT_OK
+from ..events import Reporter, Result, Started
 from . import options as shared
 
 
@@ -29,7 +28,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     import numpy as np
     from ssilk_usd.rig_io import write_rigged_stage
 
-    from ssilk_core.assets import CLASS_NAMES
+    from ..assets import CLASS_NAMES
 
     shared.check_output(options.output, options.stage, shared.wardrobe(options)[0])
     report(Started("rig", options.proxies))

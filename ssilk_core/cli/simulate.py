@@ -17,19 +17,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ssilk_core.errors import EXIT_OK, need
-from ssilk_core.events import Progress, Reporter, Result, Started
-from ssilk_core.fabrics import Fabric
-
+from ..errors import EXIT_OK, fail
+from ..events import Progress, Reporter, Result, Started
+from ..fabrics import Fabric
 from . import options as shared
 
 if TYPE_CHECKING:
     import torch
     from ssilk_usd.points import PointCache
 
-    from ssilk_core.assets import Floats, Motion, Scene
-    from ssilk_core.simulate import SimulationOptions
-    from ssilk_core.simulate.simulator import SimulatedFrame
+    from ..assets import Floats, Motion, Scene
+    from ..simulate import SimulationOptions
+    from ..simulate.simulator import SimulatedFrame
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -64,9 +63,9 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     """Simulate and write."""
     from ssilk_usd.read_motion import motion_files, read_motion
 
-    from ssilk_core.devices import chosen_device
-    from ssilk_core.simulate import SimulationOptions
-    from ssilk_core.simulate.newton import SolverOptions
+    from ..devices import chosen_device
+    from ..simulate import SimulationOptions
+    from ..simulate.newton import SolverOptions
 
     outputs = _outputs(options.output, options.motion)
     for output in outputs:
@@ -116,13 +115,20 @@ def _outputs(output: Path, motions: Sequence[Path]) -> list[Path]:
     from ssilk_usd.read_stage import LAYER_SUFFIXES, split_location
 
     if output.suffix in LAYER_SUFFIXES:
-        need(len(motions) == 1, str(output), f"one file for {len(motions)} motions", "each shot is a file of its own",
-             "name a folder")  # fmt: skip
+        if len(motions) != 1:
+            fail(
+                str(output), f"one file for {len(motions)} motions", "each shot is a file of its own", "name a folder"
+            )
         return [output]
     names = [Path(split_location(str(motion))[0]).stem for motion in motions]
     same = sorted({name for name in names if names.count(name) > 1})
-    need(not same, "--motion", f"several files are called {', '.join(same)}", "shots are named after their motions",
-         "simulate them into separate folders")  # fmt: skip
+    if same:
+        fail(
+            "--motion",
+            f"several files are called {', '.join(same)}",
+            "shots are named after their motions",
+            "simulate them into separate folders",
+        )
     return [output / f"{name}.usdc" for name in names]
 
 
@@ -136,7 +142,7 @@ def _written(
     report: Reporter,
 ) -> dict[str, object]:
     """Simulate into open files, frame by frame, and return figures of the whole."""
-    from ssilk_core.simulate import Simulator, shots_of
+    from ..simulate import Simulator, shots_of
 
     simulator, motions = Simulator(scene, fabric, settings, device=device), [shot.motion for shot in shots]
     played = shots_of(motions, settings)

@@ -13,14 +13,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ssilk_core.errors import EXIT_OK, EXIT_VERIFICATION, need
-from ssilk_core.events import Message, Progress, Reporter, Result, Started
-
+from ..errors import EXIT_OK, EXIT_VERIFICATION, fail
+from ..events import Message, Progress, Reporter, Result, Started
 from .options import check_output
 
 if TYPE_CHECKING:
-    from ssilk_core.stress.outcome import Outcome
-    from ssilk_core.stress.subject import Subject
+    from ..stress.outcome import Outcome
+    from ..stress.subject import Subject
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -45,14 +44,19 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Run the cases and tabulate them."""
-    from ssilk_core.stress.cases import CASES
-    from ssilk_core.stress.outcome import markdown
+    from ..stress.cases import CASES
+    from ..stress.outcome import markdown
 
     if options.output:
         check_output(options.output, options.model, options.stage)
     subject, cases = _subject(options), [case for case in CASES if case.matches(options.only)]
-    need(cases, "--only", f"no case contains {' or '.join(options.only)}", "'ssilk stress --help' names the option",
-         f"groups are {', '.join(dict.fromkeys(case.group for case in CASES))}")  # fmt: skip
+    if not cases:
+        fail(
+            "--only",
+            f"no case contains {' or '.join(options.only)}",
+            "'ssilk stress --help' names the option",
+            f"groups are {', '.join(dict.fromkeys(case.group for case in CASES))}",
+        )
     report(Started("stress", len(cases)))
     found, faults = [], []
     for number, case in enumerate(cases):
@@ -74,9 +78,8 @@ def _subject(options: argparse.Namespace) -> Subject:
     from ssilk_usd.read_motion import read_motion
     from ssilk_usd.read_stage import open_stage
 
-    from ssilk_core.checkpoint import load_model
-    from ssilk_core.stress.subject import FULL, QUICK, Subject
-
+    from ..checkpoint import load_model
+    from ..stress.subject import FULL, QUICK, Subject
     from ._baking import on_character
 
     file = load_model(options.model)
@@ -86,10 +89,10 @@ def _subject(options: argparse.Namespace) -> Subject:
 
 
 def _write(options: argparse.Namespace, outcomes: list[Outcome]) -> None:
-    from ssilk_core import __version__
-    from ssilk_core.devices import chosen_device, device_name
-    from ssilk_core.events import finite
-    from ssilk_core.files import replacing, sha256
+    from .. import __version__
+    from ..devices import chosen_device, device_name
+    from ..events import finite
+    from ..files import replacing, sha256
 
     document: dict[str, Any] = {
         "ssilk": __version__,

@@ -12,11 +12,11 @@ import signal
 from collections.abc import Sequence
 from pathlib import Path
 
-from ssilk_core.errors import EXIT_OK, EXIT_TASKS, SsilkError, VerificationError
-from ssilk_core.events import Event, Failed, Garment, Message, Progress, Reporter, Result, Started
-from ssilk_core.farm.job import numbers, read_job
-from ssilk_core.farm.openjd import OpenJdReporter
-from ssilk_core.farm.tasks import Task
+from ..errors import EXIT_OK, EXIT_TASKS, SsilkError, VerificationError
+from ..events import Event, Failed, Garment, Message, Progress, Reporter, Result, Started
+from ..farm.job import numbers, read_job
+from ..farm.openjd import OpenJdReporter
+from ..farm.tasks import Task
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:

@@ -16,18 +16,16 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ssilk_core import __version__
-from ssilk_core.errors import EXIT_OK, need
-from ssilk_core.events import Reporter, Result, Started
-
+from .. import __version__
+from ..errors import EXIT_OK, fail
+from ..events import Reporter, Result, Started
 from . import options as shared
 
 if TYPE_CHECKING:
-    from ssilk_core.assets import Motion
-    from ssilk_core.checkpoint import ModelFile
-    from ssilk_core.evaluation.methods import Dressed, Method, Reel
-    from ssilk_core.trade.measure import Meter, Weigh
-
+    from ..assets import Motion
+    from ..checkpoint import ModelFile
+    from ..evaluation.methods import Dressed, Method, Reel
+    from ..trade.measure import Meter, Weigh
     from ._baking import Bake
 
 CLIPS = 2  # that are measured on where none are named
@@ -51,21 +49,18 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Sweep; return 0."""
-    from ssilk_core.trade.judging import judged
-    from ssilk_core.trade.plot import write_plot
-    from ssilk_core.trade.sweep import Results, sweep
-    from ssilk_core.trade.table import judging_table, table
-    from ssilk_core.trade.variants import variants
+    from ..trade.judging import judged
+    from ..trade.plot import write_plot
+    from ..trade.sweep import Results, sweep
+    from ..trade.table import judging_table, table
+    from ..trade.variants import variants
 
     if options.output:
-        need(options.output.suffix == ".json", str(options.output), "not a name for figures", "it ends in .json")
+        if options.output.suffix != ".json":
+            fail(str(options.output), "not a name for figures", "it ends in .json")
         shared.check_output(options.output, *options.models)
-    need(
-        options.stage.is_file(),
-        str(options.stage),
-        "there is no such file",
-        "a USD stage with the character is needed",
-    )
+    if not options.stage.is_file():
+        fail(str(options.stage), "there is no such file", "a USD stage with the character is needed")
     bench = Bench(options)
     results = Results(options.output, bench.asked)
     results.resume(report)
@@ -95,20 +90,30 @@ class Bench:
     """
 
     def __init__(self, options: argparse.Namespace) -> None:
-        from ssilk_core.checkpoint import load_model
-        from ssilk_core.devices import chosen_device
-        from ssilk_core.files import sha256
+        from ..checkpoint import load_model
+        from ..devices import chosen_device
+        from ..files import sha256
 
         self.options, self.device = options, chosen_device(options.device)
         self.files: dict[Path, ModelFile] = {path: load_model(path) for path in options.models}
         first = next(iter(self.files.values()))
         names = [path.stem for path in self.files]
-        need(len(set(names)) == len(names), ", ".join(map(str, self.files)), "several models have one name",
-             "points are told apart by the model's file name", "rename a file")  # fmt: skip
+        if len(set(names)) != len(names):
+            fail(
+                ", ".join(map(str, self.files)),
+                "several models have one name",
+                "points are told apart by the model's file name",
+                "rename a file",
+            )
         for path, file in self.files.items():
             same = file.scene.garment.mesh.points.tobytes() == first.scene.garment.mesh.points.tobytes()
-            need(same and file.config.fps == first.config.fps, str(path), "a model of another garment, or rate",
-                 "models of one garment are compared", "sweep it by itself")  # fmt: skip
+            if not (same and file.config.fps == first.config.fps):
+                fail(
+                    str(path),
+                    "a model of another garment, or rate",
+                    "models of one garment are compared",
+                    "sweep it by itself",
+                )
         self.paths, self.others = self._motions(first)
         self.clips = {name: self._read(path, first) for name, path in self.paths.items()}
         self.asked: dict[str, Any] = {
@@ -122,10 +127,10 @@ class Bench:
 
     def meter(self, path: Path, file: ModelFile, *, only: str | None = None) -> Meter:
         """Return what measures a model on all clips, cut for other motions; or on `only` one, cut for it."""
-        from ssilk_core.evaluation.methods import reel_of
-        from ssilk_core.evaluation.takes import takes_of
-        from ssilk_core.reduction import Reducer
-        from ssilk_core.trade.measure import Meter
+        from ..evaluation.methods import reel_of
+        from ..evaluation.takes import takes_of
+        from ..reduction import Reducer
+        from ..trade.measure import Meter
 
         dressed = self._dressed(file)
         clips = {only: self.clips[only]} if only else self.clips
@@ -138,8 +143,7 @@ class Bench:
         """Put a garment on the character of the stage."""
         from ssilk_usd.read_stage import open_stage
 
-        from ssilk_core.evaluation.methods import Dressed
-
+        from ..evaluation.methods import Dressed
         from ._baking import on_character
 
         scene = on_character(file, open_stage(self.options.stage), self.options.root)
@@ -147,8 +151,7 @@ class Bench:
 
     def _reference(self, dressed: Dressed, reel: Reel) -> Method | None:
         """Return what the simulator made of the clips, where a folder of that is named."""
-        from ssilk_core.evaluation.methods import Cache
-
+        from ..evaluation.methods import Cache
         from ._reference import References
 
         folder: Path | None = self.options.reference
@@ -156,8 +159,13 @@ class Bench:
             return None
         found = References(folder, dressed.name, dressed.scene.garment.mesh.vertex_count, dressed.fps)
         missing = sorted(self.clips.keys() - found.clips)
-        need(not missing, str(folder), f"no shot of {', '.join(missing)}", "each clip needs one",
-             "simulate them with 'ssilk simulate'")  # fmt: skip
+        if missing:
+            fail(
+                str(folder),
+                f"no shot of {', '.join(missing)}",
+                "each clip needs one",
+                "simulate them with 'ssilk simulate'",
+            )
         return Cache("simulator", found.read, dressed, reel)
 
     def _weigh(self, path: Path) -> Weigh:
@@ -180,12 +188,17 @@ class Bench:
         from ssilk_usd.read_motion import motion_files
 
         folder: Path = self.options.motions
-        need(folder.is_dir(), str(folder), "there is no such folder", "one of motion files is needed")
+        if not folder.is_dir():
+            fail(str(folder), "there is no such folder", "one of motion files is needed")
         files = {path.stem: path for path in motion_files([folder])}
         names = self.options.clips or list(files)[:CLIPS]
         missing = sorted(set(names) - files.keys())
-        need(not missing, str(folder), f"no clip is called {', '.join(missing)}",
-             f"it holds {', '.join(list(files)[:3])} and so on")  # fmt: skip
+        if missing:
+            fail(
+                str(folder),
+                f"no clip is called {', '.join(missing)}",
+                f"it holds {', '.join(list(files)[:3])} and so on",
+            )
         others = [path for name, path in files.items() if name not in names] or list(files.values())
         return {name: files[name] for name in names}, [self._read(path, file) for path in others]
 

@@ -11,11 +11,10 @@ import argparse
 from math import inf
 from pathlib import Path
 
-from ssilk_core.config import PRESETS, ModelConfig, TrainConfig, overridden, preset_named
-from ssilk_core.errors import EXIT_INTERRUPTED, EXIT_OK, need
-from ssilk_core.events import Message, Reporter, Result, silent
-from ssilk_core.fabrics import Fabric
-
+from ..config import PRESETS, ModelConfig, TrainConfig, overridden, preset_named
+from ..errors import EXIT_INTERRUPTED, EXIT_OK, fail
+from ..events import Message, Reporter, Result, silent
+from ..fabrics import Fabric
 from . import options as shared
 
 
@@ -64,19 +63,15 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Train; return 0 when finished, 130 when interrupted."""
-    from ssilk_core.training.parallel import joined
-    from ssilk_core.training.run import train
-    from ssilk_core.training.signals import interruptible
+    from ..training.parallel import joined
+    from ..training.run import train
+    from ..training.signals import interruptible
 
-    need(
-        options.output.suffix == ".safetensors",
-        str(options.output),
-        "not a name for a model",
-        "it ends in .safetensors",
-    )
+    if options.output.suffix != ".safetensors":
+        fail(str(options.output), "not a name for a model", "it ends in .safetensors")
     shared.check_output(options.output)
-    need(options.minutes is None or 0 < options.minutes < inf, "--minutes", f"{options.minutes}",
-         "a time is more than nothing")  # fmt: skip
+    if not (options.minutes is None or 0 < options.minutes < inf):
+        fail("--minutes", f"{options.minutes}", "a time is more than nothing")
     with joined(options.device) as (team, device), interruptible() as stop:
         report = report if team.first else silent
         trained = train(training_job(options, device, report), report, stop, team)
@@ -105,8 +100,8 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
     """Read everything that the options name; return it as a `TrainJob` on a device."""
     from ssilk_usd.read_motion import motion_files, read_motions
 
-    from ssilk_core.files import sha256
-    from ssilk_core.training.job import TrainJob, split_motions
+    from ..files import sha256
+    from ..training.job import TrainJob, split_motions
 
     model, train, fabric = configured(options)
     scene = shared.load_scene(options, report)
@@ -149,7 +144,8 @@ def _settings(
     known = [*ModelConfig.__dataclass_fields__, *TrainConfig.__dataclass_fields__]
     for setting in settings:
         name, where = setting.partition("=")[0], f"--set {setting}"
-        need(name in known, where, "no such setting", f"settings are {', '.join(known)}")
+        if name not in known:
+            fail(where, "no such setting", f"settings are {', '.join(known)}")
     own = [setting for setting in settings if setting.partition("=")[0] in ModelConfig.__dataclass_fields__]
     others = [setting for setting in settings if setting not in own]
     return overridden(model, own), overridden(train, [f"seed={seed}", *others])

@@ -11,9 +11,8 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from ssilk_core.errors import EXIT_OK, fail, need
-from ssilk_core.events import Message, Reporter, Result, Started
-
+from ..errors import EXIT_OK, fail
+from ..events import Message, Reporter, Result, Started
 from .options import INPUTS
 
 
@@ -31,17 +30,12 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
     from ._baking import BakeRequest, open_bake
 
-    need(
-        options.shot.is_file(), str(options.shot), "there is no such shot", "a file written by 'ssilk bake' is needed"
-    )
+    if not options.shot.is_file():
+        fail(str(options.shot), "there is no such shot", "a file written by 'ssilk bake' is needed")
     provenance = read_provenance(options.shot)
     carried: Any = provenance.get("request")
-    need(
-        isinstance(carried, dict) and set(INPUTS) <= carried.keys(),
-        str(options.shot),
-        "the file does not say how it was baked",
-        "a shot written by 'ssilk bake' is needed",
-    )
+    if not (isinstance(carried, dict) and set(INPUTS) <= carried.keys()):
+        fail(str(options.shot), "the file does not say how it was baked", "a shot written by 'ssilk bake' is needed")
     known = {item.name for item in fields(BakeRequest)}
     request = BakeRequest(**{key: value for key, value in carried.items() if key in known})
     chosen = {name: getattr(options, name) or _found(options.shot, name, provenance) for name in INPUTS}

@@ -9,9 +9,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ssilk_core.errors import EXIT_OK, need
-from ssilk_core.events import Reporter, Result
-
+from ..errors import EXIT_OK, fail
+from ..events import Reporter, Result
 from .options import check_output
 
 
@@ -34,8 +33,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     """Draw."""
     from ssilk_usd.play import Shot
 
-    from ssilk_core.view.output import FILM, check_suffix
-    from ssilk_core.view.shots import film_of_shots, sheet_of_shots
+    from ..view.output import FILM, check_suffix
+    from ..view.shots import film_of_shots, sheet_of_shots
 
     film = check_suffix(options.output) == FILM
     check_output(options.output, *options.shots)
@@ -59,13 +58,13 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
 
 def _look(options: argparse.Namespace, film: bool):  # type: ignore[no-untyped-def]  # Look is heavy to import
-    from ssilk_core.view.shots import Look
+    from ..view.shots import Look
 
     width, height = (480, 640) if film else (320, 440)
     if options.size:
         parts = options.size.lower().split("x")
-        need(len(parts) == 2 and all(part.isdecimal() for part in parts), f"--size {options.size}", "not a size",
-             "WIDTHxHEIGHT in pixels is needed")  # fmt: skip
+        if not (len(parts) == 2 and all(part.isdecimal() for part in parts)):
+            fail(f"--size {options.size}", "not a size", "WIDTHxHEIGHT in pixels is needed")
         width, height = int(parts[0]), int(parts[1])
     azimuth = Look.azimuth if options.azimuth is None else options.azimuth
     return Look(width=width, height=height, azimuth=azimuth, workers=options.workers)

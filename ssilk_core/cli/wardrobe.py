@@ -24,15 +24,14 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from ssilk_core.errors import SsilkError, need
-from ssilk_core.events import Failed, Garment, Message, Reporter, Result, Said, Started
-from ssilk_core.files import need_writable
-from ssilk_core.wardrobe.listing import Entry, read_list
-from ssilk_core.wardrobe.panel import Panel, table
-from ssilk_core.wardrobe.queue import End, Queue, Slot
-from ssilk_core.wardrobe.record import request_hash
-from ssilk_core.wardrobe.training import Training
-
+from ..errors import SsilkError, fail
+from ..events import Failed, Garment, Message, Reporter, Result, Said, Started
+from ..files import need_writable
+from ..wardrobe.listing import Entry, read_list
+from ..wardrobe.panel import Panel, table
+from ..wardrobe.queue import End, Queue, Slot
+from ..wardrobe.record import request_hash
+from ..wardrobe.training import Training
 from . import options as shared
 from . import train
 
@@ -51,7 +50,8 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Train all; return 0, 130 when interrupted, or the exit code of a garment that failed."""
-    need(options.jobs is None or options.jobs > 0, "--jobs", f"{options.jobs} trainings at a time", "1 is the least")
+    if not (options.jobs is None or options.jobs > 0):
+        fail("--jobs", f"{options.jobs} trainings at a time", "1 is the least")
     device, slots = _slots(options.device, options.jobs)
     need_writable(options.output / "log")
     entries = read_list(options.list)
@@ -70,7 +70,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
 def _train(trainings: Sequence[Training], source: Path, device: str, slots: Sequence[Slot], show: Reporter) -> None:
     """Train what waits, the paths of the list being relative to `source`."""
-    from ssilk_core.training.signals import interruptible
+    from ..training.signals import interruptible
 
     named = {training.entry.name: training for training in trainings}
 
@@ -95,7 +95,8 @@ def _train(trainings: Sequence[Training], source: Path, device: str, slots: Sequ
 def _slots(device: str, jobs: int | None) -> tuple[str, list[Slot]]:
     """Return the device that all train on, and the environment of each training at a time."""
     gpus = [] if device == "cpu" else _visible_gpus()
-    need(gpus or device != "cuda", "--device cuda", "no GPU is visible", "'auto' and 'cpu' are allowed")
+    if not (gpus or device != "cuda"):
+        fail("--device cuda", "no GPU is visible", "'auto' and 'cpu' are allowed")
     if gpus:
         return "cuda", [{"CUDA_VISIBLE_DEVICES": gpus[index % len(gpus)]} for index in range(jobs or len(gpus))]
     jobs = jobs or 1
@@ -117,7 +118,7 @@ def _request(entry: Entry, path: Path) -> str:
     Raises:
         SsilkError: there is no such file, or 'ssilk train' would not take it.
     """
-    from ssilk_core.cli import parser
+    from ..cli import parser
 
     where = f"{path}: table '{entry.name}'"
     try:
@@ -127,7 +128,8 @@ def _request(entry: Entry, path: Path) -> str:
     except SsilkError as error:
         raise SsilkError(f"{where}: {error}") from error
     for file in files:
-        need(file.is_file(), where, f"there is no file {file}", "paths are relative to the folder of the list")
+        if not file.is_file():
+            fail(where, f"there is no file {file}", "paths are relative to the folder of the list")
     return request_hash(entry.words, files)
 
 

@@ -6,11 +6,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ssilk_core.assets import Character, Floats, Garment, Ints, Mesh
-from ssilk_core.demo.garments_dress import hooded_dress
-from ssilk_core.demo.garments_fit import Fit, fit, outline, relax, through
-from ssilk_core.demo.garments_mesh import loft
-from ssilk_core.errors import need
+from ..assets import Character, Floats, Garment, Ints, Mesh
+from ..demo.garments_dress import hooded_dress
+from ..demo.garments_fit import Fit, fit, outline, relax, through
+from ..demo.garments_mesh import loft
+from ..errors import fail
 
 CLEARANCE = 0.012  # [m]; more than the 6 mm that must remain, because triangles cut corners
 
@@ -21,7 +21,8 @@ def build_garment(name: str, character: Character) -> Garment:
     Raises:
         SsilkError: there is no garment of that name.
     """
-    need(name in CUTS, f"garment '{name}'", "no such garment in the wardrobe", f"it is one of {', '.join(GARMENTS)}")
+    if name not in CUTS:
+        fail(f"garment '{name}'", "no such garment in the wardrobe", f"it is one of {', '.join(GARMENTS)}")
     points, faces = CUTS[name](fit(character))
     return Garment(Mesh(f"/{''.join(word.title() for word in name.split('_'))}", points, faces))
 

@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ssilk_core.assets import Floats, Ints
-from ssilk_core.demo.garments_fit import Fit, keep_off, outline, relax, through
-from ssilk_core.demo.garments_mesh import cap, cut, length, loft
+from ..assets import Floats, Ints
+from ..demo.garments_fit import Fit, keep_off, outline, relax, through
+from ..demo.garments_mesh import cap, cut, length, loft
 
 CLEARANCE = 0.013  # [m]
 EDGE = 0.023  # [m]

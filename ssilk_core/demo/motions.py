@@ -8,16 +8,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from ssilk_core.assets import Floats, Motion, Skeleton
-from ssilk_core.demo.motions_biped import Biped, Track
-from ssilk_core.demo.motions_cartwheel import cartwheel
-from ssilk_core.demo.motions_curves import FPS
-from ssilk_core.demo.motions_gait import RUN, WALK, Gait, locomotion
-from ssilk_core.demo.motions_gestures import gesture, idle
-from ssilk_core.demo.motions_jump import jump
-from ssilk_core.demo.motions_spin import spin
-from ssilk_core.errors import need
-from ssilk_core.kinematics import (
+from ..assets import Floats, Motion, Skeleton
+from ..demo.motions_biped import Biped, Track
+from ..demo.motions_cartwheel import cartwheel
+from ..demo.motions_curves import FPS
+from ..demo.motions_gait import RUN, WALK, Gait, locomotion
+from ..demo.motions_gestures import gesture, idle
+from ..demo.motions_jump import jump
+from ..demo.motions_spin import spin
+from ..errors import fail
+from ..kinematics import (
     invert_rigid,
     matrix_from_quaternion,
     multiply_quaternions,
@@ -37,7 +37,8 @@ def build_motion(name: str, skeleton: Skeleton, *, seed: int = 0) -> Motion:
     Raises:
         SsilkError: there is no motion of that name, or the skeleton lacks the joints of a biped.
     """
-    need(name in MAKERS, f"motion '{name}'", "no such motion is made in code", f"it is one of {', '.join(MOTIONS)}")
+    if name not in MAKERS:
+        fail(f"motion '{name}'", "no such motion is made in code", f"it is one of {', '.join(MOTIONS)}")
     biped = Biped(skeleton)
     dice = np.random.default_rng(seed)
     track = MAKERS[name](biped, dice if seed else None)

@@ -12,10 +12,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from ssilk_core.assets import Floats, Motion, Skeleton
-from ssilk_core.demo.motions_curves import FPS, about, apply, ease, turned
-from ssilk_core.errors import need
-from ssilk_core.kinematics import invert_rigid, quaternion_from_matrix
+from ..assets import Floats, Motion, Skeleton
+from ..demo.motions_curves import FPS, about, apply, ease, turned
+from ..errors import fail
+from ..kinematics import invert_rigid, quaternion_from_matrix
 
 SIDES = ("Left", "Right")
 OUT = np.array([1.0, -1.0])  # the left points to +x
@@ -61,13 +61,13 @@ class Biped:
         names = [name.rsplit("/", 1)[-1].rsplit(":", 1)[-1] for name in skeleton.joint_names]
         self.index = {name: joint for joint, name in enumerate(names)}
         missing = [name for name in NEEDED if name not in self.index]
-        need(
-            not missing,
-            skeleton.path,
-            f"no joint named {', '.join(missing)}",
-            "the motions made in code need a two-legged rig with the joint names of the CMU mocap skeletons",
-            "rename the joints, or use motions of your own",
-        )
+        if missing:
+            fail(
+                skeleton.path,
+                f"no joint named {', '.join(missing)}",
+                "the motions made in code need a two-legged rig with the joint names of the CMU mocap skeletons",
+                "rename the joints, or use motions of your own",
+            )
         legs = [
             np.linalg.norm(self.at(a) - self.at(b)) for a, b in (("LeftUpLeg", "LeftLeg"), ("LeftLeg", "LeftFoot"))
         ]

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ssilk_core.assets import Floats
-from ssilk_core.demo.motions_biped import OUT, SIDES, Biped, Track
-from ssilk_core.demo.motions_curves import about, apply, bump, clock, ease, keyed
+from ..assets import Floats
+from ..demo.motions_biped import OUT, SIDES, Biped, Track
+from ..demo.motions_curves import about, apply, bump, clock, ease, keyed
 
 MIDDLE = 1.7  # time of the handstand [s]
 END = 2 * MIDDLE

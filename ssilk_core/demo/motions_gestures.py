@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ssilk_core.assets import Floats
-from ssilk_core.demo.motions_biped import Biped, Track
-from ssilk_core.demo.motions_curves import clock, ease, keyed, turned
+from ..assets import Floats
+from ..demo.motions_biped import Biped, Track
+from ..demo.motions_curves import clock, ease, keyed, turned
 
 
 def idle(biped: Biped, seconds: float) -> Track:

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ssilk_core.assets import Floats
-from ssilk_core.demo.motions_biped import Biped, Track
-from ssilk_core.demo.motions_curves import about, bump, clock, ease, keyed, ramp
+from ..assets import Floats
+from ..demo.motions_biped import Biped, Track
+from ..demo.motions_curves import about, bump, clock, ease, keyed, ramp
 
 GRAVITY = 9.81
 BEGIN, LOW, OFF = 0.3, 0.85, 1.12  # seconds: the crouch begins, is deepest, the feet take off

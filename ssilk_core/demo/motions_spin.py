@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ssilk_core.assets import Floats
-from ssilk_core.demo.motions_biped import Biped, Track
-from ssilk_core.demo.motions_curves import about, apply, clock, ease, keyed, travel
+from ..assets import Floats
+from ..demo.motions_biped import Biped, Track
+from ..demo.motions_curves import about, apply, clock, ease, keyed, travel
 
 BEGIN, WIND, OFF = 0.3, 0.85, 1.0  # seconds: the wind-up begins, is widest, the turn begins
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ssilk_core.assets import Mesh
-from ssilk_core.checkpoint import ModelFile, load_model
-from ssilk_core.errors import need
+from ..assets import Mesh
+from ..checkpoint import ModelFile, load_model
+from ..errors import fail
 
 FOLDER = Path(__file__).with_name("models")
 TOLERANCE = 1e-4  # [m] between the garment that a model was trained on and the one that is built here
@@ -31,8 +31,8 @@ def open_shipped(garment: str, mesh: Mesh) -> ModelFile:
         SsilkError: there is no such file, it cannot be read, or it was trained on another mesh.
     """
     path = shipped_path(garment)
-    need(path.is_file(), str(path), "the shipped model is missing", "it comes with the package",
-         "install the package again")  # fmt: skip
+    if not path.is_file():
+        fail(str(path), "the shipped model is missing", "it comes with the package", "install the package again")
     file = load_model(path)
     need_trained_on(mesh, file, path)
     return file
@@ -41,13 +41,21 @@ def open_shipped(garment: str, mesh: Mesh) -> ModelFile:
 def need_trained_on(mesh: Mesh, file: ModelFile, path: Path) -> None:
     """Raise `SsilkError` unless a model's garment is `mesh`: the same faces, and points to within `TOLERANCE`."""
     own, todo = file.scene.garment.mesh, "train it again on the garment as it is now"
-    need(np.array_equal(own.faces, mesh.faces), str(path),
-         f"trained on a garment of {own.vertex_count} vertices and {len(own.faces)} triangles",
-         f"{mesh.path} has {mesh.vertex_count} and {len(mesh.faces)}, connected as they are built here",
-         todo)  # fmt: skip
+    if not np.array_equal(own.faces, mesh.faces):
+        fail(
+            str(path),
+            f"trained on a garment of {own.vertex_count} vertices and {len(own.faces)} triangles",
+            f"{mesh.path} has {mesh.vertex_count} and {len(mesh.faces)}, connected as they are built here",
+            todo,
+        )
     away = np.abs(own.points - mesh.points).max()
-    need(away < TOLERANCE, str(path), f"trained on a garment that is {away:.3g} m away from {mesh.path}",
-         f"at most {TOLERANCE:g} m is allowed", todo)  # fmt: skip
+    if not away < TOLERANCE:
+        fail(
+            str(path),
+            f"trained on a garment that is {away:.3g} m away from {mesh.path}",
+            f"at most {TOLERANCE:g} m is allowed",
+            todo,
+        )
 
 
 def origin(file: ModelFile) -> str:

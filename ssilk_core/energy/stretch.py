@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..assets import Floats, Mesh
-from ..errors import need
+from ..errors import fail
 from ..fabrics import Fabric
 from ..mesh.topology import NO_AREA, SLIVER
 from .operators import SparseOperator
@@ -28,13 +28,13 @@ def rest_frames(mesh: Mesh) -> tuple[Floats, Floats]:
     normal = np.cross(first, second)
     doubled = np.linalg.norm(normal, axis=1)
     flat = int(np.count_nonzero(doubled <= NO_AREA * np.maximum(_longest_squared(mesh), 1e-60) + 1e-30))
-    need(
-        flat == 0,
-        mesh.path,
-        f"{flat} of {len(mesh.faces)} triangles have no area",
-        "each triangle needs one",
-        "merge or dissolve the degenerate faces",
-    )
+    if flat != 0:
+        fail(
+            mesh.path,
+            f"{flat} of {len(mesh.faces)} triangles have no area",
+            "each triangle needs one",
+            "merge or dissolve the degenerate faces",
+        )
     normal = normal / doubled[:, None]
     along = np.where(np.abs(normal[:, 1:2]) < 0.99, [0.0, 1.0, 0.0], [1.0, 0.0, 0.0])
     u = np.cross(along, normal)

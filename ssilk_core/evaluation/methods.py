@@ -17,7 +17,7 @@ from ..baselines.descriptors import joint_bank
 from ..baselines.networks import Baseline
 from ..energy import GarmentEnergy
 from ..energy.stretch import deformation_gradient_operator
-from ..errors import need
+from ..errors import fail
 from ..fabrics import Fabric
 from ..model.body import CollisionBody
 from ..model.contacts import Contacts
@@ -120,7 +120,8 @@ def reel_of(takes: Sequence[Take], dressed: Dressed, joints: np.ndarray) -> Reel
     Raises:
         SsilkError: there is no take.
     """
-    need(takes, "clips", "none of four frames or more", "one at least is needed", "name longer ones")
+    if not takes:
+        fail("clips", "none of four frames or more", "one at least is needed", "name longer ones")
     skeleton = dressed.scene.character.skeleton
     bank = build_bank([take.motion for take in takes], skeleton, joints, dressed.fps, dressed.device)
     assert len(bank.starts) == len(takes)
@@ -200,9 +201,13 @@ class Cache:
         plain = self.dressed.plain(self.reel.character(take, frames))
         away = (x - plain)[self.pinned].norm(dim=1)
         far = float(away.max()) if away.numel() else 0.0
-        need(far < SAME, self.reel.takes[take].clip,
-             f"in the point cache, pinned vertices are {far:.3g} m from where this motion has them",
-             f"{SAME:g} m are allowed", "simulate this motion on this character")  # fmt: skip
+        if not far < SAME:
+            fail(
+                self.reel.takes[take].clip,
+                f"in the point cache, pinned vertices are {far:.3g} m from where this motion has them",
+                f"{SAME:g} m are allowed",
+                "simulate this motion on this character",
+            )
 
     def still(self, take: int, frames: range) -> None:
         return None

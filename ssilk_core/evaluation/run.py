@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ..assets import Motion
-from ..errors import need
+from ..errors import fail
 from ..events import Progress, Reporter, silent
 from ..training.bank import MotionBank, build_bank
 from ..training.validation import Rolled
@@ -51,11 +51,14 @@ class EvaluationOptions:
     loop: int = 2000
 
     def __post_init__(self) -> None:
-        need(self.sequence is None or self.sequence >= 4, "evaluation", f"sequences of {self.sequence} frames",
-             "four at least are needed")  # fmt: skip
-        need(0 <= self.stops <= 100, "evaluation", f"{self.stops} stops in each clip", "0 to 100 are allowed")
-        need(0 < self.hold <= 600, "evaluation", f"a hold of {self.hold:g} s", "it lies between 0 and 600 s")
-        need(0 <= self.loop <= 1_000_000, "evaluation", f"loops of {self.loop} frames", "0 to 1,000,000 are allowed")
+        if not (self.sequence is None or self.sequence >= 4):
+            fail("evaluation", f"sequences of {self.sequence} frames", "four at least are needed")
+        if not 0 <= self.stops <= 100:
+            fail("evaluation", f"{self.stops} stops in each clip", "0 to 100 are allowed")
+        if not 0 < self.hold <= 600:
+            fail("evaluation", f"a hold of {self.hold:g} s", "it lies between 0 and 600 s")
+        if not 0 <= self.loop <= 1_000_000:
+            fail("evaluation", f"loops of {self.loop} frames", "0 to 1,000,000 are allowed")
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..errors import fail, need
+from ..errors import fail
 
 SPLITS = ("valid", "inertia", "flips")
 ALLOWED = 'an index is a JSON list of {"clip": name, "split": name, "tags": [names]}'
@@ -30,7 +30,8 @@ def read_index(path: Path) -> list[Entry]:
     Raises:
         SsilkError: there is none, or it is malformed.
     """
-    need(path.is_file(), str(path), "there is no such file", ALLOWED)
+    if not path.is_file():
+        fail(str(path), "there is no such file", ALLOWED)
     try:
         document = json.loads(path.read_text())
         return [Entry(_text(item["clip"]), _text(item["split"]), tuple(item.get("tags", ()))) for item in document]

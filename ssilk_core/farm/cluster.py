@@ -9,8 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ssilk_core.errors import SsilkError, fail
-
+from ..errors import SsilkError, fail
 from .tasks import Task
 
 Bake = Callable[[Task, Path], dict[str, object]]

@@ -10,10 +10,9 @@ from dataclasses import asdict, replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
-from ssilk_core import __version__
-from ssilk_core.errors import fail, need
-from ssilk_core.files import replacing
-
+from .. import __version__
+from ..errors import fail
+from ..files import replacing
 from .record import INPUTS
 from .tasks import Task
 
@@ -48,12 +47,14 @@ def read_job(path: str | Path, mapping: str | Path | None = None) -> list[Task]:
 
 
 def _json(path: Path, allowed: str) -> dict[str, Any]:
-    need(path.is_file(), str(path), "there is no such file", allowed)
+    if not path.is_file():
+        fail(str(path), "there is no such file", allowed)
     try:
         document = json.loads(path.read_text())
     except (ValueError, RecursionError) as error:
         fail(str(path), f"it is no JSON ({error})", allowed)
-    need(isinstance(document, dict), str(path), "it holds no names", allowed)
+    if not isinstance(document, dict):
+        fail(str(path), "it holds no names", allowed)
     return document
 
 
@@ -93,8 +94,10 @@ def numbers(text: str, count: int) -> list[int]:
     for part in text.split(","):
         first, dash, last = part.partition("-")
         plain = first.strip().isdecimal() and (not dash or last.strip().isdecimal())
-        need(plain, where, f"'{text}'", allowed)
+        if not plain:
+            fail(where, f"'{text}'", allowed)
         span = range(int(first), int(last if dash else first) + 1)
-        need(len(span) and span[-1] < count, where, f"'{text}'", allowed)
+        if not (len(span) and span[-1] < count):
+            fail(where, f"'{text}'", allowed)
         found += span
     return sorted(set(found))

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
-from ssilk_core.events import Event, Failed, Garment, Message, Progress, Result, Started, describe
-from ssilk_core.files import replacing
-
+from ..events import Event, Failed, Garment, Message, Progress, Result, Started, describe
+from ..files import replacing
 from .job import NAME, write_job
 from .record import INPUTS
 from .tasks import Task

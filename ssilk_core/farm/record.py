@@ -10,9 +10,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ssilk_core import __version__
-from ssilk_core.files import replacing, sha256
-
+from .. import __version__
+from ..files import replacing, sha256
 from .tasks import Task
 
 NAME = "bake.json"

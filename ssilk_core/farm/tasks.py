@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ssilk_core.errors import need
+from ..errors import fail
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,5 +100,10 @@ def _leaf(path: str) -> str:
 
 def _need_unique(names: Sequence[str], where: str, what: str) -> None:
     name, times = Counter(names).most_common(1)[0]
-    need(times == 1, where, f"{times} {what} are named '{name}'", "files and folders are named by them",
-         "rename one of the files")  # fmt: skip
+    if times != 1:
+        fail(
+            where,
+            f"{times} {what} are named '{name}'",
+            "files and folders are named by them",
+            "rename one of the files",
+        )

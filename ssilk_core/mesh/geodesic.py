@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ssilk_core.assets import Floats, Ints
-from ssilk_core.mesh.topology import components, edge_keys, edge_use, edges, half_edges
+from ..assets import Floats, Ints
+from ..mesh.topology import components, edge_keys, edge_use, edges, half_edges
 
 if TYPE_CHECKING:
     from scipy.sparse import coo_matrix

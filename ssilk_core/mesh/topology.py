@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ssilk_core.assets import Floats, Ints
+from ..assets import Floats, Ints
 
 NO_AREA = 1e-7  # twice the area of a triangle to the square of its longest edge; single precision sees no less
 SLIVER = 50.0  # longest edge of a triangle to its height; clean cloth stays below 15

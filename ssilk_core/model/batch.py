@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..assets import Motion
-from ..errors import need
+from ..errors import fail
 from ..kinematics import motion_transforms, skinning_matrices, split_at_cuts
 from .descriptors import gravity_features, pose_features
 from .network import GarmentModel
@@ -48,8 +48,8 @@ def driven(model: GarmentModel, motions: Sequence[Motion]) -> Driven:
     """
     fps, frames = model.config.fps, max(motion.frame_count for motion in motions)
     for motion in motions:
-        need(abs(motion.fps - fps) < 1e-6, motion.path, f"{motion.fps:g} frames per second",
-             f"the model steps at {fps:g}")  # fmt: skip
+        if not abs(motion.fps - fps) < 1e-6:
+            fail(motion.path, f"{motion.fps:g} frames per second", f"the model steps at {fps:g}")
     shots = [[_driven(model, span) for span in split_at_cuts(motion)] for motion in motions]
     parts = [map(torch.cat, zip(*spans)) for spans in shots]
     return Driven(*(

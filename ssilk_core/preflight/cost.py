@@ -7,11 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ssilk_core.assets import Motion, Scene
-from ssilk_core.config import Preset, TrainConfig
-from ssilk_core.events import format_seconds
-from ssilk_core.kinematics import quaternion_from_matrix
-
+from ..assets import Motion, Scene
+from ..config import Preset, TrainConfig
+from ..events import format_seconds
+from ..kinematics import quaternion_from_matrix
 from .finding import Finding, Findings, joint_leaves, listing
 
 # Seconds that one vertex in one frame takes, in a whole optimiser step of a garment of 2,700 vertices. Measured:
@@ -25,7 +24,7 @@ def training_cost(scene: Scene, motions: Sequence[Motion], preset: Preset) -> Fi
 
     `motions` may be empty; the reach of the garment is then that of the rest pose.
     """
-    from ssilk_core.training.reach import reachable_body
+    from ..training.reach import reachable_body
 
     reach = reachable_body(scene, motions or [rest_motion(scene)])
     yield from memory(scene, preset, len(reach.vertices))
@@ -34,8 +33,8 @@ def training_cost(scene: Scene, motions: Sequence[Motion], preset: Preset) -> Fi
 
 def memory(scene: Scene, preset: Preset, body_vertices: int) -> Findings:
     """Yield how much memory and time a preset takes with a garment that reaches `body_vertices`."""
-    from ssilk_core.devices import chosen_device
-    from ssilk_core.training.memory import decoded_frames, fitting_batch, free_memory, step_memory
+    from ..devices import chosen_device
+    from ..training.memory import decoded_frames, fitting_batch, free_memory, step_memory
 
     model, train, device = preset.model, preset.train, chosen_device("auto")
     free = free_memory(device)
@@ -76,7 +75,7 @@ def training_seconds(vertices: int, train: TrainConfig, device: str) -> float | 
 
 def irrelevant_joints(scene: Scene, colliding: np.ndarray) -> Findings:
     """Yield the joints that neither carry the garment nor move the body that it reaches (flags `colliding`, (J,))."""
-    from ssilk_core.model.network import model_joints
+    from ..model.network import model_joints
 
     skeleton = scene.character.skeleton
     unseen = np.setdiff1d(np.arange(skeleton.joint_count), model_joints(scene, colliding))

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ssilk_core.assets import Floats, Ints, Mesh
-from ssilk_core.fabrics import FABRICS
-from ssilk_core.mesh.topology import components, edge_use, edges
-from ssilk_core.setup.surface import closest_on_surface
-
+from ..assets import Floats, Ints, Mesh
+from ..fabrics import FABRICS
+from ..mesh.topology import components, edge_use, edges
+from ..setup.surface import closest_on_surface
 from .finding import Finding, Findings, amount, listing
 
 MARGIN = FABRICS["default"].margin  # [m]

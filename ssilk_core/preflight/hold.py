@@ -5,9 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ssilk_core.assets import CLASS_NAMES, LOOSE, Ints, Mesh
-from ssilk_core.mesh.topology import islands
-
+from ..assets import CLASS_NAMES, LOOSE, Ints, Mesh
+from ..mesh.topology import islands
 from .finding import Finding, Findings, listing
 
 

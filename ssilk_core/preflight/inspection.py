@@ -9,11 +9,10 @@ from importlib.util import find_spec
 
 import numpy as np
 
-from ssilk_core.assets import Character, Garment, Motion, ProxyRig, Scene
-from ssilk_core.config import Preset
-from ssilk_core.errors import SsilkError
-from ssilk_core.setup.prepare import prepare_scene
-
+from ..assets import Character, Garment, Motion, ProxyRig, Scene
+from ..config import Preset
+from ..errors import SsilkError
+from ..setup.prepare import prepare_scene
 from . import cost, fit, hold, motion, pose, units, winding
 from . import mesh as meshes
 from .finding import SEVERITIES, Finding, Findings

@@ -5,9 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ssilk_core.assets import Floats, Ints, Mesh
-from ssilk_core.mesh.topology import NO_AREA, SLIVER, edge_use, face_areas
-
+from ..assets import Floats, Ints, Mesh
+from ..mesh.topology import NO_AREA, SLIVER, edge_use, face_areas
 from .finding import Finding, Findings, amount, listing
 
 SAME_PLACE = 1e-6  # [m]; vertices closer than this share their place

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ssilk_core.assets import Floats, Ints, Motion, Skeleton
-from ssilk_core.kinematics import CUT_SPEED, split_at_cuts
-
+from ..assets import Floats, Ints, Motion, Skeleton
+from ..kinematics import CUT_SPEED, split_at_cuts
 from .finding import Finding, Findings, amount, joint_leaves, listing
 
 SNAP = 120.0  # [degrees] in one frame; the fastest human joints turn by about 7,000 degrees a second

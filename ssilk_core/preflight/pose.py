@@ -5,9 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ssilk_core.assets import Character, Floats, Mesh, Skeleton
-from ssilk_core.kinematics import invert_rigid, skin_points, skinning_matrices, world_transforms
-
+from ..assets import Character, Floats, Mesh, Skeleton
+from ..kinematics import invert_rigid, skin_points, skinning_matrices, world_transforms
 from .finding import Finding, Findings, listing
 from .fit import signed_distance
 

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ssilk_core.assets import Character, Floats, Garment, Ints, Mesh, ProxyRig
-from ssilk_core.mesh.topology import border_vertices, edge_use, edges
-
+from ..assets import Character, Floats, Garment, Ints, Mesh, ProxyRig
+from ..mesh.topology import border_vertices, edge_use, edges
 from .finding import amount
 from .fit import MARGIN, push_out
 from .mesh import SAME_PLACE, distinct_faces

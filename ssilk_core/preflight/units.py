@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ssilk_core.assets import Mesh
-
+from ..assets import Mesh
 from .finding import Finding, Findings
 from .fit import SCALES, Misplacement
 

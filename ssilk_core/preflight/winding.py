@@ -6,10 +6,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ssilk_core.assets import Floats, Ints, Mesh
-from ssilk_core.mesh.topology import components, edge_keys
-from ssilk_core.setup.surface import closest_on_surface
-
+from ..assets import Floats, Ints, Mesh
+from ..mesh.topology import components, edge_keys
+from ..setup.surface import closest_on_surface
 from .finding import Finding, Findings, listing
 
 Mask = NDArray[np.bool_]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..assets import Floats, Motion, Skeleton
-from ..errors import need
+from ..errors import fail
 from ..runtime import Player
 from ..runtime.drive import character_matrices
 from ..runtime.skinning import posed
@@ -50,7 +50,8 @@ def observe(player: Player, motions: Sequence[Motion], frames: int) -> Observed:
     Raises:
         SsilkError: there is no motion, or it is of another character.
     """
-    need(motions, "motions", "none given", "at least one is needed", "name motion files with --motions")
+    if not motions:
+        fail("motions", "none given", "at least one is needed", "name motion files with --motions")
     takes = [take for motion in motions for take in player.play(motion).takes]
     every = max(1, sum(take.motion.frame_count for take in takes) // frames)
     return Observed(

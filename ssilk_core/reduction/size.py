@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..errors import need
+from ..errors import fail
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,7 +23,8 @@ class Size:
     def __post_init__(self) -> None:
         for name, least in (("shapes", 0), ("joints", 0), ("influences", 1)):
             value = getattr(self, name)
-            need(value >= least, f"{name} = {value}", "too few to be kept", f"it is at least {least}")
+            if not value >= least:
+                fail(f"{name} = {value}", "too few to be kept", f"it is at least {least}")
 
     @classmethod
     def of(cls, text: str) -> Size:

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from ..assets import PINNED, Deformer, Floats, GarmentPose, Motion
-from ..errors import need
+from ..errors import fail
 from ..kinematics import combined_transforms, matrix_from_quaternion, quaternion_from_matrix, skinning_matrices
 
 STEPS = 15
@@ -82,7 +82,8 @@ class Refitter:
     def fitted(self, motion: Motion, pose: GarmentPose, vertices: Floats) -> Fit:
         """Return the fit of a few frames to vertices in the world [m], shape (F, V, 3)."""
         where = f"frames {pose.start} to {pose.start + pose.frame_count - 1}"
-        need(np.isfinite(vertices).all(), where, "NaN or infinity among the vertices", "all must be finite")
+        if not np.isfinite(vertices).all():
+            fail(where, "NaN or infinity among the vertices", "all must be finite")
         root = motion.translations[pose.start : pose.start + pose.frame_count, :1]
         about = replace(motion, translations=motion.translations - _of_root(motion))
         search = _Search(self, about, pose, self._tensor((vertices - root)[:, self.free]))

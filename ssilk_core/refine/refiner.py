@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from ..assets import Floats, Motion, Scene
-from ..errors import need
+from ..errors import fail
 from ..fabrics import Fabric
 from ..kinematics import split_at_cuts
 from ..simulate import SimulationOptions, Simulator
@@ -52,8 +52,10 @@ class RefineOptions:
     tolerance: float = SolverOptions.tolerance
 
     def __post_init__(self) -> None:
-        need(self.batch > 0, "refinement", f"batch = {self.batch}", "at least 1 is needed")
-        need(0 < self.iterations <= 10_000, "refinement", f"{self.iterations} iterations", "1 to 10000 are allowed")
+        if not self.batch > 0:
+            fail("refinement", f"batch = {self.batch}", "at least 1 is needed")
+        if not 0 < self.iterations <= 10_000:
+            fail("refinement", f"{self.iterations} iterations", "1 to 10000 are allowed")
 
     @property
     def solver(self) -> SolverOptions:
@@ -136,7 +138,8 @@ class Refiner:
         self, motion: Motion, network: Iterator[Floats], given: Iterator[Floats] | None
     ) -> Iterator[RefinedFrame]:
         fps = self.simulator.options.fps
-        need(abs(motion.fps - fps) < 1e-6, motion.path, f"{motion.fps:g} frames per second", f"{fps:g} is needed")
+        if not abs(motion.fps - fps) < 1e-6:
+            fail(motion.path, f"{motion.fps:g} frames per second", f"{fps:g} is needed")
         for span in split_at_cuts(motion):
             yield from self._span(span, network, given)
 

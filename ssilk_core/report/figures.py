@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import SsilkError, need
+from ..errors import SsilkError, fail
 from ..stress.outcome import HEADER, Outcome
 from ..trade.point import front
 from .charts import scatter, strip
@@ -20,7 +20,8 @@ from .terms import SHARE
 
 def read_json(path: Path) -> Any:
     """Read a JSON file; raise `SsilkError` for one that is none."""
-    need(path.is_file(), str(path), "there is no such file", "figures in JSON are needed")
+    if not path.is_file():
+        fail(str(path), "there is no such file", "figures in JSON are needed")
     try:
         return json.loads(path.read_text())
     except ValueError as error:
@@ -36,8 +37,13 @@ def section_of(path: Path) -> Section:
     document = read_json(path)
     kinds = {"outcomes": extremes, "points": trade, "figures": evaluation}
     kind = next((key for key in kinds if isinstance(document, dict) and isinstance(document.get(key), list)), None)
-    need(kind, str(path), "none of the figures that are known", f"a document with {' or '.join(kinds)} is needed",
-         "name what 'ssilk stress', 'ssilk trade' or 'ssilk evaluate' wrote")  # fmt: skip
+    if not kind:
+        fail(
+            str(path),
+            "none of the figures that are known",
+            f"a document with {' or '.join(kinds)} is needed",
+            "name what 'ssilk stress', 'ssilk trade' or 'ssilk evaluate' wrote",
+        )
     return _made(path, kinds[str(kind)], document)
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..assets import Deformer, Motion
 from ..checkpoint import ModelFile, load_model
-from ..errors import need
+from ..errors import fail
 from ..parameters import descriptor_sizes
 from .decoder import Decoder
 from .deformer import deformer
@@ -30,13 +30,13 @@ class Player:
 
     def __init__(self, file: ModelFile) -> None:
         scene, config = file.scene, file.config
-        need(
-            config.scheme in ("spring_verlet", "quasi_static"),
-            scene.garment.mesh.path,
-            f"the model's scheme is '{config.scheme}'",
-            "the runtime plays 'spring_verlet' and 'quasi_static'",
-            "use 'ssilk bake'",
-        )
+        if config.scheme not in ("spring_verlet", "quasi_static"):
+            fail(
+                scene.garment.mesh.path,
+                f"the model's scheme is '{config.scheme}'",
+                "the runtime plays 'spring_verlet' and 'quasi_static'",
+                "use 'ssilk bake'",
+            )
         self.file, self.skeleton = file, scene.character.skeleton
         static, _ = descriptor_sizes(scene, file.joints)
         self.initialiser = layers(file.parameters, "initialiser")
@@ -63,8 +63,10 @@ class Player:
             SsilkError: the motion is of another skeleton.
         """
         joints = self.skeleton.joint_count
-        need(motion.rotations.shape[1] == joints, motion.path, f"a motion of {motion.rotations.shape[1]} joints",
-             f"the model's character has {joints}")  # fmt: skip
+        if motion.rotations.shape[1] != joints:
+            fail(
+                motion.path, f"a motion of {motion.rotations.shape[1]} joints", f"the model's character has {joints}"
+            )
         return Playback(self, motion, block, pre_roll)
 
     def deformer(self) -> Deformer:

@@ -13,11 +13,11 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from ssilk_core.assets import LOOSE, PINNED, TIGHT, UP, Character, Floats, Ints, Mesh, SkinWeights
-from ssilk_core.errors import fail, need
-from ssilk_core.mesh.geodesic import distances, within
-from ssilk_core.mesh.topology import components, edge_use, edges, islands, smooth, vertex_areas
-from ssilk_core.setup.surface import SurfacePoints, closest_on_surface
+from ..assets import LOOSE, PINNED, TIGHT, UP, Character, Floats, Ints, Mesh, SkinWeights
+from ..errors import fail
+from ..mesh.geodesic import distances, within
+from ..mesh.topology import components, edge_use, edges, islands, smooth, vertex_areas
+from ..setup.surface import SurfacePoints, closest_on_surface
 
 Mask = NDArray[np.bool_]
 HANG_RADIUS = 0.06  # [m] around a border vertex: wide enough to look past a collar that curls in towards the neck
@@ -65,7 +65,8 @@ class ClassOptions:
     def __post_init__(self) -> None:
         for item in fields(self):
             value = getattr(self, item.name)
-            need(value >= 0, "classes", f"{item.name} = {value}", "it must not be negative")
+            if not value >= 0:
+                fail("classes", f"{item.name} = {value}", "it must not be negative")
 
 
 def classify(

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ssilk_core.assets import Floats, Ints, Mesh
-from ssilk_core.errors import need
-from ssilk_core.mesh.geodesic import farthest_points, nearest_sources, submesh
-from ssilk_core.mesh.topology import components, edges, vertex_areas
+from ..assets import Floats, Ints, Mesh
+from ..errors import fail
+from ..mesh.geodesic import farthest_points, nearest_sources, submesh
+from ..mesh.topology import components, edges, vertex_areas
 
 Mask = NDArray[np.bool_]
 
@@ -54,13 +54,13 @@ def find_seam(mesh: Mesh, loose: Mask) -> Seam:
     """
     seam = Seam(*nearest_sources(mesh.points, mesh.faces, np.flatnonzero(~loose)))
     adrift = int(np.count_nonzero(seam.nearest < 0))
-    need(
-        adrift == 0,
-        mesh.path,
-        f"{adrift} loose vertices lie on islands without a pinned or tight vertex",
-        "every island needs some, or it falls off",
-        "paint primvars:ssilk:class",
-    )
+    if adrift != 0:
+        fail(
+            mesh.path,
+            f"{adrift} loose vertices lie on islands without a pinned or tight vertex",
+            "every island needs some, or it falls off",
+            "paint primvars:ssilk:class",
+        )
     return seam
 
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from ssilk_core import events
-from ssilk_core.assets import CLASS_NAMES, LOOSE, Character, Garment, Ints, ProxyRig, Scene
-from ssilk_core.setup.classes import ClassOptions, classify
-from ssilk_core.setup.rig import RigOptions, build_rig
-from ssilk_core.setup.weights import WeightOptions, transfer_weights
+from .. import events
+from ..assets import CLASS_NAMES, LOOSE, Character, Garment, Ints, ProxyRig, Scene
+from ..setup.classes import ClassOptions, classify
+from ..setup.rig import RigOptions, build_rig
+from ..setup.weights import WeightOptions, transfer_weights
 
 
 def prepare_scene(

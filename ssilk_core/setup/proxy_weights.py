@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ssilk_core.assets import Floats, Mesh
-from ssilk_core.mesh.geodesic import nearest_sources
-from ssilk_core.setup.clusters import Cluster, Mask, Seam
+from ..assets import Floats, Mesh
+from ..mesh.geodesic import nearest_sources
+from ..setup.clusters import Cluster, Mask, Seam
 
 LEAST_SHARE = 1e-3  # of the body's weights on a loose vertex; less is left out, so that its rows stay short
 

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ssilk_core import events
-from ssilk_core.assets import LOOSE, Character, Floats, Garment, Ints, Mesh, ProxyRig, SkinWeights
-from ssilk_core.errors import need
-from ssilk_core.kinematics import rigid
-from ssilk_core.mesh.topology import vertex_areas, vertex_normals
-from ssilk_core.setup.clusters import Cluster, Mask, Seam, build_cluster, find_pieces, find_seam, share_out
-from ssilk_core.setup.proxy_weights import proxy_weights
+from .. import events
+from ..assets import LOOSE, Character, Floats, Garment, Ints, Mesh, ProxyRig, SkinWeights
+from ..errors import fail
+from ..kinematics import rigid
+from ..mesh.topology import vertex_areas, vertex_normals
+from ..setup.clusters import Cluster, Mask, Seam, build_cluster, find_pieces, find_seam, share_out
+from ..setup.proxy_weights import proxy_weights
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,8 @@ class RigOptions:
     def __post_init__(self) -> None:
         for name, least in (("proxies", 0), ("most_proxies", 1), ("roots_per_cluster", 1), ("influences", 1)):
             value = getattr(self, name)
-            need(value >= least, "proxy rig", f"{name} = {value}", f"it must be at least {least}")
+            if not value >= least:
+                fail("proxy rig", f"{name} = {value}", f"it must be at least {least}")
 
 
 def build_rig(
@@ -71,8 +72,10 @@ def build_rig(
         SsilkError: the garment has no weights or classes, or an island has only loose vertices.
     """
     options = options or RigOptions()
-    need(garment.skin is not None, garment.mesh.path, "no skinning weights", "weights are needed", "transfer them")
-    need(garment.classes is not None, garment.mesh.path, "no vertex classes", "classes are needed", "classify it")
+    if garment.skin is None:
+        fail(garment.mesh.path, "no skinning weights", "weights are needed", "transfer them")
+    if garment.classes is None:
+        fail(garment.mesh.path, "no vertex classes", "classes are needed", "classify it")
     assert garment.skin is not None and garment.classes is not None
     loose: Mask = np.equal(garment.classes, LOOSE)
     if options.proxies == 0 or not loose.any():

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ssilk_core.assets import Floats, Ints, Mesh
-from ssilk_core.mesh.topology import vertex_normals
+from ..assets import Floats, Ints, Mesh
+from ..mesh.topology import vertex_normals
 
 
 @dataclass(frozen=True, eq=False)

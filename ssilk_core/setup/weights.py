@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ssilk_core.assets import LOOSE, Character, Floats, Ints, Mesh, SkinWeights
-from ssilk_core.errors import need
-from ssilk_core.mesh.topology import edges, smooth
-from ssilk_core.setup.surface import closest_on_surface
+from ..assets import LOOSE, Character, Floats, Ints, Mesh, SkinWeights
+from ..errors import fail
+from ..mesh.topology import edges, smooth
+from ..setup.surface import closest_on_surface
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,10 @@ class WeightOptions:
 
     def __post_init__(self) -> None:
         for name in ("tight_rounds", "loose_rounds"):
-            need(getattr(self, name) >= 0, "weights", f"{name} = {getattr(self, name)}", "it must not be negative")
-        need(self.influences > 0, "weights", f"influences = {self.influences}", "it must be positive")
+            if not getattr(self, name) >= 0:
+                fail("weights", f"{name} = {getattr(self, name)}", "it must not be negative")
+        if not self.influences > 0:
+            fail("weights", f"influences = {self.influences}", "it must be positive")
 
 
 def transfer_weights(

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from ..energy.rounded import Rounded
-from ..errors import need
+from ..errors import fail
 from .potential import Potential, Setting
 
 SUFFICIENT = 1e-4  # share of the slope that a step has to gain
@@ -52,9 +52,11 @@ class SolverOptions:
     inner: int = 200
 
     def __post_init__(self) -> None:
-        need(0 < self.tolerance < float("inf"), "solver", f"tolerance = {self.tolerance}", "it must be positive")
+        if not 0 < self.tolerance < float("inf"):
+            fail("solver", f"tolerance = {self.tolerance}", "it must be positive")
         for name in ("iterations", "inner"):
-            need(getattr(self, name) > 0, "solver", f"{name} = {getattr(self, name)}", "at least 1 is needed")
+            if not getattr(self, name) > 0:
+                fail("solver", f"{name} = {getattr(self, name)}", "at least 1 is needed")
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,8 +151,13 @@ class _Search:
         self.state = State.at(potential, start, setting)
         energy = self.state.energy
         bad = int((~energy.isfinite()).sum())
-        need(bad == 0, "simulation", f"the first state of {bad} of {len(energy)} frames has no finite energy",
-             "positions, body and time step must be finite", "look for NaN in stage and motion")  # fmt: skip
+        if bad != 0:
+            fail(
+                "simulation",
+                f"the first state of {bad} of {len(energy)} frames has no finite energy",
+                "positions, body and time step must be finite",
+                "look for NaN in stage and motion",
+            )
         self.at_work = torch.arange(len(energy), device=start.device)
         self.moving = torch.ones_like(energy, dtype=torch.bool)
         self.held = torch.zeros_like(start[:, 0], dtype=torch.bool)

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ..assets import Floats, Motion, Scene
-from ..errors import need
+from ..errors import fail
 from ..events import Progress, Reporter, silent
 from ..fabrics import Fabric
 from ..model.descriptors import GRAVITY
@@ -54,14 +54,18 @@ class SimulationOptions:
     rest: SolverOptions = field(default_factory=lambda: SolverOptions(iterations=150))
 
     def __post_init__(self) -> None:
-        need(0 < self.fps <= 10_000, "simulation", f"{self.fps:g} frames per second", "a positive rate is needed")
-        need(0 < self.substeps <= MOST_SUBSTEPS, "simulation", f"substeps = {self.substeps}",
-             f"1 to {MOST_SUBSTEPS} are allowed")  # fmt: skip
-        need(self.batch > 0, "simulation", f"batch = {self.batch}", "at least 1 is needed")
-        need(self.sequence is None or self.sequence >= 1, "simulation", f"sequences of {self.sequence} frames",
-             "one at least is needed")  # fmt: skip
-        need(self.precision in PRECISIONS, "simulation", f"precision '{self.precision}'", "it is float64 or float32")
-        need(np.isfinite(self.gravity).all(), "simulation", f"gravity {self.gravity}", "it must be finite")
+        if not 0 < self.fps <= 10_000:
+            fail("simulation", f"{self.fps:g} frames per second", "a positive rate is needed")
+        if not 0 < self.substeps <= MOST_SUBSTEPS:
+            fail("simulation", f"substeps = {self.substeps}", f"1 to {MOST_SUBSTEPS} are allowed")
+        if not self.batch > 0:
+            fail("simulation", f"batch = {self.batch}", "at least 1 is needed")
+        if not (self.sequence is None or self.sequence >= 1):
+            fail("simulation", f"sequences of {self.sequence} frames", "one at least is needed")
+        if self.precision not in PRECISIONS:
+            fail("simulation", f"precision '{self.precision}'", "it is float64 or float32")
+        if not np.isfinite(self.gravity).all():
+            fail("simulation", f"gravity {self.gravity}", "it must be finite")
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,7 +226,8 @@ def simulate(
     Raises:
         SsilkError: no motion, no body, or a state whose energy is not finite.
     """
-    need(motions, "simulation", "no motion given", "at least one is needed")
+    if not motions:
+        fail("simulation", "no motion given", "at least one is needed")
     simulator = Simulator(scene, fabric, options, device=device)
     counts = [shot.frame_count for shot in shots_of(motions, simulator.options)]
     points = [np.zeros((count, scene.garment.mesh.vertex_count, 3)) for count in counts]

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..assets import Floats, Motion, Skeleton
-from ..errors import need
+from ..errors import fail
 from ..kinematics import motion_transforms, resample, skinning_matrices, split_at_cuts
 from ..model.descriptors import gravity_features, pose_features
 
@@ -74,9 +74,11 @@ def build_bank(
     Raises:
         SsilkError: there is no motion.
     """
-    need(motions, "motions", "none given", "at least one is needed", "name motion files with --motions")
+    if not motions:
+        fail("motions", "none given", "at least one is needed", "name motion files with --motions")
     clips = [resample(span, fps) for span in usable_spans(motions, fps, most_turn)]
-    need(clips, motions[0].path, "every motion is shorter than four frames", "longer ones are needed")
+    if not clips:
+        fail(motions[0].path, "every motion is shorter than four frames", "longer ones are needed")
     features = [pose_features(clip, skeleton, joints) for clip in clips]
     matrices = [centred_matrices(clip, skeleton)[0] for clip in clips]
     roots = [m[:, 0, :3, :3] @ skeleton.bind_transforms[0, :3, 3] + m[:, 0, :3, 3] for m in matrices]

@@ -9,7 +9,7 @@ from dataclasses import replace
 import torch
 
 from ..config import TrainConfig
-from ..errors import need
+from ..errors import fail
 from .step import EAGER_STEPS, Stepper
 
 SHARE = 0.9  # of the time that is left, for which iterations are planned; the rest is for a machine that slows down
@@ -46,8 +46,13 @@ def fitting_iterations(stepper: Stepper, config: TrainConfig, seconds: float, sc
     warm, proper = (_seconds(stepper, iteration) for iteration in (0, config.warm_iterations))
     left = SHARE * seconds - validations * scoring
     count = int(left / (config.warm * warm + (1 - config.warm) * proper))
-    need(count >= FEWEST, where, f"{max(0, count)} iterations fit into the minutes that are left on this device",
-         f"at least {FEWEST} are needed", "give more minutes, or take a smaller preset")  # fmt: skip
+    if not count >= FEWEST:
+        fail(
+            where,
+            f"{max(0, count)} iterations fit into the minutes that are left on this device",
+            f"at least {FEWEST} are needed",
+            "give more minutes, or take a smaller preset",
+        )
     return count
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from ..assets import LOOSE, PINNED, Motion, Scene
 from ..config import ModelConfig, TrainConfig
-from ..errors import need
+from ..errors import fail
 from ..fabrics import Fabric
 from .recombine import recombined
 from .state import canonical, scene_digest
@@ -95,7 +95,8 @@ def split_motions(motions: Sequence[Motion]) -> tuple[list[Motion], list[Motion]
     """Return 80 % of the clips to train on and 20 % to validate on, spread evenly; one clip is cut in two."""
     if len(motions) == 1:
         cut = int(motions[0].frame_count * 0.8)
-        need(cut > 0, motions[0].path, "one motion of one frame", "longer motions are needed to train")
+        if not cut > 0:
+            fail(motions[0].path, "one motion of one frame", "longer motions are needed to train")
         return [motions[0].clip(0, cut)], [motions[0].clip(cut, motions[0].frame_count)]
     held = set(range(4, len(motions), 5)) or {len(motions) - 1}
     return [m for i, m in enumerate(motions) if i not in held], [m for i, m in enumerate(motions) if i in held]

@@ -11,7 +11,7 @@ import torch
 
 from ..assets import Scene
 from ..config import ModelConfig, TrainConfig
-from ..errors import need
+from ..errors import fail
 
 SHARE = 0.8  # of the free memory that a training may plan for
 UNKNOWN = 8 << 30  # bytes that are planned for where the system cannot be asked portably
@@ -88,13 +88,13 @@ def need_one_window(
 ) -> None:
     """Raise `SsilkError` unless a step on a single window fits into `available` bytes."""
     needed = step_memory(scene, model, ceil(_frames_of_a_window(config)), body_vertices)
-    need(
-        needed <= available,
-        scene.garment.mesh.path,
-        f"a batch of one window of {config.window} poses needs {needed / 2**30:.2g} GiB",
-        f"{available / 2**30:.2g} GiB are free",
-        "free some, take another device (--device), or shorter windows (--set window=...)",
-    )
+    if not needed <= available:
+        fail(
+            scene.garment.mesh.path,
+            f"a batch of one window of {config.window} poses needs {needed / 2**30:.2g} GiB",
+            f"{available / 2**30:.2g} GiB are free",
+            "free some, take another device (--device), or shorter windows (--set window=...)",
+        )
 
 
 def suffices(work: Callable[[], None]) -> bool:

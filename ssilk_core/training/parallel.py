@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ..config import TrainConfig
 from ..devices import chosen_device
-from ..errors import SsilkError, need
+from ..errors import SsilkError, fail
 
 SHARED = ("batch", "warm_batch", "resting")  # settings that count what one step looks at, in all processes together
 LAUNCHED = ("RANK", "LOCAL_RANK", "WORLD_SIZE")  # what torchrun tells each process
@@ -53,8 +53,13 @@ class Team:
         """
         for name in SHARED:
             value = getattr(config, name)
-            need(value % self.size == 0, f"setting '{name}'", f"{value} for {self.size} processes",
-                 "each takes an equal part", f"use a multiple of {self.size}")  # fmt: skip
+            if value % self.size != 0:
+                fail(
+                    f"setting '{name}'",
+                    f"{value} for {self.size} processes",
+                    "each takes an equal part",
+                    f"use a multiple of {self.size}",
+                )
         return replace(config, **{name: getattr(config, name) // self.size for name in SHARED})
 
     def average(self, tensors: list[Tensor]) -> None:
@@ -126,12 +131,19 @@ def joined(device: str) -> Iterator[tuple[Team, str]]:
 
 
 def _own_device(name: str, local_rank: int) -> torch.device:
-    need(":" not in name, f"--device {name}", "torchrun gives each process a GPU of its own",
-         "'auto', 'cuda' and 'cpu' are allowed")  # fmt: skip
+    if ":" in name:
+        fail(
+            f"--device {name}", "torchrun gives each process a GPU of its own", "'auto', 'cuda' and 'cpu' are allowed"
+        )
     if name == "cpu" or not torch.cuda.is_available():
         return chosen_device(name)
     count = torch.cuda.device_count()
-    need(local_rank < count, f"process {local_rank + 1}", f"{count} GPUs are visible", "each process needs its own",
-         f"start with --nproc-per-node {count}")  # fmt: skip
+    if not local_rank < count:
+        fail(
+            f"process {local_rank + 1}",
+            f"{count} GPUs are visible",
+            "each process needs its own",
+            f"start with --nproc-per-node {count}",
+        )
     torch.cuda.set_device(local_rank)  # kernels and graphs run on the current device
     return torch.device("cuda", local_rank)

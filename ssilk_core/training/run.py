@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ..config import TrainConfig
 from ..devices import chosen_device
-from ..errors import fail, need
+from ..errors import fail
 from ..events import Checkpoint, Message, Progress, Reporter, Started
 from ..kinematics import split_at_cuts
 from .bank import MOST_TURN
@@ -61,8 +61,13 @@ class Run:
 
     def __init__(self, job: TrainJob, report: Reporter, team: Team = ALONE) -> None:
         self._began = time.monotonic()
-        need(team.size == 1 or job.minutes is None, str(job.output), "minutes for a team of processes",
-             "its clocks differ", "set the iterations instead (--set iterations=...)")  # fmt: skip
+        if not (team.size == 1 or job.minutes is None):
+            fail(
+                str(job.output),
+                "minutes for a team of processes",
+                "its clocks differ",
+                "set the iterations instead (--set iterations=...)",
+            )
         self.job, self.report, self.device, self.team = job, report, chosen_device(job.device), team
         self.keeper, identity = Keeper(job, self.device, team), {**job.identity(), "processes": team.size}
         self.state, tensors = load_state(self.keeper.state, identity) if job.resume else (RunState(identity), None)
@@ -171,15 +176,20 @@ class Run:
         """
         while not suffices(work):
             config, found = self.config, f"iteration {self.state.iteration}: {self.device} is out of memory"
-            need(self.team.size == 1, self.job.scene.garment.mesh.path, found, "a team keeps the batch it has",
-                 "train again with a smaller one (--set batch=...)")  # fmt: skip
-            need(
-                (config.warm_batch if self.state.iteration < config.warm_iterations else config.batch) > 1,
-                self.job.scene.garment.mesh.path,
-                f"{found} with a batch of one",
-                "a step needs more than is free",
-                "take another device, or shorter windows (--set window=...)",
-            )
+            if self.team.size != 1:
+                fail(
+                    self.job.scene.garment.mesh.path,
+                    found,
+                    "a team keeps the batch it has",
+                    "train again with a smaller one (--set batch=...)",
+                )
+            if not (config.warm_batch if self.state.iteration < config.warm_iterations else config.batch) > 1:
+                fail(
+                    self.job.scene.garment.mesh.path,
+                    f"{found} with a batch of one",
+                    "a step needs more than is free",
+                    "take another device, or shorter windows (--set window=...)",
+                )
             self.state.undone = int(self.stepper.faults.count)
             self._lower(found, max(1, config.batch // 2), max(1, config.warm_batch // 2))
             self._rebuild_stepper(learned(self.stepper))

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ..assets import Scene
 from ..config import TrainConfig
-from ..errors import SsilkError, need
+from ..errors import SsilkError, fail
 from ..files import replacing
 from .curve import Point
 from .step import Stepper
@@ -108,13 +108,13 @@ def load_state(path: Path, asked: dict[str, Any]) -> tuple[RunState, Tensors]:
     """
     from safetensors import safe_open
 
-    need(
-        path.is_file(),
-        str(path),
-        "there is no training to resume",
-        "the file is written beside the model",
-        "train without --resume",
-    )
+    if not path.is_file():
+        fail(
+            str(path),
+            "there is no training to resume",
+            "the file is written beside the model",
+            "train without --resume",
+        )
     with _damage_named(path):
         with safe_open(path, "pt") as stream:
             state = _state_of(json.loads((stream.metadata() or {})["ssilk_state"]))
@@ -196,13 +196,13 @@ def _need_same(path: Path, asked: dict[str, Any], before: dict[str, Any]) -> Non
             differing += sorted(name for name in value.keys() | old.keys() if value.get(name) != old.get(name))
         elif value != old:
             differing.append(key)
-    need(
-        not differing,
-        str(path),
-        f"the run was started with another {', '.join(dict.fromkeys(differing))}",
-        "a resumed run repeats the same command",
-        "use the same options or train without --resume",
-    )
+    if differing:
+        fail(
+            str(path),
+            f"the run was started with another {', '.join(dict.fromkeys(differing))}",
+            "a resumed run repeats the same command",
+            "use the same options or train without --resume",
+        )
 
 
 def scene_digest(scene: Scene) -> str:

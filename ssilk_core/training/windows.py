@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from ..config import TrainConfig
-from ..errors import need
+from ..errors import fail
 from .bank import MotionBank
 
 
@@ -42,13 +42,13 @@ class WindowSampler:
         self.stop_of = stops
         self.candidates = frames[frames + config.window <= stops]
         longest = int((bank.stops - bank.starts).max())
-        need(
-            len(self.candidates),
-            "motions",
-            f"the longest clip has {longest} frames at the model's rate",
-            f"a window of {config.window} poses must fit",
-            "give longer motions or set --set window=N",
-        )
+        if not len(self.candidates):
+            fail(
+                "motions",
+                f"the longest clip has {longest} frames at the model's rate",
+                f"a window of {config.window} poses must fit",
+                "give longer motions or set --set window=N",
+            )
         self.first = self._fresh()
         self.direction = random_directions(config.batch, config.rotated, generator, device).clone()
         self.latents = torch.zeros(2, config.batch, latent, device=device)

@@ -14,7 +14,7 @@ from typing import IO
 
 import numpy as np
 
-from ..errors import fail, need
+from ..errors import fail
 from ..files import replacing
 from .render import Image
 
@@ -27,7 +27,8 @@ RETRY = "free some space or choose another output"
 def check_suffix(path: str | Path, allowed: tuple[str, ...] = (FILM, PICTURE)) -> str:
     """Return the lower-case suffix of an output; raise `SsilkError` unless it is one of `allowed`."""
     suffix = Path(path).suffix.lower()
-    need(suffix in allowed, str(path), f"suffix '{suffix}'", f"pictures are written as {' or '.join(allowed)}")
+    if suffix not in allowed:
+        fail(str(path), f"suffix '{suffix}'", f"pictures are written as {' or '.join(allowed)}")
     return suffix
 
 
@@ -57,7 +58,8 @@ def write_film(path: str | Path, images: Iterable[Image], fps: float) -> int:
     with replacing(path) as temporary, _ffmpeg(path, temporary, shape, fps) as pipe:
         for image in chain([first], stream):
             even = _even(image)
-            need(even.shape == shape, str(path), f"picture {count} has the shape {even.shape}", f"all need {shape}")
+            if even.shape != shape:
+                fail(str(path), f"picture {count} has the shape {even.shape}", f"all need {shape}")
             pipe.write(even.tobytes())
             count += 1
     return count
@@ -89,13 +91,10 @@ def _ffmpeg(path: str | Path, temporary: Path, shape: tuple[int, ...], fps: floa
             with suppress(BrokenPipeError):
                 process.stdin.close()
             code = process.wait()
-        need(
-            code == 0,
-            str(path),
-            f"ffmpeg failed with code {code} ({_last_line(words)})",
-            "the film was not written",
-            RETRY,
-        )
+        if code != 0:
+            fail(
+                str(path), f"ffmpeg failed with code {code} ({_last_line(words)})", "the film was not written", RETRY
+            )
 
 
 def _last_line(words: IO[bytes]) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..assets import Floats, Ints
-from ..errors import need
+from ..errors import fail
 from .camera import Camera
 from .ground import floor_distance, stage
 from .light import Lit, Rig
@@ -37,9 +37,11 @@ def render(
     Raises:
         SsilkError: there is nothing to draw, or `samples` is neither 1 nor 4.
     """
-    need(samples in (1, 4), "rendering", f"{samples} samples", "1 and 4 are allowed")
+    if samples not in (1, 4):
+        fail("rendering", f"{samples} samples", "1 and 4 are allowed")
     geometry = Geometry.of(surfaces)
-    need(len(geometry.faces), "rendering", "the surfaces have no faces", "at least one triangle is needed")
+    if not len(geometry.faces):
+        fail("rendering", "the surfaces have no faces", "at least one triangle is needed")
     lit, rig = Lit.of(geometry), Rig.beside(camera)
     view = View(lit, rig, camera, width, height, ground)
     picture = stage(lit, rig, camera, view.rays(*np.mgrid[:height, :width] + 0.5), ground)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..assets import Floats
-from ..errors import need
+from ..errors import fail
 from ..events import Progress, Reporter, silent
 from .camera import Camera, follow_cameras
 from .colours import BODY, fabric_colour
@@ -44,9 +44,12 @@ class Look:
 
     def __post_init__(self) -> None:
         size = f"{self.width} x {self.height} pixels"
-        need(all(16 <= side <= 8192 for side in (self.width, self.height)), "view", size, "16 to 8192 each are drawn")
-        need(np.isfinite(self.azimuth), "view", f"azimuth = {self.azimuth}", "it must be finite")
-        need(self.workers > 0, "view", f"workers = {self.workers}", "at least 1 is needed")
+        if not all(16 <= side <= 8192 for side in (self.width, self.height)):
+            fail("view", size, "16 to 8192 each are drawn")
+        if not np.isfinite(self.azimuth):
+            fail("view", f"azimuth = {self.azimuth}", "it must be finite")
+        if not self.workers > 0:
+            fail("view", f"workers = {self.workers}", "at least 1 is needed")
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +86,8 @@ def film_of_shots(
         SsilkError: another suffix, shots that do not match, nothing to draw, or a file that cannot be written.
     """
     check_suffix(path, (FILM,))
-    need(0 < fps < np.inf, "view", f"fps = {fps:g}", "a positive rate is needed")
+    if not 0 < fps < np.inf:
+        fail("view", f"fps = {fps:g}", "a positive rate is needed")
     look = look or Look()
     step = int(np.ceil(players[0].fps / fps - 1e-6)) if players else 1
     frames = range(0, _frame_count(players), step)
@@ -107,7 +111,8 @@ def sheet_of_shots(
     The other arguments and the errors are those of `film_of_shots`, with .png for .mp4.
     """
     check_suffix(path, (PICTURE,))
-    need(columns > 0 and rows > 0, "contact sheet", f"{columns} columns and {rows} rows", "both are at least 1")
+    if not (columns > 0 and rows > 0):
+        fail("contact sheet", f"{columns} columns and {rows} rows", "both are at least 1")
     look = look or Look(width=320, height=440)
     count = _frame_count(players)
     frames = np.linspace(0, count - 1, min(columns * rows, count)).round().astype(int).tolist()
@@ -124,18 +129,20 @@ def sheet_of_shots(
 
 def _frame_count(players: Sequence[Player]) -> int:
     """Return the number of frames of shots that match; raise `SsilkError` when they do not."""
-    need(players, "view", "no shot", "at least one is needed")
+    if not players:
+        fail("view", "no shot", "at least one is needed")
     first = players[0]
     count = len(first.frame_times)
-    need(count, "view", "the shot has no frames", "at least one is needed")
+    if not count:
+        fail("view", "the shot has no frames", "at least one is needed")
     for other in players[1:]:
-        need(
-            len(other.frame_times) == count and abs(other.fps - first.fps) < 1e-6 * first.fps,
-            "view",
-            f"{count} frames at {first.fps:g} fps beside {len(other.frame_times)} at {other.fps:g}",
-            "shots shown together have the same length and rate",
-            "bake them from the same motion",
-        )
+        if not (len(other.frame_times) == count and abs(other.fps - first.fps) < 1e-6 * first.fps):
+            fail(
+                "view",
+                f"{count} frames at {first.fps:g} fps beside {len(other.frame_times)} at {other.fps:g}",
+                "shots shown together have the same length and rate",
+                "bake them from the same motion",
+            )
     return count
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..assets import Floats, Ints
-from ..errors import need
+from ..errors import fail
 
 INSIDE_SHADE = 0.75  # brightness of the inside of cloth, against its outside
 
@@ -35,23 +35,21 @@ class Surface:
 
     def __post_init__(self) -> None:
         points, faces, where = np.asarray(self.points), np.asarray(self.faces), f"surface '{self.name}'"
-        need(
-            points.ndim == 2 and points.shape[1] == 3 and faces.ndim == 2 and faces.shape[1] == 3,
-            where,
-            f"points of shape {points.shape} and faces of shape {faces.shape}",
-            "shapes (V, 3) and (F, 3) are needed",
-        )
+        if not (points.ndim == 2 and points.shape[1] == 3 and faces.ndim == 2 and faces.shape[1] == 3):
+            fail(
+                where,
+                f"points of shape {points.shape} and faces of shape {faces.shape}",
+                "shapes (V, 3) and (F, 3) are needed",
+            )
         bad = int(np.count_nonzero(~np.isfinite(points).all(axis=1)))
-        need(bad == 0, where, f"{bad} of {len(points)} points hold NaN or infinity", "all must be finite")
+        if bad != 0:
+            fail(where, f"{bad} of {len(points)} points hold NaN or infinity", "all must be finite")
         bad = int(np.count_nonzero((faces < 0) | (faces >= len(points))))
-        need(bad == 0, where, f"{bad} face indices point at no vertex", f"they lie in 0 to {len(points) - 1}")
+        if bad != 0:
+            fail(where, f"{bad} face indices point at no vertex", f"they lie in 0 to {len(points) - 1}")
         shape = np.shape(self.colour)
-        need(
-            shape in ((3,), (len(points), 3)),
-            where,
-            f"colours of shape {shape}",
-            f"(3,) or ({len(points)}, 3) is needed",
-        )
+        if shape not in ((3,), (len(points), 3)):
+            fail(where, f"colours of shape {shape}", f"(3,) or ({len(points)}, 3) is needed")
 
 
 @dataclass(frozen=True, eq=False)

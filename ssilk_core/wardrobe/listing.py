@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ..config import PRESETS
-from ..errors import fail, need
+from ..errors import fail
 from ..fabrics import FABRICS
 
 DEFAULTS = "defaults"  # the table whose keys hold for every garment that does not say otherwise
@@ -71,7 +71,8 @@ def read_list(path: Path) -> list[Entry]:
     Raises:
         SsilkError: the file is missing or no TOML, or an entry says what cannot be.
     """
-    need(path.is_file(), str(path), "there is no such file", "a TOML file with one table for each garment is needed")
+    if not path.is_file():
+        fail(str(path), "there is no such file", "a TOML file with one table for each garment is needed")
     try:
         tables = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -79,20 +80,31 @@ def read_list(path: Path) -> list[Entry]:
     for name, table in tables.items():
         _need_table(path, name, table)
     defaults = tables.pop(DEFAULTS, {})
-    need(tables, str(path), "it names no garment", "a list holds one table for each garment", "add [name]")
+    if not tables:
+        fail(str(path), "it names no garment", "a list holds one table for each garment", "add [name]")
     return [Entry(name, _words(path, name, _joined(defaults, table))) for name, table in tables.items()]
 
 
 def _need_table(path: Path, name: str, table: Any) -> None:
     """Raise `SsilkError` unless a name is fit for files and its table holds known keys with values of their kinds."""
-    need(isinstance(table, dict), f"{path}: key '{name}'", "it stands in no table",
-         f"each key belongs to [{DEFAULTS}] or to the table of a garment")  # fmt: skip
-    need(re.fullmatch(r"\w[\w.-]*", name), f"{path}: table '{name}'", "its name would be the name of files",
-         "letters, digits, '_', '-' and '.' are allowed")  # fmt: skip
+    if not isinstance(table, dict):
+        fail(
+            f"{path}: key '{name}'",
+            "it stands in no table",
+            f"each key belongs to [{DEFAULTS}] or to the table of a garment",
+        )
+    if not re.fullmatch(r"\w[\w.-]*", name):
+        fail(
+            f"{path}: table '{name}'",
+            "its name would be the name of files",
+            "letters, digits, '_', '-' and '.' are allowed",
+        )
     for key, value in table.items():
         where = f"{path}: table '{name}', key '{key}'"
-        need(key in KEYS, where, "no such key", f"keys are {', '.join(KEYS)}")
-        need(KEYS[key].fits(value), where, f"{value!r}", f"{KEYS[key].allowed} is needed")
+        if key not in KEYS:
+            fail(where, "no such key", f"keys are {', '.join(KEYS)}")
+        if not KEYS[key].fits(value):
+            fail(where, f"{value!r}", f"{KEYS[key].allowed} is needed")
 
 
 def _joined(defaults: dict[str, Any], table: dict[str, Any]) -> dict[str, Any]:
@@ -102,8 +114,8 @@ def _joined(defaults: dict[str, Any], table: dict[str, Any]) -> dict[str, Any]:
 
 def _words(path: Path, name: str, table: dict[str, Any]) -> tuple[str, ...]:
     for key in NEEDED:
-        need(key in table, f"{path}: table '{name}', key '{key}'", "missing",
-             f"it stands here or in [{DEFAULTS}]")  # fmt: skip
+        if key not in table:
+            fail(f"{path}: table '{name}', key '{key}'", "missing", f"it stands here or in [{DEFAULTS}]")
     said = [(key.option, table[name]) for name, key in KEYS.items() if name in table]
     return tuple(word for option, value in said for word in _option(option, value))
 
