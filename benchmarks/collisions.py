@@ -20,8 +20,8 @@ from subjects import Subject, arguments, clip_of, open_subject, parsed
 from torch import Tensor
 
 from ssilk_core.assets import CLASS_NAMES, Floats, Ints, Motion
-from ssilk_core.energy.collision import signed_distance
-from ssilk_core.training.validation import roll_states
+from ssilk_core.collision.distance import signed_distance
+from ssilk_core.motion_bank import roll_states
 
 ABOVE = 2e-3  # [m] over the surface, where a free surface is outside the body
 HEADER = ("garment", "", *(f"inside: {name}" for name in CLASS_NAMES), "inside: all", "by winding number",

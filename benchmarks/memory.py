@@ -31,14 +31,14 @@ from ssilk_core.assets import (
     Skeleton,
     SkinWeights,
 )
+from ssilk_core.collision.body import CollisionBody
 from ssilk_core.config import ModelConfig, TrainConfig
 from ssilk_core.energy import GarmentEnergy
 from ssilk_core.fabrics import Fabric
 from ssilk_core.kinematics import local_transforms, rigid
-from ssilk_core.model.body import CollisionBody
+from ssilk_core.memory import step_memory
 from ssilk_core.model.network import GarmentModel
-from ssilk_core.training.bank import build_bank
-from ssilk_core.training.memory import step_memory
+from ssilk_core.motion_bank import build_bank
 from ssilk_core.training.objective import Objective
 from ssilk_core.training.step import Stepper
 from ssilk_core.training.windows import WindowSampler

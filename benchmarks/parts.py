@@ -13,7 +13,7 @@ from moment import Moment
 from torch import Tensor, nn
 
 from ssilk_core import kernels
-from ssilk_core.model.descriptors import GRAVITY
+from ssilk_core.constants import GRAVITY
 
 # Operations for one element in one frame, counted on the formulas.
 TURN, COMPOSE, BLEND, TRANSFORM, NORMALISE = 15, 108, 24, 18, 9

@@ -17,12 +17,12 @@ from ssilk_core.baselines.networks import Baseline, BaselineConfig, baseline
 from ssilk_core.checkpoint import ModelFile, network
 from ssilk_core.model.batch import DOWN, driven
 from ssilk_core.model.network import GarmentModel
-from ssilk_core.model.skinning import Skinning, blended, transformed
+from ssilk_core.motion_bank import build_bank
 from ssilk_core.runtime.drive import drive
 from ssilk_core.runtime.playback import BLOCK, POSED
 from ssilk_core.runtime.player import Player
 from ssilk_core.runtime.skinning import posed
-from ssilk_core.training.bank import build_bank
+from ssilk_core.skinning import Skinning, blended, transformed
 
 DESCRIPTORS, REST, LATENTS, DECODER, KINEMATICS, SKINNING = PARTS = (
     "descriptors and character", "networks of the poses alone", "latents", "decoder", "proxy kinematics",

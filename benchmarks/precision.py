@@ -27,11 +27,12 @@ from torch import Tensor
 from ssilk_core.assets import Motion
 from ssilk_core.checkpoint import ModelFile, network, save_model
 from ssilk_core.energy import TERMS
+from ssilk_core.energy.frames import DECODED_AT_ONCE
 from ssilk_core.errors import fail
 from ssilk_core.evaluation.splits import chosen, read_index
 from ssilk_core.evaluation.takes import back_and_forth
+from ssilk_core.motion_bank import roll_states
 from ssilk_core.packing import packed, unpacked
-from ssilk_core.training.validation import DECODED_AT_ONCE, roll_states
 
 MOST_RMS = 1e-4  # [m] over all vertices, frames and clips
 # [m] any vertex in any frame: amid a cartwheel a rollout makes millimetres of any rounding, for a few frames.

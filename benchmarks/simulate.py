@@ -30,8 +30,8 @@ from ssilk_core.events import TextReporter
 from ssilk_core.fabrics import Fabric
 from ssilk_core.setup.prepare import prepare_scene
 from ssilk_core.simulate import SimulationOptions, Simulator
+from ssilk_core.simulate.incremental_potential import IncrementalPotential, StepInputs
 from ssilk_core.simulate.newton import Solution, SolverOptions
-from ssilk_core.simulate.potential import Potential, Setting
 
 HEADER = ("method", "shots at once", "ms per frame and shot", "iterations", "of conjugate gradients",
           "out of balance, median [g]", "within the tolerance", "energy [J]")  # fmt: skip
@@ -44,16 +44,16 @@ class Watched(Simulator):
     def __init__(self, scene: Scene, options: SimulationOptions, device: torch.device) -> None:
         super().__init__(scene, Fabric("default"), options, device=device)
         self.seconds: list[float] = []
-        self.problems: list[tuple[Tensor, Setting]] = []
+        self.problems: list[tuple[Tensor, StepInputs]] = []
         self.solutions: list[Solution] = []
 
-    def solve(self, start: Tensor, setting: Setting) -> Solution:
+    def solve(self, start: Tensor, inputs: StepInputs) -> Solution:
         """Solve one step."""
         first = torch.zeros(1, dtype=torch.int64, device=start.device)
         begun = now(start.device)
-        solution = super().solve(start, setting)
+        solution = super().solve(start, inputs)
         self.seconds.append(now(start.device) - begun)
-        self.problems.append((start[..., :1], setting.picked(first)))
+        self.problems.append((start[..., :1], inputs.select(first)))
         self.solutions.append(solution)
         return solution
 
@@ -85,36 +85,36 @@ def newton(scene: Scene, motions: Sequence[Motion], count: int, options: argpars
 
 def newton_figures(simulator: Watched, count: int) -> dict[str, Any]:
     """Return the figures of one run; energies are those of the first shot."""
-    imbalance = torch.cat([s.imbalance for s in simulator.solutions])
+    residual = torch.cat([s.residual for s in simulator.solutions])
     return {
         "shots": count,
         "seconds": sum(simulator.seconds) / len(simulator.seconds) / count,
         "iterations": float(torch.cat([s.iterations for s in simulator.solutions]).double().mean()),
-        "inner": sum(s.inner for s in simulator.solutions) / len(simulator.solutions),
-        "imbalance": float(imbalance.median()),
-        "solved": float((imbalance <= simulator.options.solver.tolerance).double().mean()),
+        "cg_iterations": sum(s.cg_iterations for s in simulator.solutions) / len(simulator.solutions),
+        "residual": float(residual.median()),
+        "solved": float((residual <= simulator.options.solver.tolerance).double().mean()),
         "energy": sum(float(s.energy[0]) for s in simulator.solutions) / len(simulator.solutions),
     }
 
 
-def by_lbfgs(potential: Potential, start: Tensor, setting: Setting, iterations: int) -> Tensor:
+def by_lbfgs(potential: IncrementalPotential, start: Tensor, inputs: StepInputs, iterations: int) -> Tensor:
     """Return the lowest state that L-BFGS passes at the ends of its rounds, (V, 3, 1)."""
     free, best, lowest = potential.free, start, torch.inf
     moved = start[free].clone().requires_grad_(True)
     for _ in range(max(1, iterations // ROUND)):
-        met = potential.met(start.index_copy(0, free, moved.detach()), setting)
+        body_distance = potential.body_distance(start.index_copy(0, free, moved.detach()), inputs)
         search = torch.optim.LBFGS([moved], max_iter=min(ROUND, iterations), history_size=20, tolerance_grad=1e-9,
                                    tolerance_change=1e-14, line_search_fn="strong_wolfe")  # fmt: skip
 
-        def evaluate(search: torch.optim.Optimizer = search, met: Any = met) -> Tensor:
+        def evaluate(search: torch.optim.Optimizer = search, body_distance: Any = body_distance) -> Tensor:
             search.zero_grad()
-            value = potential.energy(start.index_copy(0, free, moved), setting, met).sum()
+            value = potential.energy(start.index_copy(0, free, moved), inputs, body_distance).sum()
             value.backward()
             return value
 
         search.step(evaluate)
         x = start.index_copy(0, free, moved.detach())
-        energy = float(potential.energy(x, setting, potential.met(x, setting)))
+        energy = float(potential.energy(x, inputs, potential.body_distance(x, inputs)))
         best, lowest = (x, energy) if energy < lowest else (best, lowest)
     return best
 
@@ -123,29 +123,29 @@ def lbfgs_figures(simulator: Watched, iterations: int, frames: int) -> dict[str,
     """Return the figures of L-BFGS on the first frames of the first shot."""
     potential, problems = simulator.potential, simulator.problems[:frames]
     begun = now(potential.free.device)
-    states = [by_lbfgs(potential, start, setting, iterations) for start, setting in problems]
+    states = [by_lbfgs(potential, start, inputs, iterations) for start, inputs in problems]
     seconds = (now(potential.free.device) - begun) / len(problems)
-    energy, imbalance = [], []
-    for x, (_, setting) in zip(states, problems):
-        met = potential.met(x, setting)
-        energy.append(float(potential.energy(x, setting, met)))
-        imbalance.append(float(potential.imbalance(potential.gradient(x, setting, met))))
+    energy, residual = [], []
+    for x, (_, inputs) in zip(states, problems):
+        body_distance = potential.body_distance(x, inputs)
+        energy.append(float(potential.energy(x, inputs, body_distance)))
+        residual.append(float(potential.residual(potential.gradient(x, inputs, body_distance))))
     tolerance = simulator.options.solver.tolerance
     return {
         "shots": 1,
         "seconds": seconds,
         "iterations": iterations,
-        "imbalance": float(torch.tensor(imbalance).median()),
-        "solved": sum(value <= tolerance for value in imbalance) / len(imbalance),
+        "residual": float(torch.tensor(residual).median()),
+        "solved": sum(value <= tolerance for value in residual) / len(residual),
         "energy": sum(energy) / len(energy),
     }
 
 
 def row(method: str, found: dict[str, Any]) -> list[str]:
     """Return one line of the table."""
-    inner = f"{found['inner']:.0f}" if "inner" in found else ""
-    return [method, str(found["shots"]), f"{1000 * found['seconds']:.1f}", f"{found['iterations']:.1f}", inner,
-            f"{found['imbalance']:.1e}", f"{found['solved']:.0%}", f"{found['energy']:.6f}"]  # fmt: skip
+    cg_iterations = f"{found['cg_iterations']:.0f}" if "cg_iterations" in found else ""
+    return [method, str(found["shots"]), f"{1000 * found['seconds']:.1f}", f"{found['iterations']:.1f}",
+            cg_iterations, f"{found['residual']:.1e}", f"{found['solved']:.0%}", f"{found['energy']:.6f}"]  # fmt: skip
 
 
 def main() -> None:

@@ -14,7 +14,7 @@ from torch import Tensor
 from ssilk_core.baselines.networks import Baseline
 from ssilk_core.evaluation.methods import Network, Reel
 from ssilk_core.model.network import GarmentModel
-from ssilk_core.training.validation import Rolled
+from ssilk_core.motion_bank import LatentModel
 
 WARM_UP = 30  # frames that are not timed
 
@@ -28,7 +28,7 @@ class Times:
 
 
 @torch.no_grad()
-def frame_times(model: Rolled, reel: Reel, frames: int) -> Times:
+def frame_times(model: LatentModel, reel: Reel, frames: int) -> Times:
     """Time frames of the first take; descriptors and the skeleton's matrices are there already."""
     network = Network("timed", model, reel)
     taken = [_frame(network, 2 + number % (reel.takes[0].frame_count - 2)) for number in range(WARM_UP + frames)]
@@ -55,7 +55,7 @@ def _frame(network: Network, frame: int) -> tuple[float, float]:
 
 
 def _parts(
-    model: Rolled, past: list[Tensor], static: Tensor, pose: Tensor
+    model: LatentModel, past: list[Tensor], static: Tensor, pose: Tensor
 ) -> tuple[Callable[[], Tensor], Callable[[Tensor], Tensor]]:
     """Return what advances a network by a frame, and what it ends in."""
     if isinstance(model, GarmentModel):

@@ -56,17 +56,17 @@ def measure(subject: Subject, clip: str, stop: float, options: Any) -> dict[str,
         "distance [m]": float(rest.distance()),
         "inside": float(rest.inside(rest.start)),
         "inside at the minimum": float(rest.inside(rest.x)),
-        "out of balance [g]": float(rest.imbalance),
+        "out of balance [g]": float(rest.residual),
     }
 
 
 def row(garment: str, where: str, found: dict[str, float]) -> list[str]:
     """Return one line of the table."""
-    start, end, calm, off, over_still, over, *floats, distance, inside, below, imbalance = found.values()
+    start, end, calm, off, over_still, over, *floats, distance, inside, below, residual = found.values()
     calm_text = f"{calm:.2f}" if calm < HOLD else "never"
     return [garment, where, f"{start:.2e}", f"{end:.2e}", calm_text, f"{1000 * off:.0f}", f"{over_still:.4f}",
             f"{over:.4f}", *(f"{share:.2%}" for share in floats), f"{1000 * distance:.0f}", f"{inside:.2%}",
-            f"{below:.2%}", f"{imbalance:.1e}"]  # fmt: skip
+            f"{below:.2%}", f"{residual:.1e}"]  # fmt: skip
 
 
 def main() -> None:

@@ -16,13 +16,13 @@ from torch import Tensor
 
 from ssilk_core.assets import Motion, Scene
 from ssilk_core.checkpoint import ModelFile, load_model, network
+from ssilk_core.collision.body import CollisionBody
 from ssilk_core.devices import chosen_device
 from ssilk_core.energy import GarmentEnergy
 from ssilk_core.errors import fail
 from ssilk_core.evaluation.methods import Dressed
-from ssilk_core.model.body import CollisionBody
 from ssilk_core.model.network import GarmentModel
-from ssilk_core.training.bank import build_bank
+from ssilk_core.motion_bank import build_bank
 from ssilk_core.training.validation import Validator
 
 

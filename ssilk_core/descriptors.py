@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from .assets import Floats, Motion, Skeleton
+from .constants import GRAVITY
 from .kinematics import matrix_from_quaternion, motion_transforms
 
-GRAVITY = 9.81  # [m/s2]
 # Time over which rates are expressed, so that everyday motion gives features of order one.
 RATE_TIME = 0.1  # [s]
 # Features of rates and accelerations saturate here: a teleport must not push the network out of its range.

@@ -13,9 +13,10 @@ from torch import Tensor
 
 from .assets import Floats, GarmentPose, Motion
 from .config import LOST, RECOVERY
+from .descriptors import pose_features
 from .errors import fail
 from .kinematics import frames_at, motion_transforms, resample, run_up, skinning_matrices, split_at_cuts
-from .model.descriptors import gravity_features, pose_features
+from .model.descriptors import gravity_features
 from .model.network import GarmentModel
 from .sampling import sample_pose
 

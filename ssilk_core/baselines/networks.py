@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from ..assets import PINNED, Ints, Scene
 from ..errors import fail
-from ..model.skinning import Skinning
+from ..skinning import Skinning
 from .descriptors import MOVING, ROOT, STILL, split_features
 
 SHAPES = 1e-4  # [m], standard deviation of initial shapes: training starts close to plain skinning

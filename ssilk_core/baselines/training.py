@@ -6,10 +6,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from ..collision.body import CollisionBody
 from ..config import TrainConfig
 from ..energy import GarmentEnergy
 from ..errors import fail
-from ..model.body import CollisionBody
 from ..training.objective import Objective, Terms, total
 from ..training.step import Stepper
 from ..training.windows import WindowSampler

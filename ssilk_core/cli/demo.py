@@ -34,8 +34,8 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Make the inputs, then run the commands; the first that fails ends the demo with its exit code."""
-    from ..cli import main
     from ..demo.shipped import open_shipped, origin
+    from . import main
 
     wardrobe = _make_inputs(options.out, report)
     shipped = open_shipped(options.garment, wardrobe[options.garment])

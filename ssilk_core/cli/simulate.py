@@ -227,19 +227,19 @@ class _Figures:
     """What a simulation came to."""
 
     def __init__(self, tolerance: float) -> None:
-        self.tolerance, self.solved, self.iterations, self.held = tolerance, 0, 0, 0
+        self.tolerance, self.solved, self.iterations, self.fixed = tolerance, 0, 0, 0
 
     def add(self, frame: SimulatedFrame) -> None:
-        self.solved += frame.imbalance <= self.tolerance
+        self.solved += frame.residual <= self.tolerance
         self.iterations += frame.iterations
-        self.held += frame.held
+        self.fixed += frame.fixed
 
     def of_all(self, frames: int, seconds: float) -> dict[str, object]:
         """Return figures to show."""
         return {
             "frames": frames,
             "within the tolerance": f"{self.solved / frames:.1%}",
-            "iterations a frame": round(self.iterations / frames, 1),
-            "vertices held a frame": round(self.held / frames, 1),
-            "seconds a frame": float(f"{seconds / frames:.3g}"),
+            "Newton iterations per frame": round(self.iterations / frames, 1),
+            "fixed vertices per frame": round(self.fixed / frames, 1),
+            "seconds per frame": float(f"{seconds / frames:.3g}"),
         }

@@ -118,7 +118,7 @@ def _request(entry: Entry, path: Path) -> str:
     Raises:
         SsilkError: there is no such file, or 'ssilk train' would not take it.
     """
-    from ..cli import parser
+    from . import parser
 
     where = f"{path}: table '{entry.name}'"
     try:

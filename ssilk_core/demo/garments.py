@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..assets import Character, Floats, Garment, Ints, Mesh
-from ..demo.garments_dress import hooded_dress
-from ..demo.garments_fit import Fit, fit, outline, relax, through
-from ..demo.garments_mesh import loft
 from ..errors import fail
+from .garments_dress import hooded_dress
+from .garments_fit import Fit, fit, outline, relax, through
+from .garments_mesh import loft
 
 CLEARANCE = 0.012  # [m]; more than the 6 mm that must remain, because triangles cut corners
 

@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from ..assets import Floats, Ints
-from ..demo.garments_fit import Fit, keep_off, outline, relax, through
-from ..demo.garments_mesh import cap, cut, length, loft
+from .garments_fit import Fit, keep_off, outline, relax, through
+from .garments_mesh import cap, cut, length, loft
 
 CLEARANCE = 0.013  # [m]
 EDGE = 0.023  # [m]

@@ -9,13 +9,6 @@ from dataclasses import replace
 import numpy as np
 
 from ..assets import Floats, Motion, Skeleton
-from ..demo.motions_biped import Biped, Track
-from ..demo.motions_cartwheel import cartwheel
-from ..demo.motions_curves import FPS
-from ..demo.motions_gait import RUN, WALK, Gait, locomotion
-from ..demo.motions_gestures import gesture, idle
-from ..demo.motions_jump import jump
-from ..demo.motions_spin import spin
 from ..errors import fail
 from ..kinematics import (
     invert_rigid,
@@ -24,6 +17,13 @@ from ..kinematics import (
     quaternion_from_matrix,
     rigid,
 )
+from .motions_biped import Biped, Track
+from .motions_cartwheel import cartwheel
+from .motions_curves import FPS
+from .motions_gait import RUN, WALK, Gait, locomotion
+from .motions_gestures import gesture, idle
+from .motions_jump import jump
+from .motions_spin import spin
 
 Dice = np.random.Generator
 

@@ -13,9 +13,9 @@ from itertools import pairwise
 import numpy as np
 
 from ..assets import Floats, Motion, Skeleton
-from ..demo.motions_curves import FPS, about, apply, ease, turned
 from ..errors import fail
 from ..kinematics import invert_rigid, quaternion_from_matrix
+from .motions_curves import FPS, about, apply, ease, turned
 
 SIDES = ("Left", "Right")
 OUT = np.array([1.0, -1.0])  # the left points to +x

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..assets import Floats
-from ..demo.motions_biped import OUT, SIDES, Biped, Track
-from ..demo.motions_curves import about, apply, bump, clock, ease, keyed
+from .motions_biped import OUT, SIDES, Biped, Track
+from .motions_curves import about, apply, bump, clock, ease, keyed
 
 MIDDLE = 1.7  # time of the handstand [s]
 END = 2 * MIDDLE

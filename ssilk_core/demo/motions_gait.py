@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..assets import Floats
-from ..demo.motions_biped import OUT, Biped, Track
-from ..demo.motions_curves import FPS, about, apply, bump, clock, ease, keyed, travel, turned
+from .motions_biped import OUT, Biped, Track
+from .motions_curves import FPS, about, apply, bump, clock, ease, keyed, travel, turned
 
 BEFORE, AFTER = 0.3, 0.6  # seconds of standing around a clip
 START = -0.25  # phase at which both feet carry; at 0 the left one is in the middle of its stance

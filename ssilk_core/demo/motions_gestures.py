@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from ..assets import Floats
-from ..demo.motions_biped import Biped, Track
-from ..demo.motions_curves import clock, ease, keyed, turned
+from .motions_biped import Biped, Track
+from .motions_curves import clock, ease, keyed, turned
 
 
 def idle(biped: Biped, seconds: float) -> Track:

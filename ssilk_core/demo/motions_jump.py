@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..assets import Floats
-from ..demo.motions_biped import Biped, Track
-from ..demo.motions_curves import about, bump, clock, ease, keyed, ramp
+from ..constants import GRAVITY
+from .motions_biped import Biped, Track
+from .motions_curves import about, bump, clock, ease, keyed, ramp
 
-GRAVITY = 9.81
 BEGIN, LOW, OFF = 0.3, 0.85, 1.12  # seconds: the crouch begins, is deepest, the feet take off
 TIPTOE = 0.055  # the pelvis is this much higher at take-off than standing [m], for an adult of 1.62 m
 

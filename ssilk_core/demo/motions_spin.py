@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..assets import Floats
-from ..demo.motions_biped import Biped, Track
-from ..demo.motions_curves import about, apply, clock, ease, keyed, travel
+from .motions_biped import Biped, Track
+from .motions_curves import about, apply, clock, ease, keyed, travel
 
 BEGIN, WIND, OFF = 0.3, 0.85, 1.0  # seconds: the wind-up begins, is widest, the turn begins
 

@@ -9,12 +9,13 @@ from torch import Tensor
 
 from .. import kernels
 from ..assets import Floats, Ints, Mesh
+from ..collision.distance import PosedBody, signed, signed_distance
 from ..fabrics import Fabric
 from ..kernels.corners import elastic_tables
 from ..mesh import topology
 from ..mesh.topology import SLIVER
 from .bending import bending_energy, dihedral_angles
-from .collision import PosedBody, collision_energy, signed, signed_distance
+from .collision import collision_energy
 from .operators import difference_operator
 from .stretch import column_weights, deformation_gradient_operator, stretch_density, stretched_areas
 

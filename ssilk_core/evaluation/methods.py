@@ -15,17 +15,16 @@ from torch import Tensor
 from ..assets import PINNED, Floats, Scene
 from ..baselines.descriptors import joint_bank
 from ..baselines.networks import Baseline
+from ..collision.body import CollisionBody
+from ..collision.contacts import Contacts
+from ..constants import GRAVITY
 from ..energy import GarmentEnergy
 from ..energy.stretch import deformation_gradient_operator
 from ..errors import fail
 from ..fabrics import Fabric
-from ..model.body import CollisionBody
-from ..model.contacts import Contacts
-from ..model.descriptors import GRAVITY
-from ..model.skinning import Skinning
+from ..motion_bank import LatentModel, MotionBank, build_bank, roll_states
 from ..simulate import SimulationOptions, Simulator, simulate
-from ..training.bank import MotionBank, build_bank
-from ..training.validation import Rolled, roll_states
+from ..skinning import Skinning
 from .minimum import minima
 from .takes import Take
 
@@ -131,7 +130,7 @@ def reel_of(takes: Sequence[Take], dressed: Dressed, joints: np.ndarray) -> Reel
 class Network:
     """A trained model or a baseline, rolled over all takes side by side, each from its quasi-static start."""
 
-    def __init__(self, name: str, model: Rolled, reel: Reel) -> None:
+    def __init__(self, name: str, model: LatentModel, reel: Reel) -> None:
         self.name, self.model, self.reel = name, model, _seen_by(model, reel)
         bank = self.reel.bank
         self.down = torch.tensor([0.0, -1.0, 0.0], device=bank.root.device)
@@ -150,7 +149,7 @@ class Network:
         return self.model.vertices(quiet, self.reel.character(take, frames))
 
 
-def _seen_by(model: Rolled, reel: Reel) -> Reel:
+def _seen_by(model: LatentModel, reel: Reel) -> Reel:
     """Return a reel with the descriptors of a network."""
     if not isinstance(model, Baseline):
         return reel

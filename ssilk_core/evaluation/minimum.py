@@ -26,19 +26,21 @@ class Minima:
     Attributes:
         start: where the searches began.
         x: the minima.
-        imbalance: what the solver left out of balance [g], shape (N,).
+        residual: what the solver left out of balance [g], shape (N,).
     """
 
     simulator: Simulator
     poses: Poses
     start: Tensor
     x: Tensor
-    imbalance: Tensor
+    residual: Tensor
 
     def over(self) -> Tensor:
         """Return the energy of the starts over that of the minima [J], shape (N,)."""
-        potential, setting = self.simulator.potential, self.simulator.setting(self.poses, None)
-        start, lowest = (potential.energy(x, setting, potential.met(x, setting)) for x in (self.start, self.x))
+        potential, inputs = self.simulator.potential, self.simulator.inputs(self.poses, None)
+        start, lowest = (
+            potential.energy(x, inputs, potential.body_distance(x, inputs)) for x in (self.start, self.x)
+        )
         return start - lowest
 
     def floats(self, x: Tensor) -> Tensor:
@@ -47,7 +49,7 @@ class Minima:
 
     def inside(self, x: Tensor) -> Tensor:
         """Return the share of vertices inside any part of the body, shape (N,)."""
-        body = self.simulator.setting(self.poses, None).body
+        body = self.simulator.inputs(self.poses, None).body
         assert body is not None
         _, nearest = self.simulator.potential.contacts.distances(x.float(), body)
         return (nearest < 0).double().mean(0)
@@ -67,12 +69,12 @@ def minima(simulator: Simulator, takes: Sequence[Take], x: Tensor) -> Minima:
     origins = torch.as_tensor(np.stack([m.translations[0, 0] for m in motions], axis=1), device=x.device)
     start = simulator.pinned(x.double() + origins - poses.root, poses)
     found = simulator.rest(poses, start)
-    return Minima(simulator, poses, start, found.x, found.imbalance)
+    return Minima(simulator, poses, start, found.x, found.residual)
 
 
 def hung(found: Minima, weight: float) -> list[Hung]:
     """Return the figures of each pose, for a garment of m g L [J]."""
     floats, plain = (found.floats(x) / weight for x in (found.start, found.poses.plain))
-    columns = (found.over(), floats, plain, found.distance(), found.imbalance)
-    names = ("above", "floats", "plain", "distance", "imbalance")
+    columns = (found.over(), floats, plain, found.distance(), found.residual)
+    names = ("above", "floats", "plain", "distance", "residual")
     return [Hung(stops=1, **dict(zip(names, row))) for row in torch.stack(columns, dim=1).tolist()]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..training.validation import DECODED_AT_ONCE, energies
+from ..energy.frames import DECODED_AT_ONCE, energy_terms
 from .methods import Dressed, Method, Reel
 from .metrics import BINS, derivative, kinetic_energy, mean_square, principal_stretches, stretch_histogram
 
@@ -21,7 +21,7 @@ class Record:
     """One method over one take.
 
     Attributes:
-        values: for each frame, float64 on the CPU, shape (N,): the energies of `training.validation.energies`,
+        values: for each frame, float64 on the CPU, shape (N,): the frame_energies of `energy.frames.energy_terms`,
             "kinetic" energy [J], "jerk" squared, "largest stretch", "motion" squared [m2] away from the method's own
             quasi-static state, and squared errors of `TRUTH`. NaN where the take has no past to tell it from.
         stretches: histogram of the larger principal stretch of all triangles.
@@ -55,11 +55,13 @@ def recorded(dressed: Dressed, reel: Reel, method: Method, take: int, truth: Met
 
 
 def frame_energies(dressed: Dressed, reel: Reel, take: int, frames: range, path: Tensor) -> dict[str, Tensor]:
-    """Return `training.validation.energies` of the last frames of a path (V, 3, past + N), shape (N,)."""
+    """Return `energy.frames.energy_terms` of the last frames of a path (V, 3, past + N), shape (N,)."""
     x, character = path[..., -len(frames) :], reel.character(take, frames)
     body, joined = dressed.body.posed(character, exact=dressed.exact), path[..., -len(frames) - 2 :]
     down = x.new_tensor([0.0, -1.0, 0.0])
-    return energies(dressed.energy, x, dressed.plain(character), dressed.contacts, body, joined, dressed.fps, down)
+    return energy_terms(
+        dressed.energy, x, dressed.plain(character), dressed.contacts, body, joined, dressed.fps, down
+    )
 
 
 class _Past:

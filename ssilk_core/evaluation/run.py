@@ -14,8 +14,7 @@ from torch import Tensor
 from ..assets import Motion
 from ..errors import fail
 from ..events import Progress, Reporter, silent
-from ..training.bank import MotionBank, build_bank
-from ..training.validation import Rolled
+from ..motion_bank import LatentModel, MotionBank, build_bank
 from .figures import Figures, Holds, Hung, Loops
 from .methods import Cache, Dressed, Method, Network, Plain, Reader, Reel, Simulated, reel_of
 from .metrics import pose_distance
@@ -66,7 +65,7 @@ class Subject:
     """A network under a name, and the character's joints that it has in view."""
 
     name: str
-    model: Rolled
+    model: LatentModel
     joints: np.ndarray
 
 

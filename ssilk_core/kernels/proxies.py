@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Forward kinematics of proxies from 6D rotations, and its gradient; `model.decoder` holds the plain twin.
+"""Forward kinematics of proxies from 6D rotations, and its gradient; `model.decoder` holds the reference
+implementation.
 
 A program is one warp that owns a block of frames and walks over the proxies, parents first; backwards for the
 gradient, which it passes on from each proxy to its parent. No frame is another program's: there are no races.

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..assets import Floats, Ints
-from ..mesh.topology import components, edge_keys, edge_use, edges, half_edges
+from .topology import components, edge_keys, edge_use, edges, half_edges
 
 if TYPE_CHECKING:
     from scipy.sparse import coo_matrix

@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 from ..assets import Motion
+from ..descriptors import pose_features
 from ..errors import fail
 from ..kinematics import motion_transforms, skinning_matrices, split_at_cuts
-from .descriptors import gravity_features, pose_features
+from .descriptors import gravity_features
 from .network import GarmentModel
 
 DOWN = (0.0, -1.0, 0.0)

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from .. import kernels
 from ..assets import PINNED, Scene
-from .skinning import Skinning
+from ..skinning import Skinning
 
 
 def rotation_from_six_d(values: Tensor) -> Tensor:

@@ -6,19 +6,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..descriptors import GRAVITY, RATE_TIME, SATURATION, PoseFeatures, joints_in_view, pose_features, six_d
-
-__all__ = [
-    "GRAVITY",
-    "RATE_TIME",
-    "SATURATION",
-    "PoseFeatures",
-    "gravity_features",
-    "joints_in_view",
-    "pose_features",
-    "six_d",
-]
-
 
 def gravity_features(down: Tensor, direction: Tensor) -> Tensor:
     """Return gravity's unit direction in each joint's frame: down (N, J', 3, 3), direction (N, 3), to (N, 3 J')."""

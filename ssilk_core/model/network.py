@@ -11,10 +11,10 @@ from torch import Tensor, nn
 
 from ..assets import Deformer, Floats, GarmentPose, Scene, SkinWeights
 from ..config import ModelConfig
+from ..descriptors import joints_in_view
 from ..kinematics import matrix_from_quaternion, quaternion_from_matrix
 from ..parameters import descriptor_sizes
 from .decoder import Decoder
-from .descriptors import joints_in_view
 from .integrators import INTEGRATORS
 
 

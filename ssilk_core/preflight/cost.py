@@ -24,7 +24,7 @@ def training_cost(scene: Scene, motions: Sequence[Motion], preset: Preset) -> Fi
 
     `motions` may be empty; the reach of the garment is then that of the rest pose.
     """
-    from ..training.reach import reachable_body
+    from ..collision.reach import reachable_body
 
     reach = reachable_body(scene, motions or [rest_motion(scene)])
     yield from memory(scene, preset, len(reach.vertices))
@@ -34,7 +34,7 @@ def training_cost(scene: Scene, motions: Sequence[Motion], preset: Preset) -> Fi
 def memory(scene: Scene, preset: Preset, body_vertices: int) -> Findings:
     """Yield how much memory and time a preset takes with a garment that reaches `body_vertices`."""
     from ..devices import chosen_device
-    from ..training.memory import decoded_frames, fitting_batch, free_memory, step_memory
+    from ..memory import decoded_frames, fitting_batch, free_memory, step_memory
 
     model, train, device = preset.model, preset.train, chosen_device("auto")
     free = free_memory(device)

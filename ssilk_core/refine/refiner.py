@@ -30,8 +30,8 @@ from ..fabrics import Fabric
 from ..kinematics import split_at_cuts
 from ..simulate import SimulationOptions, Simulator
 from ..simulate.actors import Poses
+from ..simulate.incremental_potential import StepInputs
 from ..simulate.newton import SolverOptions, State, minimise_from
-from ..simulate.potential import Setting
 from ..simulate.simulator import Past
 
 
@@ -68,9 +68,9 @@ class Change:
 
     Attributes:
         before, after: energy of the network's state and of the refined one, with the same past [J].
-        inside_before, inside_after: share of the vertices inside what they meet of the body (`model.contacts`).
+        inside_before, inside_after: share of the vertices inside what they meet of the body (`collision.contacts`).
         moved: RMS distance over the mass [m].
-        imbalance: RMS acceleration that forces out of balance would give the free mass [g], held vertices included.
+        residual: RMS acceleration that forces out of balance would give the free mass [g], held vertices included.
     """
 
     before: float
@@ -78,7 +78,7 @@ class Change:
     inside_before: float
     inside_after: float
     moved: float
-    imbalance: float
+    residual: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,13 +151,13 @@ class Refiner:
         for start, stop in _blocks(span.frame_count, 1 if self.options.feedback else self.options.batch):
             world = self._taken(network, stop - start)
             poses = self.simulator.actors.posed(span.rotations[start:stop], span.translations[start:stop])
-            setting = self.simulator.setting(poses, self._past(tail, world, poses))
-            before = State.at(self.potential, self.simulator.pinned(world - poses.root, poses), setting)
+            inputs = self.simulator.inputs(poses, self._past(tail, world, poses))
+            before = State.at(self.potential, self.simulator.pinned(world - poses.root, poses), inputs)
             if given is None:
-                refined = self._refined(before, tail, world, poses, setting) + poses.root
+                refined = self._refined(before, tail, world, poses, inputs) + poses.root
             else:
                 refined = self._taken(given, stop - start)
-            yield from self._reported(before, setting, refined, poses.root)
+            yield from self._reported(before, inputs, refined, poses.root)
             tail = self._tail(tail, world, refined, poses)
 
     def _taken(self, vertices: Iterator[Floats], count: int) -> Tensor:
@@ -165,13 +165,13 @@ class Refiner:
         points = np.stack(list(islice(vertices, count)), axis=-1)
         return torch.as_tensor(points, dtype=torch.float64, device=self.potential.free.device)
 
-    def _refined(self, before: State, tail: _Tail | None, world: Tensor, poses: Poses, setting: Setting) -> Tensor:
+    def _refined(self, before: State, tail: _Tail | None, world: Tensor, poses: Poses, inputs: StepInputs) -> Tensor:
         """Return refined positions relative to the roots (V, 3, N)."""
         start = before.x
         if tail and self.options.feedback:
             corrected = self.simulator.pinned(world + tail.correction - poses.root, poses)
-            start = self.simulator.best([start, corrected], setting)
-        return minimise_from(self.potential, start, setting, self.options.solver).x.double()
+            start = self.simulator.best([start, corrected], inputs)
+        return minimise_from(self.potential, start, inputs, self.options.solver).x.double()
 
     def _past(self, tail: _Tail | None, world: Tensor, poses: Poses) -> Past | None:
         """Return what each of some consecutive frames looks back on."""
@@ -188,17 +188,19 @@ class Refiner:
         kept = kept if tail is None else torch.cat([tail.world, kept], dim=-1)
         return _Tail(kept[..., -2:], poses.root[:, -1:], poses.plain[..., -1:], (refined - world)[..., -1:])
 
-    def _reported(self, before: State, setting: Setting, refined: Tensor, root: Tensor) -> Iterator[RefinedFrame]:
+    def _reported(self, before: State, inputs: StepInputs, refined: Tensor, root: Tensor) -> Iterator[RefinedFrame]:
         """Yield frames with what was changed in them."""
         mass = self.potential.mass
-        after = State.at(self.potential, (refined - root).to(before.x.dtype), setting)
+        after = State.at(self.potential, (refined - root).to(before.x.dtype), inputs)
         inside = [
-            (state.met.distance(state.x) < 0).double().mean(0) if state.met else torch.zeros_like(state.energy)
+            (state.body_distance.distance(state.x) < 0).double().mean(0)
+            if state.body_distance
+            else torch.zeros_like(state.energy)
             for state in (before, after)
         ]
         moved = ((mass * ((after.x - before.x) ** 2).sum(1)).sum(0) / mass.sum()).sqrt()
-        imbalance = self.potential.imbalance(self.potential.gradient(after.x, setting, after.met))
-        figures = torch.stack([before.energy, after.energy, *inside, moved, imbalance], dim=1).tolist()
+        residual = self.potential.residual(self.potential.gradient(after.x, inputs, after.body_distance))
+        figures = torch.stack([before.energy, after.energy, *inside, moved, residual], dim=1).tolist()
         for points, values in zip(refined.permute(2, 0, 1).cpu().numpy(), figures):
             yield RefinedFrame(points, Change(*values))
 

@@ -9,13 +9,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..assets import Floats, Mesh
+from ..collision.distance import PosedBody, signed_distance
+from ..collision.one_ring import triangle_rings
+from ..constants import GRAVITY
 from ..energy import GarmentEnergy
-from ..energy.collision import PosedBody, signed_distance
-from ..energy.surface_point import triangle_rings
 from ..fabrics import Fabric
 from ..mesh.topology import vertex_normals
 
-GRAVITY = 9.81  # [m/s2]
 SHARE = "inside the body"
 UNITS = {"total": "J", "stretch": "J", "bending": "J", "gravity": "J", "inertia": "J", "collision": "J", SHARE: "%"}
 

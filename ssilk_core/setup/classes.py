@@ -17,7 +17,7 @@ from ..assets import LOOSE, PINNED, TIGHT, UP, Character, Floats, Ints, Mesh, Sk
 from ..errors import fail
 from ..mesh.geodesic import distances, within
 from ..mesh.topology import components, edge_use, edges, islands, smooth, vertex_areas
-from ..setup.surface import SurfacePoints, closest_on_surface
+from .surface import SurfacePoints, closest_on_surface
 
 Mask = NDArray[np.bool_]
 HANG_RADIUS = 0.06  # [m] around a border vertex: wide enough to look past a collar that curls in towards the neck

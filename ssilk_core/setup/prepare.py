@@ -9,9 +9,9 @@ import numpy as np
 
 from .. import events
 from ..assets import CLASS_NAMES, LOOSE, Character, Garment, Ints, ProxyRig, Scene
-from ..setup.classes import ClassOptions, classify
-from ..setup.rig import RigOptions, build_rig
-from ..setup.weights import WeightOptions, transfer_weights
+from .classes import ClassOptions, classify
+from .rig import RigOptions, build_rig
+from .weights import WeightOptions, transfer_weights
 
 
 def prepare_scene(

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..assets import Floats, Mesh
 from ..mesh.geodesic import nearest_sources
-from ..setup.clusters import Cluster, Mask, Seam
+from .clusters import Cluster, Mask, Seam
 
 LEAST_SHARE = 1e-3  # of the body's weights on a loose vertex; less is left out, so that its rows stay short
 

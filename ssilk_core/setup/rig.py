@@ -16,8 +16,8 @@ from ..assets import LOOSE, Character, Floats, Garment, Ints, Mesh, ProxyRig, Sk
 from ..errors import fail
 from ..kinematics import rigid
 from ..mesh.topology import vertex_areas, vertex_normals
-from ..setup.clusters import Cluster, Mask, Seam, build_cluster, find_pieces, find_seam, share_out
-from ..setup.proxy_weights import proxy_weights
+from .clusters import Cluster, Mask, Seam, build_cluster, find_pieces, find_seam, share_out
+from .proxy_weights import proxy_weights
 
 
 @dataclass(frozen=True)

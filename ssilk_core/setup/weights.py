@@ -10,7 +10,7 @@ import numpy as np
 from ..assets import LOOSE, Character, Floats, Ints, Mesh, SkinWeights
 from ..errors import fail
 from ..mesh.topology import edges, smooth
-from ..setup.surface import closest_on_surface
+from .surface import closest_on_surface
 
 
 @dataclass(frozen=True)

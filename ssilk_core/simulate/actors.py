@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from ..assets import Floats, Motion, Scene
-from ..energy.collision import PosedBody
+from ..collision.body import CollisionBody
+from ..collision.distance import PosedBody
 from ..kinematics import (
     frames_at,
     matrix_from_quaternion,
@@ -21,8 +22,7 @@ from ..kinematics import (
     split_at_cuts,
     world_transforms,
 )
-from ..model.body import CollisionBody
-from ..model.skinning import blended, transformed
+from ..skinning import blended, transformed
 
 
 @dataclass(frozen=True, eq=False)

@@ -67,18 +67,18 @@ class Hessian:
         x: Tensor,
         weight: Tensor,
         contact: Tensor | None,
-        held: Tensor | None = None,
-        whole: Tensor | None = None,
+        fixed: Tensor | None = None,
+        exact_hessian: Tensor | None = None,
     ) -> BlockMatrix:
         """Return the Hessian at x.
 
         Args:
             weight: stiffness of each free vertex alike in all directions [N/m], shape (U, 1).
             contact: added at each free vertex, shape (U, 3, 3, N), or None.
-            held: free vertices that are made so stiff that a solution leaves them alone, shape (U, N), or None.
-            whole: of `Membrane.stiffness`.
+            fixed: free vertices that are made so stiff that a solution leaves them alone, shape (U, N), or None.
+            exact_hessian: of `Membrane.stiffness`.
         """
-        blocks = self.sum_faces(self.membrane.stiffness(x, whole))
+        blocks = self.sum_faces(self.membrane.stiffness(x, exact_hessian))
         if self.hinges:
             slopes = self.hinges.slopes(x)
             blocks += self.sum_hinges(outer(slopes[self.left], slopes[self.right]))
@@ -86,9 +86,9 @@ class Hessian:
         diagonal += weight[:, None, None] * torch.eye(3, device=x.device)[:, :, None]
         if contact is not None:
             diagonal += contact.float()
-        if held is not None:
+        if fixed is not None:
             stiff = (
                 HELD * diagonal.square().sum((1, 2)).sqrt()[:, None, None] * torch.eye(3, device=x.device)[..., None]
             )
-            diagonal.copy_(torch.where(held[:, None, None], stiff, diagonal))
+            diagonal.copy_(torch.where(fixed[:, None, None], stiff, diagonal))
         return BlockMatrix(self.pattern, blocks)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Energy, gradient and positive Hessian of the membrane, for either stretch model.
+"""Energy, gradient and positive semi-definite Hessian of the membrane, for either stretch model.
 
 Both models have a first Piola-Kirchhoff stress P = F S with S symmetric, 2 x 2, and the columns w_u, w_v of F. Their
 Hessian is then the geometric part S (x) I, indefinite under compression, and a material part that is a sum of outer
@@ -7,7 +7,7 @@ products of the columns and never negative:
 
     M_uu = a w_u w_u' + b w_v w_v',   M_vv = c w_v w_v' + b w_u w_u',   M_uv = d w_u w_v' + b w_v w_u'
 
-Clamping the eigenvalues of S at zero makes the whole positive semi-definite, in closed form.
+Clamping the eigenvalues of S, the second Piola-Kirchhoff stress, at zero makes the sum positive semi-definite.
 """
 
 from __future__ import annotations
@@ -39,22 +39,24 @@ class Membrane:
     def gradient(self, x: Tensor) -> Tensor:
         """Return the gradient [N], shape (V, 3, N)."""
         w_u, w_v = self.operator(x).chunk(2)
-        uu, uv, vv = ((self.area * s)[:, None] for s in tension(w_u, w_v, self.fabric))
+        uu, uv, vv = ((self.area * s)[:, None] for s in second_piola_kirchhoff(w_u, w_v, self.fabric))
         stress = torch.cat([uu * w_u + uv * w_v, uv * w_u + vv * w_v])
         return adjoint(self.operator, stress)
 
-    def stiffness(self, x: Tensor, whole: Tensor | None = None) -> Tensor:
-        """Return the Hessian in the columns of F [J], made positive, float32; blocks uu, uv, vu, vv: (4 F, 3, 3, N).
+    def stiffness(self, x: Tensor, exact_hessian: Tensor | None = None) -> Tensor:
+        """Return the positive semi-definite Hessian in the columns of F [J], float32.
+
+        Its blocks uu, uv, vu, vv follow each other: (4 F, 3, 3, N).
 
         Args:
-            whole: frames that get the Hessian itself, which compression may make indefinite, shape (N,).
+            exact_hessian: frames that keep the exact Hessian, which compression may make indefinite, shape (N,).
         """
         w_u, w_v = self.operator(x).float().chunk(2)
-        tensions = tension(w_u, w_v, self.fabric)
-        clamped = positive(*tensions)
-        if whole is None:
-            whole = torch.zeros_like(clamped[0][0], dtype=torch.bool)
-        uu, uv, vv = (torch.where(whole, own, other)[:, None, None] for own, other in zip(tensions, clamped))
+        stresses = second_piola_kirchhoff(w_u, w_v, self.fabric)
+        clamped = project_psd(*stresses)
+        if exact_hessian is None:
+            exact_hessian = torch.zeros_like(clamped[0][0], dtype=torch.bool)
+        uu, uv, vv = (torch.where(exact_hessian, own, other)[:, None, None] for own, other in zip(stresses, clamped))
         a, b, c, d = material(w_u, w_v, self.fabric)
         identity = torch.eye(3, device=x.device)[:, :, None]
         own_u, own_v, mixed = outer(w_u, w_u), outer(w_v, w_v), outer(w_u, w_v)
@@ -74,8 +76,11 @@ def outer(a: Tensor, b: Tensor) -> Tensor:
     return a[:, :, None] * b[:, None]
 
 
-def tension(w_u: Tensor, w_v: Tensor, fabric: Fabric) -> Symmetric:
-    """Return S of P = F S for each area [N/m]; w_u, w_v are the columns of F, shape (F, 3, N)."""
+def second_piola_kirchhoff(w_u: Tensor, w_v: Tensor, fabric: Fabric) -> Symmetric:
+    """Return the second Piola-Kirchhoff stress S of P = F S for each triangle [N/m].
+
+    W_u, w_v are the columns of F, shape (F, 3, N).
+    """
     uu, uv, vv = (w_u * w_u).sum(1), (w_u * w_v).sum(1), (w_v * w_v).sum(1)
     if fabric.stretch_model == "stvk":
         trace = 0.5 * fabric.lame_lambda * (uu + vv - 2)
@@ -93,7 +98,7 @@ def material(w_u: Tensor, w_v: Tensor, fabric: Fabric) -> tuple[Tensor | float, 
     return a, 2 * fabric.shear, c, 0.0
 
 
-def positive(uu: Tensor, uv: Tensor, vv: Tensor) -> Symmetric:
+def project_psd(uu: Tensor, uv: Tensor, vv: Tensor) -> Symmetric:
     """Return the nearest positive semi-definite matrices, by clamping eigenvalues m +- r at zero."""
     m, half = 0.5 * (uu + vv), 0.5 * (uu - vv)
     r = (half * half + uv * uv).sqrt()

@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Newton's method with conjugate gradients, many frames at once.
+"""Newton's method with conjugate gradients, for many frames at once.
 
-Each iteration solves with the Hessian to a tenth of the residual, then halves the step until the energy has fallen
-enough. The distances to the body are found anew for every state, those of the line search included: the energy of a
-frame never rises, and more iterations never end higher. Far from balance the Hessian is made positive; near it the
-membrane's own is tried, for cloth that is about to buckle gives way much faster under it, and left for some
-iterations where it did not lead down.
+Each iteration solves with the Hessian to a tenth of the residual. A backtracking line search with Armijo's condition
+follows. Distances to the body are found anew for every state, those of the line search included. The energy of a
+frame therefore never rises, and more iterations never end higher.
 
-Where parts of a body pass through each other, the nearest surface changes sides and the energy has a step: no
-gradient tells. One vertex before it would keep its whole garment from moving on. Where only a small part of a step
-lowers the energy, the vertices that cost more than they should in a larger one are held, and the others go on. Once
-these are in balance, all are let go and tried once more.
+Far from the minimum the Hessian is projected to be positive semi-definite. Near it the exact Hessian of the membrane
+is tried, because cloth that is about to buckle converges much faster under it. A frame that it misleads goes without
+it for some iterations.
+
+Where parts of a body pass through each other, the nearest surface changes sides and the energy jumps. No gradient
+tells of that, and one vertex at such a jump would stop its whole garment. When only a small part of a step lowers the
+energy, the vertices that cost more than expected are fixed and the others move on. Once these have converged, all
+fixed vertices are released and tried once more.
 """
 
 from __future__ import annotations
@@ -20,41 +22,44 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ..energy.rounded import Rounded
+from ..collision.smoothed_distance import SmoothedDistance
 from ..errors import fail
-from .potential import Potential, Setting
+from .incremental_potential import IncrementalPotential, StepInputs
 
-SUFFICIENT = 1e-4  # share of the slope that a step has to gain
-HALVINGS = 12
-REDUCTION = 0.1  # of the residual by each linear solution
-REACH = 0.1  # of the garment's size, by which a step moves a vertex at most: stiff systems are solved badly
-CREEPING = 0.25  # of a step: where not even this is possible, what stands in the way is held
-SPOILING = 0.1  # share of the fall expected that a vertex takes away, from which on it stands in the way
-NEAR = 2.0  # [g] out of balance, from which on the whole Hessian is tried
-GOOD = 0.25  # of a step: where less of one is possible, the whole Hessian has misled
-PATIENCE = 4  # iterations without it from then on
+ARMIJO = 1e-4  # share of the slope that a step has to gain
+MAX_BACKTRACKS = 12
+REDUCTION = 0.1  # of the residual by each linear solve
+MAX_DISPLACEMENT = (
+    0.1  # of the garment's size, by which a step moves a vertex at most: stiff systems are solved badly
+)
+SHORT_STEP = 0.25  # of a step: where not even this is possible, obstructing vertices are fixed
+OBSTRUCTING = 0.1  # share of the expected decrease that a vertex takes away, from which on it is obstructing
+EXACT_HESSIAN_BELOW = 2.0  # [g] of residual
+MISLED_BELOW = 0.25  # of a step: where less of one is possible, the exact Hessian has misled
+COOLDOWN = 4  # iterations without the exact Hessian from then on
 
 
 @dataclass(frozen=True, kw_only=True)
 class SolverOptions:
-    """When a frame counts as solved.
+    """When a frame counts as converged.
 
     Attributes:
-        tolerance: RMS acceleration that forces out of balance would give the free mass, in units of g. As inertia
-            alone makes the Hessian at least m/dt^2, it bounds the distance to the minimum by tolerance g dt^2: 0.1 mm
-            for the default at 30 frames per second, and the energy above it by m (tolerance g dt)^2 / 2: 1e-6 J.
-        iterations: of Newton's method, at most.
-        inner: of conjugate gradients in each, at most.
+        tolerance: of the residual, the RMS acceleration that the gradient would give the free mass, in units of g.
+            As inertia alone makes the Hessian at least m/dt^2, it bounds the distance to the minimum by tolerance g
+            dt^2: 0.1 mm for the default at 30 frames per second, and the energy above it by m (tolerance g dt)^2 / 2:
+            1e-6 J.
+        iterations: Newton iterations at most.
+        cg_iterations: iterations of conjugate gradients in each, at most.
     """
 
     tolerance: float = 1e-2
     iterations: int = 100
-    inner: int = 200
+    cg_iterations: int = 200
 
     def __post_init__(self) -> None:
         if not 0 < self.tolerance < float("inf"):
             fail("solver", f"tolerance = {self.tolerance}", "it must be positive")
-        for name in ("iterations", "inner"):
+        for name in ("iterations", "cg_iterations"):
             if not getattr(self, name) > 0:
                 fail("solver", f"{name} = {getattr(self, name)}", "at least 1 is needed")
 
@@ -65,19 +70,19 @@ class Solution:
 
     Attributes:
         x: positions [m], shape (V, 3, N).
-        energy: with the nearest body points of x [J], shape (N,).
-        imbalance: what `SolverOptions.tolerance` bounds, of vertices that are not held, shape (N,).
-        iterations: of Newton's method, shape (N,).
-        held: how many vertices are held, shape (N,).
-        inner: iterations of conjugate gradients, each for all frames that were still at work.
+        energy: at x [J], shape (N,).
+        residual: what `SolverOptions.tolerance` bounds, of vertices that are not fixed, shape (N,).
+        iterations: Newton iterations, shape (N,).
+        fixed: number of fixed vertices, shape (N,).
+        cg_iterations: iterations of conjugate gradients, each for all active frames.
     """
 
     x: Tensor
     energy: Tensor
-    imbalance: Tensor
+    residual: Tensor
     iterations: Tensor
-    held: Tensor
-    inner: int
+    fixed: Tensor
+    cg_iterations: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,38 +91,42 @@ class State:
 
     Attributes:
         x: positions [m], shape (V, 3, N).
-        met: their distances to the body.
+        body_distance: their distances to the body.
         energy: [J], shape (N,).
     """
 
     x: Tensor
-    met: Rounded | None
+    body_distance: SmoothedDistance | None
     energy: Tensor
 
     @classmethod
-    def at(cls, potential: Potential, x: Tensor, setting: Setting) -> State:
+    def at(cls, potential: IncrementalPotential, x: Tensor, inputs: StepInputs) -> State:
         """Return the state of positions (V, 3, N)."""
-        met = potential.met(x, setting)
-        return cls(x, met, potential.energy(x, setting, met))
+        body_distance = potential.body_distance(x, inputs)
+        return cls(x, body_distance, potential.energy(x, inputs, body_distance))
 
     def tensors(self) -> list[Tensor]:
-        """Return all that it holds, frames last."""
-        return [self.x, self.energy, *(self.met.tensors() if self.met else [])]
+        """Return all tensors, frames last."""
+        return [self.x, self.energy, *(self.body_distance.tensors() if self.body_distance else [])]
 
-    def picked(self, frames: Tensor) -> State:
-        """Return the state of some of the frames, indices (M,)."""
-        return State(self.x[..., frames], self.met and self.met.picked(frames), self.energy[frames])
+    def select(self, frames: Tensor) -> State:
+        """Return the state of the frames with indices (M,)."""
+        return State(
+            self.x[..., frames], self.body_distance and self.body_distance.select(frames), self.energy[frames]
+        )
 
     def replaced(self, frames: Tensor, other: State) -> State:
-        """Return the state with some of the frames, indices (M,), from another."""
-        x, energy, *met = (
+        """Return the state with the frames of indices (M,) taken from another."""
+        x, energy, *body_distance = (
             own.index_copy(-1, frames, new) for own, new in zip(self.tensors(), other.tensors(), strict=True)
         )
-        return State(x, Rounded(*met) if met else None, energy)
+        return State(x, SmoothedDistance(*body_distance) if body_distance else None, energy)
 
 
 @torch.no_grad()
-def minimise_from(potential: Potential, start: Tensor, setting: Setting, options: SolverOptions) -> Solution:
+def minimise_from(
+    potential: IncrementalPotential, start: Tensor, inputs: StepInputs, options: SolverOptions
+) -> Solution:
     """Minimise the energy of each frame over the free vertices; no frame ends higher than it starts.
 
     Args:
@@ -126,29 +135,31 @@ def minimise_from(potential: Potential, start: Tensor, setting: Setting, options
     Raises:
         SsilkError: the energy of the start is not finite.
     """
-    search = _Search(potential, start, setting, options)
+    search = _Search(potential, start, inputs, options)
     for _ in range(options.iterations):
-        if not search.narrowed():
+        if not search.drop_finished():
             break
         search.advance()
     return search.solution
 
 
 class _Search:
-    """Newton's method under way: the frames still at work, and where every frame has come to.
+    """The search of `minimise_from`: the active frames, and the best state of every frame.
 
     Attributes:
-        held: vertices that stay where they are, shape (V, N).
-        waiting: iterations that frames go on without the whole Hessian, shape (N,).
-        released: frames whose held vertices have been let go, shape (N,).
+        fixed: vertices that stay where they are, shape (V, N).
+        cooldown: iterations that remain without the exact Hessian, shape (N,).
+        released: frames whose fixed vertices have been released, shape (N,).
     """
 
     gradient: Tensor
-    imbalance: Tensor
+    residual: Tensor
 
-    def __init__(self, potential: Potential, start: Tensor, setting: Setting, options: SolverOptions) -> None:
-        self.potential, self.options, self.setting = potential, options, setting
-        self.state = State.at(potential, start, setting)
+    def __init__(
+        self, potential: IncrementalPotential, start: Tensor, inputs: StepInputs, options: SolverOptions
+    ) -> None:
+        self.potential, self.options, self.inputs = potential, options, inputs
+        self.state = State.at(potential, start, inputs)
         energy = self.state.energy
         bad = int((~energy.isfinite()).sum())
         if bad != 0:
@@ -158,117 +169,124 @@ class _Search:
                 "positions, body and time step must be finite",
                 "look for NaN in stage and motion",
             )
-        self.at_work = torch.arange(len(energy), device=start.device)
+        self.active = torch.arange(len(energy), device=start.device)
         self.moving = torch.ones_like(energy, dtype=torch.bool)
-        self.held = torch.zeros_like(start[:, 0], dtype=torch.bool)
-        self.waiting, self.released = torch.zeros_like(self.at_work), torch.zeros_like(self.moving)
-        self._look()
-        iterations = torch.zeros_like(self.at_work)
-        found = start.clone(), energy.clone(), self.imbalance.clone()
+        self.fixed = torch.zeros_like(start[:, 0], dtype=torch.bool)
+        self.cooldown, self.released = torch.zeros_like(self.active), torch.zeros_like(self.moving)
+        self._evaluate()
+        iterations = torch.zeros_like(self.active)
+        found = start.clone(), energy.clone(), self.residual.clone()
         self.solution = Solution(*found, iterations, iterations.clone(), 0)
 
-    def narrowed(self) -> bool:
-        """Leave out frames that are solved or that no step improves; return whether any is left."""
-        self._release()
-        kept = (self.moving & (self.imbalance > self.options.tolerance)).nonzero()[:, 0]
-        if 0 < len(kept) < len(self.at_work):
-            self.state, self.setting = self.state.picked(kept), self.setting.picked(kept)
-            for name in ("gradient", "held", "at_work", "imbalance", "waiting", "released"):
+    def drop_finished(self) -> bool:
+        """Drop frames that have converged or that no step improves; return whether any is left."""
+        self._release_fixed()
+        kept = (self.moving & (self.residual > self.options.tolerance)).nonzero()[:, 0]
+        if 0 < len(kept) < len(self.active):
+            self.state, self.inputs = self.state.select(kept), self.inputs.select(kept)
+            for name in ("gradient", "fixed", "active", "residual", "cooldown", "released"):
                 setattr(self, name, getattr(self, name)[..., kept])
         return len(kept) > 0
 
     def advance(self) -> None:
         """Make one step."""
-        potential, setting, gradient = self.potential, self.setting, self.gradient
-        whole = (self.imbalance < NEAR) & (self.waiting <= 0)
-        step, count = newton_step(potential, self.state, setting, gradient, self.options.inner, self.held, whole)
-        self.state, length, in_the_way = line_search(potential, self.state, setting, gradient, step)
-        misled = whole & (length < GOOD)
-        self.waiting = torch.where(misled, PATIENCE, self.waiting - 1)
-        new = in_the_way & ~self.held & ~misled
-        self.held |= new
+        potential, inputs, gradient = self.potential, self.inputs, self.gradient
+        exact_hessian = (self.residual < EXACT_HESSIAN_BELOW) & (self.cooldown <= 0)
+        step, count = newton_step(
+            potential, self.state, inputs, gradient, self.options.cg_iterations, self.fixed, exact_hessian
+        )
+        self.state, length, obstructing = line_search(potential, self.state, inputs, gradient, step)
+        misled = exact_hessian & (length < MISLED_BELOW)
+        self.cooldown = torch.where(misled, COOLDOWN, self.cooldown - 1)
+        new = obstructing & ~self.fixed & ~misled
+        self.fixed |= new
         self.moving = (length > 0) | new.any(0) | misled
-        self._look()
-        self._write()
+        self._evaluate()
+        self._record()
         found = self.solution
-        found.iterations[self.at_work] += 1
-        self.solution = replace(found, inner=found.inner + count)
+        found.iterations[self.active] += 1
+        self.solution = replace(found, cg_iterations=found.cg_iterations + count)
 
-    def _release(self) -> None:
-        """Let go, once, of what frames hold that are in balance otherwise."""
-        again = (self.imbalance <= self.options.tolerance) & ~self.released & self.held.any(0)
+    def _release_fixed(self) -> None:
+        """Release the fixed vertices of frames that have converged otherwise, once."""
+        again = (self.residual <= self.options.tolerance) & ~self.released & self.fixed.any(0)
         if bool(again.any()):
-            self.held &= ~again
+            self.fixed &= ~again
             self.released |= again
-            self._look()
-            self._write()
+            self._evaluate()
+            self._record()
 
-    def _look(self) -> None:
-        """Find the forces out of balance in the states that the search stands at."""
-        gradient = self.potential.gradient(self.state.x, self.setting, self.state.met)
-        self.gradient = gradient.masked_fill(self.held[:, None], 0)
-        self.imbalance = self.potential.imbalance(self.gradient)
+    def _evaluate(self) -> None:
+        """Evaluate gradient and residual of the current states."""
+        gradient = self.potential.gradient(self.state.x, self.inputs, self.state.body_distance)
+        self.gradient = gradient.masked_fill(self.fixed[:, None], 0)
+        self.residual = self.potential.residual(self.gradient)
 
-    def _write(self) -> None:
-        """Write down where the frames at work have come to."""
-        found, rows = self.solution, self.at_work
+    def _record(self) -> None:
+        """Record the current states of the active frames."""
+        found, rows = self.solution, self.active
         found.x[..., rows], found.energy[rows] = self.state.x, self.state.energy
-        found.imbalance[rows], found.held[rows] = self.imbalance, self.held.sum(0)
+        found.residual[rows], found.fixed[rows] = self.residual, self.fixed.sum(0)
 
 
 def newton_step(
-    potential: Potential,
+    potential: IncrementalPotential,
     state: State,
-    setting: Setting,
+    inputs: StepInputs,
     gradient: Tensor,
-    inner: int,
-    held: Tensor | None = None,
-    whole: Tensor | None = None,
+    cg_iterations: int,
+    fixed: Tensor | None = None,
+    exact_hessian: Tensor | None = None,
 ) -> tuple[Tensor, int]:
-    """Return a direction (V, 3, N), zero in pinned and `held` (V, N) vertices, and the iterations it took.
+    """Return a direction (V, 3, N), zero in pinned and `fixed` (V, N) vertices, and the iterations it took.
 
-    Along it the energy falls, but for frames (N,) whose `whole` Hessian is used: those may have no step at all.
+    It is a descent direction, except perhaps in frames whose `exact_hessian` (N,) is used.
     """
     right = -gradient[potential.free].float()
-    z, count = potential.hessian(state.x, setting, state.met, held, whole).solve(right, REDUCTION, inner)
+    z, count = potential.hessian(state.x, inputs, state.body_distance, fixed, exact_hessian).solve(
+        right, REDUCTION, cg_iterations
+    )
     step = torch.zeros_like(state.x)
     step[potential.free] = z.to(step.dtype)
-    if held is not None:
-        step = step.masked_fill(held[:, None], 0)
+    if fixed is not None:
+        step = step.masked_fill(fixed[:, None], 0)
     longest = step.norm(dim=1).amax(0).clamp_min(torch.finfo(step.dtype).tiny)
-    return step * (REACH * potential.size / longest).clamp(max=1), count
+    return step * (MAX_DISPLACEMENT * potential.size / longest).clamp(max=1), count
 
 
 def line_search(
-    potential: Potential, state: State, setting: Setting, gradient: Tensor, step: Tensor
+    potential: IncrementalPotential, state: State, inputs: StepInputs, gradient: Tensor, step: Tensor
 ) -> tuple[State, Tensor, Tensor]:
-    """Return where the largest of 1, 1/2, 1/4 ... of a step takes each frame so that its energy falls enough.
+    """Backtrack from a full step until the energy of each frame meets Armijo's condition.
 
-    A frame whose energy falls with none of them stays. Also returned: which part of the step it was, 0 for those,
-    shape (N,), and the vertices that stood in the way of more where it was little, shape (V, N).
+    A frame whose energy no trial lowers enough stays.
+
+    Returns:
+        The states, the accepted share of the step (N,), 0 for frames that stay, and the vertices that obstruct longer
+        steps where that share is small (V, N).
     """
     slope = (gradient * step).sum((0, 1))
     found, left, length = state, (slope < 0).nonzero()[:, 0], 1.0
-    lengths, in_the_way = torch.zeros_like(slope), torch.zeros_like(step[:, 0], dtype=torch.bool)
-    for _ in range(HALVINGS):
+    lengths, obstructing = torch.zeros_like(slope), torch.zeros_like(step[:, 0], dtype=torch.bool)
+    for _ in range(MAX_BACKTRACKS):
         if not len(left):
             break
-        trial = State.at(potential, (state.x + length * step)[..., left], setting.picked(left))
-        fallen = trial.energy <= (state.energy + SUFFICIENT * length * slope)[left]
+        trial = State.at(potential, (state.x + length * step)[..., left], inputs.select(left))
+        fallen = trial.energy <= (state.energy + ARMIJO * length * slope)[left]
         rows = fallen.nonzero()[:, 0]
         if len(rows):
-            found = found.replaced(left[rows], trial.picked(rows))
+            found = found.replaced(left[rows], trial.select(rows))
             lengths[left[rows]] = length
-        if length <= CREEPING:
-            cost = spoiling(potential, state.picked(left), trial, length * step[..., left])
-            in_the_way[:, left] |= (cost > SPOILING * length * slope[left].abs()) & ~fallen
+        if length <= SHORT_STEP:
+            cost = excess_collision(potential, state.select(left), trial, length * step[..., left])
+            obstructing[:, left] |= (cost > OBSTRUCTING * length * slope[left].abs()) & ~fallen
         left, length = left[~fallen], length / 2
-    return found, lengths, in_the_way
+    return found, lengths, obstructing
 
 
-def spoiling(potential: Potential, state: State, trial: State, moved: Tensor) -> Tensor:
-    """Return what the collision of each vertex costs more in a trial than was to be expected [J], shape (V, N)."""
-    if state.met is None:
+def excess_collision(potential: IncrementalPotential, state: State, trial: State, moved: Tensor) -> Tensor:
+    """Return the collision energy of each vertex in a trial beyond its second-order prediction [J], (V, N)."""
+    if state.body_distance is None:
         return torch.zeros_like(moved[:, 0])
-    expected = potential.collision_at(state.met.expected(trial.x, moved))
-    return potential.collision(trial.x, trial.met) - expected
+    expected = potential.collision_at(state.body_distance.expected(trial.x, moved))
+    return potential.collision(trial.x, trial.body_distance) - expected

@@ -16,13 +16,13 @@ import torch
 from torch import Tensor
 
 from ..assets import Floats, Motion, Scene
+from ..constants import GRAVITY
 from ..errors import fail
 from ..events import Progress, Reporter, silent
 from ..fabrics import Fabric
-from ..model.descriptors import GRAVITY
 from .actors import Actors, Poses, Span, played, spans_of
+from .incremental_potential import IncrementalPotential, StepInputs
 from .newton import Solution, SolverOptions, minimise_from
-from .potential import Potential, Setting
 
 PRECISIONS = {"float64": torch.float64, "float32": torch.float32}
 MOST_SUBSTEPS = 1000
@@ -76,16 +76,16 @@ class SimulatedFrame:
         shot, number: which shot, and which of its frames.
         points: garment vertices in the world [m], float64, shape (V, 3).
         energy: what was minimised [J], heights counted from the character's root.
-        imbalance, iterations, held: of `newton.Solution`, in the last step of the frame.
+        residual, iterations, fixed: of `newton.Solution`, in the last step of the frame.
     """
 
     shot: int
     number: int
     points: Floats
     energy: float
-    imbalance: float
+    residual: float
     iterations: int
-    held: int
+    fixed: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +136,7 @@ class Simulator:
     ) -> None:
         self.options, device = options or SimulationOptions(), torch.device(device)
         dtype = PRECISIONS[self.options.precision]
-        self.potential = Potential(scene, fabric, device=device, dtype=dtype)
+        self.potential = IncrementalPotential(scene, fabric, device=device, dtype=dtype)
         self.actors = Actors(scene, device, dtype)
         self.gravity = torch.tensor(self.options.gravity, dtype=dtype, device=device)[:, None]
         self.dt = 1 / (self.options.fps * self.options.substeps)
@@ -165,37 +165,37 @@ class Simulator:
 
     def rest(self, poses: Poses, start: Tensor) -> Solution:
         """Return the quasi-static states of poses nearest to `start` (V, 3, N), relative to the roots."""
-        return minimise_from(self.potential, start, self.setting(poses, None), self.options.rest)
+        return minimise_from(self.potential, start, self.inputs(poses, None), self.options.rest)
 
-    def setting(self, poses: Poses, past: Past | None) -> Setting:
+    def inputs(self, poses: Poses, past: Past | None) -> StepInputs:
         """Return what positions relative to the roots are solved for: a step after `past`, else a state at rest."""
         gravity = self.gravity.expand(3, poses.root.shape[-1])
         if past is None:
-            return Setting(poses.body, gravity)
+            return StepInputs(poses.body, gravity)
         shift = poses.root - past.root
         predicted = past.carried_on(poses) if past.before is None else past.local + (past.last - past.before - shift)
-        return Setting(poses.body, gravity, predicted.to(past.plain.dtype), past.local, self.dt)
+        return StepInputs(poses.body, gravity, predicted.to(past.plain.dtype), past.local, self.dt)
 
     def _stepped(self, poses: Poses, past: Past) -> Solution:
         """Return the states one step later."""
-        setting = self.setting(poses, past)
-        assert setting.predicted is not None
-        starts = [setting.predicted, past.local, past.carried_on(poses)]
-        return self.solve(self.best([self.pinned(x, poses) for x in starts], setting), setting)
+        inputs = self.inputs(poses, past)
+        assert inputs.predicted is not None
+        starts = [inputs.predicted, past.local, past.carried_on(poses)]
+        return self.solve(self.best([self.pinned(x, poses) for x in starts], inputs), inputs)
 
-    def solve(self, start: Tensor, setting: Setting) -> Solution:
+    def solve(self, start: Tensor, inputs: StepInputs) -> Solution:
         """Return the minima of one step (V, 3, N), sought from `start`."""
-        return minimise_from(self.potential, start, setting, self.options.solver)
+        return minimise_from(self.potential, start, inputs, self.options.solver)
 
     def pinned(self, x: Tensor, poses: Poses) -> Tensor:
         """Return positions (V, 3, N) with the vertices that do not move freely under plain skinning."""
         free = self.potential.free
         return poses.plain.index_copy(0, free, x[free].to(poses.plain.dtype))
 
-    def best(self, starts: Sequence[Tensor], setting: Setting) -> Tensor:
+    def best(self, starts: Sequence[Tensor], inputs: StepInputs) -> Tensor:
         """Return for each frame the start of least energy."""
         potential = self.potential
-        energies = [potential.energy(x, setting, potential.met(x, setting)) for x in starts]
+        energies = [potential.energy(x, inputs, potential.body_distance(x, inputs)) for x in starts]
         chosen = torch.stack(energies).nan_to_num(nan=torch.inf).argmin(0)
         best = starts[0]
         for number, start in enumerate(starts[1:], start=1):
@@ -206,7 +206,7 @@ class Simulator:
 def _frames(spans: Sequence[Span], frame: int, world: Tensor, solution: Solution) -> Iterator[SimulatedFrame]:
     points = world.permute(2, 0, 1).cpu().numpy()
     figures = [
-        values.tolist() for values in (solution.energy, solution.imbalance, solution.iterations, solution.held)
+        values.tolist() for values in (solution.energy, solution.residual, solution.iterations, solution.fixed)
     ]
     for span, x, *found in zip(spans, points, *figures):
         yield SimulatedFrame(span.shot, span.first + frame, x, *found)

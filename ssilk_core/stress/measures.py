@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from ..assets import Floats, Scene
+from ..constants import GRAVITY
 from ..fabrics import Fabric
-from ..model.descriptors import GRAVITY
 from ..preflight.units import FileUnits, body_size
 from . import drives, worlds
 from .drives import Drive

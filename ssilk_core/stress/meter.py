@@ -15,8 +15,8 @@ from ..energy import GarmentEnergy
 from ..fabrics import Fabric
 from ..kinematics import motion_transforms, skinning_matrices
 from ..model.network import GarmentModel
-from ..model.skinning import Skinning
 from ..rollout import decode, garment_poses, roll_blocks
+from ..skinning import Skinning
 from .drives import Drive
 from .worlds import garment_size
 

@@ -12,13 +12,13 @@ from torch import Tensor
 
 from ..assets import PINNED, Motion, Scene
 from ..config import ModelConfig, TrainConfig
+from ..constants import GRAVITY
 from ..energy import GarmentEnergy
 from ..fabrics import Fabric
-from ..model.descriptors import GRAVITY
 from ..model.network import GarmentModel
-from ..model.skinning import Skinning
 from ..simulate import SimulationOptions
 from ..simulate.simulator import Simulator
+from ..skinning import Skinning
 from ..training.job import TrainJob
 from ..training.parts import build_parts
 from .drives import Drive
@@ -63,17 +63,17 @@ def trained(scene: Scene, fabric: Fabric, drive: Drive, steps: int, *, windows: 
 
 
 def simulated(scene: Scene, fabric: Fabric, motion: Motion, gravity: float = GRAVITY) -> tuple[Extent, float]:
-    """Simulate a motion under a gravity [m/s2]; return its extent and the largest imbalance of a frame [g].
+    """Simulate a motion under a gravity [m/s2]; return its extent and the largest residual of a frame [g].
 
     Frames that the solver left out of balance by more than its tolerance count as recovered.
     """
     options = SimulationOptions(fps=motion.fps, gravity=(0.0, -gravity, 0.0))
     meter = Meter(scene, fabric, motion.fps)
     frames = list(Simulator(scene, fabric, options).frames([motion]))
-    imbalance = [frame.imbalance for frame in frames]
+    residual = [frame.residual for frame in frames]
     meter.add(motion, np.stack([frame.points for frame in frames]))
-    unsolved = sum(value > options.solver.tolerance for value in imbalance)
-    return meter.extent(len(frames), recovered=unsolved, far=ELASTIC), max(imbalance)
+    unsolved = sum(value > options.solver.tolerance for value in residual)
+    return meter.extent(len(frames), recovered=unsolved, far=ELASTIC), max(residual)
 
 
 def gradient_error(scene: Scene, fabric: Fabric, motion: Motion) -> float:

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from ..collision.body import CollisionBody
+from ..collision.contacts import Contacts
 from ..evaluation.methods import Dressed, Method, Reel
-from ..model.body import CollisionBody
-from ..model.contacts import Contacts
 
 BODIES = (("triangles", True, 1), ("vertices", False, 1), ("every 4th vertex", False, 4))
 FRAMES = 64  # that are judged

@@ -6,12 +6,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ..collision.body import CollisionBody
+from ..collision.contacts import Contacts, no_planes
+from ..constants import GRAVITY
 from ..energy import GarmentEnergy
-from ..model.body import CollisionBody
-from ..model.contacts import Contacts, no_planes
-from ..model.descriptors import GRAVITY
 from ..model.network import GarmentModel
-from .bank import MotionBank
+from ..motion_bank import MotionBank
 from .regularity import irregularity
 from .windows import WindowSampler
 

@@ -7,15 +7,15 @@ from dataclasses import dataclass
 
 import torch
 
+from ..collision.body import CollisionBody
+from ..collision.reach import reachable_body
 from ..config import TrainConfig
 from ..energy import GarmentEnergy
-from ..model.body import CollisionBody
 from ..model.network import GarmentModel, model_joints
-from .bank import MOST_TURN, MotionBank, build_bank
+from ..motion_bank import MOST_TURN, MotionBank, build_bank
 from .job import TrainJob
 from .objective import Objective
 from .parallel import ALONE, Team
-from .reach import reachable_body
 from .step import Stepper
 from .validation import Validator
 from .windows import WindowSampler

@@ -20,12 +20,12 @@ from ..devices import chosen_device
 from ..errors import fail
 from ..events import Checkpoint, Message, Progress, Reporter, Started
 from ..kinematics import split_at_cuts
-from .bank import MOST_TURN
+from ..memory import decoded_frames, fitting_batch, free_memory, need_one_window, step_memory, suffices
+from ..motion_bank import MOST_TURN
 from .budget import fitting_iterations, shaped
 from .curve import Point, with_point
 from .job import TrainJob
 from .keeping import Keeper
-from .memory import decoded_frames, fitting_batch, free_memory, need_one_window, step_memory, suffices
 from .parallel import ALONE, Team
 from .parts import build_parts
 from .state import Best, Lowered, RunState, learned, load_state, restore, restore_learned

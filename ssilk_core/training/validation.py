@@ -5,22 +5,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from ..assets import Scene
+from ..collision.body import CollisionBody
+from ..collision.contacts import Contacts
 from ..energy import TERMS, GarmentEnergy
-from ..energy.collision import PosedBody
-from ..model.body import CollisionBody
-from ..model.contacts import Contacts
-from ..model.descriptors import GRAVITY
-from ..model.skinning import Skinning
-from .bank import MotionBank
+from ..energy.frames import DECODED_AT_ONCE, energy_terms
+from ..motion_bank import LatentModel, MotionBank, roll_states
+from ..skinning import Skinning
 from .parallel import ALONE, Team
-
-DECODED_AT_ONCE = 256  # frames
 
 
 @dataclass(frozen=True)
@@ -41,16 +37,6 @@ class Score:
     def total(self) -> float:
         """Sum of all terms [J]."""
         return sum(self.terms.values())
-
-
-class Rolled(Protocol):
-    """What is scored: a `GarmentModel`, or what else has states of its own, shape (N, S), and these methods."""
-
-    def initial(self, static: Tensor) -> Tensor: ...
-
-    def roll(self, states: list[Tensor], rest: Tensor, pose: Tensor) -> list[Tensor]: ...
-
-    def vertices(self, z: Tensor, character: Tensor, /) -> Tensor: ...
 
 
 class Validator:
@@ -80,7 +66,7 @@ class Validator:
         """Return plain skinning's positions (V, 3, N) [m]."""
         return self.plain(self.rest, None, self.plain.weights, character)
 
-    def score(self, model: Rolled) -> Score:
+    def score(self, model: LatentModel) -> Score:
         """Return the mean score of a model over all clips."""
         return self._mean(model)
 
@@ -88,7 +74,7 @@ class Validator:
         """Return the mean score of plain skinning over all clips."""
         return self._mean(None)
 
-    def _mean(self, model: Rolled | None) -> Score:
+    def _mean(self, model: LatentModel | None) -> Score:
         """Return the mean over all clips, dealt out to the processes of the team; all get the same score."""
         clips = self.clips[self.team.rank :: self.team.size]
         states = self._states(clips, model)
@@ -98,19 +84,19 @@ class Validator:
         joined = {name: float(torch.cat([score[name] for score in scores]).mean()) for name in scores[0]}
         return Score({name: joined[name] for name in TERMS}, joined["collisions"], joined["dynamics"] ** 0.5)
 
-    def frame_terms(self, clip: range, model: Rolled | None) -> dict[str, Tensor]:
+    def frame_terms(self, clip: range, model: LatentModel | None) -> dict[str, Tensor]:
         """Return what `Score` averages for each frame of a range of the bank, shape (N,).
 
         Without a model it is plain skinning that is scored. Distances to the quasi-static state come squared [m2].
         """
         return self._clip_terms(clip, model, self._states([clip], model)[0])
 
-    def _states(self, clips: Sequence[range], model: Rolled | None) -> Sequence[Tensor | None]:
+    def _states(self, clips: Sequence[range], model: LatentModel | None) -> Sequence[Tensor | None]:
         """Return the states of each clip; of a team, one may have none to roll."""
         return roll_states(model, self.bank, clips, self.down) if model and clips else [None] * len(clips)
 
     @torch.no_grad()
-    def _clip_terms(self, clip: range, model: Rolled | None, states: Tensor | None) -> dict[str, Tensor]:
+    def _clip_terms(self, clip: range, model: LatentModel | None, states: Tensor | None) -> dict[str, Tensor]:
         frames = torch.arange(clip.start, clip.stop, device=self.rest.device)
         parts, tail = [], None
         for start in range(0, len(frames), DECODED_AT_ONCE):
@@ -125,56 +111,7 @@ class Validator:
                 still = model.vertices(quiet, character)
             joined = x if tail is None else torch.cat([tail, x], dim=-1)
             posed = self.body.posed(character)
-            terms = energies(self.energy, x, plain, self.contacts, posed, joined, self.fps, self.down)
+            terms = energy_terms(self.energy, x, plain, self.contacts, posed, joined, self.fps, self.down)
             parts.append({**terms, "dynamics": ((x - still) ** 2).sum(1).mean(0)})
             tail = joined[..., -2:]
         return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-
-
-def energies(
-    energy: GarmentEnergy,
-    x: Tensor,
-    plain: Tensor,
-    contacts: Contacts,
-    body: PosedBody,
-    joined: Tensor,
-    fps: float,
-    down: Tensor,
-) -> dict[str, Tensor]:
-    """Return each of `TERMS` [J], and the share of vertices inside the body as "collisions", shape (N,).
-
-    The share counts what lies inside any part of the body, whichever part the vertex meets in the energy.
-
-    Args:
-        x, plain: positions (V, 3, N); gravity is that of `x` less that of `plain`.
-        joined: `x` after up to two frames before it. Where two are lacking there is no inertia.
-        down: direction of gravity, shape (3,).
-    """
-    met, nearest = contacts.distances(x, body)
-    inertia = energy.inertia(joined[..., 2:], 2 * joined[..., 1:-1] - joined[..., :-2], 1 / fps)
-    return {
-        "stretch": energy.stretch(x),
-        "bending": energy.bending(x),
-        "gravity": energy.gravity(x - plain, GRAVITY * down[:, None]),
-        "inertia": torch.cat([inertia.new_zeros(x.shape[-1] - len(inertia)), inertia]),
-        "collision": energy.collision_of(met),
-        "collisions": (nearest < 0).double().mean(0),
-    }
-
-
-@torch.no_grad()
-def roll_states(model: Rolled, bank: MotionBank, clips: Sequence[range], down: Tensor) -> list[Tensor]:
-    """Roll a model over ranges of a bank side by side, each from its quasi-static start.
-
-    Returns:
-        For each range its states, shape (frames, latent).
-    """
-    offset = torch.arange(max(map(len, clips)), device=down.device)[:, None]
-    first, last = (torch.tensor([clip[end] for clip in clips], device=down.device) for end in (0, -1))
-    frames = torch.minimum(first + offset, last)  # shorter ones wait on their last frame
-    direction = down.expand(frames.numel(), 3)
-    static = bank.static_descriptor(frames.reshape(-1), direction)
-    pose = bank.dynamic_descriptor(frames.reshape(-1), direction)
-    rest, pose = (values.reshape(*frames.shape, -1) for values in (model.initial(static), pose))
-    states = torch.stack(model.roll([*rest[:2]], rest[2:], pose[2:]))
-    return [states[: len(clip), index] for index, clip in enumerate(clips)]

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..assets import Motion
 from ..files import replacing
-from .bank import MOST_TURN, MotionBank, usable_spans
+from ..motion_bank import MOST_TURN, MotionBank, usable_spans
 from .faults import Faults
 from .state import learned
 from .step import Stepper

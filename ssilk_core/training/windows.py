@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ..config import TrainConfig
 from ..errors import fail
-from .bank import MotionBank
+from ..motion_bank import MotionBank
 
 
 def random_directions(count: int, rotated: float, generator: torch.Generator, device: torch.device) -> Tensor:

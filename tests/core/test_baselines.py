@@ -15,17 +15,18 @@ from ssilk_core.baselines.networks import METHODS, Baseline, BaselineConfig, bas
 from ssilk_core.baselines.run import BaselineJob, BaselineRun, train_baseline
 from ssilk_core.baselines.training import BaselineObjective, BaselineStepper
 from ssilk_core.checkpoint import load_model, model_file, save_model
+from ssilk_core.collision.body import CollisionBody
+from ssilk_core.collision.distance import signed
 from ssilk_core.config import ModelConfig, TrainConfig
+from ssilk_core.constants import GRAVITY
+from ssilk_core.descriptors import RATE_TIME
 from ssilk_core.energy import GarmentEnergy
-from ssilk_core.energy.collision import signed
 from ssilk_core.errors import SsilkError
 from ssilk_core.events import silent
 from ssilk_core.fabrics import Fabric
 from ssilk_core.kinematics import matrix_from_quaternion, motion_transforms, quaternion_from_matrix
-from ssilk_core.model.body import CollisionBody
-from ssilk_core.model.descriptors import GRAVITY, RATE_TIME
 from ssilk_core.model.network import GarmentModel
-from ssilk_core.training.bank import build_bank
+from ssilk_core.motion_bank import build_bank
 from ssilk_core.training.curve import curve_path
 from ssilk_core.training.job import TrainJob
 from ssilk_core.training.objective import total

@@ -10,11 +10,11 @@ import torch
 import trimesh
 
 from ssilk_core.assets import LOOSE, PINNED, TIGHT, Body, Character, Mesh, Scene, SkinWeights
-from ssilk_core.energy import collision, nearest
-from ssilk_core.energy.collision import Patches, PosedBody, nearest_planes, signed
-from ssilk_core.energy.surface_point import triangle_rings
-from ssilk_core.model.body import CollisionBody
-from ssilk_core.model.contacts import Contacts, faces_around, patches_beneath
+from ssilk_core.collision import distance, nearest_vertex
+from ssilk_core.collision.body import CollisionBody
+from ssilk_core.collision.contacts import Contacts, faces_around, patches_beneath
+from ssilk_core.collision.distance import Patches, PosedBody, nearest_planes, signed
+from ssilk_core.collision.one_ring import triangle_rings
 
 CPU = torch.device("cpu")
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"  # on a CPU kernels run in Triton's interpreter
@@ -91,12 +91,12 @@ def test_rounded_distances_are_those_of_the_planes_that_tight_and_loose_cloth_me
     x = torch.tensor(dressed.garment.mesh.points, dtype=dtype)[..., None]
     pulled = x - torch.tensor([RADIUS + 0.025, 0, 0])[:, None].to(dtype)
     contacts, posed = Contacts(dressed, device=CPU), still(body, exact=True)
-    found, met = contacts.rounded(pulled, posed), signed(pulled.float(), *contacts.planes(pulled.float(), posed))
+    found, met = contacts.smoothed(pulled, posed), signed(pulled.float(), *contacts.planes(pulled.float(), posed))
     assert found.normal.dtype == found.offset.dtype == dtype and found.curvature.dtype == torch.float32
     torch.testing.assert_close(found.distance(pulled).float(), met, rtol=0.03, atol=1e-6)
     assert (met[1::2] < -RADIUS).all() and (met[::2] > -RADIUS).all()
     pinned = replace(dressed, garment=replace(dressed.garment, classes=np.full_like(classes, PINNED)))
-    nowhere = Contacts(pinned, pinned=False, device=CPU).rounded(pulled, posed)
+    nowhere = Contacts(pinned, pinned=False, device=CPU).smoothed(pulled, posed)
     assert (nowhere.distance(pulled) > 1e5).all() and nowhere.curvature.abs().max() == 0
 
 
@@ -192,15 +192,15 @@ def test_the_nearest_of_a_list_is_found_on_both_plain_paths(scores, monkeypatch)
     x, body = rng.normal(size=(33, 3, 5)), rng.normal(size=(20, 3, 5))
     table = lists(rng, 33, 20)
     expected = chosen_by_hand(x, body, table.numpy())
-    np.testing.assert_array_equal(nearest.nearest_vertex(torch.tensor(x), torch.tensor(body), table), expected)
-    monkeypatch.setattr(nearest, "SCORES", scores)
-    monkeypatch.setattr(nearest, "_by_rows", nearest._by_products)
-    np.testing.assert_array_equal(nearest.nearest_vertex(torch.tensor(x), torch.tensor(body), table), expected)
+    np.testing.assert_array_equal(nearest_vertex.nearest_vertex(torch.tensor(x), torch.tensor(body), table), expected)
+    monkeypatch.setattr(nearest_vertex, "SCORES", scores)
+    monkeypatch.setattr(nearest_vertex, "_by_rows", nearest_vertex._by_products)
+    np.testing.assert_array_equal(nearest_vertex.nearest_vertex(torch.tensor(x), torch.tensor(body), table), expected)
 
 
 @KERNELS
 def test_the_kernel_finds_the_nearest_of_a_list():
-    from ssilk_core.kernels.listed import listed_kernel
+    from ssilk_core.kernels.candidates import listed_kernel
 
     rng = np.random.default_rng(4)
     x, body = rng.normal(size=(33, 3, 150)).astype(np.float32), rng.normal(size=(20, 3, 150)).astype(np.float32)
@@ -223,7 +223,7 @@ def test_kernels_find_the_planes_of_a_list_that_their_twins_find():
     assert not torch.allclose(expected[0], nearest_planes(x, body)[0])
     on_device = PosedBody(*(v.to(DEVICE) for v in (body.points, body.normals, body.rings)))
     for value, twin in zip(
-        collision._by_kernels(x.to(DEVICE), on_device, None, Patches(table.to(DEVICE), patches.faces)), expected
+        distance._by_kernels(x.to(DEVICE), on_device, None, Patches(table.to(DEVICE), patches.faces)), expected
     ):
         np.testing.assert_allclose(value.cpu(), twin, atol=2e-6)
 

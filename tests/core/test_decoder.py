@@ -7,6 +7,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from ssilk_core.assets import LOOSE, PINNED, GarmentPose
+from ssilk_core.descriptors import six_d
 from ssilk_core.kinematics import (
     combined_transforms,
     deform,
@@ -16,7 +17,6 @@ from ssilk_core.kinematics import (
     world_transforms,
 )
 from ssilk_core.model.decoder import compose, rotation_from_six_d
-from ssilk_core.model.descriptors import six_d
 
 SHAPES_AND_PROXIES = pytest.mark.parametrize("shapes, proxies", [(4, 2), (0, 2), (4, 0), (0, 0)])
 

@@ -9,16 +9,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from ssilk_core.assets import Motion
+from ssilk_core.constants import GRAVITY
+from ssilk_core.descriptors import RATE_TIME, SATURATION, joints_in_view, pose_features, six_d
 from ssilk_core.kinematics import matrix_from_quaternion, motion_transforms, quaternion_from_matrix
-from ssilk_core.model.descriptors import (
-    GRAVITY,
-    RATE_TIME,
-    SATURATION,
-    gravity_features,
-    joints_in_view,
-    pose_features,
-    six_d,
-)
+from ssilk_core.model.descriptors import gravity_features
 
 JOINTS = np.arange(3)
 DOWN = np.array([0.0, -1.0, 0.0])

@@ -11,13 +11,14 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from ssilk_core.assets import Body, Mesh, SkinWeights
-from ssilk_core.energy import GarmentEnergy, collision, nearest
-from ssilk_core.energy.collision import PosedBody, collision_energy, nearest_planes, signed_distance
-from ssilk_core.energy.nearest import compact_blocks
-from ssilk_core.energy.surface_point import nearest_on_rings, triangle_rings
+from ssilk_core.collision import distance, nearest_vertex
+from ssilk_core.collision.body import CollisionBody
+from ssilk_core.collision.distance import PosedBody, collision_energy, nearest_planes, signed_distance
+from ssilk_core.collision.nearest_vertex import compact_blocks
+from ssilk_core.collision.one_ring import nearest_on_rings, triangle_rings
+from ssilk_core.energy import GarmentEnergy
 from ssilk_core.fabrics import Fabric
 from ssilk_core.kinematics import skin_points
-from ssilk_core.model.body import CollisionBody
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"  # on a CPU kernels run in Triton's interpreter
 KERNELS = pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="kernels need Triton")
@@ -45,7 +46,7 @@ def test_distance_to_a_sphere_is_the_radius_short_of_its_facets():
     radius = np.linspace(0.25, 0.35, 200)
     x = torch.tensor(way / np.linalg.norm(way, axis=1, keepdims=True) * radius[:, None])[:, :, None]
     distance = signed_distance(x, PosedBody(points, points / 0.3))[:, 0].numpy()
-    # The nearest vertex lies within half an edge (1 cm) of the foot: 1 - cos of that angle at most.
+    # The nearest_vertex vertex lies within half an edge (1 cm) of the foot: 1 - cos of that angle at most.
     np.testing.assert_allclose(distance, radius - 0.3, atol=0.35 * (1 - np.cos(0.015 / 0.3)))
     assert ((distance < 0) == (radius < 0.3))[np.abs(radius - 0.3) > 1e-3].all()
 
@@ -79,12 +80,12 @@ def test_nearest_vertex_matches_brute_force_on_both_paths(vertices, body_vertice
     x = (rng.normal(size=(vertices, 3, frames)) + 50).astype(np.float32)
     body = (rng.normal(size=(body_vertices, 3, frames)) + 50).astype(np.float32)
     expected = brute_force(x, body)
-    found = nearest.nearest_vertex(torch.tensor(x), torch.tensor(body))
+    found = nearest_vertex.nearest_vertex(torch.tensor(x), torch.tensor(body))
     assert found.dtype == torch.int64
     np.testing.assert_array_equal(found, expected)
-    monkeypatch.setattr(nearest, "SCORES", scores)
-    monkeypatch.setattr(nearest, "_by_rows", nearest._by_products)
-    np.testing.assert_array_equal(nearest.nearest_vertex(torch.tensor(x), torch.tensor(body)), expected)
+    monkeypatch.setattr(nearest_vertex, "SCORES", scores)
+    monkeypatch.setattr(nearest_vertex, "_by_rows", nearest_vertex._by_products)
+    np.testing.assert_array_equal(nearest_vertex.nearest_vertex(torch.tensor(x), torch.tensor(body)), expected)
 
 
 def twice_a_cube() -> tuple[np.ndarray, np.ndarray]:
@@ -100,9 +101,9 @@ def test_ties_go_to_the_lower_index_on_both_paths(monkeypatch):
     body, x = twice_a_cube()
     expected = brute_force(x, body)
     assert (expected < 27).all()
-    np.testing.assert_array_equal(nearest.nearest_vertex(torch.tensor(x), torch.tensor(body)), expected)
-    monkeypatch.setattr(nearest, "_by_rows", nearest._by_products)
-    np.testing.assert_array_equal(nearest.nearest_vertex(torch.tensor(x), torch.tensor(body)), expected)
+    np.testing.assert_array_equal(nearest_vertex.nearest_vertex(torch.tensor(x), torch.tensor(body)), expected)
+    monkeypatch.setattr(nearest_vertex, "_by_rows", nearest_vertex._by_products)
+    np.testing.assert_array_equal(nearest_vertex.nearest_vertex(torch.tensor(x), torch.tensor(body)), expected)
 
 
 @pytest.mark.parametrize("count", [1, 31, 32, 33, 500])
@@ -120,13 +121,13 @@ def test_blocks_hold_every_point_once_and_are_compact(count):
 
 def by_kernel(x: np.ndarray, body: np.ndarray, ordered: bool = True) -> np.ndarray:
     """The kernel's answer, with blocks and groups that are compact in the first frame, or as vertices come."""
-    from ssilk_core.kernels.nearest import nearest_kernel
+    from ssilk_core.kernels.nearest_vertex import nearest_kernel
 
     tables = [
         torch.as_tensor(compact_blocks(np.nan_to_num(points[..., 0]), size))
         if ordered
-        else nearest.consecutive_blocks(len(points), size, torch.device("cpu"))
-        for points, size in ((x, nearest.BLOCK), (body, nearest.GROUP))
+        else nearest_vertex.consecutive_blocks(len(points), size, torch.device("cpu"))
+        for points, size in ((x, nearest_vertex.BLOCK), (body, nearest_vertex.GROUP))
     ]
     return nearest_kernel(*(torch.as_tensor(v).to(DEVICE) for v in (x, body, *tables))).cpu().numpy()
 
@@ -187,7 +188,7 @@ def test_of_equally_near_vertices_the_kernel_takes_the_first_in_its_table():
     body, x = twice_a_cube()
     expected = brute_force(x, body)
     np.testing.assert_array_equal(by_kernel(x, body, ordered=False), expected)
-    order = compact_blocks(body[..., 0], nearest.GROUP).reshape(-1)
+    order = compact_blocks(body[..., 0], nearest_vertex.GROUP).reshape(-1)
     np.testing.assert_array_equal(by_kernel(x, body), order[brute_force(x, body[order])])
 
 
@@ -207,7 +208,7 @@ def test_a_broken_vertex_finds_something_and_harms_no_other(broken):
 
 @KERNELS
 def test_the_kernel_finds_the_nearest_vertex_of_a_posed_body(scene, toy_motion):
-    from ssilk_core.training.bank import centred_matrices
+    from ssilk_core.motion_bank import centred_matrices
 
     merged, skeleton, garment = scene.character.merged_body(), scene.character.skeleton, scene.garment.mesh
     matrices, _ = centred_matrices(toy_motion(scene, 3), skeleton)
@@ -219,7 +220,7 @@ def test_the_kernel_finds_the_nearest_vertex_of_a_posed_body(scene, toy_motion):
 
 
 def test_body_is_posed_as_skinning_says_and_normals_turn_along(scene, toy_motion):
-    from ssilk_core.training.bank import centred_matrices
+    from ssilk_core.motion_bank import centred_matrices
 
     body, skeleton = scene.character.merged_body(), scene.character.skeleton
     matrices, _ = centred_matrices(toy_motion(scene, 5), skeleton)
@@ -349,7 +350,7 @@ def test_kernels_find_the_planes_that_their_twins_find(case, toy_grid):
     x[-1, :, 1] -= 0.4  # nothing but the nearest vertex counts this far away
     expected = nearest_planes(x, body)
     on_device = PosedBody(*(v if v is None else v.to(DEVICE) for v in (body.points, body.normals, body.rings)))
-    found = collision._by_kernels(x.to(DEVICE), on_device, None)
+    found = distance._by_kernels(x.to(DEVICE), on_device, None)
     for value, twin in zip(found, expected):
         np.testing.assert_allclose(value.cpu(), twin, atol=2e-6)
 
@@ -362,5 +363,5 @@ def test_kernels_answer_alike_each_time():
     )
     body = [v.to(DEVICE) for v in (points, normals, torch.as_tensor(triangle_rings(mesh.faces, 42)))]
     x = torch.tensor(mesh.sample(33, seed=2)[:, :, None], dtype=torch.float32, device=DEVICE)
-    once, again = (collision._by_kernels(x, PosedBody(*body), None) for _ in range(2))
+    once, again = (distance._by_kernels(x, PosedBody(*body), None) for _ in range(2))
     assert torch.equal(once[0], again[0]) and torch.equal(once[1], again[1])

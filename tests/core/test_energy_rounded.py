@@ -10,9 +10,9 @@ import pytest
 import torch
 import trimesh
 
-from ssilk_core.energy import closest, collision
-from ssilk_core.energy.collision import TOUCHING, Patches, PosedBody, nearest_planes, rounded_planes, signed
-from ssilk_core.energy.rounded import SHARPNESS
+from ssilk_core.collision import closest_point, distance
+from ssilk_core.collision.distance import TOUCHING, Patches, PosedBody, nearest_planes, signed, smoothed_planes
+from ssilk_core.collision.smoothed_distance import SHARPNESS
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
@@ -34,7 +34,7 @@ def fold(angle: float, width: float = 0.06) -> trimesh.Trimesh:
 
 
 def rounded(x: torch.Tensor, body: PosedBody) -> torch.Tensor:
-    return rounded_planes(x, body).distance(x)
+    return smoothed_planes(x, body).distance(x)
 
 
 def test_over_one_plane_it_is_the_distance() -> None:
@@ -42,7 +42,7 @@ def test_over_one_plane_it_is_the_distance() -> None:
     height = torch.tensor([0.03, 0.004, 1e-3, 2e-5, 3e-6, -1e-3, -4e-3])
     x = torch.zeros(7, 3, 1)
     x[:, 0, 0], x[:, 1, 0], x[:, 2, 0] = 0.02, 0.01 + height, -0.01  # away from the diagonal, where two are as near
-    found = rounded_planes(x.to(DEVICE), body)
+    found = smoothed_planes(x.to(DEVICE), body)
     torch.testing.assert_close(found.distance(x.to(DEVICE))[:, 0].cpu(), height, rtol=1e-5, atol=2e-8)
     expected = torch.tensor([0.0, 1.0, 0.0]).expand(7, 3)
     beyond = height.abs() > TOUCHING
@@ -59,7 +59,7 @@ def test_between_two_walls_it_is_the_norm_of_their_distances(angle: float) -> No
     # Each wall has two triangles, of which the point is over one.
     expected = (wall.double() ** -SHARPNESS).sum(0) ** (-1 / SHARPNESS)
     torch.testing.assert_close(rounded(x.to(DEVICE), body)[:, 0].cpu(), expected.float(), rtol=1e-5, atol=0)
-    middle = rounded_planes(x.to(DEVICE), body).normal[4, :, 0].cpu()
+    middle = smoothed_planes(x.to(DEVICE), body).normal[4, :, 0].cpu()
     shorter = float(np.sin(angle / 2)) * 2 ** (-1 / SHARPNESS)  # the walls push against each other across the fold
     torch.testing.assert_close(middle, torch.tensor([0.0, 0.0, shorter]), rtol=0, atol=1e-4)
 
@@ -92,7 +92,7 @@ def in_the_fold(count: int) -> torch.Tensor:
 def differences(x: torch.Tensor, body: PosedBody, step: float = 1e-6) -> tuple[torch.Tensor, torch.Tensor]:
     """First differences of the distance (V, 3) and of its gradient (V, 3, 3), in float64 on a processor."""
     moves = step * torch.eye(3, dtype=torch.float64)[:, None, :, None]
-    sides = [(rounded_planes(x + move, body), rounded_planes(x - move, body)) for move in moves]
+    sides = [(smoothed_planes(x + move, body), smoothed_planes(x - move, body)) for move in moves]
     first = [(up.distance(x + m) - down.distance(x - m)) / (2 * step) for m, (up, down) in zip(moves, sides)]
     second = [(up.normal - down.normal) / (2 * step) for up, down in sides]
     return torch.cat(first, dim=1), torch.cat(second, dim=2)
@@ -101,7 +101,7 @@ def differences(x: torch.Tensor, body: PosedBody, step: float = 1e-6) -> tuple[t
 @pytest.mark.skipif(DEVICE.type != "cpu", reason="float64 is for processors")
 def test_gradient_and_bend_are_the_derivatives() -> None:
     x, body = in_the_fold(300), body_of(fold(1.5))
-    found = rounded_planes(x, body)
+    found = smoothed_planes(x, body)
     first, second = differences(x, body)
     torch.testing.assert_close(found.normal[..., 0], first, rtol=0, atol=1e-4)
     torch.testing.assert_close(
@@ -113,7 +113,7 @@ def test_gradient_and_bend_are_the_derivatives() -> None:
 @pytest.mark.skipif(DEVICE.type != "cpu", reason="float64 is for processors")
 def test_small_moves_are_expected_to_second_order_and_large_ones_within_what_moves_can() -> None:
     x, body = in_the_fold(300), body_of(fold(1.5))
-    found = rounded_planes(x, body)
+    found = smoothed_planes(x, body)
     away = torch.randn(x.shape, generator=torch.Generator().manual_seed(6)).double()
     away = away / away.norm(dim=1, keepdim=True)
     here = found.distance(x)
@@ -128,17 +128,17 @@ def test_small_moves_are_expected_to_second_order_and_large_ones_within_what_mov
 
 def test_nothing_to_look_at_is_no_error() -> None:
     body = body_of(fold(1.5))
-    assert rounded_planes(torch.zeros(4, 3, 0, device=DEVICE), replace(body, points=body.points[..., :0],
+    assert smoothed_planes(torch.zeros(4, 3, 0, device=DEVICE), replace(body, points=body.points[..., :0],
                           normals=body.normals[..., :0])).curvature.shape == (4, 3, 3, 0)  # fmt: skip
     bare = replace(body, faces=body.faces[:0])
-    assert rounded_planes(torch.ones(4, 3, 1, device=DEVICE), bare).curvature.abs().max() == 0
+    assert smoothed_planes(torch.ones(4, 3, 1, device=DEVICE), bare).curvature.abs().max() == 0
 
 
 @pytest.mark.skipif(DEVICE.type != "cpu", reason="float64 is for processors")
 def test_inside_it_bends_about_the_nearest_edge() -> None:
     body = body_of(fold(1.5))
     x = torch.tensor([[1e-3, 0.02, -5e-3], [-2e-3, -0.03, -8e-3]], dtype=torch.float64)[..., None]
-    found = rounded_planes(x, body)
+    found = smoothed_planes(x, body)
     radius = x[:, [0, 2], 0].norm(dim=1)
     torch.testing.assert_close(-found.distance(x)[:, 0], radius * 2 ** (-1 / SHARPNESS), rtol=1e-6, atol=0)
     for curvature, at, r in zip(found.curvature[..., 0], x[..., 0], radius):
@@ -155,20 +155,20 @@ def test_only_listed_triangles_are_found_and_all_frames_are_alike() -> None:
     table = torch.cat([torch.tensor([60], device=DEVICE).int(), vertices]).repeat(40, 1)
     faces = torch.full((40, 100), -1, device=DEVICE)
     faces[:, :80] = torch.arange(80, device=DEVICE)
-    found = rounded_planes(x, body, patches=Patches(table, faces))
+    found = smoothed_planes(x, body, patches=Patches(table, faces))
     part = replace(body, faces=body.faces[:80])
-    expected = rounded_planes(x, part, patches=Patches(table, faces[:, :80]))
+    expected = smoothed_planes(x, part, patches=Patches(table, faces[:, :80]))
     torch.testing.assert_close(found.distance(x), expected.distance(x), rtol=0, atol=1e-7)
-    alone = rounded_planes(x[..., 1:], body_of(other), patches=Patches(table, faces))
+    alone = smoothed_planes(x[..., 1:], body_of(other), patches=Patches(table, faces))
     torch.testing.assert_close(found.normal[..., 1:], alone.normal, rtol=0, atol=1e-6)
 
 
 def test_frames_looked_at_in_turn_give_the_same(monkeypatch) -> None:
     ball = trimesh.creation.icosphere(subdivisions=1, radius=0.1)
     body, x = body_of(ball, ball, ball), near(ball, 0.01, 50)[..., None].float().repeat(1, 1, 3).to(DEVICE)
-    together = rounded_planes(x, body)
-    monkeypatch.setattr(closest, "SCORES", 1)
-    assert torch.equal(rounded_planes(x, body).curvature, together.curvature)
+    together = smoothed_planes(x, body)
+    monkeypatch.setattr(closest_point, "SCORES", 1)
+    assert torch.equal(smoothed_planes(x, body).curvature, together.curvature)
 
 
 @pytest.mark.parametrize("listed", [False, True])
@@ -189,9 +189,9 @@ def test_the_kernel_finds_what_its_plain_twin_does(monkeypatch, listed: bool) ->
         faces[::2, -9:] = -1
         patches = Patches(vertices, faces)
     with monkeypatch.context() as plain:
-        plain.setattr(collision.kernels, "serve", lambda x: False)
-        expected = rounded_planes(x, body, patches=patches)
-        found = collision._rounded_by_kernel(x, body, None, patches)
+        plain.setattr(distance.kernels, "serve", lambda x: False)
+        expected = smoothed_planes(x, body, patches=patches)
+        found = distance._smoothed_by_kernel(x, body, None, patches)
     torch.testing.assert_close(found.distance(x.double()), expected.distance(x.double()), rtol=0, atol=3e-7)
     sure = expected.distance(x).abs() > 1e-3  # nearer, rounding decides about weights and directions
     apart = (found.normal - expected.normal).norm(dim=1)[sure]
@@ -210,9 +210,9 @@ def test_the_kernel_serves_more_frames_than_a_block_some_of_them_far_off(monkeyp
     x = in_the_fold(3).repeat(1, 1, frames).float().to(DEVICE)
     x[:, 2, ::3] += 0.5
     with monkeypatch.context() as plain:
-        plain.setattr(collision.kernels, "serve", lambda x: False)
-        expected = rounded_planes(x, body)
-        found = collision._rounded_by_kernel(x, body, None, None)
+        plain.setattr(distance.kernels, "serve", lambda x: False)
+        expected = smoothed_planes(x, body)
+        found = distance._smoothed_by_kernel(x, body, None, None)
     torch.testing.assert_close(found.distance(x.double()), expected.distance(x.double()), rtol=0, atol=3e-7)
     assert torch.equal(found.curvature[..., ::3], torch.zeros_like(found.curvature[..., ::3]))
     assert (found.curvature[..., 1::3].norm(dim=(1, 2)) > 0).any()

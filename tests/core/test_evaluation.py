@@ -15,8 +15,9 @@ from torch import Tensor
 
 from ssilk_core.assets import Motion
 from ssilk_core.baselines.networks import METHODS, BaselineConfig, baseline
+from ssilk_core.collision.distance import signed_distance
+from ssilk_core.constants import GRAVITY
 from ssilk_core.energy import TERMS
-from ssilk_core.energy.collision import signed_distance
 from ssilk_core.errors import SsilkError
 from ssilk_core.evaluation.methods import Cache, Dressed, Network, Plain, Reel, Simulated, reel_of
 from ssilk_core.evaluation.minimum import hung, minima
@@ -39,7 +40,6 @@ from ssilk_core.evaluation.takes import Take, back_and_forth, stopped, takes_of
 from ssilk_core.evaluation.tally import Tally, against, figures
 from ssilk_core.fabrics import Fabric
 from ssilk_core.kinematics import motion_transforms, skin_points, skinning_matrices
-from ssilk_core.model.descriptors import GRAVITY
 from ssilk_core.training.validation import Validator
 
 FPS, JOINTS, CPU = 30.0, np.arange(3), torch.device("cpu")

@@ -11,6 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from ssilk_core.assets import Mesh
+from ssilk_core.descriptors import six_d
 from ssilk_core.energy.stretch import deformation_gradient_operator
 from ssilk_core.evaluation.metrics import (
     derivative,
@@ -22,7 +23,6 @@ from ssilk_core.evaluation.metrics import (
     settling_time,
     stretch_histogram,
 )
-from ssilk_core.model.descriptors import six_d
 
 FPS = 30.0
 

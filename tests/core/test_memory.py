@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from ssilk_core import memory
 from ssilk_core.config import ModelConfig, TrainConfig
 from ssilk_core.errors import SsilkError
-from ssilk_core.training import memory
-from ssilk_core.training.memory import (
+from ssilk_core.memory import (
     SHARE,
     decoded_frames,
     fitting_batch,

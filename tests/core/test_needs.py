@@ -10,8 +10,9 @@ import torch
 
 from ssilk_core.assets import LOOSE, PINNED, TIGHT, Character, ProxyRig, Scene
 from ssilk_core.checkpoint import load_model, network
+from ssilk_core.collision.distance import nearest_planes, signed_distance
+from ssilk_core.collision.reach import reachable_body
 from ssilk_core.config import ModelConfig, TrainConfig
-from ssilk_core.energy.collision import nearest_planes, signed_distance
 from ssilk_core.events import Event, Message
 from ssilk_core.fabrics import Fabric
 from ssilk_core.kinematics import deform, motion_transforms, skin_points, skinning_matrices
@@ -19,7 +20,6 @@ from ssilk_core.rollout import garment_poses, roll
 from ssilk_core.runtime import Player
 from ssilk_core.training.job import TrainJob
 from ssilk_core.training.parts import build_parts
-from ssilk_core.training.reach import reachable_body
 from ssilk_core.training.run import train
 
 CPU = torch.device("cpu")

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from ssilk_core.collision.distance import signed
 from ssilk_core.config import SCHEMES, TrainConfig
-from ssilk_core.energy.collision import signed
-from ssilk_core.model.descriptors import GRAVITY
+from ssilk_core.constants import GRAVITY
 from ssilk_core.training.objective import Objective, total
 from ssilk_core.training.step import Stepper
 from ssilk_core.training.windows import WindowSampler

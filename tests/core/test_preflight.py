@@ -391,7 +391,7 @@ def test_joints_that_cannot_matter():
 
 
 def test_memory_says_when_the_batch_is_lowered(monkeypatch):
-    from ssilk_core.training import memory
+    from ssilk_core import memory
 
     scene = dressed(tube())
     assert next(cost.memory(scene, PRESETS["draft"], 100)).severity == "info"

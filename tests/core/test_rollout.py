@@ -9,9 +9,10 @@ import torch
 from scipy.spatial.transform import Rotation, Slerp
 
 from ssilk_core.assets import GarmentPose, Motion
+from ssilk_core.descriptors import pose_features
 from ssilk_core.errors import SsilkError
 from ssilk_core.kinematics import deform, resample, run_up
-from ssilk_core.model.descriptors import gravity_features, pose_features
+from ssilk_core.model.descriptors import gravity_features
 from ssilk_core.rollout import decode, garment_poses, resample_poses, roll
 
 

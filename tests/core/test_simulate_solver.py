@@ -12,20 +12,20 @@ import torch
 from scipy.optimize import minimize
 
 from ssilk_core.assets import LOOSE, PINNED, Scene
+from ssilk_core.collision.body import CollisionBody
+from ssilk_core.collision.distance import PosedBody
+from ssilk_core.collision.smoothed_distance import SmoothedDistance
 from ssilk_core.energy import GarmentEnergy
 from ssilk_core.energy.bending import dihedral_angles
-from ssilk_core.energy.collision import PosedBody
-from ssilk_core.energy.rounded import Rounded
 from ssilk_core.energy.stretch import stretch_density
 from ssilk_core.errors import SsilkError
 from ssilk_core.fabrics import Fabric
-from ssilk_core.model.body import CollisionBody
 from ssilk_core.simulate import newton
 from ssilk_core.simulate.conjugate import CHECK_EVERY, inverse_blocks, solve
 from ssilk_core.simulate.hinges import Hinges
+from ssilk_core.simulate.incremental_potential import IncrementalPotential, StepInputs
 from ssilk_core.simulate.membrane import Membrane, outer, positive
 from ssilk_core.simulate.newton import SolverOptions, State, line_search, minimise_from, newton_step
-from ssilk_core.simulate.potential import Potential, Setting
 
 CPU = torch.device("cpu")
 DOWN = torch.tensor([[0.0], [-9.81], [0.0]], dtype=torch.float64)
@@ -46,44 +46,44 @@ def body_of(scene: Scene, frames: int) -> PosedBody:
     return CollisionBody(scene.character.merged_body(), joints, device=CPU).posed(identity.contiguous())
 
 
-def moving(scene: Scene, frames: int = 2) -> tuple[torch.Tensor, Setting]:
+def moving(scene: Scene, frames: int = 2) -> tuple[torch.Tensor, StepInputs]:
     """A crumpled strip on its way, touching the ball."""
     x = crumpled(scene, frames) + torch.tensor([0.0, 0.0, 0.03], dtype=torch.float64)[:, None]
     past, air = crumpled(scene, frames, 0.01), crumpled(scene, frames, 0.02)
-    return x, Setting(body_of(scene, frames), DOWN.expand(3, frames), past, air, 1 / 30)
+    return x, StepInputs(body_of(scene, frames), DOWN.expand(3, frames), past, air, 1 / 30)
 
 
 @pytest.fixture(params=FABRICS)
-def potential(request: pytest.FixtureRequest, scene: Scene) -> Potential:
-    return Potential(scene, FABRICS[request.param], device=CPU)
+def potential(request: pytest.FixtureRequest, scene: Scene) -> IncrementalPotential:
+    return IncrementalPotential(scene, FABRICS[request.param], device=CPU)
 
 
-def test_the_energy_is_that_of_training(potential: Potential, scene: Scene) -> None:
-    x, setting = moving(scene)
+def test_the_energy_is_that_of_training(potential: IncrementalPotential, scene: Scene) -> None:
+    x, inputs = moving(scene)
     energy = GarmentEnergy(scene.garment.mesh, potential.fabric, dtype=torch.float64)
-    body = PosedBody(setting.body.points.double(), setting.body.normals.double(), setting.body.rings)
+    body = PosedBody(inputs.body.points.double(), inputs.body.normals.double(), inputs.body.rings)
     terms = [
         energy.stretch(x),
         energy.bending(x),
         energy.gravity(x, DOWN),
-        energy.inertia(x, setting.predicted, setting.dt),
-        energy.drag(x, setting.carried, setting.dt),
+        energy.inertia(x, inputs.predicted, inputs.dt),
+        energy.drag(x, inputs.advected, inputs.dt),
         energy.collision(x, body),
     ]
     assert min(float(term.abs().min()) for term in terms) > 0
-    found = potential.energy(x, setting, potential.met(x, setting))
+    found = potential.energy(x, inputs, potential.body_distance(x, inputs))
     torch.testing.assert_close(found, sum(terms), rtol=1e-6, atol=1e-9)
 
 
-def test_the_gradient_is_that_of_autograd(potential: Potential, scene: Scene) -> None:
-    x, setting = moving(scene)
-    met = potential.met(x, setting)
+def test_the_gradient_is_that_of_autograd(potential: IncrementalPotential, scene: Scene) -> None:
+    x, inputs = moving(scene)
+    body_distance = potential.body_distance(x, inputs)
     at = x.clone().requires_grad_(True)
-    (expected,) = torch.autograd.grad(potential.energy(at, setting, met).sum(), at)
-    torch.testing.assert_close(potential.gradient(x, setting, met), expected, rtol=1e-9, atol=1e-11)
+    (expected,) = torch.autograd.grad(potential.energy(at, inputs, body_distance).sum(), at)
+    torch.testing.assert_close(potential.gradient(x, inputs, body_distance), expected, rtol=1e-9, atol=1e-11)
 
 
-def in_the_fold(scene: Scene) -> tuple[Potential, torch.Tensor, Setting]:
+def in_the_fold(scene: Scene) -> tuple[IncrementalPotential, torch.Tensor, StepInputs]:
     """A strip that stands, crumpled, between two walls that press on its vertices from both sides."""
     walls = torch.tensor([[0.0, 0, 0], [-0.06, 0, 0.06], [0.06, 0, 0.06]])
     points = torch.cat([walls + torch.tensor([0, y, 0]) for y in torch.arange(0.0, 2.0, 0.05)])
@@ -93,22 +93,25 @@ def in_the_fold(scene: Scene) -> tuple[Potential, torch.Tensor, Setting]:
     body = PosedBody(points[..., None], normals[..., None], faces=faces)
     classes = np.where(scene.classes == PINNED, PINNED, LOOSE)  # tight cloth would meet its patch of the ball alone
     loose = replace(scene, garment=replace(scene.garment, classes=classes))
-    potential = Potential(loose, replace(FABRICS["stvk"], margin=0.02), device=CPU)
+    potential = IncrementalPotential(loose, replace(FABRICS["stvk"], margin=0.02), device=CPU)
     generator = torch.Generator().manual_seed(8)
     x = torch.as_tensor(scene.garment.mesh.points.copy())[:, :, None]
     x[:, 2] = 0.012 + 0.003 * torch.rand(len(x), 1, generator=generator)
     x[:, 0] = 1e-4 * torch.randn(len(x), 1, generator=generator)
-    return potential, x, Setting(body, DOWN, x, x, 1 / 30)
+    return potential, x, StepInputs(body, DOWN, x, x, 1 / 30)
 
 
 def test_on_a_crease_the_hessian_of_contact_is_the_derivative_of_its_force(scene: Scene) -> None:
-    potential, x, setting = in_the_fold(scene)
-    with_body = dense_hessian(potential, x, setting, potential.met(x, setting))
-    alone = dense_hessian(potential, x, setting, None)
+    potential, x, inputs = in_the_fold(scene)
+    with_body = dense_hessian(potential, x, inputs, potential.body_distance(x, inputs))
+    alone = dense_hessian(potential, x, inputs, None)
     contact, free, step = (with_body - alone).double(), potential.free, 1e-7
 
     def force(x: torch.Tensor) -> torch.Tensor:
-        touched, none = (potential.gradient(x, setting, met) for met in (potential.met(x, setting), None))
+        touched, none = (
+            potential.gradient(x, inputs, body_distance)
+            for body_distance in (potential.body_distance(x, inputs), None)
+        )
         return (touched - none)[free, :, 0]
 
     own = contact[torch.arange(len(free)), :, torch.arange(len(free))]
@@ -120,14 +123,14 @@ def test_on_a_crease_the_hessian_of_contact_is_the_derivative_of_its_force(scene
 
 
 def test_taut_cloth_in_a_fold_comes_to_rest_on_the_crease(scene: Scene) -> None:
-    potential, x, setting = in_the_fold(scene)
-    pressed = replace(setting, predicted=x - torch.tensor([0, 0, 0.005]).double()[:, None])
+    potential, x, inputs = in_the_fold(scene)
+    pressed = replace(inputs, predicted=x - torch.tensor([0, 0, 0.005]).double()[:, None])
     found = minimise_from(potential, x, pressed, SolverOptions(tolerance=1e-3))
-    assert (found.imbalance <= 1e-3).all() and not found.held.any()
+    assert (found.residual <= 1e-3).all() and not found.held.any()
 
 
 def test_the_membrane_has_the_hessian_of_autograd_where_it_is_stretched(scene: Scene) -> None:
-    # Under tension nothing is clamped, so the positive Hessian is the Hessian.
+    # Under second_piola_kirchhoff nothing is clamped, so the positive Hessian is the Hessian.
     for fabric in FABRICS.values():
         membrane = Membrane(scene.garment.mesh, fabric, CPU, torch.float64)
         w_u, w_v = torch.randn(2, 1, 3, generator=torch.Generator().manual_seed(1)).double() * 0.1
@@ -167,18 +170,20 @@ def test_two_by_two_matrices_lose_their_negative_eigenvalues_only() -> None:
     torch.testing.assert_close(torch.stack([uu, uv, uv, vv], -1).reshape(-1, 2, 2), expected)
 
 
-def dense_hessian(potential: Potential, x: torch.Tensor, setting: Setting, met: Rounded | None) -> torch.Tensor:
+def dense_hessian(
+    potential: IncrementalPotential, x: torch.Tensor, inputs: StepInputs, body_distance: SmoothedDistance | None
+) -> torch.Tensor:
     """The positive Hessian (U, 3, U, 3) of the first frame, from its products with unit vectors."""
-    matrix, count = potential.hessian(x, setting, met), len(potential.free)
+    matrix, count = potential.hessian(x, inputs, body_distance), len(potential.free)
     units = torch.eye(3 * count).reshape(-1, count, 3)
     return torch.stack([(matrix @ unit[None])[0] for unit in units]).reshape(count, 3, count, 3)
 
 
-def test_the_assembled_hessian_is_the_gauss_newton_hessian(potential: Potential, scene: Scene) -> None:
+def test_the_assembled_hessian_is_the_gauss_newton_hessian(potential: IncrementalPotential, scene: Scene) -> None:
     """Against the same parts summed densely: faces through the operator, hinges through autograd's angle."""
-    x, setting = moving(scene, 1)
+    x, inputs = moving(scene, 1)
     x = x * 1.15  # stretched everywhere
-    met = potential.met(x, setting)
+    body_distance = potential.body_distance(x, inputs)
     count, free = len(x), potential.free
     weights = potential.membrane.operator.matrix.to_dense().double()
     faces = weights.shape[0] // 2
@@ -190,13 +195,13 @@ def test_the_assembled_hessian_is_the_gauss_newton_hessian(potential: Potential,
     )[:, :, :, 0] * (2 * potential.hinges.stiffness[:, :, None]).sqrt()  # fmt: skip
     expected += torch.einsum("hia,hjb->iajb", slopes, slopes)
     inertia = potential.mass[:, 0] * (900 + potential.fabric.drag / potential.fabric.density * 30)
-    push = (met.distance(x)[:, 0] < potential.fabric.margin) * 2 * potential.fabric.collision
-    n = met.normal[..., 0]
+    push = (body_distance.distance(x)[:, 0] < potential.fabric.margin) * 2 * potential.fabric.collision
+    n = body_distance.normal[..., 0]
     own = inertia[:, None, None] * torch.eye(3) + push[:, None, None] * n[:, :, None] * n[:, None]
     for v in range(count):
         expected[v, :, v] += own[v]
     assert (push > 0).any()
-    found = dense_hessian(potential, x, setting, met)
+    found = dense_hessian(potential, x, inputs, body_distance)
     torch.testing.assert_close(found, expected[free][:, :, free].float(), rtol=1e-3, atol=2e-3)
 
 
@@ -204,11 +209,11 @@ def _angles(hinges: Hinges, x: torch.Tensor) -> torch.Tensor:
     return dihedral_angles(*hinges.operator(x).chunk(3))[:, 0]
 
 
-def test_no_hessian_has_a_negative_eigenvalue(potential: Potential, scene: Scene) -> None:
-    _, setting = moving(scene, 1)
-    still = replace(setting, predicted=None, carried=None, dt=1e9)
+def test_no_hessian_has_a_negative_eigenvalue(potential: IncrementalPotential, scene: Scene) -> None:
+    _, inputs = moving(scene, 1)
+    still = replace(inputs, predicted=None, advected=None, dt=1e9)
     squeezed = 0.7 * crumpled(scene, 1, 0.01)
-    matrix = dense_hessian(potential, squeezed, still, potential.met(squeezed, still))
+    matrix = dense_hessian(potential, squeezed, still, potential.body_distance(squeezed, still))
     side = 3 * len(potential.free)
     values = torch.linalg.eigvalsh(matrix.reshape(side, side).double())
     assert values[0] > -1e-6 * values[-1]
@@ -228,13 +233,15 @@ def test_indefinite_blocks_have_definite_inverses() -> None:
         assert found.isfinite().all() and (found > 0.01).all()
 
 
-def test_under_compression_the_whole_hessian_gives_finite_steps(potential: Potential, scene: Scene) -> None:
-    x, setting = moving(scene, 3)
+def test_under_compression_the_whole_hessian_gives_finite_steps(
+    potential: IncrementalPotential, scene: Scene
+) -> None:
+    x, inputs = moving(scene, 3)
     squeezed, held = 0.3 * x, torch.zeros_like(x[:, 0], dtype=torch.bool)
     held[potential.free[::5]] = True
-    state = State.at(potential, squeezed, setting)
-    gradient = potential.gradient(squeezed, setting, state.met)
-    step, _ = newton_step(potential, state, setting, gradient, 50, held, torch.tensor([True, True, False]))
+    state = State.at(potential, squeezed, inputs)
+    gradient = potential.gradient(squeezed, inputs, state.body_distance)
+    step, _ = newton_step(potential, state, inputs, gradient, 50, held, torch.tensor([True, True, False]))
     assert step.isfinite().all() and step[potential.free[::5]].abs().max() == 0
     assert (step[..., 2] * gradient[..., 2]).sum() < 0
 
@@ -266,53 +273,53 @@ def test_conjugate_gradients_solve_each_frame_by_itself() -> None:
     torch.testing.assert_close(z, expected, rtol=1e-6, atol=1e-8)
 
 
-def test_a_line_search_accepts_no_worse_state(potential: Potential, scene: Scene) -> None:
-    x, setting = moving(scene, 3)
-    state = State.at(potential, x, setting)
-    gradient = potential.gradient(x, setting, state.met)
-    step, _ = newton_step(potential, state, setting, gradient, 50)
+def test_a_line_search_accepts_no_worse_state(potential: IncrementalPotential, scene: Scene) -> None:
+    x, inputs = moving(scene, 3)
+    state = State.at(potential, x, inputs)
+    gradient = potential.gradient(x, inputs, state.body_distance)
+    step, _ = newton_step(potential, state, inputs, gradient, 50)
     wild = step * torch.tensor([1.0, 300.0, -1.0], dtype=torch.float64)
-    found, length, _ = line_search(potential, state, setting, gradient, wild)
+    found, length, _ = line_search(potential, state, inputs, gradient, wild)
     assert (length > 0).tolist() == [True, True, False]  # uphill, no step is good enough
     share = (found.x - x).abs().sum((0, 1)) / wild.abs().sum((0, 1))
     assert 0 < share[1] < 1 and share[2] == 0
     torch.testing.assert_close(share, length, rtol=1e-9, atol=1e-12)
-    fresh = State.at(potential, found.x, setting)  # the energy is that of the body points nearest to where it ends
+    fresh = State.at(potential, found.x, inputs)  # the energy is that of the body points nearest to where it ends
     torch.testing.assert_close(found.energy, fresh.energy, rtol=1e-12, atol=0)
     assert (found.energy[:2] < state.energy[:2]).all() and found.energy[2] == state.energy[2]
 
 
-def test_no_step_is_longer_than_a_tenth_of_the_garment(potential: Potential, scene: Scene) -> None:
-    x, setting = moving(scene, 2)
-    state = State.at(potential, x, setting)
-    gradient = potential.gradient(x, setting, state.met) * torch.tensor([1e-6, 1e9], dtype=torch.float64)
-    step, _ = newton_step(potential, state, setting, gradient, 50)
+def test_no_step_is_longer_than_a_tenth_of_the_garment(potential: IncrementalPotential, scene: Scene) -> None:
+    x, inputs = moving(scene, 2)
+    state = State.at(potential, x, inputs)
+    gradient = potential.gradient(x, inputs, state.body_distance) * torch.tensor([1e-6, 1e9], dtype=torch.float64)
+    step, _ = newton_step(potential, state, inputs, gradient, 50)
     short, long = step.norm(dim=1).amax(0).tolist()
     assert 0 < short < 1e-3 < long == pytest.approx(0.1 * np.linalg.norm(np.ptp(scene.garment.mesh.points, axis=0)))
 
 
-def test_more_iterations_never_end_higher(potential: Potential, scene: Scene) -> None:
-    x, setting = moving(scene, 4)
+def test_more_iterations_never_end_higher(potential: IncrementalPotential, scene: Scene) -> None:
+    x, inputs = moving(scene, 4)
     budgets = [SolverOptions(tolerance=1e-9, iterations=n) for n in (1, 2, 3, 4, 6, 8, 12, 16)]
-    energies = [State.at(potential, x, setting).energy]
-    energies += [minimise_from(potential, x, setting, options).energy for options in budgets]
+    energies = [State.at(potential, x, inputs).energy]
+    energies += [minimise_from(potential, x, inputs, options).energy for options in budgets]
     assert (torch.stack(energies).diff(dim=0) <= 0).all() and (energies[1] < energies[0]).all()
 
 
-def test_the_solver_is_as_low_as_a_generic_minimiser(potential: Potential, scene: Scene) -> None:
+def test_the_solver_is_as_low_as_a_generic_minimiser(potential: IncrementalPotential, scene: Scene) -> None:
     """One step of implicit Euler, without the body, by L-BFGS-B."""
-    x, setting = moving(scene, 1)
-    setting = replace(setting, body=None)
-    found = minimise_from(potential, x, setting, SolverOptions(tolerance=1e-6))
-    assert found.imbalance < 1e-6
+    x, inputs = moving(scene, 1)
+    inputs = replace(inputs, body=None)
+    found = minimise_from(potential, x, inputs, SolverOptions(tolerance=1e-6))
+    assert found.residual < 1e-6
     shape, free = x[potential.free].shape, potential.free
 
     def at(values: np.ndarray) -> torch.Tensor:
         return x.index_copy(0, free, torch.as_tensor(values.reshape(shape)))
 
     def value(values: np.ndarray) -> tuple[float, np.ndarray]:
-        gradient = potential.gradient(at(values), setting, None)[free]
-        return float(potential.energy(at(values), setting, None)), gradient.numpy().reshape(-1)
+        gradient = potential.gradient(at(values), inputs, None)[free]
+        return float(potential.energy(at(values), inputs, None)), gradient.numpy().reshape(-1)
 
     start = found.x[free].numpy().reshape(-1) + 1e-3 * np.random.default_rng(0).standard_normal(len(free) * 3)
     options = {"maxiter": 3000, "maxfun": 6000, "ftol": 1e-16, "gtol": 1e-10}
@@ -321,33 +328,35 @@ def test_the_solver_is_as_low_as_a_generic_minimiser(potential: Potential, scene
     np.testing.assert_allclose(found.x[free].numpy().reshape(-1), by_bfgs.x, atol=2e-5)
 
 
-def test_frames_of_a_batch_do_not_see_each_other(potential: Potential, scene: Scene) -> None:
-    x, setting = moving(scene, 3)
+def test_frames_of_a_batch_do_not_see_each_other(potential: IncrementalPotential, scene: Scene) -> None:
+    x, inputs = moving(scene, 3)
     options = SolverOptions(tolerance=1e-5)
-    together = minimise_from(potential, x, setting, options)
+    together = minimise_from(potential, x, inputs, options)
     for frame in range(3):
         one = torch.tensor([frame])
-        alone = minimise_from(potential, x[..., one], setting.picked(one), options)
+        alone = minimise_from(potential, x[..., one], inputs.select(one), options)
         torch.testing.assert_close(together.x[..., one], alone.x, rtol=0, atol=1e-6)
         torch.testing.assert_close(together.energy[one], alone.energy, rtol=0, atol=1e-9)
 
 
-def test_pinned_vertices_stay_and_the_solution_is_in_balance(potential: Potential, scene: Scene) -> None:
-    x, setting = moving(scene, 2)
-    found = minimise_from(potential, x, setting, SolverOptions(tolerance=1e-3))
+def test_pinned_vertices_stay_and_the_solution_is_in_balance(potential: IncrementalPotential, scene: Scene) -> None:
+    x, inputs = moving(scene, 2)
+    found = minimise_from(potential, x, inputs, SolverOptions(tolerance=1e-3))
     pinned = scene.classes == 0
     assert torch.equal(found.x[pinned], x[pinned])
-    gradient = potential.gradient(found.x, setting, potential.met(found.x, setting))[potential.free]
+    gradient = potential.gradient(found.x, inputs, potential.body_distance(found.x, inputs))[potential.free]
     force = (gradient.norm(dim=1) / potential.mass[potential.free] / 9.81).square().mean(0).sqrt()
-    assert (found.imbalance <= 1e-3).all() and (force < 3e-3).all()
-    before = potential.energy(x, setting, potential.met(x, setting))
+    assert (found.residual <= 1e-3).all() and (force < 3e-3).all()
+    before = potential.energy(x, inputs, potential.body_distance(x, inputs))
     assert (found.energy < before).all()
 
 
-def creased(potential: Potential, vertex: int, at: float) -> Callable[[torch.Tensor, Setting], Rounded]:
+def creased(
+    potential: IncrementalPotential, vertex: int, at: float
+) -> Callable[[torch.Tensor, StepInputs], SmoothedDistance]:
     """What finds distances where one vertex stands between two walls that both push it, 1 cm deep in either."""
 
-    def met(x: torch.Tensor, setting: Setting) -> Rounded:
+    def body_distance(x: torch.Tensor, inputs: StepInputs) -> SmoothedDistance:
         normal, offset = torch.zeros_like(x), torch.full_like(x[:, 0], -1e6)
         side = torch.where(
             x[vertex, 0] < at, -1.0, 1.0
@@ -355,63 +364,65 @@ def creased(potential: Potential, vertex: int, at: float) -> Callable[[torch.Ten
         normal[vertex, 0] = -side
         offset[vertex] = -side * at + 0.01
         curvature = 1e4 * torch.eye(3)[None, :, :, None].repeat(len(x), 1, 1, x.shape[2])  # as on a crease
-        return Rounded(normal, offset, curvature)
+        return SmoothedDistance(normal, offset, curvature)
 
-    return met
+    return body_distance
 
 
 def test_a_vertex_on_a_crease_does_not_keep_the_others_from_coming_to_rest(
-    monkeypatch, potential: Potential, scene: Scene
+    monkeypatch, potential: IncrementalPotential, scene: Scene
 ) -> None:
-    x, setting = moving(scene, 2)
+    x, inputs = moving(scene, 2)
     vertex = int(potential.free[len(potential.free) // 2])
-    monkeypatch.setattr(potential, "met", creased(potential, vertex, float(x[vertex, 0, 0])))
+    monkeypatch.setattr(potential, "body_distance", creased(potential, vertex, float(x[vertex, 0, 0])))
     options = SolverOptions(tolerance=1e-3)
-    found = minimise_from(potential, x, setting, options)
-    assert (found.imbalance <= 1e-3).all()
+    found = minimise_from(potential, x, inputs, options)
+    assert (found.residual <= 1e-3).all()
     monkeypatch.setattr(newton, "SPOILING", torch.inf)
-    stuck = minimise_from(potential, x, setting, options)
-    assert (stuck.imbalance[0] > 1) and found.energy[0] <= stuck.energy[0]
+    stuck = minimise_from(potential, x, inputs, options)
+    assert (stuck.residual[0] > 1) and found.energy[0] <= stuck.energy[0]
 
 
-def test_held_vertices_are_let_go_once_when_the_rest_is_in_balance(potential: Potential, scene: Scene) -> None:
-    x, setting = moving(scene, 2)
-    start = minimise_from(potential, x, setting, SolverOptions(tolerance=1e-5)).x
+def test_held_vertices_are_let_go_once_when_the_rest_is_in_balance(
+    potential: IncrementalPotential, scene: Scene
+) -> None:
+    x, inputs = moving(scene, 2)
+    start = minimise_from(potential, x, inputs, SolverOptions(tolerance=1e-5)).x
     vertex = int(potential.free[-1])
     start[vertex, 1] += 2e-3
-    search = newton._Search(potential, start, setting, SolverOptions(tolerance=1e9))
+    search = newton._Search(potential, start, inputs, SolverOptions(tolerance=1e9))
     search.held[vertex] = torch.tensor([True, False])
     assert not search.narrowed() and not search.held.any() and search.released.tolist() == [True, False]
-    assert torch.equal(search.solution.imbalance, search.imbalance) and not search.solution.held.any()
-    assert (search.imbalance > 0.1).all()  # what was held counts again
+    assert torch.equal(search.solution.residual, search.residual) and not search.solution.held.any()
+    assert (search.residual > 0.1).all()  # what was held counts again
     search.held[vertex] = True
     search.narrowed()
     assert search.held[vertex].tolist() == [True, False]
 
 
 def test_a_frame_that_the_whole_hessian_misleads_goes_on_without_it(
-    monkeypatch, potential: Potential, scene: Scene
+    monkeypatch, potential: IncrementalPotential, scene: Scene
 ) -> None:
-    x, setting = moving(scene, 2)
+    x, inputs = moving(scene, 2)
     asked = []
 
-    def misleading(potential, state, setting, gradient, inner, held=None, whole=None):
-        step, count = newton_step(potential, state, setting, gradient, inner, held)
+    def misleading(potential, state, inputs, gradient, inner, held=None, whole=None):
+        step, count = newton_step(potential, state, inputs, gradient, inner, held)
         asked.append(whole)
         return torch.where(whole, 0.0, step), count  # as where the first direction already curves down
 
     monkeypatch.setattr(newton, "newton_step", misleading)
-    found = minimise_from(potential, x, setting, SolverOptions(tolerance=1e-3))
+    found = minimise_from(potential, x, inputs, SolverOptions(tolerance=1e-3))
     tried = torch.stack([whole[0] for whole in asked if len(whole) == 2])
-    assert (found.imbalance <= 1e-3).all() and tried.any()
+    assert (found.residual <= 1e-3).all() and tried.any()
     assert not (tried[1:] & tried[:-1]).any()  # it waits before it tries again
 
 
-def test_states_that_are_not_finite_are_refused(potential: Potential, scene: Scene) -> None:
-    x, setting = moving(scene, 2)
+def test_states_that_are_not_finite_are_refused(potential: IncrementalPotential, scene: Scene) -> None:
+    x, inputs = moving(scene, 2)
     x[3, 1, 1] = torch.nan
     with pytest.raises(SsilkError, match=r"first state of 1 of 2 frames has no finite energy"):
-        minimise_from(potential, x, setting, SolverOptions())
+        minimise_from(potential, x, inputs, SolverOptions())
 
 
 def test_outer_products() -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 from ssilk_core import kernels
 from ssilk_core.assets import SkinWeights
 from ssilk_core.model.decoder import compose, rotation_from_six_d
-from ssilk_core.model.skinning import PARTS, Skinning, by_joint
+from ssilk_core.skinning import PARTS, Skinning, by_joint
 
 pytest.importorskip("triton", reason="kernels need Triton")
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -195,7 +195,7 @@ def test_degenerate_six_d_rotations_are_clamped_as_the_twin_clamps_them(zero):
 def test_a_decoder_trains_by_kernels_as_it_does_without(
     toy_scene, toy_motion, toy_model, monkeypatch, shapes, proxies
 ):
-    from ssilk_core.training.bank import centred_matrices
+    from ssilk_core.motion_bank import centred_matrices
 
     scene = toy_scene(proxies=proxies)
     matrices, _ = centred_matrices(toy_motion(scene, 3), scene.character.skeleton)

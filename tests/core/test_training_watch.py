@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from ssilk_core.training.bank import build_bank
+from ssilk_core.motion_bank import build_bank
 from ssilk_core.training.faults import Faults
 from ssilk_core.training.watch import EVERY, Watch, places_of
 

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from ssilk_core.config import TrainConfig
+from ssilk_core.descriptors import pose_features
 from ssilk_core.errors import SsilkError
 from ssilk_core.kinematics import motion_transforms, skinning_matrices
-from ssilk_core.model.descriptors import pose_features
-from ssilk_core.training.bank import MotionBank, build_bank
+from ssilk_core.motion_bank import MotionBank, build_bank
 from ssilk_core.training.windows import WindowSampler, random_directions
 
 CPU, JOINTS = torch.device("cpu"), np.arange(3)

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import torch
 
-from ..assets import Scene
-from ..config import ModelConfig, TrainConfig
-from ..errors import fail
+from .assets import Scene
+from .config import ModelConfig, TrainConfig
+from .errors import fail
 
 SHARE = 0.8  # of the free memory that a training may plan for
 UNKNOWN = 8 << 30  # bytes that are planned for where the system cannot be asked portably

@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from ..assets import Body, Ints, Mesh, SkinWeights
-from ..energy.closest import patches_of
-from ..energy.collision import PosedBody
-from ..energy.nearest import GROUP, compact_blocks
-from ..energy.surface_point import triangle_rings
 from ..mesh import topology
-from .skinning import Skinning
+from ..skinning import Skinning
+from .closest_point import patches_of
+from .distance import PosedBody
+from .nearest_vertex import GROUP, compact_blocks
+from .one_ring import triangle_rings
 
 
 def faces_among(mesh: Mesh, chosen: Ints) -> Ints:

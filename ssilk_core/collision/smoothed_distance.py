@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The distance to a body's whole surface, rounded where several of its triangles are about equally near.
+"""The distance to a body's whole surface, smoothed where several of its triangles are about equally near.
 
 The Euclidean distance has a crease wherever two points of the surface are equally near. Taut cloth lies on such
 creases, in the concave folds of a body: there it is in balance, and no gradient tells so. With the distances r_f to
@@ -19,8 +19,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .closest import least_of_each, pairs_within_reach
-from .surface_point import closest_in_triangle
+from .closest_point import least_of_each, pairs_within_reach
+from .one_ring import closest_in_triangle
 
 SHARPNESS = 100.0
 SLACK = 12.0 / SHARPNESS  # further away by this share than the nearest, a triangle counts e^-12 of it
@@ -28,8 +28,8 @@ ON_EDGE = 1e-6  # barycentric coordinate up to which a point counts as on the ed
 
 
 @dataclass(frozen=True, eq=False)
-class Rounded:
-    """Rounded distances to first and second order, for each vertex and frame.
+class SmoothedDistance:
+    """Smoothed distances to first and second order, for each vertex and frame.
 
     Attributes:
         normal: their gradients, shorter than 1 on creases, shape (V, 3, N).
@@ -61,16 +61,16 @@ class Rounded:
         """Return all that it holds, frames last."""
         return [self.normal, self.offset, self.curvature]
 
-    def picked(self, frames: Tensor) -> Rounded:
-        """Return those of some of the frames, indices (M,)."""
-        return Rounded(*(values[..., frames] for values in self.tensors()))
+    def select(self, frames: Tensor) -> SmoothedDistance:
+        """Return those of the frames with indices (M,)."""
+        return SmoothedDistance(*(values[..., frames] for values in self.tensors()))
 
-    def to(self, dtype: torch.dtype) -> Rounded:
+    def to(self, dtype: torch.dtype) -> SmoothedDistance:
         """Return the planes in a precision; the curvature stays float32."""
-        return Rounded(self.normal.to(dtype), self.offset.to(dtype), self.curvature)
+        return SmoothedDistance(self.normal.to(dtype), self.offset.to(dtype), self.curvature)
 
 
-def rounded_distance(
+def smoothed_distance(
     x: Tensor,
     reach: Tensor,
     points: Tensor,
@@ -78,7 +78,7 @@ def rounded_distance(
     faces: Tensor,
     touching: float,
     listed: Tensor | None = None,
-) -> tuple[Tensor, Rounded]:
+) -> tuple[Tensor, SmoothedDistance]:
     """Return which of the queries have a triangle within reach, (V, N), and their distances, zero for the others.
 
     Args:
@@ -110,7 +110,7 @@ def rounded_distance(
     curvature = torch.where(touches, 0, torch.where(inside, turning, closing))
     offset = (gradient * x.permute(1, 0, 2).reshape(3, -1)[:, found]).sum(0) - distance
     found = found.reshape(rows, frames)
-    return found, Rounded(*(_spread(values, found) for values in (gradient, offset, curvature.float())))
+    return found, SmoothedDistance(*(_spread(values, found) for values in (gradient, offset, curvature.float())))
 
 
 def _nearest_points(x: Tensor, positions: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from ..assets import Floats, Ints
-from .nearest import compact_blocks
-from .surface_point import closest_in_triangle
+from .nearest_vertex import compact_blocks
+from .one_ring import closest_in_triangle
 
 SCORES = 1 << 25  # pairs of a vertex and a triangle looked at together, on a processor
 ON_GPU = 8  # times as many: 2 GB of scores, in few launches

@@ -5,15 +5,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..assets import Floats, Motion, Skeleton
-from ..errors import fail
-from ..kinematics import motion_transforms, resample, skinning_matrices, split_at_cuts
-from ..model.descriptors import gravity_features, pose_features
+from .assets import Floats, Motion, Skeleton
+from .descriptors import pose_features
+from .errors import fail
+from .kinematics import motion_transforms, resample, skinning_matrices, split_at_cuts
+from .model.descriptors import gravity_features
 
 # Captured joints that flip turn faster than this [rad/s], people do not; the garment would learn from the blow.
 MOST_TURN = 40.0
@@ -113,3 +115,31 @@ def centred_matrices(motion: Motion, skeleton: Skeleton) -> tuple[Floats, Floats
     origin = world[0, 0, :3, 3].copy()
     world[..., :3, 3] -= origin
     return skinning_matrices(world, skeleton.bind_transforms), origin
+
+
+class LatentModel(Protocol):
+    """What is scored: a `GarmentModel`, or what else has states of its own, shape (N, S), and these methods."""
+
+    def initial(self, static: Tensor) -> Tensor: ...
+
+    def roll(self, states: list[Tensor], rest: Tensor, pose: Tensor) -> list[Tensor]: ...
+
+    def vertices(self, z: Tensor, character: Tensor, /) -> Tensor: ...
+
+
+@torch.no_grad()
+def roll_states(model: LatentModel, bank: MotionBank, clips: Sequence[range], down: Tensor) -> list[Tensor]:
+    """Roll a model over ranges of a bank side by side, each from its quasi-static start.
+
+    Returns:
+        For each range its states, shape (frames, latent).
+    """
+    offset = torch.arange(max(map(len, clips)), device=down.device)[:, None]
+    first, last = (torch.tensor([clip[end] for clip in clips], device=down.device) for end in (0, -1))
+    frames = torch.minimum(first + offset, last)  # shorter ones wait on their last frame
+    direction = down.expand(frames.numel(), 3)
+    static = bank.static_descriptor(frames.reshape(-1), direction)
+    pose = bank.dynamic_descriptor(frames.reshape(-1), direction)
+    rest, pose = (values.reshape(*frames.shape, -1) for values in (model.initial(static), pose))
+    states = torch.stack(model.roll([*rest[:2]], rest[2:], pose[2:]))
+    return [states[: len(clip), index] for index, clip in enumerate(clips)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rounded distance to a body's surface; `energy.rounded` holds the plain twin.
+"""The smoothed distance to a body's surface; `collision.smoothed_distance` holds the reference implementation.
 
 A program owns one garment vertex in a block of frames and looks at its triangles one after another, closely at those
 whose bounding sphere is within reach in any of the frames. Sums over them are kept relative to the nearest so far, so
@@ -13,14 +13,14 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from .surface import _closest_alone, _mixed
+from .one_ring import _closest_alone, _mixed
 from .vectors import dot, load3, store3
 
 BLOCK = 32  # frames of one program
 TINY = tl.constexpr(1e-30)
 
 
-def rounded_kernel(
+def smoothed_distance_kernel(
     x: Tensor,
     index: Tensor,
     points: Tensor,
@@ -35,10 +35,10 @@ def rounded_kernel(
     slack: float,
     on_edge: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return gradients (V, 3, N), rounded distances (V, N) and their curvature (V, 3, 3, N).
+    """Return gradients (V, 3, N), smoothed distances (V, N) and their curvature (V, 3, 3, N).
 
-    They are those of `energy.rounded.rounded_distance`, which has the constants, and of the nearest vertex's plane
-    for vertices `far` from it.
+    They are those of `collision.smoothed_distance.smoothed_distance`, which has the constants, and of the nearest
+    vertex's plane for vertices `far` from it.
 
     Args:
         x: queries (V, 3, N); index: their nearest body vertices (V, N), int32.

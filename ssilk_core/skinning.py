@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from .. import kernels
-from ..assets import Ints, SkinWeights
+from . import kernels
+from .assets import Ints, SkinWeights
 
 PARTS = 16  # programs that share the gradient of a joint's matrix, so that few joints fill a GPU too
 
@@ -82,7 +82,7 @@ class Skinning(nn.Module):
             weights: of the influences (V, I), zero where there is none; matrices: of all joints (J, 3, 4, N).
         """
         if kernels.available(rest.device):
-            from ..kernels.skinning import skin_kernel
+            from .kernels.skinning import skin_kernel
 
             movers = (self.first_trainable, self.entries, self.starts)
             return skin_kernel(rest, offsets, weights, matrices, (self.joints, self.counts), movers)
@@ -92,7 +92,7 @@ class Skinning(nn.Module):
     def surface(self, points: Tensor, normals: Tensor, matrices: Tensor) -> tuple[Tensor, Tensor]:
         """Return skinned points and unit normals (V, 3, N) of points and normals (V, 3); without gradients."""
         if kernels.available(points.device):
-            from ..kernels.skinning import skin_surface_kernel
+            from .kernels.skinning import skin_surface_kernel
 
             return skin_surface_kernel(points, normals, self.weights, matrices, (self.joints, self.counts))
         affine = blended(self.dense(self.weights), matrices[self.used])

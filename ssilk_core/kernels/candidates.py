@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nearest of the body vertices listed for each garment vertex; `energy.nearest` holds the plain twin.
+"""The nearest of the body vertices listed for each garment vertex; `collision.nearest_vertex` holds the reference
+implementation.
 
 A program owns one garment vertex in a block of frames: the list is the same for all of its threads.
 """

@@ -18,12 +18,12 @@ import torch
 from torch import Tensor
 
 from ..assets import PINNED, TIGHT, Floats, Ints, Mesh, Scene
-from ..energy.collision import FAR, Patches, PosedBody, nearest_planes, rounded_planes, signed
-from ..energy.nearest import BLOCK, compact_blocks
-from ..energy.rounded import Rounded
 from ..mesh import topology
 from ..mesh.geodesic import edge_graph
 from .body import faces_among
+from .distance import FAR, Patches, PosedBody, nearest_planes, signed, smoothed_planes
+from .nearest_vertex import BLOCK, compact_blocks
+from .smoothed_distance import SmoothedDistance
 
 EXTENT = 1 / 12  # radius of a patch along the body, as a share of the body's diagonal: half the girth of an upper arm
 MOST = 256  # vertices of a patch; of a finer body the patch is smaller
@@ -80,16 +80,16 @@ class Contacts:
         normal, offset = self._of_groups(x, body, nearest_planes, no_planes)
         return normal, offset
 
-    def rounded(self, x: Tensor, body: PosedBody) -> Rounded:
-        """Return rounded distances of x (V, 3, N) to what it meets, as `planes` does, in the precision of x."""
+    def smoothed(self, x: Tensor, body: PosedBody) -> SmoothedDistance:
+        """Return smoothed distances of x (V, 3, N) to what it meets, as `planes` does, in the precision of x."""
 
         def find(*asked: Any) -> Sequence[Tensor]:
-            return rounded_planes(*asked).tensors()
+            return smoothed_planes(*asked).tensors()
 
         def nothing(x: Tensor) -> Sequence[Tensor]:
             return *no_planes(x), x.new_zeros(len(x), 3, *x.shape[1:], dtype=torch.float32)
 
-        return Rounded(*self._of_groups(x, body, find, nothing))
+        return SmoothedDistance(*self._of_groups(x, body, find, nothing))
 
     def _of_groups(
         self,

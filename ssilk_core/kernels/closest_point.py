@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The plane of the nearest point of a body's whole surface; `energy.closest` holds the plain twin.
+"""The plane of the nearest point of a body's whole surface; `collision.closest_point` holds the reference
+implementation.
 
 As in `nearest`, vertices of the garment come in compact blocks with bounding boxes, a program owns one frame and a
 few blocks, and groups of the body whose boxes are out of reach are left out. A group here is a patch of triangles,
@@ -12,8 +13,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from .nearest import CHUNK, RUN, SAFE, _gaps, _three, by_frame
-from .surface import _closest_alone
+from .nearest_vertex import CHUNK, RUN, SAFE, _gaps, _three, by_frame
+from .one_ring import _closest_alone
 from .vectors import dot
 
 LANES = tl.constexpr(8)  # triangles of a patch; their corners are four rows of a table, of which the last fills up
@@ -35,8 +36,8 @@ def closest_kernel(
     Args:
         x: queries (V, 3, N); index: their nearest body vertices (V, N), int32.
         points, normals: of the body (B, 3, N).
-        blocks: the queries in compact blocks (`energy.nearest.compact_blocks`), int32.
-        patches: corners of triangles in compact patches (`energy.closest.patches_of`), int32.
+        blocks: the queries in compact blocks (`collision.nearest_vertex.compact_blocks`), int32.
+        patches: corners of triangles in compact patches (`collision.closest_point.patches_of`), int32.
         far: further than this from its nearest vertex [m], a query keeps that as its nearest point.
         touching: nearer than this to its nearest point [m], a query keeps the normal there.
     """

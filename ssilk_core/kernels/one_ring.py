@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The plane of the nearest body point, on the triangles around the nearest vertex; `energy.collision` holds the twin.
+"""The plane of the nearest body point, on the triangles around the nearest vertex; `collision.distance` holds the
+reference implementation.
 
 A program owns one garment vertex in a block of frames: mostly its threads look at the same few triangles, and
 neighbouring frames are neighbours in memory.
@@ -26,7 +27,7 @@ def surface_kernel(
     Args:
         x: queries (V, 3, N); index: their nearest body vertices (V, N), int32.
         points, normals: of the body (B, 3, N).
-        rings: neighbours around each vertex (`energy.surface_point.triangle_rings`), int32.
+        rings: neighbours around each vertex (`collision.one_ring.triangle_rings`), int32.
         far: further than this from its nearest vertex [m], a query keeps that as its nearest point.
     """
     x, points, normals = x.contiguous(), points.contiguous(), normals.contiguous()

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The exact nearest body vertex, with far groups of body vertices left out; `energy.nearest` holds the plain twin.
+"""The exact nearest body vertex, with far groups of body vertices left out; `collision.nearest_vertex` holds the
+reference implementation.
 
 Vertices of the garment come in blocks and those of the body in groups, both compact, each with its bounding box in
 every frame. A program owns one frame and a few blocks. For one block it looks at the group nearest to its middle:
@@ -27,7 +28,8 @@ def nearest_kernel(x: Tensor, points: Tensor, blocks: Tensor, groups: Tensor) ->
 
     Args:
         x, points: garment (V, 3, N) and body (B, 3, N), float32.
-        blocks, groups: their vertices in compact blocks (`energy.nearest.compact_blocks`), int32, as powers of two.
+        blocks, groups: their vertices in compact blocks (`collision.nearest_vertex.compact_blocks`), int32, as powers
+            of two.
     """
     vertices, _, frames = x.shape
     found = torch.empty(vertices, frames, dtype=torch.int32, device=x.device)

@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""All energies of frames in a row, as validation and evaluation tell them."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ..collision.contacts import Contacts
+from ..collision.distance import PosedBody
+from ..constants import GRAVITY
+from .garment import GarmentEnergy
+
+DECODED_AT_ONCE = 256  # frames in memory
+
+
+def energy_terms(
+    energy: GarmentEnergy,
+    x: Tensor,
+    plain: Tensor,
+    contacts: Contacts,
+    body: PosedBody,
+    joined: Tensor,
+    fps: float,
+    down: Tensor,
+) -> dict[str, Tensor]:
+    """Return each of `TERMS` [J], and the share of vertices inside the body as "collisions", shape (N,).
+
+    The share counts what lies inside any part of the body, whichever part the vertex meets in the energy.
+
+    Args:
+        x, plain: positions (V, 3, N); gravity is that of `x` less that of `plain`.
+        joined: `x` after up to two frames before it. Where two are lacking there is no inertia.
+        down: direction of gravity, shape (3,).
+    """
+    met, nearest = contacts.distances(x, body)
+    inertia = energy.inertia(joined[..., 2:], 2 * joined[..., 1:-1] - joined[..., :-2], 1 / fps)
+    return {
+        "stretch": energy.stretch(x),
+        "bending": energy.bending(x),
+        "gravity": energy.gravity(x - plain, GRAVITY * down[:, None]),
+        "inertia": torch.cat([inertia.new_zeros(x.shape[-1] - len(inertia)), inertia]),
+        "collision": energy.collision_of(met),
+        "collisions": (nearest < 0).double().mean(0),
+    }

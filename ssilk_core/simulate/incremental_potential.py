@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The incremental potential that a frame minimises: the training energy, with its gradient and Hessian.
+
+Implicit Euler with time step dt is the minimum of
+
+    stretch + bending + gravity + collision + m/(2 dt^2) |x - (2 x' - x'')|^2 + drag a/(2 dt) |x - advected|^2
+
+(`energy.GarmentEnergy`); a quasi-static state leaves the last two out. The distance to the body is that to the whole
+surface that a vertex may meet. Training takes the triangles around the nearest vertex alone. The distance is smoothed
+on its creases (`collision.smoothed_distance`), so that the gradient vanishes at minima there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..assets import PINNED, Scene
+from ..collision.contacts import Contacts
+from ..collision.distance import PosedBody
+from ..collision.smoothed_distance import SmoothedDistance
+from ..constants import GRAVITY
+from ..energy import GarmentEnergy
+from ..energy.collision import collision_energy
+from ..fabrics import Fabric
+from ..mesh import topology
+from .blocks import BlockMatrix
+from .hessian import Hessian
+from .hinges import Hinges
+from .membrane import Membrane, outer
+
+
+@dataclass(frozen=True, eq=False)
+class StepInputs:
+    """What the energy of N frames depends on besides the garment.
+
+    Attributes:
+        body: in the coordinates of the positions, float32.
+        gravity: acceleration [m/s2], shape (3, N).
+        predicted: 2 x' - x'' [m], shape (V, 3, N), or None for a quasi-static state.
+        advected: where the air took x' [m], shape (V, 3, N), or None likewise.
+        dt: time step [s]. In a quasi-static state it damps the steps of the solver alone.
+    """
+
+    body: PosedBody | None
+    gravity: Tensor
+    predicted: Tensor | None = None
+    advected: Tensor | None = None
+    dt: float = 0.1
+
+    def select(self, frames: Tensor) -> StepInputs:
+        """Return the inputs of the frames with indices (M,)."""
+        body = self.body and self.body.select(frames)
+        predicted, advected = (v if v is None else v[..., frames] for v in (self.predicted, self.advected))
+        return StepInputs(body, self.gravity[..., frames], predicted, advected, self.dt)
+
+
+class IncrementalPotential:
+    """The incremental potential of one garment; positions are (V, 3, N).
+
+    Attributes:
+        free: indices of the vertices that move: all with mass that are not pinned, shape (U,).
+        size: diagonal of the garment's box at rest [m].
+
+    Args:
+        dtype: of positions, energies and gradients; Hessians are float32.
+    """
+
+    def __init__(
+        self, scene: Scene, fabric: Fabric, *, device: torch.device, dtype: torch.dtype = torch.float64
+    ) -> None:
+        mesh = scene.garment.mesh
+        energy = GarmentEnergy(mesh, fabric, device=device, dtype=dtype)
+        hinges = topology.hinges(mesh.faces) if fabric.bending else np.zeros((0, 4), dtype=np.int64)
+        self.fabric, self.dtype = fabric, dtype
+        self.mass: Tensor = energy.mass[:, None]
+        self.size = float(np.linalg.norm(np.ptp(mesh.points, axis=0)))
+        self.contacts = Contacts(scene, device=device)
+        self.membrane = Membrane(mesh, fabric, device, dtype)
+        self.hinges = Hinges(hinges, energy, mesh.vertex_count) if len(hinges) else None
+        free = np.flatnonzero((scene.classes != PINNED) & (topology.vertex_areas(mesh.points, mesh.faces) > 0))
+        self.free = torch.as_tensor(free, device=device)
+        self._hessian = Hessian(self.membrane, self.hinges, hinges, free, mesh.vertex_count)
+
+    def body_distance(self, x: Tensor, inputs: StepInputs) -> SmoothedDistance | None:
+        """Return the distances of x to the body, to second order."""
+        return None if inputs.body is None else self.contacts.smoothed(x, inputs.body)
+
+    def energy(self, x: Tensor, inputs: StepInputs, body_distance: SmoothedDistance | None) -> Tensor:
+        """Return the energy [J] of each frame, shape (N,), at the distances `body_distance` of x."""
+        total = self.membrane.energy(x) - (self.mass * (x * inputs.gravity).sum(1)).sum(0)
+        if self.hinges:
+            total = total + self.hinges.energy(x)
+        for weight, target in self._anchors(inputs):
+            total = total + (0.5 * weight * ((x - target) ** 2).sum(1)).sum(0)
+        return total + self.collision(x, body_distance).sum(0)
+
+    def collision(self, x: Tensor, body_distance: SmoothedDistance | None) -> Tensor:
+        """Return the energy of each vertex that meets the body [J], shape (V, N)."""
+        return torch.zeros_like(x[:, 0]) if body_distance is None else self.collision_at(body_distance.distance(x))
+
+    def collision_at(self, distance: Tensor) -> Tensor:
+        """Return the energy of vertices so far from the body [J], shape (V, N)."""
+        return collision_energy(distance, self.fabric.collision, self.fabric.margin)
+
+    def gradient(self, x: Tensor, inputs: StepInputs, body_distance: SmoothedDistance | None) -> Tensor:
+        """Return the gradient [N] in all vertices, shape (V, 3, N)."""
+        total = self.membrane.gradient(x) - self.mass[:, None] * inputs.gravity
+        if self.hinges:
+            total += self.hinges.gradient(x)
+        for weight, target in self._anchors(inputs):
+            total += weight[:, None] * (x - target)
+        if body_distance:
+            total -= self._push(x, body_distance)[:, None] * body_distance.normal
+        return total
+
+    def hessian(
+        self,
+        x: Tensor,
+        inputs: StepInputs,
+        body_distance: SmoothedDistance | None,
+        fixed: Tensor | None = None,
+        exact_hessian: Tensor | None = None,
+    ) -> BlockMatrix:
+        """Return the Hessian over the free vertices, in float32, its parts made positive semi-definite.
+
+        Args:
+            fixed: vertices that must not move, shape (V, N); none by default.
+            exact_hessian: frames whose membrane keeps its exact Hessian, which compression may make indefinite,
+                shape (N,); none by default.
+        """
+        still = [] if inputs.predicted is not None else [(self.mass / inputs.dt**2, None)]
+        weight = sum((weight for weight, _ in [*self._anchors(inputs), *still]), torch.zeros_like(self.mass))
+        contact = None
+        if body_distance:
+            push, normal = self._push(x, body_distance)[self.free], body_distance.normal[self.free]
+            stiffness = 2 * self.fabric.collision * (push > 0)
+            contact = (
+                stiffness[:, None, None] * outer(normal, normal)
+                + push[:, None, None] * body_distance.curvature[self.free]
+            )
+        fixed = None if fixed is None else fixed[self.free]
+        return self._hessian(x, weight[self.free].float(), contact, fixed, exact_hessian)
+
+    def residual(self, gradient: Tensor) -> Tensor:
+        """Return the RMS acceleration, over the free mass, that a gradient (V, 3, N) leaves, in units of g: (N,)."""
+        force, mass = gradient[self.free], self.mass[self.free]
+        return ((force * force).sum(1) / mass).sum(0).div(mass.sum()).sqrt() / GRAVITY
+
+    def _anchors(self, inputs: StepInputs) -> list[tuple[Tensor, Tensor]]:
+        """Return stiffness [N/m] (V, 1) and target (V, 3, N) of inertia and drag, where they act."""
+        found = []
+        if inputs.predicted is not None:
+            found.append((self.mass / inputs.dt**2, inputs.predicted))
+        if inputs.advected is not None and self.fabric.drag:
+            found.append((self.fabric.drag / self.fabric.density * self.mass / inputs.dt, inputs.advected))
+        return found
+
+    def _push(self, x: Tensor, body_distance: SmoothedDistance) -> Tensor:
+        """Return the force along the gradient of the distance on each vertex within the margin [N], shape (V, N)."""
+        return 2 * self.fabric.collision * (self.fabric.margin - body_distance.distance(x)).clamp_min(0)
