@@ -24,10 +24,17 @@ from ssilk_core.events import Failed, Result, TextReporter
 
 METHODS = {
     "ncs": ("ncs", 0.0),
-    "ncs*": ("ncs", TrainConfig.rotated),
+    "ncs*": ("ncs", TrainConfig.rotated_fraction),
     "snug": ("snug", 0.0),
 }  # network, and share of windows that are rotated
-SCHEDULE = ("warm=0", "batch=640", "window=18", "carry=0", "rate=1e-3", "final_rate=4e-5")
+SCHEDULE = (
+    "static_fraction=0",
+    "batch=640",
+    "window=18",
+    "state_reuse=0",
+    "learning_rate=1e-3",
+    "final_learning_rate=4e-5",
+)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -46,7 +53,7 @@ def asked(options: argparse.Namespace, report: TextReporter) -> BaselineJob:
     """Read everything that the options name."""
     network, rotated = METHODS[options.method]
     iterations = [] if options.iterations is None else [f"iterations={options.iterations}"]
-    options.settings = [*SCHEDULE, f"rotated={rotated}", *iterations, *options.settings]
+    options.settings = [*SCHEDULE, f"rotated_fraction={rotated}", *iterations, *options.settings]
     base = train.training_job(options, str(chosen_device(options.device)), report)
     return BaselineJob(
         base=base,

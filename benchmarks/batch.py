@@ -26,7 +26,7 @@ from ssilk_core.model.network import GarmentModel
 
 SHOTS = (1, 8, 64, 512, 2048)
 FRAMES = 128
-SIZE = synthetic.Size(vertices=2500, body=600, proxies=20, shapes=64, batch=1, window=3, resting=0)
+SIZE = synthetic.Size(vertices=2500, body=600, proxies=20, shapes=64, batch=1, window=3, static_batch=0)
 
 
 def build(device: torch.device) -> tuple[GarmentModel, Driven]:

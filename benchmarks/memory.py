@@ -106,7 +106,9 @@ def stepper(whole: Scene, config: TrainConfig, device: torch.device) -> Stepper:
     body = CollisionBody(whole.character.merged_body(), JOINTS, device=device)
     generator = torch.Generator(device).manual_seed(0)
     sampler = WindowSampler(bank, config, model.latent, generator)
-    return Stepper(network, Objective(network, energy, body, bank, config.surface == "triangles"), sampler, config)
+    return Stepper(
+        network, Objective(network, energy, body, bank, config.closest_point == "triangles"), sampler, config
+    )
 
 
 class Peak:
@@ -137,10 +139,10 @@ class Peak:
 def measure(vertices: int, body_vertices: int, frames: int, surface: str, device: torch.device) -> dict[str, int]:
     """Return the measured and the predicted peak of a step that decodes `frames` at once [bytes]."""
     whole = scene(vertices, body_vertices)
-    config = TrainConfig(batch=frames // WINDOW, window=WINDOW, warm_batch=frames, surface=surface)
+    config = TrainConfig(batch=frames // WINDOW, window=WINDOW, pretraining_batch=frames, closest_point=surface)
     steps = stepper(whole, config, device)
     peak = Peak(device)
-    for iteration in (0, config.warm_iterations):
+    for iteration in (0, config.static_iterations):
         steps.run(iteration)
         steps.run(iteration + 1)  # beside the optimiser's moments, which the first step makes
     body = whole.character.bodies[0].mesh.vertex_count

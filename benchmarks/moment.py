@@ -21,7 +21,11 @@ class Moment:
     def __init__(self, stepper: Stepper) -> None:
         self.stepper, self.model, self.sampler = stepper, stepper.model, stepper.sampler
         self.decoder, self.objective, self.bank = stepper.model.decoder, stepper.objective, stepper.objective.bank
-        self.batch, self.window, self.resting = stepper.config.batch, stepper.config.window, stepper.config.resting
+        self.batch, self.window, self.static_batch = (
+            stepper.config.batch,
+            stepper.config.window,
+            stepper.config.static_batch,
+        )
         with torch.no_grad():
             self._seen()
             self._decoded()
@@ -31,7 +35,7 @@ class Moment:
         steps, given = torch.arange(self.window, device=self.sampler.first.device)[:, None], 2 * self.batch
         self.times = (self.sampler.first + steps).reshape(-1)
         self.down = self.sampler.direction.repeat(self.window, 1)
-        self.single, self.single_down = self.sampler.poses(self.resting)
+        self.single, self.single_down = self.sampler.poses(self.static_batch)
         self.static, self.pose, self.quiet = self.descriptors()
         self.frames = torch.cat([self.times[given:], self.single])
         self.direction = torch.cat([self.down[given:], self.single_down])
@@ -58,7 +62,7 @@ class Moment:
         return len(self.frames)
 
     def sample(self) -> Tensors:
-        noise, poses = self.sampler.noise(), self.sampler.poses(self.resting)
+        noise, poses = self.sampler.noise(), self.sampler.poses(self.static_batch)
         self.sampler.advance(self.sampler.latents + noise)
         return self.sampler.first, self.sampler.direction, self.sampler.latents, *poses
 

@@ -25,22 +25,29 @@ BASELINE_STEP = 8.5  # [ms]
 START, VALIDATION, EVALUATION, FRAME = 25.0, 1.5, 3.0, 0.05  # [s]; the last: of the simulator, a frame of a shot
 VALIDATIONS = 10
 RECIPES = {
-    "cape": ("shape_rate=1",),
-    "hooded_dress": ("shape_rate=1",),
-    "fringe_skirt": ("shape_rate=1",),
+    "cape": ("shape_learning_rate_scale=1",),
+    "hooded_dress": ("shape_learning_rate_scale=1",),
+    "fringe_skirt": ("shape_learning_rate_scale=1",),
     "tshirt": ("shapes=256",),
     "long_sleeve": ("shapes=256",),
     "pants": ("shapes=256",),
 }
 SWEEPS: dict[str, dict[str, tuple[str, ...]]] = {
-    "table4": {"regularity": ("0.001", "0.01")},
+    "table4": {"latent_regularization": ("0.001", "0.01")},
     "table5": {"batch": ("32", "64", "512"), "window": ("4", "10", "18"), "latent": ("16", "64", "512")},
     "figure11": {"scheme": ("verlet", "direct", "direct_residual")},
     "figure12": {"shapes": ("0", "8", "16", "32", "128", "256", "512"), "proxies": ("0", "4", "8", "32", "64")},
 }
 """Settings of the cape that are changed, one at a time; Figure 8 takes the zeros of Figure 12."""
-USUAL = {"batch": 256, "window": 6, "resting": 256}
-REHEARSED = ("iterations=4", "validate_every=2", "valid_frames=4", "recombined=0", "resting=2", "warm_batch=2")
+USUAL = {"batch": 256, "window": 6, "static_batch": 256}
+REHEARSED = (
+    "iterations=4",
+    "validate_every=2",
+    "valid_frames=4",
+    "recombinations=0",
+    "static_batch=2",
+    "pretraining_batch=2",
+)
 PYTHON, SSILK = "python", ("python", "-m", "ssilk_core")
 
 
@@ -151,7 +158,7 @@ class Training:
     def _cost(self) -> float:
         """Return the predicted time of a step over the usual one's: half of it goes with the frames decoded."""
         changed = {name: int(value) for name, _, value in (s.partition("=") for s in self.settings) if name in USUAL}
-        frames, usual = (of["batch"] * (of["window"] - 2) + of["resting"] for of in (USUAL | changed, USUAL))
+        frames, usual = (of["batch"] * (of["window"] - 2) + of["static_batch"] for of in (USUAL | changed, USUAL))
         return 0.5 + 0.5 * frames / usual
 
 

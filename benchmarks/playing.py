@@ -109,8 +109,8 @@ def with_torch(model: GarmentModel, skinner: Skinner, motion: Motion, chunk: int
     states: list[Tensor] = []
     for frames in spans(motion.frame_count, chunk):
         rest, pose = given.rest[frames], given.pose[frames]
-        resting = max(0, min(2 - frames.start, len(rest)))
-        states = model.roll([*states[-2:], *rest[:resting]], rest[resting:], pose[resting:])
+        static_batch = max(0, min(2 - frames.start, len(rest)))
+        states = model.roll([*states[-2:], *rest[:static_batch]], rest[static_batch:], pose[static_batch:])
         watch.lap(LATENTS)
         activations, rotations = model.pose(torch.cat(states[-len(rest) :]))
         watch.lap(DECODER)

@@ -26,7 +26,7 @@ SETTINGS: dict[str, Callable[[ModelFile], Any]] = {
     "blendshapes": lambda file: file.config.shapes,
     "proxies": lambda file: file.scene.rig.proxy_count,
     "scheme": lambda file: file.config.scheme,
-    "regularity": lambda file: file.provenance["train"].get("regularity", 0.0),
+    "latent_regularization": lambda file: file.provenance["train"].get("latent_regularization", 0.0),
 }
 
 

@@ -134,7 +134,9 @@ def live(path: Path, python: str) -> dict[str, list[float]]:
 
 def cloak(vertices: int, config: ModelConfig) -> tuple[GarmentModel, Motion]:
     """Return an untrained network on a cloak, and a motion."""
-    size = synthetic.Size(vertices=vertices, body=600, proxies=20, shapes=config.shapes, batch=1, window=3, resting=0)
+    size = synthetic.Size(
+        vertices=vertices, body=600, proxies=20, shapes=config.shapes, batch=1, window=3, static_batch=0
+    )
     scene = synthetic.scene(size)
     model = GarmentModel(scene, config, np.arange(synthetic.JOINTS))
     return model, synthetic.motion(scene.character.skeleton, config.fps, 0).clip(0, GROWTH_FRAMES)

@@ -52,7 +52,7 @@ def measure(options: argparse.Namespace, batch: str, team: Team, device: str) ->
         words = ["train", *options.training, "--set", f"batch={whole}", "-o", f"{folder}/model.safetensors"]
         job = training_job(ssilk_parser().parse_args(words), device, silent)
         run = Run(replace(job, train=Team(0, int(parts or 1)).part(job.train)), silent, team)
-    phases = {"warm start": 0, "windows": run.config.warm_iterations}
+    phases = {"warm start": 0, "windows": run.config.static_iterations}
     times = {name: blocks(run, iteration, team, options) for name, iteration in phases.items()}
     parameters = b"".join(value.detach().cpu().numpy().tobytes() for value in run.stepper.model.parameters())
     alike = len(set(team.gather(hashlib.sha256(parameters).hexdigest()))) == 1

@@ -37,7 +37,7 @@ from ssilk_core.rollout import garment_poses
 from ssilk_core.training.job import TrainJob
 from ssilk_core.training.parts import build_parts
 
-SIZE = synthetic.Size(vertices=2500, body=4000, proxies=20, shapes=64, batch=8, window=6, resting=8)
+SIZE = synthetic.Size(vertices=2500, body=4000, proxies=20, shapes=64, batch=8, window=6, static_batch=8)
 STEPS, CLIPS, TIMES = 6, 4, 6
 HEADER = ("scene", "free vertices", "proxies", "body vertices", "train step [ms]", "memory [MiB]", "roll [ms/frame]",
           "bake [ms/frame]", "model [kB]", "shot [kB]")  # fmt: skip
@@ -115,12 +115,13 @@ def measure(name: str) -> dict[str, float]:
 
 def measured(scene: Scene, motions: tuple[Motion, ...]) -> dict[str, float]:
     """Train a few steps, roll and bake one garment."""
-    config = TrainConfig(batch=SIZE.batch, window=SIZE.window, resting=SIZE.resting, warm_batch=SIZE.decoded,
-                         recombined=0)  # fmt: skip
+    config = TrainConfig(batch=SIZE.batch, window=SIZE.window, static_batch=SIZE.static_batch,
+                         pretraining_batch=SIZE.decoded,
+                         recombinations=0)  # fmt: skip
     job = TrainJob(scene=scene, motions=motions, held_out=motions[:1], model=ModelConfig(shapes=SIZE.shapes),
                    train=config, fabric=Fabric("default"), output=Path("none"), device="cpu")  # fmt: skip
     parts = build_parts(job, torch.device("cpu"))
-    stepper, first = parts.stepper(job.train, 0), job.train.warm_iterations
+    stepper, first = parts.stepper(job.train, 0), job.train.static_iterations
     peak = Peak(torch.device("cpu"))
     stepper.run(first)
     began = time.perf_counter()

@@ -145,7 +145,8 @@ def row(method: str, found: dict[str, Any]) -> list[str]:
     """Return one line of the table."""
     cg_iterations = f"{found['cg_iterations']:.0f}" if "cg_iterations" in found else ""
     return [method, str(found["shots"]), f"{1000 * found['seconds']:.1f}", f"{found['iterations']:.1f}",
-            cg_iterations, f"{found['residual']:.1e}", f"{found['solved']:.0%}", f"{found['energy']:.6f}"]  # fmt: skip
+            cg_iterations, f"{found['residual']:.1e}",
+            f"{found['solved']:.0%}", f"{found['energy']:.6f}"]  # fmt: skip
 
 
 def main() -> None:

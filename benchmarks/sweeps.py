@@ -19,7 +19,7 @@ from ssilk_core.errors import fail
 from ssilk_core.evaluation.splits import SPLITS
 
 SWEEPS = {
-    "table4": ("regularity",),
+    "table4": ("latent_regularization",),
     "table5": ("batch", "window", "latent"),
     "figure8": ("decoder",),
     "figure11": ("scheme",),

@@ -56,12 +56,12 @@ class Size:
     shapes: int
     batch: int
     window: int
-    resting: int
+    static_batch: int
 
     @property
     def decoded(self) -> int:
         """Frames that are decoded for their energy: the two before a window's first new one are not."""
-        return self.batch * (self.window - 2) + self.resting
+        return self.batch * (self.window - 2) + self.static_batch
 
 
 def coil(path: str, count: int, top: float, bottom: float, radius: Callable[[Floats], Floats]) -> tuple[Mesh, Floats]:
@@ -163,7 +163,9 @@ def stepper(size: Size, device: torch.device) -> Stepper:
     """Return what trains the default network at a size, as a training run puts it together."""
     whole, model = scene(size), ModelConfig(shapes=size.shapes)
     # Both phases decode as many frames, so that one measurement of a part serves both.
-    config = TrainConfig(batch=size.batch, window=size.window, resting=size.resting, warm_batch=size.decoded)
+    config = TrainConfig(
+        batch=size.batch, window=size.window, static_batch=size.static_batch, pretraining_batch=size.decoded
+    )
     skeleton, joints = whole.character.skeleton, np.arange(JOINTS)
     motions = [motion(skeleton, model.fps, seed) for seed in range(CLIPS)]
     bank = build_bank(motions, skeleton, joints, model.fps, device)

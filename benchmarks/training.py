@@ -46,7 +46,7 @@ SIZES = {
     "shapes": (64, 16, 256),
     "window": (32, 16, 64),
     "batch": (32, 16, 64),
-    "resting": (64,),
+    "static_batch": (64,),
 }
 PLAIN, KERNELS = "plain", "kernels"
 
@@ -58,7 +58,7 @@ def cases(options: argparse.Namespace) -> dict[str, Size]:
     base = Size(**{name: getattr(options, name)[0] for name in SIZES})
     others = [{name: count} for name in SIZES for count in getattr(options, name)[1:]]
     if options.default_batch:
-        others.append({name: getattr(TrainConfig(), name) for name in ("batch", "window", "resting")})
+        others.append({name: getattr(TrainConfig(), name) for name in ("batch", "window", "static_batch")})
     named = {", ".join(f"{name} {count}" for name, count in other.items()): other for other in others}
     return {"base": base, **{name: replace(base, **other) for name, other in named.items()}}
 
@@ -86,7 +86,7 @@ def measure(size: Size, name: str, clock: Clock, device: torch.device) -> Figure
 
 def whole_step(steps: Stepper, phase: str, captured: bool, clock: Clock) -> Span:
     """Time whole steps of a phase, one after the other."""
-    iteration = 0 if phase == WARM else steps.config.warm_iterations
+    iteration = 0 if phase == WARM else steps.config.static_iterations
     if clock.on_gpu and not captured:
         return clock.calls(getattr(steps, phase))
     for _ in range(5):

@@ -29,7 +29,31 @@ from .tensors import read_tensors
 if TYPE_CHECKING:
     from .model.network import GarmentModel
 
-FORMAT = 3  # before it, spring_verlet had an alpha, and no model was reduced
+FORMAT = 4
+# Settings that format 3 stored under other names; older formats held other networks.
+RENAMED_SINCE_3 = {
+    "config": {"bound": "latent_bound", "push": "max_latent_step"},
+    "train": {
+        "warm": "static_fraction",
+        "warm_batch": "pretraining_batch",
+        "carry": "state_reuse",
+        "rotated": "rotated_fraction",
+        "recombined": "recombinations",
+        "resting": "static_batch",
+        "kick": "noise_probability",
+        "regularity": "latent_regularization",
+        "regularity_scale": "latent_regularization_scale",
+        "through_time": "bptt",
+        "warm_rate": "static_learning_rate",
+        "rate": "learning_rate",
+        "final_rate": "final_learning_rate",
+        "rate_warmup": "learning_rate_warmup",
+        "skin_rate": "skin_learning_rate_scale",
+        "shape_rate": "shape_learning_rate_scale",
+        "average": "ema_decay",
+        "surface": "closest_point",
+    },
+}
 # Parts of the header that are no plain values, as tuples (JSON: lists) and dicts.
 HEADER: dict[str, Any] = {
     "joint_names": (), "proxy_names": (), "paths": {}, "config": {}, "fabric": {}, "provenance": {},
@@ -170,9 +194,26 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     except (TypeError, ValueError, RecursionError) as error:
         raise SsilkError(f"{path}: the model's header is damaged ({error}); train again.") from error
     found = document.get("format") if isinstance(document, dict) else None
+    if found == 3:
+        document, found = _from_format_3(document), FORMAT
     if found != FORMAT:
-        fail(str(path), f"model format {found}", f"this version reads format {FORMAT}", "train it again")
+        fail(str(path), f"model format {found}", f"this version reads formats 3 and {FORMAT}", "train it again")
     return tensors, document
+
+
+def _from_format_3(document: dict[str, Any]) -> dict[str, Any]:
+    """Return the header of a model of format 3 as format 4 has it; what is damaged in it stays so."""
+
+    def renamed(values: object, part: str) -> object:
+        names = RENAMED_SINCE_3[part]
+        return (
+            {names.get(name, name): value for name, value in values.items()} if isinstance(values, dict) else values
+        )
+
+    provenance = document.get("provenance")
+    if isinstance(provenance, dict) and "train" in provenance:
+        provenance = {**provenance, "train": renamed(provenance["train"], "train")}
+    return {**document, "config": renamed(document.get("config"), "config"), "provenance": provenance}
 
 
 def _need_header(document: dict[str, Any]) -> None:

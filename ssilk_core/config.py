@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 from .errors import fail
 
-SURFACES = ("triangles", "vertices")
+CLOSEST_POINTS = ("triangles", "vertices")
 SCHEMES = ("spring_verlet", "verlet", "direct", "direct_residual", "quasi_static")
 MOST = 1e9  # of anything that has no other bound
 
@@ -39,8 +39,8 @@ class ModelConfig:
         activations: what D gives for them, where it is more than K ("ssilk reduce"); zero for K itself.
         scheme: how z is integrated: "verlet" (Eq. 3), "direct" (Eq. 11), "direct_residual" (Eq. 12), or
             "spring_verlet", which is Eq. 3 with a spring to the quasi-static state, or "quasi_static", that state.
-        bound: soft bound on each latent dimension; zero leaves the latents free, as the paper does.
-        push: soft bound on what S and the spring add to each dimension in one step; zero for none.
+        latent_bound: soft bound on each latent dimension; zero for none, as in the paper.
+        max_latent_step: soft bound on the sum of S and the spring in each dimension in one step; zero for none.
         stiffness: largest spring constant of "spring_verlet", in (0, 1].
         fps: rate at which the model steps [1/s].
     """
@@ -50,8 +50,8 @@ class ModelConfig:
     shapes: int = 64
     activations: int = 0
     scheme: str = "spring_verlet"
-    bound: float = 4.0
-    push: float = 0.3
+    latent_bound: float = 4.0
+    max_latent_step: float = 0.3
     stiffness: float = 0.2
     fps: float = 30.0
 
@@ -62,7 +62,7 @@ class ModelConfig:
         if not min(self.widths) > 0:
             fail("model", f"widths = {self.widths}", "each is at least 1")
         _need_between(self, 1, MOST, "latent", "fps")
-        _need_between(self, 0, MOST, "shapes", "activations", "bound", "push")
+        _need_between(self, 0, MOST, "shapes", "activations", "latent_bound", "max_latent_step")
         _need_between(self, 1e-6, 1, "stiffness")
 
     @property
@@ -73,80 +73,97 @@ class ModelConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
-    """How a model is trained (paper, Section 3.7; defaults that differ are explained in docs/training.md).
+    """How a model is trained (paper, Section 3.7; docs/training.md explains defaults that differ).
+
+    Static training fits the initialiser P and the decoder D to single poses, in their quasi-static states. Dynamic
+    training then fits everything to windows of consecutive poses.
 
     Attributes:
-        iterations: optimiser steps, warm start included.
-        warm: share of the iterations that train P and D alone on single poses (quasi-static warm start).
-        warm_batch: poses for each step of the warm start.
-        batch, window: windows for each step, and poses in each window, the two before the first new one included.
-        carry: share of windows that continue from the state where the last window of their slot ended.
-        rotated: share of windows that get a random rotation, uniform on SO(3); the others stay upright.
-        recombined: more motions made of each one, in which limbs move as in another.
-        resting: single poses that go on training the initialiser beside the windows.
-        kick: chance in each frame that a carried state is moved by noise; windows that begin anew always are.
-        noise: standard deviation added to the first two latents of a window.
-        noise_correlation: of the noise on the first latent with that on the second; 0 is the paper's.
-        regularity: weight [J] of the regularisation of the latents (Eq. 13); zero for none.
-        regularity_scale: distance that garments are to have whose latents are one apart, RMS [m].
-        through_time: back-propagate through the whole window, as the paper does, or through each step by itself.
-        warm_rate: Adam's step size in the warm start, decaying to a tenth.
-        rate, final_rate: Adam's step size in training proper, after its warm-up and at the end (cosine in between).
-        skin_rate: factor on the step size of skinning weights and of the integrator's own parameters.
-        shape_rate: factor on the step size of blendshapes, all of which move a vertex at once.
-        validate_every: iterations between validations; valid_frames: frames of each clip used for them.
-        average: decay of the running average of the parameters, which is what is validated and kept; 0 for none.
-        surface: nearest body point on "triangles", or at "vertices", which is faster and blunter.
+        iterations: optimiser steps, static training included.
+        static_fraction: share of the iterations that are static training.
+        pretraining_batch: poses in each step of static training.
+        batch, window: windows in each step of dynamic training, and poses in each window; its first two are given.
+        state_reuse: share of windows that continue from the state in which the last window of their slot ended.
+        rotated_fraction: share of windows with a random rotation, uniform on SO(3); the others stay upright.
+        recombinations: motions made of each one in addition, whose limbs move as in another motion.
+        static_batch: single poses on which dynamic training goes on fitting P, beside the windows.
+        noise_probability: chance in each frame that noise moves a reused state; a new window always starts with
+            noise.
+        noise: standard deviation of the noise on the first two latents of a window.
+        noise_correlation: correlation of the noise on the first latent with that on the second; 0 is the paper's.
+        latent_regularization: weight [J] of the regularisation of the latents (Eq. 13); zero for none.
+        latent_regularization_scale: RMS distance between garments whose latents are one apart, for Eq. 13 [m].
+        bptt: back-propagate through the whole window, as the paper does, instead of through each step by itself.
+        static_learning_rate: of Adam in static training, decaying to a tenth.
+        learning_rate, final_learning_rate: of Adam in dynamic training, after its warm-up and at the end of the
+            cosine.
+        learning_rate_warmup: iterations over which the learning rate rises at the start of dynamic training.
+        skin_learning_rate_scale: factor on the learning rate of skinning weights and of the integrator's parameters.
+        shape_learning_rate_scale: factor on the learning rate of blendshapes, each of which moves many vertices.
+        ema_decay: of the exponential moving average of the parameters, which is validated and kept; 0 for none.
+        closest_point: body point that cloth meets: on the "triangles" around the nearest vertex, or that of
+            "vertices" itself, which is faster and coarser.
+        validate_every: iterations between validations.
+        valid_frames: frames of each clip that are validated.
         seed: of everything random.
     """
 
     iterations: int = 250_000
-    warm: float = 0.1
-    warm_batch: int = 1024
+    static_fraction: float = 0.1
+    pretraining_batch: int = 1024
     batch: int = 256
     window: int = 6
-    carry: float = 0.97
-    rotated: float = 0.5
-    recombined: int = 3
-    resting: int = 256
-    kick: float = 0.03
+    state_reuse: float = 0.97
+    rotated_fraction: float = 0.5
+    recombinations: int = 3
+    static_batch: int = 256
+    noise_probability: float = 0.03
     noise: float = 0.1
     noise_correlation: float = 0.99
-    regularity: float = 0.0
-    regularity_scale: float = 0.03
-    through_time: bool = False
-    warm_rate: float = 1e-3
-    rate: float = 3e-4
-    final_rate: float = 2e-5
-    rate_warmup: int = 500
-    skin_rate: float = 0.1
-    shape_rate: float = 0.3
-    average: float = 0.998
-    surface: str = "triangles"
+    latent_regularization: float = 0.0
+    latent_regularization_scale: float = 0.03
+    bptt: bool = False
+    static_learning_rate: float = 1e-3
+    learning_rate: float = 3e-4
+    final_learning_rate: float = 2e-5
+    learning_rate_warmup: int = 500
+    skin_learning_rate_scale: float = 0.1
+    shape_learning_rate_scale: float = 0.3
+    ema_decay: float = 0.998
+    closest_point: str = "triangles"
     validate_every: int = 1000
     valid_frames: int = 300
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.surface not in SURFACES:
-            fail("training", f"surface '{self.surface}'", f"it is one of {', '.join(SURFACES)}")
+        if self.closest_point not in CLOSEST_POINTS:
+            fail("training", f"closest_point '{self.closest_point}'", f"it is one of {', '.join(CLOSEST_POINTS)}")
         if not self.window >= 3:
             fail("training", f"a window of {self.window} poses", "inertia needs at least 3")
-        _need_between(self, 1, MOST, "iterations", "batch", "warm_batch", "resting", "validate_every")
+        _need_between(self, 1, MOST, "iterations", "batch", "pretraining_batch", "static_batch", "validate_every")
         _need_between(self, 3, MOST, "valid_frames")
-        _need_between(self, 0, 1, "carry", "rotated", "noise_correlation", "kick")
-        _need_between(self, 0, 0.99999, "warm", "average")
+        _need_between(self, 0, 1, "state_reuse", "rotated_fraction", "noise_correlation", "noise_probability")
+        _need_between(self, 0, 0.99999, "static_fraction", "ema_decay")
         _need_between(
-            self, 0, MOST, "noise", "warm_rate", "rate", "final_rate", "rate_warmup", "skin_rate", "shape_rate"
+            self,
+            0,
+            MOST,
+            "noise",
+            "static_learning_rate",
+            "learning_rate",
+            "final_learning_rate",
+            "learning_rate_warmup",
+            "skin_learning_rate_scale",
+            "shape_learning_rate_scale",
         )
-        _need_between(self, 0, MOST, "regularity")
-        _need_between(self, 1e-9, MOST, "regularity_scale")
-        _need_between(self, 0, 1000, "recombined")
+        _need_between(self, 0, MOST, "latent_regularization")
+        _need_between(self, 1e-9, MOST, "latent_regularization_scale")
+        _need_between(self, 0, 1000, "recombinations")
         _need_between(self, 0, 2**63 - 1, "seed")
 
     @property
-    def warm_iterations(self) -> int:
-        return int(self.iterations * self.warm)
+    def static_iterations(self) -> int:
+        return int(self.iterations * self.static_fraction)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,21 +183,21 @@ PRESETS = {
             model=ModelConfig(latent=32, widths=(128, 128), shapes=24),
             train=TrainConfig(
                 iterations=500,
-                warm=0.55,
-                warm_batch=48,
-                warm_rate=2e-3,
+                static_fraction=0.55,
+                pretraining_batch=48,
+                static_learning_rate=2e-3,
                 batch=4,
                 window=16,
-                carry=0.7,
-                resting=8,
-                recombined=0,
-                rotated=0.3,
-                rate=6e-4,
-                final_rate=1e-4,
-                shape_rate=1.0,
-                rate_warmup=20,
-                average=0.98,
-                surface="vertices",
+                state_reuse=0.7,
+                static_batch=8,
+                recombinations=0,
+                rotated_fraction=0.3,
+                learning_rate=6e-4,
+                final_learning_rate=1e-4,
+                shape_learning_rate_scale=1.0,
+                learning_rate_warmup=20,
+                ema_decay=0.98,
+                closest_point="vertices",
                 validate_every=100,
                 valid_frames=90,
             ),
@@ -188,9 +205,11 @@ PRESETS = {
         Preset(
             name="preview",
             model=ModelConfig(),
-            train=TrainConfig(iterations=8_000, warm=0.3, shape_rate=1.0, validate_every=800),
+            train=TrainConfig(
+                iterations=8_000, static_fraction=0.3, shape_learning_rate_scale=1.0, validate_every=800
+            ),
         ),
-        Preset(name="final", model=ModelConfig(), train=TrainConfig(average=0.9995)),
+        Preset(name="final", model=ModelConfig(), train=TrainConfig(ema_decay=0.9995)),
     )
 }
 

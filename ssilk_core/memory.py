@@ -64,12 +64,12 @@ def step_memory(scene: Scene, config: ModelConfig, frames: int, body_vertices: i
 
 def decoded_frames(config: TrainConfig, batch: int) -> int:
     """Return the frames that the larger phase decodes at once."""
-    return max(ceil(batch * _frames_of_a_window(config)), config.warm_batch if config.warm else 0)
+    return max(ceil(batch * _frames_of_a_window(config)), config.pretraining_batch if config.static_fraction else 0)
 
 
 def _frames_of_a_window(config: TrainConfig) -> float:
     """Return the frames of a window, with its share of the single poses beside all of them."""
-    return config.window + config.resting / config.batch
+    return config.window + config.static_batch / config.batch
 
 
 def fitting_batch(
@@ -79,7 +79,7 @@ def fitting_batch(
     per_frame = step_memory(scene, model, 1, body_vertices) - step_memory(scene, model, 0, body_vertices)
     frames = int(max(1, (SHARE * available - step_memory(scene, model, 0, body_vertices)) // per_frame))
     return max(1, min(config.batch, int(frames / _frames_of_a_window(config)))), max(
-        1, min(config.warm_batch, frames)
+        1, min(config.pretraining_batch, frames)
     )
 
 

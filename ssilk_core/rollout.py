@@ -119,8 +119,8 @@ def _advance(
     dynamic = torch.cat([static, tensor(features.dynamic)], dim=1)
     rest, lost = _kept(model.initial(static))
     rest, pose = rest.unsqueeze(1), dynamic.unsqueeze(1)
-    resting = min(max(0, HISTORY - start), count)
-    return _rolled(model, [*state, *rest[:resting]], rest[resting:], pose[resting:], lost)
+    static_batch = min(max(0, HISTORY - start), count)
+    return _rolled(model, [*state, *rest[:static_batch]], rest[static_batch:], pose[static_batch:], lost)
 
 
 def _kept(states: Tensor) -> tuple[Tensor, Tensor]:

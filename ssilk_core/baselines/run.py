@@ -72,7 +72,7 @@ class BaselineRun:
         bank, held = (joint_bank(bank, inner, job.config.fps) for bank in (parts.bank, parts.validator.bank))
         self.validator, parts.validator.bank = parts.validator, held
         self.model = baseline(base.scene, job.config, joints, base.train.seed).to(device)
-        surface = base.train.surface == "triangles"
+        surface = base.train.closest_point == "triangles"
         objective = BaselineObjective(
             self.model, parts.energy, parts.body, bank, surface, judged=job.judged, mixed=job.mixed
         )
@@ -132,7 +132,7 @@ class BaselineRun:
                 str(base.output),
                 f"{broken} not finite at iteration {state.iteration}",
                 "the best model before it is kept",
-                "train again with smaller steps (--set rate=...)",
+                "train again with smaller steps (--set learning_rate=...)",
             )
         self.report(verdict(state.iteration, score, self.plain, base.scene.rig.proxy_count > 0))
         finite = {name: value for name, value in self.batch.items() if math.isfinite(value)}

@@ -121,7 +121,7 @@ class Opened:
         told = self.file.provenance
         if KEY not in told:
             return "ssilk"
-        rotated = told.get("train", {}).get("rotated", 0) > 0
+        rotated = told.get("train", {}).get("rotated_fraction", 0) > 0
         return told[KEY]["method"] + "*" * rotated
 
     @property

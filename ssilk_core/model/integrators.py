@@ -42,7 +42,7 @@ def shortened(vectors: Tensor, longest: Tensor) -> Tensor:
 class Integrator(nn.Module, ABC):
     """Advances z from two past states.
 
-    With `config.bound` each new state is limited, so that it can never leave the range where the decoder was
+    With `config.latent_bound` each new state is limited, so that it can never leave the range where the decoder was
     trained, however long the rollout.
 
     Args:
@@ -82,7 +82,7 @@ class Integrator(nn.Module, ABC):
 
     def bounded(self, z: Tensor) -> Tensor:
         """Return states within their bound."""
-        return limited(z, self.config.bound)
+        return limited(z, self.config.latent_bound)
 
     @abstractmethod
     def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *known: Tensor) -> Tensor: ...
@@ -91,7 +91,7 @@ class Integrator(nn.Module, ABC):
 class Verlet(Integrator):
     """z_t = zbar + S([zbar, z_{t-1}, pose]) with zbar = alpha z_{t-1} + beta (z_{t-1} - z_{t-2}) (Eqs. 2, 3).
 
-    With `config.push` what S adds in a step, a latent acceleration, is limited: the state cannot be flung.
+    With `config.max_latent_step` what S adds in a step, a latent acceleration, is limited: the state cannot be flung.
     """
 
     def __init__(self, config: ModelConfig, rates: int = 0) -> None:
@@ -103,7 +103,7 @@ class Verlet(Integrator):
     def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *known: Tensor) -> Tensor:
         _, pose = known
         forward = self.alpha * now + self.beta * (now - before)
-        return forward + limited(stepper(torch.cat([forward, now, pose], dim=1)), self.config.push)
+        return forward + limited(stepper(torch.cat([forward, now, pose], dim=1)), self.config.max_latent_step)
 
 
 class SpringVerlet(Integrator):
@@ -116,7 +116,7 @@ class SpringVerlet(Integrator):
     What S would do to a garment at rest under a character that holds still is taken off, so that the garment rests
     at p exactly: where gravity alone pulls, an error of a millimetre a frame is a tenth of gravity, and no loss
     that also holds stretch and collisions can see it. Stiffnesses start spread from slow swings to quick following
-    and stay under `config.stiffness`; spring and S together are limited by `config.push`.
+    and stay under `config.stiffness`; spring and S together are limited by `config.max_latent_step`.
 
     And it rests nowhere else, whatever S has learnt: S may give half of what the spring gives, and more only
     while something moves,
@@ -157,7 +157,7 @@ class SpringVerlet(Integrator):
 
         rest, pose, held, roused = known
         moved = stepper(seen_kernel(before, now, rest, pose, self.beta, (self.velocity_scale, self.distance_scale)))
-        stiffness, push, bound = self.config.stiffness, self.config.push, self.config.bound
+        stiffness, push, bound = self.config.stiffness, self.config.max_latent_step, self.config.latent_bound
         limits = stiffness, self.most, self.reach, self.own_share, push, bound
         return next_kernel((before, now), rest, (moved, held), roused, (self.beta, self.share), limits)
 
@@ -169,7 +169,9 @@ class SpringVerlet(Integrator):
         moved = self._of(stepper, now, self.velocity_scale * velocity, self.distance_scale * away, pose)
         spring = self.config.stiffness * torch.sigmoid(self.share) * away
         allowed = self.own_share * (length(spring) + length(velocity)) + roused
-        return forward + limited(spring + shortened(self.reach * (moved - held), allowed), self.config.push)
+        return forward + limited(
+            spring + shortened(self.reach * (moved - held), allowed), self.config.max_latent_step
+        )
 
     def _of(self, stepper: nn.Module, *seen: Tensor) -> Tensor:
         return stepper(torch.cat(seen, dim=1)).clamp(-self.most, self.most)

@@ -39,9 +39,12 @@ def memory(scene: Scene, preset: Preset, body_vertices: int) -> Findings:
     model, train, device = preset.model, preset.train, chosen_device("auto")
     free = free_memory(device)
     needed = step_memory(scene, model, decoded_frames(train, train.batch), body_vertices)
-    batch, warm_batch = fitting_batch(scene, model, train, body_vertices, free)
-    lowered = (batch, warm_batch) != (train.batch, train.warm_batch)
-    note = f"; the batch goes from {train.batch} to {batch} windows and from {train.warm_batch} to {warm_batch} poses"
+    batch, pretraining_batch = fitting_batch(scene, model, train, body_vertices, free)
+    lowered = (batch, pretraining_batch) != (train.batch, train.pretraining_batch)
+    note = (
+        f"; the batch goes from {train.batch} to {batch} windows "
+        f"and from {train.pretraining_batch} to {pretraining_batch} poses"
+    )
     yield Finding(
         severity="warning" if lowered else "info",
         code="memory",
@@ -67,10 +70,10 @@ def training_seconds(vertices: int, train: TrainConfig, device: str) -> float | 
     if device not in SECONDS_PER_VERTEX:
         return None
     trained = (
-        train.batch * (train.window - 2) + train.resting
+        train.batch * (train.window - 2) + train.static_batch
     )  # frames of a step, those that windows begin at left out
-    proper = (train.iterations - train.warm_iterations) * trained
-    return SECONDS_PER_VERTEX[device] * vertices * (train.warm_iterations * train.warm_batch + proper)
+    proper = (train.iterations - train.static_iterations) * trained
+    return SECONDS_PER_VERTEX[device] * vertices * (train.static_iterations * train.pretraining_batch + proper)
 
 
 def irrelevant_joints(scene: Scene, colliding: np.ndarray) -> Findings:

@@ -76,6 +76,6 @@ class Player:
     def at_rest(self, static: NDArray) -> NDArray:
         """Return the quasi-static latents (F, latent) of static descriptors (F, S) (Eq. 1)."""
         rest = np.ascontiguousarray(evaluated(self.initialiser, static.T).T)
-        Limit(self.file.config.bound, rest.shape)(rest)
+        Limit(self.file.config.latent_bound, rest.shape)(rest)
         rest[lost(rest)] = 0
         return rest

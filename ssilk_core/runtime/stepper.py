@@ -161,7 +161,7 @@ class SpringStepper:
         along, pull, own = (np.empty(z, np.float32) for _ in range(3))
         state, (away, velocity) = differences.reshape(-1), differences
         sums, last = rooms[0].sums, self.later[-1].rows
-        push, bound = Limit(self.config.push, (z,)), Limit(self.config.bound, (z,))
+        push, bound = Limit(self.config.max_latent_step, (z,)), Limit(self.config.latent_bound, (z,))
         poses = course.driven[start:], course.held[start:], course.allowed[start:].tolist()
         frames = zip(history[:-2], history[:-2, 0], history[1:-1, 1], history[2:, 1], *poses)
         with np.errstate(over="ignore", invalid="ignore"):  # `rolled` looks for lost states

@@ -48,7 +48,13 @@ def trained(scene: Scene, fabric: Fabric, drive: Drive, steps: int, *, windows: 
     error = gradient_error(scene, fabric, drive.motion(0, 1))
     motion = drive.motion()
     config = TrainConfig(
-        iterations=steps, warm=0.5, warm_batch=2 * windows, batch=windows, window=4, resting=windows, recombined=0
+        iterations=steps,
+        static_fraction=0.5,
+        pretraining_batch=2 * windows,
+        batch=windows,
+        window=4,
+        static_batch=windows,
+        recombinations=0,
     )
     job = TrainJob(
         scene=scene, motions=[motion], held_out=[motion], model=replace(SMALL, fps=drive.fps), train=config,

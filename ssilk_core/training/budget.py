@@ -24,9 +24,9 @@ def shaped(config: TrainConfig, iterations: int) -> TrainConfig:
     return replace(
         config,
         iterations=iterations,
-        rate_warmup=round(config.rate_warmup * factor),
+        learning_rate_warmup=round(config.learning_rate_warmup * factor),
         validate_every=max(1, round(config.validate_every * factor)),
-        average=min(SLOWEST_AVERAGE, config.average ** (1 / factor)),
+        ema_decay=min(SLOWEST_AVERAGE, config.ema_decay ** (1 / factor)),
     )
 
 
@@ -42,10 +42,10 @@ def fitting_iterations(stepper: Stepper, config: TrainConfig, seconds: float, sc
     Raises:
         SsilkError: hardly any fit.
     """
-    validations = int((1 - config.warm) * config.iterations / config.validate_every) + 1
-    warm, proper = (_seconds(stepper, iteration) for iteration in (0, config.warm_iterations))
+    validations = int((1 - config.static_fraction) * config.iterations / config.validate_every) + 1
+    warm, proper = (_seconds(stepper, iteration) for iteration in (0, config.static_iterations))
     left = SHARE * seconds - validations * scoring
-    count = int(left / (config.warm * warm + (1 - config.warm) * proper))
+    count = int(left / (config.static_fraction * warm + (1 - config.static_fraction) * proper))
     if not count >= FEWEST:
         fail(
             where,

@@ -46,10 +46,10 @@ class TrainJob:
         if not self.has_loose:
             object.__setattr__(self, "model", replace(self.model, scheme="quasi_static"))
         if self.model.scheme == "quasi_static":  # nothing has a past to vary
-            object.__setattr__(self, "train", replace(self.train, carry=0, noise=0))
+            object.__setattr__(self, "train", replace(self.train, state_reuse=0, noise=0))
         if not self.learns:
             object.__setattr__(self, "model", replace(self.model, latent=1, widths=(1,), shapes=1))
-            least = replace(self.train, iterations=1, batch=1, warm_batch=1, resting=1, recombined=0)
+            least = replace(self.train, iterations=1, batch=1, pretraining_batch=1, static_batch=1, recombinations=0)
             object.__setattr__(self, "train", least)
 
     @property
@@ -65,7 +65,7 @@ class TrainJob:
     def trained_motions(self) -> list[Motion]:
         """Return the motions and what is recombined from them."""
         skeleton = self.scene.character.skeleton
-        return [*self.motions, *recombined(self.motions, skeleton, self.train.recombined, self.train.seed)]
+        return [*self.motions, *recombined(self.motions, skeleton, self.train.recombinations, self.train.seed)]
 
     def identity(self) -> dict[str, Any]:
         """Return what makes a run the run it is, as it comes back from JSON; a resumed run must be asked the same."""

@@ -12,7 +12,7 @@ from ..constants import GRAVITY
 from ..energy import GarmentEnergy
 from ..model.network import GarmentModel
 from ..motion_bank import MotionBank
-from .regularity import irregularity
+from .latent_regularization import latent_irregularity
 from .windows import WindowSampler
 
 Terms = dict[str, Tensor]
@@ -84,10 +84,10 @@ class Objective:
         with torch.set_grad_enabled(not model.integrator.states):
             target = model.initial(static).reshape(length, batch, -1)
             start = torch.where(sampler.carried[None, :, None], sampler.latents, target[:2])
-        with torch.set_grad_enabled(sampler.config.through_time):
+        with torch.set_grad_enabled(sampler.config.bptt):
             z = model.roll([*(start + noise)], target[2:], pose[2:])
         rolled = torch.cat(z[2:])
-        if not sampler.config.through_time:
+        if not sampler.config.bptt:
             # The same steps once more, all at once, from states that carry no gradient.
             states = torch.cat(z)
             rolled = model.step(
@@ -102,16 +102,16 @@ class Objective:
         terms = self.potential(x, torch.cat([down[2 * batch :], direction]), character)
         count = (length - 2) * batch
         dynamic = {name: value[:count] for name, value in terms.items()}
-        resting = {name: value[count:] for name, value in terms.items()}
+        static_batch = {name: value[count:] for name, value in terms.items()}
         path = torch.cat([past, x[..., : count - batch].detach()], dim=-1)
         root = bank.root[times].T
         dynamic["inertia"], dynamic["drag"] = self.energy.kinetic(
             x, path[..., batch:], path[..., :-batch], root[:, 2 * batch :] - root[:, batch:-batch], self.dt
         )
-        if weight := sampler.config.regularity:
-            drawn, scale = torch.cat([rolled[-batch:], quiet]), sampler.config.regularity_scale
-            dynamic["regularity"] = weight * irregularity(model, self.energy.mass, drawn, scale)
-        return dynamic, resting, torch.stack(z[-2:]).detach()
+        if weight := sampler.config.latent_regularization:
+            drawn, scale = torch.cat([rolled[-batch:], quiet]), sampler.config.latent_regularization_scale
+            dynamic["latent regularization"] = weight * latent_irregularity(model, self.energy.mass, drawn, scale)
+        return dynamic, static_batch, torch.stack(z[-2:]).detach()
 
 
 def total(terms: Terms) -> Tensor:

@@ -19,7 +19,11 @@ from ..config import TrainConfig
 from ..devices import chosen_device
 from ..errors import SsilkError, fail
 
-SHARED = ("batch", "warm_batch", "resting")  # settings that count what one step looks at, in all processes together
+SHARED = (
+    "batch",
+    "pretraining_batch",
+    "static_batch",
+)  # settings that count what one step looks at, in all processes together
 LAUNCHED = ("RANK", "LOCAL_RANK", "WORLD_SIZE")  # what torchrun tells each process
 
 Value = TypeVar("Value")

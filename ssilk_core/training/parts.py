@@ -59,7 +59,7 @@ class Parts:
         team, own = self.team, self.team.part(config)
         generator = torch.Generator(self.device).manual_seed(team.seed(seed))
         sampler = WindowSampler(self.bank, own, self.model.config.latent, generator)
-        objective = Objective(self.model, self.energy, self.body, self.bank, config.surface == "triangles")
+        objective = Objective(self.model, self.energy, self.body, self.bank, config.closest_point == "triangles")
         return Stepper(self.model, objective, sampler, own, team.average if team.size > 1 else None)
 
 

@@ -145,10 +145,10 @@ class Run:
             free //= team.size
         need_one_window(job.scene, job.model, config, self.parts.reached, free)
         fitting = team.gather(fitting_batch(job.scene, job.model, team.part(config), self.parts.reached, free))
-        batch, warm_batch = (team.size * min(counts) for counts in zip(*fitting))
-        if (batch, warm_batch) != (config.batch, config.warm_batch):
+        batch, pretraining_batch = (team.size * min(counts) for counts in zip(*fitting))
+        if (batch, pretraining_batch) != (config.batch, config.pretraining_batch):
             found = f"{self._memory() / 2**30:.1f} GiB needed, {free / 2**30:.1f} GiB free on {self.device}"
-            self._lower(found, batch, warm_batch)
+            self._lower(found, batch, pretraining_batch)
 
     def _memory(self) -> int:
         """Predict what a step takes in this process [bytes]."""
@@ -156,14 +156,15 @@ class Run:
         frames = decoded_frames(own, own.batch)
         return step_memory(self.job.scene, self.job.model, frames, self.parts.reached)
 
-    def _lower(self, found: str, batch: int, warm_batch: int) -> None:
+    def _lower(self, found: str, batch: int, pretraining_batch: int) -> None:
         before, lowered = self.config, self.state.lowered
         pace = lowered[-1].pace if lowered else 1.0
-        lowered.append(Lowered(self.state.iteration, batch, warm_batch, pace))
+        lowered.append(Lowered(self.state.iteration, batch, pretraining_batch, pace))
         self.report(
             Message(
-                f"{found}: the batch goes from {before.batch} to {batch} windows and from {before.warm_batch} to "
-                f"{warm_batch} single poses.",
+                f"{found}: the batch goes from {before.batch} to {batch} windows and from {before.pretraining_batch} "
+                "to "
+                f"{pretraining_batch} single poses.",
                 "warning",
             )
         )
@@ -183,7 +184,10 @@ class Run:
                     "a team keeps the batch it has",
                     "train again with a smaller one (--set batch=...)",
                 )
-            if not (config.warm_batch if self.state.iteration < config.warm_iterations else config.batch) > 1:
+            if (
+                not (config.pretraining_batch if self.state.iteration < config.static_iterations else config.batch)
+                > 1
+            ):
                 fail(
                     self.job.scene.garment.mesh.path,
                     f"{found} with a batch of one",
@@ -191,7 +195,7 @@ class Run:
                     "take another device, or shorter windows (--set window=...)",
                 )
             self.state.undone = int(self.stepper.faults.count)
-            self._lower(found, max(1, config.batch // 2), max(1, config.warm_batch // 2))
+            self._lower(found, max(1, config.batch // 2), max(1, config.pretraining_batch // 2))
             self._rebuild_stepper(learned(self.stepper))
 
     def _announce(self) -> None:
@@ -234,7 +238,7 @@ class Run:
         """Whether the schedule wants a validation now."""
         config, iteration = self.config, self.state.iteration
         scheduled = iteration % config.validate_every == 0 or iteration == config.iterations
-        return scheduled and iteration >= max(1, config.warm_iterations) and iteration != self.saved
+        return scheduled and iteration >= max(1, config.static_iterations) and iteration != self.saved
 
     def validate(self) -> None:
         """Score the model on the held-out clips and keep it when it is the best so far."""
@@ -259,7 +263,7 @@ class Run:
         """End where the time is up, with a validation if what was learned since the last one deserves it."""
         self._report_progress(0.0)
         self.report(Message(f"time is up at iteration {self.state.iteration} of {self.config.iterations}"))
-        if self.state.iteration != self.saved and self.state.iteration >= self.config.warm_iterations:
+        if self.state.iteration != self.saved and self.state.iteration >= self.config.static_iterations:
             self.validate()
 
     def _score(self) -> Score:
@@ -278,7 +282,7 @@ class Run:
         if lowered and lowered[-1].pace < 1:
             self._give_up(found)
         before, tensors = load_state(self.keeper.state, self.state.asked)
-        slower = Lowered(before.iteration, config.batch, config.warm_batch, SLOWER)
+        slower = Lowered(before.iteration, config.batch, config.pretraining_batch, SLOWER)
         undone, seconds = int(self.stepper.faults.count), self.state.seconds
         self.state = replace(before, lowered=[*lowered, slower], undone=undone, seconds=seconds)
         self._rebuild_stepper(tensors)
@@ -296,7 +300,7 @@ class Run:
             str(self.job.output),
             f"training diverged: {found}",
             "the best model before it is kept" if self.state.best else "there is no model yet",
-            f"study {self.keeper.fault}, or train again with smaller steps (--set rate=...)",
+            f"study {self.keeper.fault}, or train again with smaller steps (--set learning_rate=...)",
         )
 
     def save(self) -> None:

@@ -42,20 +42,25 @@ class Lowered:
 
     Attributes:
         iteration: steps done until then.
-        batch, warm_batch: what fits into memory; single poses beside the windows are lowered with them.
+        batch, pretraining_batch: what fits into memory; single poses beside the windows are lowered with them.
         pace: factor on every step size, below one after steps that were not finite.
     """
 
     iteration: int
     batch: int
-    warm_batch: int
+    pretraining_batch: int
     pace: float = 1.0
 
     def applied(self, config: TrainConfig) -> TrainConfig:
         """Return the schedule with this instead of what was asked for."""
-        rates = {name: getattr(config, name) * self.pace for name in ("warm_rate", "rate", "final_rate")}
-        resting = max(1, config.resting * self.batch // config.batch)
-        return replace(config, batch=self.batch, warm_batch=self.warm_batch, resting=resting, **rates)
+        rates = {
+            name: getattr(config, name) * self.pace
+            for name in ("static_learning_rate", "learning_rate", "final_learning_rate")
+        }
+        static_batch = max(1, config.static_batch * self.batch // config.batch)
+        return replace(
+            config, batch=self.batch, pretraining_batch=self.pretraining_batch, static_batch=static_batch, **rates
+        )
 
 
 @dataclass

@@ -22,13 +22,18 @@ EAGER_STEPS = 3  # before a CUDA graph is captured: allocators, handles and kern
 
 def learning_rate(config: TrainConfig, iteration: int) -> float:
     """Step size at an iteration: linear warm-up, then a cosine to the final rate, in each phase anew."""
-    warm = config.warm_iterations
+    warm = config.static_iterations
     if iteration < warm:
         # At a constant rate the warm start's energy climbs again.
-        done, span, peak, final = iteration, warm, config.warm_rate, 0.1 * config.warm_rate
+        done, span, peak, final = iteration, warm, config.static_learning_rate, 0.1 * config.static_learning_rate
     else:
-        done, span, peak, final = iteration - warm, config.iterations - warm, config.rate, config.final_rate
-    ramp = min(1.0, (done + 1) / max(1, config.rate_warmup))
+        done, span, peak, final = (
+            iteration - warm,
+            config.iterations - warm,
+            config.learning_rate,
+            config.final_learning_rate,
+        )
+    ramp = min(1.0, (done + 1) / max(1, config.learning_rate_warmup))
     return ramp * (final + (peak - final) * 0.5 * (1 + math.cos(math.pi * done / max(1, span))))
 
 
@@ -59,7 +64,7 @@ class Stepper:
         self.share = share
         self.device = sampler.first.device
         self.optimiser = _optimiser(model, self.device)
-        self.factors = [1.0, config.skin_rate, config.shape_rate]
+        self.factors = [1.0, config.skin_learning_rate_scale, config.shape_learning_rate_scale]
         self.averaged = copy.deepcopy(model).requires_grad_(False)
         self.terms: dict[str, Tensor] = {}
         self.faults = Faults(self.device)
@@ -69,21 +74,21 @@ class Stepper:
 
     def warm(self) -> None:
         """Train P and D on single random poses under static energies."""
-        frames, direction = self.sampler.poses(self.config.warm_batch)
+        frames, direction = self.sampler.poses(self.config.pretraining_batch)
         terms = self.objective.static(frames, direction)
         means = {name: value.mean() for name, value in terms.items()}
         self._descend(sum(means.values()), means, {"frames": frames, "directions": direction})  # type: ignore[arg-type]
 
     def windows(self) -> None:
         """Train everything on one window of every slot, and P on single poses beside them."""
-        noise, poses = self.sampler.noise(), self.sampler.poses(self.config.resting)
-        dynamic, resting, latents = self.objective.window(self.sampler, noise, *poses)
-        moving, still = (next(iter(terms.values())).shape[0] for terms in (dynamic, resting))
+        noise, poses = self.sampler.noise(), self.sampler.poses(self.config.static_batch)
+        dynamic, static_batch, latents = self.objective.window(self.sampler, noise, *poses)
+        moving, still = (next(iter(terms.values())).shape[0] for terms in (dynamic, static_batch))
         # Every frame weighs the same, those that the initialiser answers for included.
-        loss = (total(dynamic) * moving + total(resting) * still) / (moving + still)
+        loss = (total(dynamic) * moving + total(static_batch) * still) / (moving + still)
         means = {name: value.mean() for name, value in dynamic.items()}
-        beside = {f"resting {name}": value.mean() for name, value in resting.items()}
-        drawn = {"noise": noise, "resting frames": poses[0], "resting directions": poses[1]}
+        beside = {f"static_batch {name}": value.mean() for name, value in static_batch.items()}
+        drawn = {"noise": noise, "static_batch frames": poses[0], "static_batch directions": poses[1]}
         self._descend(loss, means, {**self.sampler.window(), **drawn}, beside)
         self.sampler.advance(latents)
 
@@ -110,7 +115,7 @@ class Stepper:
         self.optimiser.found_inf = bad.float()  # type: ignore[attr-defined]
         self.optimiser.step()
         with torch.no_grad():
-            torch._foreach_lerp_([*self.averaged.parameters()], [*self.model.parameters()], 1 - self.config.average)
+            torch._foreach_lerp_([*self.averaged.parameters()], [*self.model.parameters()], 1 - self.config.ema_decay)
         terms = {name: value.detach() for name, value in terms.items()}
         self.faults.record(bad, self._iteration, terms | (beside or {}), window)
         for name, value in terms.items():
@@ -125,7 +130,7 @@ class Stepper:
                 group["lr"].fill_(rate * factor)
             else:
                 group["lr"] = rate * factor
-        name = "warm" if iteration < self.config.warm_iterations else "windows"
+        name = "warm" if iteration < self.config.static_iterations else "windows"
         body = self.warm if name == "warm" else self.windows
         if self.device.type == "cuda":
             self._replay(name, body)

@@ -83,7 +83,7 @@ def save_fault(path: Path, stepper: Stepper, motions: Sequence[Motion], found: s
     from safetensors.torch import save
 
     faults, bank = stepper.faults, stepper.objective.bank
-    still = int(faults.iteration) < stepper.config.warm_iterations
+    still = int(faults.iteration) < stepper.config.static_iterations
     window = {name: value.cpu() for name, value in faults.window.items() if (name in POSES) == still}
     frames = window.get("frames" if still else "first")
     places = [] if frames is None else places_of(frames, bank, motions, stepper.model.config.fps)

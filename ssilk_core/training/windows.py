@@ -50,7 +50,7 @@ class WindowSampler:
                 "give longer motions or set --set window=N",
             )
         self.first = self._fresh()
-        self.direction = random_directions(config.batch, config.rotated, generator, device).clone()
+        self.direction = random_directions(config.batch, config.rotated_fraction, generator, device).clone()
         self.latents = torch.zeros(2, config.batch, latent, device=device)
         self.carried = torch.zeros(config.batch, dtype=torch.bool, device=device)
 
@@ -63,7 +63,7 @@ class WindowSampler:
         bank, device = self.bank, self.candidates.device
         draw = torch.rand(count, generator=self.generator, device=device)
         frames = (draw * bank.frame_count).long().clamp_max(bank.frame_count - 1)
-        return frames, random_directions(count, self.config.rotated, self.generator, device)
+        return frames, random_directions(count, self.config.rotated_fraction, self.generator, device)
 
     def noise(self) -> Tensor:
         """Return noise for the first two latents of each window, shape (2, batch, latent).
@@ -74,7 +74,7 @@ class WindowSampler:
         config, device = self.config, self.latents.device
         first, second = torch.randn(self.latents.shape, generator=self.generator, device=device)
         second = config.noise_correlation * first + (1 - config.noise_correlation**2) ** 0.5 * second
-        chance = 1 - (1 - config.kick) ** (config.window - 2)
+        chance = 1 - (1 - config.noise_probability) ** (config.window - 2)
         kicked = torch.rand(config.batch, 1, generator=self.generator, device=device) < chance
         return config.noise * torch.stack([first, second]) * (kicked | ~self.carried[:, None])
 
@@ -83,8 +83,8 @@ class WindowSampler:
         config, device = self.config, self.first.device
         following = self.first + config.window - 2
         fits = following + config.window <= self.stop_of[self.first]
-        wish = torch.rand(config.batch, generator=self.generator, device=device) < config.carry
-        fresh = random_directions(config.batch, config.rotated, self.generator, device)
+        wish = torch.rand(config.batch, generator=self.generator, device=device) < config.state_reuse
+        fresh = random_directions(config.batch, config.rotated_fraction, self.generator, device)
         chosen = self._fresh()
         # A state that is not finite ends here, or it would spoil every window after it.
         go_on = fits & wish & latents.isfinite().all(dim=2).all(dim=0)

@@ -36,7 +36,16 @@ from ssilk_core.training.windows import WindowSampler
 JOINTS, INNER = np.arange(3), torch.tensor([False, True, True])
 CPU = torch.device("cpu")
 FABRIC = Fabric("toy", bending=1e-4, margin=0.02)
-CONFIG = TrainConfig(iterations=60, warm=0.0, batch=3, window=8, carry=0.0, rotated=0.0, rate=1e-3, rate_warmup=5)
+CONFIG = TrainConfig(
+    iterations=60,
+    static_fraction=0.0,
+    batch=3,
+    window=8,
+    state_reuse=0.0,
+    rotated_fraction=0.0,
+    learning_rate=1e-3,
+    learning_rate_warmup=5,
+)
 
 
 def bank_of(scene: Scene, *motions: Motion) -> JointBank:
@@ -172,7 +181,9 @@ def test_ncs_without_motion_is_its_static_code_alone(scene, motions):
 @pytest.mark.parametrize("judged", [1, 3])
 def test_the_terms_of_a_window_are_those_of_its_frames(scene, motions, method, judged):
     objective = objective_of(scene, method, *motions, judged=judged)
-    sampler = WindowSampler(objective.bank, replace(CONFIG, rotated=1.0), 0, torch.Generator().manual_seed(3))
+    sampler = WindowSampler(
+        objective.bank, replace(CONFIG, rotated_fraction=1.0), 0, torch.Generator().manual_seed(3)
+    )
     terms, model, energy = objective.rolled(sampler), objective.model, objective.energy
     for slot in range(3):
         frames, down = sampler.first[slot] + torch.arange(8), sampler.direction[slot].repeat(8, 1)
@@ -228,7 +239,7 @@ def test_mixed_windows_teach_the_decoder_alone(scene, motions):
 def test_rotation_augmentation_changes_the_direction_of_gravity_alone(scene, motions):
     bank = bank_of(scene, *motions)
     samplers = [
-        WindowSampler(bank, replace(CONFIG, rotated=share), 0, torch.Generator().manual_seed(3))
+        WindowSampler(bank, replace(CONFIG, rotated_fraction=share), 0, torch.Generator().manual_seed(3))
         for share in (0.0, 1.0)
     ]
     upright, turned = samplers
@@ -275,7 +286,7 @@ def job(scene, motions, tmp_path):
             motions=motions,
             held_out=motions[1:],
             model=ModelConfig(latent=4, widths=(8,), shapes=2),
-            train=replace(CONFIG, iterations=8, validate_every=3, valid_frames=12, recombined=0),
+            train=replace(CONFIG, iterations=8, validate_every=3, valid_frames=12, recombinations=0),
             fabric=FABRIC,
             output=tmp_path / f"{method}.safetensors",
             device="cpu",

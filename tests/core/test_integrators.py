@@ -12,7 +12,7 @@ from ssilk_core.config import SCHEMES, ModelConfig
 from ssilk_core.kinematics import motion_transforms, skinning_matrices
 from ssilk_core.model.integrators import INTEGRATORS, limited
 
-FREE = {"bound": 0.0, "push": 0.0}
+FREE = {"latent_bound": 0.0, "max_latent_step": 0.0}
 
 
 class Says(nn.Module):
@@ -201,14 +201,14 @@ def test_no_stepper_can_drive_the_state_out_of_its_bound(scheme, answer):
     for count in range(10_000):
         says = Says(answer if count // 50 % 2 else -answer)
         z = [z[-1], step(says, z[-2], z[-1], REST, POSE)]
-        assert z[-1].abs().max() <= config.bound
+        assert z[-1].abs().max() <= config.latent_bound
     assert torch.isfinite(z[-1]).all()
 
 
 @torch.no_grad()
 @pytest.mark.parametrize(("scheme", "kept"), [("verlet", 0.9), ("spring_verlet", 0.7)])
 def test_one_step_is_pushed_no_further_than_allowed(scheme, kept):
-    step = integrator(scheme, push=0.15, bound=0.0)
+    step = integrator(scheme, max_latent_step=0.15, latent_bound=0.0)
     for answer in (1e6, -1e6):
         z = step(Says(answer), BEFORE, NOW, REST, POSE)
         assert (z - NOW - kept * (NOW - BEFORE)).abs().max() <= 0.15 + 1e-6
@@ -235,7 +235,9 @@ def test_decoded_cloth_stays_within_reach_of_what_holds_it(scene, toy_motion, to
 
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="kernels need Triton")
-@pytest.mark.parametrize("size, options", [(1.0, {}), (30.0, {}), (1.0, {"bound": 0.0, "push": 0.0}), (0.0, {})])
+@pytest.mark.parametrize(
+    "size, options", [(1.0, {}), (30.0, {}), (1.0, {"latent_bound": 0.0, "max_latent_step": 0.0}), (0.0, {})]
+)
 @torch.no_grad()
 def test_the_kernels_step_as_their_twin_does(size, options, monkeypatch):
     """States of a few sizes, so that each of the limits is met; one of them is lost."""

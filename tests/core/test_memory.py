@@ -21,7 +21,7 @@ from ssilk_core.memory import (
     suffices,
 )
 
-MODEL, CONFIG = ModelConfig(), TrainConfig(batch=32, window=16, resting=32, warm_batch=700)
+MODEL, CONFIG = ModelConfig(), TrainConfig(batch=32, window=16, static_batch=32, pretraining_batch=700)
 
 
 def test_more_of_anything_needs_more(scene):
@@ -39,7 +39,7 @@ def test_frames_cost_the_same_each(scene):
 def test_the_larger_phase_counts():
     assert decoded_frames(CONFIG, 32) == 700
     assert decoded_frames(CONFIG, 64) == 64 * 17  # a window of 16 poses, and one of the single poses
-    assert decoded_frames(replace(CONFIG, warm=0.0), 32) == 32 * 17
+    assert decoded_frames(replace(CONFIG, static_fraction=0.0), 32) == 32 * 17
 
 
 def test_what_fits_is_left_as_it_is(scene):
@@ -49,7 +49,7 @@ def test_what_fits_is_left_as_it_is(scene):
 @pytest.mark.parametrize("megabytes", [150, 200, 300])
 def test_a_lowered_batch_fits_and_one_more_would_not(scene, megabytes):
     available = megabytes << 20
-    config = replace(CONFIG, batch=10_000, warm_batch=100_000, resting=10_000)
+    config = replace(CONFIG, batch=10_000, pretraining_batch=100_000, static_batch=10_000)
     batch, warm = fitting_batch(scene, MODEL, config, 1000, available)
     assert 1 < batch < 10_000 and 1 < warm < 100_000
     assert step_memory(scene, MODEL, max(batch * 17, warm), 1000) <= SHARE * available

@@ -35,7 +35,9 @@ def classed(scene: Scene, classes: np.ndarray) -> Scene:
 
 
 def job_of(scene: Scene, motion, output: Path = Path("none.safetensors")) -> TrainJob:
-    config = TrainConfig(iterations=40, batch=2, window=4, warm_batch=4, resting=2, recombined=0, valid_frames=9)
+    config = TrainConfig(
+        iterations=40, batch=2, window=4, pretraining_batch=4, static_batch=2, recombinations=0, valid_frames=9
+    )
     return TrainJob(
         scene=scene, motions=[motion], held_out=[motion], model=ModelConfig(latent=8, widths=(16,), shapes=4),
         train=config, fabric=Fabric("toy"), output=output, device="cpu",
@@ -81,7 +83,7 @@ def test_a_garment_with_anything_free_learns_as_asked(scene, toy_motion):
 def test_a_body_out_of_reach_costs_no_collisions_and_no_posing(scene, toy_motion):
     parts = build_parts(job_of(moved_away(scene), toy_motion(scene, 30)), CPU)
     assert parts.body is None and parts.reached == 0
-    stepper = parts.stepper(TrainConfig(batch=2, window=4, resting=2, warm=0.0), 0)
+    stepper = parts.stepper(TrainConfig(batch=2, window=4, static_batch=2, static_fraction=0.0), 0)
     stepper.run(0)
     assert float(stepper.terms["collision"]) == 0 < float(stepper.terms["stretch"])
 
@@ -90,7 +92,7 @@ def test_only_what_is_not_pinned_meets_the_body(scene, toy_motion):
     """The others stand where they stand: their planes are far away, and their collisions have no gradient."""
     classes = np.where(np.arange(len(scene.classes)) % 2, PINNED, TIGHT)
     parts = build_parts(job_of(classed(scene, classes), toy_motion(scene, 30)), CPU)
-    objective = parts.stepper(TrainConfig(batch=2, window=4, resting=2), 0).objective
+    objective = parts.stepper(TrainConfig(batch=2, window=4, static_batch=2), 0).objective
     character = parts.bank.character(torch.arange(5))
     x = parts.model.vertices(torch.zeros(5, 8), character).detach()
     normal, offset = objective._planes(x, character)
@@ -129,9 +131,13 @@ def test_a_garment_with_nothing_loose_has_no_stepper(scene, toy_motion, tmp_path
     asked, loose = (job_of(world, toy_motion(scene, 40), output) for world in (tight, scene))
     assert asked.model.scheme == "quasi_static" and loose.model.scheme == "spring_verlet"
     chosen = replace(loose, model=replace(loose.model, scheme="quasi_static"))
-    assert [(job.train.carry, job.train.noise) for job in (asked, chosen)] == [(0, 0)] * 2 and loose.train.noise > 0
+    assert [(job.train.state_reuse, job.train.noise) for job in (asked, chosen)] == [
+        (0, 0)
+    ] * 2 and loose.train.noise > 0
     assert initialiser_learns_from_windows(asked) and not initialiser_learns_from_windows(loose)
-    done = train(replace(asked, train=replace(asked.train, warm=0.3, rate_warmup=2)), lambda event: None)
+    done = train(
+        replace(asked, train=replace(asked.train, static_fraction=0.3, learning_rate_warmup=2)), lambda event: None
+    )
     assert done.score.total < done.plain.total
     file = load_model(output)
     assert not [name for name in file.parameters if name.startswith(("stepper", "integrator"))]

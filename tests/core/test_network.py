@@ -24,7 +24,7 @@ def test_mlp_has_the_layers_asked_for_and_a_quiet_last_one():
 
 
 def test_training_starts_from_plain_verlet_and_almost_plain_skinning(scene):
-    model = fresh(scene, scheme="verlet", bound=0.0, push=0.0)
+    model = fresh(scene, scheme="verlet", latent_bound=0.0, max_latent_step=0.0)
     before, now = torch.randn(2, 6, 8, generator=torch.Generator().manual_seed(0))
     pose = torch.randn(6, model.stepper[0].in_features - 16, generator=torch.Generator().manual_seed(1))
     with torch.no_grad():

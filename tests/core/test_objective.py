@@ -15,7 +15,7 @@ from ssilk_core.training.objective import Objective, total
 from ssilk_core.training.step import Stepper
 from ssilk_core.training.windows import WindowSampler
 
-CONFIG = TrainConfig(batch=3, window=6, resting=6, rotated=0.5, noise=0.2)
+CONFIG = TrainConfig(batch=3, window=6, static_batch=6, rotated_fraction=0.5, noise=0.2)
 
 
 @pytest.fixture
@@ -46,11 +46,11 @@ def at_frame(objective: Objective, z: torch.Tensor, frame: torch.Tensor, down: t
     return x, terms
 
 
-def reference(objective: Objective, sampler: WindowSampler, noise: torch.Tensor, through_time: bool) -> tuple:
+def reference(objective: Objective, sampler: WindowSampler, noise: torch.Tensor, bptt: bool) -> tuple:
     """The windows of all slots, one state at a time; time-major lists of terms, and the last two latents."""
     model, bank, length = objective.model, objective.bank, sampler.config.window
     dynamic = [[{} for _ in sampler.first] for _ in range(length - 2)]
-    resting = [[{}] for _ in POSES[0]]
+    static_batch = [[{}] for _ in POSES[0]]
     latents = []
     for slot, first in enumerate(sampler.first):
         down = sampler.direction[slot : slot + 1]
@@ -60,7 +60,7 @@ def reference(objective: Objective, sampler: WindowSampler, noise: torch.Tensor,
         z = list((begun + noise[:, slot]).split(1))
         x = [at_frame(objective, z[t], frames[t], down)[0].detach() for t in range(2)]
         for t in range(2, length):
-            past = z[-2:] if through_time else [v.detach() for v in z[-2:]]
+            past = z[-2:] if bptt else [v.detach() for v in z[-2:]]
             z.append(model.step(*past, rest[t].detach(), bank.dynamic_descriptor(frames[t], down)))
             now, terms = at_frame(objective, z[-1], frames[t], down)
             terms["inertia"] = objective.energy.inertia(now, 2 * x[-1] - x[-2], objective.dt)
@@ -69,9 +69,9 @@ def reference(objective: Objective, sampler: WindowSampler, noise: torch.Tensor,
             dynamic[t - 2][slot] = terms
             x.append(now.detach())
         latents.append(torch.stack(z[-2:])[:, 0].detach())
-    for row, frame, down in zip(resting, POSES[0].split(1), POSES[1].split(1)):
+    for row, frame, down in zip(static_batch, POSES[0].split(1), POSES[1].split(1)):
         row[0] = at_frame(objective, model.initial(bank.static_descriptor(frame, down)), frame, down)[1]
-    return flat(dynamic), flat(resting), torch.stack(latents, dim=1)
+    return flat(dynamic), flat(static_batch), torch.stack(latents, dim=1)
 
 
 def flat(rows: list) -> dict[str, torch.Tensor]:
@@ -84,11 +84,11 @@ def gradients(objective: Objective, loss: torch.Tensor) -> dict[str, torch.Tenso
     return {name: torch.zeros_like(v) if g is None else g for name, v, g in zip(names, values, found)}
 
 
-@pytest.mark.parametrize("through_time", [False, True])
-def test_a_window_equals_a_plain_loop(objective, through_time):
-    sampler = sampler_of(objective, replace(CONFIG, through_time=through_time))
+@pytest.mark.parametrize("bptt", [False, True])
+def test_a_window_equals_a_plain_loop(objective, bptt):
+    sampler = sampler_of(objective, replace(CONFIG, bptt=bptt))
     noise = sampler.noise()
-    found, expected = objective.window(sampler, noise, *POSES), reference(objective, sampler, noise, through_time)
+    found, expected = objective.window(sampler, noise, *POSES), reference(objective, sampler, noise, bptt)
     for mine, theirs in zip(found[:2], expected[:2]):
         assert mine.keys() == theirs.keys()
         for name, value in mine.items():
@@ -97,7 +97,7 @@ def test_a_window_equals_a_plain_loop(objective, through_time):
     assert found[0]["collision"].max() > 0
     np.testing.assert_allclose(found[2], expected[2], atol=1e-5)
     mine, theirs = (
-        gradients(objective, total(dynamic) + total(resting)) for dynamic, resting, _ in (found, expected)
+        gradients(objective, total(dynamic) + total(static_batch)) for dynamic, static_batch, _ in (found, expected)
     )
     for name, value in mine.items():
         np.testing.assert_allclose(
@@ -107,18 +107,18 @@ def test_a_window_equals_a_plain_loop(objective, through_time):
 
 def test_through_time_the_stepper_answers_for_later_frames(objective):
     slopes = []
-    for through_time in (False, True):
-        sampler = sampler_of(objective, replace(CONFIG, through_time=through_time))
+    for bptt in (False, True):
+        sampler = sampler_of(objective, replace(CONFIG, bptt=bptt))
         dynamic, _, _ = objective.window(sampler, torch.zeros(2, 3, 8), *POSES)
         slopes.append(gradients(objective, dynamic["gravity"][-3:].sum())["stepper.0.weight"])
     assert (slopes[0] - slopes[1]).norm() > 0.05 * slopes[1].norm()
 
 
-@pytest.mark.parametrize("through_time", [False, True])
-def test_the_initialiser_learns_from_rest_states_alone(objective, through_time):
-    sampler = sampler_of(objective, replace(CONFIG, through_time=through_time))
-    dynamic, resting, _ = objective.window(sampler, sampler.noise(), *POSES)
-    from_motion, from_rest = gradients(objective, total(dynamic)), gradients(objective, total(resting))
+@pytest.mark.parametrize("bptt", [False, True])
+def test_the_initialiser_learns_from_rest_states_alone(objective, bptt):
+    sampler = sampler_of(objective, replace(CONFIG, bptt=bptt))
+    dynamic, static_batch, _ = objective.window(sampler, sampler.noise(), *POSES)
+    from_motion, from_rest = gradients(objective, total(dynamic)), gradients(objective, total(static_batch))
     for name in from_motion:
         if name.startswith("initialiser."):
             assert from_motion[name].abs().max() == 0 and from_rest[name].abs().max() > 0
@@ -130,9 +130,9 @@ def test_the_initialiser_learns_from_rest_states_alone(objective, through_time):
 def test_every_scheme_trains_every_parameter(scene, toy_motion, toy_model, toy_objective, scheme):
     objective = toy_objective(scene, toy_model(scene, scheme=scheme), toy_motion(scene, 50))
     sampler = sampler_of(objective, CONFIG)
-    dynamic, resting, _ = objective.window(sampler, sampler.noise(), *POSES)
+    dynamic, static_batch, _ = objective.window(sampler, sampler.noise(), *POSES)
     unused = {"integrator.alpha", "integrator.beta"} if scheme.startswith("direct") else set()
-    for name, value in gradients(objective, total(dynamic) + total(resting)).items():
+    for name, value in gradients(objective, total(dynamic) + total(static_batch)).items():
         assert torch.isfinite(value).all() and (name in unused or value.abs().max() > 0), name
 
 
@@ -152,9 +152,11 @@ def test_total_is_the_mean_over_frames_of_the_sum_of_terms():
 
 def test_a_step_weighs_every_frame_the_same(objective):
     """Those the initialiser answers for included, and the gradient of exactly that reaches the optimiser."""
-    sampler = sampler_of(objective, replace(CONFIG, noise=0.0, rate=0.0))
-    dynamic, resting, _ = objective.window(sampler, torch.zeros(2, 3, 8), *POSES)
-    frames = sum(torch.cat([dynamic[name], resting[name]]).mean() for name in resting)  # terms that all frames have
+    sampler = sampler_of(objective, replace(CONFIG, noise=0.0, learning_rate=0.0))
+    dynamic, static_batch, _ = objective.window(sampler, torch.zeros(2, 3, 8), *POSES)
+    frames = sum(
+        torch.cat([dynamic[name], static_batch[name]]).mean() for name in static_batch
+    )  # terms that all frames have
     rest = sum(dynamic[name].mean() for name in ("inertia", "drag")) * 4 / 5
     expected = gradients(objective, frames + rest)
     length = torch.cat([value.flatten() for value in expected.values()]).norm()  # only directions count

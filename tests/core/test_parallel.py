@@ -30,11 +30,11 @@ from ssilk_core.training.run import Run, train
 from ssilk_core.training.state import state_path
 
 SHORT = TrainConfig(
-    iterations=24, warm=0.3, warm_batch=8, batch=4, window=5, resting=8, rate_warmup=2, average=0.9,
-    validate_every=12, valid_frames=12, seed=7,
+    iterations=24, static_fraction=0.3, pretraining_batch=8, batch=4, window=5, static_batch=8,
+    learning_rate_warmup=2, ema_decay=0.9, validate_every=12, valid_frames=12, seed=7,
 )  # fmt: skip
 # Without noise, a step depends on where the windows stand and on nothing drawn.
-ONE_STEP = replace(SHORT, warm=0.0, noise=0.0)
+ONE_STEP = replace(SHORT, static_fraction=0.0, noise=0.0)
 
 
 class Recorder:
@@ -66,7 +66,7 @@ def shared_gradient(job: TrainJob, team: Team) -> dict[str, object]:
         run.stepper.run(iteration)
     before = team.gather({name: value.clone() for name, value in run.stepper.sampler.state().items()})
     parameters = [value.detach().clone() for value in run.stepper.model.parameters()]
-    recorder, half = Recorder(run), ONE_STEP.resting // team.size
+    recorder, half = Recorder(run), ONE_STEP.static_batch // team.size
     poses(run, team.rank * half, half)
     run.stepper.run(3)
     return {"samplers": before, "parameters": parameters, "gradient": recorder.given[0]}
@@ -166,7 +166,7 @@ def test_two_halves_of_a_batch_give_the_gradient_of_the_whole(job, together):
         for value, trained in zip(alone.stepper.model.parameters(), ours["parameters"]):
             value.copy_(trained)
     recorder = Recorder(alone)
-    poses(alone, 0, ONE_STEP.resting)
+    poses(alone, 0, ONE_STEP.static_batch)
     alone.stepper.run(3)
     assert len(recorder.given[0]) == len(ours["gradient"])
     for whole, mine, other in zip(recorder.given[0], ours["gradient"], theirs["gradient"]):
@@ -212,9 +212,9 @@ def test_each_process_draws_its_own(job):
 
 
 def test_batches_are_divided_equally_or_refused():
-    assert Team(1, 2).part(SHORT) == replace(SHORT, batch=2, warm_batch=4, resting=4)
+    assert Team(1, 2).part(SHORT) == replace(SHORT, batch=2, pretraining_batch=4, static_batch=4)
     with pytest.raises(SsilkError, match=r"setting 'batch': 4 for 3 processes; .*a multiple of 3"):
-        Team(0, 3).part(replace(SHORT, warm_batch=9))
+        Team(0, 3).part(replace(SHORT, pretraining_batch=9))
 
 
 def test_that_another_process_has_ended_is_told(monkeypatch):

@@ -69,7 +69,7 @@ def test_a_decoder_that_fails_leaves_the_rig_as_it_is(model, scene, toy_motion):
 
 def test_a_free_latent_that_runs_away_is_caught(scene, toy_model, toy_motion):
     model = toy_model(scene, scale=0.1).eval()
-    model.integrator.config = replace(model.config, bound=0.0, push=0.0)
+    model.integrator.config = replace(model.config, latent_bound=0.0, max_latent_step=0.0)
     with torch.no_grad():
         model.integrator.beta.fill_(-3.0)
     steps = list(roll(model, toy_motion(scene, 200)))

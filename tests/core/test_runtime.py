@@ -60,7 +60,9 @@ def playback(model, motion):
     return player_of(model).play(motion)
 
 
-@pytest.mark.parametrize("options", [{}, {"widths": (16, 24, 12)}, {"bound": 0.0, "push": 0.0}, {"shapes": 0}])
+@pytest.mark.parametrize(
+    "options", [{}, {"widths": (16, 24, 12)}, {"latent_bound": 0.0, "max_latent_step": 0.0}, {"shapes": 0}]
+)
 @pytest.mark.parametrize("proxies, shuffled", [(2, False), (2, True), (0, False)])
 def test_vertices_are_those_of_the_network(toy_scene, toy_model, toy_motion, options, proxies, shuffled):
     scene = toy_scene(proxies=proxies, shuffled=shuffled)
@@ -71,8 +73,8 @@ def test_vertices_are_those_of_the_network(toy_scene, toy_model, toy_motion, opt
 
 
 def test_limits_are_reached_and_kept_as_in_the_network(scene, toy_model, motion):
-    model = toy_model(scene, scale=0.1, bound=0.2, push=0.02).eval()
-    free = toy_model(scene, scale=0.1, bound=0.0, push=0.0).eval()
+    model = toy_model(scene, scale=0.1, latent_bound=0.2, max_latent_step=0.02).eval()
+    free = toy_model(scene, scale=0.1, latent_bound=0.0, max_latent_step=0.0).eval()
     states = states_of(model, motion)
     assert 0.1 < np.abs(states).max() < 0.2001 < np.abs(states_of(free, motion)).max()
     found, theirs = player_of(model).play(motion).poses(), garment_poses(model, motion, motion.fps)
@@ -212,7 +214,7 @@ def test_garments_run_up_to_the_first_frame_as_in_a_bake(model, motion, fps):
 
 
 def test_lost_states_rest_for_a_while_as_in_a_bake(scene, toy_model, motion):
-    model = toy_model(scene, scale=0.1, bound=0.0, push=0.0).eval()
+    model = toy_model(scene, scale=0.1, latent_bound=0.0, max_latent_step=0.0).eval()
     with torch.no_grad():
         model.integrator.beta.fill_(1.6)  # flies off
     mine, theirs = (

@@ -24,7 +24,7 @@ from ssilk_core.simulate import newton
 from ssilk_core.simulate.conjugate import CHECK_EVERY, inverse_blocks, solve
 from ssilk_core.simulate.hinges import Hinges
 from ssilk_core.simulate.incremental_potential import IncrementalPotential, StepInputs
-from ssilk_core.simulate.membrane import Membrane, outer, positive
+from ssilk_core.simulate.membrane import Membrane, outer, project_psd
 from ssilk_core.simulate.newton import SolverOptions, State, line_search, minimise_from, newton_step
 
 CPU = torch.device("cpu")
@@ -130,7 +130,7 @@ def test_taut_cloth_in_a_fold_comes_to_rest_on_the_crease(scene: Scene) -> None:
 
 
 def test_the_membrane_has_the_hessian_of_autograd_where_it_is_stretched(scene: Scene) -> None:
-    # Under second_piola_kirchhoff nothing is clamped, so the positive Hessian is the Hessian.
+    # Under tension nothing is clamped, so the positive Hessian is the Hessian.
     for fabric in FABRICS.values():
         membrane = Membrane(scene.garment.mesh, fabric, CPU, torch.float64)
         w_u, w_v = torch.randn(2, 1, 3, generator=torch.Generator().manual_seed(1)).double() * 0.1
@@ -166,7 +166,7 @@ def test_two_by_two_matrices_lose_their_negative_eigenvalues_only() -> None:
     dense = torch.stack([entries[0], entries[1], entries[1], entries[2]], -1).reshape(-1, 2, 2)
     values, vectors = torch.linalg.eigh(dense)
     expected = vectors @ torch.diag_embed(values.clamp_min(0)) @ vectors.transpose(1, 2)
-    uu, uv, vv = positive(*entries)
+    uu, uv, vv = project_psd(*entries)
     torch.testing.assert_close(torch.stack([uu, uv, uv, vv], -1).reshape(-1, 2, 2), expected)
 
 

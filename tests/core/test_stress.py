@@ -69,7 +69,10 @@ def test_what_raises_is_a_fault_and_what_is_refused_is_none(subject):
 
 
 def test_a_lost_rollout_falls_back(subject):
-    lost = replace(subject, file=replace(subject.file, config=replace(subject.file.config, bound=0.0, push=0.0)))
+    lost = replace(
+        subject,
+        file=replace(subject.file, config=replace(subject.file.config, latent_bound=0.0, max_latent_step=0.0)),
+    )
     lost.file.parameters["integrator.beta"] = np.full(lost.file.config.latent, -3.0, dtype=np.float32)
     outcome = Case("motion", "none", measures.driven(lambda subject, base: base), ("falls back",)).run(lost)
     assert outcome.verdict == "falls back" and outcome.measured.extent.recovered > 10

@@ -22,20 +22,20 @@ from ssilk_core.training.step import learning_rate
 
 from .test_training_run import SHORT, job  # noqa: F401  (a fixture)
 
-PLAN = TrainConfig(iterations=1000, warm=0.3, rate_warmup=50, validate_every=100, average=0.998)
+PLAN = TrainConfig(iterations=1000, static_fraction=0.3, learning_rate_warmup=50, validate_every=100, ema_decay=0.998)
 
 
 @pytest.mark.parametrize("iterations", [50, 1000, 8000])
 def test_a_stretched_schedule_has_the_same_shape(iterations):
     found, factor = shaped(PLAN, iterations), iterations / PLAN.iterations
-    assert found.iterations == iterations and found.warm_iterations == round(PLAN.warm_iterations * factor)
+    assert found.iterations == iterations and found.static_iterations == round(PLAN.static_iterations * factor)
     assert found.iterations // found.validate_every == 10
     for share in (0.1, 0.4, 0.6, 0.9):
         rates = [learning_rate(config, int(share * config.iterations)) for config in (found, PLAN)]
         assert rates[0] == pytest.approx(rates[1], rel=0.02)
     # What the running average still holds of the first parameters in the end.
-    assert found.average**iterations == pytest.approx(PLAN.average**1000, rel=1e-6)
-    assert shaped(replace(PLAN, average=0.0), iterations).average == 0
+    assert found.average**iterations == pytest.approx(PLAN.ema_decay**1000, rel=1e-6)
+    assert shaped(replace(PLAN, ema_decay=0.0), iterations).average == 0
 
 
 class Clocked:
@@ -47,7 +47,7 @@ class Clocked:
         self.times, self.now = (warm, proper), 0.0
 
     def run(self, iteration: int) -> None:
-        self.now += self.times[iteration >= PLAN.warm_iterations]
+        self.now += self.times[iteration >= PLAN.static_iterations]
 
 
 def planned(monkeypatch: pytest.MonkeyPatch, seconds: float, scoring: float = 0.0) -> int:

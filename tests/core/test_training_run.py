@@ -37,12 +37,12 @@ from ssilk_core.training.windows import WindowSampler
 
 SHORT = TrainConfig(
     iterations=14,
-    warm=0.3,
-    warm_batch=6,
+    static_fraction=0.3,
+    pretraining_batch=6,
     batch=3,
     window=5,
-    rate_warmup=2,
-    average=0.9,
+    learning_rate_warmup=2,
+    ema_decay=0.9,
     validate_every=5,
     valid_frames=12,
     seed=7,
@@ -105,7 +105,15 @@ def assert_same_state(one: TrainJob, other: TrainJob) -> None:
 
 
 def test_training_lowers_the_energy_of_held_out_motion(job):
-    config = replace(SHORT, iterations=110, warm=0.6, warm_batch=16, warm_rate=6e-3, rate=2e-3, surface="vertices")
+    config = replace(
+        SHORT,
+        iterations=110,
+        static_fraction=0.6,
+        pretraining_batch=16,
+        static_learning_rate=6e-3,
+        learning_rate=2e-3,
+        closest_point="vertices",
+    )
     trained = train(job("learning", config), silent)
     assert trained.finished and trained.iterations == 110
     assert trained.score.total < 0.8 * trained.plain.total
@@ -189,7 +197,7 @@ def test_the_best_model_is_kept(job, monkeypatch):
         validation.Validator, "score", lambda self, model: replace(score(self, model), terms={"all": next(totals)})
     )
     events: list[Event] = []
-    kept = job("best", replace(SHORT, validate_every=4, iterations=16, warm=0.0))
+    kept = job("best", replace(SHORT, validate_every=4, iterations=16, static_fraction=0.0))
     trained = train(kept, events.append)
     assert [event.done for event in events if isinstance(event, Checkpoint)] == [4, 8]
     assert trained.score.total == 1.0
@@ -223,7 +231,16 @@ def test_provenance_tells_how_the_model_came_to_be(uninterrupted):
 def test_a_diverging_run_says_so_and_keeps_the_best_model(job):
     """Smaller steps are tried once; these are too large even so."""
     wild = job(
-        "diverging", replace(SHORT, iterations=20, warm=0.5, validate_every=10, rate=1e9, final_rate=1e9, average=0.0)
+        "diverging",
+        replace(
+            SHORT,
+            iterations=20,
+            static_fraction=0.5,
+            validate_every=10,
+            learning_rate=1e9,
+            final_learning_rate=1e9,
+            ema_decay=0.0,
+        ),
     )
     events: list[Event] = []
     with pytest.raises(SsilkError, match=r"training diverged: .* at iteration 20 .*not finite.*kept") as error:
@@ -246,11 +263,11 @@ def poison(monkeypatch: pytest.MonkeyPatch, bad: Callable[[Stepper, int], bool],
         run(self, iteration)
 
     def spoiled(self: Objective, sampler: WindowSampler, *drawn: torch.Tensor):
-        dynamic, resting, latents = window(self, sampler, *drawn)
+        dynamic, static_batch, latents = window(self, sampler, *drawn)
         if poisoned[0]:
-            kind = resting if name.startswith("resting ") else dynamic
-            kind[name.removeprefix("resting ")] = kind[name.removeprefix("resting ")] * float("nan")
-        return dynamic, resting, latents
+            kind = static_batch if name.startswith("static_batch ") else dynamic
+            kind[name.removeprefix("static_batch ")] = kind[name.removeprefix("static_batch ")] * float("nan")
+        return dynamic, static_batch, latents
 
     monkeypatch.setattr(Stepper, "run", watched)
     monkeypatch.setattr(Objective, "window", spoiled)
@@ -262,19 +279,22 @@ def test_an_undone_step_is_told_of_by_term_and_iteration_and_counted_across_resu
         poison(patch, lambda stepper, iteration: iteration == 7)
         train(spoiled, silent, stop_after(patch, 9))
     events: list[Event] = []
-    poison(monkeypatch, lambda stepper, iteration: iteration in (11, 12), "resting stretch")
+    poison(monkeypatch, lambda stepper, iteration: iteration in (11, 12), "static_batch stretch")
     train(replace(spoiled, resume=True), events.append)
     told = [event.text for event in events if isinstance(event, Message) and "undone" in event.text]
     assert told == [
-        "2 steps up to iteration 13 were undone: resting stretch not finite.",
+        "2 steps up to iteration 13 were undone: static_batch stretch not finite.",
         "3 steps in all were undone.",
     ]
     assert load_state(state_path(spoiled.output), spoiled.identity())[0].undone == 3
 
 
 def test_many_undone_steps_lead_back_to_the_last_state_and_smaller_steps(job, monkeypatch):
-    config = replace(SHORT, iterations=120, warm=0.0, validate_every=15)
-    poison(monkeypatch, lambda stepper, iteration: iteration >= 19 and stepper.config.rate == config.rate)
+    config = replace(SHORT, iterations=120, static_fraction=0.0, validate_every=15)
+    poison(
+        monkeypatch,
+        lambda stepper, iteration: iteration >= 19 and stepper.config.learning_rate == config.learning_rate,
+    )
     events: list[Event] = []
     slowed = job("slowed", config)
     assert train(slowed, events.append).finished
@@ -291,7 +311,9 @@ def test_many_undone_steps_lead_back_to_the_last_state_and_smaller_steps(job, mo
 def test_what_stays_broken_stops_with_the_window_to_study(job, monkeypatch, scene):
     """Every window is spoiled; a step to iteration 140 is the last, as 60 is more than half of 100."""
     poison(monkeypatch, lambda stepper, iteration: True)
-    broken = job("broken", replace(SHORT, iterations=400, warm=0.0, validate_every=1000, rotated=0.0))
+    broken = job(
+        "broken", replace(SHORT, iterations=400, static_fraction=0.0, validate_every=1000, rotated_fraction=0.0)
+    )
     with pytest.raises(SsilkError, match=r"undone at iteration 60 \(bending.*no model yet.*broken.fault.safetensors"):
         train(broken, silent)
     assert not broken.output.exists()
@@ -306,12 +328,12 @@ def test_what_stays_broken_stops_with_the_window_to_study(job, monkeypatch, scen
 
 
 def test_the_batch_is_lowered_to_fit_and_that_is_said(job, monkeypatch):
-    small = job("lowered", replace(SHORT, batch=4000, warm_batch=90_000, iterations=1, warm=0.0))
+    small = job("lowered", replace(SHORT, batch=4000, pretraining_batch=90_000, iterations=1, static_fraction=0.0))
     monkeypatch.setattr(training, "free_memory", lambda device: 1 << 30)
     events: list[Event] = []
     monkeypatch.setattr(Stepper, "run", lambda self, iteration: None)
     run = training.Run(small, events.append)
-    assert 1 <= run.config.batch < 4000 and 1 <= run.config.warm_batch < 90_000
+    assert 1 <= run.config.batch < 4000 and 1 <= run.config.pretraining_batch < 90_000
     warning = next(event for event in events if isinstance(event, Message))
     assert warning.level == "warning" and f"from 4000 to {run.config.batch} windows" in warning.text
     started = next(event for event in events if isinstance(event, Started))
@@ -321,7 +343,10 @@ def test_the_batch_is_lowered_to_fit_and_that_is_said(job, monkeypatch):
 
 def test_a_run_lowered_to_fit_is_resumed_as_it_was(job, monkeypatch):
     """Free memory is never the same twice; the batch of a resumed run must be."""
-    big = job("refit", replace(SHORT, batch=4000, warm_batch=90_000, iterations=1, warm=0.0, validate_every=1))
+    big = job(
+        "refit",
+        replace(SHORT, batch=4000, pretraining_batch=90_000, iterations=1, static_fraction=0.0, validate_every=1),
+    )
     runs = []
     for megabytes in (400, 500, 330):
         monkeypatch.setattr(training, "free_memory", lambda device, size=megabytes << 20: size)
@@ -354,7 +379,7 @@ def limited(monkeypatch: pytest.MonkeyPatch, windows: int, poses: int) -> None:
 
 
 def test_a_run_that_is_out_of_memory_goes_on_with_half_the_batch(job, monkeypatch):
-    big, events = job("big", replace(SHORT, batch=12, warm_batch=16)), []
+    big, events = job("big", replace(SHORT, batch=12, pretraining_batch=16)), []
     limited(monkeypatch, windows=3, poses=9)
     assert not train(big, events.append, stop_after(monkeypatch, 9)).finished
     told = [event.text for event in events if isinstance(event, Message) and "memory" in event.text]
@@ -369,7 +394,7 @@ def test_a_run_that_is_out_of_memory_goes_on_with_half_the_batch(job, monkeypatc
 
 
 def test_nothing_that_was_learned_is_lost_with_half_the_batch(job, monkeypatch):
-    run = training.Run(job("halved", replace(SHORT, batch=8, warm_batch=8)), silent)
+    run = training.Run(job("halved", replace(SHORT, batch=8, pretraining_batch=8)), silent)
     for _ in range(6):
         run.step()
     before = learned(run.stepper)
@@ -421,7 +446,7 @@ def may_have(monkeypatch):
 
 def test_a_gpu_that_is_out_of_memory_goes_on_with_half_the_batch(job, may_have):
     may_have(2 << 30)
-    big = job("gpu", replace(SHORT, iterations=40, batch=100_000, warm_batch=1_000_000), device="cuda")
+    big = job("gpu", replace(SHORT, iterations=40, batch=100_000, pretraining_batch=1_000_000), device="cuda")
     assert train(big, silent).finished
     assert load_model(big.output).provenance["lowered"][-1]["batch"] < 50_000
 
@@ -437,7 +462,7 @@ def test_a_gpu_that_is_out_of_memory_in_a_graph_goes_on_with_half_the_batch(job,
         run(self, iteration)
 
     monkeypatch.setattr(Stepper, "run", short)
-    big = job("graph", replace(SHORT, iterations=20, batch=5000, warm=0.0), device="cuda")
+    big = job("graph", replace(SHORT, iterations=20, batch=5000, static_fraction=0.0), device="cuda")
     assert train(big, silent).finished
     assert [item["batch"] for item in load_model(big.output).provenance["lowered"]] == [2500]
 
@@ -564,7 +589,14 @@ def test_devices_are_chosen_or_refused():
 
 
 def test_step_sizes_warm_up_and_decay_in_each_phase():
-    config = TrainConfig(iterations=1000, warm=0.4, warm_rate=1.0, rate=0.5, final_rate=0.01, rate_warmup=10)
+    config = TrainConfig(
+        iterations=1000,
+        static_fraction=0.4,
+        static_learning_rate=1.0,
+        learning_rate=0.5,
+        final_learning_rate=0.01,
+        learning_rate_warmup=10,
+    )
     rates = [learning_rate(config, i) for i in range(1000)]
     assert rates[0] == pytest.approx(0.1) and rates[400] == pytest.approx(0.05)
     assert np.argmax(rates[:400]) < 15 and np.argmax(rates[400:]) < 15

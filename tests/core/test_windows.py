@@ -15,7 +15,7 @@ from ssilk_core.motion_bank import MotionBank, build_bank
 from ssilk_core.training.windows import WindowSampler, random_directions
 
 CPU, JOINTS = torch.device("cpu"), np.arange(3)
-CONFIG = TrainConfig(batch=6, window=5, carry=0.7)
+CONFIG = TrainConfig(batch=6, window=5, state_reuse=0.7)
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -95,7 +95,7 @@ def test_windows_stay_within_their_clip_and_carry_what_they_say(bank):
 
 
 def test_a_slot_at_the_end_of_its_clip_starts_anew(bank):
-    sampler = WindowSampler(bank, replace(CONFIG, carry=1.0), 3, generator())
+    sampler = WindowSampler(bank, replace(CONFIG, state_reuse=1.0), 3, generator())
     last = sampler.first + 3 + 5 > sampler.stop_of[sampler.first]
     sampler.advance(torch.zeros(2, 6, 3))
     assert torch.equal(sampler.carried, ~last) and last.any() and not last.all()
@@ -104,7 +104,7 @@ def test_a_slot_at_the_end_of_its_clip_starts_anew(bank):
 @pytest.mark.parametrize("carry, expected", [(0.0, 0.0), (0.5, 0.5), (1.0, 1.0)])
 def test_the_share_that_is_carried(scene, toy_motion, carry, expected):
     long = build_bank([toy_motion(scene, 4000)], scene.character.skeleton, JOINTS, 30.0, CPU)
-    sampler = WindowSampler(long, replace(CONFIG, batch=2000, carry=carry), 3, generator())
+    sampler = WindowSampler(long, replace(CONFIG, batch=2000, state_reuse=carry), 3, generator())
     sampler.advance(torch.zeros(2, 2000, 3))
     assert sampler.carried.double().mean().item() == pytest.approx(expected, abs=0.04)
 
@@ -145,7 +145,7 @@ def test_a_window_longer_than_every_clip_is_refused(bank):
 
 
 def test_a_carried_window_is_displaced_now_and_then_and_a_new_one_always(bank):
-    config = replace(CONFIG, batch=4000, kick=0.1, noise=1.0)
+    config = replace(CONFIG, batch=4000, noise_probability=0.1, noise=1.0)
     sampler = WindowSampler(bank, config, 3, generator())
     sampler.carried[:] = torch.arange(4000) < 3000
     moved = (sampler.noise() != 0).all(dim=2).all(dim=0)

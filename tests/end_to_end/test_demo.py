@@ -27,7 +27,8 @@ from ssilk_core.energy import GarmentEnergy
 from ssilk_core.events import silent
 
 SHORT = shlex.split(
-    "--set iterations=2 --set warm=0.5 --set validate_every=2 --set valid_frames=4 --set batch=1 --set warm_batch=4 "
+    "--set iterations=2 --set static_fraction=0.5 --set validate_every=2 --set valid_frames=4 --set batch=1 --set "
+    "pretraining_batch=4 "
     "--set window=3"
 )
 

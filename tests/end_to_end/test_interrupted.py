@@ -26,7 +26,10 @@ from ssilk_core.cli import main
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="processes are forked, and killed by a signal")
 
 # Files are written after every step, and steps are so large that some models are the best so far and some are not.
-SETTINGS = "iterations=24 warm=0.1 validate_every=1 rate=0.004 final_rate=0.004 rate_warmup=0 average=0"
+SETTINGS = (
+    "iterations=24 static_fraction=0.1 validate_every=1 learning_rate=0.004 final_learning_rate=0.004 "
+    "learning_rate_warmup=0 ema_decay=0"
+)
 MODEL, STATE, CURVE = Path("model.safetensors"), Path("model.resume.safetensors"), Path("model.curve.json")
 
 

@@ -402,9 +402,9 @@ OPTIONS = [
     Case("no iterations", f"{TRAIN} --set iterations=0", ("'iterations'", "0", "between 1 and")),
     Case("zero-length window", f"{TRAIN} --set window=0", ("window of 0 poses", "at least 3")),
     Case("window longer than the clip", f"{TRAIN} --set window=500", ("500", "--set window=")),
-    Case("NaN rate", f"{TRAIN} --set rate=nan", ("'rate'", "nan", "between")),
+    Case("NaN rate", f"{TRAIN} --set learning_rate=nan", ("'learning_rate'", "nan", "between")),
     Case("infinite noise", f"{TRAIN} --set noise=inf", ("noise", "inf")),
-    Case("negative rate", f"{TRAIN} --set rate=-1", ("rate", "-1")),
+    Case("negative rate", f"{TRAIN} --set learning_rate=-1", ("learning_rate", "-1")),
     Case("huge seed", f"{TRAIN} --seed 99999999999999999999999", ("seed",)),
     Case("unknown property of the fabric", f"{TRAIN} --material silkiness=1", ("silkiness", "density")),
     Case("negative density", f"{TRAIN} --material density=-1", ("density", "-1")),
@@ -473,7 +473,11 @@ def state_header(words: str) -> Damage:
 RESUME = "train rigged.usda --motions clip.usda -o model.safetensors --resume TRAINING"
 MODELS = [
     Case("resumed without a state", f"{TRAIN} --resume", ("new.resume.safetensors", "no training to resume")),
-    Case("resumed with other settings", f"{RESUME} --set rate=1e-3", ("model.resume", "another rate", "same")),
+    Case(
+        "resumed with other settings",
+        f"{RESUME} --set learning_rate=1e-3",
+        ("model.resume", "another learning_rate", "same"),
+    ),
     Case(
         "resumed on other motion",
         RESUME,

@@ -224,7 +224,10 @@ def test_an_interrupted_training_goes_on_to_the_same_model(world):
     Steps are so large that the model is best where it was interrupted, between two validations: a run that was
     left alone never looks at it there.
     """
-    settings = "--set iterations=120 --set validate_every=60 --set warm=0.4 --set warm_rate=1e-6 --set rate=0.1"
+    settings = (
+        "--set iterations=120 --set validate_every=60 --set static_fraction=0.4 --set static_learning_rate=1e-6 "
+        "--set learning_rate=0.1"
+    )
     train = [*shlex.split("train rigged.usda --motions clip.usda"), *world.training, *shlex.split(settings)]
     process = subprocess.Popen(
         [sys.executable, "-m", "ssilk_core", *train, "-o", "halved.safetensors", "--json"],

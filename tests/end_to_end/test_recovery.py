@@ -13,7 +13,7 @@ from ssilk_core.cli import main
 
 def test_a_bake_says_where_its_rollout_was_lost(toy, tmp_path, capsys):
     file = load_model(toy.folder / "model.safetensors")
-    free = replace(file.config, bound=0.0, push=0.0)
+    free = replace(file.config, latent_bound=0.0, max_latent_step=0.0)
     wild = {**file.parameters, "integrator.beta": np.full(free.latent, -9, dtype=np.float32)}
     model, shot = tmp_path / "wild.safetensors", tmp_path / "shot.usda"
     save_model(model, replace(file, config=free, parameters=wild))

@@ -32,7 +32,7 @@ def world(toy, tmp_path, monkeypatch):
         train = {**file.provenance["train"], "batch": batch}
         save_model(tmp_path / "models" / f"{batch}.safetensors", replace(file, provenance={"train": train}))
     ncs = baseline(file.scene, BaselineConfig(method="ncs"), file.joints)
-    save_baseline(tmp_path / "ncs.safetensors", ncs, file.fabric, {"train": {"rotated": 0.5}})
+    save_baseline(tmp_path / "ncs.safetensors", ncs, file.fabric, {"train": {"rotated_fraction": 0.5}})
     return tmp_path
 
 

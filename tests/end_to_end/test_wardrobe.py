@@ -32,7 +32,8 @@ LIST = """
 stage = "rigged.usda"
 motions = ["clip.usda"]
 preset = "draft"
-set = { latent = 8, widths = [16], shapes = 4, iterations = 240, warm = 0.5, batch = 2, warm_batch = 4, window = 4 }
+set = { latent = 8, widths = [16], shapes = 4, iterations = 240, static_fraction = 0.5, batch = 2,
+        pretraining_batch = 4, window = 4 }
 
 [skirt]
 seed = 3
@@ -54,8 +55,10 @@ def listed(folder: Path, text: str) -> list[Entry]:
 def test_a_garment_has_its_own_keys_and_the_defaults(tmp_path):
     skirt, torn = listed(tmp_path, LIST + 'material = { drag = 0.2, damp = true }\nvalid = ["a", "b"]\n')
     assert (skirt.name, torn.name) == ("skirt", "torn")
-    settings = "--set latent=8 --set widths=16 --set shapes=4 --set iterations=240 --set warm=0.5 --set batch=2 "
-    settings += "--set warm_batch=4 --set window=4"
+    settings = (
+        "--set latent=8 --set widths=16 --set shapes=4 --set iterations=240 --set static_fraction=0.5 --set batch=2 "
+    )
+    settings += "--set pretraining_batch=4 --set window=4"
     assert shlex.join(skirt.words) == (
         f"rigged.usda --motions clip.usda --preset draft {settings} --set valid_frames=8 --seed 3"
     )

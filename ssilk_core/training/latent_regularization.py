@@ -13,7 +13,7 @@ from ..model.network import GarmentModel
 SMALLEST = 1e-6  # distance of latents, and of garments [m], whose logarithm is finite
 
 
-def irregularity(model: GarmentModel, mass: Tensor, z: Tensor, scale: float) -> Tensor:
+def latent_irregularity(model: GarmentModel, mass: Tensor, z: Tensor, scale: float) -> Tensor:
     """Return (log(|x - x'| / (scale |z - z'|)))^2 of each latent z (N, latent) and the next one, shape (N,).
 
     x are garments in the bind pose, where nothing but their latents tells them apart; their distance is RMS over the
