@@ -30,7 +30,7 @@ from ssilk_core.assets import Floats
 from ssilk_core.cli import main
 from ssilk_core.cli._layers import Wardrobe, bake_task, layout_of
 from ssilk_core.events import silent
-from ssilk_core.farm.tasks import Task
+from ssilk_core.farm.tasks import BakeTask
 from ssilk_core.kinematics import deform
 from ssilk_core.targets import TARGETS, capped
 
@@ -54,7 +54,7 @@ def measure() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         motion = _motion(options, folder)
-        task = Task(
+        task = BakeTask(
             garment="garment", shot="shot", model=options.model, stage=options.stage, motion=str(motion), points=True
         )
         wardrobe = Wardrobe()
@@ -97,7 +97,7 @@ def _motion(options: argparse.Namespace, folder: Path) -> Path:
     return path
 
 
-def _rows(task: Task, folder: Path, exact: Floats) -> Iterator[Row]:
+def _rows(task: BakeTask, folder: Path, exact: Floats) -> Iterator[Row]:
     lean, full = layout_of(task, folder / "usd"), layout_of(task, folder / "blender")
     errors = _errors(lean.animation, exact)
     yield Row(name="points.usdc, the point cache", size=lean.points.stat().st_size, errors=_rounding(exact))
@@ -114,7 +114,7 @@ def _rows(task: Task, folder: Path, exact: Floats) -> Iterator[Row]:
         yield Row(name=name, size=_deflated(rounded), errors=_errors(rounded, exact))
 
 
-def _targets(task: Task, folder: Path, exact: Floats) -> Iterator[Row]:
+def _targets(task: BakeTask, folder: Path, exact: Floats) -> Iterator[Row]:
     """Yield the shot as one file for each target, garment alone."""
     for name, target in TARGETS.items():
         path = folder / f"{name}{target.suffixes[0]}"
@@ -127,7 +127,7 @@ def _share(size: int, cache: int) -> tuple[str, str]:
     return (f"{size:,}", f"1 / {cache / size:.1f}") if size else ("", "")
 
 
-def _heaviest(wardrobe: Wardrobe, task: Task, exact: Floats) -> Row:
+def _heaviest(wardrobe: Wardrobe, task: BakeTask, exact: Floats) -> Row:
     """Return what capping influences alone would cost: the heaviest of each vertex, with nothing learned."""
     bake = wardrobe.dressed(task).over(task.motion)
     deformer = capped(bake.deformer, TARGETS["game4"])

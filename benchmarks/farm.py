@@ -37,7 +37,7 @@ from ssilk_core.cli._layers import Wardrobe, bake_task, clear, is_done, layout_o
 from ssilk_core.cli.farm import bake_here
 from ssilk_core.events import silent
 from ssilk_core.farm.cluster import run_on_cluster
-from ssilk_core.farm.tasks import Task, plan
+from ssilk_core.farm.tasks import BakeTask, plan
 from ssilk_core.files import sha256
 
 PERIOD = 10.0  # seconds from one kill to the next; a worker takes a few to start
@@ -60,7 +60,7 @@ class Killer:
     over: threading.Event = field(default_factory=threading.Event)
 
     def run(self) -> None:
-        """Kill and watch until it is over."""
+        """Kill and monitor until it is over."""
         began, choice = time.monotonic(), random.Random(0)
         while not self.over.wait(PERIOD):
             busy = workers(os.getpid())
@@ -133,8 +133,8 @@ def _options() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def _like(options: argparse.Namespace) -> Task:
-    return Task(garment="", shot="", motion="", model=options.model, stage=str(Path(options.stage).absolute()))
+def _like(options: argparse.Namespace) -> BakeTask:
+    return BakeTask(garment="", shot="", motion="", model=options.model, stage=str(Path(options.stage).absolute()))
 
 
 def _shots(options: argparse.Namespace, folder: Path) -> list[str]:
@@ -154,17 +154,17 @@ def _part(motion: Motion, shot: int, frames: int) -> Motion:
     return replace(motion.clip(start, start + frames), start=0.0)
 
 
-def _on_cluster(tasks: Sequence[Task], folder: Path) -> dict[str, Any]:
+def _on_cluster(tasks: Sequence[BakeTask], folder: Path) -> dict[str, Any]:
     """Bake all tasks while workers are killed; return what became of them."""
     killer = Killer(kill=True)
-    watch = threading.Thread(target=killer.run)
-    watch.start()
+    monitor = threading.Thread(target=killer.run)
+    monitor.start()
     began = time.perf_counter()
     outcomes = list(run_on_cluster(tasks, folder / "cluster", bake_here))
     seconds = time.perf_counter() - began
     clear(tasks, folder / "cluster")
     killer.over.set()
-    watch.join()
+    monitor.join()
     names = Counter(outcome.task.name for outcome in outcomes if not outcome.error)
     half = len(killer.memory) // 2
     return {
@@ -181,7 +181,7 @@ def _on_cluster(tasks: Sequence[Task], folder: Path) -> dict[str, Any]:
     }
 
 
-def _differing(tasks: Sequence[Task], folder: Path) -> int:
+def _differing(tasks: Sequence[BakeTask], folder: Path) -> int:
     """Return how many of a share of the tasks hold other bytes than one process makes undisturbed."""
     wardrobe, differing = Wardrobe(), 0
     for task in random.Random(1).sample(list(tasks), min(SHARE, len(tasks))):
@@ -192,7 +192,7 @@ def _differing(tasks: Sequence[Task], folder: Path) -> int:
     return differing
 
 
-def _cores(tasks: Sequence[Task], folder: Path, cores: Sequence[int]) -> dict[str, Any]:
+def _cores(tasks: Sequence[BakeTask], folder: Path, cores: Sequence[int]) -> dict[str, Any]:
     """Return the rate of numbers of cores, without what starting a cluster and its workers takes."""
     rates: dict[str, Any] = {}
     for count in cores:
@@ -205,7 +205,7 @@ def _cores(tasks: Sequence[Task], folder: Path, cores: Sequence[int]) -> dict[st
     return {**rates, "load of the machine meanwhile": round(os.getloadavg()[1], 1)}
 
 
-def _start(task: Task, folder: Path) -> dict[str, Any]:
+def _start(task: BakeTask, folder: Path) -> dict[str, Any]:
     """Return what a process takes before its first shot, and for a shot then [s]."""
     words = "import torch, ssilk_usd.shot, ssilk_usd.check, ssilk_core.cli._layers"
     wardrobe, taken = Wardrobe(), [time.perf_counter()]
@@ -222,7 +222,7 @@ def _start(task: Task, folder: Path) -> dict[str, Any]:
     return {f"seconds {name}": round(float(each), 2) for name, each in zip(names, np.diff(taken))}
 
 
-def _soak(task: Task, folder: Path, bakes: int) -> dict[str, Any]:
+def _soak(task: BakeTask, folder: Path, bakes: int) -> dict[str, Any]:
     """Bake one shot again and again; return memory ten times, how it grows between, and file handles."""
     wardrobe, step = Wardrobe(), max(bakes // 10, 1)
     memory, handles = {}, {}

@@ -23,8 +23,8 @@ from ssilk_core.checkpoint import ModelFile
 from ssilk_core.cli.trade import Bench
 from ssilk_core.cost import model_bytes
 from ssilk_core.quality import QUALITIES
-from ssilk_core.trade.measure import Meter
-from ssilk_core.trade.point import SECONDS, Point
+from ssilk_core.trade.measure import VariantMeter
+from ssilk_core.trade.point import SECONDS, TradePoint
 from ssilk_core.trade.variants import Variant, variants
 
 HEADER = ("garment", "level", "shapes/proxies/influences", "fps", "off [mm]", "cut for the shot [mm]", "energy [J]",
@@ -36,8 +36,8 @@ HEADER = ("garment", "level", "shapes/proxies/influences", "fps", "off [mm]", "c
 class Level:
     """A level on some clips: cut for other motions, and for each clip, of so many frames, by itself."""
 
-    other: Point
-    own: list[Point]
+    other: TradePoint
+    own: list[TradePoint]
     frames: list[int]
     packed: int
 
@@ -55,7 +55,7 @@ class Level:
         return float(np.average(values, weights=self.frames))
 
 
-def levels(meter: Meter, fps: float) -> list[Variant]:
+def levels(meter: VariantMeter, fps: float) -> list[Variant]:
     """Return the whole model and the levels, none of them refined."""
     tried = variants(meter.reducer.whole, fps, refined=False)
     return [variant for variant in tried if variant.name in ("as trained", *QUALITIES)]

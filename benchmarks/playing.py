@@ -58,25 +58,25 @@ def spans(count: int, size: int) -> Iterator[slice]:
 
 def with_numpy(player: Player, motion: Motion) -> Laps:
     """Play a motion at the model's rate as `runtime.Playback` does; return the time of each part [s]."""
-    watch, before = Stopwatch(), None
+    monitor, before = Stopwatch(), None
     assert player.stepper is not None
     for frames in spans(motion.frame_count, BLOCK):
         seen = min(frames.start, 2)
         given = drive(motion.clip(frames.start - seen, frames.stop), player.skeleton, player.file.joints, seen)
-        watch.lap(DESCRIPTORS)
+        monitor.lap(DESCRIPTORS)
         course = player.stepper.prepared(player.at_rest(given.static), given.static, given.rates, before)
-        watch.lap(REST)
+        monitor.lap(REST)
         states = player.stepper.rolled(course)
         before = states[-2:]
-        watch.lap(LATENTS)
+        monitor.lap(LATENTS)
         activations, rotations = player.decoder.decoded(states)
-        watch.lap(DECODER)
+        monitor.lap(DECODER)
         matrices = player.kinematics.matrices(rotations, given.matrices)
-        watch.lap(KINEMATICS)
+        monitor.lap(KINEMATICS)
         for part in spans(len(states), POSED):
             posed(player.tiles, activations[:, part], matrices[..., part], given.origins[part])
-        watch.lap(SKINNING)
-    return watch.laps
+        monitor.lap(SKINNING)
+    return monitor.laps
 
 
 class Skinner:
@@ -103,47 +103,47 @@ def with_torch(model: GarmentModel, skinner: Skinner, motion: Motion, chunk: int
 
     Latents advance frame by frame in any case. The stepper sees each pose moved and held still in one call.
     """
-    watch = Stopwatch()
+    monitor = Stopwatch()
     given = driven(model, [motion])
-    watch.lap(DESCRIPTORS)  # with the quasi-static latents, which PyTorch computes at once
+    monitor.lap(DESCRIPTORS)  # with the quasi-static latents, which PyTorch computes at once
     states: list[Tensor] = []
     for frames in spans(motion.frame_count, chunk):
         rest, pose = given.rest[frames], given.pose[frames]
         static_batch = max(0, min(2 - frames.start, len(rest)))
         states = model.roll([*states[-2:], *rest[:static_batch]], rest[static_batch:], pose[static_batch:])
-        watch.lap(LATENTS)
+        monitor.lap(LATENTS)
         activations, rotations = model.pose(torch.cat(states[-len(rest) :]))
-        watch.lap(DECODER)
+        monitor.lap(DECODER)
         character = given.character[frames, ..., 0].permute(1, 2, 3, 0)
         matrices = model.decoder.proxy_matrices(rotations, character)
-        watch.lap(KINEMATICS)
+        monitor.lap(KINEMATICS)
         for part in spans(len(rest), POSED):
             skinner(activations[:, part], matrices[..., part])
-        watch.lap(SKINNING)
-    return watch.laps
+        monitor.lap(SKINNING)
+    return monitor.laps
 
 
 @torch.no_grad()
 def with_baseline(model: Baseline, skinner: Skinner, motion: Motion, chunk: int) -> Laps:
     """Play a motion with a baseline, `chunk` frames at a time; return the time of each part [s]."""
-    watch, skeleton = Stopwatch(), model.scene.character.skeleton
+    monitor, skeleton = Stopwatch(), model.scene.character.skeleton
     bank = build_bank([motion], skeleton, model.joints, model.config.fps, torch.device("cpu"))
     inner = torch.as_tensor(skeleton.parents[model.joints] >= 0)
     seen = joint_bank(bank, inner, model.config.fps)
     down = torch.tensor(DOWN).expand(bank.frame_count, 3)
     every = torch.arange(bank.frame_count)
     static, pose = seen.static_descriptor(every, down), seen.dynamic_descriptor(every, down)[:, None]
-    watch.lap(DESCRIPTORS)
+    monitor.lap(DESCRIPTORS)
     states = [model.initial(static[:1])]
-    watch.lap(REST)
+    monitor.lap(REST)
     for frames in spans(bank.frame_count, chunk):
         states = model.roll(states[-1:], states[-1][None], pose[frames])[1:]
-        watch.lap(LATENTS)
+        monitor.lap(LATENTS)
         codes = model.code(torch.cat(states))
-        watch.lap(DECODER)
+        monitor.lap(DECODER)
         skinner(codes.T, bank.character(every[frames]))
-        watch.lap(SKINNING)
-    return watch.laps
+        monitor.lap(SKINNING)
+    return monitor.laps
 
 
 def ways(file: ModelFile, chunks: dict[str, int]) -> dict[str, Way]:

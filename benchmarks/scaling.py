@@ -32,9 +32,9 @@ from ssilk_core.cli import parser as ssilk_parser
 from ssilk_core.cli.train import training_job
 from ssilk_core.devices import chosen_device, device_name
 from ssilk_core.events import silent
-from ssilk_core.training.parallel import Team, joined
-from ssilk_core.training.run import Run
-from ssilk_core.training.watch import EVERY
+from ssilk_core.training.divergence import EVERY
+from ssilk_core.training.parallel import ProcessGroup, joined
+from ssilk_core.training.run import TrainingRun
 
 SETTLE = 8  # steps before any is timed: eager ones, the capture, and some more
 HEADER = ("step", "processes", "batch", "ms", "10 % - 90 %", "iterations/s", "speed-up", "exchange [ms]", "alike")
@@ -45,21 +45,21 @@ Figures = dict[str, Any]
 # --- in the processes that train ----------------------------------------------------------------------------------
 
 
-def measure(options: argparse.Namespace, batch: str, team: Team, device: str) -> Figures:
+def measure(options: argparse.Namespace, batch: str, group: ProcessGroup, device: str) -> Figures:
     """Return times of both kinds of step of "batch" or "batch/parts" [s], and whether parameters are alike."""
     whole, _, parts = batch.partition("/")
     with tempfile.TemporaryDirectory() as folder:
         words = ["train", *options.training, "--set", f"batch={whole}", "-o", f"{folder}/model.safetensors"]
         job = training_job(ssilk_parser().parse_args(words), device, silent)
-        run = Run(replace(job, train=Team(0, int(parts or 1)).part(job.train)), silent, team)
+        run = TrainingRun(replace(job, train=ProcessGroup(0, int(parts or 1)).part(job.train)), silent, group)
     phases = {"warm start": 0, "windows": run.config.static_iterations}
-    times = {name: blocks(run, iteration, team, options) for name, iteration in phases.items()}
+    times = {name: blocks(run, iteration, group, options) for name, iteration in phases.items()}
     parameters = b"".join(value.detach().cpu().numpy().tobytes() for value in run.stepper.model.parameters())
-    alike = len(set(team.gather(hashlib.sha256(parameters).hexdigest()))) == 1
-    return {"times": times, "exchange": exchange(run, team, options), "alike": alike}
+    alike = len(set(group.gather(hashlib.sha256(parameters).hexdigest()))) == 1
+    return {"times": times, "exchange": exchange(run, group, options), "alike": alike}
 
 
-def blocks(run: Run, iteration: int, team: Team, options: argparse.Namespace) -> list[float]:
+def blocks(run: TrainingRun, iteration: int, group: ProcessGroup, options: argparse.Namespace) -> list[float]:
     """Return the time of a step in each of several blocks of steps [s]."""
     for _ in range(SETTLE):
         run.stepper.run(iteration)
@@ -68,32 +68,32 @@ def blocks(run: Run, iteration: int, team: Team, options: argparse.Namespace) ->
         for number in range(options.steps):
             run.stepper.run(iteration)
             if number % EVERY == 0:
-                team.any(False)  # as training does
+                group.any(False)  # as training does
 
-    return [timed(steps, run, team) / options.steps for _ in range(options.blocks)]
+    return [timed(steps, run, group) / options.steps for _ in range(options.blocks)]
 
 
-def exchange(run: Run, team: Team, options: argparse.Namespace) -> float:
+def exchange(run: TrainingRun, group: ProcessGroup, options: argparse.Namespace) -> float:
     """Return the time that averaging the gradients takes by itself, launched as it is [s]."""
-    if team.size == 1:
+    if group.size == 1:
         return 0.0
     tensors = [torch.zeros_like(value) for value in run.stepper.model.parameters()]
 
     def average() -> None:
         for _ in range(options.steps):
-            team.average(tensors)
+            group.average(tensors)
 
-    return min(timed(average, run, team) for _ in range(3)) / options.steps
+    return min(timed(average, run, group) for _ in range(3)) / options.steps
 
 
-def timed(work: Any, run: Run, team: Team) -> float:
+def timed(work: Any, run: TrainingRun, group: ProcessGroup) -> float:
     """Return how long the slowest process takes, all beginning together [s]."""
     settle(run.device)
-    team.gather(None)
+    group.gather(None)
     began = time.perf_counter()
     work()
     settle(run.device)
-    return max(team.gather(time.perf_counter() - began))
+    return max(group.gather(time.perf_counter() - began))
 
 
 def settle(device: torch.device) -> None:
@@ -102,10 +102,10 @@ def settle(device: torch.device) -> None:
 
 
 def work_in_team(options: argparse.Namespace) -> None:
-    """Measure the batches that this process was started for; the first of the team writes what was found."""
-    with joined(options.device) as (team, device):
-        found = {batch: measure(options, batch, team, device) for batch in options.only}
-        if team.first:
+    """Measure the batches that this process was started for; the first of the group writes what was found."""
+    with joined(options.device) as (group, device):
+        found = {batch: measure(options, batch, group, device) for batch in options.only}
+        if group.first:
             options.into.write_text(json.dumps(found))
 
 

@@ -12,7 +12,7 @@ from clock import now
 from torch import Tensor
 
 from ssilk_core.baselines.networks import Baseline
-from ssilk_core.evaluation.methods import Network, Reel
+from ssilk_core.evaluation.methods import Network, TakeSet
 from ssilk_core.model.network import GarmentModel
 from ssilk_core.motion_bank import LatentModel
 
@@ -28,7 +28,7 @@ class Times:
 
 
 @torch.no_grad()
-def frame_times(model: LatentModel, reel: Reel, frames: int) -> Times:
+def frame_times(model: LatentModel, reel: TakeSet, frames: int) -> Times:
     """Time frames of the first take; descriptors and the skeleton's matrices are there already."""
     network = Network("timed", model, reel)
     taken = [_frame(network, 2 + number % (reel.takes[0].frame_count - 2)) for number in range(WARM_UP + frames)]

@@ -20,7 +20,7 @@ from ssilk_core.collision.body import CollisionBody
 from ssilk_core.devices import chosen_device
 from ssilk_core.energy import GarmentEnergy
 from ssilk_core.errors import fail
-from ssilk_core.evaluation.methods import Dressed
+from ssilk_core.evaluation.methods import EvaluationScene
 from ssilk_core.model.network import GarmentModel
 from ssilk_core.motion_bank import build_bank
 from ssilk_core.training.validation import Validator
@@ -33,7 +33,7 @@ class Subject:
     name: str
     file: ModelFile
     model: GarmentModel
-    dressed: Dressed
+    dressed: EvaluationScene
 
     @property
     def scene(self) -> Scene:
@@ -71,14 +71,14 @@ def open_subject(path: Path, stage: Path, device: str) -> Subject:
     return Subject(path.stem, file, network(file, dressed.scene).to(dressed.device), dressed)
 
 
-def dressed_in(file: ModelFile, stage: Path, device: str) -> Dressed:
+def dressed_in(file: ModelFile, stage: Path, device: str) -> EvaluationScene:
     """Put the garment of a model or a baseline on the character of a stage."""
     skeleton = file.scene.character.skeleton
     character = read_character(open_stage(stage), root=None, garment=None)
     if character.skeleton.joint_names != skeleton.joint_names:
         fail(str(stage), "its joints are not the model's", "a model is measured on the character it was trained with")
     scene = replace(file.scene, character=replace(character, skeleton=skeleton))
-    return Dressed(scene, file.fabric, file.config.fps, chosen_device(device))
+    return EvaluationScene(scene, file.fabric, file.config.fps, chosen_device(device))
 
 
 def arguments(purpose: str) -> argparse.ArgumentParser:

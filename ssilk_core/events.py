@@ -58,14 +58,14 @@ Said = Started | Progress | Message | Checkpoint | Result | Failed
 
 
 @dataclass(frozen=True)
-class Garment:
+class GarmentEvent:
     """What one of several trainings says."""
 
     name: str
     said: Said
 
 
-Event = Said | Garment
+Event = Said | GarmentEvent
 
 
 class Reporter(Protocol):
@@ -89,7 +89,7 @@ class JsonReporter:
 
 
 def _document(event: Event) -> dict[str, Any]:
-    own = {"said": _document(event.said)} if isinstance(event, Garment) else {}
+    own = {"said": _document(event.said)} if isinstance(event, GarmentEvent) else {}
     return {"event": type(event).__name__.lower(), **finite(asdict(event)), **own}
 
 
@@ -170,7 +170,7 @@ def describe(event: Event) -> str:
             return f"error: {event.error}"
         case Result():
             return "\n".join(f"  {name}: {value}" for name, value in event.detail.items())
-        case Garment():
+        case GarmentEvent():
             return f"{event.name}: {describe(event.said)}"
     return ""
 

@@ -10,7 +10,7 @@ from itertools import product
 
 from .checkpoint import ModelFile
 from .errors import fail
-from .reduction import Reduced, Reducer, Size
+from .reduction import ModelSize, Reduced, Reducer
 
 ALL = 1_000_000  # more than any garment has
 
@@ -35,8 +35,8 @@ class Quality:
     about: str
 
     @property
-    def size(self) -> Size:
-        return Size(shapes=self.shapes, joints=self.joints, influences=self.influences)
+    def size(self) -> ModelSize:
+        return ModelSize(shapes=self.shapes, joints=self.joints, influences=self.influences)
 
     def rate(self, fps: float) -> float:
         """Return the frames per second of a shot whose motion has `fps`."""
@@ -103,11 +103,13 @@ def budget_of(text: str) -> Budget:
 SHAPES, JOINTS, INFLUENCES = (1.0, 0.75, 0.5, 0.375, 0.25, 0.125, 0.0), (1.0, 0.5, 0.25, 0.0), (ALL, 4)
 
 
-def candidates(whole: Size) -> list[Size]:
+def candidates(whole: ModelSize) -> list[ModelSize]:
     """Return the sizes that a budget is spent on, from all to nothing."""
     grid = product(JOINTS, INFLUENCES, SHAPES)  # shapes last: what others need is worked out once
     sizes = [
-        Size(shapes=round(share * whole.shapes), joints=round(joints * whole.joints), influences=most).within(whole)
+        ModelSize(shapes=round(share * whole.shapes), joints=round(joints * whole.joints), influences=most).within(
+            whole
+        )
         for joints, most, share in grid
     ]
     return list(dict.fromkeys(sizes))
@@ -121,7 +123,7 @@ class Choice:
     cost: float
 
 
-def best_within(reducer: Reducer, budget: Budget, cost: Callable[[ModelFile], float], most: Size) -> Choice:
+def best_within(reducer: Reducer, budget: Budget, cost: Callable[[ModelFile], float], most: ModelSize) -> Choice:
     """Return the model that loses least, as predicted, of those that cost no more than a budget, as measured.
 
     Args:
@@ -144,9 +146,9 @@ def best_within(reducer: Reducer, budget: Budget, cost: Callable[[ModelFile], fl
     )
 
 
-def _cheaper(reducer: Reducer, sizes: list[Size], cost: Callable[[ModelFile], float]) -> Iterator[Choice]:
+def _cheaper(reducer: Reducer, sizes: list[ModelSize], cost: Callable[[ModelFile], float]) -> Iterator[Choice]:
     """Yield models by what they lose, each without those that hold no less than one before."""
-    tried: list[Size] = []
+    tried: list[ModelSize] = []
     for size in sorted(sizes, key=lambda size: (reducer.predicted(size), sum(vars(size).values()))):
         if not any(other.within(size) == other for other in tried):
             tried.append(size)

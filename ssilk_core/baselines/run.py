@@ -14,10 +14,10 @@ import torch
 from ..devices import chosen_device
 from ..errors import fail
 from ..events import Checkpoint, Message, Progress, Reporter, Started
-from ..training.curve import Point, with_point
+from ..training.curve import CurvePoint, with_point
 from ..training.job import TrainJob
-from ..training.keeping import Keeper
 from ..training.parts import build_parts
+from ..training.run_files import RunFiles
 from ..training.state import Best, RunState, load_state, restore
 from ..training.validation import Score
 from ..training.verdict import not_finite, verdict
@@ -64,8 +64,8 @@ class BaselineRun:
     def __init__(self, job: BaselineJob, report: Reporter) -> None:
         self.job, self.report, base = job, report, job.base
         device = chosen_device(base.device)
-        self.keeper = Keeper(base, device)
-        self.keeper.tidy()
+        self.files = RunFiles(base, device)
+        self.files.tidy()
         parts = build_parts(base, device)
         joints = parts.model.joints
         inner = torch.as_tensor(base.scene.character.skeleton.parents[joints] >= 0, device=device)
@@ -91,8 +91,8 @@ class BaselineRun:
         return self.validator.plain_score()
 
     def _take_up(self) -> None:
-        self.state, tensors = load_state(self.keeper.state, self.state.asked)
-        restore(self.keeper.state, self.stepper, tensors)
+        self.state, tensors = load_state(self.files.state, self.state.asked)
+        restore(self.files.state, self.stepper, tensors)
         self.stepper.faults.count.fill_(self.state.undone)
         self._plan(self.state.seconds / self.state.iteration)
 
@@ -136,14 +136,14 @@ class BaselineRun:
             )
         self.report(verdict(state.iteration, score, self.plain, base.scene.rig.proxy_count > 0))
         finite = {name: value for name, value in self.batch.items() if math.isfinite(value)}
-        state.curve = with_point(state.curve, Point(state.iteration, state.seconds, finite, score))
+        state.curve = with_point(state.curve, CurvePoint(state.iteration, state.seconds, finite, score))
         state.undone = int(self.stepper.faults.count)
         if state.best is None or score.total < state.best.score.total:
             state.best = Best(state.iteration, score)
-            save_baseline(base.output, self.stepper.averaged, base.fabric, self.keeper.provenance(state, score))
+            save_baseline(base.output, self.stepper.averaged, base.fabric, self.files.provenance(state, score))
             self.report(Checkpoint(str(base.output), state.iteration, True))
-        self.keeper.save_state(self.stepper, state)
-        self.keeper.save_curve(state, self.plain)
+        self.files.save_state(self.stepper, state)
+        self.files.save_curve(state, self.plain)
 
 
 def train_baseline(job: BaselineJob, report: Reporter) -> RunState:

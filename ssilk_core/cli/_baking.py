@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from ssilk_usd.units import StageUnits
 
     from ..checkpoint import ModelFile
-    from ..farm.tasks import Task
+    from ..farm.tasks import BakeTask
     from ..model.network import GarmentModel
 
 CHUNK = 256  # frames in memory at once
@@ -58,7 +58,7 @@ class BakeRequest:
     keep: str = ""  # blendshapes, proxies and influences of the model, "24,12,4"; all where empty
 
     @classmethod
-    def of(cls, task: Task) -> BakeRequest:
+    def of(cls, task: BakeTask) -> BakeRequest:
         """Return what a task asks for, which is the whole model."""
         return cls(**{item.name: getattr(task, item.name) for item in fields(cls) if item.name != "keep"})
 
@@ -263,10 +263,10 @@ class Dressed:
 
     def _cut(self, motion: Motion) -> Dressed:
         """Return the garment with as much kept as the request says: what is best for this motion."""
-        from ..reduction import Reducer, Size
+        from ..reduction import ModelSize, Reducer
 
         reducer = Reducer(self.file, [motion])
-        found = reducer.reduced(Size.of(self.request.keep))
+        found = reducer.reduced(ModelSize.of(self.request.keep))
         assert self.model is not None
         model, deformer = worn(found.file, self.model, self.request)
         provenance = {**self.provenance, "reduced": lost(reducer.whole, found)}

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import fail
 from ..events import Message, Reporter, silent
-from ..farm.record import NAME, Record, is_current, read_record, task_key, write_record
-from ..farm.tasks import Task
+from ..farm.record import NAME, TaskRecord, is_current, read_record, task_key, write_record
+from ..farm.tasks import BakeTask
 from ..files import remove_unfinished, replacing, sha256
 from ..targets import need_influences
 from ._baking import Bake, BakeRequest, Dressed, dressed
@@ -31,11 +31,11 @@ class Wardrobe:
         self.open = lru_cache(maxsize=1)(dressed)
         self.written: tuple[object, Asset] | None = None
 
-    def dressed(self, task: Task) -> Dressed:
+    def dressed(self, task: BakeTask) -> Dressed:
         """Return the garment of a task, ready for any motion."""
         return self.open(replace(BakeRequest.of(task), motion=""))
 
-    def asset(self, task: Task, layout: Layout, report: Reporter) -> Asset:
+    def asset(self, task: BakeTask, layout: Layout, report: Reporter) -> Asset:
         """Return the asset of a task, which is there as `_write_asset` leaves it."""
         garment = self.dressed(task)
         asked = (garment, task.body, layout.asset)
@@ -49,14 +49,14 @@ def _digests(layout: Layout) -> list[str]:
     return [sha256(path) for path in (layout.asset, layout.geometry) if path.is_file()]
 
 
-def layout_of(task: Task, folder: Path) -> Layout:
+def layout_of(task: BakeTask, folder: Path) -> Layout:
     """Return where the files of a task lie."""
     from ssilk_usd.layers import Layout
 
     return Layout(folder, task.garment, task.shot)
 
 
-def key_of(task: Task) -> str:
+def key_of(task: BakeTask) -> str:
     """Return the key of a task, from what its inputs hold now.
 
     Raises:
@@ -74,13 +74,13 @@ def key_of(task: Task) -> str:
     return task_key(task, contents)
 
 
-def is_done(task: Task, folder: Path) -> bool:
+def is_done(task: BakeTask, folder: Path) -> bool:
     """Return whether a task is done with the inputs as they are now, and its files are as they were written."""
     return is_current(layout_of(task, folder).animation.parent, key_of(task))
 
 
 def bake_task(
-    task: Task, folder: Path, wardrobe: Wardrobe, report: Reporter, *, again: bool = False
+    task: BakeTask, folder: Path, wardrobe: Wardrobe, report: Reporter, *, again: bool = False
 ) -> dict[str, object]:
     """Bake one garment in one shot, unless that is done already; return figures for people.
 
@@ -100,11 +100,11 @@ def bake_task(
     detail = _write_animation(layout, asset, bake, task, report)
     files = [layout.animation, layout.asset, layout.geometry, *([layout.points] if task.points else [])]
     written = {os.path.relpath(path, home): sha256(path) for path in files}
-    write_record(home, Record(key=key, files=written, detail=detail))
+    write_record(home, TaskRecord(key=key, files=written, detail=detail))
     return {"layer": str(layout.animation), **detail}
 
 
-def _write_asset(layout: Layout, garment: Dressed, task: Task, report: Reporter) -> Asset:
+def _write_asset(layout: Layout, garment: Dressed, task: BakeTask, report: Reporter) -> Asset:
     """Write the asset of a task where it is not there already; warn of what layers above relied on."""
     from ssilk_usd import layers
 
@@ -116,7 +116,7 @@ def _write_asset(layout: Layout, garment: Dressed, task: Task, report: Reporter)
     return written.asset
 
 
-def _write_animation(layout: Layout, asset: Asset, bake: Bake, task: Task, report: Reporter) -> dict[str, object]:
+def _write_animation(layout: Layout, asset: Asset, bake: Bake, task: BakeTask, report: Reporter) -> dict[str, object]:
     """Write and prove what moves; return figures."""
     from ssilk_usd import layers
 
@@ -153,7 +153,7 @@ def _write_animation(layout: Layout, asset: Asset, bake: Bake, task: Task, repor
     }
 
 
-def write_stages(tasks: Sequence[Task], folder: Path, report: Reporter) -> None:
+def write_stages(tasks: Sequence[BakeTask], folder: Path, report: Reporter) -> None:
     """Write the stage of each shot of tasks that are done; name shots that an asset outgrew."""
     from ssilk_usd.layers import write_stage
 
@@ -171,7 +171,7 @@ def write_stages(tasks: Sequence[Task], folder: Path, report: Reporter) -> None:
                 f"({', '.join(outgrown[:3])}); bake them again", "warning"))  # fmt: skip
 
 
-def clear(tasks: Sequence[Task], folder: Path) -> None:
+def clear(tasks: Sequence[BakeTask], folder: Path) -> None:
     """Remove what killed processes left half-written of tasks that nobody works on any more."""
     layouts = [layout_of(task, folder) for task in tasks]
     shared = {path for layout in layouts for path in (layout.asset, layout.geometry, layout.stage)}

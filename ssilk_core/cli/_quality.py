@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from ..events import Message, Reporter
 from ..quality import QUALITIES, best_within, budget_of, in_units, quality_named
-from ..reduction import Size
+from ..reduction import ModelSize
 
 if TYPE_CHECKING:
     from ..assets import Motion
@@ -26,12 +26,12 @@ def add_level(verb: argparse.ArgumentParser, size: str) -> None:
     verb.add_argument("--budget", metavar="AMOUNT", help=f"keep the most within 0.3ms for each frame, or {size}")
 
 
-def level_size(quality: str | None, whole: Size) -> Size:
+def level_size(quality: str | None, whole: ModelSize) -> ModelSize:
     """Return what a level keeps of a model; all without one."""
     return quality_named(quality).size.within(whole) if quality else whole
 
 
-def lost(whole: Size, found: Reduced) -> dict[str, object]:
+def lost(whole: ModelSize, found: Reduced) -> dict[str, object]:
     """Return what was kept of a model, and what that loses."""
     names = dict(zip(NUMBERS, ("blendshapes", "proxies", "influences")))
     return {
@@ -44,7 +44,7 @@ def lost(whole: Size, found: Reduced) -> dict[str, object]:
 def spent(
     text: str,
     reducer: Reducer,
-    most: Size,
+    most: ModelSize,
     motion: Motion,
     size: Callable[[ModelFile], float],
     report: Reporter,

@@ -32,7 +32,7 @@ from .options import add_bake, check_output, is_folder, layer_tasks, tasks_of
 if TYPE_CHECKING:
     from ssilk_usd.shot import ShotSummary
 
-    from ..farm.tasks import Task
+    from ..farm.tasks import BakeTask
     from ._baking import Bake, BakeRequest
 
 
@@ -96,7 +96,7 @@ def _bake_file(options: argparse.Namespace, report: Reporter) -> int:
     return EXIT_OK
 
 
-def _one_task(options: argparse.Namespace) -> Task:
+def _one_task(options: argparse.Namespace) -> BakeTask:
     """Return the only task; raise `SsilkError` where there are more, or the file cannot be what is asked for."""
     from ssilk_usd.read_stage import split_location
 
@@ -114,7 +114,9 @@ def _one_task(options: argparse.Namespace) -> Task:
     return task
 
 
-def _write_proven(bake: Bake, task: Task, output: Path, report: Reporter) -> tuple[ShotSummary, dict[str, object]]:
+def _write_proven(
+    bake: Bake, task: BakeTask, output: Path, report: Reporter
+) -> tuple[ShotSummary, dict[str, object]]:
     """Write a file that appears once it is proven; return what it holds, and figures."""
     from ssilk_usd.export import packaged
 
@@ -126,7 +128,7 @@ def _write_proven(bake: Bake, task: Task, output: Path, report: Reporter) -> tup
         return summary, bake.verify(unproven, report) if task.verify else {}
 
 
-def _request(task: Task, options: argparse.Namespace) -> BakeRequest:
+def _request(task: BakeTask, options: argparse.Namespace) -> BakeRequest:
     """Return what a task asks for, refined as its level of quality is where the options say nothing of it."""
     from ._baking import BakeRequest
 
@@ -142,7 +144,7 @@ def _request(task: Task, options: argparse.Namespace) -> BakeRequest:
     return request
 
 
-def _write(layer: Path, bake: Bake, task: Task, output: Path) -> ShotSummary:
+def _write(layer: Path, bake: Bake, task: BakeTask, output: Path) -> ShotSummary:
     """Write a shot whose garment joints move, or one that has its points refined."""
     from ssilk_usd.points import point_cache
     from ssilk_usd.shot import write_shot

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
     from ..baselines.networks import Baseline
     from ..checkpoint import ModelFile
-    from ..evaluation.methods import Dressed
-    from ..evaluation.run import EvaluationOptions, Playlist, Row, Subject
+    from ..evaluation.methods import EvaluationScene
+    from ..evaluation.run import EvaluatedModel, EvaluationClips, EvaluationOptions, ResultRow
     from ..model.network import GarmentModel
 
 
@@ -74,7 +74,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     asked = _asked(options)
     device = chosen_device(options.device)
     opened = [Opened(path, *load_network(path)) for path in options.models]
-    rows: list[Row] = []
+    rows: list[ResultRow] = []
     found: list[dict[str, Any]] = []
     for models in _by_garment(opened):
         dressed, subjects = _dressed(models[0].file, options, device), _subjects(models, device)
@@ -139,34 +139,34 @@ def _by_garment(opened: Iterable[Opened]) -> list[list[Opened]]:
     return list(groups.values())
 
 
-def _subjects(models: list[Opened], device: torch.device) -> list[Subject]:
+def _subjects(models: list[Opened], device: torch.device) -> list[EvaluatedModel]:
     """Return the networks of one garment, called after their files where several are of one method."""
-    from ..evaluation.run import Subject
+    from ..evaluation.run import EvaluatedModel
 
     methods = [one.method for one in models]
     names = [
         method if methods.count(method) == 1 else f"{method} ({one.path.stem})"
         for method, one in zip(methods, models)
     ]
-    return [Subject(name, one.model.to(device), one.file.joints) for name, one in zip(names, models)]
+    return [EvaluatedModel(name, one.model.to(device), one.file.joints) for name, one in zip(names, models)]
 
 
-def _dressed(file: ModelFile, options: argparse.Namespace, device: torch.device) -> Dressed:
+def _dressed(file: ModelFile, options: argparse.Namespace, device: torch.device) -> EvaluationScene:
     """Put the garment of a model on the character of the stage."""
     from ssilk_usd.read_stage import open_stage
 
-    from ..evaluation.methods import Dressed
+    from ..evaluation.methods import EvaluationScene
     from ._baking import on_character
 
     scene = on_character(file, open_stage(options.stage), options.root)
-    return Dressed(scene, file.fabric, file.config.fps, device, exact=options.exact)
+    return EvaluationScene(scene, file.fabric, file.config.fps, device, exact=options.exact)
 
 
-def _playlist(options: argparse.Namespace, dressed: Dressed) -> Playlist:
+def _playlist(options: argparse.Namespace, dressed: EvaluationScene) -> EvaluationClips:
     """Read the clips that are asked for, and what there is to compare with."""
     from ssilk_usd.read_motion import read_motion, read_motions
 
-    from ..evaluation.run import Playlist
+    from ..evaluation.run import EvaluationClips
     from ._reference import References
 
     skeleton = dressed.scene.character.skeleton
@@ -176,7 +176,7 @@ def _playlist(options: argparse.Namespace, dressed: Dressed) -> Playlist:
     if options.reference:
         vertices = dressed.scene.garment.mesh.vertex_count
         reference = References(options.reference, dressed.name, vertices, dressed.fps)
-    return Playlist(
+    return EvaluationClips(
         clips={name: read_motion(files[name], skeleton) for name in names},
         splits=splits,
         simulated=reference.clips & names.keys() if reference else frozenset(),

@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import EXIT_OK, EXIT_TASKS, fail
-from ..events import Failed, Garment, Progress, Reporter, Result, Started, silent
+from ..events import Failed, GarmentEvent, Progress, Reporter, Result, Started, silent
 from ..farm.openjd import TEMPLATE, BundleOptions, write_bundle
-from ..farm.tasks import Task
+from ..farm.tasks import BakeTask
 from .options import add_bake, layer_tasks
 
 if TYPE_CHECKING:
-    from ..farm.cluster import Outcome
+    from ..farm.cluster import TaskOutcome
     from ._layers import Wardrobe
 
 
@@ -61,7 +61,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     return _run(tasks, options, report)
 
 
-def _absolute(task: Task) -> Task:
+def _absolute(task: BakeTask) -> BakeTask:
     """Return a task whose inputs are named from the root: workers start elsewhere."""
     from ssilk_usd.read_stage import split_location
 
@@ -72,7 +72,7 @@ def _absolute(task: Task) -> Task:
     )
 
 
-def _write(tasks: Sequence[Task], options: argparse.Namespace, report: Reporter) -> int:
+def _write(tasks: Sequence[BakeTask], options: argparse.Namespace, report: Reporter) -> int:
     for name in ("chunk", "memory", "timeout"):
         if not getattr(options, name) > 0:
             fail(f"--{name}", str(getattr(options, name)), "a positive number is needed")
@@ -91,17 +91,17 @@ def _write(tasks: Sequence[Task], options: argparse.Namespace, report: Reporter)
     return EXIT_OK
 
 
-def _run(tasks: Sequence[Task], options: argparse.Namespace, report: Reporter) -> int:
+def _run(tasks: Sequence[BakeTask], options: argparse.Namespace, report: Reporter) -> int:
     from ..farm.cluster import run_on_cluster
     from ._layers import clear, write_stages
 
     report(Started("farm", len(tasks), {"output": str(options.output)}))
-    ended: list[Outcome] = []
+    ended: list[TaskOutcome] = []
     where = {"address": options.cluster or None, "cores": options.cores, "gpu": options.gpu}
     for outcome in run_on_cluster(tasks, options.output, bake_here, **where):
         ended.append(outcome)
         if outcome.error:
-            report(Garment(outcome.task.name, Failed(outcome.error)))
+            report(GarmentEvent(outcome.task.name, Failed(outcome.error)))
         report(Progress(len(ended), len(tasks)))
     clear(tasks, options.output)
     done = [outcome for outcome in ended if not outcome.error]
@@ -111,7 +111,7 @@ def _run(tasks: Sequence[Task], options: argparse.Namespace, report: Reporter) -
     return EXIT_TASKS if failed else EXIT_OK
 
 
-def bake_here(task: Task, folder: Path) -> dict[str, object]:
+def bake_here(task: BakeTask, folder: Path) -> dict[str, object]:
     """Bake a task in this process, which keeps the garment of the last one."""
     from ._layers import bake_task
 

@@ -12,7 +12,7 @@ from ..config import overridden
 from ..errors import fail
 from ..events import Reporter
 from ..fabrics import FABRICS, Fabric, fabric_named
-from ..farm.tasks import Task, plan
+from ..farm.tasks import BakeTask, plan
 from ..files import need_writable
 from ..setup.classes import ClassOptions
 from ..setup.rig import RigOptions
@@ -124,12 +124,12 @@ def _add_output(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--device", default="cpu", help="where the network runs (default cpu)")
 
 
-def tasks_of(options: argparse.Namespace) -> list[Task]:
+def tasks_of(options: argparse.Namespace) -> list[BakeTask]:
     """Return the tasks that the options of `add_bake` ask for."""
     from ssilk_usd.read_stage import split_location
 
     named = [split_location(model) for model in options.model]
-    like = Task(
+    like = BakeTask(
         garment="", shot="", model="", motion="",
         stage=str(options.stage),
         fps=options.fps,
@@ -148,7 +148,7 @@ def tasks_of(options: argparse.Namespace) -> list[Task]:
     return plan([(model, root or options.root) for model, root in named], options.motion, like)
 
 
-def layer_tasks(options: argparse.Namespace) -> list[Task]:
+def layer_tasks(options: argparse.Namespace) -> list[BakeTask]:
     """Return the tasks that the options of `add_bake` ask for, as layers.
 
     Raises:

@@ -75,13 +75,13 @@ def _shot(path: Path, report: Reporter) -> list[Section]:
     from ssilk_usd.read_shot import read_parts
 
     from ..report.page import Section, facts
-    from ..report.shots import Dressed, shot_sections
+    from ..report.shots import ShotGarment, shot_sections
 
     shot = Shot(path)
     parts = read_parts(shot)
     report(Started("report", len(shot.frame_times)))
     garments = [
-        Dressed(index, part.mesh, _fabric(part.record))
+        ShotGarment(index, part.mesh, _fabric(part.record))
         for index, (mesh, part) in enumerate(zip(shot.meshes, parts))
         if mesh.is_garment
     ]

@@ -18,8 +18,8 @@ from ..events import Message, Progress, Reporter, Result, Started
 from .options import check_output
 
 if TYPE_CHECKING:
-    from ..stress.outcome import Outcome
-    from ..stress.subject import Subject
+    from ..stress.outcome import CaseOutcome
+    from ..stress.subject import StressSubject
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -73,22 +73,22 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     return EXIT_VERIFICATION if faults else EXIT_OK
 
 
-def _subject(options: argparse.Namespace) -> Subject:
+def _subject(options: argparse.Namespace) -> StressSubject:
     """Load the model, its character and the motion."""
     from ssilk_usd.read_motion import read_motion
     from ssilk_usd.read_stage import open_stage
 
     from ..checkpoint import load_model
-    from ..stress.subject import FULL, QUICK, Subject
+    from ..stress.subject import FULL, QUICK, StressSubject
     from ._baking import on_character
 
     file = load_model(options.model)
     scene = on_character(file, open_stage(options.stage), options.root)
     clip = read_motion(str(options.motion), scene.character.skeleton) if options.motion else None
-    return Subject(file, scene, clip, QUICK if options.quick else FULL)
+    return StressSubject(file, scene, clip, QUICK if options.quick else FULL)
 
 
-def _write(options: argparse.Namespace, outcomes: list[Outcome]) -> None:
+def _write(options: argparse.Namespace, outcomes: list[CaseOutcome]) -> None:
     from .. import __version__
     from ..devices import chosen_device, device_name
     from ..events import finite

@@ -13,10 +13,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..errors import EXIT_OK, EXIT_TASKS, SsilkError, VerificationError
-from ..events import Event, Failed, Garment, Message, Progress, Reporter, Result, Started
+from ..events import Event, Failed, GarmentEvent, Message, Progress, Reporter, Result, Started
 from ..farm.job import numbers, read_job
 from ..farm.openjd import OpenJdReporter
-from ..farm.tasks import Task
+from ..farm.tasks import BakeTask
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -43,22 +43,22 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     return _bake(chosen, options, report)
 
 
-def _bake(tasks: Sequence[Task], options: argparse.Namespace, report: Reporter) -> int:
+def _bake(tasks: Sequence[BakeTask], options: argparse.Namespace, report: Reporter) -> int:
     from ._layers import Wardrobe, bake_task
 
     wardrobe, failed = Wardrobe(), 0
     for index, task in enumerate(tasks):
-        report(Garment(task.name, Started("bake", 1)))
+        report(GarmentEvent(task.name, Started("bake", 1)))
         part = _part(report, index, len(tasks))
         try:
             report(
-                Garment(
+                GarmentEvent(
                     task.name, Result("bake", bake_task(task, options.output, wardrobe, part, again=options.again))
                 )
             )
         except SsilkError as error:
             failed += 1
-            report(Garment(task.name, Failed(str(error))))
+            report(GarmentEvent(task.name, Failed(str(error))))
         report(Progress(index + 1, len(tasks)))
     return EXIT_TASKS if failed else EXIT_OK
 
@@ -75,7 +75,7 @@ def _part(report: Reporter, index: int, count: int) -> Reporter:
     return part
 
 
-def _check(tasks: Sequence[Task], output: Path, report: Reporter) -> int:
+def _check(tasks: Sequence[BakeTask], output: Path, report: Reporter) -> int:
     """Write the stages of the shots and raise `VerificationError` unless everything is there."""
     from ._layers import clear, write_stages
 
@@ -92,7 +92,7 @@ def _check(tasks: Sequence[Task], output: Path, report: Reporter) -> int:
     return EXIT_OK
 
 
-def _is_done(task: Task, output: Path, report: Reporter) -> bool:
+def _is_done(task: BakeTask, output: Path, report: Reporter) -> bool:
     from ._layers import is_done
 
     try:

@@ -24,8 +24,8 @@ from . import options as shared
 if TYPE_CHECKING:
     from ..assets import Motion
     from ..checkpoint import ModelFile
-    from ..evaluation.methods import Dressed, Method, Reel
-    from ..trade.measure import Meter, Weigh
+    from ..evaluation.methods import EvaluationScene, Method, TakeSet
+    from ..trade.measure import VariantMeter, Weigh
     from ._baking import Bake
 
 CLIPS = 2  # that are measured on where none are named
@@ -125,33 +125,33 @@ class Bench:
             "ssilk": __version__,
         }
 
-    def meter(self, path: Path, file: ModelFile, *, only: str | None = None) -> Meter:
+    def meter(self, path: Path, file: ModelFile, *, only: str | None = None) -> VariantMeter:
         """Return what measures a model on all clips, cut for other motions; or on `only` one, cut for it."""
         from ..evaluation.methods import reel_of
         from ..evaluation.takes import takes_of
         from ..reduction import Reducer
-        from ..trade.measure import Meter
+        from ..trade.measure import VariantMeter
 
         dressed = self._dressed(file)
         clips = {only: self.clips[only]} if only else self.clips
         takes = [take for name, clip in clips.items() for take in takes_of(name, clip, dressed.fps)]
         reel = reel_of(takes, dressed, file.joints)
         reducer = Reducer(file, [self.clips[only]] if only else self.others)
-        return Meter(path.stem, reducer, dressed, reel, self._weigh(path), self._reference(dressed, reel))
+        return VariantMeter(path.stem, reducer, dressed, reel, self._weigh(path), self._reference(dressed, reel))
 
-    def _dressed(self, file: ModelFile) -> Dressed:
+    def _dressed(self, file: ModelFile) -> EvaluationScene:
         """Put a garment on the character of the stage."""
         from ssilk_usd.read_stage import open_stage
 
-        from ..evaluation.methods import Dressed
+        from ..evaluation.methods import EvaluationScene
         from ._baking import on_character
 
         scene = on_character(file, open_stage(self.options.stage), self.options.root)
-        return Dressed(scene, file.fabric, file.config.fps, self.device)
+        return EvaluationScene(scene, file.fabric, file.config.fps, self.device)
 
-    def _reference(self, dressed: Dressed, reel: Reel) -> Method | None:
+    def _reference(self, dressed: EvaluationScene, reel: TakeSet) -> Method | None:
         """Return what the simulator made of the clips, where a folder of that is named."""
-        from ..evaluation.methods import Cache
+        from ..evaluation.methods import CachedPoints
         from ._reference import References
 
         folder: Path | None = self.options.reference
@@ -166,7 +166,7 @@ class Bench:
                 "each clip needs one",
                 "simulate them with 'ssilk simulate'",
             )
-        return Cache("simulator", found.read, dressed, reel)
+        return CachedPoints("simulator", found.read, dressed, reel)
 
     def _weigh(self, path: Path) -> Weigh:
         """Return what tells how large a model's shots of the first clip are, without the body."""

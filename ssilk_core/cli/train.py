@@ -72,9 +72,9 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     shared.check_output(options.output)
     if not (options.minutes is None or 0 < options.minutes < inf):
         fail("--minutes", f"{options.minutes}", "a time is more than nothing")
-    with joined(options.device) as (team, device), interruptible() as stop:
-        report = report if team.first else silent
-        trained = train(training_job(options, device, report), report, stop, team)
+    with joined(options.device) as (group, device), interruptible() as stop:
+        report = report if group.first else silent
+        trained = train(training_job(options, device, report), report, stop, group)
     share = 1 - trained.score.total / trained.plain.total
     report(
         Result(

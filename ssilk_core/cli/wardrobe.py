@@ -25,13 +25,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..errors import SsilkError, fail
-from ..events import Failed, Garment, Message, Reporter, Result, Said, Started
+from ..events import Failed, GarmentEvent, Message, Reporter, Result, Said, Started
 from ..files import need_writable
-from ..wardrobe.listing import Entry, read_list
-from ..wardrobe.panel import Panel, table
+from ..wardrobe.listing import WardrobeEntry, read_list
+from ..wardrobe.panel import ProgressTable, table
 from ..wardrobe.queue import End, Queue, Slot
 from ..wardrobe.record import request_hash
-from ..wardrobe.training import Training
+from ..wardrobe.training import GarmentTraining
 from . import options as shared
 from . import train
 
@@ -55,9 +55,9 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     device, slots = _slots(options.device, options.jobs)
     need_writable(options.output / "log")
     entries = read_list(options.list)
-    trainings = [Training(entry, options.output, _request(entry, options.list)) for entry in entries]
+    trainings = [GarmentTraining(entry, options.output, _request(entry, options.list)) for entry in entries]
     options.output.mkdir(parents=True, exist_ok=True)
-    show = report if options.json else Panel([entry.name for entry in entries])
+    show = report if options.json else ProgressTable([entry.name for entry in entries])
     show(Started("wardrobe", len(trainings), {"device": device, "at a time": len(slots)}))
     _train(trainings, options.list.absolute().parent, device, slots, show)
     rows = [training.row() for training in trainings]
@@ -68,7 +68,9 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     return max(training.code for training in trainings)
 
 
-def _train(trainings: Sequence[Training], source: Path, device: str, slots: Sequence[Slot], show: Reporter) -> None:
+def _train(
+    trainings: Sequence[GarmentTraining], source: Path, device: str, slots: Sequence[Slot], show: Reporter
+) -> None:
     """Train what waits, the paths of the list being relative to `source`."""
     from ..training.signals import interruptible
 
@@ -77,7 +79,7 @@ def _train(trainings: Sequence[Training], source: Path, device: str, slots: Sequ
     def tell(name: str, event: Said) -> None:
         if isinstance(event, Failed):
             named[name].error = event.error
-        show(Garment(name, event))
+        show(GarmentEvent(name, event))
 
     def ended(name: str, end: End) -> None:
         named[name].end(end)
@@ -112,7 +114,7 @@ def _visible_gpus() -> list[str]:
     return [name.strip() for name in visible.split(",")][:count] if visible else [str(n) for n in range(count)]
 
 
-def _request(entry: Entry, path: Path) -> str:
+def _request(entry: WardrobeEntry, path: Path) -> str:
     """Return a hash of what is asked for a garment of the list at `path`.
 
     Raises:

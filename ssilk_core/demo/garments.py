@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from ..assets import Character, Floats, Garment, Ints, Mesh
 from ..errors import fail
 from .garments_dress import hooded_dress
-from .garments_fit import Fit, fit, outline, relax, through
+from .garments_fit import BodyFit, fit, outline, relax, through
 from .garments_mesh import loft
 
 CLEARANCE = 0.012  # [m]; more than the 6 mm that must remain, because triangles cut corners
@@ -27,7 +27,7 @@ def build_garment(name: str, character: Character) -> Garment:
     return Garment(Mesh(f"/{''.join(word.title() for word in name.split('_'))}", points, faces))
 
 
-def cape(fit: Fit) -> tuple[Floats, Ints]:
+def cape(fit: BodyFit) -> tuple[Floats, Ints]:
     """Cut a cape: collar and yoke on the shoulders, open at the front, flared to the calves."""
     s = fit.size
     grid, depth = through(cape_keys(fit, s), 81)
@@ -35,7 +35,7 @@ def cape(fit: Fit) -> tuple[Floats, Ints]:
     return loft(relax(fit, grid, CLEARANCE, cling=cling, rounds=60), 0.0205 * s)
 
 
-def cape_keys(fit: Fit, s: float) -> Floats:
+def cape_keys(fit: BodyFit, s: float) -> Floats:
     """Return the lines across a cape that shape it, from collar to hem, shape (6, 61, 3)."""
     nape, shoulder, knee = fit.joint("Neck"), fit.joint("LeftArm"), fit.joint("LeftLeg")
     return np.stack(
@@ -74,7 +74,7 @@ def arc(degrees: float, half_width: float, middle: ArrayLike, end: ArrayLike) ->
     return line
 
 
-def fringe_skirt(fit: Fit) -> tuple[Floats, Ints]:
+def fringe_skirt(fit: BodyFit) -> tuple[Floats, Ints]:
     """Cut a skirt: a waistband on the hips, and 32 strips that hang from it to the knees, free of each other."""
     strips, band = 32, 8
     grid = skirt_surface(fit, strips * 3 + 1, band)[:, :-1]
@@ -96,7 +96,7 @@ def halve(quads: Ints, forward: Ints) -> Ints:
     return np.concatenate([first, second])
 
 
-def skirt_surface(fit: Fit, columns: int, band: int) -> Floats:
+def skirt_surface(fit: BodyFit, columns: int, band: int) -> Floats:
     """Return a closed grid from the waist to the knees whose first `band` rows cling to the hips."""
     s, hips, knee = fit.size, fit.joint("Hips"), fit.joint("LeftLeg")
     top, hem, edge = hips[1] + 0.125 * s, knee[1] - 0.01 * s, 0.0125 * s

@@ -9,14 +9,14 @@ from dataclasses import replace
 import numpy as np
 
 from ..assets import Floats, Ints
-from .garments_fit import Fit, keep_off, outline, relax, through
+from .garments_fit import BodyFit, keep_off, outline, relax, through
 from .garments_mesh import cap, cut, length, loft
 
 CLEARANCE = 0.013  # [m]
 EDGE = 0.023  # [m]
 
 
-def hooded_dress(fit: Fit) -> tuple[Floats, Ints]:
+def hooded_dress(fit: BodyFit) -> tuple[Floats, Ints]:
     """Cut the dress: hood round the head, bodice close to the chest, skirt flared to the ankles."""
     s = fit.size
     trunk = without_arms(fit, s)
@@ -36,14 +36,14 @@ def hooded_dress(fit: Fit) -> tuple[Floats, Ints]:
     return points, faces
 
 
-def without_arms(fit: Fit, s: float) -> Fit:
+def without_arms(fit: BodyFit, s: float) -> BodyFit:
     """Return the body less its arms, from a little inside the shoulder joints."""
     beyond = np.abs(fit.points[:, 0]) > fit.joint("LeftArm")[0] + 0.03 * s
     arms = beyond & (fit.points[:, 1] > fit.joint("LeftLeg")[1] + 0.2 * s)
     return replace(fit, faces=fit.faces[~arms[fit.faces].any(axis=1)])
 
 
-def dress_keys(trunk: Fit, s: float) -> Floats:
+def dress_keys(trunk: BodyFit, s: float) -> Floats:
     """Return closed lines round the body that shape the dress, from crown to hem, shape (K, 97, 3)."""
     head, neck, shoulder, hips = (trunk.joint(name) for name in ("Head", "Neck", "LeftArm", "Hips"))
     crown = trunk.points[:, 1].max()
@@ -85,7 +85,7 @@ def dress_keys(trunk: Fit, s: float) -> Floats:
     )
 
 
-def face_opening(fit: Fit, s: float, points: Floats) -> Floats:
+def face_opening(fit: BodyFit, s: float, points: Floats) -> Floats:
     """Return how far points lie inside the opening for the face [m], positive inside, shape (N,)."""
     chin = fit.joint("Head")
     crown = fit.points[:, 1].max()

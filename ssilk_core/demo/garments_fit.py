@@ -23,7 +23,7 @@ PROPORTIONS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class BodyFit:
     """A body in its bind pose to cut garments on: points [m] (V, 3), faces (F, 3), joint positions by plain name."""
 
     points: Floats
@@ -57,21 +57,23 @@ class Fit:
         return distance, away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
 
 
-def fit(character: Character) -> Fit:
+def fit(character: Character) -> BodyFit:
     """Return the merged body of a character with its joint positions at the bind pose."""
     body, skeleton = character.merged_body(), character.skeleton
     names = [name.rsplit("/", 1)[-1].rsplit(":", 1)[-1] for name in skeleton.joint_names]
     joints = dict(zip(names, skeleton.bind_transforms[:, :3, 3]))
-    return Fit(np.asarray(body.mesh.points), np.asarray(body.mesh.faces), joints)
+    return BodyFit(np.asarray(body.mesh.points), np.asarray(body.mesh.faces), joints)
 
 
-def keep_off(fit: Fit, points: Floats, clearance: float) -> Floats:
+def keep_off(fit: BodyFit, points: Floats, clearance: float) -> Floats:
     """Return points (N, 3) moved out to `clearance` [m] from the body where they are closer or inside."""
     distance, away = fit.nearest(points)
     return points + np.maximum(clearance - distance, 0.0)[:, None] * away
 
 
-def relax(fit: Fit, grid: Floats, clearance: float, *, cling: Floats, rounds: int, closed: bool = False) -> Floats:
+def relax(
+    fit: BodyFit, grid: Floats, clearance: float, *, cling: Floats, rounds: int, closed: bool = False
+) -> Floats:
     """Smooth a grid of points, shape (rows, columns, 3), while it stays off the body.
 
     `cling` in [0, 1], shape (rows, 1), is how much each row is drawn to lie at `clearance` [m] from the body. The
@@ -100,7 +102,7 @@ def through(keys: Floats, count: int) -> tuple[Floats, Floats]:
     return PchipInterpolator(at, keys)(depth), depth
 
 
-def outline(fit: Fit, height: float, clearance: float, *, half_width: float, count: int = 97) -> Floats:
+def outline(fit: BodyFit, height: float, clearance: float, *, half_width: float, count: int = 97) -> Floats:
     """Return a closed convex line round the body at a height [m], from the back by its left side, shape (count, 3).
 
     Only what lies within `half_width` [m] of the middle is seen, so that hanging arms are left out.

@@ -57,13 +57,13 @@ def locomotion(biped: Biped, gait: Gait, cycles: float, *turns: tuple[float, flo
     time = clock(BEFORE + seconds + AFTER)
     gone = travel((time - BEFORE) * gait.rate, cycles + spell, spell)
     pace = ease((time - BEFORE) * gait.rate / spell) * ease((BEFORE + seconds - time) * gait.rate / spell)
-    course = Course(gait.stride * biped.scale, cycles - gait.soft, turns)
+    course = WalkPath(gait.stride * biped.scale, cycles - gait.soft, turns)
     phase = gone + START
     body = carry(biped, gait, phase, pace, travel(gone, cycles, gait.soft), course)
     return step(biped, gait, phase, pace, course, body)
 
 
-class Course:
+class WalkPath:
     """The line that a figure follows, by cycles gone."""
 
     def __init__(self, stride: float, cycles: float, turns: tuple[tuple[float, float, float], ...]) -> None:
@@ -87,7 +87,7 @@ class Course:
         return self.line(np.clip(gone, 0.0, self.cycles))
 
 
-def carry(biped: Biped, gait: Gait, phase: Floats, pace: Floats, gone: Floats, course: Course) -> Track:
+def carry(biped: Biped, gait: Gait, phase: Floats, pace: Floats, gone: Floats, course: WalkPath) -> Track:
     """Return pelvis, spine and arms of a gait: bob, sway, twist, and arms against the legs."""
     scale, still = biped.scale, biped.stand(len(phase))
     once, side = np.sin(2 * np.pi * phase), np.cos(2 * np.pi * phase)
@@ -110,7 +110,7 @@ def carry(biped: Biped, gait: Gait, phase: Floats, pace: Floats, gone: Floats, c
     return replace(still, hips=hips, pelvis=turned(angles), spine=spine, head=-0.5 * spine, arms=arms)
 
 
-def step(biped: Biped, gait: Gait, phase: Floats, pace: Floats, course: Course, body: Track) -> Track:
+def step(biped: Biped, gait: Gait, phase: Floats, pace: Floats, course: WalkPath, body: Track) -> Track:
     """Return a track with its feet: standing by turns, rolling off over the ball, swinging to the next stand."""
     sides = [foot(biped, gait, phase, pace, course, side) for side in range(2)]
     feet, toes, ground, heel, lift = (np.stack(values, axis=1) for values in zip(*sides))
@@ -120,7 +120,7 @@ def step(biped: Biped, gait: Gait, phase: Floats, pace: Floats, course: Course, 
 
 
 def foot(
-    biped: Biped, gait: Gait, phase: Floats, pace: Floats, course: Course, side: int
+    biped: Biped, gait: Gait, phase: Floats, pace: Floats, course: WalkPath, side: int
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Return one foot's rotations, toe bends, ground points, shares of heel pivot and lifts."""
     centres = np.arange(-0.5 * side, course.cycles + gait.soft + 1e-6)
@@ -148,7 +148,7 @@ def foot(
 
 
 def plants(
-    biped: Biped, gait: Gait, course: Course, centres: Floats, inner: Floats, side: int
+    biped: Biped, gait: Gait, course: WalkPath, centres: Floats, inner: Floats, side: int
 ) -> tuple[Floats, Floats]:
     """Return heading and ground point of each stand of a foot."""
     at = np.clip(centres - START - gait.soft / 2, 0.0, course.cycles)

@@ -30,7 +30,7 @@ class Against:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Poses:
+class PoseNovelty:
     """How far poses are from those trained on, and what that costs.
 
     Attributes:
@@ -139,7 +139,7 @@ class Figures:
     jitter_of_plain: float
     stretches: tuple[float, ...]
     truth: Against | None = None
-    poses: Poses | None = None
+    poses: PoseNovelty | None = None
     holds: Holds | None = None
     hung: Hung | None = None
     loops: Loops | None = None

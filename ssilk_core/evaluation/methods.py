@@ -48,7 +48,7 @@ class Method(Protocol):
         ...
 
 
-class Dressed:
+class EvaluationScene:
     """A garment on its whole character, and what measures it.
 
     Args:
@@ -92,7 +92,7 @@ class Dressed:
 
 
 @dataclass(frozen=True, eq=False)
-class Reel:
+class TakeSet:
     """Takes of one garment's character on a device; clip `i` of the bank is take `i`."""
 
     takes: tuple[Take, ...]
@@ -113,7 +113,7 @@ class Reel:
         return torch.as_tensor(local.transpose(1, 2, 0).copy(), dtype=torch.float32, device=self.bank.root.device)
 
 
-def reel_of(takes: Sequence[Take], dressed: Dressed, joints: np.ndarray) -> Reel:
+def reel_of(takes: Sequence[Take], dressed: EvaluationScene, joints: np.ndarray) -> TakeSet:
     """Return takes with what networks that have these joints in view see of them.
 
     Raises:
@@ -124,13 +124,13 @@ def reel_of(takes: Sequence[Take], dressed: Dressed, joints: np.ndarray) -> Reel
     skeleton = dressed.scene.character.skeleton
     bank = build_bank([take.motion for take in takes], skeleton, joints, dressed.fps, dressed.device)
     assert len(bank.starts) == len(takes)
-    return Reel(tuple(takes), bank)
+    return TakeSet(tuple(takes), bank)
 
 
 class Network:
     """A trained model or a baseline, rolled over all takes side by side, each from its quasi-static start."""
 
-    def __init__(self, name: str, model: LatentModel, reel: Reel) -> None:
+    def __init__(self, name: str, model: LatentModel, reel: TakeSet) -> None:
         self.name, self.model, self.reel = name, model, _seen_by(model, reel)
         bank = self.reel.bank
         self.down = torch.tensor([0.0, -1.0, 0.0], device=bank.root.device)
@@ -149,7 +149,7 @@ class Network:
         return self.model.vertices(quiet, self.reel.character(take, frames))
 
 
-def _seen_by(model: LatentModel, reel: Reel) -> Reel:
+def _seen_by(model: LatentModel, reel: TakeSet) -> TakeSet:
     """Return a reel with the descriptors of a network."""
     if not isinstance(model, Baseline):
         return reel
@@ -163,7 +163,7 @@ class Plain:
 
     name = "plain"
 
-    def __init__(self, dressed: Dressed, reel: Reel) -> None:
+    def __init__(self, dressed: EvaluationScene, reel: TakeSet) -> None:
         self.dressed, self.reel = dressed, reel
 
     def vertices(self, take: int, frames: range) -> Tensor:
@@ -173,14 +173,14 @@ class Plain:
         return None
 
 
-class Cache:
+class CachedPoints:
     """Points that were written frame by frame, by a simulator or by anything else.
 
     Args:
         read: gives the points of a clip at the rate of the takes.
     """
 
-    def __init__(self, name: str, read: Reader, dressed: Dressed, reel: Reel) -> None:
+    def __init__(self, name: str, read: Reader, dressed: EvaluationScene, reel: TakeSet) -> None:
         self.name, self.read, self.dressed, self.reel = name, read, dressed, reel
         self.pinned = torch.as_tensor((dressed.scene.classes == PINNED).nonzero()[0], device=dressed.device)
 
@@ -215,7 +215,7 @@ class Cache:
 class Simulated:
     """The reference simulator itself, over all takes side by side."""
 
-    def __init__(self, name: str, dressed: Dressed, reel: Reel) -> None:
+    def __init__(self, name: str, dressed: EvaluationScene, reel: TakeSet) -> None:
         self.name, self.dressed, self.reel = name, dressed, reel
         scene, motions = dressed.scene, [take.motion for take in reel.takes]
         options, device = dressed.simulator.options, dressed.device

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..simulate import Simulator
-from ..simulate.actors import Poses
+from ..simulate.actors import PosedCharacters
 from .figures import Hung
 from .metrics import mean_square
 from .takes import Take
@@ -30,7 +30,7 @@ class Minima:
     """
 
     simulator: Simulator
-    poses: Poses
+    poses: PosedCharacters
     start: Tensor
     x: Tensor
     residual: Tensor

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from .figures import Holds, Hung, Loops
-from .methods import Dressed, Method, Reel
+from .methods import EvaluationScene, Method, TakeSet
 from .metrics import kinetic_energy, mean_square, ratio, settling_time
 from .record import frame_energies
 from .takes import EASE, Take, back_and_forth, stopped
@@ -37,12 +37,12 @@ def stops(takes: Sequence[Take], fps: float, count: int, hold: float) -> tuple[l
 
 
 @torch.no_grad()
-def held(dressed: Dressed, reel: Reel, method: Method, first: Sequence[int]) -> list[Holds]:
+def held(dressed: EvaluationScene, reel: TakeSet, method: Method, first: Sequence[int]) -> list[Holds]:
     """Return what happens after each stop; a take of the reel is at rest from its frame `first` on."""
     return [_held(dressed, reel, method, take, at_rest) for take, at_rest in enumerate(first)]
 
 
-def _held(dressed: Dressed, reel: Reel, method: Method, take: int, first: int) -> Holds:
+def _held(dressed: EvaluationScene, reel: TakeSet, method: Method, take: int, first: int) -> Holds:
     count, mass, fps = reel.takes[take].frame_count, dressed.energy.mass, dressed.fps
     path = method.vertices(take, range(first, count))
     kinetic = kinetic_energy(path, mass, fps)
@@ -112,12 +112,12 @@ def looped(takes: Sequence[Take], fps: float, frames: int) -> tuple[list[Take], 
 
 
 @torch.no_grad()
-def drifted(dressed: Dressed, reel: Reel, method: Method, lengths: Sequence[int]) -> list[Loops]:
+def drifted(dressed: EvaluationScene, reel: TakeSet, method: Method, lengths: Sequence[int]) -> list[Loops]:
     """Return how the last loop of each take differs from its second."""
     return [_drifted(dressed, reel, method, take, length) for take, length in enumerate(lengths)]
 
 
-def _drifted(dressed: Dressed, reel: Reel, method: Method, take: int, length: int) -> Loops:
+def _drifted(dressed: EvaluationScene, reel: TakeSet, method: Method, take: int, length: int) -> Loops:
     count = reel.takes[take].frame_count
     second, last = range(length, 2 * length), range(count - length, count)
     paths = [method.vertices(take, range(loop.start - 2, loop.stop)) for loop in (second, last)]
@@ -134,7 +134,7 @@ def _drifted(dressed: Dressed, reel: Reel, method: Method, take: int, length: in
     )
 
 
-def _total(dressed: Dressed, reel: Reel, take: int, frames: range, path: Tensor) -> float:
+def _total(dressed: EvaluationScene, reel: TakeSet, take: int, frames: range, path: Tensor) -> float:
     terms = frame_energies(dressed, reel, take, frames, path)
     return sum(float(values.mean()) for name, values in terms.items() if name != "collisions")
 

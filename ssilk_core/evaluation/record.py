@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..energy.frames import DECODED_AT_ONCE, energy_terms
-from .methods import Dressed, Method, Reel
+from .methods import EvaluationScene, Method, TakeSet
 from .metrics import BINS, derivative, kinetic_energy, mean_square, principal_stretches, stretch_histogram
 
 PAST = 3  # frames that a third difference looks back on
@@ -17,7 +17,7 @@ TRUTH = ("position", "velocity", "acceleration")  # differences from another met
 
 
 @dataclass(frozen=True, eq=False)
-class Record:
+class TakeRecord:
     """One method over one take.
 
     Attributes:
@@ -32,7 +32,9 @@ class Record:
 
 
 @torch.no_grad()
-def recorded(dressed: Dressed, reel: Reel, method: Method, take: int, truth: Method | None = None) -> Record:
+def recorded(
+    dressed: EvaluationScene, reel: TakeSet, method: Method, take: int, truth: Method | None = None
+) -> TakeRecord:
     """Measure a method over a take, beside `truth` where there is one."""
     parts, stretches = [], torch.zeros(BINS, dtype=torch.float64)
     ours, theirs = _Past(method, take), _Past(truth, take) if truth else None
@@ -51,10 +53,12 @@ def recorded(dressed: Dressed, reel: Reel, method: Method, take: int, truth: Met
             **({} if theirs is None else _errors(dressed, path - theirs.joined(frames), len(frames))),
         }
         parts.append({name: value.double().cpu() for name, value in values.items()})
-    return Record({name: torch.cat([part[name] for part in parts]) for name in parts[0]}, stretches)
+    return TakeRecord({name: torch.cat([part[name] for part in parts]) for name in parts[0]}, stretches)
 
 
-def frame_energies(dressed: Dressed, reel: Reel, take: int, frames: range, path: Tensor) -> dict[str, Tensor]:
+def frame_energies(
+    dressed: EvaluationScene, reel: TakeSet, take: int, frames: range, path: Tensor
+) -> dict[str, Tensor]:
     """Return `energy.frames.energy_terms` of the last frames of a path (V, 3, past + N), shape (N,)."""
     x, character = path[..., -len(frames) :], reel.character(take, frames)
     body, joined = dressed.body.posed(character, exact=dressed.exact), path[..., -len(frames) - 2 :]
@@ -77,7 +81,7 @@ class _Past:
         return path
 
 
-def _moving(dressed: Dressed, path: Tensor, count: int) -> dict[str, Tensor]:
+def _moving(dressed: EvaluationScene, path: Tensor, count: int) -> dict[str, Tensor]:
     mass, fps = dressed.energy.mass, dressed.fps
     return {
         "kinetic": _last(kinetic_energy(path, mass, fps), count),
@@ -85,7 +89,7 @@ def _moving(dressed: Dressed, path: Tensor, count: int) -> dict[str, Tensor]:
     }
 
 
-def _errors(dressed: Dressed, away: Tensor, count: int) -> dict[str, Tensor]:
+def _errors(dressed: EvaluationScene, away: Tensor, count: int) -> dict[str, Tensor]:
     mass, fps = dressed.energy.mass, dressed.fps
     orders = {name: derivative(away, order, fps) for order, name in enumerate(TRUTH)}
     return {name: _last(mean_square(vectors, mass), count) for name, vectors in orders.items()}

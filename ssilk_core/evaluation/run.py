@@ -16,7 +16,7 @@ from ..errors import fail
 from ..events import Progress, Reporter, silent
 from ..motion_bank import LatentModel, MotionBank, build_bank
 from .figures import Figures, Holds, Hung, Loops
-from .methods import Cache, Dressed, Method, Network, Plain, Reader, Reel, Simulated, reel_of
+from .methods import CachedPoints, EvaluationScene, Method, Network, Plain, Reader, Simulated, TakeSet, reel_of
 from .metrics import pose_distance
 from .minimum import hung, minima
 from .probes import drifted, held, joined_holds, joined_hung, joined_loops, last_frames, looped, stops
@@ -61,7 +61,7 @@ class EvaluationOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class Subject:
+class EvaluatedModel:
     """A network under a name, and the character's joints that it has in view."""
 
     name: str
@@ -70,7 +70,7 @@ class Subject:
 
 
 @dataclass(frozen=True, eq=False)
-class Playlist:
+class EvaluationClips:
     """What is played.
 
     Attributes:
@@ -88,7 +88,7 @@ class Playlist:
 
 
 @dataclass(frozen=True)
-class Row:
+class ResultRow:
     """Figures of one method on one split."""
 
     garment: str
@@ -98,12 +98,12 @@ class Row:
 
 
 def evaluate(
-    dressed: Dressed,
-    subjects: Sequence[Subject],
-    playlist: Playlist,
+    dressed: EvaluationScene,
+    subjects: Sequence[EvaluatedModel],
+    playlist: EvaluationClips,
     options: EvaluationOptions | None = None,
     report: Reporter = silent,
-) -> Iterator[Row]:
+) -> Iterator[ResultRow]:
     """Yield the figures of plain skinning, of the simulator where it has played, and of each network, by split.
 
     Raises:
@@ -121,9 +121,9 @@ class _Run:
 
     def __init__(
         self,
-        dressed: Dressed,
-        subjects: Sequence[Subject],
-        playlist: Playlist,
+        dressed: EvaluationScene,
+        subjects: Sequence[EvaluatedModel],
+        playlist: EvaluationClips,
         options: EvaluationOptions,
         report: Reporter,
     ) -> None:
@@ -136,11 +136,11 @@ class _Run:
         self.joints = subjects[0].joints
         reel = reel_of(self.takes, dressed, self.joints)
         read = playlist.read
-        self.cache = Cache(SIMULATOR, read, dressed, reel) if read else None
+        self.cache = CachedPoints(SIMULATOR, read, dressed, reel) if read else None
         self.truth = self._tally(reel, self.cache, self.simulated) if self.cache else Tally({}, self.clips)
         self.plain = self._tally(reel, Plain(dressed, reel), list(self.clips))
 
-    def _tally(self, reel: Reel, method: Method, takes: Sequence[int]) -> Tally:
+    def _tally(self, reel: TakeSet, method: Method, takes: Sequence[int]) -> Tally:
         """Measure a method over takes, beside the simulator where that has played."""
         records = {}
         for take in takes:
@@ -150,26 +150,26 @@ class _Run:
             self.report(Progress(self.done, self.total))
         return Tally(records, self.clips)
 
-    def rows(self, tally: Tally, method: str) -> Iterator[Row]:
+    def rows(self, tally: Tally, method: str) -> Iterator[ResultRow]:
         """Yield the figures of a method that has no state of its own."""
         for split, names in self.playlist.splits.items():
             own = tally.only(takes_in(self.clips, names))
             if own.records:
-                yield Row(self.dressed.name, method, split, self._figures(own))
+                yield ResultRow(self.dressed.name, method, split, self._figures(own))
 
     def _figures(self, tally: Tally) -> Figures:
         takes, weight = list(tally.records), self.dressed.weight
         found = figures(tally, self.plain.only(takes), weight)
         return replace(found, truth=against(tally, self.truth.only(takes), weight))
 
-    def truth_rows(self) -> Iterator[Row]:
+    def truth_rows(self) -> Iterator[ResultRow]:
         """Yield the figures of the simulator."""
         wanted = self.options.simulate and self.options.stops and self.truth.records
         stopped = self._stopped(self.joints, lambda reel: Simulated(SIMULATOR, self.dressed, reel)) if wanted else []
         for row in self.rows(self.truth, SIMULATOR):
             yield replace(row, figures=replace(row.figures, **self._rested(stopped, row.split)))
 
-    def network_rows(self, subject: Subject) -> Iterator[Row]:
+    def network_rows(self, subject: EvaluatedModel) -> Iterator[ResultRow]:
         """Yield the figures of a network."""
         reel = reel_of(self.takes, self.dressed, subject.joints)
         tally = self._tally(reel, Network(subject.name, subject.model, reel), list(self.clips))
@@ -185,7 +185,7 @@ class _Run:
             )
             yield replace(row, figures=found)
 
-    def _distances(self, reel: Reel, subject: Subject) -> dict[int, Tensor]:
+    def _distances(self, reel: TakeSet, subject: EvaluatedModel) -> dict[int, Tensor]:
         """Return how far the poses of each take are from those seen in training [rad], (N,); empty if not known."""
         if not self.playlist.seen:
             return {}
@@ -194,7 +194,7 @@ class _Run:
         far = pose_distance(_upright(reel.bank), _upright(seen), len(subject.joints))
         return dict(enumerate(far.split((reel.bank.stops - reel.bank.starts).tolist())))
 
-    def _stopped(self, joints: np.ndarray, method_on: Callable[[Reel], Method]) -> list[Stop]:
+    def _stopped(self, joints: np.ndarray, method_on: Callable[[TakeSet], Method]) -> list[Stop]:
         """Return what happens after stops, and where that is beside the minimum, with the clip of each."""
         options, dressed = self.options, self.dressed
         takes, first = stops(self.takes, dressed.fps, options.stops, options.hold)
@@ -216,7 +216,7 @@ class _Run:
             "hung": joined_hung([rest for _, _, rest in own if rest]),
         }
 
-    def _loops(self, subject: Subject) -> list[tuple[str, Loops]]:
+    def _loops(self, subject: EvaluatedModel) -> list[tuple[str, Loops]]:
         """Return how looped takes drift, with the clip of each."""
         if not self.options.loop:
             return []

@@ -16,7 +16,7 @@ ALLOWED = 'an index is a JSON list of {"clip": name, "split": name, "tags": [nam
 
 
 @dataclass(frozen=True)
-class Entry:
+class ClipEntry:
     """A clip of an index."""
 
     clip: str
@@ -24,7 +24,7 @@ class Entry:
     tags: tuple[str, ...] = ()
 
 
-def read_index(path: Path) -> list[Entry]:
+def read_index(path: Path) -> list[ClipEntry]:
     """Read an index.
 
     Raises:
@@ -34,7 +34,9 @@ def read_index(path: Path) -> list[Entry]:
         fail(str(path), "there is no such file", ALLOWED)
     try:
         document = json.loads(path.read_text())
-        return [Entry(_text(item["clip"]), _text(item["split"]), tuple(item.get("tags", ()))) for item in document]
+        return [
+            ClipEntry(_text(item["clip"]), _text(item["split"]), tuple(item.get("tags", ()))) for item in document
+        ]
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         fail(str(path), f"no index of clips ({type(error).__name__}: {error})", ALLOWED)
 
@@ -45,12 +47,12 @@ def _text(value: Any) -> str:
     return value
 
 
-def chosen(index: Sequence[Entry], split: str) -> list[str]:
+def chosen(index: Sequence[ClipEntry], split: str) -> list[str]:
     """Return the clips of a split, or those of `valid` with a tag."""
     return [e.clip for e in index if e.split == split or (e.split == "valid" and split in e.tags)]
 
 
-def splits_of(index: Sequence[Entry], clips: Sequence[str] = ()) -> dict[str, list[str]]:
+def splits_of(index: Sequence[ClipEntry], clips: Sequence[str] = ()) -> dict[str, list[str]]:
     """Return the clips of each of `SPLITS` that has any, only those of `clips` where some are given."""
     names = {split: [clip for clip in chosen(index, split) if not clips or clip in clips] for split in SPLITS}
     return {split: found for split, found in names.items() if found}

@@ -8,8 +8,8 @@ from math import degrees, isfinite
 from typing import Any
 
 from ..energy import TERMS
-from .figures import Against, Figures, Holds, Hung, Loops, Poses
-from .run import Row
+from .figures import Against, Figures, Holds, Hung, Loops, PoseNovelty
+from .run import ResultRow
 
 
 def aligned(header: Sequence[str], rows: Sequence[Sequence[str]], words: int) -> str:
@@ -24,7 +24,7 @@ def aligned(header: Sequence[str], rows: Sequence[Sequence[str]], words: int) ->
     return "\n".join([line(header), line(rule), *map(line, rows)]) + "\n"
 
 
-def tables(rows: Sequence[Row]) -> str:
+def tables(rows: Sequence[ResultRow]) -> str:
     """Return one table for each kind of figures that any row has, the methods of a split together."""
     places = {(row.garment, row.split): place for place, row in reversed(list(enumerate(rows)))}
     together = sorted(rows, key=lambda row: places[row.garment, row.split])
@@ -32,7 +32,10 @@ def tables(rows: Sequence[Row]) -> str:
 
 
 def _table(
-    rows: Sequence[Row], pick: Callable[[Figures], Any], header: Sequence[str], cells: Callable[[Any], list[str]]
+    rows: Sequence[ResultRow],
+    pick: Callable[[Figures], Any],
+    header: Sequence[str],
+    cells: Callable[[Any], list[str]],
 ) -> str:
     lines = [
         [row.garment, row.split, row.method, *cells(part)] for row in rows if (part := pick(row.figures)) is not None
@@ -85,7 +88,7 @@ def _loops(f: Loops) -> list[str]:
             _millimetres(f.apart)]  # fmt: skip
 
 
-def _poses(f: Poses) -> list[str]:
+def _poses(f: PoseNovelty) -> list[str]:
     return [f"{degrees(f.mean):.1f}", f"{degrees(f.high):.1f}", f"{f.familiar:.4g}", f"{f.unfamiliar:.4g}"]
 
 

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from ..energy import TERMS
-from .figures import Against, Figures, Poses
+from .figures import Against, Figures, PoseNovelty
 from .metrics import histogram_quantiles, ratio
-from .record import TRUTH, Record
+from .record import TRUTH, TakeRecord
 
 SHARES = (0.5, 0.95, 0.99)  # of triangles and frames, below which quantiles of stretch lie
 NEAR, FAR = 0.5, 0.9  # quantiles up to which poses count as familiar, and from which as unfamiliar
@@ -22,7 +22,7 @@ NEAR, FAR = 0.5, 0.9  # quantiles up to which poses count as familiar, and from 
 class Tally:
     """Records of one method on some takes, by the takes' numbers, with the clip of each."""
 
-    records: Mapping[int, Record]
+    records: Mapping[int, TakeRecord]
     clips: Mapping[int, str]
 
     def each(self, name: str) -> Tensor:
@@ -103,12 +103,12 @@ def against(tally: Tally, truth: Tally, weight: float) -> Against | None:
     )
 
 
-def poses(tally: Tally, distances: Mapping[int, Tensor]) -> Poses:
+def poses(tally: Tally, distances: Mapping[int, Tensor]) -> PoseNovelty:
     """Return what the distance of poses from those trained on [rad], by take (N,), does to a method."""
     far = torch.cat([distances[take] for take in tally.records]).double().cpu()
     totals = tally.totals()
     near, high = (far.quantile(share) for share in (NEAR, FAR))
-    return Poses(
+    return PoseNovelty(
         mean=float(far.mean()),
         high=float(far.quantile(0.95)),
         familiar=float(totals[far <= near].mean()),

@@ -10,30 +10,30 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import SsilkError, fail
-from .tasks import Task
+from .tasks import BakeTask
 
-Bake = Callable[[Task, Path], dict[str, object]]
+Bake = Callable[[BakeTask, Path], dict[str, object]]
 RETRIES = 10  # of a task whose worker died
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TaskOutcome:
     """How a task ended: `detail` as the bake says it, or what was wrong."""
 
-    task: Task
+    task: BakeTask
     detail: dict[str, object]
     error: str = ""
 
 
 def run_on_cluster(
-    tasks: Sequence[Task],
+    tasks: Sequence[BakeTask],
     folder: Path,
     bake: Bake,
     *,
     address: str | None = None,
     cores: int | None = None,
     gpu: bool = False,
-) -> Iterator[Outcome]:
+) -> Iterator[TaskOutcome]:
     """Yield the outcome of each task as it ends, on a cluster that is there or on the cores of this machine.
 
     Args:
@@ -63,13 +63,13 @@ def run_on_cluster(
             try:
                 yield ray.get(done)
             except RayError as error:
-                yield Outcome(task, {}, f"its workers died ({str(error).splitlines()[0]})")
+                yield TaskOutcome(task, {}, f"its workers died ({str(error).splitlines()[0]})")
     finally:
         ray.shutdown()
 
 
-def _outcome(bake: Bake, task: Task, folder: Path) -> Outcome:
+def _outcome(bake: Bake, task: BakeTask, folder: Path) -> TaskOutcome:
     try:
-        return Outcome(task, bake(task, folder))
+        return TaskOutcome(task, bake(task, folder))
     except SsilkError as error:
-        return Outcome(task, {}, str(error))
+        return TaskOutcome(task, {}, str(error))

@@ -14,19 +14,19 @@ from .. import __version__
 from ..errors import fail
 from ..files import replacing
 from .record import INPUTS
-from .tasks import Task
+from .tasks import BakeTask
 
 NAME = "job.json"
 
 
-def write_job(path: str | Path, tasks: Sequence[Task]) -> None:
+def write_job(path: str | Path, tasks: Sequence[BakeTask]) -> None:
     """Write the tasks of a job; raise `SsilkError` where that is not possible."""
     document = {"ssilk": __version__, "tasks": [asdict(task) for task in tasks]}
     with replacing(path, keep_same=True) as temporary:
         temporary.write_text(json.dumps(document, indent=1) + "\n")
 
 
-def read_job(path: str | Path, mapping: str | Path | None = None) -> list[Task]:
+def read_job(path: str | Path, mapping: str | Path | None = None) -> list[BakeTask]:
     """Return the tasks of a job.
 
     Args:
@@ -38,7 +38,7 @@ def read_job(path: str | Path, mapping: str | Path | None = None) -> list[Task]:
     document = _json(Path(path), "a file written by 'ssilk farm' is needed")
     rules = _json(Path(mapping), "path mapping rules are needed").get("path_mapping_rules", []) if mapping else []
     try:
-        tasks = [Task(**entry) for entry in document["tasks"]]
+        tasks = [BakeTask(**entry) for entry in document["tasks"]]
         for task in tasks:
             _check_types(task)
         return [_mapped(task, rules) for task in tasks]
@@ -58,9 +58,9 @@ def _json(path: Path, allowed: str) -> dict[str, Any]:
     return document
 
 
-def _check_types(task: Task) -> None:
+def _check_types(task: BakeTask) -> None:
     """Raise `TypeError` unless all values have the types that were written."""
-    like = Task(garment="", shot="", model="", stage="", motion="")
+    like = BakeTask(garment="", shot="", model="", stage="", motion="")
     for name, value in vars(task).items():
         allowed = {"fps": (int, float, type(None)), "root": (str, type(None))}.get(name, (type(getattr(like, name)),))
         if type(value) not in allowed:
@@ -69,7 +69,7 @@ def _check_types(task: Task) -> None:
         raise TypeError(f"{task.name!r} names no files")
 
 
-def _mapped(task: Task, rules: Iterable[dict[str, str]]) -> Task:
+def _mapped(task: BakeTask, rules: Iterable[dict[str, str]]) -> BakeTask:
     """Return a task with its inputs where they lie on this machine."""
     model, stage, motion = (_found(getattr(task, name), rules) for name in INPUTS)
     return replace(task, model=model, stage=stage, motion=motion)

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
-from ..events import Event, Failed, Garment, Message, Progress, Result, Started, describe
+from ..events import Event, Failed, GarmentEvent, Message, Progress, Result, Started, describe
 from ..files import replacing
 from .job import NAME, write_job
 from .record import INPUTS
-from .tasks import Task
+from .tasks import BakeTask
 
 TEMPLATE, VALUES, ASSETS = "template.json", "parameter_values.json", "asset_references.json"
 NOTICE = 30  # seconds that a worker has to stop
@@ -42,7 +42,7 @@ class BundleOptions:
     timeout: int = 3600
 
 
-def write_bundle(folder: Path, tasks: Sequence[Task], output: Path | None, options: BundleOptions) -> None:
+def write_bundle(folder: Path, tasks: Sequence[BakeTask], output: Path | None, options: BundleOptions) -> None:
     """Write a job bundle: template, job, parameter values and the files that it takes and gives.
 
     Raises:
@@ -60,7 +60,7 @@ def _write(path: Path, document: dict[str, Any]) -> None:
         temporary.write_text(json.dumps(document, indent=1) + "\n")
 
 
-def _asset_references(tasks: Sequence[Task], output: Path | None) -> dict[str, Any]:
+def _asset_references(tasks: Sequence[BakeTask], output: Path | None) -> dict[str, Any]:
     files = sorted({getattr(task, name).partition(":/")[0] for task in tasks for name in INPUTS})
     folders = [] if output is None else [str(output.absolute())]
     return {
@@ -114,7 +114,7 @@ def _bake_step(count: int, options: BundleOptions) -> dict[str, Any]:
         "name": "Bake",
         "parameterSpace": {"taskParameterDefinitions": [shots]},
         "hostRequirements": _host(options),
-        "script": _script(options, "--tasks", "{{Task.Param.Shots}}"),
+        "script": _script(options, "--tasks", "{{BakeTask.Param.Shots}}"),
     }
 
 
@@ -149,11 +149,11 @@ class OpenJdReporter:
         match event:
             case Progress():
                 self._progress(100 * event.done / max(event.total, 1))
-            case Garment(name, Started(task)):
+            case GarmentEvent(name, Started(task)):
                 self._say(f"openjd_status: {task} {name}")
-            case Failed() | Garment(_, Failed()):
+            case Failed() | GarmentEvent(_, Failed()):
                 self._say(f"openjd_fail: {describe(event)}")
-            case Message() | Result() | Garment():
+            case Message() | Result() | GarmentEvent():
                 self._say(describe(event))
 
     def _progress(self, percent: float) -> None:

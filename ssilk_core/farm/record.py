@@ -12,14 +12,14 @@ from typing import Any
 
 from .. import __version__
 from ..files import replacing, sha256
-from .tasks import Task
+from .tasks import BakeTask
 
 NAME = "bake.json"
 INPUTS = ("model", "stage", "motion")  # where they lie makes no difference, what they hold does
 
 
 @dataclass(frozen=True, kw_only=True)
-class Record:
+class TaskRecord:
     """A finished task.
 
     Attributes:
@@ -33,7 +33,7 @@ class Record:
     detail: dict[str, Any] = field(default_factory=dict)
 
 
-def task_key(task: Task, contents: Mapping[str, str]) -> str:
+def task_key(task: BakeTask, contents: Mapping[str, str]) -> str:
     """Return a hash of all that decides what a task writes.
 
     Args:
@@ -44,17 +44,17 @@ def task_key(task: Task, contents: Mapping[str, str]) -> str:
     return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
 
 
-def write_record(folder: Path, record: Record) -> None:
+def write_record(folder: Path, record: TaskRecord) -> None:
     """Write a record into the folder of its files, last of all."""
     with replacing(folder / NAME, keep_same=True) as temporary:
         temporary.write_text(json.dumps(asdict(record), indent=1, sort_keys=True) + "\n")
 
 
-def read_record(folder: Path) -> Record | None:
+def read_record(folder: Path) -> TaskRecord | None:
     """Return the record of a folder; None where there is none that can be read, so that its task is done again."""
     try:
         document = json.loads((folder / NAME).read_text())
-        record = Record(**document)
+        record = TaskRecord(**document)
         whole = isinstance(record.files, dict) and isinstance(record.detail, dict)
     except (OSError, ValueError, TypeError, RecursionError):
         return None

@@ -13,7 +13,7 @@ from ..errors import fail
 
 
 @dataclass(frozen=True, kw_only=True)
-class Task:
+class BakeTask:
     """One garment in one shot.
 
     Attributes:
@@ -59,7 +59,7 @@ class Task:
         return f"{self.shot}/{self.garment}"
 
 
-def plan(models: Sequence[tuple[str, str | None]], motions: Sequence[str], like: Task) -> list[Task]:
+def plan(models: Sequence[tuple[str, str | None]], motions: Sequence[str], like: BakeTask) -> list[BakeTask]:
     """Return a task for each model over each motion, the tasks of a model together.
 
     Args:
@@ -80,7 +80,7 @@ def plan(models: Sequence[tuple[str, str | None]], motions: Sequence[str], like:
         dressed.add(root)
         for shot, motion in zip(shots, motions):
             named = {"garment": garment, "shot": shot, "model": model, "root": root, "motion": motion, "body": body}
-            tasks.append(Task(**{**vars(like), **named}))
+            tasks.append(BakeTask(**{**vars(like), **named}))
     return tasks
 
 

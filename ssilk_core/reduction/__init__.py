@@ -2,6 +2,6 @@
 """Smaller models of a trained one, without training."""
 
 from .reducer import Reduced, Reducer
-from .size import Size
+from .size import ModelSize
 
-__all__ = ["Reduced", "Reducer", "Size"]
+__all__ = ["ModelSize", "Reduced", "Reducer"]

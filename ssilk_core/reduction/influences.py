@@ -20,7 +20,7 @@ RIDGE = 1e-3  # pull towards the weights that were, relative to H: decides where
 
 
 @dataclass(frozen=True, eq=False)
-class Influences:
+class InfluenceCandidates:
     """Weights of each vertex over its candidate joints, and what others would cost.
 
     Attributes:
@@ -38,16 +38,16 @@ class Influences:
         change = weights - self.weights
         return np.einsum("vc,vcd,vd->v", change, self.costs, change).clip(min=0)
 
-    def of(self, rows: Ints) -> Influences:
+    def of(self, rows: Ints) -> InfluenceCandidates:
         """Return those of some vertices."""
-        return Influences(self.joints[rows], self.weights[rows], self.costs[rows])
+        return InfluenceCandidates(self.joints[rows], self.weights[rows], self.costs[rows])
 
 
-def measured(joints: Ints, weights: Floats, matrices: NDArray, points: NDArray) -> Influences:
+def measured(joints: Ints, weights: Floats, matrices: NDArray, points: NDArray) -> InfluenceCandidates:
     """Measure what other weights cost.
 
     Args:
-        joints, weights: as in `Influences`.
+        joints, weights: as in `InfluenceCandidates`.
         matrices: skinning matrices of all joints (J + P, 3, 4, F); points: unskinned ones (V, 3, F) [m].
     """
     costs = np.empty((*joints.shape, joints.shape[1]))
@@ -57,7 +57,7 @@ def measured(joints: Ints, weights: Floats, matrices: NDArray, points: NDArray) 
         carried -= np.einsum("vc,vcaf->vaf", weights[rows], carried)[:, None]
         flat = carried.reshape(*joints[rows].shape, -1)
         costs[rows] = flat @ flat.swapaxes(1, 2) / points.shape[2]
-    return Influences(joints, weights, costs)
+    return InfluenceCandidates(joints, weights, costs)
 
 
 def carried_by(joints: Ints, matrices: NDArray, points: NDArray) -> NDArray:
@@ -66,7 +66,7 @@ def carried_by(joints: Ints, matrices: NDArray, points: NDArray) -> NDArray:
     return np.einsum("vcabf,vbf->vcaf", chosen[:, :, :, :3], points) + chosen[:, :, :, 3]
 
 
-def fitted(influences: Influences, allowed: NDArray, most: int) -> Floats:
+def fitted(influences: InfluenceCandidates, allowed: NDArray, most: int) -> Floats:
     """Return weights (V, C), not negative and summing to one, of at most `most` of the `allowed` candidates (V, C).
 
     Each moves its vertex as little as its support allows. Supports shrink by one candidate at a time, first by those
@@ -85,7 +85,7 @@ def fitted(influences: Influences, allowed: NDArray, most: int) -> Floats:
     return weights
 
 
-def _constrained(influences: Influences, allowed: NDArray) -> tuple[Floats, Floats]:
+def _constrained(influences: InfluenceCandidates, allowed: NDArray) -> tuple[Floats, Floats]:
     """Return the best weights that sum to one (V, C), of whatever sign, and what dropping each would cost (V, C)."""
     count, size = allowed.shape
     scale = np.einsum("vcc->v", influences.costs)[:, None, None] / size + 1e-30

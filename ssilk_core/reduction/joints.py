@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..assets import Floats, Ints, Scene
-from .influences import Influences
+from .influences import InfluenceCandidates
 
 
 def candidates(scene: Scene, weights: Floats) -> Ints:
@@ -34,7 +34,7 @@ def candidates(scene: Scene, weights: Floats) -> Ints:
     return np.where(np.take_along_axis(wanted, order, axis=1), order, -1)
 
 
-def least_missed(scene: Scene, influences: Influences, mass: Floats) -> list[int]:
+def least_missed(scene: Scene, influences: InfluenceCandidates, mass: Floats) -> list[int]:
     """Return all proxies in the order in which to take them off, as combined joint indices.
 
     Args:
@@ -51,7 +51,7 @@ def least_missed(scene: Scene, influences: Influences, mass: Floats) -> list[int
     return order
 
 
-def _missed(influences: Influences, parents: Ints, mass: Floats, gone: list[int]) -> float:
+def _missed(influences: InfluenceCandidates, parents: Ints, mass: Floats, gone: list[int]) -> float:
     """Return what the vertices that the last of these joints moves lose more by its going [m2, weighted by mass]."""
     rows = np.flatnonzero((influences.joints == gone[-1]).any(axis=1))
     own = influences.of(rows)
@@ -59,7 +59,7 @@ def _missed(influences: Influences, parents: Ints, mass: Floats, gone: list[int]
     return float(mass[rows] @ (after - before))
 
 
-def handed_down(influences: Influences, parents: Ints, gone: list[int]) -> Floats:
+def handed_down(influences: InfluenceCandidates, parents: Ints, gone: list[int]) -> Floats:
     """Return weights (V, C) with those of some joints given to what carries them.
 
     Args:

@@ -20,11 +20,11 @@ from ..mesh.topology import vertex_areas
 from ..runtime import Player
 from ..runtime.skinning import trained_weights
 from .files import with_basis, with_weights
-from .influences import AT_ONCE, Influences, carried_by, fitted, measured
+from .influences import AT_ONCE, InfluenceCandidates, carried_by, fitted, measured
 from .joints import candidates, dense, handed_down, least_missed
 from .observed import observe
 from .shapes import Modes, basis, modes
-from .size import Size
+from .size import ModelSize
 
 FRAMES = 512  # that are looked at, spread evenly over all motions
 STEPS = 8  # of turning displacements back through blended matrices
@@ -40,7 +40,7 @@ class Reduced:
     """
 
     file: ModelFile
-    size: Size
+    size: ModelSize
     rms: float
     largest: float
 
@@ -69,7 +69,7 @@ class Reducer:
         self.mass, self.free = areas / areas.sum(), np.flatnonzero(self.scene.classes != PINNED)
         skin = SkinWeights("", self.scene.rig.skin.indices, trained_weights(self.scene, file.parameters))
         self.weights = skin.dense(len(self.scene.joint_names))
-        self.whole = Size(
+        self.whole = ModelSize(
             shapes=file.config.shapes,
             joints=self.scene.rig.proxy_count,
             influences=int((self.weights > 0).sum(axis=1).max()),
@@ -77,7 +77,7 @@ class Reducer:
         self._skinned = lru_cache(4)(self._fitted)
         self._followed = lru_cache(4)(self._modes)
 
-    def reduced(self, size: Size) -> Reduced:
+    def reduced(self, size: ModelSize) -> Reduced:
         """Return the model with so much kept; what it has less of stays as it is."""
         kept, file = size.within(self.whole), self.file
         skin = (kept.joints, kept.influences)
@@ -90,7 +90,7 @@ class Reducer:
             file = with_basis(file, basis(found, kept.shapes, readout))
         return Reduced(file, kept, *self._difference(file))
 
-    def predicted(self, size: Size) -> float:
+    def predicted(self, size: ModelSize) -> float:
         """Return about what a model of this size loses [m], RMS weighted by mass, without making it."""
         kept = size.within(self.whole)
         if kept == self.whole:
@@ -109,7 +109,7 @@ class Reducer:
         return moved + self.file.parameters.get("decoder.offset", np.zeros((1, 3), np.float32))[:, :, None]
 
     @cached_property
-    def influences(self) -> Influences:
+    def influences(self) -> InfluenceCandidates:
         """The trained weights, and what others would cost."""
         joints = candidates(self.scene, self.weights)
         weights = np.where(joints >= 0, np.take_along_axis(self.weights, joints.clip(min=0), axis=1), 0)

@@ -9,7 +9,7 @@ from ..errors import fail
 
 
 @dataclass(frozen=True, kw_only=True)
-class Size:
+class ModelSize:
     """What is kept of a garment.
 
     Attributes:
@@ -27,7 +27,7 @@ class Size:
                 fail(f"{name} = {value}", "too few to be kept", f"it is at least {least}")
 
     @classmethod
-    def of(cls, text: str) -> Size:
+    def of(cls, text: str) -> ModelSize:
         """Return what `str` wrote."""
         shapes, joints, influences = map(int, text.split(","))
         return cls(shapes=shapes, joints=joints, influences=influences)
@@ -35,6 +35,6 @@ class Size:
     def __str__(self) -> str:
         return f"{self.shapes},{self.joints},{self.influences}"
 
-    def within(self, other: Size) -> Size:
+    def within(self, other: ModelSize) -> ModelSize:
         """Return what both have."""
-        return Size(**{name: min(most, vars(other)[name]) for name, most in vars(self).items()})
+        return ModelSize(**{name: min(most, vars(other)[name]) for name, most in vars(self).items()})

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Between a network and the simulator: a rollout refined on the training energy, frame by frame."""
 
-from .fit import Fit, Refitter
+from .fit import PoseFit, Refitter
 from .refiner import Change, RefinedFrame, RefineOptions, Refiner, Summary
 
-__all__ = ["Change", "Fit", "RefineOptions", "RefinedFrame", "Refiner", "Refitter", "Summary"]
+__all__ = ["Change", "PoseFit", "RefineOptions", "RefinedFrame", "Refiner", "Refitter", "Summary"]

@@ -27,7 +27,7 @@ AT_ONCE = 16  # frames; the Jacobian of one takes 4 MB for 2,700 vertices, 64 sh
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class PoseFit:
     """Poses of consecutive frames and what they lose.
 
     Attributes:
@@ -64,7 +64,7 @@ class Refitter:
     def _tensor(self, values: np.ndarray, dtype: torch.dtype = torch.float64) -> Tensor:
         return torch.as_tensor(np.array(values), dtype=dtype, device=self.device)
 
-    def fit(self, motion: Motion, poses: Iterable[GarmentPose], vertices: Iterable[Floats]) -> Iterator[Fit]:
+    def fit(self, motion: Motion, poses: Iterable[GarmentPose], vertices: Iterable[Floats]) -> Iterator[PoseFit]:
         """Yield fits, some frames at a time.
 
         Args:
@@ -79,7 +79,7 @@ class Refitter:
                 some = GarmentPose(pose.start + at, pose.rotations[part], pose.weights[part])
                 yield self.fitted(motion, some, np.stack([next(wanted) for _ in range(some.frame_count)]))
 
-    def fitted(self, motion: Motion, pose: GarmentPose, vertices: Floats) -> Fit:
+    def fitted(self, motion: Motion, pose: GarmentPose, vertices: Floats) -> PoseFit:
         """Return the fit of a few frames to vertices in the world [m], shape (F, V, 3)."""
         where = f"frames {pose.start} to {pose.start + pose.frame_count - 1}"
         if not np.isfinite(vertices).all():
@@ -218,10 +218,10 @@ class _Search:
         turned = np.swapaxes(above, -1, -2) @ turn @ above @ matrix_from_quaternion(pose.rotations)
         return GarmentPose(pose.start, quaternion_from_matrix(turned), weights)
 
-    def found(self) -> Fit:
+    def found(self) -> PoseFit:
         """Return the poses as they are now."""
         distance = self.posed.away.norm(dim=2).amax(1)
-        return Fit(self.pose, self.posed.error.sqrt().cpu().numpy(), distance.cpu().numpy())
+        return PoseFit(self.pose, self.posed.error.sqrt().cpu().numpy(), distance.cpu().numpy())
 
 
 def _cross(vectors: Tensor) -> Tensor:

@@ -29,7 +29,7 @@ from ..errors import fail
 from ..fabrics import Fabric
 from ..kinematics import split_at_cuts
 from ..simulate import SimulationOptions, Simulator
-from ..simulate.actors import Poses
+from ..simulate.actors import PosedCharacters
 from ..simulate.incremental_potential import StepInputs
 from ..simulate.newton import SolverOptions, State, minimise_from
 from ..simulate.simulator import Past
@@ -165,7 +165,9 @@ class Refiner:
         points = np.stack(list(islice(vertices, count)), axis=-1)
         return torch.as_tensor(points, dtype=torch.float64, device=self.potential.free.device)
 
-    def _refined(self, before: State, tail: _Tail | None, world: Tensor, poses: Poses, inputs: StepInputs) -> Tensor:
+    def _refined(
+        self, before: State, tail: _Tail | None, world: Tensor, poses: PosedCharacters, inputs: StepInputs
+    ) -> Tensor:
         """Return refined positions relative to the roots (V, 3, N)."""
         start = before.x
         if tail and self.options.feedback:
@@ -173,7 +175,7 @@ class Refiner:
             start = self.simulator.best([start, corrected], inputs)
         return minimise_from(self.potential, start, inputs, self.options.solver).x.double()
 
-    def _past(self, tail: _Tail | None, world: Tensor, poses: Poses) -> Past | None:
+    def _past(self, tail: _Tail | None, world: Tensor, poses: PosedCharacters) -> Past | None:
         """Return what each of some consecutive frames looks back on."""
         if tail is None:
             return None if self.options.feedback else Past(world, None, poses.root, poses.plain)
@@ -182,7 +184,7 @@ class Refiner:
         root = torch.cat([tail.root, poses.root[:, :-1]], dim=1)
         return Past(seen[..., -count:], before, root, torch.cat([tail.plain, poses.plain[..., :-1]], dim=-1))
 
-    def _tail(self, tail: _Tail | None, world: Tensor, refined: Tensor, poses: Poses) -> _Tail:
+    def _tail(self, tail: _Tail | None, world: Tensor, refined: Tensor, poses: PosedCharacters) -> _Tail:
         """Return what the frames after these look back on."""
         kept = refined if self.options.feedback else world
         kept = kept if tail is None else torch.cat([tail.world, kept], dim=-1)

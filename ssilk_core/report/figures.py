@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import SsilkError, fail
-from ..stress.outcome import HEADER, Outcome
+from ..stress.outcome import HEADER, CaseOutcome
 from ..trade.point import front
 from .charts import scatter, strip
 from .page import Section, facts, flattened, table
@@ -66,7 +66,7 @@ def _made(path: Path, make: Callable[[Mapping[str, Any]], Section], document: Ma
 
 def extremes(document: Mapping[str, Any]) -> Section:
     """Return the table of 'ssilk stress'."""
-    found = [Outcome.of(each) for each in document["outcomes"]]
+    found = [CaseOutcome.of(each) for each in document["outcomes"]]
     bad = [number for number, outcome in enumerate(found) if outcome.verdict == "breaks"]
     rest = facts({name: value for name, value in document.items() if name != "outcomes"})
     return Section("Extremes", table(HEADER, [outcome.row() for outcome in found], bad) + rest)

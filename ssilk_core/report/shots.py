@@ -12,7 +12,7 @@ from ..assets import Floats, Mesh
 from ..events import Progress, Reporter, silent
 from ..fabrics import Fabric
 from ..view.camera import follow_cameras
-from ..view.player import Player
+from ..view.player import ShotPlayer
 from ..view.render import Image, render
 from ..view.shots import shot_surfaces
 from .charts import strip
@@ -25,7 +25,7 @@ LETTERS = "ABCDEFGH"
 
 
 @dataclass(frozen=True, eq=False)
-class Dressed:
+class ShotGarment:
     """A garment of a shot: which of the player's meshes it is, at rest, and what it is made of."""
 
     index: int
@@ -34,7 +34,7 @@ class Dressed:
 
 
 def shot_sections(
-    player: Player, garments: Sequence[Dressed], bodies: Mapping[int, Mesh], report: Reporter = silent
+    player: ShotPlayer, garments: Sequence[ShotGarment], bodies: Mapping[int, Mesh], report: Reporter = silent
 ) -> list[Section]:
     """Return the sections about a shot.
 
@@ -61,7 +61,7 @@ def joined(meshes: Sequence[Mesh]) -> Mesh | None:
     return Mesh(meshes[0].path, np.concatenate([mesh.points for mesh in meshes]), faces)
 
 
-def _sections(player: Player, garment: Dressed, meter: TermsMeter) -> list[Section]:
+def _sections(player: ShotPlayer, garment: ShotGarment, meter: TermsMeter) -> list[Section]:
     values = {name: np.array(found) for name, found in meter.values.items()}
     bad = values["total"] - values["gravity"]  # height is no fault
     worst = worst_frames(bad, PICTURES, max(1, round(APART * player.fps)))
@@ -85,7 +85,7 @@ def _spread(values: Floats) -> list[str]:
     return [f"{value:.4g}" for value in figures]
 
 
-def picture(player: Player, frame: int) -> Image:
+def picture(player: ShotPlayer, frame: int) -> Image:
     """Return one frame of a shot, the figure filling it."""
     surfaces = shot_surfaces(player, frame)
     points = np.concatenate([surface.points for surface in surfaces])

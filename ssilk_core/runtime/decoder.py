@@ -15,7 +15,7 @@ from .networks import Parameters, evaluated, layers
 IDENTITY = np.array([1, 0, 0, 0, 1, 0], dtype=np.float32)[:, None]
 
 
-class Decoder:
+class NumpyDecoder:
     """D of one garment.
 
     Args:

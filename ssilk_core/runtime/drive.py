@@ -14,7 +14,7 @@ from ..kinematics import motion_transforms, skinning_matrices
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
+class CharacterFrames:
     """The character's share of a motion of F frames.
 
     Attributes:
@@ -30,7 +30,7 @@ class Drive:
     origins: Floats
 
 
-def drive(motion: Motion, skeleton: Skeleton, joints: NDArray, seen: int = 0) -> Drive:
+def drive(motion: Motion, skeleton: Skeleton, joints: NDArray, seen: int = 0) -> CharacterFrames:
     """Return what a motion at the model's rate says about its frames, gravity pointing down.
 
     The first `seen` frames are only what descriptors look back on.
@@ -40,7 +40,7 @@ def drive(motion: Motion, skeleton: Skeleton, joints: NDArray, seen: int = 0) ->
     down = -features.down[..., 1].reshape(motion.frame_count, -1)
     static = np.concatenate([features.static, down], axis=1, dtype=np.float32)
     matrices, origins = _about_root(world[seen:], skeleton)
-    return Drive(static[seen:], features.dynamic[seen:].astype(np.float32), matrices, origins)
+    return CharacterFrames(static[seen:], features.dynamic[seen:].astype(np.float32), matrices, origins)
 
 
 def character_matrices(motion: Motion, skeleton: Skeleton) -> tuple[NDArray, Floats]:

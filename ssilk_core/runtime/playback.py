@@ -17,7 +17,7 @@ from ..kinematics import resample, split_at_cuts
 from ..sampling import sample_pose
 from .drive import character_matrices
 from .skinning import posed
-from .take import Decoded, Take, take_of
+from .take import Decoded, RolledSpan, take_of
 
 if TYPE_CHECKING:
     from .player import Player
@@ -125,7 +125,7 @@ class Playback:
         matrices = self.player.kinematics.matrices(decoded.rotations, character)
         return Block(self.firsts[span] + start, decoded, matrices, origins)
 
-    def _interpolated(self, take: Take, positions: Floats) -> Decoded:
+    def _interpolated(self, take: RolledSpan, positions: Floats) -> Decoded:
         """Return what the decoder said between steps, at fractional ones."""
         positions = positions.clip(max=take.frame_count - 1)
         low, high = int(positions[0]), int(np.ceil(positions[-1]))

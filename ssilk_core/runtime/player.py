@@ -12,7 +12,7 @@ from ..assets import Deformer, Motion
 from ..checkpoint import ModelFile, load_model
 from ..errors import fail
 from ..parameters import descriptor_sizes
-from .decoder import Decoder
+from .decoder import NumpyDecoder
 from .deformer import deformer
 from .kinematics import ProxyKinematics
 from .networks import evaluated, layers
@@ -42,7 +42,7 @@ class Player:
         self.initialiser = layers(file.parameters, "initialiser")
         steps = config.scheme == "spring_verlet"
         self.stepper = SpringStepper(config, file.parameters, static) if steps else None
-        self.decoder = Decoder(scene, file.parameters, config)
+        self.decoder = NumpyDecoder(scene, file.parameters, config)
         self.kinematics = ProxyKinematics(scene.rig, self.skeleton.joint_count)
         self.tiles = tiles(scene, file.parameters)
 

@@ -83,7 +83,7 @@ class Room:
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class StepperInputs:
     """F frames of a motion as the stepper takes them.
 
     Attributes:
@@ -122,7 +122,7 @@ class SpringStepper:
         self.stiffness = (config.stiffness / (1 + np.exp(-share))).astype(np.float32)
         self.config = config
 
-    def prepared(self, rest: NDArray, static: NDArray, rates: NDArray, before: NDArray | None) -> Course:
+    def prepared(self, rest: NDArray, static: NDArray, rates: NDArray, before: NDArray | None) -> StepperInputs:
         """Return what poses decide.
 
         Args:
@@ -137,11 +137,11 @@ class SpringStepper:
         history[:-2, 0] = rest
         if before is None:
             history[2:4, 1] = rest[:2]
-            return Course(history, driven, held, allowed, 2)
+            return StepperInputs(history, driven, held, allowed, 2)
         history[:2, 1] = before
-        return Course(history, driven, held, allowed, 0)
+        return StepperInputs(history, driven, held, allowed, 0)
 
-    def rolled(self, course: Course) -> NDArray:
+    def rolled(self, course: StepperInputs) -> NDArray:
         """Return the latents of all frames (F, latent), written into `course`."""
         z, rest, start = course.history[2:, 1], course.history[:-2, 0], course.first
         while start < len(z):
@@ -154,7 +154,7 @@ class SpringStepper:
             z[first:start] = rest[first:start]
         return z
 
-    def _advance(self, course: Course, start: int) -> None:
+    def _advance(self, course: StepperInputs, start: int) -> None:
         z, history = self.config.latent, course.history[start:]
         rooms = [Room(rows) for rows in (self.first, *(layer.rows for layer in self.later[:-1]))]
         differences = np.empty((2, z), np.float32)

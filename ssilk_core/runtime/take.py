@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..assets import GarmentPose, Motion
 from ..kinematics import run_up
-from .drive import Drive, drive
+from .drive import CharacterFrames, drive
 
 if TYPE_CHECKING:
     from .player import Player
@@ -28,7 +28,7 @@ class Decoded:
     rotations: NDArray
 
 
-class Take:
+class RolledSpan:
     """Latents of a span, and what they decode to, in blocks that begin at fixed frames.
 
     A block is always computed whole and from the one before it, so that every bit is the same in whatever order
@@ -52,7 +52,7 @@ class Take:
     def frame_count(self) -> int:
         return self.motion.frame_count - self.before
 
-    def resume(self, other: Take, frames: int) -> None:
+    def resume(self, other: RolledSpan, frames: int) -> None:
         """Take over the latents of the span's first `frames` frames, over which both motions are the same."""
         same = min(other.rolled - other.before, frames, other.frame_count - 1)  # the last one may be held
         if same >= HISTORY:  # all that a run-up depends on
@@ -91,7 +91,7 @@ class Take:
         self.rolled = done + len(driven.static)
         self.latents[done : self.rolled] = latents
 
-    def _driven(self, number: int) -> Drive:
+    def _driven(self, number: int) -> CharacterFrames:
         frames = self._frames(number)
         seen = min(frames.start, HISTORY)
         return drive(
@@ -104,12 +104,12 @@ class Take:
         return Decoded(*self.player.decoder.decoded(self.states(stop)[start:]))
 
 
-def take_of(player: Player, span: Motion, block: int, pre_roll: float) -> Take:
+def take_of(player: Player, span: Motion, block: int, pre_roll: float) -> RolledSpan:
     """Return the take of a span at the player's rate; with `pre_roll` [s] the garment runs up to its first frame."""
     if not pre_roll:
-        return Take(player, span, block, 0)
+        return RolledSpan(player, span, block, 0)
     before = run_up(span, max(pre_roll, HISTORY / span.fps))
     rotations, translations = (
         np.concatenate([getattr(part, name) for part in (before, span)]) for name in ("rotations", "translations")
     )
-    return Take(player, Motion(span.path, span.fps, rotations, translations), block, before.frame_count)
+    return RolledSpan(player, Motion(span.path, span.fps, rotations, translations), block, before.frame_count)

@@ -26,7 +26,7 @@ from ..skinning import blended, transformed
 
 
 @dataclass(frozen=True, eq=False)
-class Span:
+class MotionSpan:
     """A part of a shot without cuts, at the rate of the solver's steps.
 
     Attributes:
@@ -47,7 +47,7 @@ class Span:
         return (self.motion.frame_count - 1) // self.substeps + 1
 
 
-def spans_of(motion: Motion, shot: int, fps: float, substeps: int, longest: int | None = None) -> list[Span]:
+def spans_of(motion: Motion, shot: int, fps: float, substeps: int, longest: int | None = None) -> list[MotionSpan]:
     """Return the spans of a motion between its cuts, of `longest` frames at most, those of a shot at `fps`."""
     spans, first, source = [], 0, 0
     for part in split_at_cuts(motion):
@@ -57,12 +57,12 @@ def spans_of(motion: Motion, shot: int, fps: float, substeps: int, longest: int 
             count = (min(most, stop - start) - 1) * substeps + 1
             position = (start + np.arange(count) / substeps) * motion.fps / fps - source
             poses = sample_motion(part, position.clip(0, part.frame_count - 1))
-            spans.append(Span(shot, start, substeps, Motion(motion.path, fps * substeps, *poses)))
+            spans.append(MotionSpan(shot, start, substeps, Motion(motion.path, fps * substeps, *poses)))
         first, source = stop, source + part.frame_count
     return spans
 
 
-def played(motion: Motion, spans: Sequence[Span]) -> Motion:
+def played(motion: Motion, spans: Sequence[MotionSpan]) -> Motion:
     """Return the motion as its spans play it: the character of a shot, frame by frame."""
     fps, substeps = spans[0].motion.fps / spans[0].substeps, spans[0].substeps
     parts = [span.motion for span in spans]
@@ -72,7 +72,7 @@ def played(motion: Motion, spans: Sequence[Span]) -> Motion:
 
 
 @dataclass(frozen=True, eq=False)
-class Poses:
+class PosedCharacters:
     """Characters at one step, each about its own root.
 
     Attributes:
@@ -96,12 +96,12 @@ class Actors:
         self.weights = torch.as_tensor(scene.plain_skin.dense(joints), dtype=dtype, device=device)
         self.rest = torch.as_tensor(np.array(scene.garment.mesh.points), dtype=dtype, device=device)[:, :, None]
 
-    def poses(self, spans: Sequence[Span], step: int) -> Poses:
+    def poses(self, spans: Sequence[MotionSpan], step: int) -> PosedCharacters:
         """Return the poses of all spans at a step."""
         rotations = np.stack([span.motion.rotations[step] for span in spans])
         return self.posed(rotations, np.stack([span.motion.translations[step] for span in spans]))
 
-    def posed(self, rotations: Floats, translations: Floats) -> Poses:
+    def posed(self, rotations: Floats, translations: Floats) -> PosedCharacters:
         """Return poses of local joint rotations (N, J, 4) and translations (N, J, 3)."""
         world = world_transforms(rigid(matrix_from_quaternion(rotations), translations), self.skeleton.parents)
         root = world[:, 0, :3, 3].copy()
@@ -109,7 +109,7 @@ class Actors:
         matrices = skinning_matrices(world, self.skeleton.bind_transforms)[:, :, :3].transpose(1, 2, 3, 0)
         character = torch.as_tensor(matrices.copy(), dtype=self.dtype, device=self.rest.device)
         plain = transformed(blended(self.weights, character), self.rest)
-        return Poses(
+        return PosedCharacters(
             torch.as_tensor(root.T.copy(), device=self.rest.device),
             self.body.posed(character.float(), exact=True),
             plain,

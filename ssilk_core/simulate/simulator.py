@@ -20,7 +20,7 @@ from ..constants import GRAVITY
 from ..errors import fail
 from ..events import Progress, Reporter, silent
 from ..fabrics import Fabric
-from .actors import Actors, Poses, Span, played, spans_of
+from .actors import Actors, MotionSpan, PosedCharacters, played, spans_of
 from .incremental_potential import IncrementalPotential, StepInputs
 from .newton import Solution, SolverOptions, minimise_from
 
@@ -114,7 +114,7 @@ class Past:
         """Return the last positions relative to the root then, shape (V, 3, N)."""
         return (self.last - self.root).to(self.plain.dtype)
 
-    def carried_on(self, poses: Poses) -> Tensor:
+    def carried_on(self, poses: PosedCharacters) -> Tensor:
         """Return positions as far from plain skinning as one step ago, relative to the roots of `poses`."""
         return self.local - self.plain + poses.plain
 
@@ -150,7 +150,7 @@ class Simulator:
         for start in range(0, len(spans), options.batch):
             yield from self._advanced(spans[start : start + options.batch])
 
-    def _advanced(self, spans: Sequence[Span]) -> Iterator[SimulatedFrame]:
+    def _advanced(self, spans: Sequence[MotionSpan]) -> Iterator[SimulatedFrame]:
         """Yield the frames of spans, the longest first."""
         past: Past | None = None
         for step in range(spans[0].motion.frame_count):
@@ -163,11 +163,11 @@ class Simulator:
             if step % self.options.substeps == 0:
                 yield from _frames(running, step // self.options.substeps, world, solution)
 
-    def rest(self, poses: Poses, start: Tensor) -> Solution:
+    def rest(self, poses: PosedCharacters, start: Tensor) -> Solution:
         """Return the quasi-static states of poses nearest to `start` (V, 3, N), relative to the roots."""
         return minimise_from(self.potential, start, self.inputs(poses, None), self.options.rest)
 
-    def inputs(self, poses: Poses, past: Past | None) -> StepInputs:
+    def inputs(self, poses: PosedCharacters, past: Past | None) -> StepInputs:
         """Return what positions relative to the roots are solved for: a step after `past`, else a state at rest."""
         gravity = self.gravity.expand(3, poses.root.shape[-1])
         if past is None:
@@ -176,7 +176,7 @@ class Simulator:
         predicted = past.carried_on(poses) if past.before is None else past.local + (past.last - past.before - shift)
         return StepInputs(poses.body, gravity, predicted.to(past.plain.dtype), past.local, self.dt)
 
-    def _stepped(self, poses: Poses, past: Past) -> Solution:
+    def _stepped(self, poses: PosedCharacters, past: Past) -> Solution:
         """Return the states one step later."""
         inputs = self.inputs(poses, past)
         assert inputs.predicted is not None
@@ -187,7 +187,7 @@ class Simulator:
         """Return the minima of one step (V, 3, N), sought from `start`."""
         return minimise_from(self.potential, start, inputs, self.options.solver)
 
-    def pinned(self, x: Tensor, poses: Poses) -> Tensor:
+    def pinned(self, x: Tensor, poses: PosedCharacters) -> Tensor:
         """Return positions (V, 3, N) with the vertices that do not move freely under plain skinning."""
         free = self.potential.free
         return poses.plain.index_copy(0, free, x[free].to(poses.plain.dtype))
@@ -203,7 +203,7 @@ class Simulator:
         return best
 
 
-def _frames(spans: Sequence[Span], frame: int, world: Tensor, solution: Solution) -> Iterator[SimulatedFrame]:
+def _frames(spans: Sequence[MotionSpan], frame: int, world: Tensor, solution: Solution) -> Iterator[SimulatedFrame]:
     points = world.permute(2, 0, 1).cpu().numpy()
     figures = [
         values.tolist() for values in (solution.energy, solution.residual, solution.iterations, solution.fixed)

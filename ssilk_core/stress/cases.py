@@ -32,8 +32,8 @@ from .measures import (
     turned,
     weighed,
 )
-from .outcome import Measured, Outcome, Verdict
-from .subject import Subject
+from .outcome import CaseMeasurement, CaseOutcome, Verdict
+from .subject import StressSubject
 
 UPWARD, FORWARD = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
@@ -57,19 +57,19 @@ class Case:
         """Return whether the case's name contains one of some words, or there are none."""
         return not words or any(word in f"{self.group}: {self.name}" for word in words)
 
-    def run(self, subject: Subject) -> Outcome:
+    def run(self, subject: StressSubject) -> CaseOutcome:
         """Do it and say what came of it."""
         began = time.perf_counter()
         verdict, said, measured = self._tried(subject)
-        return Outcome(self.name, self.group, verdict, said, measured, time.perf_counter() - began)
+        return CaseOutcome(self.name, self.group, verdict, said, measured, time.perf_counter() - began)
 
-    def _tried(self, subject: Subject) -> tuple[Verdict, str, Measured]:
+    def _tried(self, subject: StressSubject) -> tuple[Verdict, str, CaseMeasurement]:
         try:
             measured = self.measure(subject)
         except SsilkError as error:
-            return "refuses", str(error), Measured()
+            return "refuses", str(error), CaseMeasurement()
         except (RuntimeError, ValueError, ArithmeticError, IndexError, MemoryError) as error:
-            return "breaks", f"{type(error).__name__}: {error}".partition("\n")[0], Measured()
+            return "breaks", f"{type(error).__name__}: {error}".partition("\n")[0], CaseMeasurement()
         return measured.verdict, measured.note, measured
 
 

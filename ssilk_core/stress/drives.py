@@ -22,7 +22,7 @@ Turn = Callable[[Floats], Floats]  # times [s] (N,) to quaternions (N, 4)
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
+class ProceduralMotion:
     """A motion of `frames` frames at `fps`, given by joint rotations and translations at any times [s] (N,).
 
     `loop` is the time after which it repeats [s]; zero where it does not.
@@ -47,22 +47,22 @@ class Drive:
         for start in range(0, self.frames, size):
             yield self.motion(start, start + size)
 
-    def lasting(self, seconds: float, fps: float | None = None) -> Drive:
+    def lasting(self, seconds: float, fps: float | None = None) -> ProceduralMotion:
         """Return the drive for so many seconds, at another rate."""
         fps = fps or self.fps
         return replace(self, fps=fps, frames=round(seconds * fps) + 1)
 
-    def looping(self, seconds: float) -> Drive:
+    def looping(self, seconds: float) -> ProceduralMotion:
         """Return the drive for at least so many seconds and three of its loops, ended by a whole one."""
         loops = max(3, int(np.ceil(seconds / self.loop)))
         return self.lasting(loops * self.loop)
 
-    def then(self, change: Callable[[Floats, Floats, Floats], Sampled]) -> Drive:
+    def then(self, change: Callable[[Floats, Floats, Floats], Sampled]) -> ProceduralMotion:
         """Return the drive with rotations and translations changed by a function of (times, both)."""
         return replace(self, at=lambda times: change(times, *self.at(times)))
 
 
-def sway(skeleton: Skeleton, fps: float) -> Drive:
+def sway(skeleton: Skeleton, fps: float) -> ProceduralMotion:
     """Return a drive for want of a motion: every joint turns by sines of its own about the bind pose, in a loop."""
     random, loop = np.random.default_rng(0), SWAY
     local = local_transforms(skeleton.bind_transforms, skeleton.parents)
@@ -77,10 +77,10 @@ def sway(skeleton: Skeleton, fps: float) -> Drive:
         moved[:, 0, 0] += 0.3 * np.sin(times * 2 * np.pi / loop)
         return multiply_quaternions(rest, turn / np.linalg.norm(turn, axis=-1, keepdims=True)), moved
 
-    return Drive(fps, 1, at, loop)
+    return ProceduralMotion(fps, 1, at, loop)
 
 
-def looped(motion: Motion, fps: float) -> Drive:
+def looped(motion: Motion, fps: float) -> ProceduralMotion:
     """Return a clip played to and fro without end, slowing at both ends; a loop has whole frames at `fps`."""
     last = motion.frame_count - 1
     loop = max(1, round(np.pi * last / motion.fps * fps)) / fps  # at the clip's own speed in its middle
@@ -88,10 +88,10 @@ def looped(motion: Motion, fps: float) -> Drive:
     def at(times: Floats) -> Sampled:
         return sample_motion(motion, last * (1 - np.cos(2 * np.pi * times / loop)) / 2)
 
-    return Drive(fps, 1, at, loop)
+    return ProceduralMotion(fps, 1, at, loop)
 
 
-def turned(drive: Drive, skeleton: Skeleton, turn: Turn) -> Drive:
+def turned(drive: ProceduralMotion, skeleton: Skeleton, turn: Turn) -> ProceduralMotion:
     """Return the drive with the whole character turned about its first joint, by a function of time."""
     roots = np.flatnonzero(skeleton.parents < 0)
 
@@ -122,7 +122,7 @@ def about(axis: tuple[float, float, float], speed: float = 0.0, angle: float = 0
     return turn
 
 
-def carried(drive: Drive, path: Callable[[Floats], Floats], skeleton: Skeleton) -> Drive:
+def carried(drive: ProceduralMotion, path: Callable[[Floats], Floats], skeleton: Skeleton) -> ProceduralMotion:
     """Return the drive with the character moved by a path: times [s] (N,) to offsets [m] (N, 3)."""
     roots = np.flatnonzero(skeleton.parents < 0)
 
@@ -134,12 +134,12 @@ def carried(drive: Drive, path: Callable[[Floats], Floats], skeleton: Skeleton) 
     return drive.then(change)
 
 
-def stopping(drive: Drive, time: float) -> Drive:
+def stopping(drive: ProceduralMotion, time: float) -> ProceduralMotion:
     """Return the drive with its pose at a time [s] held from then on, at once."""
     return replace(drive, at=lambda times: drive.at(np.minimum(times, time)))
 
 
-def contorted(drive: Drive, skeleton: Skeleton, every: float) -> Drive:
+def contorted(drive: ProceduralMotion, skeleton: Skeleton, every: float) -> ProceduralMotion:
     """Return a drive in which each joint but the roots turns at will: uniform on SO(3), anew `every` so often [s]."""
     random, inner = np.random.default_rng(1), skeleton.parents >= 0
     keys = random.normal(size=(64, skeleton.joint_count, 4))
@@ -154,7 +154,7 @@ def contorted(drive: Drive, skeleton: Skeleton, every: float) -> Drive:
     return drive.then(change)
 
 
-def broken(drive: Drive, frame: int) -> Drive:
+def broken(drive: ProceduralMotion, frame: int) -> ProceduralMotion:
     """Return the drive with NaN for all rotations of one frame."""
 
     def change(times: Floats, rotations: Floats, translations: Floats) -> Sampled:
@@ -164,6 +164,6 @@ def broken(drive: Drive, frame: int) -> Drive:
     return drive.then(change)
 
 
-def enlarged(drive: Drive, scale: float) -> Drive:
+def enlarged(drive: ProceduralMotion, scale: float) -> ProceduralMotion:
     """Return the drive of a character that is so many times as large."""
     return drive.then(lambda times, rotations, translations: (rotations, scale * translations))

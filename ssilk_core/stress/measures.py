@@ -15,28 +15,28 @@ from ..constants import GRAVITY
 from ..fabrics import Fabric
 from ..preflight.units import FileUnits, body_size
 from . import drives, worlds
-from .drives import Drive
+from .drives import ProceduralMotion
 from .meter import extent, positions, precision_errors
-from .outcome import Measured
-from .subject import Subject
+from .outcome import CaseMeasurement
+from .subject import StressSubject
 from .trials import Trial, simulated, trained
 
 PATCH = 600  # vertices of what is simulated
 
-Measure = Callable[[Subject], Measured]
+Measure = Callable[[StressSubject], CaseMeasurement]
 
 
-def driven(change: Callable[[Subject, Drive], Drive]) -> Measure:
+def driven(change: Callable[[StressSubject, ProceduralMotion], ProceduralMotion]) -> Measure:
     """Return what rolls the model over a changed motion."""
-    return lambda subject: Measured(extent(subject.model, subject.fabric, change(subject, subject.base)))
+    return lambda subject: CaseMeasurement(extent(subject.model, subject.fabric, change(subject, subject.base)))
 
 
 def lasting(frames: int) -> Measure:
     """Return what rolls the model over so many frames."""
 
-    def measure(subject: Subject) -> Measured:
+    def measure(subject: StressSubject) -> CaseMeasurement:
         count = round(frames * subject.effort.frames)
-        return Measured(extent(subject.model, subject.fabric, replace(subject.base, frames=count)))
+        return CaseMeasurement(extent(subject.model, subject.fabric, replace(subject.base, frames=count)))
 
     return measure
 
@@ -44,16 +44,16 @@ def lasting(frames: int) -> Measure:
 def at_rate(fps: int) -> Measure:
     """Return what bakes at another rate; the error is the distance from the bake at the model's rate [m]."""
 
-    def measure(subject: Subject) -> Measured:
+    def measure(subject: StressSubject) -> CaseMeasurement:
         base = subject.base
         drive = base.lasting((base.frames - 1) / base.fps, fps)
         error = rate_error(subject, drive) if subject.fps.is_integer() else None
-        return Measured(extent(subject.model, subject.fabric, drive), error, "m")
+        return CaseMeasurement(extent(subject.model, subject.fabric, drive), error, "m")
 
     return measure
 
 
-def rate_error(subject: Subject, drive: Drive) -> float:
+def rate_error(subject: StressSubject, drive: ProceduralMotion) -> float:
     """Return the largest distance of a vertex from the bake at the model's rate, at the times of both [m]."""
     fps, own = round(drive.fps), round(subject.fps)
     shared = gcd(fps, own)
@@ -99,16 +99,18 @@ def solved_with(height: float) -> Measure:
     return lambda subject: solved(subject, worlds.pinched(patch(subject), height), subject.fabric)
 
 
-def patch(subject: Subject) -> Scene:
+def patch(subject: StressSubject) -> Scene:
     """Return as much of a garment as is simulated."""
     return worlds.resized(subject.scene, min(PATCH, subject.effort.vertices))
 
 
-def solved(subject: Subject, scene: Scene, fabric: Fabric, gravity: float = GRAVITY) -> Measured:
+def solved(subject: StressSubject, scene: Scene, fabric: Fabric, gravity: float = GRAVITY) -> CaseMeasurement:
     """Simulate some frames; the error is how far out of balance the solver stopped at worst [g]."""
     motion = subject.base.motion(0, subject.effort.simulated)
     found, imbalance = simulated(scene, fabric, motion, gravity)
-    return Measured(found, imbalance, "g", f"simulated, {found.recovered} of {found.frames} frames not to tolerance")
+    return CaseMeasurement(
+        found, imbalance, "g", f"simulated, {found.recovered} of {found.frames} frames not to tolerance"
+    )
 
 
 def membrane(fabric: Fabric, stiffness: float) -> Fabric:
@@ -116,7 +118,7 @@ def membrane(fabric: Fabric, stiffness: float) -> Fabric:
     return replace(fabric, lame_mu=stiffness, lame_lambda=stiffness, stretch=stiffness, shear=stiffness)
 
 
-def measured(trial: Trial, note: str = "") -> Measured:
+def measured(trial: Trial, note: str = "") -> CaseMeasurement:
     """Return a trial training as a measurement; the error is that of single-precision forces, relative to them.
 
     Raises:
@@ -125,13 +127,13 @@ def measured(trial: Trial, note: str = "") -> Measured:
     undone = f"{trial.undone} of {trial.steps} steps undone" if trial.undone else ""
     if 2 * trial.undone > trial.steps:
         raise ArithmeticError(undone)
-    return Measured(trial.extent, trial.error, "of the force", "; ".join(filter(None, (note, undone))))
+    return CaseMeasurement(trial.extent, trial.error, "of the force", "; ".join(filter(None, (note, undone))))
 
 
 def sized(metres: float) -> Measure:
     """Return what trains a garment of another size, with everything around it."""
 
-    def measure(subject: Subject) -> Measured:
+    def measure(subject: StressSubject) -> CaseMeasurement:
         scale = metres / worlds.garment_size(subject.scene)
         scene, drive = worlds.enlarged(subject.scene, scale), drives.enlarged(subject.base, scale)
         body, units = scene.character.merged_body().mesh, FileUnits("", 1.0, "Y", True, True)
@@ -144,7 +146,7 @@ def sized(metres: float) -> Measure:
 def made_of(stiffness: float) -> Measure:
     """Return what trains with a fabric of so many N/m in each of its membranes' constants."""
 
-    def measure(subject: Subject) -> Measured:
+    def measure(subject: StressSubject) -> CaseMeasurement:
         fabric = membrane(subject.fabric, stiffness)
         return measured(trained(subject.scene, fabric, subject.base, subject.effort.steps))
 
@@ -154,7 +156,7 @@ def made_of(stiffness: float) -> Measure:
 def meshed(height: float) -> Measure:
     """Return what trains with slivers among the triangles, so many times as high as long."""
 
-    def measure(subject: Subject) -> Measured:
+    def measure(subject: StressSubject) -> CaseMeasurement:
         scene = worlds.pinched(subject.scene, height)
         return measured(trained(scene, subject.fabric, subject.base, subject.effort.steps))
 
@@ -164,7 +166,7 @@ def meshed(height: float) -> Measure:
 def counted(vertices: int) -> Measure:
     """Return what trains a garment of about so many vertices."""
 
-    def measure(subject: Subject) -> Measured:
+    def measure(subject: StressSubject) -> CaseMeasurement:
         scene = worlds.resized(subject.scene, min(vertices, subject.effort.vertices))
         few = scene.garment.mesh.vertex_count > 50_000
         base, steps = subject.base, min(subject.effort.steps, 4) if few else subject.effort.steps
@@ -178,11 +180,11 @@ def counted(vertices: int) -> Measure:
 def in_precision(dtype: torch.dtype) -> Measure:
     """Return what rolls and skins in a precision; the error is the distance from float64 [m]."""
 
-    def measure(subject: Subject) -> Measured:
+    def measure(subject: StressSubject) -> CaseMeasurement:
         model, exact = subject.in_precision(dtype), subject.in_precision(torch.float64)
         networks, whole = precision_errors(model, exact, subject.base)
         note = f"{networks:.2g} m of that by the networks, skinned in float64"
-        return Measured(extent(model, subject.fabric, subject.base), whole, "m", note)
+        return CaseMeasurement(extent(model, subject.fabric, subject.base), whole, "m", note)
 
     return measure
 

@@ -17,7 +17,7 @@ from ..kinematics import motion_transforms, skinning_matrices
 from ..model.network import GarmentModel
 from ..rollout import decode, garment_poses, roll_blocks
 from ..skinning import Skinning
-from .drives import Drive
+from .drives import ProceduralMotion
 from .worlds import garment_size
 
 ENERGY_EVERY = 4  # frames: energies take ten times as long as all else
@@ -69,7 +69,7 @@ class Latents:
         self.largest = max(self.largest, float(inputs[0].abs().max()))
 
 
-class Meter:
+class ExtentMeter:
     """Takes blocks of frames of one garment and keeps what an `Extent` needs; energies in `spans` of frames alone."""
 
     def __init__(self, scene: Scene, fabric: Fabric, fps: float, spans: Sequence[range] = ()) -> None:
@@ -113,7 +113,7 @@ class Meter:
         return Extent(frames, self.finite, self.speed, self.distance, allowed, latent, self.growth, recovered)
 
 
-def compared_loops(drive: Drive) -> tuple[range, ...]:
+def compared_loops(drive: ProceduralMotion) -> tuple[range, ...]:
     """Return the frames of a drive's second loop and of its last; nothing where there are not three."""
     length = round(drive.loop * drive.fps)
     loops = drive.frames // length if length else 0
@@ -131,11 +131,11 @@ def matrices_about_root(motion: Motion, scene: Scene) -> tuple[Tensor, Floats]:
 
 
 @dataclass(eq=False)
-class Course:
+class StressRollout:
     """A drive as a model plays it, block by block: the motion of a block and the garment's pose on it."""
 
     model: GarmentModel
-    drive: Drive
+    drive: ProceduralMotion
     recovered: list[range] = field(default_factory=list)
 
     def __iter__(self) -> Iterator[tuple[Motion, GarmentPose]]:
@@ -156,16 +156,16 @@ class Course:
             yield block, GarmentPose(0, *self.model.file_pose(step.activation, step.rotations))
 
 
-def extent(model: GarmentModel, fabric: Fabric, drive: Drive) -> Extent:
+def extent(model: GarmentModel, fabric: Fabric, drive: ProceduralMotion) -> Extent:
     """Roll a model over a drive and measure it; of more than `LONG` frames some blocks are decoded, evenly spread,
     and those of the compared loops.
 
     Raises:
         SsilkError: the motion cannot be played.
     """
-    course, latents = Course(model, drive), Latents()
+    course, latents = StressRollout(model, drive), Latents()
     spans = compared_loops(drive)
-    meter = Meter(model.scene, fabric, drive.fps, spans)
+    meter = ExtentMeter(model.scene, fabric, drive.fps, spans)
     skipped = -(-drive.frames // LONG)
     handle = latents.watched(model)
     try:
@@ -179,18 +179,18 @@ def extent(model: GarmentModel, fabric: Fabric, drive: Drive) -> Extent:
     return meter.extent(drive.frames, latent=latents.largest, recovered=lost)
 
 
-def positions(model: GarmentModel, drive: Drive) -> Floats:
+def positions(model: GarmentModel, drive: ProceduralMotion) -> Floats:
     """Return the garment's points over a drive, relative to the root (F, V, 3) [m]; all are held in memory."""
     found = []
-    for motion, pose in Course(model, drive):
+    for motion, pose in StressRollout(model, drive):
         found.append(decode(model, motion, pose) - matrices_about_root(motion, model.scene)[1])
     return np.concatenate(found)
 
 
-def precision_errors(model: GarmentModel, exact: GarmentModel, drive: Drive) -> tuple[float, float]:
+def precision_errors(model: GarmentModel, exact: GarmentModel, drive: ProceduralMotion) -> tuple[float, float]:
     """Return how far any vertex is off [m]: by the networks of `model` alone, and by its skinning as well."""
     networks, whole = 0.0, 0.0
-    for (motion, pose), (_, true) in zip(Course(model, drive), Course(exact, drive)):
+    for (motion, pose), (_, true) in zip(StressRollout(model, drive), StressRollout(exact, drive)):
         expected = decode(exact, motion, true)
         networks = max(networks, float(np.linalg.norm(decode(exact, motion, pose) - expected, axis=2).max()))
         whole = max(whole, float(np.linalg.norm(decode(model, motion, pose) - expected, axis=2).max()))

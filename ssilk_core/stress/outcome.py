@@ -16,7 +16,7 @@ HEADER = ("extreme", "what happens", "frames", "bounded", "speed [m/s]", "off pl
 
 
 @dataclass(frozen=True)
-class Measured:
+class CaseMeasurement:
     """What a case found: an extent where there was a rollout, an error and its unit, and words to add."""
 
     extent: Extent | None = None
@@ -34,7 +34,7 @@ class Measured:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class CaseOutcome:
     """One line of the table.
 
     Attributes:
@@ -49,17 +49,17 @@ class Outcome:
     group: str
     verdict: Verdict
     said: str
-    measured: Measured
+    measured: CaseMeasurement
     seconds: float
 
     @classmethod
-    def of(cls, document: Mapping[str, Any]) -> Outcome:
+    def of(cls, document: Mapping[str, Any]) -> CaseOutcome:
         """Return an outcome that was written as JSON, where None stands for what is not finite."""
         found = dict(document["measured"])
         if found["extent"]:
             figures: dict[str, Any] = {k: nan if value is None else value for k, value in found["extent"].items()}
             found["extent"] = Extent(**figures)
-        return cls(**{**document, "measured": Measured(**found)})
+        return cls(**{**document, "measured": CaseMeasurement(**found)})
 
     def row(self) -> list[str]:
         """Return the line as words."""
@@ -75,7 +75,7 @@ class Outcome:
         return [f"{self.group}: {self.name}", words, *figures, off, f"{self.seconds:.0f}"]
 
 
-def markdown(outcomes: Sequence[Outcome]) -> str:
+def markdown(outcomes: Sequence[CaseOutcome]) -> str:
     """Return outcomes as a Markdown table."""
     lines = [HEADER, ["---"] * 2 + ["---:"] * (len(HEADER) - 2), *(outcome.row() for outcome in outcomes)]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"

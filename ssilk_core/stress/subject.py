@@ -12,7 +12,7 @@ from ..assets import Motion, Scene
 from ..checkpoint import ModelFile, network
 from ..fabrics import Fabric
 from ..model.network import GarmentModel
-from .drives import Drive, looped, sway
+from .drives import ProceduralMotion, looped, sway
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +38,7 @@ QUICK = Effort(seconds=3.0, frames=0.1, steps=12, simulated=3, vertices=20_000)
 
 
 @dataclass(frozen=True, eq=False)
-class Subject:
+class StressSubject:
     """A model file, its scene with the bodies of the character, and a clip; none for a made-up motion."""
 
     file: ModelFile
@@ -55,7 +55,7 @@ class Subject:
         return self.file.config.fps
 
     @cached_property
-    def base(self) -> Drive:
+    def base(self) -> ProceduralMotion:
         """The motion that every case begins from."""
         skeleton = self.scene.character.skeleton
         endless = looped(self.clip, self.fps) if self.clip else sway(skeleton, self.fps)

@@ -21,8 +21,8 @@ from ..simulate.simulator import Simulator
 from ..skinning import Skinning
 from ..training.job import TrainJob
 from ..training.parts import build_parts
-from .drives import Drive
-from .meter import Extent, Meter, extent, matrices_about_root
+from .drives import ProceduralMotion
+from .meter import Extent, ExtentMeter, extent, matrices_about_root
 
 SMALL = ModelConfig(latent=16, widths=(32, 32), shapes=8)
 WIGGLE = 1e-3  # of the garment's size: by how much points are moved off plain skinning to have energies compared
@@ -39,7 +39,7 @@ class Trial:
     error: float
 
 
-def trained(scene: Scene, fabric: Fabric, drive: Drive, steps: int, *, windows: int = 2) -> Trial:
+def trained(scene: Scene, fabric: Fabric, drive: ProceduralMotion, steps: int, *, windows: int = 2) -> Trial:
     """Train a small network for some steps, roll it over the same drive, and compare energies' precisions.
 
     Raises:
@@ -74,7 +74,7 @@ def simulated(scene: Scene, fabric: Fabric, motion: Motion, gravity: float = GRA
     Frames that the solver left out of balance by more than its tolerance count as recovered.
     """
     options = SimulationOptions(fps=motion.fps, gravity=(0.0, -gravity, 0.0))
-    meter = Meter(scene, fabric, motion.fps)
+    meter = ExtentMeter(scene, fabric, motion.fps)
     frames = list(Simulator(scene, fabric, options).frames([motion]))
     residual = [frame.residual for frame in frames]
     meter.add(motion, np.stack([frame.points for frame in frames]))

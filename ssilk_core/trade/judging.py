@@ -14,7 +14,7 @@ import torch
 
 from ..collision.body import CollisionBody
 from ..collision.contacts import Contacts
-from ..evaluation.methods import Dressed, Method, Reel
+from ..evaluation.methods import EvaluationScene, Method, TakeSet
 
 BODIES = (("triangles", True, 1), ("vertices", False, 1), ("every 4th vertex", False, 4))
 FRAMES = 64  # that are judged
@@ -39,7 +39,7 @@ class Judged:
 
 
 @torch.no_grad()
-def judged(dressed: Dressed, reel: Reel, method: Method) -> list[Judged]:
+def judged(dressed: EvaluationScene, reel: TakeSet, method: Method) -> list[Judged]:
     """Judge the first frames of the first take with each body."""
     frames = range(min(FRAMES, reel.takes[0].frame_count))
     x, character = method.vertices(0, frames), reel.character(0, frames)

@@ -13,15 +13,15 @@ import numpy as np
 from ..assets import Motion
 from ..checkpoint import ModelFile, network
 from ..cost import POINT, ShotBytes, Time, memory, model_bytes, operations, play_time
-from ..evaluation.methods import Dressed, Method, Reel
+from ..evaluation.methods import EvaluationScene, Method, TakeSet
 from ..evaluation.record import recorded
 from ..evaluation.tally import Tally
 from ..kinematics import resample
-from ..reduction import Reducer, Size
+from ..reduction import ModelSize, Reducer
 from ..rollout import decode, garment_poses
 from ..runtime import Player
 from .played import Played
-from .point import SECONDS, Point
+from .point import SECONDS, TradePoint
 from .variants import Variant
 
 HALVES = ("float16", "bfloat16")  # two bytes on disk for each parameter
@@ -31,7 +31,7 @@ Weigh = Callable[[ModelFile, float], ShotBytes]
 """Tells how large shots of a model are at a frame rate."""
 
 
-class Meter:
+class VariantMeter:
     """Measures variants of one model on takes.
 
     Args:
@@ -41,7 +41,13 @@ class Meter:
     """
 
     def __init__(
-        self, name: str, reducer: Reducer, dressed: Dressed, reel: Reel, weigh: Weigh, reference: Method | None = None
+        self,
+        name: str,
+        reducer: Reducer,
+        dressed: EvaluationScene,
+        reel: TakeSet,
+        weigh: Weigh,
+        reference: Method | None = None,
     ) -> None:
         self.name, self.reducer, self.dressed, self.reel, self.weigh = name, reducer, dressed, reel, weigh
         self.whole = Played(name, reducer.player, dressed, reel, fps=dressed.fps)
@@ -49,7 +55,7 @@ class Meter:
         self._cut = lru_cache(1)(lambda size: reducer.reduced(size).file)
         self._torch = lru_cache(1)(self._torch_time)
 
-    def point(self, variant: Variant) -> Point:
+    def point(self, variant: Variant) -> TradePoint:
         """Measure one variant."""
         cut = self._cut(variant.size)
         player = Player(variant.rounded(cut))
@@ -57,7 +63,7 @@ class Meter:
         tally, timed = self._tally(method, self.whole), self._time(variant, method)
         shot = self._shot(variant, cut)
         total = float(tally.totals().mean())
-        return Point(
+        return TradePoint(
             model=self.name,
             swept=variant.swept,
             variant=variant.name,
@@ -94,7 +100,7 @@ class Meter:
             return Time.of(method.milliseconds)
         return play_time(method.player, resample(self.motion, variant.fps))
 
-    def _torch_time(self, size: Size) -> float:
+    def _torch_time(self, size: ModelSize) -> float:
         """Return the milliseconds that a frame takes in PyTorch, of the second of two passes over a clip."""
         model = network(self._cut(size)).to(self.dressed.device)
         for _ in range(2):

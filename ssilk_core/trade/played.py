@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ..assets import Floats, GarmentPose, Motion
-from ..evaluation.methods import Dressed, Reel
+from ..evaluation.methods import EvaluationScene, TakeSet
 from ..kinematics import resample, sample_motion
 from ..refine import RefineOptions, Refiner
 from ..runtime import Player
@@ -32,7 +32,7 @@ class Played:
     """
 
     def __init__(
-        self, name: str, player: Player, dressed: Dressed, reel: Reel, *, fps: float, refine: int = 0
+        self, name: str, player: Player, dressed: EvaluationScene, reel: TakeSet, *, fps: float, refine: int = 0
     ) -> None:
         self.name, self.player, self.dressed, self.reel, self.fps = name, player, dressed, reel, fps
         self.options = RefineOptions(iterations=refine) if refine else None

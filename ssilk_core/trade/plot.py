@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..files import replacing
-from .point import SECONDS, Point, front
+from .point import SECONDS, TradePoint, front
 
 if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
@@ -56,7 +56,7 @@ class Axis:
         return [v for decade in decades for step in steps if self.low <= (v := step * 10.0**decade) <= self.high]
 
 
-def write_plot(path: Path, points: Sequence[Point]) -> None:
+def write_plot(path: Path, points: Sequence[TradePoint]) -> None:
     """Draw points, coloured by what was swept; the front is marked, and named are its points and quality levels."""
     from PIL import Image, ImageDraw
 
@@ -88,7 +88,12 @@ def _legend(pen: ImageDraw, colours: dict[str, str]) -> None:
 
 
 def _panel(
-    pen: ImageDraw, corner: tuple[int, int], points: Sequence[Point], cost: str, error: str, colours: dict[str, str]
+    pen: ImageDraw,
+    corner: tuple[int, int],
+    points: Sequence[TradePoint],
+    cost: str,
+    error: str,
+    colours: dict[str, str],
 ) -> None:
     """Draw one cost against one error; what the solver refined lies beyond, at the edge."""
     (name, unit), (title, scale) = COSTS[cost], ERRORS[error]

@@ -10,7 +10,7 @@ SECONDS = 10  # of the shots whose bytes are compared
 
 
 @dataclass(frozen=True, kw_only=True)
-class Point:
+class TradePoint:
     """One variant of one model; SI units but for times.
 
     Attributes:

@@ -13,8 +13,8 @@ from ..errors import SsilkError
 from ..events import Message, Progress, Reporter, silent
 from ..files import replacing
 from .judging import Judged
-from .measure import Meter
-from .point import Point
+from .measure import VariantMeter
+from .point import TradePoint
 from .variants import Variant
 
 
@@ -31,7 +31,7 @@ class Results:
     path: Path | None
     asked: Mapping[str, Any]
     judging: Sequence[Judged] = ()
-    points: list[Point] = field(default_factory=list)
+    points: list[TradePoint] = field(default_factory=list)
 
     def resume(self, report: Reporter) -> None:
         """Take over what an earlier run with the same question has measured."""
@@ -39,7 +39,7 @@ class Results:
             return
         try:
             document = json.loads(self.path.read_text())
-            points = [Point(**point) for point in document["points"]]
+            points = [TradePoint(**point) for point in document["points"]]
             same = document["asked"] == json.loads(json.dumps(self.asked))
         except (ValueError, TypeError, KeyError) as error:
             raise SsilkError(f"{self.path}: these are no figures of a trade ({error}); name another file.") from error
@@ -51,7 +51,7 @@ class Results:
         """Return whether a variant was measured."""
         return any((p.model, p.swept, p.variant) == (model, variant.swept, variant.name) for p in self.points)
 
-    def add(self, point: Point) -> None:
+    def add(self, point: TradePoint) -> None:
         """Keep a point."""
         self.points.append(point)
         if self.path is not None:
@@ -65,7 +65,7 @@ class Results:
                 temporary.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
-def sweep(meter: Meter, variants: Iterable[Variant], results: Results, report: Reporter = silent) -> None:
+def sweep(meter: VariantMeter, variants: Iterable[Variant], results: Results, report: Reporter = silent) -> None:
     """Measure a model's variants but for those that were measured before, and keep each as it comes."""
     tried = list(variants)
     for done, variant in enumerate(tried):

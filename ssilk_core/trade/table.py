@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from ..evaluation.tables import aligned
 from .judging import Judged
-from .point import SECONDS, Point, front
+from .point import SECONDS, TradePoint, front
 
 HEADER = ("model", "swept", "variant", "size", "ms a frame", "95 %", "PyTorch", "memory [MB]", "model [MB]",
           f"{SECONDS} s shot [MB]", "total [J]", "excess [J]", "inside", "RMS [mm]", "velocity [mm/s]",
@@ -15,7 +15,7 @@ HEADER = ("model", "swept", "variant", "size", "ms a frame", "95 %", "PyTorch", 
 MARKS = {"milliseconds": "time", "shot_bytes": "shot", "model_bytes": "model"}
 
 
-def table(points: Sequence[Point]) -> str:
+def table(points: Sequence[TradePoint]) -> str:
     """Return a line for each point; "best at" says for which costs no other is nearer to the whole model."""
     best = {mark: front([(getattr(p, cost), p.position) for p in points]) for cost, mark in MARKS.items()}
     rows = [_cells(point, [mark for mark, own in best.items() if row in own]) for row, point in enumerate(points)]
@@ -31,7 +31,7 @@ def judging_table(found: Sequence[Judged]) -> str:
     return aligned(header, rows, 1)
 
 
-def _cells(p: Point, best: list[str]) -> list[str]:
+def _cells(p: TradePoint, best: list[str]) -> list[str]:
     return [
         p.model,
         p.swept,

@@ -11,7 +11,7 @@ import numpy as np
 from ..checkpoint import ModelFile
 from ..packing import packed, unpacked
 from ..quality import QUALITIES
-from ..reduction import Size
+from ..reduction import ModelSize
 
 WHOLE = "as trained"
 SHAPES, JOINTS = (0.75, 0.5, 0.25, 0.125, 0.0), (0.75, 0.5, 0.25, 0.0)  # shares of what there is
@@ -44,7 +44,7 @@ class Variant:
 
     swept: str
     name: str
-    size: Size
+    size: ModelSize
     precision: str = "float32"
     fps: float
     refine: int = 0
@@ -55,7 +55,7 @@ class Variant:
         return replace(file, parameters=parameters)
 
 
-def variants(whole: Size, fps: float, *, refined: bool = True) -> Iterator[Variant]:
+def variants(whole: ModelSize, fps: float, *, refined: bool = True) -> Iterator[Variant]:
     """Yield the whole model first, then what each sweep tries, then the quality levels.
 
     Args:

@@ -15,7 +15,7 @@ MOST_POINTS = 400
 
 
 @dataclass(frozen=True)
-class Point:
+class CurvePoint:
     """One validation.
 
     Attributes:
@@ -36,13 +36,13 @@ def curve_path(model: str | Path) -> Path:
     return Path(model).with_suffix(".curve.json")
 
 
-def with_point(curve: list[Point], point: Point) -> list[Point]:
+def with_point(curve: list[CurvePoint], point: CurvePoint) -> list[CurvePoint]:
     """Return a curve with one point more; every second one is dropped when there are too many."""
     curve = [*curve, point]
     return curve if len(curve) <= MOST_POINTS else curve[::2]
 
 
-def write_curve(path: Path, curve: list[Point], plain: Score) -> None:
+def write_curve(path: Path, curve: list[CurvePoint], plain: Score) -> None:
     """Write {"plain": score of plain skinning, "points": [{"iteration", "seconds", "batch", "validation"}, ...]}."""
     points = [
         {"iteration": p.iteration, "seconds": round(p.seconds, 3), "batch": p.batch, "validation": summary(p.score)}

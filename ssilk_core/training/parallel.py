@@ -30,7 +30,7 @@ Value = TypeVar("Value")
 
 
 @dataclass(frozen=True)
-class Team:
+class ProcessGroup:
     """The processes that train one garment, and this one's place among them; one alone exchanges nothing.
 
     All hold the same parameters, bit for bit: they start from one seed, and each step uses one averaged gradient.
@@ -107,11 +107,11 @@ class Team:
             ) from error
 
 
-ALONE = Team()
+SINGLE_PROCESS = ProcessGroup()
 
 
 @contextmanager
-def joined(device: str) -> Iterator[tuple[Team, str]]:
+def joined(device: str) -> Iterator[tuple[ProcessGroup, str]]:
     """Join the processes that torchrun has started; yield this one's place among them, and its device.
 
     Without torchrun, a process is alone on the device that was asked for. Host values travel through gloo, so that
@@ -121,15 +121,15 @@ def joined(device: str) -> Iterator[tuple[Team, str]]:
         SsilkError: a device is asked for by number, or there are fewer GPUs than processes.
     """
     if any(name not in os.environ for name in LAUNCHED) or os.environ["WORLD_SIZE"] == "1":
-        yield ALONE, device
+        yield SINGLE_PROCESS, device
         return
     own = _own_device(device, int(os.environ["LOCAL_RANK"]))
     dist.init_process_group("cpu:gloo,cuda:nccl" if own.type == "cuda" else "gloo")
-    team = Team(dist.get_rank(), dist.get_world_size())
-    yield team, str(own)
+    group = ProcessGroup(dist.get_rank(), dist.get_world_size())
+    yield group, str(own)
     # After an error the others may never come here, and nothing waits for them. Otherwise all leave together, since
     # torchrun ends those that are left, and captured graphs go before the communicator in them, which waits for that.
-    team.gather(None)
+    group.gather(None)
     gc.collect()
     dist.destroy_process_group()
 

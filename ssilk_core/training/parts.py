@@ -15,7 +15,7 @@ from ..model.network import GarmentModel, model_joints
 from ..motion_bank import MOST_TURN, MotionBank, build_bank
 from .job import TrainJob
 from .objective import Objective
-from .parallel import ALONE, Team
+from .parallel import SINGLE_PROCESS, ProcessGroup
 from .step import Stepper
 from .validation import Validator
 from .windows import WindowSampler
@@ -37,7 +37,7 @@ class Parts:
     validator: Validator
     reached: int
     device: torch.device
-    team: Team = ALONE
+    group: ProcessGroup = SINGLE_PROCESS
 
     def detail(self) -> dict[str, object]:
         """Return what is trained, for people."""
@@ -51,19 +51,19 @@ class Parts:
             "body vertices": self.reached,
             "parameters": sum(value.numel() for value in self.model.parameters()),
             "device": str(self.device),
-            "processes": self.team.size,
+            "processes": self.group.size,
         }
 
     def stepper(self, config: TrainConfig, seed: int) -> Stepper:
-        """Return a stepper at its beginning, whose draws have a seed of their own; a team shares the batch."""
-        team, own = self.team, self.team.part(config)
-        generator = torch.Generator(self.device).manual_seed(team.seed(seed))
+        """Return a stepper at its beginning, whose draws have a seed of their own; a group shares the batch."""
+        group, own = self.group, self.group.part(config)
+        generator = torch.Generator(self.device).manual_seed(group.seed(seed))
         sampler = WindowSampler(self.bank, own, self.model.config.latent, generator)
         objective = Objective(self.model, self.energy, self.body, self.bank, config.closest_point == "triangles")
-        return Stepper(self.model, objective, sampler, own, team.average if team.size > 1 else None)
+        return Stepper(self.model, objective, sampler, own, group.average if group.size > 1 else None)
 
 
-def build_parts(job: TrainJob, device: torch.device, team: Team = ALONE) -> Parts:
+def build_parts(job: TrainJob, device: torch.device, group: ProcessGroup = SINGLE_PROCESS) -> Parts:
     """Build what a run needs.
 
     Raises:
@@ -82,5 +82,5 @@ def build_parts(job: TrainJob, device: torch.device, team: Team = ALONE) -> Part
     # Validation looks at the whole body: what training leaves out must not go unnoticed.
     whole = CollisionBody(body, count, device=device)
     rest, frames = model.decoder.rest, job.train.valid_frames
-    validator = Validator(held, energy, whole, scene, rest, fps, frames, team)
-    return Parts(model, bank, energy, touched, validator, len(reach.vertices), device, team)
+    validator = Validator(held, energy, whole, scene, rest, fps, frames, group)
+    return Parts(model, bank, energy, touched, validator, len(reach.vertices), device, group)

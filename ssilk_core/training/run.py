@@ -23,22 +23,22 @@ from ..kinematics import split_at_cuts
 from ..memory import decoded_frames, fitting_batch, free_memory, need_one_window, step_memory, suffices
 from ..motion_bank import MOST_TURN
 from .budget import fitting_iterations, shaped
-from .curve import Point, with_point
+from .curve import CurvePoint, with_point
+from .divergence import EVERY, SPAN, DivergenceMonitor
 from .job import TrainJob
-from .keeping import Keeper
-from .parallel import ALONE, Team
+from .parallel import SINGLE_PROCESS, ProcessGroup
 from .parts import build_parts
+from .run_files import RunFiles
 from .state import Best, Lowered, RunState, learned, load_state, restore, restore_learned
 from .validation import Score
 from .verdict import not_finite, verdict
-from .watch import EVERY, SPAN, Watch
 
 SAVE_EVERY = 60.0  # [s] that a killed process loses at most, a step and a validation aside
 SLOWER = 0.25  # factor on the step sizes once training has not stayed finite
 
 
 @dataclass(frozen=True)
-class Trained:
+class TrainingResult:
     """How a run ended: `finished` is False when it was interrupted; `score` is that of the best model kept."""
 
     finished: bool
@@ -47,7 +47,7 @@ class Trained:
     plain: Score
 
 
-class Run:
+class TrainingRun:
     """A training run that has been set up, or taken up where it stopped, and can be stepped.
 
     Processes that train together hold one each and do the same with it; the first of them writes the files.
@@ -59,20 +59,20 @@ class Run:
         saved: iteration of the state on disk.
     """
 
-    def __init__(self, job: TrainJob, report: Reporter, team: Team = ALONE) -> None:
+    def __init__(self, job: TrainJob, report: Reporter, group: ProcessGroup = SINGLE_PROCESS) -> None:
         self._began = time.monotonic()
-        if not (team.size == 1 or job.minutes is None):
+        if not (group.size == 1 or job.minutes is None):
             fail(
                 str(job.output),
-                "minutes for a team of processes",
+                "minutes for a group of processes",
                 "its clocks differ",
                 "set the iterations instead (--set iterations=...)",
             )
-        self.job, self.report, self.device, self.team = job, report, chosen_device(job.device), team
-        self.keeper, identity = Keeper(job, self.device, team), {**job.identity(), "processes": team.size}
-        self.state, tensors = load_state(self.keeper.state, identity) if job.resume else (RunState(identity), None)
+        self.job, self.report, self.device, self.group = job, report, chosen_device(job.device), group
+        self.files, identity = RunFiles(job, self.device, group), {**job.identity(), "processes": group.size}
+        self.state, tensors = load_state(self.files.state, identity) if job.resume else (RunState(identity), None)
         self._began -= self.state.seconds
-        self.parts = build_parts(job, self.device, team)
+        self.parts = build_parts(job, self.device, group)
         if not job.resume:
             self._fit()
         self.plain, self.scoring = self._score_plain()
@@ -80,12 +80,12 @@ class Run:
             self._plan(60 * job.minutes)
         self._build_stepper()
         self._announce()
-        self.keeper.tidy()
+        self.files.tidy()
         if tensors is None:
             self._write_state()
         else:
             self._take_up(tensors)
-        self.keeper.save_curve(self.state, self.plain)
+        self.files.save_curve(self.state, self.plain)
         self._since = self._saved_at = time.monotonic()
 
     @property
@@ -115,11 +115,11 @@ class Run:
         seed = self.job.train.seed + len(self.state.lowered)  # so as not to draw the same windows once more
         self.stepper = self.parts.stepper(self.config, seed)
         self.stepper.faults.count.fill_(self.state.undone)
-        self.watch = Watch(self.stepper.faults)
+        self.monitor = DivergenceMonitor(self.stepper.faults)
 
     def _rebuild_stepper(self, tensors: dict[str, Tensor]) -> None:
         """Make a stepper of what was learned and of what is lowered now."""
-        del self.stepper, self.watch
+        del self.stepper, self.monitor
         self._empty_memory()
         self._build_stepper()
         restore_learned(self.stepper, tensors)
@@ -130,7 +130,7 @@ class Run:
             torch.cuda.empty_cache()
 
     def _take_up(self, tensors: dict[str, Tensor]) -> None:
-        restore(self.keeper.state, self.stepper, tensors, self.team.rank)
+        restore(self.files.state, self.stepper, tensors, self.group.rank)
         self.saved, best = self.state.iteration, self.state.best
         self.report(Message(f"resumed at iteration {self.state.iteration} of {self.config.iterations}"))
         if best and best.iteration == self.state.iteration:
@@ -140,19 +140,19 @@ class Run:
 
     def _fit(self) -> None:
         """Lower the batch until the predicted memory fits, and say so."""
-        job, config, team, free = self.job, self.job.train, self.team, free_memory(self.device)
+        job, config, group, free = self.job, self.job.train, self.group, free_memory(self.device)
         if self.device.type == "cpu":
-            free //= team.size
+            free //= group.size
         need_one_window(job.scene, job.model, config, self.parts.reached, free)
-        fitting = team.gather(fitting_batch(job.scene, job.model, team.part(config), self.parts.reached, free))
-        batch, pretraining_batch = (team.size * min(counts) for counts in zip(*fitting))
+        fitting = group.gather(fitting_batch(job.scene, job.model, group.part(config), self.parts.reached, free))
+        batch, pretraining_batch = (group.size * min(counts) for counts in zip(*fitting))
         if (batch, pretraining_batch) != (config.batch, config.pretraining_batch):
             found = f"{self._memory() / 2**30:.1f} GiB needed, {free / 2**30:.1f} GiB free on {self.device}"
             self._lower(found, batch, pretraining_batch)
 
     def _memory(self) -> int:
         """Predict what a step takes in this process [bytes]."""
-        own = self.team.part(self.config)
+        own = self.group.part(self.config)
         frames = decoded_frames(own, own.batch)
         return step_memory(self.job.scene, self.job.model, frames, self.parts.reached)
 
@@ -177,11 +177,11 @@ class Run:
         """
         while not suffices(work):
             config, found = self.config, f"iteration {self.state.iteration}: {self.device} is out of memory"
-            if self.team.size != 1:
+            if self.group.size != 1:
                 fail(
                     self.job.scene.garment.mesh.path,
                     found,
-                    "a team keeps the batch it has",
+                    "a group keeps the batch it has",
                     "train again with a smaller one (--set batch=...)",
                 )
             if (
@@ -221,10 +221,10 @@ class Run:
     def look(self, seconds_left: float) -> None:
         """Report how far training is, and look after steps that were undone."""
         self._report_progress(seconds_left)
-        if told := self.watch.look():
+        if told := self.monitor.look():
             self.report(Message(told, "warning"))
-        if self.watch.hopeless:
-            self._recover(f"more than half of the last {SPAN} steps were undone", self.watch.culprits)
+        if self.monitor.is_diverging:
+            self._recover(f"more than half of the last {SPAN} steps were undone", self.monitor.non_finite_terms)
 
     def _report_progress(self, seconds_left: float) -> None:
         self.report(Progress(self.state.iteration, self.config.iterations, seconds_left, self._batch_terms()))
@@ -250,12 +250,12 @@ class Run:
                 return
             self.report(verdict(state.iteration, score, self.plain, self.job.scene.rig.proxy_count > 0))
             finite = {name: value for name, value in batch.items() if isfinite(value)}
-            state.curve = with_point(state.curve, Point(state.iteration, state.seconds, finite, score))
+            state.curve = with_point(state.curve, CurvePoint(state.iteration, state.seconds, finite, score))
             better = state.best is None or score.total < state.best.score.total
             if better:
                 state.best = Best(state.iteration, score)
             self._write_state()
-            self.keeper.save_curve(state, self.plain)
+            self.files.save_curve(state, self.plain)
             if better:
                 self._write_model(score)
 
@@ -281,18 +281,18 @@ class Run:
         config, lowered = self.config, self.state.lowered
         if lowered and lowered[-1].pace < 1:
             self._give_up(found)
-        before, tensors = load_state(self.keeper.state, self.state.asked)
+        before, tensors = load_state(self.files.state, self.state.asked)
         slower = Lowered(before.iteration, config.batch, config.pretraining_batch, SLOWER)
         undone, seconds = int(self.stepper.faults.count), self.state.seconds
         self.state = replace(before, lowered=[*lowered, slower], undone=undone, seconds=seconds)
         self._rebuild_stepper(tensors)
-        text = f"{found}; back to iteration {before.iteration} with steps of {SLOWER:.0%}, see {self.keeper.fault}"
+        text = f"{found}; back to iteration {before.iteration} with steps of {SLOWER:.0%}, see {self.files.fault}"
         self.report(Message(text, "warning"))
 
     def _studied(self, found: str, broken: list[str]) -> str:
         """Keep the last window that was not finite; return what was found, where."""
         found = f"{found} at iteration {self.state.iteration} ({' and '.join(broken)} not finite)"
-        self.keeper.save_fault(self.stepper, found)
+        self.files.save_fault(self.stepper, found)
         return found
 
     def _give_up(self, found: str) -> NoReturn:
@@ -300,7 +300,7 @@ class Run:
             str(self.job.output),
             f"training diverged: {found}",
             "the best model before it is kept" if self.state.best else "there is no model yet",
-            f"study {self.keeper.fault}, or train again with smaller steps (--set learning_rate=...)",
+            f"study {self.files.fault}, or train again with smaller steps (--set learning_rate=...)",
         )
 
     def save(self) -> None:
@@ -326,18 +326,18 @@ class Run:
         return self._agreed(stop.is_set())
 
     def _agreed(self, wish: bool) -> bool:
-        """Return whether to do what this process wishes; a team does, now and then, what any of it wishes."""
-        if self.team.size == 1:
+        """Return whether to do what this process wishes; a group does, now and then, what any of it wishes."""
+        if self.group.size == 1:
             return wish
-        return self.state.iteration % EVERY == 0 and self.team.any(wish)
+        return self.state.iteration % EVERY == 0 and self.group.any(wish)
 
     def _write_state(self) -> None:
         self.state.undone = int(self.stepper.faults.count)
-        self.keeper.save_state(self.stepper, self.state)
+        self.files.save_state(self.stepper, self.state)
         self.saved, self._saved_at = self.state.iteration, time.monotonic()
 
     def _write_model(self, score: Score) -> None:
-        self.keeper.save_model(self.stepper.averaged, self.state, score)
+        self.files.save_model(self.stepper.averaged, self.state, score)
         self.report(Checkpoint(str(self.job.output), self.state.iteration, True))
 
     @contextmanager
@@ -363,28 +363,30 @@ class Run:
         return score
 
 
-def train(job: TrainJob, report: Reporter, stop: threading.Event | None = None, team: Team = ALONE) -> Trained:
+def train(
+    job: TrainJob, report: Reporter, stop: threading.Event | None = None, group: ProcessGroup = SINGLE_PROCESS
+) -> TrainingResult:
     """Train a model, keeping the best on disk and the run's state beside it.
 
     Args:
         job: what to train.
         report: takes the events.
         stop: set from outside to stop after the current step; the state is saved then.
-        team: the processes that train together, each of which calls this.
+        group: the processes that train together, each of which calls this.
 
     Raises:
         SsilkError: the inputs or the memory do not suffice, or training diverged.
     """
-    run = Run(job, report, team)
+    run = TrainingRun(job, report, group)
     finished = _loop(run, stop or threading.Event())
     run.save()
     if run.state.undone:
         report(Message(f"{run.state.undone} steps in all were undone.", "warning"))
     score = run.kept()
-    return Trained(finished, run.state.iteration, score, run.plain)
+    return TrainingResult(finished, run.state.iteration, score, run.plain)
 
 
-def _loop(run: Run, stop: threading.Event) -> bool:
+def _loop(run: TrainingRun, stop: threading.Event) -> bool:
     """Do iterations until all are done, or time is up, or somebody wants to stop; return whether it was not that."""
     began, steps, total = time.monotonic(), 0, run.config.iterations
     while run.state.iteration < total and not run.stops(stop):

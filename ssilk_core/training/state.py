@@ -19,7 +19,7 @@ from ..assets import Scene
 from ..config import TrainConfig
 from ..errors import SsilkError, fail
 from ..files import replacing
-from .curve import Point
+from .curve import CurvePoint
 from .step import Stepper
 from .validation import Score
 
@@ -86,7 +86,7 @@ class RunState:
     undone: int = 0
     seconds: float = 0.0
     planned: int = 0
-    curve: list[Point] = field(default_factory=list)
+    curve: list[CurvePoint] = field(default_factory=list)
 
 
 def state_path(model: str | Path) -> Path:
@@ -174,7 +174,7 @@ def _state_of(document: dict[str, Any]) -> RunState:
     return RunState(
         best=None if best is None else Best(best["iteration"], Score(**best["score"])),
         lowered=[Lowered(**item) for item in lowered],
-        curve=[Point(**{**item, "score": Score(**item["score"])}) for item in curve],
+        curve=[CurvePoint(**{**item, "score": Score(**item["score"])}) for item in curve],
         **document,
     )
 

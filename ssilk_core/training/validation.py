@@ -16,7 +16,7 @@ from ..energy import TERMS, GarmentEnergy
 from ..energy.frames import DECODED_AT_ONCE, energy_terms
 from ..motion_bank import LatentModel, MotionBank, roll_states
 from ..skinning import Skinning
-from .parallel import ALONE, Team
+from .parallel import SINGLE_PROCESS, ProcessGroup
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,9 @@ class Validator:
         rest: Tensor,
         fps: float,
         frames: int,
-        team: Team = ALONE,
+        group: ProcessGroup = SINGLE_PROCESS,
     ) -> None:
-        self.bank, self.energy, self.body, self.fps, self.team = bank, energy, body, fps, team
+        self.bank, self.energy, self.body, self.fps, self.group = bank, energy, body, fps, group
         self.plain = Skinning(scene.plain_skin).to(rest.device)
         self.contacts = Contacts(scene, vertices=body.vertices, device=rest.device)
         self.rest = rest
@@ -75,12 +75,12 @@ class Validator:
         return self._mean(None)
 
     def _mean(self, model: LatentModel | None) -> Score:
-        """Return the mean over all clips, dealt out to the processes of the team; all get the same score."""
-        clips = self.clips[self.team.rank :: self.team.size]
+        """Return the mean over all clips, dealt out to the processes of the group; all get the same score."""
+        clips = self.clips[self.group.rank :: self.group.size]
         states = self._states(clips, model)
         own = [self._clip_terms(clip, model, latents) for clip, latents in zip(clips, states)]
-        dealt = self.team.gather([{name: value.cpu() for name, value in terms.items()} for terms in own])
-        scores = [dealt[index % self.team.size][index // self.team.size] for index in range(len(self.clips))]
+        dealt = self.group.gather([{name: value.cpu() for name, value in terms.items()} for terms in own])
+        scores = [dealt[index % self.group.size][index // self.group.size] for index in range(len(self.clips))]
         joined = {name: float(torch.cat([score[name] for score in scores]).mean()) for name in scores[0]}
         return Score({name: joined[name] for name in TERMS}, joined["collisions"], joined["dynamics"] ** 0.5)
 
@@ -92,7 +92,7 @@ class Validator:
         return self._clip_terms(clip, model, self._states([clip], model)[0])
 
     def _states(self, clips: Sequence[range], model: LatentModel | None) -> Sequence[Tensor | None]:
-        """Return the states of each clip; of a team, one may have none to roll."""
+        """Return the states of each clip; of a group, one may have none to roll."""
         return roll_states(model, self.bank, clips, self.down) if model and clips else [None] * len(clips)
 
     @torch.no_grad()

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..assets import Floats
 from .camera import Camera
-from .light import LAMP_RAYS, Lit, Rig, sky_directions, sky_radiance
+from .light import LAMP_RAYS, Lighting, Lit, sky_directions, sky_radiance
 from .surface import linear
 
 BACKDROP, HAZE, FLOOR = linear([0.70, 0.735, 0.775]), linear([0.90, 0.91, 0.92]), linear([0.855, 0.86, 0.868])
@@ -22,7 +22,7 @@ CELL = 0.06  # its grid [m]
 FLOOR_RAYS = 160  # directions over the sphere, of which the floor sees half
 
 
-def stage(lit: Lit, rig: Rig, camera: Camera, directions: Floats, height: float) -> Floats:
+def stage(lit: Lit, rig: Lighting, camera: Camera, directions: Floats, height: float) -> Floats:
     """Return the linear colours of the stage, shape (H, W, 3).
 
     Args:
@@ -66,7 +66,7 @@ def _line_cover(coordinate: Floats) -> Floats:
     return np.clip((covered_until(start + width) - covered_until(start)) / width, 0, 1)
 
 
-def _key_shade(lit: Lit, rig: Rig, x: Floats, z: Floats, height: float) -> Floats:
+def _key_shade(lit: Lit, rig: Lighting, x: Floats, z: Floats, height: float) -> Floats:
     """Return the floor's brightness (H, W) under the key lamp, with a soft edge."""
     points = lit.geometry.points
     cast = points[:, ::2] - (points[:, 1:2] - height) * (rig.key[::2] / rig.key[1])

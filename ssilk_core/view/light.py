@@ -28,7 +28,7 @@ OFFSET = 1e-3  # rays start this far off the surface [m], past the error of floa
 
 
 @dataclass(frozen=True, eq=False)
-class Rig:
+class Lighting:
     """Unit directions to the lamps `key` and `rim`, shape (3,), and to points all over the key lamp, (16, 3)."""
 
     key: Floats
@@ -36,7 +36,7 @@ class Rig:
     lamp: Floats
 
     @classmethod
-    def beside(cls, camera: Camera) -> Rig:
+    def beside(cls, camera: Camera) -> Lighting:
         """Return lamps that go with the view: the key above its left shoulder, the rim behind on the right."""
         right = camera.axes()[0]
         level = np.cross(UP, right)  # into the picture

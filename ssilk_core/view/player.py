@@ -22,7 +22,7 @@ class PlayerMesh(Protocol):
     def is_garment(self) -> bool: ...
 
 
-class Player(Protocol):
+class ShotPlayer(Protocol):
     """A shot that can be posed at each of its frames."""
 
     @property

@@ -13,7 +13,7 @@ from ..assets import Floats, Ints
 from ..errors import fail
 from .camera import Camera
 from .ground import floor_distance, stage
-from .light import Lit, Rig
+from .light import Lighting, Lit
 from .shade import shade
 from .surface import Geometry, Surface
 
@@ -42,7 +42,7 @@ def render(
     geometry = Geometry.of(surfaces)
     if not len(geometry.faces):
         fail("rendering", "the surfaces have no faces", "at least one triangle is needed")
-    lit, rig = Lit.of(geometry), Rig.beside(camera)
+    lit, rig = Lit.of(geometry), Lighting.beside(camera)
     view = View(lit, rig, camera, width, height, ground)
     picture = stage(lit, rig, camera, view.rays(*np.mgrid[:height, :width] + 0.5), ground)
     _draw(picture, view, samples)
@@ -54,7 +54,7 @@ class View:
     """A lit geometry as one camera sees it."""
 
     lit: Lit
-    rig: Rig
+    rig: Lighting
     camera: Camera
     width: int
     height: int

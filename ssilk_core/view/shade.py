@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..assets import Floats, Ints
-from .light import KEY, OFFSET, RIM, Lit, Rig
+from .light import KEY, OFFSET, RIM, Lighting, Lit
 from .trace import Hits
 
 SHEEN = 0.16  # light that fibres of cloth catch at grazing angles
@@ -14,7 +14,7 @@ FILL = 0.10  # light from the camera, so that nothing is quite black
 GLOSS = 0.10  # highlight of skin
 
 
-def shade(lit: Lit, hits: Hits, view: Floats, rig: Rig, lamps: Ints) -> Floats:
+def shade(lit: Lit, hits: Hits, view: Floats, rig: Lighting, lamps: Ints) -> Floats:
     """Return the linear colours of hits, shape (N, 3).
 
     Args:
@@ -74,7 +74,7 @@ def _smooth_points(lit: Lit, corners: Ints, hits: Hits) -> Floats:
     return points - np.einsum("nk,nkc->nc", hits.barycentric * depth, corner_normals)
 
 
-def _key_light(lit: Lit, points: Floats, normals: Floats, rig: Rig, lamps: Ints) -> Floats:
+def _key_light(lit: Lit, points: Floats, normals: Floats, rig: Lighting, lamps: Ints) -> Floats:
     """Return how much of the key lamp reaches points with these normals, shape (N,)."""
     towards = rig.lamp[lamps]
     cosine = _dot(normals, towards)

@@ -18,7 +18,7 @@ from .colours import BODY, fabric_colour
 from .ordered import in_order
 from .output import FILM, PICTURE, check_suffix, write_film, write_image
 from .panels import captioned, compare, contact_sheet
-from .player import Player
+from .player import ShotPlayer
 from .render import Image, render
 from .surface import Surface
 
@@ -53,7 +53,7 @@ class Look:
 
 
 @dataclass(frozen=True, eq=False)
-class Panel:
+class Picture:
     """One picture to be drawn."""
 
     surfaces: tuple[Surface, ...]
@@ -65,7 +65,7 @@ class Panel:
 
 def film_of_shots(
     path: str | Path,
-    players: Sequence[Player],
+    players: Sequence[ShotPlayer],
     *,
     labels: Sequence[str] = (),
     fps: float = 30.0,
@@ -97,7 +97,7 @@ def film_of_shots(
 
 def sheet_of_shots(
     path: str | Path,
-    players: Sequence[Player],
+    players: Sequence[ShotPlayer],
     *,
     labels: Sequence[str] = (),
     columns: int = 6,
@@ -127,7 +127,7 @@ def sheet_of_shots(
     return len(frames)
 
 
-def _frame_count(players: Sequence[Player]) -> int:
+def _frame_count(players: Sequence[ShotPlayer]) -> int:
     """Return the number of frames of shots that match; raise `SsilkError` when they do not."""
     if not players:
         fail("view", "no shot", "at least one is needed")
@@ -147,17 +147,17 @@ def _frame_count(players: Sequence[Player]) -> int:
 
 
 def _panels(
-    players: Sequence[Player], frames: Sequence[int], labels: Sequence[str], look: Look, label_every: int = 1
-) -> Iterator[Panel]:
+    players: Sequence[ShotPlayer], frames: Sequence[int], labels: Sequence[str], look: Look, label_every: int = 1
+) -> Iterator[Picture]:
     """Yield the panels of each frame in turn, one for each player."""
     cameras, ground = _survey(players, look)
     for number, frame in enumerate(frames):
         for shot, player in enumerate(players):
             label = labels[shot] if shot < len(labels) and number % label_every == 0 else ""
-            yield Panel(shot_surfaces(player, frame), cameras[frame], ground, label, f"{frame / player.fps:.2f} s")
+            yield Picture(shot_surfaces(player, frame), cameras[frame], ground, label, f"{frame / player.fps:.2f} s")
 
 
-def _survey(players: Sequence[Player], look: Look) -> tuple[list[Camera], float]:
+def _survey(players: Sequence[ShotPlayer], look: Look) -> tuple[list[Camera], float]:
     """Return one camera for each frame, the same whichever frames are drawn, and the height of the floor."""
     lows: list[float] = []
 
@@ -172,7 +172,7 @@ def _survey(players: Sequence[Player], look: Look) -> tuple[list[Camera], float]
     return cameras, float(np.median(lows)) if look.ground is None else look.ground
 
 
-def shot_surfaces(player: Player, frame: int) -> tuple[Surface, ...]:
+def shot_surfaces(player: ShotPlayer, frame: int) -> tuple[Surface, ...]:
     """Return the meshes of a shot at one frame: skin in grey, each garment in a colour of its own."""
     points = player.points(player.frame_times[frame])
     return tuple(
@@ -181,15 +181,15 @@ def shot_surfaces(player: Player, frame: int) -> tuple[Surface, ...]:
     )
 
 
-def _colours(player: Player) -> list[Floats]:
+def _colours(player: ShotPlayer) -> list[Floats]:
     garments = np.cumsum([mesh.is_garment for mesh in player.meshes]) - 1
     return [fabric_colour(number) if mesh.is_garment else BODY for mesh, number in zip(player.meshes, garments)]
 
 
-def _drawn(panels: Iterator[Panel], look: Look, total: int, report: Reporter) -> Iterator[Image]:
+def _drawn(panels: Iterator[Picture], look: Look, total: int, report: Reporter) -> Iterator[Image]:
     """Yield the panels as pictures, in order, and report each."""
 
-    def draw(panel: Panel) -> Image:
+    def draw(panel: Picture) -> Image:
         image = render(
             panel.surfaces, panel.camera, look.width, look.height, samples=look.samples, ground=panel.ground
         )

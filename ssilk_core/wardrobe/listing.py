@@ -19,7 +19,7 @@ TABLES = ("material", "set")  # keys whose values are joined with those of the d
 
 
 @dataclass(frozen=True)
-class Entry:
+class WardrobeEntry:
     """A garment of a list: its name, and the words after 'ssilk train' that say what is trained."""
 
     name: str
@@ -65,7 +65,7 @@ KEYS = {
 NEEDED = ("stage", "motions")
 
 
-def read_list(path: Path) -> list[Entry]:
+def read_list(path: Path) -> list[WardrobeEntry]:
     """Return the garments of a list in its order; paths in it are relative to its folder.
 
     Raises:
@@ -82,7 +82,7 @@ def read_list(path: Path) -> list[Entry]:
     defaults = tables.pop(DEFAULTS, {})
     if not tables:
         fail(str(path), "it names no garment", "a list holds one table for each garment", "add [name]")
-    return [Entry(name, _words(path, name, _joined(defaults, table))) for name, table in tables.items()]
+    return [WardrobeEntry(name, _words(path, name, _joined(defaults, table))) for name, table in tables.items()]
 
 
 def _need_table(path: Path, name: str, table: Any) -> None:

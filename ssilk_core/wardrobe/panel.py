@@ -9,13 +9,13 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import TextIO
 
-from ..events import Event, Garment, Progress, Result, Said, describe, describe_progress, format_seconds
+from ..events import Event, GarmentEvent, Progress, Result, Said, describe, describe_progress, format_seconds
 
 RENEWED = 0.1  # seconds between two renewals of the lines
 TOLD = 60.0  # seconds between two plain lines about the progress of one garment
 
 
-class Panel:
+class ProgressTable:
     """A reporter with one line for each garment on a terminal that has room for them; elsewhere plain lines."""
 
     def __init__(self, names: Sequence[str], stream: TextIO | None = None) -> None:
@@ -27,7 +27,7 @@ class Panel:
         self._last: dict[str, float] = {}
 
     def __call__(self, event: Event) -> None:
-        if not isinstance(event, Garment):
+        if not isinstance(event, GarmentEvent):
             self._print(describe(event))
         elif not isinstance(event.said, Result):  # the table at the end has it
             self._hear(event.name, event.said)

@@ -21,7 +21,7 @@ LOOK = 0.2  # seconds between two looks at whether to stop
 
 
 @dataclass(frozen=True)
-class Task:
+class CommandTask:
     """A command that prints events as JSON lines, the folder to run it in, and the log that it is written to."""
 
     name: str
@@ -41,7 +41,7 @@ class End:
 
 @dataclass
 class _Running:
-    task: Task
+    task: CommandTask
     slot: Slot
     process: subprocess.Popen[str]
     began: float = field(default_factory=time.monotonic)
@@ -75,7 +75,7 @@ class Queue:
         self._running: dict[str, _Running] = {}
         self._heard: queue.Queue[tuple[str, Said | None]] = queue.Queue()
 
-    def run(self, tasks: Iterable[Task], stop: threading.Event) -> None:
+    def run(self, tasks: Iterable[CommandTask], stop: threading.Event) -> None:
         """Run all tasks, each taken when a slot is free; once `stop` is set, ask those that run to stop, and end.
 
         Whatever else ends this call, a second interrupt above all, ends them at once.
@@ -95,7 +95,7 @@ class Queue:
             for running in self._running.values():
                 running.process.kill()
 
-    def _start(self, task: Task) -> None:
+    def _start(self, task: CommandTask) -> None:
         slot = self._free.popleft()
         with open(task.log, "a", encoding="utf-8") as log:
             process = subprocess.Popen(
@@ -111,7 +111,7 @@ class Queue:
         self._running[task.name] = _Running(task, slot, process)
         threading.Thread(target=self._read, args=(task, process), daemon=True).start()
 
-    def _read(self, task: Task, process: subprocess.Popen[str]) -> None:
+    def _read(self, task: CommandTask, process: subprocess.Popen[str]) -> None:
         """Pass on what a process prints; in a thread of its own."""
         assert process.stdout is not None
         with open(task.log, "a", encoding="utf-8") as log:

@@ -15,7 +15,7 @@ from ..files import replacing, sha256
 
 
 @dataclass(frozen=True)
-class Record:
+class TrainingRecord:
     """One garment's training.
 
     Attributes:
@@ -35,7 +35,7 @@ def request_hash(words: Iterable[str], files: Iterable[Path]) -> str:
     return hashlib.sha256(json.dumps(document).encode()).hexdigest()
 
 
-def load_record(path: Path) -> Record | None:
+def load_record(path: Path) -> TrainingRecord | None:
     """Return a record, or None where there is none.
 
     Raises:
@@ -44,13 +44,13 @@ def load_record(path: Path) -> Record | None:
     if not path.exists():
         return None
     try:
-        return Record(**json.loads(path.read_text(encoding="utf-8")))
+        return TrainingRecord(**json.loads(path.read_text(encoding="utf-8")))
     except (ValueError, TypeError) as error:
         fail(str(path), f"the record of a training is damaged ({error})", "it says what is trained already",
              "delete it to train again")  # fmt: skip
 
 
-def save_record(path: Path, record: Record) -> None:
+def save_record(path: Path, record: TrainingRecord) -> None:
     """Write a record."""
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(asdict(record), indent=1) + "\n", encoding="utf-8")

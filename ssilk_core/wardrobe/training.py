@@ -8,14 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..errors import EXIT_INTERNAL, EXIT_INTERRUPTED, EXIT_OK
-from .listing import Entry
-from .queue import End, Task
-from .record import Record, load_record, save_record
+from .listing import WardrobeEntry
+from .queue import CommandTask, End
+from .record import TrainingRecord, load_record, save_record
 
 COLUMNS = ("garment", "iterations", "total [J]", "lower by", "collisions", "time", "state")
 
 
-class Training:
+class GarmentTraining:
     """One garment of a list.
 
     Attributes:
@@ -25,11 +25,11 @@ class Training:
         plan: what is done about it, in words; nothing where it just waits.
     """
 
-    def __init__(self, entry: Entry, folder: Path, request: str) -> None:
+    def __init__(self, entry: WardrobeEntry, folder: Path, request: str) -> None:
         self.entry, self.folder = entry, folder
         before = load_record(self._file(".json"))
         same = before is not None and before.asked == request
-        self.record = before if before is not None and same else Record(request)
+        self.record = before if before is not None and same else TrainingRecord(request)
         finished = self.record.result is not None and self._file(".safetensors").exists()
         self.resumed = same and not finished and self._file(".resume.safetensors").exists()
         self.state, self.code = ("finished", EXIT_OK) if finished else ("waiting", EXIT_INTERRUPTED)
@@ -44,7 +44,7 @@ class Training:
     def _file(self, suffix: str) -> Path:
         return self.folder / f"{self.entry.name}{suffix}"
 
-    def begin(self, source: Path, device: str) -> Task:
+    def begin(self, source: Path, device: str) -> CommandTask:
         """Return the training as a task, run in the folder `source` that the list's paths are relative to."""
         model, log = self._file(".safetensors").absolute(), self._file(".log")
         save_record(self._file(".json"), replace(self.record, result=None))
@@ -52,7 +52,7 @@ class Training:
             for old in (log, self._file(".resume.safetensors")):
                 old.unlink(missing_ok=True)
         words = [*self.entry.words, "-o", str(model), "--device", device, "--json", *["--resume"] * self.resumed]
-        return Task(self.entry.name, [sys.executable, "-m", "ssilk_core", "train", *words], source, log)
+        return CommandTask(self.entry.name, [sys.executable, "-m", "ssilk_core", "train", *words], source, log)
 
     def end(self, end: End) -> None:
         """Take note of how it ended."""

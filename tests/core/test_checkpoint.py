@@ -232,7 +232,10 @@ def configure(**changes: object) -> Callable[[dict, dict], None]:
 
 DAMAGE = {
     "another format": (set_header("format", 99), "model format 99; this version reads formats 3 and 4"),
-    "an older format": (set_header("format", 2), "model format 2; this version reads formats 3 and 4; train it again"),
+    "an older format": (
+        set_header("format", 2),
+        "model format 2; this version reads formats 3 and 4; train it again",
+    ),
     "header is a list": (lambda tensors, document: document.clear(), "model format None"),
     "integers without their scale": (
         set_tensor("model.output.0.weight", np.ones((16, 8), np.int16)),

@@ -19,7 +19,7 @@ from ssilk_core.collision.distance import signed_distance
 from ssilk_core.constants import GRAVITY
 from ssilk_core.energy import TERMS
 from ssilk_core.errors import SsilkError
-from ssilk_core.evaluation.methods import Cache, Dressed, Network, Plain, Reel, Simulated, reel_of
+from ssilk_core.evaluation.methods import CachedPoints, EvaluationScene, Network, Plain, Simulated, TakeSet, reel_of
 from ssilk_core.evaluation.minimum import hung, minima
 from ssilk_core.evaluation.probes import (
     CALM,
@@ -33,7 +33,7 @@ from ssilk_core.evaluation.probes import (
     stops,
 )
 from ssilk_core.evaluation.record import recorded
-from ssilk_core.evaluation.run import SIMULATOR, EvaluationOptions, Playlist, Subject, evaluate
+from ssilk_core.evaluation.run import SIMULATOR, EvaluatedModel, EvaluationClips, EvaluationOptions, evaluate
 from ssilk_core.evaluation.splits import chosen, read_index, splits_of
 from ssilk_core.evaluation.tables import aligned, tables
 from ssilk_core.evaluation.takes import Take, back_and_forth, stopped, takes_of
@@ -46,8 +46,8 @@ FPS, JOINTS, CPU = 30.0, np.arange(3), torch.device("cpu")
 
 
 @pytest.fixture
-def dressed(scene) -> Dressed:
-    return Dressed(scene, Fabric("toy", bending=1e-4, margin=0.02), FPS, CPU)
+def dressed(scene) -> EvaluationScene:
+    return EvaluationScene(scene, Fabric("toy", bending=1e-4, margin=0.02), FPS, CPU)
 
 
 @pytest.fixture
@@ -56,7 +56,7 @@ def motion(scene, toy_motion) -> Motion:
 
 
 @pytest.fixture
-def reel(dressed, motion) -> Reel:
+def reel(dressed, motion) -> TakeSet:
     return reel_of(takes_of("sway", motion, FPS), dressed, JOINTS)
 
 
@@ -65,7 +65,7 @@ class Still:
 
     name = "still"
 
-    def __init__(self, dressed: Dressed, reel: Reel, offsets: Tensor) -> None:
+    def __init__(self, dressed: EvaluationScene, reel: TakeSet, offsets: Tensor) -> None:
         self.plain, self.offsets = Plain(dressed, reel), offsets
 
     def vertices(self, take: int, frames: range) -> Tensor:
@@ -158,7 +158,7 @@ def test_collisions_can_be_with_the_whole_body(scene, dressed, reel):
     points[points[:, 2].argmin()] = [0.0, 0.9, -0.16]
     body = replace(ball, mesh=replace(ball.mesh, points=points))
     spiked = replace(scene, character=replace(scene.character, bodies=(body,)))
-    near, whole = (Dressed(spiked, dressed.fabric, FPS, CPU, exact=exact) for exact in (False, True))
+    near, whole = (EvaluationScene(spiked, dressed.fabric, FPS, CPU, exact=exact) for exact in (False, True))
     found = [recorded(one, reel, Plain(one, reel), 0).values["collision"] for one in (near, whole)]
     character = reel.character(0, range(40))
     distance = signed_distance(whole.plain(character), whole.body.posed(character, exact=True))
@@ -176,13 +176,13 @@ def test_a_point_cache_is_measured_as_the_cloth_that_was_written(scene, dressed,
         motion_transforms(motion, scene.character.skeleton.parents), scene.character.skeleton.bind_transforms
     )
     points = skin_points(scene.garment.mesh.points, scene.plain_skin, matrices)
-    cache = Cache("cache", lambda clip, frames: points[frames.start : frames.stop], dressed, reel)
+    cache = CachedPoints("cache", lambda clip, frames: points[frames.start : frames.stop], dressed, reel)
     plain = Plain(dressed, reel)
     ours, theirs = (recorded(dressed, reel, method, 0, plain) for method in (cache, plain))
     for name in (*TERMS, "kinetic"):
         np.testing.assert_allclose(ours.values[name], theirs.values[name], rtol=1e-3, atol=2e-6, err_msg=name)
     assert ours.values["position"].max() < 1e-10
-    elsewhere = Cache("cache", lambda clip, frames: points[frames.start : frames.stop] + 0.1, dressed, reel)
+    elsewhere = CachedPoints("cache", lambda clip, frames: points[frames.start : frames.stop] + 0.1, dressed, reel)
     with pytest.raises(SsilkError, match=r"sway: in the point cache, pinned vertices are 0.173 m from"):
         elsewhere.vertices(0, range(5))
 
@@ -244,7 +244,7 @@ def _origins(takes: Sequence[Take]) -> Tensor:
 
 def test_the_simulator_comes_to_rest_at_its_own_minimum(scene, dressed, motion):
     """Played over a stop in thick air like any other method: calm at the end, where forces balance."""
-    dressed = Dressed(scene, replace(dressed.fabric, drag=1.2), FPS, CPU)
+    dressed = EvaluationScene(scene, replace(dressed.fabric, drag=1.2), FPS, CPU)
     takes, first = stops(takes_of("sway", motion, FPS), FPS, 1, 1.5)
     reel = reel_of(takes, dressed, JOINTS)
     found = held(dressed, reel, Simulated("simulator", dressed, reel), first)[0]
@@ -277,8 +277,8 @@ def test_drift_is_what_changes_from_loop_to_loop(dressed, motion):
     assert joined.most == -1.0 and joined.drift == pytest.approx((found.drift - 1) / 2)
 
 
-def playlist(dressed: Dressed, motion: Motion, slow: Motion, **options: object) -> Playlist:
-    return Playlist(
+def playlist(dressed: EvaluationScene, motion: Motion, slow: Motion, **options: object) -> EvaluationClips:
+    return EvaluationClips(
         clips={"sway": motion, "slow": slow}, splits={"valid": ["sway", "slow"], "flips": ["slow"]}, **options
     )
 
@@ -286,8 +286,8 @@ def playlist(dressed: Dressed, motion: Motion, slow: Motion, **options: object) 
 def test_every_method_gets_its_row_in_every_split(scene, dressed, motion, toy_motion, toy_model):
     motion, slow = motion.clip(0, 20), toy_motion(scene, 12, speed=0.3)
     subjects = [
-        Subject("ssilk", toy_model(scene), JOINTS),
-        Subject("ncs", baseline(scene, BaselineConfig(method="ncs"), JOINTS), JOINTS),
+        EvaluatedModel("ssilk", toy_model(scene), JOINTS),
+        EvaluatedModel("ncs", baseline(scene, BaselineConfig(method="ncs"), JOINTS), JOINTS),
     ]
     cache = {}
 
@@ -321,17 +321,21 @@ def test_every_method_gets_its_row_in_every_split(scene, dressed, motion, toy_mo
 
 def test_a_character_that_never_moves_has_no_jitter_to_compare_with(scene, dressed, motion, toy_model):
     frozen = replace(motion, rotations=motion.rotations[[5] * 12], translations=motion.translations[[5] * 12])
-    played = Playlist(clips={"frozen": frozen}, splits={"all": ["frozen"]})
+    played = EvaluationClips(clips={"frozen": frozen}, splits={"all": ["frozen"]})
     rows = list(
-        evaluate(dressed, [Subject("ssilk", toy_model(scene), JOINTS)], played, EvaluationOptions(stops=0, loop=0))
+        evaluate(
+            dressed, [EvaluatedModel("ssilk", toy_model(scene), JOINTS)], played, EvaluationOptions(stops=0, loop=0)
+        )
     )
     assert rows[0].figures.jitter == 0 and math.isnan(rows[1].figures.jitter_of_plain) and "nan" in tables(rows)
 
 
 def test_nothing_is_asked_for_nothing_is_computed(scene, dressed, motion, toy_model):
-    played = Playlist(clips={"sway": motion}, splits={"all": ["sway"]})
+    played = EvaluationClips(clips={"sway": motion}, splits={"all": ["sway"]})
     rows = list(
-        evaluate(dressed, [Subject("ssilk", toy_model(scene), JOINTS)], played, EvaluationOptions(stops=0, loop=0))
+        evaluate(
+            dressed, [EvaluatedModel("ssilk", toy_model(scene), JOINTS)], played, EvaluationOptions(stops=0, loop=0)
+        )
     )
     assert [row.method for row in rows] == ["plain", "ssilk"]
     found = rows[1].figures

@@ -42,8 +42,10 @@ def run_with_arguments(*arguments: str) -> str:
     ids=["import", "help", "train-help"],
 )
 def test_nothing_heavy_is_loaded(code):
-    watch = f"import atexit, sys; atexit.register(lambda: print(set({HEAVY}) & sys.modules.keys(), file=sys.stderr))"
-    done = subprocess.run([sys.executable, "-c", f"{watch}\n{code}"], capture_output=True, text=True, check=True)
+    monitor = (
+        f"import atexit, sys; atexit.register(lambda: print(set({HEAVY}) & sys.modules.keys(), file=sys.stderr))"
+    )
+    done = subprocess.run([sys.executable, "-c", f"{monitor}\n{code}"], capture_output=True, text=True, check=True)
     assert done.stderr.strip() == "set()"
     assert ("usage: ssilk" in done.stdout) == ("help" in code)
 

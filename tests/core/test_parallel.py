@@ -25,8 +25,8 @@ from ssilk_core.errors import SsilkError
 from ssilk_core.events import silent
 from ssilk_core.fabrics import Fabric
 from ssilk_core.training.job import TrainJob
-from ssilk_core.training.parallel import LAUNCHED, Team, joined
-from ssilk_core.training.run import Run, train
+from ssilk_core.training.parallel import LAUNCHED, ProcessGroup, joined
+from ssilk_core.training.run import TrainingRun, train
 from ssilk_core.training.state import state_path
 
 SHORT = TrainConfig(
@@ -40,7 +40,7 @@ ONE_STEP = replace(SHORT, static_fraction=0.0, noise=0.0)
 class Recorder:
     """Shares gradients as a run does, and keeps a copy of what it gave back."""
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: TrainingRun) -> None:
         self.share, self.given = run.stepper.share, []
         run.stepper.share = self
 
@@ -53,33 +53,33 @@ class Recorder:
 # --- in each of the processes -------------------------------------------------------------------------------------
 
 
-def poses(run: Run, first: int, count: int) -> None:
+def poses(run: TrainingRun, first: int, count: int) -> None:
     """Let a run look at certain single poses instead of drawing them."""
     down = torch.tensor([0.0, -1.0, 0.0]).expand(count, 3)
     run.stepper.sampler.poses = lambda _: (torch.arange(first, first + count), down)
 
 
-def shared_gradient(job: TrainJob, team: Team) -> dict[str, object]:
+def shared_gradient(job: TrainJob, group: ProcessGroup) -> dict[str, object]:
     """Where every process's windows stood after three steps, and the gradient of the fourth."""
-    run = Run(replace(job, train=ONE_STEP), silent, team)
+    run = TrainingRun(replace(job, train=ONE_STEP), silent, group)
     for iteration in range(3):
         run.stepper.run(iteration)
-    before = team.gather({name: value.clone() for name, value in run.stepper.sampler.state().items()})
+    before = group.gather({name: value.clone() for name, value in run.stepper.sampler.state().items()})
     parameters = [value.detach().clone() for value in run.stepper.model.parameters()]
-    recorder, half = Recorder(run), ONE_STEP.static_batch // team.size
-    poses(run, team.rank * half, half)
+    recorder, half = Recorder(run), ONE_STEP.static_batch // group.size
+    poses(run, group.rank * half, half)
     run.stepper.run(3)
     return {"samplers": before, "parameters": parameters, "gradient": recorder.given[0]}
 
 
-def undone_step(job: TrainJob, team: Team) -> dict[str, object]:
+def undone_step(job: TrainJob, group: ProcessGroup) -> dict[str, object]:
     """The parameters before and after a step in which only the last process found no number."""
-    run = Run(replace(job, train=ONE_STEP), silent, team)
+    run = TrainingRun(replace(job, train=ONE_STEP), silent, group)
 
     def poisoned(gradients: list[torch.Tensor]) -> None:
-        if not team.first:
+        if not group.first:
             gradients[0][0] = float("nan")
-        team.average(gradients)
+        group.average(gradients)
 
     run.stepper.share = poisoned
     before = [value.detach().clone() for value in run.stepper.model.parameters()]
@@ -99,26 +99,26 @@ class SecondLook(threading.Event):
         return looked
 
 
-def resumed(job: TrainJob, team: Team) -> list[tuple[bool, int]]:
+def resumed(job: TrainJob, group: ProcessGroup) -> list[tuple[bool, int]]:
     """Train, the last process alone being asked to stop, and resume; how both ended."""
-    stop = threading.Event() if team.first else SecondLook()
-    ends = [train(job, silent, stop, team), train(replace(job, resume=True), silent, None, team)]
+    stop = threading.Event() if group.first else SecondLook()
+    ends = [train(job, silent, stop, group), train(replace(job, resume=True), silent, None, group)]
     return [(trained.finished, trained.iterations) for trained in ends]
 
 
 def main(folder: Path) -> None:
     torch.set_num_threads(1)
     job: TrainJob = pickle.loads((folder / "job").read_bytes())
-    with joined("cpu") as (team, device):
+    with joined("cpu") as (group, device):
         job = replace(job, device=device)
         whole = replace(job, output=folder / "whole.safetensors")
         found = {
-            "one step": shared_gradient(whole, team),
-            "undone": undone_step(whole, team),
-            "trained": train(whole, silent, None, team),
-            "resumed": resumed(replace(job, output=folder / "halves.safetensors"), team),
+            "one step": shared_gradient(whole, group),
+            "undone": undone_step(whole, group),
+            "trained": train(whole, silent, None, group),
+            "resumed": resumed(replace(job, output=folder / "halves.safetensors"), group),
         }
-        torch.save(found, folder / f"{team.rank}.pt")
+        torch.save(found, folder / f"{group.rank}.pt")
 
 
 # --- in the test's process ----------------------------------------------------------------------------------------
@@ -155,7 +155,7 @@ def together(job) -> list[dict]:
 
 def test_two_halves_of_a_batch_give_the_gradient_of_the_whole(job, together):
     ours, theirs = (found["one step"] for found in together)
-    alone = Run(replace(job, train=ONE_STEP), silent)
+    alone = TrainingRun(replace(job, train=ONE_STEP), silent)
     first, second = ours["samplers"]
     assert not torch.equal(first["first"], second["first"])
     slots = {name: (first[name], second[name]) for name in ("first", "direction", "carried")}
@@ -206,15 +206,15 @@ def test_a_run_is_resumed_by_as_many_processes(job, together):
 
 
 def test_each_process_draws_its_own(job):
-    seeds = [Team(rank, 8).seed(seed) for rank in range(8) for seed in (0, 1, 2)]
+    seeds = [ProcessGroup(rank, 8).seed(seed) for rank in range(8) for seed in (0, 1, 2)]
     assert seeds[:3] == [0, 1, 2] and len(set(seeds)) == 24
     assert all(torch.Generator().manual_seed(seed).initial_seed() == seed for seed in seeds)
 
 
 def test_batches_are_divided_equally_or_refused():
-    assert Team(1, 2).part(SHORT) == replace(SHORT, batch=2, pretraining_batch=4, static_batch=4)
+    assert ProcessGroup(1, 2).part(SHORT) == replace(SHORT, batch=2, pretraining_batch=4, static_batch=4)
     with pytest.raises(SsilkError, match=r"setting 'batch': 4 for 3 processes; .*a multiple of 3"):
-        Team(0, 3).part(replace(SHORT, pretraining_batch=9))
+        ProcessGroup(0, 3).part(replace(SHORT, pretraining_batch=9))
 
 
 def test_that_another_process_has_ended_is_told(monkeypatch):
@@ -223,7 +223,7 @@ def test_that_another_process_has_ended_is_told(monkeypatch):
 
     for name in ("all_reduce", "all_gather_object"):
         monkeypatch.setattr(torch.distributed, name, broken)
-    for exchange in (lambda: Team(1, 2).average([torch.zeros(1)]), lambda: Team(1, 2).any(True)):
+    for exchange in (lambda: ProcessGroup(1, 2).average([torch.zeros(1)]), lambda: ProcessGroup(1, 2).any(True)):
         with pytest.raises(SsilkError, match=r"^process 2 of 2: .*\(\[pair.cc:1\] Connection closed by peer\); see"):
             exchange()
 
@@ -231,8 +231,8 @@ def test_that_another_process_has_ended_is_told(monkeypatch):
 def test_without_torchrun_a_process_is_alone(monkeypatch):
     for name in LAUNCHED:
         monkeypatch.delenv(name, raising=False)
-    with joined("cuda:5") as (team, device):
-        assert team == Team() and device == "cuda:5"
+    with joined("cuda:5") as (group, device):
+        assert group == ProcessGroup() and device == "cuda:5"
 
 
 def test_torchrun_gives_out_the_devices(monkeypatch):

@@ -13,7 +13,7 @@ from ssilk_core.checkpoint import model_file
 from ssilk_core.errors import SsilkError
 from ssilk_core.fabrics import FABRICS
 from ssilk_core.quality import QUALITIES, Budget, best_within, budget_of, candidates, in_units, quality_named
-from ssilk_core.reduction import Reducer, Size
+from ssilk_core.reduction import ModelSize, Reducer
 from ssilk_core.runtime import Player
 
 
@@ -53,7 +53,7 @@ def test_levels_keep_more_and_more():
     for less, more in pairwise(levels):
         assert less.size.within(more.size) == less.size and less.refine <= more.refine
         assert less.rate(60) <= more.rate(60)
-    whole = Size(shapes=64, joints=20, influences=8)
+    whole = ModelSize(shapes=64, joints=20, influences=8)
     assert levels[-1].size.within(whole) == whole
     assert quality_named("crowd").rate(60) == 15 and quality_named("crowd").rate(12) == 12
     assert quality_named("film").rate(60) == 60
@@ -75,7 +75,7 @@ def test_the_best_within_a_budget_is_chosen(reducer, share):
 
 
 def test_nothing_more_is_kept_than_may_be(reducer):
-    most = Size(shapes=4, joints=1, influences=2)
+    most = ModelSize(shapes=4, joints=1, influences=2)
     assert best_within(reducer, Budget(1e9, "bytes"), packed_bytes, most).reduced.size == most
 
 
@@ -92,7 +92,7 @@ def test_what_is_predicted_is_about_what_is_lost(reducer):
 
 
 def test_operations_are_those_of_the_matrix_products(reducer):
-    file = reducer.reduced(Size(shapes=3, joints=1, influences=1)).file
+    file = reducer.reduced(ModelSize(shapes=3, joints=1, influences=1)).file
     found, free = cost.operations(file), int((file.scene.classes != 0).sum())
     static = 12 + 9  # two joints' rotations, and gravity in three frames
     assert found["P"] == static * 16 + 16 * 8
@@ -102,7 +102,7 @@ def test_operations_are_those_of_the_matrix_products(reducer):
 
 
 def test_memory_falls_with_what_is_kept(reducer):
-    sizes = [reducer.whole, Size(shapes=4, joints=2, influences=2), Size(shapes=0, joints=0, influences=1)]
+    sizes = [reducer.whole, ModelSize(shapes=4, joints=2, influences=2), ModelSize(shapes=0, joints=0, influences=1)]
     players = [Player(reducer.reduced(size).file) for size in sizes]
     found = [cost.memory(player) for player in players]
     assert found == sorted(found, reverse=True)

@@ -14,15 +14,15 @@ from ssilk_core.checkpoint import load_model, model_file, network, save_model
 from ssilk_core.errors import SsilkError
 from ssilk_core.fabrics import FABRICS
 from ssilk_core.kinematics import deform
-from ssilk_core.reduction import Reducer, Size
-from ssilk_core.reduction.influences import Influences, fitted, measured
+from ssilk_core.reduction import ModelSize, Reducer
+from ssilk_core.reduction.influences import InfluenceCandidates, fitted, measured
 from ssilk_core.reduction.joints import candidates, least_missed
 from ssilk_core.reduction.shapes import basis, modes
 from ssilk_core.rollout import decode, garment_poses
 from ssilk_core.runtime import Player
 
 VERTICES, FRAMES, GIVEN = 7, 60, 5
-WHOLE = Size(shapes=6, joints=2, influences=2)
+WHOLE = ModelSize(shapes=6, joints=2, influences=2)
 
 
 def dice(seed: int = 0) -> np.random.Generator:
@@ -112,11 +112,11 @@ def test_activations_that_never_vary_are_no_trouble(linear, activations, mass):
     np.testing.assert_allclose(rebuilt(every, still), linear @ still + more, atol=1e-9)
 
 
-def random_influences(count: int = 5, vertices: int = 40) -> Influences:
+def random_influences(count: int = 5, vertices: int = 40) -> InfluenceCandidates:
     root = dice(8).normal(size=(vertices, count, count + 2))
     weights = dice(9).dirichlet(np.ones(count), vertices)
     root -= (weights[:, :, None] * root).sum(1, keepdims=True)  # the weights that were lose nothing
-    return Influences(np.tile(np.arange(count), (vertices, 1)), weights, root @ root.swapaxes(1, 2))
+    return InfluenceCandidates(np.tile(np.arange(count), (vertices, 1)), weights, root @ root.swapaxes(1, 2))
 
 
 def best_by_search(cost: np.ndarray, most: int) -> float:
@@ -170,7 +170,7 @@ def test_candidates_are_the_joints_that_move_a_vertex_and_those_below(scene):
 
 def test_only_ends_of_chains_are_taken_off(scene, toy_scene):
     joints = np.tile([1, 3, 4], (2, 1))
-    useless_root = Influences(joints, np.tile([0.0, 0, 1], (2, 1)), np.tile(np.diag([9.0, 1, 0]), (2, 1, 1)))
+    useless_root = InfluenceCandidates(joints, np.tile([0.0, 0, 1], (2, 1)), np.tile(np.diag([9.0, 1, 0]), (2, 1, 1)))
     assert least_missed(scene, useless_root, np.ones(2)) == [4, 3]
     assert least_missed(toy_scene(shuffled=True), useless_root, np.ones(2)) == [3, 4]
 
@@ -196,17 +196,17 @@ def vertices(file, motion) -> np.ndarray:
 
 
 SIZES = [
-    Size(shapes=3, joints=2, influences=2),
-    Size(shapes=6, joints=1, influences=2),
-    Size(shapes=6, joints=2, influences=1),
-    Size(shapes=2, joints=0, influences=2),
-    Size(shapes=0, joints=1, influences=1),
+    ModelSize(shapes=3, joints=2, influences=2),
+    ModelSize(shapes=6, joints=1, influences=2),
+    ModelSize(shapes=6, joints=2, influences=1),
+    ModelSize(shapes=2, joints=0, influences=2),
+    ModelSize(shapes=0, joints=1, influences=1),
 ]
 
 
 def test_a_model_that_keeps_all_is_the_whole_one(reducer, file):
     assert reducer.whole == WHOLE
-    found = reducer.reduced(Size(shapes=99, joints=99, influences=99))
+    found = reducer.reduced(ModelSize(shapes=99, joints=99, influences=99))
     assert found.file is file and found.size == WHOLE and found.rms == found.largest == 0
 
 
@@ -251,15 +251,15 @@ def test_blendshapes_predict_what_they_miss_before_skinning(file, motion):
 
 
 def test_blendshapes_make_up_for_joints_as_far_as_they_can(reducer):
-    lost = [reducer.reduced(Size(shapes=count, joints=1, influences=2)).rms for count in (0, 2, 6)]
+    lost = [reducer.reduced(ModelSize(shapes=count, joints=1, influences=2)).rms for count in (0, 2, 6)]
     assert lost[0] > 1.05 * lost[1] > 1.05**2 * lost[2] > 0
 
 
 def test_a_smaller_model_can_be_cut_again(reducer, motion):
-    once = reducer.reduced(Size(shapes=4, joints=1, influences=2)).file
-    twice = Reducer(once, [motion]).reduced(Size(shapes=2, joints=1, influences=2)).file
+    once = reducer.reduced(ModelSize(shapes=4, joints=1, influences=2)).file
+    twice = Reducer(once, [motion]).reduced(ModelSize(shapes=2, joints=1, influences=2)).file
     assert twice.config.shapes == 2 and twice.config.given == 6
-    at_once = reducer.reduced(Size(shapes=2, joints=1, influences=2)).file
+    at_once = reducer.reduced(ModelSize(shapes=2, joints=1, influences=2)).file
     np.testing.assert_allclose(vertices(twice, motion), vertices(at_once, motion), atol=2e-3)
 
 
@@ -267,13 +267,13 @@ def test_garments_without_shapes_or_proxies_are_cut_too(toy_scene, toy_model, mo
     for options, proxies in (({"shapes": 0}, 2), ({"shapes": 6}, 0)):
         scene = toy_scene(proxies=proxies)
         file = model_file(toy_model(scene, scale=0.1, **options).eval(), FABRICS["silk"], {})
-        found = Reducer(file, [motion]).reduced(Size(shapes=3, joints=1, influences=1))
+        found = Reducer(file, [motion]).reduced(ModelSize(shapes=3, joints=1, influences=1))
         away = np.linalg.norm(vertices(found.file, motion) - vertices(file, motion), axis=2)
         assert 0 < away.max() == pytest.approx(found.largest, rel=1e-3)
 
 
 def test_bad_sizes_and_no_motions_are_refused(file):
     with pytest.raises(SsilkError, match="influences = 0: too few to be kept; it is at least 1"):
-        Size(shapes=1, joints=1, influences=0)
+        ModelSize(shapes=1, joints=1, influences=0)
     with pytest.raises(SsilkError, match="motions: none given"):
         Reducer(file, [])

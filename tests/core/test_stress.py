@@ -14,8 +14,8 @@ from ssilk_core.fabrics import Fabric
 from ssilk_core.kinematics import motion_transforms, split_at_cuts
 from ssilk_core.stress import drives, measures, meter, worlds
 from ssilk_core.stress.cases import CASES, Case
-from ssilk_core.stress.outcome import Measured, markdown
-from ssilk_core.stress.subject import Effort, Subject
+from ssilk_core.stress.outcome import CaseMeasurement, markdown
+from ssilk_core.stress.subject import Effort, StressSubject
 from ssilk_core.stress.trials import gradient_error, trained
 
 TINY = Effort(seconds=1.0, frames=0.02, steps=2, simulated=2, vertices=120)
@@ -23,10 +23,10 @@ FABRIC = Fabric("toy", bending=1e-4)
 
 
 @pytest.fixture(scope="module")
-def subject(scene, toy_model) -> Subject:
+def subject(scene, toy_model) -> StressSubject:
     model = toy_model(scene, scale=0.1)
     parameters = {name: value.detach().numpy() for name, value in model.named_parameters()}
-    return Subject(ModelFile(scene, model.config, FABRIC, model.joints, parameters), scene, None, TINY)
+    return StressSubject(ModelFile(scene, model.config, FABRIC, model.joints, parameters), scene, None, TINY)
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def test_what_leaves_all_bounds_is_a_fault(subject, monkeypatch, points):
 
 
 def test_what_raises_is_a_fault_and_what_is_refused_is_none(subject):
-    def stumbles(subject: Subject) -> Measured:
+    def stumbles(subject: StressSubject) -> CaseMeasurement:
         raise RuntimeError("numbers ran out\nmore")
 
     assert Case("", "", stumbles).run(subject).said == "RuntimeError: numbers ran out"
@@ -246,7 +246,7 @@ def test_a_trial_trains_what_it_says(scene, base):
 
 
 def test_a_training_that_never_moves_is_a_fault(subject):
-    def measure(subject: Subject) -> Measured:
+    def measure(subject: StressSubject) -> CaseMeasurement:
         trial = trained(subject.scene, FABRIC, replace(subject.base, frames=30), 2)
         return measures.measured(replace(trial, undone=2))
 

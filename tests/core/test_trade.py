@@ -13,19 +13,19 @@ import torch
 from ssilk_core.checkpoint import model_file
 from ssilk_core.cost import ShotBytes, model_bytes
 from ssilk_core.errors import SsilkError
-from ssilk_core.evaluation.methods import Dressed, Network, reel_of
+from ssilk_core.evaluation.methods import EvaluationScene, Network, reel_of
 from ssilk_core.evaluation.record import recorded
 from ssilk_core.evaluation.takes import takes_of
 from ssilk_core.fabrics import FABRICS
 from ssilk_core.kinematics import deform, resample, sample_motion
-from ssilk_core.reduction import Reducer, Size
+from ssilk_core.reduction import ModelSize, Reducer
 from ssilk_core.runtime import Player
 from ssilk_core.sampling import sample_pose
 from ssilk_core.trade.judging import judged
-from ssilk_core.trade.measure import Meter
+from ssilk_core.trade.measure import VariantMeter
 from ssilk_core.trade.played import Played
 from ssilk_core.trade.plot import Axis, write_plot
-from ssilk_core.trade.point import Point, front
+from ssilk_core.trade.point import TradePoint, front
 from ssilk_core.trade.sweep import Results, sweep
 from ssilk_core.trade.table import judging_table, table
 from ssilk_core.trade.variants import PRECISIONS, variants
@@ -42,7 +42,7 @@ def model(scene, toy_model):
 def bench(scene, model, toy_motion):
     """A reducer, and a dressed garment with a reel of two takes."""
     file = model_file(model, FABRICS["silk"], {})
-    dressed = Dressed(scene, file.fabric, FPS, torch.device("cpu"))
+    dressed = EvaluationScene(scene, file.fabric, FPS, torch.device("cpu"))
     takes = [
         take
         for name, frames in (("long", 50), ("short", 20))
@@ -53,25 +53,25 @@ def bench(scene, model, toy_motion):
 
 @pytest.fixture(scope="module")
 def meter(bench):
-    return Meter("toy", *bench, lambda file, fps: ShotBytes(1000.0 * file.config.shapes, 60.0))
+    return VariantMeter("toy", *bench, lambda file, fps: ShotBytes(1000.0 * file.config.shapes, 60.0))
 
 
-def chosen(meter: Meter, name: str):
+def chosen(meter: VariantMeter, name: str):
     return next(v for v in variants(meter.reducer.whole, FPS) if v.name == name)
 
 
 @pytest.fixture(scope="module")
-def points(meter) -> dict[str, Point]:
+def points(meter) -> dict[str, TradePoint]:
     names = ("as trained", "2 blendshapes", "0 proxies", "int16", "float16", "15 frames/s", "1 iterations")
     sizes = {name: chosen(meter, name) for name in names if name != "2 blendshapes"}
     sizes["2 blendshapes"] = replace(
-        sizes["as trained"], name="2 blendshapes", size=Size(shapes=2, joints=2, influences=2)
+        sizes["as trained"], name="2 blendshapes", size=ModelSize(shapes=2, joints=2, influences=2)
     )
     return {name: meter.point(variant) for name, variant in sizes.items()}
 
 
 def test_one_thing_is_swept_at_a_time_and_levels_come_last():
-    whole = Size(shapes=64, joints=20, influences=8)
+    whole = ModelSize(shapes=64, joints=20, influences=8)
     tried = list(variants(whole, FPS))
     base = tried[0]
     assert base.size == whole and len({(v.swept, v.name) for v in tried}) == len(tried)
@@ -107,7 +107,7 @@ def test_the_whole_model_is_what_the_network_in_pytorch_is(meter, bench, model, 
 
 def test_errors_are_distances_and_speeds_from_the_whole_model(meter, bench, points):
     reducer, dressed, reel = bench
-    small = Player(reducer.reduced(Size(shapes=2, joints=2, influences=2)).file)
+    small = Player(reducer.reduced(ModelSize(shapes=2, joints=2, influences=2)).file)
     mass, squares, speeds = dressed.energy.mass.numpy(), [], []
     for take in reel.takes:
         played = [player.play(take.motion) for player in (small, reducer.player)]
@@ -122,7 +122,7 @@ def test_errors_are_distances_and_speeds_from_the_whole_model(meter, bench, poin
 
 def test_collisions_are_told_with_any_body(meter, scene):
     fabric = replace(FABRICS["silk"], margin=0.2)  # as wide as the gap between the toy's garment and its body
-    dressed = Dressed(scene, fabric, FPS, torch.device("cpu"))
+    dressed = EvaluationScene(scene, fabric, FPS, torch.device("cpu"))
     surface, points, few = judged(dressed, meter.reel, meter.whole)
     body = dressed.body.posed(meter.reel.character(0, range(50)))
     met, nearest = dressed.contacts.distances(meter.whole.vertices(0, range(50)), body)

@@ -15,8 +15,8 @@ from ssilk_core.events import Message, Progress, Started, silent
 from ssilk_core.training import budget
 from ssilk_core.training import run as training
 from ssilk_core.training.budget import fitting_iterations, shaped
-from ssilk_core.training.parallel import Team
-from ssilk_core.training.run import Run, train
+from ssilk_core.training.parallel import ProcessGroup
+from ssilk_core.training.run import TrainingRun, train
 from ssilk_core.training.state import load_state, state_path
 from ssilk_core.training.step import learning_rate
 
@@ -86,7 +86,7 @@ def test_a_run_with_minutes_is_one_of_as_many_iterations(job, monkeypatch):  # n
 def test_a_run_ends_with_its_time_and_goes_on_with_more(job, monkeypatch):  # noqa: F811
     monkeypatch.setattr(training, "fitting_iterations", lambda *_: 13)
     with monkeypatch.context() as patch:
-        patch.setattr(Run, "time_left", property(lambda run: 8.0 - run.state.iteration))
+        patch.setattr(TrainingRun, "time_left", property(lambda run: 8.0 - run.state.iteration))
         said: list = []
         trained = train(job("early", minutes=1.0), said.append)
     assert trained.finished and trained.iterations == 8
@@ -101,17 +101,17 @@ def test_a_run_ends_with_its_time_and_goes_on_with_more(job, monkeypatch):  # no
 @pytest.mark.parametrize("resume", [False, True])
 def test_a_team_has_no_minutes(job, resume):  # noqa: F811
     """Each process would end by a clock of its own, and the others wait for it."""
-    with pytest.raises(SsilkError, match="minutes for a team of processes; its clocks differ; set the iterations"):
-        Run(job("team", minutes=1.0, resume=resume), silent, Team(0, 2))
+    with pytest.raises(SsilkError, match="minutes for a group of processes; its clocks differ; set the iterations"):
+        TrainingRun(job("group", minutes=1.0, resume=resume), silent, ProcessGroup(0, 2))
 
 
 def test_time_is_up_when_no_validation_fits_any_more(job, monkeypatch):  # noqa: F811
     monkeypatch.setattr(training, "fitting_iterations", lambda *_: 13)
-    run = Run(job("clock", minutes=1.0), silent)
+    run = TrainingRun(job("clock", minutes=1.0), silent)
     now = run._began
     monkeypatch.setattr(training.time, "monotonic", lambda: now)
     run.scoring = 10.0
     for spent in (49.0, 51.0):
         now = run._began + spent
         assert run.time_left == pytest.approx(50.0 - spent)
-    assert Run(job("endless"), silent).time_left == inf
+    assert TrainingRun(job("endless"), silent).time_left == inf

@@ -23,16 +23,16 @@ from ssilk_core.fabrics import Fabric
 from ssilk_core.model.network import GarmentModel
 from ssilk_core.training import run as training
 from ssilk_core.training import validation
-from ssilk_core.training.curve import Point, curve_path, with_point
+from ssilk_core.training.curve import CurvePoint, curve_path, with_point
+from ssilk_core.training.divergence import fault_path
 from ssilk_core.training.job import TrainJob, split_motions
-from ssilk_core.training.keeping import Keeper
 from ssilk_core.training.objective import Objective
 from ssilk_core.training.run import train
+from ssilk_core.training.run_files import RunFiles
 from ssilk_core.training.signals import interruptible
 from ssilk_core.training.state import RunState, learned, load_state, state_path
 from ssilk_core.training.step import EAGER_STEPS, Stepper, learning_rate
 from ssilk_core.training.validation import Score
-from ssilk_core.training.watch import fault_path
 from ssilk_core.training.windows import WindowSampler
 
 SHORT = TrainConfig(
@@ -417,7 +417,7 @@ def test_a_run_that_is_out_of_memory_with_a_batch_of_one_stops(job, monkeypatch,
     with pytest.raises(
         SsilkError, match=rf"iteration {iteration}: cpu is out of memory with a batch of one; .*window"
     ):
-        train(job(f"hopeless{windows}"), silent)
+        train(job(f"is_diverging{windows}"), silent)
 
 
 def test_no_model_that_is_not_finite_is_written_where_a_run_is_interrupted(job, monkeypatch):
@@ -468,13 +468,13 @@ def test_a_gpu_that_is_out_of_memory_in_a_graph_goes_on_with_half_the_batch(job,
 
 
 def test_a_state_is_saved_by_time_too(job, monkeypatch):
-    saved, save = [], Keeper.save_state
+    saved, save = [], RunFiles.save_state
 
-    def noted(self: Keeper, stepper: Stepper, state: RunState) -> None:
+    def noted(self: RunFiles, stepper: Stepper, state: RunState) -> None:
         saved.append(state.iteration)
         save(self, stepper, state)
 
-    monkeypatch.setattr(Keeper, "save_state", noted)
+    monkeypatch.setattr(RunFiles, "save_state", noted)
     monkeypatch.setattr(training, "SAVE_EVERY", 0.0)
     train(job("timed"), silent)
     assert saved == [*range(15)]
@@ -486,15 +486,15 @@ def test_a_model_that_was_not_written_any_more_is_in_the_state(job, monkeypatch)
     monkeypatch.setattr(
         validation.Validator, "score", lambda self, model: replace(score(self, model), terms={"all": next(totals)})
     )
-    killed, write = job("killed"), Keeper.save_model
+    killed, write = job("killed"), RunFiles.save_model
 
-    def second(self: Keeper, model: GarmentModel, state: RunState, score: Score) -> None:
+    def second(self: RunFiles, model: GarmentModel, state: RunState, score: Score) -> None:
         if state.iteration == 10:
             raise InterruptedError
         write(self, model, state, score)
 
     with monkeypatch.context() as patch, pytest.raises(InterruptedError):
-        patch.setattr(Keeper, "save_model", second)
+        patch.setattr(RunFiles, "save_model", second)
         train(killed, silent)
     assert load_model(killed.output).provenance["iteration"] == 5
     at_once = threading.Event()
@@ -536,9 +536,9 @@ def test_the_learning_curve_goes_on_where_a_resumed_run_does(job, uninterrupted,
 
 
 def test_a_long_curve_is_thinned_and_ends_at_the_last_validation():
-    curve: list[Point] = []
+    curve: list[CurvePoint] = []
     for iteration in range(1, 5001):
-        curve = with_point(curve, Point(iteration, iteration / 100, {}, Score({}, 0.0)))
+        curve = with_point(curve, CurvePoint(iteration, iteration / 100, {}, Score({}, 0.0)))
         assert curve[-1].iteration == iteration and len(curve) <= 400
     assert curve[0].iteration == 1 and len(curve) > 200
 

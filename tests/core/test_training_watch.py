@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from ssilk_core.motion_bank import build_bank
+from ssilk_core.training.divergence import EVERY, DivergenceMonitor, places_of
 from ssilk_core.training.faults import Faults
-from ssilk_core.training.watch import EVERY, Watch, places_of
 
 CPU = torch.device("cpu")
 
@@ -24,48 +24,51 @@ def step(faults: Faults, iteration: int, **broken: bool) -> None:
 
 
 def test_an_undone_step_is_named_by_term_and_iteration_once():
-    watch = Watch(faults := Faults(CPU))
+    monitor = DivergenceMonitor(faults := Faults(CPU))
     step(faults, 0)
-    assert watch.look() == ""
+    assert monitor.look() == ""
     step(faults, 1, bending=True)
     step(faults, 2)
-    assert watch.look() == "1 step up to iteration 2 was undone: bending not finite."
-    assert watch.look() == ""
+    assert monitor.look() == "1 step up to iteration 2 was undone: bending not finite."
+    assert monitor.look() == ""
     step(faults, 3, gradient=True)
     step(faults, 4, stretch=True, inertia=True)
-    assert watch.look() == "2 steps up to iteration 5 were undone: stretch and inertia and gradient not finite."
-    assert watch.count == 3 and watch.iteration == 5
+    assert monitor.look() == "2 steps up to iteration 5 were undone: stretch and inertia and gradient not finite."
+    assert monitor.count == 3 and monitor.iteration == 5
 
 
 def test_of_many_ever_fewer_are_told_of():
     faults, told = Faults(CPU), []
     faults.count.fill_(5000)  # of earlier runs: these count anew
-    watch = Watch(faults)
+    monitor = DivergenceMonitor(faults)
     for iteration in range(1000):
         step(faults, iteration, stretch=iteration % 10 == 0)
         if (iteration + 1) % EVERY == 0:
-            told.append(watch.look())
+            told.append(monitor.look())
     assert 4 < sum(map(bool, told)) < 15 and told[0]
 
 
-@pytest.mark.parametrize(("share", "hopeless"), [(0.4, False), (0.6, True)])
-def test_training_is_hopeless_once_most_of_the_last_hundred_steps_were_undone(share, hopeless):
-    watch, broken = Watch(faults := Faults(CPU)), np.random.default_rng(0).permutation(100) < share * 100
+@pytest.mark.parametrize(("share", "is_diverging"), [(0.4, False), (0.6, True)])
+def test_training_is_hopeless_once_most_of_the_last_hundred_steps_were_undone(share, is_diverging):
+    monitor, broken = (
+        DivergenceMonitor(faults := Faults(CPU)),
+        np.random.default_rng(0).permutation(100) < share * 100,
+    )
     for iteration in range(1000):
         step(faults, iteration, stretch=bool(broken[iteration % 100]) and iteration >= 500)
         if (iteration + 1) % EVERY == 0:
-            watch.look()
-            assert not watch.hopeless or iteration > 540
-    assert watch.hopeless == hopeless and watch.culprits == ["stretch"]
+            monitor.look()
+            assert not monitor.is_diverging or iteration > 540
+    assert monitor.is_diverging == is_diverging and monitor.non_finite_terms == ["stretch"]
 
 
 def test_undone_steps_of_long_ago_are_forgiven():
-    watch = Watch(faults := Faults(CPU))
+    monitor = DivergenceMonitor(faults := Faults(CPU))
     for iteration in range(200):
         step(faults, iteration, bending=iteration < 70)
         if (iteration + 1) % EVERY == 0:
-            watch.look()
-    assert faults.count == 70 and not watch.hopeless
+            monitor.look()
+    assert faults.count == 70 and not monitor.is_diverging
 
 
 def test_frames_of_a_bank_are_those_of_the_motions(scene, toy_motion):

@@ -11,7 +11,7 @@ import trimesh
 
 from ssilk_core.errors import SsilkError
 from ssilk_core.view.camera import Camera
-from ssilk_core.view.light import LAMP_RADIUS, Rig, sky_directions
+from ssilk_core.view.light import LAMP_RADIUS, Lighting, sky_directions
 from ssilk_core.view.render import render
 from ssilk_core.view.surface import INSIDE_SHADE, Surface
 
@@ -81,7 +81,7 @@ def test_the_shadow_falls_where_the_lamp_is_hidden():
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     rays = camera.directions(x, y, WIDTH, HEIGHT)
     floor = camera.position - camera.position[1] / rays[..., 1:2] * rays
-    key = Rig.beside(camera).key
+    key = Lighting.beside(camera).key
     apart = np.linalg.norm(np.cross(centre - floor, key), axis=-1)  # from the ball's centre to the ray at the lamp
     seen = (rays[..., 1] < 0) & (np.linalg.norm(np.cross(centre - camera.position, rays), axis=-1) > 1.1 * radius)
     penumbra = 1.2 * LAMP_RADIUS * centre[1] / key[1]
@@ -92,7 +92,7 @@ def test_the_shadow_falls_where_the_lamp_is_hidden():
 
 
 def test_surfaces_cast_shadows_on_each_other():
-    key = Rig.beside(AHEAD).key
+    key = Lighting.beside(AHEAD).key
     alone = render([sheet(GREY)], AHEAD, WIDTH, HEIGHT, ground=FAR_BELOW)
     # A ball outside the picture, between the middle of the sheet and the lamp.
     shaded = render([sheet(GREY), ball(8 * key, 0.6)], AHEAD, WIDTH, HEIGHT, ground=FAR_BELOW)

@@ -20,12 +20,12 @@ import pytest
 from ssilk_core.checkpoint import load_model
 from ssilk_core.cli import main
 from ssilk_core.errors import SsilkError
-from ssilk_core.events import Garment, JsonReporter, Message, Progress, Said, read_event
-from ssilk_core.wardrobe.listing import Entry, read_list
-from ssilk_core.wardrobe.panel import Panel, table
-from ssilk_core.wardrobe.queue import End, Queue, Task
+from ssilk_core.events import GarmentEvent, JsonReporter, Message, Progress, Said, read_event
+from ssilk_core.wardrobe.listing import WardrobeEntry, read_list
+from ssilk_core.wardrobe.panel import ProgressTable, table
+from ssilk_core.wardrobe.queue import CommandTask, End, Queue
 from ssilk_core.wardrobe.record import request_hash
-from ssilk_core.wardrobe.training import Training
+from ssilk_core.wardrobe.training import GarmentTraining
 
 LIST = """
 [defaults]
@@ -47,7 +47,7 @@ motions = "torn.usda"
 # --- what a list says ---------------------------------------------------------------------------------------------
 
 
-def listed(folder: Path, text: str) -> list[Entry]:
+def listed(folder: Path, text: str) -> list[WardrobeEntry]:
     (folder / "list.toml").write_text(text)
     return read_list(folder / "list.toml")
 
@@ -109,10 +109,10 @@ def test_nothing_is_trained_when_an_entry_cannot_be(toy, tmp_path, monkeypatch, 
 # --- trainings side by side ---------------------------------------------------------------------------------------
 
 
-def task(folder: Path, name: str, code: str) -> Task:
+def task(folder: Path, name: str, code: str) -> CommandTask:
     """A process that costs little, in place of a training."""
     told = "import json, os, signal, sys, time\ndef say(**event): print(json.dumps(event), flush=True)\n"
-    return Task(name, [sys.executable, "-S", "-c", told + code], folder, folder / f"{name}.log")
+    return CommandTask(name, [sys.executable, "-S", "-c", told + code], folder, folder / f"{name}.log")
 
 
 class Heard:
@@ -127,7 +127,7 @@ class Heard:
     def tell(self, name: str, event: Said) -> None:
         self.said.append((name, event))
 
-    def run(self, *tasks: Task) -> dict[str, End]:
+    def run(self, *tasks: CommandTask) -> dict[str, End]:
         self.queue.run(iter(tasks), self.stop)
         return self.ends
 
@@ -194,27 +194,27 @@ def test_a_second_interrupt_ends_all_at_once(tmp_path):
 
 
 def test_what_is_finished_is_skipped_unless_something_else_is_asked(tmp_path):
-    entry, done = Entry("cape", ("stage.usda",)), {"iterations": 5, "higher by": "3.0%"}
-    first = Training(entry, tmp_path, "request")
+    entry, done = WardrobeEntry("cape", ("stage.usda",)), {"iterations": 5, "higher by": "3.0%"}
+    first = GarmentTraining(entry, tmp_path, "request")
     assert (first.state, first.resumed, first.code) == ("waiting", False, 130)
     begun = first.begin(tmp_path, "cpu")
     assert "--resume" not in begun.command and begun.command[3:6] == ["train", "stage.usda", "-o"]
-    assert Training(entry, tmp_path, "request").plan == ""  # killed before it had a state
+    assert GarmentTraining(entry, tmp_path, "request").plan == ""  # killed before it had a state
     (tmp_path / "cape.resume.safetensors").touch()
-    again = Training(entry, tmp_path, "request")
+    again = GarmentTraining(entry, tmp_path, "request")
     assert again.resumed and again.begin(tmp_path, "cpu").command[-1] == "--resume"
     again.end(End(130, 2.0, None))
     assert (again.state, again.code) == ("stopped", 130)
     (tmp_path / "cape.safetensors").touch()
-    last = Training(entry, tmp_path, "request")
+    last = GarmentTraining(entry, tmp_path, "request")
     last.end(End(0, 3.0, read_event(json.dumps({"event": "result", "task": "train", "detail": done}))))
-    kept = Training(entry, tmp_path, "request")
+    kept = GarmentTraining(entry, tmp_path, "request")
     assert (kept.state, kept.code, kept.plan) == ("finished", 0, "finished before; skipped")
     assert kept.row() == {
         "garment": "cape", "iterations": 5, "total [J]": None, "lower by": "-3.0%", "collisions": None,
         "time": 5.0, "state": "finished",
     }  # fmt: skip
-    changed = Training(entry, tmp_path, "another request")
+    changed = GarmentTraining(entry, tmp_path, "another request")
     assert changed.state == "waiting" and not changed.resumed and "something else" in changed.plan
     changed.begin(tmp_path, "cpu")
     assert not (tmp_path / "cape.resume.safetensors").exists()  # it belongs to what was asked before
@@ -222,7 +222,7 @@ def test_what_is_finished_is_skipped_unless_something_else_is_asked(tmp_path):
     assert (changed.state, changed.code) == ("failed", 1)
     (tmp_path / "cape.json").write_text("{")
     with pytest.raises(SsilkError, match=r"cape.json: the record of a training is damaged .*delete it"):
-        Training(entry, tmp_path, "request")
+        GarmentTraining(entry, tmp_path, "request")
 
 
 def test_a_request_changes_with_words_and_contents(tmp_path):
@@ -247,10 +247,10 @@ class Terminal(io.StringIO):
 def test_a_terminal_has_a_line_for_each(monkeypatch):
     monkeypatch.setenv("COLUMNS", "30")
     monkeypatch.setenv("LINES", "24")
-    panel = Panel(["cape", "skirt"], Terminal())
+    panel = ProgressTable(["cape", "skirt"], Terminal())
     for done in (1, 2):  # the second comes too soon
-        panel(Garment("skirt", Progress(done, 9, 5.0, {"stretch": 0.5})))
-    panel(Garment("cape", Message("a warning that is longer than the line", "warning")))
+        panel(GarmentEvent("skirt", Progress(done, 9, 5.0, {"stretch": 0.5})))
+    panel(GarmentEvent("cape", Message("a warning that is longer than the line", "warning")))
     first, second = panel.stream.getvalue().split("\x1b[2A")
     assert first == "\r\x1b[Kcape   waiting\n\r\x1b[Kskirt  1/9  5 s left  stretch\n"
     assert second == "\r\x1b[Kcape   warning: a warning tha\n\r\x1b[Kskirt  2/9  5 s left  stretch\n"
@@ -258,10 +258,10 @@ def test_a_terminal_has_a_line_for_each(monkeypatch):
 
 def test_elsewhere_lines_say_whose_they_are():
     stream = io.StringIO()
-    panel = Panel(["cape", "skirt"], stream)
+    panel = ProgressTable(["cape", "skirt"], stream)
     for name in ("cape", "skirt", "cape"):
-        panel(Garment(name, Progress(1, 9, None, {"stretch": 0.5})))
-    panel(Garment("skirt", Message("half of it")))
+        panel(GarmentEvent(name, Progress(1, 9, None, {"stretch": 0.5})))
+    panel(GarmentEvent("skirt", Message("half of it")))
     assert stream.getvalue().splitlines() == [
         "cape: 1/9  stretch 0.5",
         "skirt: 1/9  stretch 0.5",
@@ -283,7 +283,7 @@ def test_events_are_read_as_they_were_written():
     stream = io.StringIO()
     said = Progress(1, 2, None, {"stretch": float("nan"), "bending": 0.5})
     JsonReporter(stream)(said)
-    JsonReporter(stream)(Garment("cape", Message("well")))
+    JsonReporter(stream)(GarmentEvent("cape", Message("well")))
     alone, named = stream.getvalue().splitlines()
     assert repr(read_event(alone)) == repr(said)
     inner = {"event": "message", "text": "well", "level": "info"}

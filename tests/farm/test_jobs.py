@@ -14,14 +14,14 @@ from hypothesis import strategies as st
 from openjd.model import create_job, decode_job_template, preprocess_job_parameters
 
 from ssilk_core.errors import SsilkError
-from ssilk_core.events import Failed, Garment, Message, Progress, Started
+from ssilk_core.events import Failed, GarmentEvent, Message, Progress, Started
 from ssilk_core.farm.job import numbers, read_job, write_job
 from ssilk_core.farm.openjd import BundleOptions, OpenJdReporter, template, write_bundle
-from ssilk_core.farm.record import INPUTS, NAME, Record, is_current, read_record, task_key, write_record
-from ssilk_core.farm.tasks import Task, plan
+from ssilk_core.farm.record import INPUTS, NAME, TaskRecord, is_current, read_record, task_key, write_record
+from ssilk_core.farm.tasks import BakeTask, plan
 from ssilk_core.files import sha256
 
-LIKE = Task(garment="", shot="", model="", stage="/s/hero.usd", motion="")
+LIKE = BakeTask(garment="", shot="", model="", stage="/s/hero.usd", motion="")
 TASK = replace(LIKE, garment="cape", shot="walk", model="/m/cape.safetensors", motion="/s/walk.usd")
 CONTENTS = dict.fromkeys(INPUTS, "0")
 SETTINGS = settings(max_examples=200, deadline=None, derandomize=True, database=None,
@@ -71,7 +71,7 @@ def test_a_key_is_of_all_that_decides_what_is_written():
 
 def test_a_task_is_current_while_its_files_are_as_written(tmp_path):
     (tmp_path / "anim.usdc").write_bytes(b"shot")
-    write_record(tmp_path, Record(key="k", files={"anim.usdc": sha256(tmp_path / "anim.usdc")}))
+    write_record(tmp_path, TaskRecord(key="k", files={"anim.usdc": sha256(tmp_path / "anim.usdc")}))
     assert is_current(tmp_path, "k") and not is_current(tmp_path, "other")
     (tmp_path / "anim.usdc").write_bytes(b"shut")
     assert not is_current(tmp_path, "k")
@@ -120,7 +120,7 @@ def test_any_json_is_a_job_or_one_sentence(tmp_path, document):
     path = tmp_path / "job.json"
     path.write_text(json.dumps(document))
     try:
-        assert all(isinstance(task, Task) for task in read_job(path))
+        assert all(isinstance(task, BakeTask) for task in read_job(path))
     except SsilkError as error:
         assert str(error).startswith(str(path)) and str(error).endswith(".")
 
@@ -156,8 +156,8 @@ def test_what_sessions_read_of_a_worker():
     stream = io.StringIO()
     report = OpenJdReporter(stream)
     for event in (
-        Garment("walk/cape", Started("bake", 1)), Progress(1, 8), Progress(1, 8), Progress(8, 8),
-        Message("mind this", "warning"), Garment("walk/cape", Failed("x: bad.")),
+        GarmentEvent("walk/cape", Started("bake", 1)), Progress(1, 8), Progress(1, 8), Progress(8, 8),
+        Message("mind this", "warning"), GarmentEvent("walk/cape", Failed("x: bad.")),
     ):  # fmt: skip
         report(event)
     assert stream.getvalue().splitlines() == [

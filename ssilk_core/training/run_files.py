@@ -15,48 +15,48 @@ from ..devices import device_name
 from ..files import remove_unfinished
 from ..model.network import GarmentModel
 from .curve import curve_path, summary, write_curve
+from .divergence import fault_path, save_fault
 from .job import TrainJob
-from .parallel import ALONE, Team
+from .parallel import SINGLE_PROCESS, ProcessGroup
 from .state import RunState, canonical, copied, save_state, state_path
 from .step import Stepper
 from .validation import Score
-from .watch import fault_path, save_fault
 
 
-class Keeper:
-    """Writes the files of one run, all beside its model; of a team of processes, only the first writes."""
+class RunFiles:
+    """Writes the files of one run, all beside its model; of a group of processes, only the first writes."""
 
-    def __init__(self, job: TrainJob, device: torch.device, team: Team = ALONE) -> None:
-        self.job, self.device, self.team = job, device, team
+    def __init__(self, job: TrainJob, device: torch.device, group: ProcessGroup = SINGLE_PROCESS) -> None:
+        self.job, self.device, self.group = job, device, group
         self.model, self.state = job.output, state_path(job.output)
         self.curve, self.fault = curve_path(job.output), fault_path(job.output)
 
     def tidy(self) -> None:
         """Remove what a run that was killed while it wrote has left behind."""
-        if self.team.first:
+        if self.group.first:
             for path in (self.model, self.state, self.curve, self.fault):
                 remove_unfinished(path)
 
     def save_state(self, stepper: Stepper, state: RunState) -> None:
-        """Write the state, for which all of a team are needed."""
-        samplers = self.team.gather(copied(stepper.sampler.state()))
-        if self.team.first:
+        """Write the state, for which all of a group are needed."""
+        samplers = self.group.gather(copied(stepper.sampler.state()))
+        if self.group.first:
             save_state(self.state, stepper, samplers, state)
-        self.team.gather(None)  # none goes on before it is there to be read
+        self.group.gather(None)  # none goes on before it is there to be read
 
     def save_curve(self, state: RunState, plain: Score) -> None:
         """Write the learning curve that is in the state, for whoever wants to look at it."""
-        if self.team.first:
+        if self.group.first:
             write_curve(self.curve, state.curve, plain)
 
     def save_model(self, model: GarmentModel, state: RunState, score: Score) -> None:
         """Write a model with its provenance."""
-        if self.team.first:
+        if self.group.first:
             save_model(self.model, model_file(model, self.job.fabric, self.provenance(state, score)))
 
     def save_fault(self, stepper: Stepper, found: str) -> None:
         """Write what a step that was not finite was computed from."""
-        if self.team.first:
+        if self.group.first:
             save_fault(self.fault, stepper, self.job.trained_motions(), found)
 
     def provenance(self, state: RunState, score: Score) -> dict[str, Any]:

@@ -25,7 +25,7 @@ POSES = ("frames", "directions")  # what a step of the warm start is computed fr
 LIMIT = 0.5  # of the steps in a span; with more of them undone, training is not going anywhere
 
 
-class Watch:
+class DivergenceMonitor:
     """Looks now and then at the steps that a stepper has undone.
 
     Attributes:
@@ -34,7 +34,7 @@ class Watch:
 
     def __init__(self, faults: Faults) -> None:
         self.faults, self.count = faults, int(faults.count)
-        self._before = self.count
+        self._initial_count = self.count
         self._counts = deque([self.count], maxlen=SPAN // EVERY + 1)
         self._told, self._blamed = self.count, {name: int(value) for name, value in faults.terms.items()}
 
@@ -42,7 +42,7 @@ class Watch:
         """Return one sentence when steps were undone; of many, ever fewer are told of. It waits for the device."""
         self.count = int(self.faults.count)
         self._counts.append(self.count)
-        if self.count == self._told or self.count - self._before < 1.5 * (self._told - self._before):
+        if self.count == self._told or self.count - self._initial_count < 1.5 * (self._told - self._initial_count):
             return ""
         blamed = {name: int(value) for name, value in self.faults.terms.items()}
         names = [name for name, value in blamed.items() if value > self._blamed.get(name, 0)]
@@ -58,12 +58,12 @@ class Watch:
         return int(self.faults.iteration) + 1
 
     @property
-    def hopeless(self) -> bool:
+    def is_diverging(self) -> bool:
         """Whether too many of the last steps were undone."""
         return self._counts[-1] - self._counts[0] > LIMIT * SPAN
 
     @property
-    def culprits(self) -> list[str]:
+    def non_finite_terms(self) -> list[str]:
         """Names of what was not finite, the most frequent first."""
         counts = {name: int(value) for name, value in self.faults.terms.items()}
         return sorted((name for name in counts if counts[name]), key=lambda name: -counts[name])
