@@ -48,13 +48,13 @@ def buried(subject: Subject, body: Floats, points: Floats) -> np.ndarray:
 
 
 def poses(subject: Subject, motion: Motion, step: int) -> list[tuple[Tensor, Tensor, Tensor]]:
-    """Return skinning matrices, the model's and plain skinning's positions for every `step`-th frame of a motion."""
+    """Return skinning matrices and the positions of model and LBS for every `step`-th frame of a motion."""
     validator, found = subject.validator(motion), []
     for clip in validator.clips:
         frames = torch.arange(clip.start, clip.stop)
         states = roll_states(subject.model, validator.bank, [clip], validator.down)[0][::step]
         character = validator.bank.character(frames[::step])
-        found.append((character, subject.model.vertices(states, character), validator.plain_vertices(character)))
+        found.append((character, subject.model.vertices(states, character), validator.lbs_vertices(character)))
     return found
 
 
@@ -99,7 +99,7 @@ class Count:
     def _joints(self) -> dict[str, float]:
         """Return the three joints that most of the colliding vertices belong to, with their shares."""
         scene = self.subject.scene
-        skin = scene.plain_skin
+        skin = scene.lbs_skin
         owner: Ints = skin.indices[np.arange(len(skin.indices)), skin.weights.argmax(axis=1)]
         hits = np.bincount(owner, self.inside, minlength=len(scene.joint_names)) / max(self.inside.sum(), 1)
         return {scene.joint_names[j].rpartition("/")[2]: float(hits[j]) for j in np.argsort(-hits)[:3]}
@@ -123,15 +123,15 @@ def row(garment: str, how: str, found: dict[str, Any]) -> list[str]:
 
 @torch.no_grad()
 def measure(subject: Subject, options: Any) -> dict[str, Any]:
-    """Return the figures at rest, under the model and under plain skinning."""
+    """Return the figures at rest, under the model and under linear blend skinning."""
     rest = rest_distances(subject)
     counts = {how: Count(subject, rest) for how in ("at rest", "model", "plain")}
     bind = torch.eye(3, 4).expand(subject.scene.character.skeleton.joint_count, 3, 4)[..., None]
     counts["at rest"].add(subject.model.decoder.rest[..., None], bind)
     for clip in options.clips:
-        for character, x, plain in poses(subject, clip_of(options, clip, subject), options.step):
+        for character, x, lbs in poses(subject, clip_of(options, clip, subject), options.step):
             counts["model"].add(x, character)
-            counts["plain"].add(plain, character)
+            counts["plain"].add(lbs, character)
     found = {how: count.figures() for how, count in counts.items()}
     quantiles = [float(np.quantile(rest, q)) for q in (0, 0.05, 0.5)]
     closer = float(np.mean(rest < subject.file.fabric.margin))

@@ -32,13 +32,16 @@ SHOWN = 0.9  # share of the values that a panel shows: the first ones would flat
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """The validations of one training: iterations, seconds and values, shape (points,); plain skinning's total."""
+    """The validations of one training: iterations, seconds and values, shape (points,).
+
+    Linear blend skinning's total.
+    """
 
     name: str
     iterations: np.ndarray
     seconds: np.ndarray
     values: dict[str, np.ndarray]
-    plain: float
+    lbs: float
 
     @property
     def best(self) -> np.ndarray:
@@ -72,7 +75,7 @@ def read_run(text: str) -> Run:
         fail(str(path), "the curve has no point yet", "one validation at least is needed", "train longer")
     values = {key: np.array([point["validation"][key] for point in points]) for key in PANELS}
     iterations, seconds = (np.array([point[key] for point in points]) for key in ("iteration", "seconds"))
-    return Run(name or Path(model).stem, iterations, seconds, values, document["plain"]["total"])
+    return Run(name or Path(model).stem, iterations, seconds, values, document["lbs"]["total"])
 
 
 def bounds(values: Iterable[np.ndarray]) -> tuple[float, float]:
@@ -104,7 +107,7 @@ def compare(runs: list[Run], totals: list[float]) -> str:
     """Return a table of what runs reach in equal time and iterations, and when they reach the totals [J]."""
     shared = min(float(run.seconds[-1]) for run in runs)
     times, iterations = [shared / 4, shared / 2, shared], min(int(run.iterations[-1]) for run in runs)
-    header = ["run", "iterations", "time", "best total [J]", "plain skinning [J]"]
+    header = ["run", "iterations", "time", "best total [J]", "linear blend skinning [J]"]
     header += [f"best within {format_seconds(time)}" for time in times]
     header += [f"best within {iterations} iterations", *(f"time (iterations) to {total:.4g} J" for total in totals)]
     return table(header, [_line(run, times, iterations, totals) for run in runs])
@@ -116,7 +119,7 @@ def _line(run: Run, times: list[float], iterations: int, totals: list[float]) ->
     arrivals = [run.reached(total) for total in totals]
     return [
         *begun,
-        *(f"{value:.4g}" for value in (run.best[-1], run.plain)),
+        *(f"{value:.4g}" for value in (run.best[-1], run.lbs)),
         *("" if value is None else f"{value:.4g}" for value in best),
         *("never" if at is None else f"{format_seconds(run.seconds[at])} ({run.iterations[at]})" for at in arrivals),
     ]
@@ -140,7 +143,7 @@ def main() -> None:
         run.name: {
             "iterations": run.iterations.tolist(),
             "seconds": run.seconds.tolist(),
-            "plain skinning": run.plain,
+            "linear blend skinning": run.lbs,
             **{key: values.tolist() for key, values in run.values.items()},
         }
         for run in runs

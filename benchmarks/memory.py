@@ -80,7 +80,7 @@ def scene(vertices: int, body_vertices: int) -> Scene:
     bones, (cloth, row), (skin, ring) = skeleton(), tube("/cloth", vertices, 0.2), tube("/body", body_vertices, 0.18)
     on_bones = np.tile(np.arange(4), (len(ring), 1)) + (ring % (JOINTS - 4))[:, None]
     body = Body(skin, SkinWeights("/body", on_bones, np.ones(on_bones.shape)))
-    plain = SkinWeights("/cloth", np.tile([JOINTS - 1, JOINTS - 2], (len(row), 1)), np.ones((len(row), 2)))
+    lbs = SkinWeights("/cloth", np.tile([JOINTS - 1, JOINTS - 2], (len(row), 1)), np.ones((len(row), 2)))
     on_proxies = JOINTS + np.tile(np.arange(4), (len(row), 1)) + (row % (PROXIES - 4))[:, None]
     on_proxies[row == 0] = JOINTS - 1
     places = np.stack([np.zeros(PROXIES), np.linspace(1.4, 0.7, PROXIES), np.full(PROXIES, 0.2)], axis=1)
@@ -91,7 +91,7 @@ def scene(vertices: int, body_vertices: int) -> Scene:
         rigid(np.tile(np.eye(3), (PROXIES, 1, 1)), places),
         SkinWeights("/rig", on_proxies, np.ones(on_proxies.shape)),
     )
-    garment = Garment(cloth, plain, np.where(row == 0, PINNED, LOOSE))
+    garment = Garment(cloth, lbs, np.where(row == 0, PINNED, LOOSE))
     return Scene(Character("/character", bones, (body,)), garment, rig)
 
 

@@ -116,9 +116,9 @@ def with_parameters(subject: Subject, parameters: dict[str, np.ndarray]) -> Subj
     return replace(subject, file=file, model=network(file, subject.scene).to(subject.device))
 
 
-def means(subject: Subject, motions: Sequence[Motion], *, plain: bool = False) -> dict[str, float]:
+def means(subject: Subject, motions: Sequence[Motion], *, lbs: bool = False) -> dict[str, float]:
     """Return the means over all frames of some motions of what `Validator.frame_terms` gives."""
-    terms = [subject.frame_terms(motion, plain=plain) for motion in motions]
+    terms = [subject.frame_terms(motion, lbs=lbs) for motion in motions]
     return {name: float(torch.cat([each[name] for each in terms]).mean()) for name in terms[0]}
 
 

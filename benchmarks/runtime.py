@@ -108,7 +108,7 @@ def cloth(scene: Scene, motion: Motion, python: str) -> dict[str, list[float]]:
             shot,
             body=skin_points(body.mesh.points, body.skin, matrices) @ z_up.T,
             body_faces=body.mesh.faces,
-            garment=skin_points(scene.garment.mesh.points, scene.plain_skin, matrices) @ z_up.T,
+            garment=skin_points(scene.garment.mesh.points, scene.lbs_skin, matrices) @ z_up.T,
             garment_faces=scene.garment.mesh.faces,
             pinned=np.flatnonzero(scene.classes == PINNED),
             fps=motion.fps,

@@ -60,12 +60,12 @@ def dressed(loose: float, *, tight: bool = True) -> Scene:
     classes = np.where(hangs, LOOSE, held)
     garment = replace(whole.garment, classes=classes)
     if not hangs.any():
-        none = ProxyRig("/rig", (), np.zeros(0, dtype=np.int32), np.zeros((0, 4, 4)), whole.plain_skin)
+        none = ProxyRig("/rig", (), np.zeros(0, dtype=np.int32), np.zeros((0, 4, 4)), whole.lbs_skin)
         return Scene(whole.character, garment, none)
     proxies = max(synthetic.CHAINS, round(SIZE.proxies * loose))
     joints = whole.character.skeleton.joint_count
-    plain = whole.plain_skin.dense(joints)
-    return Scene(whole.character, garment, synthetic.cloak_rig(garment.mesh, plain, classes, proxies))
+    lbs = whole.lbs_skin.dense(joints)
+    return Scene(whole.character, garment, synthetic.cloak_rig(garment.mesh, lbs, classes, proxies))
 
 
 def beside(scene: Scene) -> Scene:

@@ -74,13 +74,13 @@ def record(subject: Subject, found: Loss, motions: list[Motion]) -> dict[str, An
 
     Its stretching on the demo's own shot tells later versions whether it still does what it did.
     """
-    plain, shot = means(subject, motions, plain=True), demo_shot(subject.scene.character.skeleton)
+    lbs, shot = means(subject, motions, lbs=True), demo_shot(subject.scene.character.skeleton)
     return {
         "date": datetime.now(UTC).date().isoformat(),
         "largest error [m]": found.largest,
         "held-out clips": len(motions),
         "energy [J]": sum(found.energies.values()),
-        "plain skinning [J]": sum(plain[name] for name in TERMS),
+        "linear blend skinning [J]": sum(lbs[name] for name in TERMS),
         "inside the body": found.inside,
         "stretch on the demo's shot [J]": means(subject, [shot])["stretch"],
     }

@@ -28,7 +28,7 @@ from ssilk_core.simulate.newton import SolverOptions
 STOPS = (("02_04", 1.7), ("02_04", 3.7), ("02_02", 1.1), ("05_12", 4.0))
 HOLD = 5.0  # [s]
 HEADER = ("garment", "stopped at", "kinetic energy at the stop [J]", "after 5 s", "calm after [s]", "off P [mm]",
-          "over P [J]", "over the minimum [J]", "floats, of m g L", "P floats", "plain skinning floats",
+          "over P [J]", "over the minimum [J]", "floats, of m g L", "P floats", "linear blend skinning floats",
           "RMS off the minimum [mm]", "inside the body", "at the minimum", "out of balance [g]")  # fmt: skip
 
 
@@ -52,7 +52,7 @@ def measure(subject: Subject, clip: str, stop: float, options: Any) -> dict[str,
         "over the minimum [J]": float(rest.over()),
         "floats [m g L]": float(rest.floats(rest.start)) / weight,
         "P floats [m g L]": float(still.floats(still.start)) / weight,
-        "plain floats [m g L]": float(rest.floats(rest.poses.plain)) / weight,
+        "plain floats [m g L]": float(rest.floats(rest.poses.lbs)) / weight,
         "distance [m]": float(rest.distance()),
         "inside": float(rest.inside(rest.start)),
         "inside at the minimum": float(rest.inside(rest.x)),

@@ -57,10 +57,10 @@ class Subject:
         bank = build_bank([motion], skeleton, self.model.joints, fps, self.device)
         return Validator(bank, self.energy, self.body, self.scene, self.model.decoder.rest, fps, bank.frame_count)
 
-    def frame_terms(self, motion: Motion, *, plain: bool = False) -> dict[str, Tensor]:
+    def frame_terms(self, motion: Motion, *, lbs: bool = False) -> dict[str, Tensor]:
         """Return `Validator.frame_terms` over all frames of a motion, shape (N,)."""
         validator = self.validator(motion)
-        spans = [validator.frame_terms(span, None if plain else self.model) for span in validator.clips]
+        spans = [validator.frame_terms(span, None if lbs else self.model) for span in validator.clips]
         return {name: torch.cat([span[name] for span in spans]) for name in spans[0]}
 
 

@@ -118,11 +118,11 @@ def hanging_proxies(count: int) -> tuple[Floats, np.ndarray]:
     return places, np.where(level == 0, JOINTS - 5, JOINTS + index - CHAINS)
 
 
-def cloak_rig(mesh: Mesh, plain: Floats, classes: np.ndarray, proxies: int) -> ProxyRig:
+def cloak_rig(mesh: Mesh, lbs: Floats, classes: np.ndarray, proxies: int) -> ProxyRig:
     """Return a rig that moves loose vertices by their nearest proxies and the others as plain weights (V, J) do."""
     places, parents = hanging_proxies(proxies)
     loose = (classes == LOOSE)[:, None]
-    dense = np.concatenate([plain * ~loose, falloff(mesh.points, places, 0.2) * loose], axis=1)
+    dense = np.concatenate([lbs * ~loose, falloff(mesh.points, places, 0.2) * loose], axis=1)
     binds = rigid(np.tile(np.eye(3), (proxies, 1, 1)), places)
     skin = SkinWeights.from_dense("/rig", dense, INFLUENCES)
     names = joint_paths(np.concatenate([np.arange(-1, JOINTS - 1), parents]))[JOINTS:]
@@ -136,10 +136,10 @@ def scene(size: Size) -> Scene:
     surface, _ = coil("/body", size.body, BODY_TOP, 0.0, capsule_radius)
     skin = SkinWeights.from_dense("/body", falloff(surface.points, joints, 0.1), INFLUENCES)
     cloak, turns = coil("/cloak", size.vertices, NECK, HEM, cloak_radius)
-    plain = falloff(cloak.points, joints, 0.1)
+    lbs = falloff(cloak.points, joints, 0.1)
     classes = np.where(turns < 1, PINNED, np.where(turns < 2, TIGHT, LOOSE))
-    garment = Garment(cloak, SkinWeights.from_dense("/cloak", plain, INFLUENCES), classes)
-    rig = cloak_rig(cloak, plain, classes, size.proxies)
+    garment = Garment(cloak, SkinWeights.from_dense("/cloak", lbs, INFLUENCES), classes)
+    rig = cloak_rig(cloak, lbs, classes, size.proxies)
     return Scene(Character("/character", skeleton, (Body(surface, skin),)), garment, rig)
 
 

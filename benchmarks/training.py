@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time a training step and each of its parts, beside the plain PyTorch twins and the floor, and how that grows.
+"""Time a training step and each of its parts, beside the reference implementations in PyTorch and the floor, and how
+that grows.
 
     python benchmarks/training.py --device cuda
 
 The scene is synthetic, so that every size is exact. The first of each list of sizes is the base case, around which
 one size at a time is changed; the batch that training has by default is a case of its own. On a GPU each part is a
-CUDA graph of its own, timed with cold caches; the plain twin of the nearest body point, and with it the plain step,
-cannot be captured and are launched as they are. Each time is a median over repeats. A floor is the larger of bytes
-over the rate of a copy and operations over the rate of a float32 matrix product, both measured in the same run
-(benchmarks/floors.py); that of the nearest body point counts brute force.
+CUDA graph of its own, timed with cold caches; the reference implementation of the nearest body point, and with it the
+plain step, cannot be captured and are launched as they are. Each time is a median over repeats. A floor is the larger
+of bytes over the rate of a copy and operations over the rate of a float32 matrix product, both measured in the same
+run (benchmarks/floors.py); that of the nearest body point counts brute force.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ def cases(options: argparse.Namespace) -> dict[str, Size]:
 
 @contextmanager
 def variant(name: str) -> Iterator[None]:
-    """Let everything be built and run with the plain twins, or as it is."""
+    """Let everything be built and run with the reference implementations, or as it is."""
     if name == KERNELS:
         yield
         return

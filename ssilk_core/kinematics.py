@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rotations, forward kinematics and skinning in float64 numpy: the slow twin of every fast path."""
+"""Rotations, forward kinematics and skinning in float64 numpy, the slow reference of every fast path."""
 
 from __future__ import annotations
 
@@ -243,13 +243,13 @@ def deform(deformer: Deformer, motion: Motion, pose: GarmentPose) -> Floats:
     return skin_points(canonical, deformer.skin, matrices)
 
 
-def plain_deformer(scene: Scene) -> Deformer:
-    """Return a garment under plain skinning: no proxies, no blendshapes."""
-    none = ProxyRig(scene.rig.path, (), np.zeros(0, dtype=np.int32), np.zeros((0, 4, 4)), scene.plain_skin)
-    return Deformer(replace(scene, rig=none), scene.plain_skin, np.zeros((0, scene.garment.mesh.vertex_count, 3)))
+def lbs_deformer(scene: Scene) -> Deformer:
+    """Return a garment under linear blend skinning: no proxies, no blendshapes."""
+    none = ProxyRig(scene.rig.path, (), np.zeros(0, dtype=np.int32), np.zeros((0, 4, 4)), scene.lbs_skin)
+    return Deformer(replace(scene, rig=none), scene.lbs_skin, np.zeros((0, scene.garment.mesh.vertex_count, 3)))
 
 
-def plain_poses(frame_count: int) -> Iterator[GarmentPose]:
+def lbs_poses(frame_count: int) -> Iterator[GarmentPose]:
     """Yield the poses of a `plain_deformer`, which hold nothing, some frames at a time."""
     for start in range(0, frame_count, POSES_AT_ONCE):
         frames = min(POSES_AT_ONCE, frame_count - start)

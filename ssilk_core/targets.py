@@ -57,7 +57,7 @@ def capped(deformer: Deformer, target: Target) -> Deformer:
     """Return a garment and its character's bodies with each vertex moved by its heaviest influences alone.
 
     What is left of a vertex's weights is scaled to a sum of one, as exporters do it. A trained garment has no more
-    than its target takes by then (`need_influences`); what is capped are bodies, and plain skinning.
+    than its target takes by then (`need_influences`); what is capped are bodies, and linear blend skinning.
     """
     most = target.influences
     if most is None:

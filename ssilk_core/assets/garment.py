@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A garment, its plain skinning and its vertex classes."""
+"""A garment, its linear blend skinning and its vertex classes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Garment:
 
     Attributes:
         mesh: the garment at rest; its rest shape for the energies.
-        skin: weights onto the character's joints ("plain skinning"), or None when none are authored.
+        skin: weights onto the character's joints ("linear blend skinning"), or None when none are authored.
         classes: PINNED, TIGHT or LOOSE for each vertex, shape (V,), or None when none are authored.
     """
 

@@ -46,7 +46,7 @@ class Scene:
             fail(where, "the garment has no skinning weights", "weights are needed", "run 'ssilk rig' on it")
         if self.garment.classes is None:
             fail(where, "the garment has no vertex classes", "classes are needed", "run 'ssilk rig' on it")
-        self.plain_skin.check_joints(self.character.skeleton.joint_count)
+        self.lbs_skin.check_joints(self.character.skeleton.joint_count)
 
     def _check_rig(self) -> None:
         rig, joints = self.rig, self.character.skeleton.joint_count
@@ -67,7 +67,7 @@ class Scene:
             )
 
     @property
-    def plain_skin(self) -> SkinWeights:
+    def lbs_skin(self) -> SkinWeights:
         assert self.garment.skin is not None
         return self.garment.skin
 

@@ -19,7 +19,7 @@ from ..errors import fail
 from ..skinning import Skinning
 from .descriptors import MOVING, ROOT, STILL, split_features
 
-SHAPES = 1e-4  # [m], standard deviation of initial shapes: training starts close to plain skinning
+SHAPES = 1e-4  # [m], standard deviation of initial shapes: training starts close to linear blend skinning
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +53,7 @@ class Baseline(nn.Module, ABC):
         free = np.flatnonzero(scene.classes != PINNED)
         self.register_buffer("rest", torch.tensor(scene.garment.mesh.points, dtype=torch.float32), persistent=False)
         self.register_buffer("free", torch.tensor(free), persistent=False)
-        self.skin = Skinning(scene.plain_skin)
+        self.skin = Skinning(scene.lbs_skin)
         self.shapes = nn.Parameter(SHAPES * torch.randn(len(free), 3, codes))
 
     @abstractmethod

@@ -86,9 +86,9 @@ class BaselineRun:
         report(Started(job.config.method, self.iterations, {**shared, "parameters": parameters}))
 
     @cached_property
-    def plain(self) -> Score:
-        """Score of plain skinning."""
-        return self.validator.plain_score()
+    def lbs(self) -> Score:
+        """Score of linear blend skinning."""
+        return self.validator.lbs_score()
 
     def _take_up(self) -> None:
         self.state, tensors = load_state(self.files.state, self.state.asked)
@@ -134,7 +134,7 @@ class BaselineRun:
                 "the best model before it is kept",
                 "train again with smaller steps (--set learning_rate=...)",
             )
-        self.report(verdict(state.iteration, score, self.plain, base.scene.rig.proxy_count > 0))
+        self.report(verdict(state.iteration, score, self.lbs, base.scene.rig.proxy_count > 0))
         finite = {name: value for name, value in self.batch.items() if math.isfinite(value)}
         state.curve = with_point(state.curve, CurvePoint(state.iteration, state.seconds, finite, score))
         state.undone = int(self.stepper.faults.count)
@@ -143,7 +143,7 @@ class BaselineRun:
             save_baseline(base.output, self.stepper.averaged, base.fabric, self.files.provenance(state, score))
             self.report(Checkpoint(str(base.output), state.iteration, True))
         self.files.save_state(self.stepper, state)
-        self.files.save_curve(state, self.plain)
+        self.files.save_curve(state, self.lbs)
 
 
 def train_baseline(job: BaselineJob, report: Reporter) -> RunState:

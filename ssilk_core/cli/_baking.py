@@ -17,7 +17,7 @@ from ..devices import chosen_device
 from ..errors import VerificationError, fail
 from ..events import Message, Progress, Reporter, silent
 from ..fabrics import Fabric
-from ..kinematics import deform, plain_deformer, plain_poses, resample
+from ..kinematics import deform, lbs_deformer, lbs_poses, resample
 from ..targets import TARGETS, Target, capped
 from ._quality import lost
 from ._refining import Refinement
@@ -47,7 +47,7 @@ class BakeRequest:
     motion: str
     fps: float | None = None
     root: str | None = None
-    plain: bool = False
+    lbs: bool = False
     device: str = "cpu"
     target: str = "usd"
     samples: int = 1  # in each frame
@@ -65,7 +65,7 @@ class BakeRequest:
 
 @dataclass(frozen=True, eq=False)
 class Bake:
-    """A garment over a motion at the rate of the shot's samples; `model` is None under plain skinning.
+    """A garment over a motion at the rate of the shot's samples; `model` is None under linear blend skinning.
 
     `deformer` is as the target takes it; `hidden` as `ssilk_usd.read_visibility` says it. `recovered` says, once
     `poses` are through, at which frames the rollout was lost and the garment was put to rest.
@@ -100,7 +100,7 @@ class Bake:
 
     @property
     def influences(self) -> int:
-        """Return how many joints move a vertex of the trained garment, at most; 0 under plain skinning."""
+        """Return how many joints move a vertex of the trained garment, at most; 0 under linear blend skinning."""
         return 0 if self.model is None else self.model.scene.rig.skin.indices.shape[1]
 
     def carried(self, output: Path) -> dict[str, Any]:
@@ -142,7 +142,7 @@ class Bake:
     def rollout(self) -> Iterator[GarmentPose]:
         """Yield the network's poses, some frames at a time."""
         if self.model is None:
-            yield from plain_poses(self.motion.frame_count)
+            yield from lbs_poses(self.motion.frame_count)
             return
         from ..rollout import garment_poses
 
@@ -216,7 +216,7 @@ class Bake:
 
 @dataclass(frozen=True, eq=False)
 class Dressed:
-    """A garment on its character, ready for any motion; `model` is None under plain skinning."""
+    """A garment on its character, ready for any motion; `model` is None under linear blend skinning."""
 
     request: BakeRequest
     file: ModelFile
@@ -317,8 +317,8 @@ def dressed(request: BakeRequest) -> Dressed:
     file = load_model(request.model)
     stage = open_stage(request.stage)
     scene = on_character(file, stage, request.root)
-    model = None if request.plain else network(file, scene).to(device)
-    deformer = plain_deformer(scene) if model is None else model.deformer()
+    model = None if request.lbs else network(file, scene).to(device)
+    deformer = lbs_deformer(scene) if model is None else model.deformer()
     provenance = {"model_sha256": sha256(request.model), "training": file.provenance.get("ssilk", "")}
     return Dressed(request, file, model, capped(deformer, target), _units(stage, target), provenance)
 

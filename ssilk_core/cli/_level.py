@@ -28,15 +28,15 @@ def levelled(bake: Bake, options: argparse.Namespace, report: Reporter) -> Bake:
     What is kept is the best for this shot's own motion: weights and blendshapes are fitted to it.
 
     Raises:
-        SsilkError: nothing fits the budget, or plain skinning is baked.
+        SsilkError: nothing fits the budget, or linear blend skinning is baked.
     """
     most = bake.target.influences or bake.influences
     if not (options.quality or options.budget or bake.influences > most):
         return bake
     if bake.model is None:
         fail(
-            "--plain",
-            "plain skinning has no level of quality",
+            "--lbs",
+            "linear blend skinning has no level of quality",
             "--quality and --budget are about the network",
             "leave one of them out",
         )

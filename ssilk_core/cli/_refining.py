@@ -38,8 +38,8 @@ class Refinement:
             fail("--refined-output", f"'{request.refined}'", f"it is one of {OUTPUTS}")
         if not (bake.model is not None or request.refined == "points"):
             fail(
-                "--plain",
-                "plain skinning has no proxies and no blendshapes to put refined vertices back onto",
+                "--lbs",
+                "linear blend skinning has no proxies and no blendshapes to put refined vertices back onto",
                 "they can be written as points",
                 "use --refined-output points",
             )

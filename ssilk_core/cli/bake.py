@@ -5,8 +5,8 @@ One garment over one motion goes into one file: joints, blendshapes and their an
 takes any number of both, as layers: an asset for each garment, a small layer for each garment in each shot, and a
 stage for each shot. What is there already and would come out the same is left alone.
 
-A file that fails the proof (exit code 3) is not kept, and an older one of its name stays as it was. --plain bakes
-the same garments under plain skinning, to compare with.
+A file that fails the proof (exit code 3) is not kept, and an older one of its name stays as it was. --lbs bakes
+the same garments under linear blend skinning, to compare with.
 
 --refine lets the simulator's solver go on from the network in every frame, for hero shots: what is inside the body
 comes out, and wrinkles that no blendshape has appear. The garment is then written as time-sampled points, bound to

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Film a garment that ships trained beside plain skinning, then train a draft of it and film that beside both.
+"""Film a garment that ships trained beside linear blend skinning, then train a draft of it and film that beside both.
 
 Everything the demo does is a command that can be typed: each is printed before it runs. --pretrained leaves the
 training out.
@@ -59,19 +59,19 @@ def _shipped(options: argparse.Namespace) -> list[list[str]]:
     bake = ["bake", str(shipped_path(options.garment)), "--stage", str(_body())]
     bake += ["--motion", str(options.out / "shot.usdc")]
     return [
-        [*bake, "-o", shots["plain skinning"], "--plain"],
+        [*bake, "-o", shots["linear blend skinning"], "--lbs"],
         [*bake, "-o", shots["shipped"]],
         # The film after the training has every frame of these two shots; until then half of them will do.
         *_views(
             options.out / "shipped",
-            {name: shots[name] for name in ("plain skinning", "shipped")},
+            {name: shots[name] for name in ("linear blend skinning", "shipped")},
             fps=30 if options.pretrained else 15,
         ),
     ]
 
 
 def _trained(options: argparse.Namespace) -> list[list[str]]:
-    """Return the commands that rig the garment, train it, and film it between plain skinning and what ships."""
+    """Return the commands that rig the garment, train it, and film it beside LBS and the shipped model."""
     out, garment, preset, shots = options.out, options.garment, options.preset, _shots(options)
     stage, model = str(out / f"{garment}_stage.usdc"), str(out / f"{garment}_{preset}.safetensors")
     settings = [word for setting in options.settings for word in ("--set", setting)]
@@ -85,7 +85,7 @@ def _trained(options: argparse.Namespace) -> list[list[str]]:
 
 def _shots(options: argparse.Namespace) -> dict[str, str]:
     """Return the shots by what their panels are called, in the order of the film."""
-    files = {"plain skinning": "plain", options.preset: f"{options.garment}_{options.preset}"}
+    files = {"linear blend skinning": "plain", options.preset: f"{options.garment}_{options.preset}"}
     files["shipped"] = f"{options.garment}_shipped"
     return {name: str(options.out / f"{file}.usdc") for name, file in files.items()}
 

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measure trained garments on whole clips: energies, against the simulator, and what energies hide.
 
-Models of 'ssilk train' and baselines are measured side by side, with plain skinning, on the character that they
-were trained with. Gravity is relative to plain skinning. --reference compares with what the reference simulator makes
+Models of 'ssilk train' and baselines are measured side by side, with linear blend skinning, on the character that
+they were trained with. Gravity is relative to linear blend skinning. --reference compares with what the reference
+simulator makes
 of the same clips: a folder of shots written by 'ssilk simulate', named after the clips, or one such folder for each
 garment, under its name. Beside the clips, poses are held after stops, and the clips' first seconds are looped: a
 garment should come to rest where its own quasi-static state P is, and repeat itself.

@@ -100,7 +100,7 @@ def add_bake(verb: argparse.ArgumentParser) -> None:
 
 def _add_output(verb: argparse.ArgumentParser) -> None:
     """Add the options that say what becomes of the garment, and what is written with it."""
-    verb.add_argument("--plain", action="store_true", help="bake plain skinning instead of the network")
+    verb.add_argument("--lbs", action="store_true", help="bake linear blend skinning instead of the network")
     verb.add_argument("--points", action="store_true", help="write point caches as well (folders)")
     verb.add_argument(
         "--refine",
@@ -136,7 +136,7 @@ def tasks_of(options: argparse.Namespace) -> list[BakeTask]:
         samples=options.samples_per_frame,
         pre_roll=options.pre_roll,
         target=options.target,
-        plain=options.plain,
+        lbs=options.lbs,
         body=not options.no_body,
         points=options.points or (options.refine > 0 and options.refined_output == "points"),
         refine=options.refine,
@@ -165,7 +165,7 @@ def layer_tasks(options: argparse.Namespace) -> list[BakeTask]:
             "bake one garment over one motion into such a file",
         )
     tasks = tasks_of(options)
-    for model in sorted({task.model for task in tasks if target.influences and not task.plain}):
+    for model in sorted({task.model for task in tasks if target.influences and not task.lbs}):
         need_influences(load_model(model).scene.rig.skin.indices.shape[1], options.target, model)
     return tasks
 

@@ -75,7 +75,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     with joined(options.device) as (group, device), interruptible() as stop:
         report = report if group.first else silent
         trained = train(training_job(options, device, report), report, stop, group)
-    share = 1 - trained.score.total / trained.plain.total
+    share = 1 - trained.score.total / trained.lbs.total
     report(
         Result(
             "train",
@@ -83,7 +83,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
                 "model": str(options.output),
                 "iterations": trained.iterations,
                 "total [J]": round(trained.score.total, 5),
-                "plain skinning [J]": round(trained.plain.total, 5),
+                "linear blend skinning [J]": round(trained.lbs.total, 5),
                 ("lower by" if share >= 0 else "higher by"): f"{abs(share):.1%}",
                 "collisions": f"{trained.score.collisions:.2%}",
                 **{f"{k} [J]": round(v, 5) for k, v in trained.score.terms.items()},

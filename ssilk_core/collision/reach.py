@@ -29,8 +29,8 @@ def reachable_body(scene: Scene, motions: Sequence[Motion]) -> Reach:
     """Find the body vertices that come within reach of the garment in any of a spread of poses.
 
     A loose vertex hangs from its anchor, the nearest pinned or tight vertex along the cloth, and stays within
-    the length of cloth between them; tight vertices stay within `SLACK` of plain skinning. Where pinned ones are
-    cannot be helped, so that they touch nothing.
+    the length of cloth between them; tight vertices stay within `SLACK` of linear blend skinning. Where pinned ones
+    are cannot be helped, so that they touch nothing.
     """
     from scipy.spatial import cKDTree
     from scipy.spatial.distance import cdist
@@ -42,10 +42,10 @@ def reachable_body(scene: Scene, motions: Sequence[Motion]) -> Reach:
     for frame in _spread_frames(motions) if len(tight) or len(anchors) else ():
         matrices = skinning_matrices(motion_transforms(frame, skeleton.parents), skeleton.bind_transforms)
         posed = skin_points(body.mesh.points, body.skin, matrices)[0]
-        plain = skin_points(garment.points, scene.plain_skin, matrices)[0]
+        lbs = skin_points(garment.points, scene.lbs_skin, matrices)[0]
         if len(tight):
-            reached |= cKDTree(plain[tight]).query(posed)[0] < SLACK
-        reached |= (cdist(plain[anchors], posed) < lengths[:, None] + SLACK).any(axis=0)
+            reached |= cKDTree(lbs[tight]).query(posed)[0] < SLACK
+        reached |= (cdist(lbs[anchors], posed) < lengths[:, None] + SLACK).any(axis=0)
     vertices = np.flatnonzero(reached)
     joints = np.zeros(skeleton.joint_count, dtype=bool)
     joints[body.skin.indices[vertices][body.skin.weights[vertices] > 0.05]] = True

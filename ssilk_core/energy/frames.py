@@ -17,7 +17,7 @@ DECODED_AT_ONCE = 256  # frames in memory
 def energy_terms(
     energy: GarmentEnergy,
     x: Tensor,
-    plain: Tensor,
+    lbs: Tensor,
     contacts: Contacts,
     body: PosedBody,
     joined: Tensor,
@@ -29,7 +29,7 @@ def energy_terms(
     The share counts what lies inside any part of the body, whichever part the vertex meets in the energy.
 
     Args:
-        x, plain: positions (V, 3, N); gravity is that of `x` less that of `plain`.
+        x, lbs: positions (V, 3, N); gravity is that of `x` less that of `lbs`.
         joined: `x` after up to two frames before it. Where two are lacking there is no inertia.
         down: direction of gravity, shape (3,).
     """
@@ -38,7 +38,7 @@ def energy_terms(
     return {
         "stretch": energy.stretch(x),
         "bending": energy.bending(x),
-        "gravity": energy.gravity(x - plain, GRAVITY * down[:, None]),
+        "gravity": energy.gravity(x - lbs, GRAVITY * down[:, None]),
         "inertia": torch.cat([inertia.new_zeros(x.shape[-1] - len(inertia)), inertia]),
         "collision": energy.collision_of(met),
         "collisions": (nearest < 0).double().mean(0),

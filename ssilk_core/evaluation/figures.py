@@ -76,7 +76,7 @@ class Hung:
     Attributes:
         stops: how many.
         above: energy over the minimum's [J].
-        floats, plain: gravity over the minimum's, of the garment and of plain skinning, as shares of m g L.
+        floats, lbs: gravity over the minimum's, of the garment and of linear blend skinning, as shares of m g L.
         distance: RMS from the minimum [m].
         imbalance: what the solver left out of balance, at most [g].
     """
@@ -84,7 +84,7 @@ class Hung:
     stops: int
     above: float
     floats: float
-    plain: float
+    lbs: float
     distance: float
     imbalance: float
 
@@ -115,13 +115,14 @@ class Figures:
 
     Attributes:
         clips, frames: how many.
-        total: the paper's L_tot [J], of `terms`; gravity is relative to plain skinning.
+        total: the paper's L_tot [J], of `terms`; gravity is relative to linear blend skinning.
         collisions: share of vertices inside the body.
         clip_totals: smallest, median and largest total of a clip [J].
-        lift: gravity relative to plain skinning, as a share of m g L: weight times height of the garment.
+        lift: gravity relative to linear blend skinning, as a share of m g L: weight times height of the garment.
         kinetic: kinetic energy [J].
         motion: RMS distance to the method's own quasi-static state of each pose [m].
-        jitter: RMS third derivative over mass and frames [m/s3]; `jitter_of_plain`: relative to plain skinning's.
+        jitter: RMS third derivative over mass and frames [m/s3]; `jitter_of_plain`: relative to linear blend
+            skinning's.
         stretches: 50, 95 and 99 % quantiles and the largest of the larger principal stretch.
         truth, poses, holds, hung, loops: what else was asked for, where the method has it.
     """
@@ -136,7 +137,7 @@ class Figures:
     kinetic: float
     motion: float | None
     jitter: float
-    jitter_of_plain: float
+    jitter_of_lbs: float
     stretches: tuple[float, ...]
     truth: Against | None = None
     poses: PoseNovelty | None = None

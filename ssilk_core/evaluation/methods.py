@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Everything that dresses a character, behind one call: networks, plain skinning, and point caches."""
+"""Everything that dresses a character, behind one call: networks, linear blend skinning, and point caches."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class EvaluationScene:
         skeleton = scene.character.skeleton
         self.body = CollisionBody(scene.character.merged_body(), skeleton.joint_count, device=device)
         self.contacts = Contacts(scene, device=device)
-        self.skin = Skinning(scene.plain_skin).to(device)
+        self.skin = Skinning(scene.lbs_skin).to(device)
         self.rest = torch.tensor(mesh.points, dtype=torch.float32, device=device)
         self.weight = float(self.energy.mass.sum()) * GRAVITY * float(np.ptp(mesh.points[:, 1]))
 
@@ -86,8 +86,8 @@ class EvaluationScene:
         """The reference simulator of this garment."""
         return Simulator(self.scene, self.fabric, SimulationOptions(fps=self.fps), device=self.device)
 
-    def plain(self, character: Tensor) -> Tensor:
-        """Return plain skinning's positions (V, 3, N) [m] of skinning matrices (J, 3, 4, N)."""
+    def lbs(self, character: Tensor) -> Tensor:
+        """Return linear blend skinning's positions (V, 3, N) [m] of skinning matrices (J, 3, 4, N)."""
         return self.skin(self.rest, None, self.skin.weights, character)
 
 
@@ -159,15 +159,15 @@ def _seen_by(model: LatentModel, reel: TakeSet) -> TakeSet:
 
 
 class Plain:
-    """Plain skinning."""
+    """Linear blend skinning."""
 
-    name = "plain"
+    name = "LBS"
 
     def __init__(self, dressed: EvaluationScene, reel: TakeSet) -> None:
         self.dressed, self.reel = dressed, reel
 
     def vertices(self, take: int, frames: range) -> Tensor:
-        return self.dressed.plain(self.reel.character(take, frames))
+        return self.dressed.lbs(self.reel.character(take, frames))
 
     def still(self, take: int, frames: range) -> None:
         return None
@@ -197,8 +197,8 @@ class CachedPoints:
         return x
 
     def _check(self, x: Tensor, take: int, frames: range) -> None:
-        plain = self.dressed.plain(self.reel.character(take, frames))
-        away = (x - plain)[self.pinned].norm(dim=1)
+        lbs = self.dressed.lbs(self.reel.character(take, frames))
+        away = (x - lbs)[self.pinned].norm(dim=1)
         far = float(away.max()) if away.numel() else 0.0
         if not far < SAME:
             fail(

@@ -74,7 +74,7 @@ def minima(simulator: Simulator, takes: Sequence[Take], x: Tensor) -> Minima:
 
 def hung(found: Minima, weight: float) -> list[Hung]:
     """Return the figures of each pose, for a garment of m g L [J]."""
-    floats, plain = (found.floats(x) / weight for x in (found.start, found.poses.plain))
-    columns = (found.over(), floats, plain, found.distance(), found.residual)
-    names = ("above", "floats", "plain", "distance", "residual")
+    floats, lbs = (found.floats(x) / weight for x in (found.start, found.poses.lbs))
+    columns = (found.over(), floats, lbs, found.distance(), found.residual)
+    names = ("above", "floats", "lbs", "distance", "residual")
     return [Hung(stops=1, **dict(zip(names, row))) for row in torch.stack(columns, dim=1).tolist()]

@@ -63,9 +63,7 @@ def frame_energies(
     x, character = path[..., -len(frames) :], reel.character(take, frames)
     body, joined = dressed.body.posed(character, exact=dressed.exact), path[..., -len(frames) - 2 :]
     down = x.new_tensor([0.0, -1.0, 0.0])
-    return energy_terms(
-        dressed.energy, x, dressed.plain(character), dressed.contacts, body, joined, dressed.fps, down
-    )
+    return energy_terms(dressed.energy, x, dressed.lbs(character), dressed.contacts, body, joined, dressed.fps, down)
 
 
 class _Past:

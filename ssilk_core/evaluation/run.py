@@ -104,20 +104,21 @@ def evaluate(
     options: EvaluationOptions | None = None,
     report: Reporter = silent,
 ) -> Iterator[ResultRow]:
-    """Yield the figures of plain skinning, of the simulator where it has played, and of each network, by split.
+    """Yield the figures of linear blend skinning, of the simulator where it has played, and of each network, by
+    split.
 
     Raises:
         SsilkError: no clip has four frames, or a point cache is not of its clip.
     """
     run = _Run(dressed, subjects, playlist, options or EvaluationOptions(), report)
-    yield from run.rows(run.plain, "plain")
+    yield from run.rows(run.lbs, "LBS")
     yield from run.truth_rows()
     for subject in subjects:
         yield from run.network_rows(subject)
 
 
 class _Run:
-    """Takes of all clips, with the records of plain skinning and of the simulator on them."""
+    """Takes of all clips, with the records of linear blend skinning and of the simulator on them."""
 
     def __init__(
         self,
@@ -138,7 +139,7 @@ class _Run:
         read = playlist.read
         self.cache = CachedPoints(SIMULATOR, read, dressed, reel) if read else None
         self.truth = self._tally(reel, self.cache, self.simulated) if self.cache else Tally({}, self.clips)
-        self.plain = self._tally(reel, Plain(dressed, reel), list(self.clips))
+        self.lbs = self._tally(reel, Plain(dressed, reel), list(self.clips))
 
     def _tally(self, reel: TakeSet, method: Method, takes: Sequence[int]) -> Tally:
         """Measure a method over takes, beside the simulator where that has played."""
@@ -159,7 +160,7 @@ class _Run:
 
     def _figures(self, tally: Tally) -> Figures:
         takes, weight = list(tally.records), self.dressed.weight
-        found = figures(tally, self.plain.only(takes), weight)
+        found = figures(tally, self.lbs.only(takes), weight)
         return replace(found, truth=against(tally, self.truth.only(takes), weight))
 
     def truth_rows(self) -> Iterator[ResultRow]:

@@ -44,12 +44,12 @@ def _table(
 
 
 ENERGIES = ("frames", "total [J]", *TERMS, "inside the body", "gravity, of m g L", "clips: min / median / max")
-MOVING = ("kinetic [J]", "own motion [mm]", "jitter [m/s3]", "of plain's", "stretch 50 / 95 / 99 / 100 %")
+MOVING = ("kinetic [J]", "own motion [mm]", "jitter [m/s3]", "of LBS", "stretch 50 / 95 / 99 / 100 %")
 TRUTH = ("frames", "excess [J]", "simulator [J]", "floats, of m g L", "position [mm]", "velocity [m/s]",
          "acceleration [m/s2]", "jitter, of its")  # fmt: skip
 HOLDS = ("stops", "kinetic at the stop [J]", "at the end", "settle", "within [s]", "off P, RMS [mm]", "at most",
          "over P [J]", "floats over P, of m g L")  # fmt: skip
-HUNG = ("stops", "over the minimum [J]", "floats, of m g L", "plain skinning floats", "off it, RMS [mm]",
+HUNG = ("stops", "over the minimum [J]", "floats, of m g L", "linear blend skinning floats", "off it, RMS [mm]",
         "out of balance, at most [g]")  # fmt: skip
 LOOPS = ("clips", "frames", "second loop [J]", "last [J]", "drift [J]", "at most", "apart [mm]")
 POSES = ("from trained poses, mean [deg]", "95 %", "total, nearest half [J]", "furthest tenth [J]")
@@ -64,7 +64,7 @@ def _energies(f: Figures) -> list[str]:
 def _moving(f: Figures) -> list[str]:
     motion = "" if f.motion is None else _millimetres(f.motion)
     stretches = " / ".join(f"{value:.3f}" for value in f.stretches)
-    return [f"{f.kinetic:.3g}", motion, f"{f.jitter:.3g}", f"{f.jitter_of_plain:.2f}", stretches]
+    return [f"{f.kinetic:.3g}", motion, f"{f.jitter:.3g}", f"{f.jitter_of_lbs:.2f}", stretches]
 
 
 def _truth(f: Against) -> list[str]:
@@ -79,7 +79,7 @@ def _holds(f: Holds) -> list[str]:
 
 
 def _hung(f: Hung) -> list[str]:
-    return [str(f.stops), f"{f.above:.4f}", f"{f.floats:+.2%}", f"{f.plain:+.2%}", _millimetres(f.distance),
+    return [str(f.stops), f"{f.above:.4f}", f"{f.floats:+.2%}", f"{f.lbs:+.2%}", _millimetres(f.distance),
             f"{f.imbalance:.1g}"]  # fmt: skip
 
 

@@ -57,11 +57,11 @@ def takes_in(clips: Mapping[int, str], names: Collection[str]) -> list[int]:
     return [take for take, clip in clips.items() if clip in names]
 
 
-def figures(tally: Tally, plain: Tally, weight: float) -> Figures:
+def figures(tally: Tally, lbs: Tally, weight: float) -> Figures:
     """Return what a method comes to.
 
     Args:
-        plain: plain skinning on the same takes.
+        lbs: linear blend skinning on the same takes.
         weight: m g L of the garment [J].
     """
     jitter = tally.root("jerk")
@@ -78,7 +78,7 @@ def figures(tally: Tally, plain: Tally, weight: float) -> Figures:
         kinetic=tally.mean("kinetic"),
         motion=tally.root("motion") if has_still else None,
         jitter=jitter,
-        jitter_of_plain=ratio(jitter, plain.root("jerk")),
+        jitter_of_lbs=ratio(jitter, lbs.root("jerk")),
         stretches=(*histogram_quantiles(stretches, SHARES), float(tally.each("largest stretch").max())),
     )
 

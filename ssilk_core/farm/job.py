@@ -93,8 +93,8 @@ def numbers(text: str, count: int) -> list[int]:
     found: list[int] = []
     for part in text.split(","):
         first, dash, last = part.partition("-")
-        plain = first.strip().isdecimal() and (not dash or last.strip().isdecimal())
-        if not plain:
+        lbs = first.strip().isdecimal() and (not dash or last.strip().isdecimal())
+        if not lbs:
             fail(where, f"'{text}'", allowed)
         span = range(int(first), int(last if dash else first) + 1)
         if not (len(span) and span[-1] < count):

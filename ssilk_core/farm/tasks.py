@@ -25,7 +25,7 @@ class BakeTask:
         samples: in each frame.
         pre_roll: how long the garment settles before the first frame [s].
         target: who receives it (see `ssilk_core.targets`).
-        plain: plain skinning instead of the network.
+        lbs: linear blend skinning instead of the network.
         body: write the character's body meshes as well.
         points: write a point cache as well.
         refine: iterations of the solver in each frame.
@@ -45,7 +45,7 @@ class BakeTask:
     samples: int = 1
     pre_roll: float = 0.0
     target: str = "usd"
-    plain: bool = False
+    lbs: bool = False
     body: bool = True
     points: bool = False
     refine: int = 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Triton kernels for CUDA. Each has a plain PyTorch twin beside its caller, used everywhere else.
+"""Triton kernels for CUDA. Each has a reference implementation in PyTorch beside its caller, used everywhere else.
 
 Modules with kernels import Triton, and are themselves imported only where `available` said yes.
 """

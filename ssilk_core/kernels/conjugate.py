@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Conjugate gradients on symmetric matrices of blocks, in three kernels an iteration; `simulate.conjugate` holds the
-plain twin.
+reference implementation.
 
 The frames of a batch share one sparsity: columns are read once for all of them, and of two symmetric blocks only one
 is stored. A program owns some rows and some frames. It leaves its part of an inner product in a row of its own, and

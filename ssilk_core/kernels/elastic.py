@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stretch and bending; `GarmentEnergy.stretch` and `.bending` are the plain twins.
+"""Stretch and bending; `GarmentEnergy.stretch` and `.bending` are the reference implementations.
 
 Every program owns a block of frames. For values it goes through a few triangles or hinges and writes their share of
 the sum; for gradients it owns a vertex and gathers from the triangles around. Nothing is written twice: results do
@@ -89,7 +89,7 @@ def _columns(px, py, pz, qx, qy, qz, number):
 
 @triton.jit
 def _length(square):
-    return tl.sqrt(tl.maximum(square, 1e-12))  # the floor is the plain twin's
+    return tl.sqrt(tl.maximum(square, 1e-12))  # the floor is the reference implementation's
 
 
 @triton.jit
@@ -182,7 +182,7 @@ def _bending(x, hinges, numbers, slope, shares, count, frames, chunk: tl.constex
         square = dot(ex, ey, ez, ex, ey, ez)
         sine = -dot(rx, ry, rz, lx, ly, lz) * tl.sqrt(tl.maximum(square, 1e-18))
         cosine = dot(mx, my, mz, rx, ry, rz)
-        # As in the plain twin, a collapsed hinge counts as flat and pulls nowhere.
+        # As in the reference implementation, a collapsed hinge counts as flat and pulls nowhere.
         collapsed = tl.abs(sine) + tl.abs(cosine) < tl.maximum(1e-6 * square * square, 1e-18)
         angle = tl.where(collapsed, 0.0, _atan2(sine, tl.where(collapsed, 1.0, cosine)))
         stiffness = tl.load(numbers + hinge * 2)

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Energies of single vertices; `GarmentEnergy.gravity`, `.collision_of`, `.inertia` and `.drag` are the plain twins.
+"""Energies of single vertices; `GarmentEnergy.gravity`, `.collision_of`, `.inertia` and `.drag` are the reference
+implementations.
 
 A program owns a block of frames and, for values, a few vertices, whose share of the sum it writes; for gradients one
 vertex. Nothing is written twice: results do not depend on the order.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Linear blend skinning over sparse influences, and its gradients; `skinning` holds the plain twins.
+"""Linear blend skinning over sparse influences, and its gradients; `skinning` holds the reference implementations.
 
 A program is one warp: it owns a block of frames and takes a few vertices in turn, so that joints and weights are
 scalars and matrices stay in the cache. Homogeneous coordinates run along the first axis of its tensors, which lies

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A step of the spring in two launches beside those of S; `model.integrators.SpringVerlet.advance` is the plain twin.
+"""A step of the spring in two launches beside those of S; `model.integrators.SpringVerlet.advance` is the reference
+implementation.
 
 A program owns a row. Steps wait for one another, and so small that starting a kernel takes longer than running it.
 """

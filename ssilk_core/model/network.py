@@ -59,7 +59,7 @@ class GarmentModel(nn.Module):
         seen, bias = self.integrator.states * z + static + dynamic, not self.integrator.centred
         has_stepper = self.integrator.states > 0
         self.stepper = mlp(seen, config.widths, z, generator, 0.0, bias) if has_stepper else nn.Sequential()
-        # Small: training starts as plain skinning.
+        # Small: training starts as linear blend skinning.
         self.output = mlp(z, config.widths, self.decoder.output_count, generator, 0.01)
 
     def initial(self, static: Tensor) -> Tensor:
@@ -149,7 +149,7 @@ def model_joints(scene: Scene, colliding: Floats) -> np.ndarray:
     """
     skeleton = scene.character.skeleton
     used = np.array(colliding, dtype=bool)
-    for skin in (scene.rig.skin, scene.plain_skin):
+    for skin in (scene.rig.skin, scene.lbs_skin):
         indices = skin.indices[skin.weights > 0]
         used[indices[indices < skeleton.joint_count]] = True
     for parent in scene.rig.parents:

@@ -92,11 +92,11 @@ class RefinedFrame:
 @dataclass(frozen=True, eq=False)
 class _Tail:
     """What the next frames look back on: up to two frames of positions in the world (V, 3, 1 or 2), the last root and
-    plainly skinned garment, and how far refining moved the last frame (V, 3, 1)."""
+    linearly skinned garment, and how far refining moved the last frame (V, 3, 1)."""
 
     world: Tensor
     root: Tensor
-    plain: Tensor
+    lbs: Tensor
     correction: Tensor
 
 
@@ -178,17 +178,17 @@ class Refiner:
     def _past(self, tail: _Tail | None, world: Tensor, poses: PosedCharacters) -> Past | None:
         """Return what each of some consecutive frames looks back on."""
         if tail is None:
-            return None if self.options.feedback else Past(world, None, poses.root, poses.plain)
+            return None if self.options.feedback else Past(world, None, poses.root, poses.lbs)
         seen, count = torch.cat([tail.world, world[..., :-1]], dim=-1), world.shape[-1]
         before = seen[..., -count - 1 : -1] if seen.shape[-1] > count else None
         root = torch.cat([tail.root, poses.root[:, :-1]], dim=1)
-        return Past(seen[..., -count:], before, root, torch.cat([tail.plain, poses.plain[..., :-1]], dim=-1))
+        return Past(seen[..., -count:], before, root, torch.cat([tail.lbs, poses.lbs[..., :-1]], dim=-1))
 
     def _tail(self, tail: _Tail | None, world: Tensor, refined: Tensor, poses: PosedCharacters) -> _Tail:
         """Return what the frames after these look back on."""
         kept = refined if self.options.feedback else world
         kept = kept if tail is None else torch.cat([tail.world, kept], dim=-1)
-        return _Tail(kept[..., -2:], poses.root[:, -1:], poses.plain[..., -1:], (refined - world)[..., -1:])
+        return _Tail(kept[..., -2:], poses.root[:, -1:], poses.lbs[..., -1:], (refined - world)[..., -1:])
 
     def _reported(self, before: State, inputs: StepInputs, refined: Tensor, root: Tensor) -> Iterator[RefinedFrame]:
         """Yield frames with what was changed in them."""

@@ -103,11 +103,11 @@ def records(found: Sequence[Mapping[str, Any]]) -> str:
 
 def learning(document: Mapping[str, Any]) -> Section:
     """Return the learning curve that a training leaves beside its model."""
-    points, plain = document["points"], document["plain"]
+    points, lbs = document["points"], document["lbs"]
     best = min(range(len(points)), key=lambda number: points[number]["validation"]["total"])
     times = np.array([point["seconds"] for point in points])
     totals, inside = ([point["validation"][name] for point in points] for name in ("total", "collisions"))
-    words = f"plain skinning: {plain['total']:.4g} J, {plain['collisions']:.2%} inside the body"
+    words = f"linear blend skinning: {lbs['total']:.4g} J, {lbs['collisions']:.2%} inside the body"
     charts = strip("total at validation", "J", times, np.array(totals), {best: "best"})
     charts += strip(SHARE, "%", times, 100.0 * np.array(inside), {best: "best"})
     return Section("Training", charts + f'<p class="note">{words}</p>')

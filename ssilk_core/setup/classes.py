@@ -32,7 +32,7 @@ class ClassOptions:
     Attributes:
         tight_distance: farthest that held cloth lies from the body [m].
         tear_rate: change of skinning weights along an edge, half the sum of absolute differences per length
-            [1/m], above which plain skinning tears; bodies themselves stay below about 30.
+            [1/m], above which linear blend skinning tears; bodies themselves stay below about 30.
         tear_width: how far around a tear, along the cloth, it counts as torn [m].
         torn_distance: farthest that torn cloth lies from the body and is still held [m].
         support: least upward part of the body's normal where it carries cloth (cosine with up).

@@ -78,22 +78,22 @@ class PosedCharacters:
     Attributes:
         root: position of the first joint [m], float64, shape (3, N).
         body: relative to the root.
-        plain: the garment under plain skinning, relative to the root, shape (V, 3, N).
+        lbs: the garment under linear blend skinning, relative to the root, shape (V, 3, N).
     """
 
     root: Tensor
     body: PosedBody
-    plain: Tensor
+    lbs: Tensor
 
 
 class Actors:
-    """Poses the character and the plainly skinned garment of a scene."""
+    """Poses the character and the linearly skinned garment of a scene."""
 
     def __init__(self, scene: Scene, device: torch.device, dtype: torch.dtype) -> None:
         self.skeleton, self.dtype = scene.character.skeleton, dtype
         joints = self.skeleton.joint_count
         self.body = CollisionBody(scene.character.merged_body(), joints, device=device)
-        self.weights = torch.as_tensor(scene.plain_skin.dense(joints), dtype=dtype, device=device)
+        self.weights = torch.as_tensor(scene.lbs_skin.dense(joints), dtype=dtype, device=device)
         self.rest = torch.as_tensor(np.array(scene.garment.mesh.points), dtype=dtype, device=device)[:, :, None]
 
     def poses(self, spans: Sequence[MotionSpan], step: int) -> PosedCharacters:
@@ -108,9 +108,9 @@ class Actors:
         world[:, :, :3, 3] -= root[:, None]
         matrices = skinning_matrices(world, self.skeleton.bind_transforms)[:, :, :3].transpose(1, 2, 3, 0)
         character = torch.as_tensor(matrices.copy(), dtype=self.dtype, device=self.rest.device)
-        plain = transformed(blended(self.weights, character), self.rest)
+        lbs = transformed(blended(self.weights, character), self.rest)
         return PosedCharacters(
             torch.as_tensor(root.T.copy(), device=self.rest.device),
             self.body.posed(character.float(), exact=True),
-            plain,
+            lbs,
         )

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The reference simulator: implicit Euler on the training energy, several shots at once.
 
-A shot starts with the quasi-static state of its first pose, and with the velocity that plain skinning has then: a
-character that walks at once does not walk out of its garment. Each step works about the character's root of that
-step, where single precision of the body is finest; between steps positions are kept in the world, in float64.
+A shot starts with the quasi-static state of its first pose, and with the velocity that linear blend skinning has
+then: a character that walks at once does not walk out of its garment. Each step works about the character's root of
+that step, where single precision of the body is finest; between steps positions are kept in the world, in float64.
 """
 
 from __future__ import annotations
@@ -96,27 +96,27 @@ class Past:
         last, before: positions one and two steps ago in the world [m], float64, shape (V, 3, N); None for `before` in
             the step after the first.
         root: the character's root one step ago [m], float64, shape (3, N).
-        plain: the garment under plain skinning one step ago, relative to that root, shape (V, 3, N).
+        lbs: the garment under linear blend skinning one step ago, relative to that root, shape (V, 3, N).
     """
 
     last: Tensor
     before: Tensor | None
     root: Tensor
-    plain: Tensor
+    lbs: Tensor
 
     def first(self, count: int) -> Past:
         """Return the past of the first `count` shots."""
         before = None if self.before is None else self.before[..., :count]
-        return Past(self.last[..., :count], before, self.root[:, :count], self.plain[..., :count])
+        return Past(self.last[..., :count], before, self.root[:, :count], self.lbs[..., :count])
 
     @property
     def local(self) -> Tensor:
         """Return the last positions relative to the root then, shape (V, 3, N)."""
-        return (self.last - self.root).to(self.plain.dtype)
+        return (self.last - self.root).to(self.lbs.dtype)
 
     def carried_on(self, poses: PosedCharacters) -> Tensor:
-        """Return positions as far from plain skinning as one step ago, relative to the roots of `poses`."""
-        return self.local - self.plain + poses.plain
+        """Return positions as far from linear blend skinning as one step ago, relative to the roots of `poses`."""
+        return self.local - self.lbs + poses.lbs
 
 
 class Simulator:
@@ -157,9 +157,9 @@ class Simulator:
             running = [span for span in spans if span.motion.frame_count > step]
             poses = self.actors.poses(running, step)
             past = past and past.first(len(running))
-            solution = self._stepped(poses, past) if past else self.rest(poses, poses.plain)
+            solution = self._stepped(poses, past) if past else self.rest(poses, poses.lbs)
             world = solution.x.double() + poses.root
-            past = Past(world, past.last if past else None, poses.root, poses.plain)
+            past = Past(world, past.last if past else None, poses.root, poses.lbs)
             if step % self.options.substeps == 0:
                 yield from _frames(running, step // self.options.substeps, world, solution)
 
@@ -174,7 +174,7 @@ class Simulator:
             return StepInputs(poses.body, gravity)
         shift = poses.root - past.root
         predicted = past.carried_on(poses) if past.before is None else past.local + (past.last - past.before - shift)
-        return StepInputs(poses.body, gravity, predicted.to(past.plain.dtype), past.local, self.dt)
+        return StepInputs(poses.body, gravity, predicted.to(past.lbs.dtype), past.local, self.dt)
 
     def _stepped(self, poses: PosedCharacters, past: Past) -> Solution:
         """Return the states one step later."""
@@ -188,9 +188,9 @@ class Simulator:
         return minimise_from(self.potential, start, inputs, self.options.solver)
 
     def pinned(self, x: Tensor, poses: PosedCharacters) -> Tensor:
-        """Return positions (V, 3, N) with the vertices that do not move freely under plain skinning."""
+        """Return positions (V, 3, N) with the vertices that do not move freely under linear blend skinning."""
         free = self.potential.free
-        return poses.plain.index_copy(0, free, x[free].to(poses.plain.dtype))
+        return poses.lbs.index_copy(0, free, x[free].to(poses.lbs.dtype))
 
     def best(self, starts: Sequence[Tensor], inputs: StepInputs) -> Tensor:
         """Return for each frame the start of least energy."""
@@ -254,5 +254,5 @@ def minimise(
     """Return the quasi-static garment in each pose of a motion by itself, in the world [m], shape (F, V, 3)."""
     simulator = Simulator(scene, fabric, options, device=device)
     poses = simulator.actors.posed(motion.rotations, motion.translations)
-    solution = simulator.rest(poses, poses.plain)
+    solution = simulator.rest(poses, poses.lbs)
     return (solution.x.double() + poses.root).permute(2, 0, 1).cpu().numpy()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a rolled garment is measured by: latents, speeds, distance from plain skinning, energies."""
+"""What a rolled garment is measured by: latents, speeds, distance from linear blend skinning, energies."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .drives import ProceduralMotion
 from .worlds import garment_size
 
 ENERGY_EVERY = 4  # frames: energies take ten times as long as all else
-FAR = 2.0  # times the garment's own size from plain skinning: cloth that hangs the other way is no further off
+FAR = 2.0  # times the garment's own size from linear blend skinning: cloth that hangs the other way is no further off
 LONG = 4096  # frames; more are streamed, and only so many of them decoded
 
 
@@ -33,7 +33,7 @@ class Extent:
         frames: that were rolled.
         finite: whether every number was.
         speed: largest of any vertex, relative to the character's root [m/s].
-        distance: largest of any vertex from plain skinning [m].
+        distance: largest of any vertex from linear blend skinning [m].
         allowed: largest distance that still counts as bounded [m].
         latent: largest entry of any latent.
         growth: mean elastic and kinetic energy in the last loop of the motion over that in the second, the first one
@@ -75,7 +75,7 @@ class ExtentMeter:
     def __init__(self, scene: Scene, fabric: Fabric, fps: float, spans: Sequence[range] = ()) -> None:
         self.scene, self.fps, self.spans = scene, fps, [span[::ENERGY_EVERY] for span in spans]
         self.energy = GarmentEnergy(scene.garment.mesh, fabric, dtype=torch.float64)
-        self.skin = Skinning(scene.plain_skin).double()
+        self.skin = Skinning(scene.lbs_skin).double()
         self.rest = torch.tensor(scene.garment.mesh.points)
         self.speed, self.distance, self.finite = 0.0, 0.0, True
         self.energies: list[list[float]] = [[] for _ in spans]
@@ -85,8 +85,8 @@ class ExtentMeter:
         self.finite &= bool(np.isfinite(points).all())
         matrices, origin = matrices_about_root(motion, self.scene)
         x = torch.as_tensor((points - origin).transpose(1, 2, 0))
-        plain = self.skin(self.rest, None, self.skin.weights, matrices)
-        self.distance = max(self.distance, float((x - plain).norm(dim=1).max()))
+        lbs = self.skin(self.rest, None, self.skin.weights, matrices)
+        self.distance = max(self.distance, float((x - lbs).norm(dim=1).max()))
         velocity = x.diff(dim=2) * self.fps
         if not velocity.shape[2]:
             return

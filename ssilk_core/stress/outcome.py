@@ -11,7 +11,7 @@ from typing import Any, Literal
 from .meter import Extent
 
 Verdict = Literal["works", "falls back", "refuses", "breaks"]
-HEADER = ("extreme", "what happens", "frames", "bounded", "speed [m/s]", "off plain skinning [m]", "latent",
+HEADER = ("extreme", "what happens", "frames", "bounded", "speed [m/s]", "off linear blend skinning [m]", "latent",
           "energy growth", "error", "s")  # fmt: skip
 
 

@@ -25,7 +25,9 @@ from .drives import ProceduralMotion
 from .meter import Extent, ExtentMeter, extent, matrices_about_root
 
 SMALL = ModelConfig(latent=16, widths=(32, 32), shapes=8)
-WIGGLE = 1e-3  # of the garment's size: by how much points are moved off plain skinning to have energies compared
+WIGGLE = (
+    1e-3  # of the garment's size: by how much points are moved off linear blend skinning to have energies compared
+)
 ELASTIC = 1e4  # times its size: how far the softest fabric may hang, which is physics
 
 
@@ -85,10 +87,11 @@ def simulated(scene: Scene, fabric: Fabric, motion: Motion, gravity: float = GRA
 def gradient_error(scene: Scene, fabric: Fabric, motion: Motion) -> float:
     """Return how far single precision is off in the force of stretch and bending, relative to it, in the norm.
 
-    Forces are those on plain skinning in the first frame, its points moved at random by a thousandth of the garment.
+    Forces are those on linear blend skinning in the first frame, its points moved at random by a thousandth of the
+    garment.
     """
     matrices, _ = matrices_about_root(motion, scene)
-    skin, rest = Skinning(scene.plain_skin).double(), torch.tensor(scene.garment.mesh.points)
+    skin, rest = Skinning(scene.lbs_skin).double(), torch.tensor(scene.garment.mesh.points)
     x = skin(rest, None, skin.weights, matrices[..., :1])
     size = float((rest.amax(0) - rest.amin(0)).norm())
     free = torch.tensor(scene.classes != PINNED)[:, None, None]

@@ -17,7 +17,7 @@ class Cloth:
     """A garment with dense weights: points (V, 3), plain (V, J) and rig weights (V, J + P), classes (V,)."""
 
     points: Floats
-    plain: Floats
+    lbs: Floats
     rig: Floats
     classes: Ints
 
@@ -73,9 +73,9 @@ def pinched(scene: Scene, height: float, every: int = 100) -> Scene:
 
 def resized(scene: Scene, count: int) -> Scene:
     """Return a scene whose garment has about `count` vertices: a patch of it, subdivided as often as that takes."""
-    skin, rig, faces = scene.plain_skin, scene.rig.skin, scene.garment.mesh.faces
-    plain, whole = skin.dense(scene.character.skeleton.joint_count), rig.dense(len(scene.joint_names))
-    cloth = Cloth(scene.garment.mesh.points, plain, whole, scene.classes)
+    skin, rig, faces = scene.lbs_skin, scene.rig.skin, scene.garment.mesh.faces
+    lbs, whole = skin.dense(scene.character.skeleton.joint_count), rig.dense(len(scene.joint_names))
+    cloth = Cloth(scene.garment.mesh.points, lbs, whole, scene.classes)
     while len(cloth.points) < count:
         cloth, faces = _subdivided(cloth, faces)
     return _garbed(scene, *_patch(cloth, faces, count))
@@ -93,7 +93,7 @@ def _subdivided(cloth: Cloth, faces: Ints) -> tuple[Cloth, Ints]:
         return np.concatenate([values, values[pairs].mean(axis=1)])
 
     classes = np.concatenate([cloth.classes, cloth.classes[pairs].max(axis=1)])
-    split = Cloth(between(cloth.points), between(cloth.plain), between(cloth.rig), classes)
+    split = Cloth(between(cloth.points), between(cloth.lbs), between(cloth.rig), classes)
     return split, np.concatenate([np.stack(part, axis=1) for part in corners])
 
 
@@ -107,12 +107,12 @@ def _patch(cloth: Cloth, faces: Ints, count: int) -> tuple[Cloth, Ints]:
     newly = np.bincount(first // 3, minlength=len(faces))  # vertices that each face, in this order, brings
     most = max(1, int(np.searchsorted(np.cumsum(newly), count, side="right")))
     used, compact = np.unique(faces[order[:most]], return_inverse=True)
-    kept = Cloth(points[used], cloth.plain[used], cloth.rig[used], classes[used])
+    kept = Cloth(points[used], cloth.lbs[used], cloth.rig[used], classes[used])
     return kept, compact.reshape(-1, 3)
 
 
 def _garbed(scene: Scene, cloth: Cloth, faces: Ints) -> Scene:
     path = scene.garment.mesh.path
-    skin, rig = (SkinWeights.from_dense(path, values, INFLUENCES) for values in (cloth.plain, cloth.rig))
+    skin, rig = (SkinWeights.from_dense(path, values, INFLUENCES) for values in (cloth.lbs, cloth.rig))
     garment = Garment(Mesh(path, cloth.points, faces), skin, cloth.classes)
     return Scene(scene.character, garment, replace(scene.rig, skin=rig))

@@ -42,14 +42,14 @@ def with_point(curve: list[CurvePoint], point: CurvePoint) -> list[CurvePoint]:
     return curve if len(curve) <= MOST_POINTS else curve[::2]
 
 
-def write_curve(path: Path, curve: list[CurvePoint], plain: Score) -> None:
-    """Write {"plain": score of plain skinning, "points": [{"iteration", "seconds", "batch", "validation"}, ...]}."""
+def write_curve(path: Path, curve: list[CurvePoint], lbs: Score) -> None:
+    """Write {"lbs": score, "points": [{"iteration", "seconds", "batch", "validation"}, ...]}."""
     points = [
         {"iteration": p.iteration, "seconds": round(p.seconds, 3), "batch": p.batch, "validation": summary(p.score)}
         for p in curve
     ]
     with replacing(path) as temporary:
-        temporary.write_text(json.dumps({"plain": summary(plain), "points": points}, indent=1))
+        temporary.write_text(json.dumps({"lbs": summary(lbs), "points": points}, indent=1))
 
 
 def summary(score: Score) -> dict[str, Any]:

@@ -44,7 +44,7 @@ class TrainingResult:
     finished: bool
     iterations: int
     score: Score
-    plain: Score
+    lbs: Score
 
 
 class TrainingRun:
@@ -54,7 +54,7 @@ class TrainingRun:
 
     Attributes:
         state: what changes while the run goes on.
-        plain: score of plain skinning.
+        lbs: score of linear blend skinning.
         scoring: how long a validation takes, about [s].
         saved: iteration of the state on disk.
     """
@@ -75,7 +75,7 @@ class TrainingRun:
         self.parts = build_parts(job, self.device, group)
         if not job.resume:
             self._fit()
-        self.plain, self.scoring = self._score_plain()
+        self.lbs, self.scoring = self._score_lbs()
         if job.minutes and job.learns and not job.resume:
             self._plan(60 * job.minutes)
         self._build_stepper()
@@ -85,7 +85,7 @@ class TrainingRun:
             self._write_state()
         else:
             self._take_up(tensors)
-        self.files.save_curve(self.state, self.plain)
+        self.files.save_curve(self.state, self.lbs)
         self._since = self._saved_at = time.monotonic()
 
     @property
@@ -95,10 +95,10 @@ class TrainingRun:
         config = shaped(asked, state.planned) if state.planned else asked
         return state.lowered[-1].applied(config) if state.lowered else config
 
-    def _score_plain(self) -> tuple[Score, float]:
-        """Return the score of plain skinning, and how long that took [s]."""
+    def _score_lbs(self) -> tuple[Score, float]:
+        """Return the score of linear blend skinning, and how long that took [s]."""
         began = time.monotonic()
-        return self.parts.validator.plain_score(), time.monotonic() - began
+        return self.parts.validator.lbs_score(), time.monotonic() - began
 
     def _plan(self, seconds: float) -> None:
         """Choose as many iterations as fit, by a few steps of a model that is put back afterwards."""
@@ -248,14 +248,14 @@ class TrainingRun:
             if broken := not_finite(score):
                 self._recover("validation is not finite", broken)
                 return
-            self.report(verdict(state.iteration, score, self.plain, self.job.scene.rig.proxy_count > 0))
+            self.report(verdict(state.iteration, score, self.lbs, self.job.scene.rig.proxy_count > 0))
             finite = {name: value for name, value in batch.items() if isfinite(value)}
             state.curve = with_point(state.curve, CurvePoint(state.iteration, state.seconds, finite, score))
             better = state.best is None or score.total < state.best.score.total
             if better:
                 state.best = Best(state.iteration, score)
             self._write_state()
-            self.files.save_curve(state, self.plain)
+            self.files.save_curve(state, self.lbs)
             if better:
                 self._write_model(score)
 
@@ -383,7 +383,7 @@ def train(
     if run.state.undone:
         report(Message(f"{run.state.undone} steps in all were undone.", "warning"))
     score = run.kept()
-    return TrainingResult(finished, run.state.iteration, score, run.plain)
+    return TrainingResult(finished, run.state.iteration, score, run.lbs)
 
 
 def _loop(run: TrainingRun, stop: threading.Event) -> bool:

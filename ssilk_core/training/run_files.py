@@ -44,10 +44,10 @@ class RunFiles:
             save_state(self.state, stepper, samplers, state)
         self.group.gather(None)  # none goes on before it is there to be read
 
-    def save_curve(self, state: RunState, plain: Score) -> None:
+    def save_curve(self, state: RunState, lbs: Score) -> None:
         """Write the learning curve that is in the state, for whoever wants to look at it."""
         if self.group.first:
-            write_curve(self.curve, state.curve, plain)
+            write_curve(self.curve, state.curve, lbs)
 
     def save_model(self, model: GarmentModel, state: RunState, score: Score) -> None:
         """Write a model with its provenance."""

@@ -216,8 +216,8 @@ def scene_digest(scene: Scene) -> str:
     bodies = scene.character.bodies
     body = [array for b in bodies for array in (b.mesh.points, b.mesh.faces, b.skin.indices, b.skin.weights)]
     garment = (scene.garment.mesh.points, scene.garment.mesh.faces, scene.classes)
-    plain, rig = scene.plain_skin, scene.rig.skin
-    skins = (plain.indices, plain.weights, rig.indices, rig.weights)
+    lbs, rig = scene.lbs_skin, scene.rig.skin
+    skins = (lbs.indices, lbs.weights, rig.indices, rig.weights)
     for array in (*body, *garment, *skins, scene.parents, scene.bind_transforms):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good a model is on whole clips: each term by itself, beside plain skinning."""
+"""How good a model is on whole clips: each term by itself, beside linear blend skinning."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Score:
     """Means over all frames of all clips.
 
     Attributes:
-        terms: each energy [J]; gravity is relative to plain skinning.
+        terms: each energy [J]; gravity is relative to linear blend skinning.
         collisions: share of garment vertices inside the body.
         dynamics: RMS distance between the rollout and the quasi-static state of the same pose [m].
     """
@@ -40,7 +40,7 @@ class Score:
 
 
 class Validator:
-    """Rolls a model over whole clips and scores it against plain skinning on the same frames."""
+    """Rolls a model over whole clips and scores it against linear blend skinning on the same frames."""
 
     def __init__(
         self,
@@ -54,7 +54,7 @@ class Validator:
         group: ProcessGroup = SINGLE_PROCESS,
     ) -> None:
         self.bank, self.energy, self.body, self.fps, self.group = bank, energy, body, fps, group
-        self.plain = Skinning(scene.plain_skin).to(rest.device)
+        self.lbs = Skinning(scene.lbs_skin).to(rest.device)
         self.contacts = Contacts(scene, vertices=body.vertices, device=rest.device)
         self.rest = rest
         self.clips = [
@@ -62,16 +62,16 @@ class Validator:
         ]
         self.down = torch.tensor([0.0, -1.0, 0.0], device=rest.device)
 
-    def plain_vertices(self, character: Tensor) -> Tensor:
-        """Return plain skinning's positions (V, 3, N) [m]."""
-        return self.plain(self.rest, None, self.plain.weights, character)
+    def lbs_vertices(self, character: Tensor) -> Tensor:
+        """Return linear blend skinning's positions (V, 3, N) [m]."""
+        return self.lbs(self.rest, None, self.lbs.weights, character)
 
     def score(self, model: LatentModel) -> Score:
         """Return the mean score of a model over all clips."""
         return self._mean(model)
 
-    def plain_score(self) -> Score:
-        """Return the mean score of plain skinning over all clips."""
+    def lbs_score(self) -> Score:
+        """Return the mean score of linear blend skinning over all clips."""
         return self._mean(None)
 
     def _mean(self, model: LatentModel | None) -> Score:
@@ -87,7 +87,8 @@ class Validator:
     def frame_terms(self, clip: range, model: LatentModel | None) -> dict[str, Tensor]:
         """Return what `Score` averages for each frame of a range of the bank, shape (N,).
 
-        Without a model it is plain skinning that is scored. Distances to the quasi-static state come squared [m2].
+        Without a model it is linear blend skinning that is scored. Distances to the quasi-static state come squared
+        [m2].
         """
         return self._clip_terms(clip, model, self._states([clip], model)[0])
 
@@ -102,8 +103,8 @@ class Validator:
         for start in range(0, len(frames), DECODED_AT_ONCE):
             window = slice(start, start + DECODED_AT_ONCE)
             character = self.bank.character(frames[window])
-            plain = self.plain_vertices(character)
-            x, still = plain, plain
+            lbs = self.lbs_vertices(character)
+            x, still = lbs, lbs
             if model is not None and states is not None:
                 x = model.vertices(states[window], character)
                 direction = self.down.expand(len(frames[window]), 3)
@@ -111,7 +112,7 @@ class Validator:
                 still = model.vertices(quiet, character)
             joined = x if tail is None else torch.cat([tail, x], dim=-1)
             posed = self.body.posed(character)
-            terms = energy_terms(self.energy, x, plain, self.contacts, posed, joined, self.fps, self.down)
+            terms = energy_terms(self.energy, x, lbs, self.contacts, posed, joined, self.fps, self.down)
             parts.append({**terms, "dynamics": ((x - still) ** 2).sum(1).mean(0)})
             tail = joined[..., -2:]
         return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}

@@ -17,13 +17,16 @@ def not_finite(score: Score) -> list[str]:
     return [name for name, value in score.terms.items() if not isfinite(value)]
 
 
-def verdict(iteration: int, score: Score, plain: Score, moves: bool) -> Message:
-    """Return how a score compares with plain skinning's; a warning when a garment that `moves` has learned not to."""
-    share = 1 - score.total / plain.total
+def verdict(iteration: int, score: Score, lbs: Score, moves: bool) -> Message:
+    """Return how a score compares with linear blend skinning's.
+
+    A warning when a garment that `moves` has learned not to.
+    """
+    share = 1 - score.total / lbs.total
     terms = ", ".join(f"{name} {value:.4g}" for name, value in score.terms.items())
     text = (
         f"validation at {iteration}: total {score.total:.4g} J, "
-        f"{share:.1%} under plain skinning's {plain.total:.4g} J "
+        f"{share:.1%} under linear blend skinning's {lbs.total:.4g} J "
         f"({terms}), collisions {score.collisions:.2%}, motion of its own {score.dynamics * 1000:.0f} mm"
     )
     if score.dynamics < NO_DYNAMICS and moves:

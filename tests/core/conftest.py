@@ -62,8 +62,8 @@ def turned(positions: np.ndarray, seed: int) -> np.ndarray:
     return rigid(Rotation.random(len(positions), random_state=seed).as_matrix(), positions)
 
 
-def dense_rig_weights(height: np.ndarray, proxies: int, classes: np.ndarray, plain: np.ndarray) -> np.ndarray:
-    weights = np.concatenate([plain, np.zeros((len(plain), proxies))], axis=1)
+def dense_rig_weights(height: np.ndarray, proxies: int, classes: np.ndarray, lbs: np.ndarray) -> np.ndarray:
+    weights = np.concatenate([lbs, np.zeros((len(lbs), proxies))], axis=1)
     for vertex in np.flatnonzero(classes == LOOSE) if proxies else ():
         distance = np.abs(height[vertex] - PROXIES[:proxies, 1]) + 0.05
         weights[vertex] = 0
@@ -86,15 +86,15 @@ def build_scene(proxies: int = 2, shuffled: bool = False) -> Scene:
     row = np.repeat(np.arange(ROWS), COLUMNS)
     classes = np.where(row == 0, PINNED, np.where(row <= 2, TIGHT, LOOSE))
     lean = ((points[:, 1] - 0.9) / 0.5).clip(0.1, 0.9)
-    plain = np.stack([1 - lean, lean, np.zeros(len(points))], axis=1)
-    garment = Garment(Mesh("/toy/strip", points, faces), SkinWeights.from_dense("/toy/strip", plain), classes)
+    lbs = np.stack([1 - lean, lean, np.zeros(len(points))], axis=1)
+    garment = Garment(Mesh("/toy/strip", points, faces), SkinWeights.from_dense("/toy/strip", lbs), classes)
     parents = np.array([1, 0 if shuffled else 3])[:proxies]
     rig = ProxyRig(
         "/toy/rig",
         ("Hips/Spine/P0", "Hips/Spine/P0/P1")[:proxies],
         parents,
         turned(PROXIES[:proxies], 2) if proxies else np.zeros((0, 4, 4)),
-        SkinWeights.from_dense("/toy/rig", dense_rig_weights(points[:, 1], proxies, classes, plain)),
+        SkinWeights.from_dense("/toy/rig", dense_rig_weights(points[:, 1], proxies, classes, lbs)),
     )
     return Scene(Character("/toy", skeleton, (Body(body, skin),)), garment, rig)
 

@@ -132,11 +132,11 @@ def test_networks_give_vertices_with_pinned_ones_where_the_skeleton_puts_them(sc
     states = torch.cat(rolled(model, bank, 0, 10))
     character = bank.character(torch.arange(10))
     x = model.vertices(states, character)
-    plain = model.skin(model.rest, None, model.skin.weights, character)
+    lbs = model.skin(model.rest, None, model.skin.weights, character)
     assert x.shape == (scene.garment.mesh.vertex_count, 3, 10) and x.is_contiguous()
     pinned = torch.tensor(scene.classes == PINNED)
-    np.testing.assert_allclose(x[pinned].detach(), plain[pinned], atol=1e-6)
-    assert (x - plain)[~pinned].norm(dim=1).min() > 0
+    np.testing.assert_allclose(x[pinned].detach(), lbs[pinned], atol=1e-6)
+    assert (x - lbs)[~pinned].norm(dim=1).min() > 0
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -220,9 +220,9 @@ def test_the_gradient_reaches_every_parameter(scene, motions, method):
 
 def test_mixed_windows_teach_the_decoder_alone(scene, motions):
     """Two of three windows swap their motion: they have their own energies, no inertia, and nothing for encoders."""
-    plain, mixed = (objective_of(scene, "ncs", *motions, mixed=share) for share in (0.0, 0.67))
+    lbs, mixed = (objective_of(scene, "ncs", *motions, mixed=share) for share in (0.0, 0.67))
     samplers = [WindowSampler(mixed.bank, CONFIG, 0, torch.Generator().manual_seed(3)) for _ in range(2)]
-    before, after = (o.rolled(sampler) for o, sampler in zip((plain, mixed), samplers))
+    before, after = (o.rolled(sampler) for o, sampler in zip((lbs, mixed), samplers))
     slots = {name: (before[name].unflatten(0, (2, 3)), after[name].unflatten(0, (2, 3))) for name in before}
     for name, (own, found) in slots.items():
         assert torch.equal(found[:, 2], own[:, 2] * (3 if name in ("inertia", "drag") else 1)), name
@@ -260,11 +260,11 @@ def test_a_short_training_lowers_the_energy_of_whole_clips(scene, motions, metho
     body = CollisionBody(scene.character.merged_body(), 3, device=CPU)
     rest = objective.model.rest
     validator = Validator(objective.bank, objective.energy, body, scene, rest, 30.0, 20)
-    before, plain = validator.score(objective.model).total, validator.plain_score().total
+    before, lbs = validator.score(objective.model).total, validator.lbs_score().total
     for iteration in range(60):
         stepper.run(iteration)
     after = validator.score(objective.model)
-    assert after.total < before and after.total < plain and after.dynamics > 0
+    assert after.total < before and after.total < lbs and after.dynamics > 0
     assert int(stepper.faults.count) == 0
 
 

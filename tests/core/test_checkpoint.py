@@ -58,7 +58,7 @@ def test_a_round_trip_is_exact(path, model):
     for mine, theirs in (
         (read.scene.character.skeleton, model.scene.character.skeleton),
         (read.scene.garment.mesh, model.scene.garment.mesh),
-        (read.scene.plain_skin, model.scene.plain_skin),
+        (read.scene.lbs_skin, model.scene.lbs_skin),
         (read.scene.rig, model.scene.rig),
         (read.scene.rig.skin, model.scene.rig.skin),
     ):
@@ -105,7 +105,7 @@ def test_a_packed_model_is_what_it_was_to_16_bits(path, model, tmp_path):
         else:
             largest = np.abs(mine).max(axis=tuple(range(1, mine.ndim)), keepdims=True)
             assert (np.abs(found - mine) <= 0.501 * largest / STEPS + 1e-30).all(), name
-    for mine, found in ((model.scene.plain_skin, read.scene.plain_skin), (model.scene.rig.skin, read.scene.rig.skin)):
+    for mine, found in ((model.scene.lbs_skin, read.scene.lbs_skin), (model.scene.rig.skin, read.scene.rig.skin)):
         np.testing.assert_array_equal(found.indices, mine.indices)
         np.testing.assert_allclose(found.weights, mine.weights, rtol=0, atol=1e-7)
     np.testing.assert_array_equal(read.scene.garment.mesh.points, model.scene.garment.mesh.points)

@@ -210,7 +210,7 @@ def test_the_kernel_finds_the_nearest_of_a_list():
 
 
 @KERNELS
-def test_kernels_find_the_planes_of_a_list_that_their_twins_find():
+def test_kernels_find_the_planes_of_a_list_that_their_references_find():
     rng = np.random.default_rng(5)
     mesh = trimesh.creation.icosphere(subdivisions=1, radius=0.1)
     around = mesh.vertices + 0.003 * rng.normal(size=(3, *mesh.vertices.shape))
@@ -222,10 +222,10 @@ def test_kernels_find_the_planes_of_a_list_that_their_twins_find():
     expected = nearest_planes(x, body, patches=patches)
     assert not torch.allclose(expected[0], nearest_planes(x, body)[0])
     on_device = PosedBody(*(v.to(DEVICE) for v in (body.points, body.normals, body.rings)))
-    for value, twin in zip(
+    for value, reference in zip(
         distance._by_kernels(x.to(DEVICE), on_device, None, Patches(table.to(DEVICE), patches.faces)), expected
     ):
-        np.testing.assert_allclose(value.cpu(), twin, atol=2e-6)
+        np.testing.assert_allclose(value.cpu(), reference, atol=2e-6)
 
 
 def test_the_faces_around_a_patch_are_those_with_a_corner_in_it():

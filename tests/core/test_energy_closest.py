@@ -90,7 +90,7 @@ def test_planes_held_still_are_the_true_gradient_of_the_distance() -> None:
     assert away.median() < 1e-3 and away.quantile(0.9) < 0.1  # the others lie within a step of a crease's two sides
 
 
-def test_the_kernel_finds_what_its_plain_twin_does() -> None:
+def test_the_kernel_finds_what_its_reference_does() -> None:
     meshes = [slab(), slab(1.1)]
     body, x = body_of(*meshes), scattered(90, 2).to(DEVICE)
     patches = torch.as_tensor(patches_of(meshes[0].vertices, np.array(meshes[0].faces)), device=DEVICE)

@@ -215,7 +215,7 @@ def test_the_kernel_finds_the_nearest_vertex_of_a_posed_body(scene, toy_motion):
     matrices, _ = centred_matrices(toy_motion(scene, 3), skeleton)
     character = torch.tensor(matrices[:, :, :3].transpose(1, 2, 3, 0), dtype=torch.float32)
     body = CollisionBody(merged, skeleton.joint_count, device=torch.device("cpu")).posed(character)
-    x = skin_points(garment.points, scene.plain_skin, matrices).transpose(1, 2, 0).astype(np.float32)
+    x = skin_points(garment.points, scene.lbs_skin, matrices).transpose(1, 2, 0).astype(np.float32)
     np.testing.assert_array_equal(np.unique(body.groups), np.arange(len(merged.mesh.points)))
     np.testing.assert_array_equal(by_kernel(x, body.points.numpy()), brute_force(x, body.points.numpy()))
 
@@ -332,7 +332,7 @@ def test_frames_of_a_moving_body_do_not_mix():
 
 @KERNELS
 @pytest.mark.parametrize("case", ["triangles", "open", "obtuse", "vertices"])
-def test_kernels_find_the_planes_that_their_twins_find(case, toy_grid):
+def test_kernels_find_the_planes_that_their_references_find(case, toy_grid):
     rng = np.random.default_rng(8)
     if case == "open":
         points, faces = toy_grid(5, 4)
@@ -352,8 +352,8 @@ def test_kernels_find_the_planes_that_their_twins_find(case, toy_grid):
     expected = nearest_planes(x, body)
     on_device = PosedBody(*(v if v is None else v.to(DEVICE) for v in (body.points, body.normals, body.rings)))
     found = distance._by_kernels(x.to(DEVICE), on_device, None)
-    for value, twin in zip(found, expected):
-        np.testing.assert_allclose(value.cpu(), twin, atol=2e-6)
+    for value, reference in zip(found, expected):
+        np.testing.assert_allclose(value.cpu(), reference, atol=2e-6)
 
 
 @KERNELS

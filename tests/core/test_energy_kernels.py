@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fused energies against their plain twins in double precision, in values and in gradients."""
+"""Fused energies against their reference implementations in double precision, in values and in gradients."""
 
 import importlib.util
 from dataclasses import replace
@@ -93,9 +93,9 @@ def evaluate(terms: str, mesh: Mesh, fabric: Fabric, positions: np.ndarray, dtyp
     return found
 
 
-def assert_equal_to_twin(terms: str, mesh: Mesh, fabric: Fabric, positions: np.ndarray) -> None:
-    fused, plain = (evaluate(terms, mesh, fabric, positions, dtype) for dtype in (torch.float32, torch.float64))
-    for (value, gradient), (expected, slope) in zip(fused, plain):
+def assert_equal_to_reference(terms: str, mesh: Mesh, fabric: Fabric, positions: np.ndarray) -> None:
+    fused, lbs = (evaluate(terms, mesh, fabric, positions, dtype) for dtype in (torch.float32, torch.float64))
+    for (value, gradient), (expected, slope) in zip(fused, lbs):
         relative = value / expected - 1
         assert np.abs(relative).max() < 2e-6 and abs(relative.mean()) < 4e-7
         size, scale = (np.linalg.norm(v, axis=(0, 1)) for v in (gradient, slope))
@@ -107,18 +107,18 @@ def assert_equal_to_twin(terms: str, mesh: Mesh, fabric: Fabric, positions: np.n
 
 @pytest.mark.parametrize("fabric", [STVK, WOVEN], ids=lambda fabric: fabric.name)
 def test_stretch_and_bending(sheet, fabric):
-    assert_equal_to_twin("elastic", sheet, fabric, extreme(sheet.points))
+    assert_equal_to_reference("elastic", sheet, fabric, extreme(sheet.points))
 
 
 @pytest.mark.parametrize("terms", ["potential", "kinetic"])
 def test_terms_of_single_vertices(sheet, terms):
-    assert_equal_to_twin(terms, sheet, STVK, crumpled(sheet.points))
+    assert_equal_to_reference(terms, sheet, STVK, crumpled(sheet.points))
 
 
 def test_a_triangle_that_is_wound_the_other_way(scrap):
     faces = scrap.faces.copy()
     faces[2] = faces[2, ::-1]
-    assert_equal_to_twin("elastic", Mesh("/mixed", scrap.points, faces), STVK, crumpled(scrap.points))
+    assert_equal_to_reference("elastic", Mesh("/mixed", scrap.points, faces), STVK, crumpled(scrap.points))
 
 
 def test_without_hinges_only_stretch_is_left(sheet):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every energy against a slow twin, element by element in float64 numpy, with gradients written out by hand."""
+"""Every energy against a slow reference in float64 numpy, element by element, with gradients written out by hand."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -214,7 +214,7 @@ def fast(case: Case, term: str, dtype: torch.dtype) -> tuple[np.ndarray, np.ndar
 @pytest.mark.parametrize(
     "dtype, tolerance", [(torch.float32, 2e-4), (torch.float64, 1e-10)], ids=["single", "double"]
 )
-def test_fast_path_equals_its_slow_twin(case, term, dtype, tolerance):
+def test_fast_path_equals_its_slow_reference(case, term, dtype, tolerance):
     slow = [TWINS[term](case, case.x[..., frame], frame) for frame in range(FRAMES)]
     value, gradient = np.array([v for v, _ in slow]), np.stack([g for _, g in slow], axis=-1)
     found, slope = fast(case, term, dtype)

@@ -61,18 +61,18 @@ def reel(dressed, motion) -> TakeSet:
 
 
 class Still:
-    """Cloth that moves by given offsets (N, 3) away from plain skinning, whose quasi-static state that is."""
+    """Cloth that moves by given offsets (N, 3) away from linear blend skinning, whose quasi-static state that is."""
 
     name = "still"
 
     def __init__(self, dressed: EvaluationScene, reel: TakeSet, offsets: Tensor) -> None:
-        self.plain, self.offsets = Plain(dressed, reel), offsets
+        self.lbs, self.offsets = Plain(dressed, reel), offsets
 
     def vertices(self, take: int, frames: range) -> Tensor:
-        return self.plain.vertices(take, frames) + self.offsets[frames.start : frames.stop].T
+        return self.lbs.vertices(take, frames) + self.offsets[frames.start : frames.stop].T
 
     def still(self, take: int, frames: range) -> Tensor:
-        return self.plain.vertices(take, frames)
+        return self.lbs.vertices(take, frames)
 
 
 def test_takes_are_the_frames_of_a_simulated_shot(scene, toy_motion):
@@ -112,9 +112,9 @@ def test_energies_are_those_of_the_validation(scene, dressed, toy_motion, toy_mo
     found = recorded(dressed, reel, network, 0).values
     for name in (*TERMS, "collisions"):
         np.testing.assert_allclose(found[name], expected[name].double(), rtol=1e-4, atol=1e-7)
-    plain = recorded(dressed, reel, Plain(dressed, reel), 0).values
-    np.testing.assert_allclose(plain["stretch"], validator.frame_terms(range(23), None)["stretch"], rtol=1e-4)
-    assert plain["gravity"].abs().max() == 0 and "motion" not in plain
+    lbs = recorded(dressed, reel, Plain(dressed, reel), 0).values
+    np.testing.assert_allclose(lbs["stretch"], validator.frame_terms(range(23), None)["stretch"], rtol=1e-4)
+    assert lbs["gravity"].abs().max() == 0 and "motion" not in lbs
 
 
 def test_a_record_in_blocks_is_that_of_the_whole(dressed, reel, monkeypatch):
@@ -148,7 +148,7 @@ def test_errors_against_a_reference_are_those_of_the_offset(dressed, reel):
     own = figures(tally, truth, dressed.weight)
     assert found.excess == pytest.approx(own.total - found.total) and found.frames == 40
     assert own.motion == pytest.approx(expected[0], rel=1e-3) and own.lift == pytest.approx(found.floats, rel=1e-3)
-    assert own.jitter_of_plain == pytest.approx(found.jitter)
+    assert own.jitter_of_lbs == pytest.approx(found.jitter)
 
 
 def test_collisions_can_be_with_the_whole_body(scene, dressed, reel):
@@ -161,7 +161,7 @@ def test_collisions_can_be_with_the_whole_body(scene, dressed, reel):
     near, whole = (EvaluationScene(spiked, dressed.fabric, FPS, CPU, exact=exact) for exact in (False, True))
     found = [recorded(one, reel, Plain(one, reel), 0).values["collision"] for one in (near, whole)]
     character = reel.character(0, range(40))
-    distance = signed_distance(whole.plain(character), whole.body.posed(character, exact=True))
+    distance = signed_distance(whole.lbs(character), whole.body.posed(character, exact=True))
     np.testing.assert_allclose(found[1], whole.energy.collision_of(distance), rtol=1e-5)
     assert (found[0] - found[1]).abs().max() > 1e-3
 
@@ -175,10 +175,10 @@ def test_a_point_cache_is_measured_as_the_cloth_that_was_written(scene, dressed,
     matrices = skinning_matrices(
         motion_transforms(motion, scene.character.skeleton.parents), scene.character.skeleton.bind_transforms
     )
-    points = skin_points(scene.garment.mesh.points, scene.plain_skin, matrices)
+    points = skin_points(scene.garment.mesh.points, scene.lbs_skin, matrices)
     cache = CachedPoints("cache", lambda clip, frames: points[frames.start : frames.stop], dressed, reel)
-    plain = Plain(dressed, reel)
-    ours, theirs = (recorded(dressed, reel, method, 0, plain) for method in (cache, plain))
+    lbs = Plain(dressed, reel)
+    ours, theirs = (recorded(dressed, reel, method, 0, lbs) for method in (cache, lbs))
     for name in (*TERMS, "kinetic"):
         np.testing.assert_allclose(ours.values[name], theirs.values[name], rtol=1e-3, atol=2e-6, err_msg=name)
     assert ours.values["position"].max() < 1e-10
@@ -219,11 +219,11 @@ def test_cloth_that_is_held_up_is_found_out(dressed, motion):
 
 
 def test_minima_are_where_forces_balance(dressed, motion):
-    """Of two poses at once, from plain skinning: lower, in balance, and a place to measure heights from."""
+    """Of two poses at once, from linear blend skinning: lower, in balance, and a place to measure heights from."""
     takes, _ = stops(takes_of("sway", motion, FPS), FPS, 2, 0.5)
     reel = reel_of(takes, dressed, JOINTS)
     found = minima(dressed.simulator, takes, last_frames(Plain(dressed, reel), takes))
-    np.testing.assert_allclose(found.start, found.poses.plain, atol=1e-6)
+    np.testing.assert_allclose(found.start, found.poses.lbs, atol=1e-6)
     assert (found.imbalance < 0.01).all() and (found.over() > 0.01).all() and (found.distance() > 0.01).all()
     middle = dressed.simulator.setting(found.poses, None).body.points.double().mean(0)
     assert (found.inside(0 * found.x + middle) == 1).all() and (found.inside(found.x + 100) == 0).all()
@@ -232,7 +232,7 @@ def test_minima_are_where_forces_balance(dressed, motion):
     np.testing.assert_allclose(found.floats(lifted), mass * GRAVITY * 0.1, rtol=1e-6)
     figures_of = hung(found, dressed.weight)
     joined = joined_hung(figures_of)
-    assert joined.floats == pytest.approx(joined.plain, rel=1e-4) and joined.stops == 2 and joined_hung([]) is None
+    assert joined.floats == pytest.approx(joined.lbs, rel=1e-4) and joined.stops == 2 and joined_hung([]) is None
     assert joined.above == pytest.approx(float(found.over().mean())) and joined.imbalance == found.imbalance.max()
     again = minima(dressed.simulator, takes, found.x.float() + found.poses.root - _origins(takes))
     assert (again.over().abs() < 1e-5).all() and (again.distance() < 1e-3).all()
@@ -302,14 +302,14 @@ def test_every_method_gets_its_row_in_every_split(scene, dressed, motion, toy_mo
         evaluate(dressed, subjects, played, EvaluationOptions(stops=1, hold=0.2, minimum=True, simulate=True, loop=1))
     )
     names = [(row.method, row.split) for row in rows]
-    methods = ("plain", SIMULATOR, "ssilk", "ncs")
+    methods = ("LBS", SIMULATOR, "ssilk", "ncs")
     assert names == [(method, split) for method in methods for split in ("valid", "flips")]
     by_name = {name: row.figures for name, row in zip(names, rows)}
     model, simulated = by_name["ssilk", "valid"], by_name[SIMULATOR, "valid"]
     assert (model.frames, model.truth.frames, simulated.frames, simulated.clips) == (32, 12, 12, 1)
-    assert by_name["plain", "valid"].truth.position < 1e-6 < model.truth.position  # plain is what was written
+    assert by_name["LBS", "valid"].truth.position < 1e-6 < model.truth.position  # LBS is what was written
     assert (model.holds.stops, model.hung.stops, model.loops.clips) == (2, 2, 2) and model.hung.above > 0
-    assert by_name["plain", "valid"].holds is None and simulated.holds.stops == 2
+    assert by_name["LBS", "valid"].holds is None and simulated.holds.stops == 2
     # The training saw 'sway' and not 'slow', which is why the whole is nearer than the part.
     assert model.poses.mean < by_name["ssilk", "flips"].poses.mean
     assert model.clip_totals[0] <= model.total <= model.clip_totals[2]
@@ -327,7 +327,7 @@ def test_a_character_that_never_moves_has_no_jitter_to_compare_with(scene, dress
             dressed, [EvaluatedModel("ssilk", toy_model(scene), JOINTS)], played, EvaluationOptions(stops=0, loop=0)
         )
     )
-    assert rows[0].figures.jitter == 0 and math.isnan(rows[1].figures.jitter_of_plain) and "nan" in tables(rows)
+    assert rows[0].figures.jitter == 0 and math.isnan(rows[1].figures.jitter_of_lbs) and "nan" in tables(rows)
 
 
 def test_nothing_is_asked_for_nothing_is_computed(scene, dressed, motion, toy_model):
@@ -337,7 +337,7 @@ def test_nothing_is_asked_for_nothing_is_computed(scene, dressed, motion, toy_mo
             dressed, [EvaluatedModel("ssilk", toy_model(scene), JOINTS)], played, EvaluationOptions(stops=0, loop=0)
         )
     )
-    assert [row.method for row in rows] == ["plain", "ssilk"]
+    assert [row.method for row in rows] == ["LBS", "ssilk"]
     found = rows[1].figures
     assert (found.truth, found.poses, found.holds, found.loops) == (None, None, None, None)
 

@@ -80,7 +80,7 @@ def test_every_frame_is_what_a_shot_stores(exported, model, scene, toy_motion, c
 
 def test_a_tight_garment_without_proxies_or_stepper_is_exported(scene, toy_motion, tmp_path):
     garment = replace(scene.garment, classes=np.full(len(scene.classes), TIGHT))
-    none = ProxyRig("/none", (), np.zeros(0, dtype=np.int32), np.zeros((0, 4, 4)), scene.plain_skin)
+    none = ProxyRig("/none", (), np.zeros(0, dtype=np.int32), np.zeros((0, 4, 4)), scene.lbs_skin)
     tight = Scene(scene.character, garment, none)
     config = ModelConfig(latent=8, widths=(16,), shapes=4, scheme="quasi_static")
     model = GarmentModel(tight, config, np.arange(tight.character.skeleton.joint_count)).eval()

@@ -239,7 +239,7 @@ def test_decoded_cloth_stays_within_reach_of_what_holds_it(scene, toy_motion, to
     "size, options", [(1.0, {}), (30.0, {}), (1.0, {"latent_bound": 0.0, "max_latent_step": 0.0}), (0.0, {})]
 )
 @torch.no_grad()
-def test_the_kernels_step_as_their_twin_does(size, options, monkeypatch):
+def test_the_kernels_step_as_their_reference_does(size, options, monkeypatch):
     """States of a few sizes, so that each of the limits is met; one of them is lost."""
     device = "cuda" if torch.cuda.is_available() else "cpu"
     generator = torch.Generator().manual_seed(7)

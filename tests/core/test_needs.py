@@ -30,7 +30,7 @@ def classed(scene: Scene, classes: np.ndarray) -> Scene:
     garment = replace(scene.garment, classes=classes)
     if (classes == LOOSE).any():
         return replace(scene, garment=garment)
-    none = ProxyRig("/none", (), np.zeros(0, dtype=np.int32), np.zeros((0, 4, 4)), scene.plain_skin)
+    none = ProxyRig("/none", (), np.zeros(0, dtype=np.int32), np.zeros((0, 4, 4)), scene.lbs_skin)
     return Scene(scene.character, garment, none)
 
 
@@ -61,7 +61,7 @@ def test_a_pinned_garment_has_nothing_to_learn(scene, toy_motion, tmp_path):
 
     done = train(job_of(pinned, toy_motion(scene, 30), output), report)
     assert (done.iterations, done.finished) == (1, True)
-    assert done.score.total == pytest.approx(done.plain.total, rel=1e-4)
+    assert done.score.total == pytest.approx(done.lbs.total, rel=1e-4)
     assert any(isinstance(event, Message) and "nothing to learn" in event.text for event in told)
     file = load_model(output)
     assert sum(value.size for value in file.parameters.values()) < 500
@@ -69,9 +69,9 @@ def test_a_pinned_garment_has_nothing_to_learn(scene, toy_motion, tmp_path):
     (pose,) = garment_poses(model, motion, 30.0)
     world = motion_transforms(motion, pinned.character.skeleton.parents)
     matrices = skinning_matrices(world, pinned.character.skeleton.bind_transforms)
-    plain = skin_points(pinned.garment.mesh.points, pinned.plain_skin, matrices)
-    np.testing.assert_allclose(deform(model.deformer(), motion, pose), plain, atol=1e-6)
-    assert Player(file).play(motion).vertices(5) == pytest.approx(plain[5], abs=1e-5)
+    lbs = skin_points(pinned.garment.mesh.points, pinned.lbs_skin, matrices)
+    np.testing.assert_allclose(deform(model.deformer(), motion, pose), lbs, atol=1e-6)
+    assert Player(file).play(motion).vertices(5) == pytest.approx(lbs[5], abs=1e-5)
     assert reachable_body(pinned, [toy_motion(scene, 30)]).vertices.size == 0
 
 
@@ -138,7 +138,7 @@ def test_a_garment_with_nothing_loose_has_no_stepper(scene, toy_motion, tmp_path
     done = train(
         replace(asked, train=replace(asked.train, static_fraction=0.3, learning_rate_warmup=2)), lambda event: None
     )
-    assert done.score.total < done.plain.total
+    assert done.score.total < done.lbs.total
     file = load_model(output)
     assert not [name for name in file.parameters if name.startswith(("stepper", "integrator"))]
     model, motion = network(file, tight).eval(), toy_motion(scene, 30, speed=2.0)

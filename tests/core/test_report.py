@@ -129,7 +129,7 @@ POINT = {"model": "m", "swept": "shapes", "variant": "16", "milliseconds": 0.5, 
 FIGURES = {
     "Extremes": ({"ssilk": "1", "outcomes": [OUTCOME]}, "breaks"),
     "Trade": ({"asked": {"clips": ["a"]}, "points": [POINT]}, "0.002"),
-    "Evaluation": ({"units": "SI", "figures": [{"method": "plain", "figures": {"total": 2.5}}]}, "figures.total"),
+    "Evaluation": ({"units": "SI", "figures": [{"method": "LBS", "figures": {"total": 2.5}}]}, "figures.total"),
 }
 
 
@@ -160,10 +160,10 @@ def test_a_learning_curve_marks_its_best(tmp_path):
     score, path = {"total": 2.0, "collisions": 0.01}, tmp_path / "model.curve.json"
     assert learning_of(path) == []
     points = [{"seconds": 9.0 * i, "validation": {**score, "total": abs(i - 2) + 0.5}} for i in range(5)]
-    path.write_text(json.dumps({"plain": score, "points": points}))
+    path.write_text(json.dumps({"lbs": score, "points": points}))
     (section,) = learning_of(path)
-    assert "best: 0.5 J at 18.00 s" in section.body and "plain skinning: 2 J, 1.00% inside" in section.body
-    path.write_text(json.dumps({"plain": score, "points": []}))
+    assert "best: 0.5 J at 18.00 s" in section.body and "linear blend skinning: 2 J, 1.00% inside" in section.body
+    path.write_text(json.dumps({"lbs": score, "points": []}))
     assert learning_of(path) == []
     path.write_text(json.dumps({"points": points}))
     with pytest.raises(SsilkError, match="incomplete \\('plain'\\)"):

@@ -193,7 +193,7 @@ def test_prepare_respects_what_is_authored(trunk):
     again = prepare_scene(trunk, painted, first.rig, report=said.append)
     assert again.rig is first.rig and said == []
     np.testing.assert_array_equal(again.classes, painted.classes)
-    np.testing.assert_array_equal(again.plain_skin.dense(2), skin.dense(2))
+    np.testing.assert_array_equal(again.lbs_skin.dense(2), skin.dense(2))
 
 
 @pytest.mark.skipif(not SHARED.exists(), reason="the shared data is not beside the checkout")

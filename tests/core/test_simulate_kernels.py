@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Conjugate gradients by kernels against the plain twin, on blocks of random sparsity."""
+"""Conjugate gradients by kernels against the reference implementation, on blocks of random sparsity."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_the_kernel_solves_as_dense_algebra_does(frames) -> None:
     torch.testing.assert_close(found.permute(2, 0, 1).reshape(-1).double(), expected, rtol=1e-4, atol=1e-6)
 
 
-def test_the_kernel_stops_where_the_plain_twin_does(monkeypatch) -> None:
+def test_the_kernel_stops_where_the_reference_does(monkeypatch) -> None:
     monkeypatch.setattr("ssilk_core.kernels.available", lambda device: False)
     matrix = random_matrix(25, 5)
     right = torch.randn(matrix.pattern.count, 3, 5, generator=torch.Generator().manual_seed(2)).to(DEVICE)

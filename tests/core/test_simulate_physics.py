@@ -203,10 +203,10 @@ def test_pinned_vertices_are_skinned_plainly(scene, toy_motion) -> None:
     (shot,) = shots_of([motion], options)
     skeleton = scene.character.skeleton
     matrices = skinning_matrices(motion_transforms(shot, skeleton.parents), skeleton.bind_transforms)
-    plain = skin_points(scene.garment.mesh.points, scene.plain_skin, matrices)
+    lbs = skin_points(scene.garment.mesh.points, scene.lbs_skin, matrices)
     pinned = scene.classes == PINNED
-    np.testing.assert_allclose(points[:, pinned], plain[:, pinned], atol=1e-9)
-    assert np.abs(points - plain)[:, ~pinned].max() > 0.01
+    np.testing.assert_allclose(points[:, pinned], lbs[:, pinned], atol=1e-9)
+    assert np.abs(points - lbs)[:, ~pinned].max() > 0.01
 
 
 def test_a_shot_has_the_frames_of_its_motion(scene, toy_motion) -> None:
@@ -261,7 +261,7 @@ def test_a_quasi_static_pose_hangs_lower_than_plain_skinning(scene, toy_motion) 
     inputs = StepInputs(at.body, simulator.gravity.expand(3, 3))
     x = torch.as_tensor(points.transpose(1, 2, 0)) - at.root
     energies = [
-        simulator.potential.energy(y, inputs, simulator.potential.body_distance(y, inputs)) for y in (x, at.plain)
+        simulator.potential.energy(y, inputs, simulator.potential.body_distance(y, inputs)) for y in (x, at.lbs)
     ]
     assert (energies[0] < energies[1]).all()
 

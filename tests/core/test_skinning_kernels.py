@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Skinning and proxy kernels against their plain twins in float64: values, gradients, and the same bits twice."""
+"""Skinning and proxy kernels against their references in float64: values, gradients, and the same bits twice."""
 
 from __future__ import annotations
 
@@ -177,7 +177,7 @@ def test_proxies_and_their_gradient_equal_the_composed_transforms(tree, frames):
 
 
 @pytest.mark.parametrize("zero", [slice(0, 3), slice(3, 6), slice(0, 6)], ids=["first", "second", "both"])
-def test_degenerate_six_d_rotations_are_clamped_as_the_twin_clamps_them(zero):
+def test_degenerate_six_d_rotations_are_clamped_as_the_reference_clamps_them(zero):
     six_d = random_numbers(2, 6, 3, seed=1)
     six_d[0, zero] = 0
     six_d.requires_grad_()

@@ -172,7 +172,7 @@ def test_frames_looked_at_in_turn_give_the_same(monkeypatch) -> None:
 
 
 @pytest.mark.parametrize("listed", [False, True])
-def test_the_kernel_finds_what_its_plain_twin_does(monkeypatch, listed: bool) -> None:
+def test_the_kernel_finds_what_its_reference_does(monkeypatch, listed: bool) -> None:
     pytest.importorskip("triton")
     walls = fold(1.2)
     ball = trimesh.util.concatenate([walls, trimesh.creation.icosahedron().apply_scale(0.05)])
@@ -188,8 +188,8 @@ def test_the_kernel_finds_what_its_plain_twin_does(monkeypatch, listed: bool) ->
         faces = torch.arange(len(body.faces), device=DEVICE).repeat(len(x), 1)
         faces[::2, -9:] = -1
         patches = Patches(vertices, faces)
-    with monkeypatch.context() as plain:
-        plain.setattr(distance.kernels, "serve", lambda x: False)
+    with monkeypatch.context() as lbs:
+        lbs.setattr(distance.kernels, "serve", lambda x: False)
         expected = smoothed_planes(x, body, patches=patches)
         found = distance._smoothed_by_kernel(x, body, None, patches)
     torch.testing.assert_close(found.distance(x.double()), expected.distance(x.double()), rtol=0, atol=3e-7)
@@ -209,8 +209,8 @@ def test_the_kernel_serves_more_frames_than_a_block_some_of_them_far_off(monkeyp
     body = body_of(*[walls] * frames)
     x = in_the_fold(3).repeat(1, 1, frames).float().to(DEVICE)
     x[:, 2, ::3] += 0.5
-    with monkeypatch.context() as plain:
-        plain.setattr(distance.kernels, "serve", lambda x: False)
+    with monkeypatch.context() as lbs:
+        lbs.setattr(distance.kernels, "serve", lambda x: False)
         expected = smoothed_planes(x, body)
         found = distance._smoothed_by_kernel(x, body, None, None)
     torch.testing.assert_close(found.distance(x.double()), expected.distance(x.double()), rtol=0, atol=3e-7)

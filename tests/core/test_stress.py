@@ -30,7 +30,7 @@ def subject(scene, toy_model) -> StressSubject:
 
 
 @pytest.fixture(scope="module")
-def base(scene) -> drives.Drive:
+def base(scene) -> drives.ProceduralMotion:
     return drives.sway(scene.character.skeleton, 30.0).looping(1.0)
 
 
@@ -145,12 +145,12 @@ def test_a_garment_on_plain_skinning_is_nowhere_else_and_moves_as_it_does(scene,
     motion = held.motion(0, 20)
     matrices, origin = meter.matrices_about_root(motion, scene)
     tool = meter.Meter(scene, FABRIC, 30.0, [range(1, 5), range(10, 20)])
-    plain = tool.skin(tool.rest, None, tool.skin.weights, matrices).permute(2, 0, 1).numpy() + origin
-    tool.add(motion, plain)
-    radius = np.linalg.norm((plain - origin)[0][:, [0, 2]], axis=1).max()
+    lbs = tool.skin(tool.rest, None, tool.skin.weights, matrices).permute(2, 0, 1).numpy() + origin
+    tool.add(motion, lbs)
+    radius = np.linalg.norm((lbs - origin)[0][:, [0, 2]], axis=1).max()
     assert tool.distance < 1e-9 and tool.growth == pytest.approx(1.0, abs=1e-9)
     assert tool.speed == pytest.approx(2 * radius * np.sin(0.1) * 30, rel=1e-6)
-    tool.add(motion, plain + [0, 0, 0.25])
+    tool.add(motion, lbs + [0, 0, 0.25])
     assert tool.distance == pytest.approx(0.25)
 
 
@@ -224,7 +224,7 @@ def test_slivers_are_as_high_as_asked(scene, height):
 
 
 def stretched(world: Scene, motion: Motion) -> float:
-    """Stretch energy of plain skinning whose points are moved at random by a millimetre."""
+    """Stretch energy of linear blend skinning whose points are moved at random by a millimetre."""
     tool = meter.Meter(world, FABRIC, 30.0)
     x = tool.skin(tool.rest, None, tool.skin.weights, meter.matrices_about_root(motion, world)[0])
     noise = torch.randn(x.shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype)

@@ -75,11 +75,11 @@ def test_a_run_with_minutes_is_one_of_as_many_iterations(job, monkeypatch):  # n
     assert any(
         "11 iterations are planned for 5 minutes" in event.text for event in said if isinstance(event, Message)
     )
-    plain = job("iterations", shaped(SHORT, 11))
-    train(plain, silent)
+    lbs = job("iterations", shaped(SHORT, 11))
+    train(lbs, silent)
     asked = job("minutes", minutes=5.0)
     _, one = load_state(state_path(asked.output), asked.identity())
-    _, other = load_state(state_path(plain.output), plain.identity())
+    _, other = load_state(state_path(lbs.output), lbs.identity())
     assert one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
 
 

@@ -116,9 +116,9 @@ def test_training_lowers_the_energy_of_held_out_motion(job):
     )
     trained = train(job("learning", config), silent)
     assert trained.finished and trained.iterations == 110
-    assert trained.score.total < 0.8 * trained.plain.total
-    assert trained.plain.dynamics == 0 < trained.score.dynamics
-    assert trained.plain.terms["gravity"] == pytest.approx(0, abs=1e-6)
+    assert trained.score.total < 0.8 * trained.lbs.total
+    assert trained.lbs.dynamics == 0 < trained.score.dynamics
+    assert trained.lbs.terms["gravity"] == pytest.approx(0, abs=1e-6)
 
 
 def test_a_run_repeats_bit_for_bit(job, uninterrupted):
@@ -214,7 +214,7 @@ def test_events_say_what_is_trained_and_how_it_goes(job):
     assert progress[-1].seconds_left == 0
     assert set(progress[-1].terms) == {"stretch", "bending", "gravity", "inertia", "collision", "drag"}
     judged = [event.text for event in events if isinstance(event, Message) and "validation at" in event.text]
-    assert len(judged) == 2 and "under plain skinning's" in judged[0]
+    assert len(judged) == 2 and "under linear blend skinning's" in judged[0]
 
 
 def test_provenance_tells_how_the_model_came_to_be(uninterrupted):
@@ -525,7 +525,7 @@ def test_the_learning_curve_goes_on_where_a_resumed_run_does(job, uninterrupted,
     train(replace(resumed, resume=True), silent)
     last = json.loads(curve_path(resumed.output).read_text())
     assert [point["iteration"] for point in last["points"]] == [5, 10, 14]
-    assert last["points"][:1] == first["points"] and last["plain"] == first["plain"]
+    assert last["points"][:1] == first["points"] and last["lbs"] == first["lbs"]
     assert 0 < last["points"][0]["seconds"] < last["points"][1]["seconds"] < last["points"][2]["seconds"]
     whole = json.loads(curve_path(uninterrupted.output).read_text())
     assert [p["validation"] for p in whole["points"]] == [p["validation"] for p in last["points"]]

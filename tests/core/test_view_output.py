@@ -114,9 +114,9 @@ def test_a_contact_sheet_puts_its_images_in_rows():
 
 
 def test_captions_stand_in_their_corners():
-    plain = np.full((120, 160, 3), 200, dtype=np.uint8)
-    changed = (captioned(plain, top="plain skinning") != plain).any(axis=2)
+    lbs = np.full((120, 160, 3), 200, dtype=np.uint8)
+    changed = (captioned(lbs, top="linear blend skinning") != lbs).any(axis=2)
     assert changed[:30].any() and not changed[40:].any()
-    changed = (captioned(plain, bottom="1.25 s") != plain).any(axis=2)
+    changed = (captioned(lbs, bottom="1.25 s") != lbs).any(axis=2)
     assert changed[90:].any() and not changed[:80].any()
-    assert (plain == 200).all()
+    assert (lbs == 200).all()

@@ -61,7 +61,7 @@ def test_a_film_of_two_shots(tmp_path):
     events: list[Progress] = []
     path = tmp_path / "film.mp4"
     written = film_of_shots(
-        path, [ToyShot(), ToyShot()], labels=["plain skinning", "ssilk"], look=SMALL, report=events.append
+        path, [ToyShot(), ToyShot()], labels=["linear blend skinning", "ssilk"], look=SMALL, report=events.append
     )
     assert written == frame_count(path) == 4  # 8 frames at 60 fps, shown at 30
     meta = next(imageio_ffmpeg.read_frames(str(path)))

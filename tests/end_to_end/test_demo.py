@@ -73,7 +73,7 @@ def test_shipped_models_fit_what_the_demo_builds(garment, tmp_path):
     np.testing.assert_allclose(mine.garment.mesh.points, theirs.garment.mesh.points, atol=1e-5)
     np.testing.assert_allclose(mine.bind_transforms, theirs.bind_transforms, atol=1e-5)
     count = len(mine.joint_names)
-    np.testing.assert_allclose(mine.plain_skin.dense(count), theirs.plain_skin.dense(count), atol=1e-4)
+    np.testing.assert_allclose(mine.lbs_skin.dense(count), theirs.lbs_skin.dense(count), atol=1e-4)
     np.testing.assert_allclose(mine.rig.skin.dense(count), theirs.rig.skin.dense(count), atol=1e-4)
 
 

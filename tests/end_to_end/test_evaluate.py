@@ -38,7 +38,7 @@ def test_figures_by_split_are_shown_and_written(world, capsys):
     document = json.loads((world / "out" / "figures.json").read_text())
     assert document["models"] == {"model.safetensors": sha256("model.safetensors")} and document["units"] == "SI"
     rows = {(row["method"], row["split"]): row["figures"] for row in document["figures"]}
-    assert rows.keys() == {(m, s) for m in ("plain", "ssilk") for s in ("valid", "inertia", "flips")}
+    assert rows.keys() == {(m, s) for m in ("LBS", "ssilk") for s in ("valid", "inertia", "flips")}
     assert rows["ssilk", "valid"] == rows["ssilk", "inertia"] and rows["ssilk", "flips"]["frames"] == 10
     found = rows["ssilk", "valid"]
     assert found["total"] == pytest.approx(sum(found["terms"].values())) and found["poses"]["mean"] < 0.1
@@ -64,10 +64,10 @@ def test_the_simulators_shots_are_the_reference(world, capsys):
     assert evaluated(f"{QUICK} --reference ref --json") == 0
     event = json.loads(capsys.readouterr().out.splitlines()[-1])
     rows = {row["method"]: row["figures"] for row in event["detail"]["figures"]}
-    assert (rows["simulator"]["frames"], rows["plain"]["frames"], rows["plain"]["truth"]["frames"]) == (6, 16, 6)
+    assert (rows["simulator"]["frames"], rows["LBS"]["frames"], rows["LBS"]["truth"]["frames"]) == (6, 16, 6)
     # The simulator minimises what is measured: it is lower than cloth that does nothing, and moves elsewhere.
-    assert rows["plain"]["truth"]["excess"] > 0 and rows["plain"]["truth"]["position"] > 0.001
-    assert rows["simulator"]["total"] == pytest.approx(rows["plain"]["truth"]["total"])
+    assert rows["LBS"]["truth"]["excess"] > 0 and rows["LBS"]["truth"]["position"] > 0.001
+    assert rows["simulator"]["total"] == pytest.approx(rows["LBS"]["truth"]["total"])
     assert rows["simulator"]["truth"] is None
 
 
@@ -82,7 +82,7 @@ def test_several_models_of_a_garment_share_its_table(world, capsys):
     (world / "again.safetensors").write_bytes((world / "model.safetensors").read_bytes())
     assert evaluated(f"again.safetensors {QUICK} --clips brief --stops 0 --loop 0") == 0
     lines = [line.split("|")[3].strip() for line in capsys.readouterr().out.split("\n\n")[0].splitlines()[2:]]
-    assert lines == ["plain", "ssilk (model)", "ssilk (again)"]
+    assert lines == ["LBS", "ssilk (model)", "ssilk (again)"]
 
 
 @pytest.mark.parametrize(

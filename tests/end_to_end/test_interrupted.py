@@ -87,7 +87,7 @@ def check_files() -> None:
     unfinished = tuple(f".{path.stem}.partial-" for path in (MODEL, STATE, CURVE))
     assert all(name.startswith(unfinished) for name in names - {str(path) for path in (MODEL, STATE, CURVE)})
     if CURVE.exists():
-        assert json.loads(CURVE.read_text())["plain"]
+        assert json.loads(CURVE.read_text())["lbs"]
     if STATE.exists():
         check_best()
 

@@ -111,7 +111,7 @@ LATE = """#usda 1.0
 def test_a_shot_starts_at_the_time_of_its_motion(world, rate, fps):
     """At 60 time codes and 30 frames a second, time code 120 is 2 s."""
     Path("late.usda").write_text(LATE)
-    assert run(f"{SHOT.replace('clip', 'late')} {rate} --plain --no-verify -o shot.usdc") == 0
+    assert run(f"{SHOT.replace('clip', 'late')} {rate} --lbs --no-verify -o shot.usdc") == 0
     stage = Usd.Stage.Open("shot.usdc")
     assert stage.GetStartTimeCode() / stage.GetTimeCodesPerSecond() == 2
     assert stage.GetTimeCodesPerSecond() == fps
@@ -127,10 +127,10 @@ def test_the_same_bake_gives_the_same_bytes(world):
 def test_a_pre_roll_changes_poses_and_no_times(world):
     assert run(f"{SHOT} -o shot.usdc --no-verify") == 0
     assert run(f"{SHOT} -o settled.usdc --pre-roll 0.5") == 0
-    plain, settled = Usd.Stage.Open("shot.usdc"), Usd.Stage.Open("settled.usdc")
+    lbs, settled = Usd.Stage.Open("shot.usdc"), Usd.Stage.Open("settled.usdc")
     for read in (Usd.Stage.GetStartTimeCode, Usd.Stage.GetEndTimeCode):
-        assert read(plain) == read(settled)
-    first = [np.array(animation(shot).GetRotationsAttr().Get(shot.GetStartTimeCode())) for shot in (plain, settled)]
+        assert read(lbs) == read(settled)
+    first = [np.array(animation(shot).GetRotationsAttr().Get(shot.GetStartTimeCode())) for shot in (lbs, settled)]
     np.testing.assert_array_equal(first[0][:3], first[1][:3])
     assert np.abs(first[0][3:] - first[1][3:]).max() > 1e-4
     assert run("verify settled.usdc") == 0
@@ -143,7 +143,7 @@ def test_a_pre_roll_out_of_range_is_refused(world, capsys, seconds):
 
 
 def test_plain_skinning_moves_with_the_body_alone(world):
-    assert run(f"{SHOT} -o plain.usdc --plain") == 0
+    assert run(f"{SHOT} -o plain.usdc --lbs") == 0
     stage = Usd.Stage.Open("plain.usdc")
     assert len(animation(stage).GetJointsAttr().Get()) == 3
     assert not animation(stage).GetBlendShapesAttr().Get()

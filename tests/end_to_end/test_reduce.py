@@ -110,7 +110,7 @@ def test_a_bake_keeps_to_its_budget_and_verifies_as_it_was_cut(world, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ("--quality game --plain", "--plain: plain skinning has no level of quality"),
+        ("--quality game --lbs", "--lbs: linear blend skinning has no level of quality"),
         ("--budget 1kB", "nothing fits 1 kB"),
         ("--quality game -o layers", "bake models that 'ssilk reduce' made"),
     ],

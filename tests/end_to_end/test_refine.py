@@ -99,7 +99,7 @@ def test_samples_within_frames_are_refined_too(there):
     ("words", "complaint"),
     [
         (["--refine", "-1"], "-1 iterations; 1 to 10000"),
-        (["--refine", "2", "--plain", "--refined-output", "joints"], "use --refined-output points"),
+        (["--refine", "2", "--lbs", "--refined-output", "joints"], "use --refined-output points"),
         (["--refine", "2", "--budget", "1MB"], "a budget for points"),
     ],
 )

@@ -61,7 +61,7 @@ def made(world, monkeypatch):
 def test_methods_stand_side_by_side_and_seeds_together(made, world):
     (header, *lines), figures = made(f"table1 models ncs.safetensors {WORLD}")
     assert header[:4] == ["garment", "method", "valid: L_tot [J]", "valid: collisions"] and len(header) == 8
-    assert [line[:2] for line in lines] == [["Skirt", "plain"], ["Skirt", "ssilk"], ["Skirt", "ncs*"]]
+    assert [line[:2] for line in lines] == [["Skirt", "LBS"], ["Skirt", "ssilk"], ["Skirt", "ncs*"]]
     assert "±" in lines[1][2] and "±" not in lines[2][2]  # two models are seeds of one method
     assert {row["model"] for row in figures} == {
         None,

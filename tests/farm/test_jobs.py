@@ -61,7 +61,7 @@ def test_numbers_that_name_no_task(text):
 def test_a_key_is_of_all_that_decides_what_is_written():
     key = task_key(TASK, CONTENTS)
     others = [task_key(replace(TASK, **{name: value}), CONTENTS) for name, value in (
-        ("fps", 24.0), ("samples", 2), ("target", "game4"), ("plain", True), ("body", False), ("points", True),
+        ("fps", 24.0), ("samples", 2), ("target", "game4"), ("lbs", True), ("body", False), ("points", True),
         ("garment", "hat"), ("shot", "run"), ("refine", 1),
     )]  # fmt: skip
     others += [task_key(TASK, {**CONTENTS, name: "1"}) for name in INPUTS]

@@ -13,7 +13,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdSkel, Vt
 from ssilk_core.assets import Floats, Motion, Scene
 from ssilk_core.errors import need
 from ssilk_core.files import replacing
-from ssilk_core.kinematics import plain_deformer, plain_poses
+from ssilk_core.kinematics import lbs_deformer, lbs_poses
 
 from .author import extent_array
 from .export import need_layer_suffix, save
@@ -107,9 +107,9 @@ def point_cache(
     with replacing(path) as temporary:
         shot = write_shot(
             temporary,
-            plain_deformer(scene),
+            lbs_deformer(scene),
             motion,
-            plain_poses(motion.frame_count),
+            lbs_poses(motion.frame_count),
             units=units,
             start=motion.start if start is None else start,
             samples_per_frame=samples_per_frame,

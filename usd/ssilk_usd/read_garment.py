@@ -53,7 +53,7 @@ def read_garment(
     skel = fitted_skeleton(prim, root)
     mesh = read_mesh(prim, garment_to_core(prim, skel))
     joints = skel.joints if skel else ()
-    return Garment(mesh, plain_skin(prim, joints, skeleton), _classes(prim))
+    return Garment(mesh, lbs_skin(prim, joints, skeleton), _classes(prim))
 
 
 def find_garment(stage: Usd.Stage, garment: str | None = None) -> Usd.Prim:
@@ -105,7 +105,7 @@ def garment_to_core(prim: Usd.Prim, skel: SkelSource | None) -> Floats:
     return skel.bind_to_core @ skel.world_to_bind @ world_matrix(prim)
 
 
-def plain_skin(prim: Usd.Prim, joints: tuple[str, ...], skeleton: Skeleton) -> SkinWeights | None:
+def lbs_skin(prim: Usd.Prim, joints: tuple[str, ...], skeleton: Skeleton) -> SkinWeights | None:
     """Return a garment's weights onto the character's joints alone, or None; those kept beside a rig go first."""
     if has_value(prim, PLAIN[0]):
         influences = read_influences(prim, joints, PLAIN)

@@ -21,7 +21,7 @@ from ssilk_core.events import Message, Reporter, silent
 from .author import bind_skin, define_mesh, matrix_array, prim_names, sorted_influences
 from .export import export, need_layer_suffix
 from .garment_api import apply_garment_api
-from .read_garment import find_garment, fitted_skeleton, garment_to_core, plain_skin
+from .read_garment import find_garment, fitted_skeleton, garment_to_core, lbs_skin
 from .read_mesh import CLASS, PROXIES, is_garment
 from .read_skeleton import find_skeleton
 from .read_skin import PLAIN, SKEL, leaf, match_joints, read_influences
@@ -151,7 +151,7 @@ def _rig_skin(
     lost = (weights.sum(axis=1) <= 0) & (influences.weights.sum(axis=1) > 0)
     if not lost.any():
         return SkinWeights(influences.path, indices, weights)
-    plain = plain_skin(prim, skel.joints, skeleton)
+    plain = lbs_skin(prim, skel.joints, skeleton)
     need(
         plain,
         influences.path,
@@ -298,7 +298,7 @@ def _bind_garment(
     _author_names(prim, PROXIES, proxies)
     _author_names(prim, PLAIN[2], plain_joints)
     _author_rows(prim, CLASS, scene.classes[:, None].astype(np.int32))
-    for name, rows in zip(PLAIN[:2], sorted_influences(scene.plain_skin)):
+    for name, rows in zip(PLAIN[:2], sorted_influences(scene.lbs_skin)):
         _author_rows(prim, name, rows)
 
 
