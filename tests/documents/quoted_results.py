@@ -156,6 +156,12 @@ def dynamics() -> Text:
             for method in METHODS
         )
         yield row(GARMENTS[garment], *errors)
+    error = {key: mean(cell["velocity_error"]) for key, cell in found.items() if "velocity_error" in cell}
+    others = [method for method in METHODS if method != "ssilk"]
+    nearest = [g for g in GARMENTS if all(error[g, "ssilk", "inertia"] < error[g, m, "inertia"] for m in others)]
+    yield f"nearest to the simulator in {len(nearest)} of {len(GARMENTS)} garments"
+    *first, last = (GARMENTS[g] for g in GARMENTS if error[g, "ssilk", "flips"] > error[g, "plain", "flips"])
+    yield f"On flips the {', the '.join(first)} and the {last} are further from it than with LBS"
 
 
 def ablations() -> Text:
@@ -260,7 +266,8 @@ def playing() -> Text:
     frame = result("table3_cuda")
     single = [1000 * frame[f"cape_{name}"]["full"][0] for name in ("ssilk", "ncs", "snug")]
     yield f"SSILK {single[0]:.1f} ms, NCS {single[1]:.1f} ms, SNUG {single[2]:.1f} ms"
-    yield f"standard deviation of {1000 * frame['cape_ssilk']['full'][1]:.1f} ms"
+    deviations = [1000 * frame[f"cape_{name}"]["full"][1] for name in ("ssilk", "ncs", "snug")]
+    yield f"standard deviations of {min(deviations):.1f} to {max(deviations):.1f} ms"
     for count in (1, 8, 64, 512, 2048):
         rates = [result("batch")[f"{count} {what}"] for what in ("network alone", "with vertices")]
         yield row(f"{count:,}", *(f"{rate['median [us]']:.0f}" for rate in rates), *(

@@ -53,7 +53,8 @@ def blanked(text: str, pattern: str) -> str:
 
 def words(quote: str) -> str:
     """Return a pattern for text whose lines may be broken anywhere, and which does not end within a number."""
-    return r"(?<![\d.])" + r"\s+".join(map(re.escape, quote.split())) + r"(?!\d|\.\d)"
+    first, *rest = map(re.escape, quote.split())
+    return first + rf"(?<![\d.]{first})" + "".join(rf"\s+{word}" for word in rest) + r"(?!\d|\.\d)"
 
 
 def unsourced(text: str, quotes: list[str]) -> list[str]:
