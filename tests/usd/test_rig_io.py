@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from scipy.spatial.transform import Rotation
+from ssilk_usd.facts import playback_rate
 from ssilk_usd.read_motion import read_motion
-from ssilk_usd.read_scene import read_scene
+from ssilk_usd.read_scene import read_rigged, read_scene
 from ssilk_usd.rig_io import read_proxy_rig, write_rigged_stage
 
 from ssilk_core import kinematics
@@ -160,6 +161,15 @@ def test_a_written_rig_reads_back(where, meters, up, tmp_path):
     assert rig.joint_names == PROXIES and rig.parents.tolist() == [1, 3, 3]
     np.testing.assert_allclose(rig.bind_transforms, scene.rig.bind_transforms, atol=1e-9)
     np.testing.assert_allclose(rig.skin.dense(6), WEIGHTS, atol=1e-7)
+
+
+def test_garments_with_proxies_are_found(tmp_path):
+    _, source, out = rigged(tmp_path)
+    ((skeleton, garment, rig),) = read_rigged(out)
+    assert (skeleton.joint_names, rig.joint_names) == (JOINTS, PROXIES)
+    np.testing.assert_allclose(garment.skin.dense(3), PLAIN, atol=1e-7)
+    np.testing.assert_allclose(rig.skin.dense(6), WEIGHTS, atol=1e-7)
+    assert (read_rigged(source), playback_rate(out)) == ([], 30)
 
 
 @pytest.mark.parametrize("where", ["skelroot", "beside", "own file"])

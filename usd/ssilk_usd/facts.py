@@ -40,6 +40,16 @@ def stage_facts(source: StageLike) -> StageFacts:
     )
 
 
+def playback_rate(source: StageLike) -> float | None:
+    """Return the frames per second of a stage that has a time range [1/s]; None for one that has none.
+
+    Raises:
+        SsilkError: not a readable stage.
+    """
+    stage = open_stage(source)
+    return float(stage.GetFramesPerSecond()) if stage.HasAuthoredTimeCodeRange() else None
+
+
 def animated(motion: Motion, skeleton: Skeleton) -> tuple[Ints, Floats]:
     """Return which joints of a skeleton a motion's SkelAnimation animates, and when it has samples [s].
 

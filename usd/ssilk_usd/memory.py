@@ -12,6 +12,7 @@ from pathlib import Path
 from ssilk_core.errors import need
 
 VARIABLE, USUAL = "SSILK_READ_GIB", 1.0  # GiB; a character of a million vertices takes 0.6
+HOST = "bpy"  # Blender's own module
 STACK = 8 << 20  # bytes of each thread that USD may start meanwhile
 
 
@@ -30,9 +31,10 @@ def allowed_gib() -> float:
 def bounded_memory(gib: float | None = None) -> Iterator[None]:
     """Let this process take so much more than it has, or `allowed_gib`; USD and numpy then refuse what does not fit.
 
-    Where the system knows no such bound (all but Linux), and within a smaller one, nothing changes.
+    Nothing changes where the system has no such bound (all but Linux), within a smaller bound, and inside Blender,
+    whose other threads would meet the bound too.
     """
-    if not sys.platform.startswith("linux"):
+    if not sys.platform.startswith("linux") or HOST in sys.modules:
         yield
         return
     import resource

@@ -11,9 +11,10 @@ from ssilk_core.assets import Body, Character, Floats
 from ssilk_core.errors import need
 from ssilk_core.events import Message, Reporter, silent
 
+from .names import SKEL
 from .read_mesh import is_drawn, is_garment, read_mesh
 from .read_skeleton import bound_skeleton, character_skeleton, find_skeleton
-from .read_skin import SKEL, read_skin
+from .read_skin import read_skin
 from .read_spaces import SkelSource
 from .read_stage import (
     PRIMS,

@@ -9,10 +9,11 @@ from pxr import Usd, UsdGeom
 from ssilk_core.assets import Floats, Garment, Ints, Skeleton, SkinWeights
 from ssilk_core.errors import need
 
+from .names import CLASS, PLAIN, PROXIES
 from .read_character import geom_to_core, is_skinned
-from .read_mesh import CLASS, PROXIES, is_drawn, is_garment, read_mesh
+from .read_mesh import is_drawn, is_garment, read_mesh
 from .read_skeleton import bound_skeleton, find_skeleton, skeletons
-from .read_skin import PLAIN, read_influences, read_skin
+from .read_skin import read_influences, read_skin
 from .read_spaces import SkelSource
 from .read_stage import (
     EARLIEST,

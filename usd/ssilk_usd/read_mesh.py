@@ -9,12 +9,9 @@ from pxr import Sdf, Usd, UsdGeom
 from ssilk_core.assets import Floats, Ints, Mesh
 from ssilk_core.errors import need
 
+from .names import CLASS, GARMENT, PROXIES
 from .read_polygons import triangulate
 from .read_stage import EARLIEST, apply, has_value, location, value
-
-CLASS = "primvars:ssilk:class"
-GARMENT = "ssilk:garment"
-PROXIES = "ssilk:proxyJoints"
 
 
 def is_garment(prim: Usd.Prim) -> bool:

@@ -85,7 +85,7 @@ def read_motion(source: StageLike, skeleton: Skeleton, *, prim: str | None = Non
     joints = tuple(str(name) for name in UsdSkel.Animation(animation).GetJointsAttr().Get() or ())
     match = _matched(joints, skeleton, where)
     codes, fps = _time_codes(stage, animation, placed)
-    rotations, translations = _samples(animation, codes, len(joints), where)
+    rotations, translations = read_samples(animation, codes, len(joints), where)
     placements = np.stack([world_matrix(placed, code) for code in codes]) if placed else np.eye(4)[None]
     if placed:
         need_similarity(placed, placements)
@@ -173,7 +173,7 @@ def _time_codes(stage: Usd.Stage, animation: Usd.Prim, placed: Usd.Prim | None) 
     return first + step * np.arange(int((last - first) / step + 1e-6) + 1), fps
 
 
-def _samples(animation: Usd.Prim, codes: Floats, count: int, where: str) -> tuple[Floats, Floats]:
+def read_samples(animation: Usd.Prim, codes: Floats, count: int, where: str) -> tuple[Floats, Floats]:
     """Return rotations (F, N, 4) as (w, x, y, z) and translations (F, N, 3) in stage units."""
     rotations = _sampled(animation, "rotations", codes, (count, 4), where)
     translations = _sampled(animation, "translations", codes, (count, 3), where)

@@ -9,7 +9,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdSkel
 from ssilk_core.assets import Floats, Ints, Skeleton
 from ssilk_core.errors import fail, need
 
-from .read_mesh import PROXIES
+from .names import PROXIES
 from .read_skin import match_joints
 from .read_spaces import SkelSource, joints_to_core, need_similarity
 from .read_stage import (

@@ -12,16 +12,12 @@ from pxr import Usd, UsdGeom
 from ssilk_core.assets import Floats, Ints, SkinWeights
 from ssilk_core.errors import need
 
+from .names import JOINTS, SKEL
 from .read_stage import EARLIEST, inherited, location
-
-JOINTS = "skel:joints"
-# Indices, weights and, where the mesh names its joints, their order.
-SKEL = ("primvars:skel:jointIndices", "primvars:skel:jointWeights", JOINTS)
-PLAIN = ("primvars:ssilk:plainJointIndices", "primvars:ssilk:plainJointWeights", "ssilk:plainJoints")
 
 
 @dataclass(frozen=True, eq=False)
-class Influences:
+class AuthoredInfluences:
     """Influences as authored: `indices` (V, I) into the names `joints`, and `weights` (V, I)."""
 
     path: str
@@ -88,7 +84,7 @@ def read_skin(prim: Usd.Prim, joints: tuple[str, ...], names: tuple[str, ...]) -
 
 def read_influences(
     prim: Usd.Prim, joints: tuple[str, ...], properties: tuple[str, str, str] = SKEL
-) -> Influences | None:
+) -> AuthoredInfluences | None:
     """Read the influences of a mesh under the names `properties`, over its own joint order or else `joints`."""
     where = location(prim)
     indices, weights = (inherited(prim, name) for name in properties[:2])
@@ -113,7 +109,7 @@ def read_influences(
     )
     own = inherited(prim, properties[2]) or inherited(prim, JOINTS)
     names = joints if own is None else tuple(own.Get(EARLIEST) or ())
-    return Influences(where, names, _checked(rows_of_indices, rows_of_weights, names, where), rows_of_weights)
+    return AuthoredInfluences(where, names, _checked(rows_of_indices, rows_of_weights, names, where), rows_of_weights)
 
 
 def _rows(attribute: Usd.Attribute, point_count: int, where: str) -> Floats:

@@ -18,13 +18,21 @@ from ssilk_core.assets import Floats, Garment, Ints, ProxyRig, Scene, Skeleton, 
 from ssilk_core.errors import fail, need
 from ssilk_core.events import Message, Reporter, silent
 
-from .author import bind_skin, define_mesh, matrix_array, prim_names, sorted_influences
+from .author import (
+    bind_skin,
+    define_mesh,
+    keep_plain_skin,
+    mark_garment,
+    matrix_array,
+    prim_names,
+)
 from .export import export, need_layer_suffix
 from .garment_api import apply_garment_api
+from .names import CLASS, PLAIN, PROXIES, SKEL
 from .read_garment import find_garment, fitted_skeleton, garment_to_core, plain_skin
-from .read_mesh import CLASS, PROXIES, is_garment
+from .read_mesh import is_garment
 from .read_skeleton import find_skeleton
-from .read_skin import PLAIN, SKEL, leaf, match_joints, read_influences
+from .read_skin import leaf, match_joints, read_influences
 from .read_spaces import SkelSource
 from .read_stage import (
     PRIMS,
@@ -295,23 +303,5 @@ def _bind_garment(
     binding = UsdSkel.BindingAPI(prim)
     binding.CreateGeomBindTransformAttr(Gf.Matrix4d(to_bind.T.tolist()))
     binding.CreateJointsAttr(Vt.TokenArray((*plain_joints, *proxies)))
-    _author_names(prim, PROXIES, proxies)
-    _author_names(prim, PLAIN[2], plain_joints)
-    _author_rows(prim, CLASS, scene.classes[:, None].astype(np.int32))
-    for name, rows in zip(PLAIN[:2], sorted_influences(scene.plain_skin)):
-        _author_rows(prim, name, rows)
-
-
-def _author_names(prim: Usd.Prim, name: str, names: tuple[str, ...]) -> None:
-    attribute = prim.CreateAttribute(name, Sdf.ValueTypeNames.TokenArray, False, Sdf.VariabilityUniform)
-    attribute.Set(Vt.TokenArray(names))
-
-
-def _author_rows(prim: Usd.Prim, name: str, rows: np.ndarray) -> None:
-    """Author a vertex primvar of whole numbers or floats, shape (V, elementSize)."""
-    whole = np.issubdtype(rows.dtype, np.integer)
-    kind = Sdf.ValueTypeNames.IntArray if whole else Sdf.ValueTypeNames.FloatArray
-    array = (Vt.IntArray if whole else Vt.FloatArray).FromNumpy(np.ascontiguousarray(rows).reshape(-1))
-    primvar = UsdGeom.PrimvarsAPI(prim).CreatePrimvar(name.removeprefix("primvars:"), kind, UsdGeom.Tokens.vertex)
-    primvar.SetElementSize(rows.shape[1])
-    primvar.Set(array)
+    mark_garment(prim, scene.classes, proxies)
+    keep_plain_skin(prim, scene.plain_skin, plain_joints)

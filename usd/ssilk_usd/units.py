@@ -8,12 +8,15 @@ roots' transforms, and of all other joints the length of their translations alon
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from pxr import Usd, UsdGeom
 
 from ssilk_core.assets import Floats
 from ssilk_core.errors import need
+
+if TYPE_CHECKING:
+    from pxr import Usd
 
 _TO_Y_UP = {
     "Y": np.eye(3),
@@ -35,6 +38,8 @@ class StageUnits:
         Raises:
             SsilkError: metersPerUnit is not positive, or the up axis is neither Y nor Z.
         """
+        from pxr import UsdGeom
+
         where, meters = stage.GetRootLayer().identifier, UsdGeom.GetStageMetersPerUnit(stage)
         need(0 < meters < np.inf, where, f"metersPerUnit is {meters}", "it must be positive", "set it in the file")
         axis = str(UsdGeom.GetStageUpAxis(stage))
@@ -52,6 +57,14 @@ class StageUnits:
         matrix = np.eye(4)
         matrix[:3, :3] = self.rotation * self.meters_per_unit
         return matrix
+
+    def points_to_core(self, points: Floats) -> Floats:
+        """Return points in the stage's units and axes, shape (..., 3), in metres, y up."""
+        return np.asarray(points) @ self.rotation.T * self.meters_per_unit
+
+    def transforms_to_core(self, transforms: Floats) -> Floats:
+        """Return rigid joint-to-world transforms of the stage, shape (..., 4, 4), in metres, y up."""
+        return self.matrix @ transforms @ scaling(1 / self.meters_per_unit)
 
     def points_from_core(self, points: Floats) -> Floats:
         """Return points [m], y up, shape (..., 3), in the stage's units and axes."""

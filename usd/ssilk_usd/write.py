@@ -1,21 +1,59 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plain files of a garment mesh and of a motion, as artists and motion libraries hand them over."""
+"""Plain files of characters, garments and motions, as artists and motion libraries hand them over."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
-from pxr import Gf, Kind, Usd, UsdGeom, UsdSkel, Vt
+from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
-from ssilk_core.assets import Mesh, Motion, Skeleton
+from ssilk_core.assets import Character, Garment, Mesh, Motion, ProxyRig, Skeleton
 from ssilk_core.files import replacing
 
-from .author import define_mesh, prim_names
+from .author import bind_skin, define_mesh, define_skeleton, keep_plain_skin, mark_garment, prim_names
 from .export import new_stage, save
+from .names import GARMENT
 from .units import StageUnits
 
 CORE_UNITS = StageUnits(1.0, UsdGeom.Tokens.y)
+
+
+def write_scene(
+    path: str | Path, character: Character, garment: Garment, rig: ProxyRig | None = None, *, units: StageUnits
+) -> None:
+    """Write a character with a garment at its bind pose, as `read_scene` reads them.
+
+    SkelRoot, Skeleton and meshes are named after the last parts of their paths. Weights, classes and proxies are
+    left out where there are none; the garment's weights over the character's joints stand beside those of its rig.
+
+    Args:
+        path: the file to write: .usdc, .usd or .usda.
+        units: units and up axis of the stage.
+
+    Raises:
+        SsilkError: the joint paths spell another hierarchy than the parents, or the file cannot be written.
+    """
+    skeleton, bodies = character.skeleton, character.bodies
+    with replacing(path) as temporary:
+        stage = new_stage(temporary, units)
+        root = UsdSkel.Root.Define(stage, _root_path(character.path))
+        stage.SetDefaultPrim(root.GetPrim())
+        names = prim_names([skeleton.path, garment.mesh.path, *(body.mesh.path for body in bodies)])
+        paths = [root.GetPath().AppendChild(name) for name in names]
+        joints = define_skeleton(stage, paths[0], skeleton, rig, units)
+        UsdSkel.BindingAPI.Apply(root.GetPrim()).CreateSkeletonRel().SetTargets([joints.GetPath()])
+        mesh = define_mesh(stage, paths[1], garment.mesh, units)
+        skin = garment.skin if rig is None else rig.skin
+        if skin is not None:
+            bind_skin(mesh, skin, joints)
+        mesh.GetPrim().CreateAttribute(GARMENT, Sdf.ValueTypeNames.Bool).Set(True)
+        mark_garment(mesh.GetPrim(), garment.classes, None if rig is None else rig.joint_names)
+        if rig is not None and garment.skin is not None:
+            keep_plain_skin(mesh.GetPrim(), garment.skin, skeleton.joint_names)
+        for place, body in zip(paths[2:], bodies):
+            bind_skin(define_mesh(stage, place, body.mesh, units), body.skin, joints)
+        save(stage.GetRootLayer(), path)
 
 
 def write_garment(path: str | Path, mesh: Mesh) -> None:
