@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from ssilk_core.errors import need
+from ssilk_core.errors import fail
 
 VARIABLE, USUAL = "SSILK_READ_GIB", 1.0  # GiB; a character of a million vertices takes 0.6
 HOST = "bpy"  # Blender's own module
@@ -23,7 +23,8 @@ def allowed_gib() -> float:
         allowed = float(text)
     except ValueError:
         allowed = 0.0
-    need(0 < allowed < 1e6, VARIABLE, f"'{text}'", "a number of GiB is needed", "correct it in the environment")
+    if not 0 < allowed < 1e6:
+        fail(VARIABLE, f"'{text}'", "a number of GiB is needed", "correct it in the environment")
     return allowed
 
 

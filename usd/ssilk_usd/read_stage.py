@@ -13,7 +13,7 @@ import numpy as np
 from pxr import Pcp, Tf, Usd, UsdGeom, UsdUtils
 
 from ssilk_core.assets import Floats
-from ssilk_core.errors import fail, need
+from ssilk_core.errors import fail
 from ssilk_core.files import sha256
 
 from .garment_api import register_schema
@@ -65,7 +65,8 @@ def open_stage(source: StageLike) -> Usd.Stage:
     """
     if isinstance(source, Usd.Stage):
         return source
-    need(Path(source).is_file(), str(source), "there is no such file", "a USD file is needed", "check the path")
+    if not Path(source).is_file():
+        fail(str(source), "there is no such file", "a USD file is needed", "check the path")
     quiet = UsdUtils.CoalescingDiagnosticDelegate()  # what USD would print, the errors below say
     stage = Usd.Stage.Open(str(source), Usd.Stage.LoadAll)
     stage.Reload()
@@ -76,7 +77,8 @@ def open_stage(source: StageLike) -> Usd.Stage:
         if isinstance(error, _MISSING)
     ]
     free_when_closed(stage.GetUsedLayers())
-    need(not missing, str(source), " and ".join(missing[:2]), "every layer must be found", "restore it or its path")
+    if missing:
+        fail(str(source), " and ".join(missing[:2]), "every layer must be found", "restore it or its path")
     return stage
 
 

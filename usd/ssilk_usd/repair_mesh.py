@@ -11,7 +11,7 @@ import numpy as np
 from pxr import Usd, UsdGeom
 
 from ssilk_core.assets import Floats, Ints
-from ssilk_core.errors import need
+from ssilk_core.errors import fail
 
 from .read_stage import EARLIEST, location, value
 
@@ -129,13 +129,13 @@ def _check_length(attribute: Usd.Attribute, size: int, interpolation: str, repai
     expected = rows.get(interpolation, len(repair.new_index))
     for time in _times(attribute):
         found = len(attribute.Get(time))
-        need(
-            found == expected * size,
-            location(attribute.GetPrim()),
-            f"{attribute.GetName()} holds {found} values for {expected} x {size} ({interpolation} interpolation)",
-            "one for each is needed",
-            "author it again, or remove it",
-        )
+        if found != expected * size:
+            fail(
+                location(attribute.GetPrim()),
+                f"{attribute.GetName()} holds {found} values for {expected} x {size} ({interpolation} interpolation)",
+                "one for each is needed",
+                "author it again, or remove it",
+            )
 
 
 def _torn(attribute: Usd.Attribute, size: int, repair: MeshRepair) -> bool:

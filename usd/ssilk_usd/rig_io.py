@@ -15,7 +15,7 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from ssilk_core.assets import Floats, Garment, Ints, ProxyRig, Scene, Skeleton, SkinWeights
-from ssilk_core.errors import fail, need
+from ssilk_core.errors import fail
 from ssilk_core.events import Message, Reporter, silent
 
 from .author import (
@@ -125,23 +125,18 @@ def _proxy_parents(skel: SkelSource, mine: Ints, skeleton: Skeleton, where: str)
     parents = []
     for index in mine:
         above = int(skel.parents[index])
-        need(
-            above >= 0,
-            where,
-            f"proxy '{skel.joints[index]}' has no parent",
-            "proxies hang from joints",
-            "reparent it",
-        )
+        if above < 0:
+            fail(where, f"proxy '{skel.joints[index]}' has no parent", "proxies hang from joints", "reparent it")
         combined = own.get(above, -1)
         if combined < 0 and not skel.owners[above]:
             combined = match_joints((skel.joints[above],), skeleton.joint_names)[0]
-        need(
-            combined >= 0,
-            where,
-            f"proxy '{skel.joints[index]}' hangs from '{skel.joints[above]}'",
-            "a proxy hangs from a joint of the character or from a proxy of the same garment",
-            "reparent it",
-        )
+        if combined < 0:
+            fail(
+                where,
+                f"proxy '{skel.joints[index]}' hangs from '{skel.joints[above]}'",
+                "a proxy hangs from a joint of the character or from a proxy of the same garment",
+                "reparent it",
+            )
         parents.append(combined)
     return np.array(parents, dtype=np.int64)
 
@@ -160,14 +155,13 @@ def _rig_skin(
     if not lost.any():
         return SkinWeights(influences.path, indices, weights)
     plain = plain_skin(prim, skel.joints, skeleton)
-    need(
-        plain,
-        influences.path,
-        f"{np.count_nonzero(lost)} vertices are weighted to joints that are gone, and to no others",
-        "each vertex needs a weight",
-        "paint them, or rig the garment again",
-    )
-    assert plain is not None
+    if plain is None:
+        fail(
+            influences.path,
+            f"{np.count_nonzero(lost)} vertices are weighted to joints that are gone, and to no others",
+            "each vertex needs a weight",
+            "paint them, or rig the garment again",
+        )
     report(Message(f"{influences.path}: {np.count_nonzero(lost)} vertices lost all proxies and follow the body"))
     width = max(indices.shape[1], plain.indices.shape[1])
     mixed = [

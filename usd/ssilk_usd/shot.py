@@ -11,7 +11,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom, Vt
 
 from ssilk_core.assets import Deformer, GarmentPose, Motion
-from ssilk_core.errors import fail, need
+from ssilk_core.errors import fail
 from ssilk_core.files import replacing
 
 from .author import define_asset
@@ -167,7 +167,8 @@ def _checked(poses: Iterable[GarmentPose], deformer: Deformer, motion: Motion) -
     """Yield the chunks; raise unless they are of this garment and cover the motion in order."""
     where, count = deformer.scene.garment.mesh.path, 0
     for pose in poses:
-        need(pose.start == count, where, f"a chunk that starts at frame {pose.start}", f"frame {count} comes next")
+        if pose.start != count:
+            fail(where, f"a chunk that starts at frame {pose.start}", f"frame {count} comes next")
         _check_pose(pose, deformer)
         count += pose.frame_count
         _need_frames(count <= motion.frame_count, count, deformer, motion)
@@ -176,30 +177,30 @@ def _checked(poses: Iterable[GarmentPose], deformer: Deformer, motion: Motion) -
 
 
 def _need_frames(enough: bool, count: int, deformer: Deformer, motion: Motion) -> None:
-    need(
-        enough,
-        deformer.scene.garment.mesh.path,
-        f"{count} garment frames for the {motion.frame_count} of {motion.path}",
-        "each frame of the motion needs one",
-    )
+    if not enough:
+        fail(
+            deformer.scene.garment.mesh.path,
+            f"{count} garment frames for the {motion.frame_count} of {motion.path}",
+            "each frame of the motion needs one",
+        )
 
 
 def _check_pose(pose: GarmentPose, deformer: Deformer) -> None:
     where = deformer.scene.garment.mesh.path
     frames, proxies, shapes = pose.frame_count, deformer.scene.rig.proxy_count, deformer.shape_count
-    need(
-        pose.rotations.shape == (frames, proxies, 4) and pose.weights.shape == (frames, shapes),
-        where,
-        f"proxy rotations of shape {pose.rotations.shape} and blendshape weights of shape {pose.weights.shape}",
-        f"({frames}, {proxies}, 4) and ({frames}, {shapes}) are needed",
-    )
-    need(
-        np.isfinite(pose.rotations).all(),
-        where,
-        f"NaN or infinity among the proxy rotations from frame {pose.start}",
-        "rotations are unit quaternions",
-        "train the model again, or for longer",
-    )
+    if pose.rotations.shape != (frames, proxies, 4) or pose.weights.shape != (frames, shapes):
+        fail(
+            where,
+            f"proxy rotations of shape {pose.rotations.shape} and blendshape weights of shape {pose.weights.shape}",
+            f"({frames}, {proxies}, 4) and ({frames}, {shapes}) are needed",
+        )
+    if not np.isfinite(pose.rotations).all():
+        fail(
+            where,
+            f"NaN or infinity among the proxy rotations from frame {pose.start}",
+            "rotations are unit quaternions",
+            "train the model again, or for longer",
+        )
     wrong = np.argwhere(~((pose.weights >= 0) & (pose.weights <= 1)))
     if wrong.size:
         frame, shape = wrong[0]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ssilk_core.assets import Floats
-from ssilk_core.errors import need
+from ssilk_core.errors import fail
 
 if TYPE_CHECKING:
     from pxr import Usd
@@ -41,9 +41,11 @@ class StageUnits:
         from pxr import UsdGeom
 
         where, meters = stage.GetRootLayer().identifier, UsdGeom.GetStageMetersPerUnit(stage)
-        need(0 < meters < np.inf, where, f"metersPerUnit is {meters}", "it must be positive", "set it in the file")
+        if not 0 < meters < np.inf:
+            fail(where, f"metersPerUnit is {meters}", "it must be positive", "set it in the file")
         axis = str(UsdGeom.GetStageUpAxis(stage))
-        need(axis in _TO_Y_UP, where, f"upAxis is '{axis}'", "it is Y or Z", "set it in the file")
+        if axis not in _TO_Y_UP:
+            fail(where, f"upAxis is '{axis}'", "it is Y or Z", "set it in the file")
         return cls(meters, axis)
 
     @property
