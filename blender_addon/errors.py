@@ -3,12 +3,8 @@
 
 from __future__ import annotations
 
+from ssilk_core.errors import SsilkError
 
-class SetupError(Exception):
+
+class SetupError(SsilkError):
     """A scene, a setting or a process is not as it must be; operators report it and change nothing."""
-
-
-def need(condition: object, sentence: str) -> None:
-    """Raise `SetupError` with `sentence` unless `condition` holds."""
-    if not condition:
-        raise SetupError(sentence)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import bpy
 
-from ..errors import SetupError, need
+from ..errors import SetupError
 from ..outside import python as pythons
 from ..outside.work import Work
 from ..preferences import ROOT, handshake, interpreter, preferences, state
@@ -41,7 +41,8 @@ class FindPython(tasks.OutsideOperator, bpy.types.Operator):
 
     def prepare(self, context: bpy.types.Context) -> Work:
         found = pythons.find(places())
-        need(found, "No Python with ssilk was found; choose it, or create an environment.")
+        if not found:
+            raise SetupError("No Python with ssilk was found; choose it, or create an environment.")
         preferences(context).python = found[0]
         return ask(found[0])
 
@@ -70,7 +71,8 @@ class CreateEnvironment(tasks.OutsideOperator, bpy.types.Operator):
 
     def prepare(self, context: bpy.types.Context) -> Work:
         wheel = source(context)
-        need(Path(wheel).exists(), f"'{wheel}' does not exist; choose a wheel or a project folder of ssilk.")
+        if not Path(wheel).exists():
+            raise SetupError(f"'{wheel}' does not exist; choose a wheel or a project folder of ssilk.")
         made = folder()
         python = str(pythons.venv_python(made))
         commands = [*pythons.venv_commands(sys.executable, made, wheel), pythons.probe_command(python)]
@@ -100,7 +102,8 @@ def greet(context: bpy.types.Context, work: Work) -> str:
     """
     settings = preferences(context)
     settings.handshake = json.dumps(work.result)
-    need(not handshake(settings).mismatch, handshake(settings).mismatch)
+    if handshake(settings).mismatch:
+        raise SetupError(handshake(settings).mismatch)
     return state(settings)[0]
 
 

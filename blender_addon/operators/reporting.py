@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..errors import SetupError
+from ssilk_core.errors import SsilkError
 
 
 class RefusingOperator:
@@ -35,7 +35,7 @@ class ReportingOperator(RefusingOperator):
         """Do the work and report it."""
         try:
             told = self.apply(context)
-        except SetupError as error:
+        except SsilkError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         if told:

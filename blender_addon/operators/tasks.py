@@ -7,6 +7,8 @@ import time
 
 import bpy
 
+from ssilk_core.errors import SsilkError
+
 from ..errors import SetupError
 from ..outside.work import Work
 from .reporting import RefusingOperator
@@ -78,7 +80,7 @@ class OutsideOperator(RefusingOperator):
         global current
         try:
             self.work = self.prepare(context)
-        except SetupError as error:
+        except SsilkError as error:
             self.report({"ERROR"}, str(error))
             return False
         current = self.work
@@ -92,7 +94,7 @@ class OutsideOperator(RefusingOperator):
             if reason:
                 raise SetupError(reason)
             self.report({"INFO"}, self.finish(context, work))
-        except SetupError as error:
+        except SsilkError as error:
             self.report({"WARNING" if work.cancelled else "ERROR"}, str(error))
             return {"CANCELLED"}
         finally:

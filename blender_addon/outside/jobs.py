@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..errors import SetupError, need
+from ..errors import SetupError
 from .process import environment
 from .runner import BEAT, CANCEL, ORDER, STATE
 
@@ -112,8 +112,10 @@ def resume(python: str, folder: Path) -> None:
         SetupError: it works already, its files are gone, or the Python cannot be started.
     """
     state, order = read_state(folder), _read(folder / ORDER)
-    need(order, f"There is no training in {folder} any more; train again.")
-    need(not (state and state.alive), "The training is under way already.")
+    if not order:
+        raise SetupError(f"There is no training in {folder} any more; train again.")
+    if state and state.alive:
+        raise SetupError("The training is under way already.")
     _write(folder / ORDER, {"command": [*(word for word in order["command"] if word != "--resume"), "--resume"]})
     _launch(python, folder)
 

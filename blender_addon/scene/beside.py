@@ -14,7 +14,7 @@ from .armature import read_joints
 from .garment import armature_of
 from .heat import hide
 from .models import model_of
-from .trained import Trained
+from .trained import TrainedGarment
 from .weights import write_groups
 
 OWNER = "ssilk_plain_of"  # custom property of the empty and the copy: the garment
@@ -30,12 +30,11 @@ def put_beside(garment: bpy.types.Object) -> None:
     """Show a copy without proxies and shapes to the side. In object mode.
 
     Raises:
-        SetupError: there is no model, or it is of other bones.
+        SsilkError: there is no model, it cannot be read, or it is of other bones.
     """
     armature = armature_of(garment)
     joints = read_joints(armature, garment)
-    trained = Trained(model_of(garment), joints, bpy.context.scene.unit_settings.scale_length)
-    copy = _plain_copy(garment, trained)
+    copy = _plain_copy(garment, TrainedGarment(model_of(garment), joints))
     collection = bpy.data.collections.new(f"{garment.name} plain")
     collection.objects.link(copy)
     shown = bpy.data.objects.new(f"{garment.name} plain, beside", None)
@@ -72,7 +71,7 @@ def _clear_shapes(copy: bpy.types.Object) -> None:
         bpy.data.batch_remove([left])
 
 
-def _plain_copy(garment: bpy.types.Object, trained: Trained) -> bpy.types.Object:
+def _plain_copy(garment: bpy.types.Object, trained: TrainedGarment) -> bpy.types.Object:
     copy = garment.copy()
     copy.data, copy.name = garment.data.copy(), f"{garment.name} plain"
     copy[OWNER] = garment

@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import bpy
 
-from ..contract.findings import Finding
+from ssilk_core.preflight.finding import Finding
+
 from .armature import is_evenly_scaled
 from .garment import armature_of, shaping_modifiers
 
@@ -13,7 +14,7 @@ SCALE = "unequal-scale"
 
 
 def scene_findings(garment: bpy.types.Object) -> list[Finding]:
-    """Return what has to be mended before ssilk can look at a garment.
+    """Return what has to be mended before ssilk can look at a garment; objects stand for prims.
 
     Raises:
         SetupError: it has no armature, or several.
@@ -21,12 +22,12 @@ def scene_findings(garment: bpy.types.Object) -> list[Finding]:
     armature, found = armature_of(garment), []
     if not is_evenly_scaled(armature):
         found.append(Finding(
-            severity="error", code=SCALE, target=armature.name, found="its bones are scaled unequally or mirrored",
+            severity="error", code=SCALE, prim=armature.name, found="its bones are scaled unequally or mirrored",
             why="joints turn and move, they have no scale", fix="apply its scale (Ctrl A)", fixable=True,
         ))  # fmt: skip
     found += [
         Finding(
-            severity="error", code="shaping-modifier", target=garment.name,
+            severity="error", code="shaping-modifier", prim=garment.name,
             found=f"its modifier '{modifier.name}' shapes it before bones move it",
             why="what is trained are the vertices that bones move", fix="apply the modifier",
         )

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import bpy
 import numpy as np
 
-from ..contract.edits import Edits
+from ..edits import Edits
 from .armature import MADE, collection_of, keys_of, made_collection, proxy_names
 from .weights import SAME_WEIGHTS, signature
 from .worn import own_groups

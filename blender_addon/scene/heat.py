@@ -15,7 +15,7 @@ import numpy as np
 from mathutils.bvhtree import BVHTree
 
 from .. import heat
-from ..errors import SetupError, need
+from ..errors import SetupError
 from .garment import armature_of, bodies_of
 from .shapes import rest_points
 
@@ -105,7 +105,8 @@ def show(garment: bpy.types.Object, measured: Measured, red: float) -> None:
         SetupError: it has other vertices by now.
     """
     same = len(garment.data.vertices) == len(measured.values)
-    need(same, f"'{garment.name}' was edited while it was measured; look again.")
+    if not same:
+        raise SetupError(f"'{garment.name}' was edited while it was measured; look again.")
     garment.ssilk.heat, garment.ssilk.heat_red = measured.kind, red
     _paint(garment.data, measured, red)
 
@@ -127,10 +128,11 @@ def _paint(mesh: bpy.types.Mesh, measured: Measured, red: float) -> None:
 
 def _need_same_vertices(garment: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> None:
     shown, count = len(garment.evaluated_get(depsgraph).data.vertices), len(garment.data.vertices)
-    need(
-        shown == count,
-        f"A modifier gives '{garment.name}' {shown} vertices where its mesh has {count}; switch it off in viewports.",
-    )
+    if shown != count:
+        raise SetupError(
+            f"A modifier gives '{garment.name}' {shown} vertices where its mesh has {count}; switch it off in "
+            "viewports."
+        )
 
 
 def _world_points(thing: bpy.types.Object) -> np.ndarray:

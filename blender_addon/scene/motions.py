@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import bpy
 
-from ..errors import SetupError, need
+from ..errors import SetupError
 from .keys import SLOTS, curves_of, is_baked
 
 TIMELINE, ACTION, STRIP, FILE = "TIMELINE", "ACTION", "STRIP", "FILE"
@@ -109,7 +109,8 @@ def _bone(path: str) -> str:
 
 def _action(source: Source) -> bpy.types.Action:
     action = bpy.data.actions.get(source.name)
-    need(action, f"The action '{source.name}' is gone; find the motions again.")
+    if not action:
+        raise SetupError(f"The action '{source.name}' is gone; find the motions again.")
     return action
 
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 import bpy
 from bpy.app.handlers import persistent
 
-from ..core import core
-from ..errors import SetupError
+from ssilk_core.errors import SsilkError
+
 from .live import Live
 from .models import model_of
 
@@ -126,7 +126,7 @@ def _attempt(uid: int, call, *arguments: object) -> object:  # type: ignore[no-u
     """Return what a call gives; a garment for which it fails is played no longer, and the panel says why."""
     try:
         return call(*arguments)
-    except (SetupError, core("errors").SsilkError) as error:
+    except SsilkError as error:
         _played.pop(uid, None)
         _reasons[uid] = str(error)
         return None

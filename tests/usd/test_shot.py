@@ -18,8 +18,9 @@ from ssilk_usd.read_garment import read_garment
 from ssilk_usd.read_motion import read_motion
 from ssilk_usd.read_polygons import triangulate
 from ssilk_usd.read_scene import read_scene
-from ssilk_usd.read_shot import SkinnedGarment, read_baked
+from ssilk_usd.read_shot import read_baked
 from ssilk_usd.shot import write_shot
+from ssilk_usd.skinned import SkinnedGarment
 from ssilk_usd.units import StageUnits
 from ssilk_usd.write import write_scene
 

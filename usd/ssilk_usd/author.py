@@ -16,7 +16,7 @@ from ssilk_core.errors import fail
 from ssilk_core.kinematics import local_transforms, world_transforms
 
 from .garment_api import GarmentRecord, apply_garment_api
-from .names import CLASS, PLAIN, PROXIES
+from .names import CLASS, PLAIN, PROXIES, shape_name
 from .units import StageUnits
 
 
@@ -75,11 +75,6 @@ def define_asset(
     for path, body in zip(paths[3:], bodies):
         bind_skin(define_mesh(stage, path, body.mesh, units), body.skin, skeleton)
     return Asset(root.GetPath(), paths[2], paths[1], bodies, shapes)
-
-
-def shape_name(index: int) -> str:
-    """Return what a blendshape is called."""
-    return f"shape_{index:03d}"
 
 
 def prim_names(paths: Sequence[str]) -> list[str]:

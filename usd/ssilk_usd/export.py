@@ -16,7 +16,8 @@ from pxr import Sdf, Tf, Usd, UsdGeom
 from ssilk_core.errors import fail
 from ssilk_core.files import replacing
 
-from .read_stage import LAYER_SUFFIXES, usd_reason
+from .names import LAYER_SUFFIXES
+from .read_stage import usd_reason
 from .specs import free_when_closed
 from .units import StageUnits
 

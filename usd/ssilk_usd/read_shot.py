@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pxr import Usd, UsdGeom, UsdSkel
 
-from ssilk_core.assets import Deformer, Floats, GarmentPose, Mesh, SkinWeights
+from ssilk_core.assets import Floats, GarmentPose, Mesh
 from ssilk_core.errors import fail
 
-from .author import shape_name
 from .garment_api import GarmentRecord, read_garment_record
 from .play import Shot, frame_times
 from .read_garment import find_garment, fitted_skeleton, garment_to_core, read_garment
@@ -21,6 +20,7 @@ from .read_skeleton import character_skeleton
 from .read_skin import match_joints
 from .read_stage import StageLike, apply, location, needs_whole_files, open_stage
 from .rig_io import read_proxy_rig
+from .skinned import BakedGarment, SkinnedGarment
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,44 +29,6 @@ class ShotPart:
 
     mesh: Mesh
     record: GarmentRecord | None
-
-
-@dataclass(frozen=True, eq=False)
-class SkinnedGarment:
-    """A garment as UsdSkel deforms it: rest points, blendshapes, joints and weights.
-
-    Attributes:
-        joint_names: UsdSkel joint paths, the character's first, then the proxies, length J.
-        bind_transforms: joint to world at the bind pose, rigid [m], shape (J, 4, 4).
-        points: at rest [m], shape (V, 3).
-        skin: weights over all joints.
-        shape_names: of the blendshapes, length K.
-        shapes: their offsets [m], shape (K, V, 3).
-    """
-
-    joint_names: tuple[str, ...]
-    bind_transforms: Floats
-    points: Floats
-    skin: SkinWeights
-    shape_names: tuple[str, ...]
-    shapes: Floats
-
-    @classmethod
-    def of(cls, deformer: Deformer) -> SkinnedGarment:
-        """Return a trained garment with the blendshapes that a shot of it would have, and those that move nothing."""
-        scene = deformer.scene
-        names = tuple(map(shape_name, range(deformer.shape_count)))
-        points = scene.garment.mesh.points
-        return cls(scene.joint_names, scene.bind_transforms, points, deformer.skin, names, deformer.shapes)
-
-
-@dataclass(frozen=True, eq=False)
-class BakedGarment:
-    """A baked garment with all its frames; `start` is the time code of the first one."""
-
-    garment: SkinnedGarment
-    pose: GarmentPose
-    start: float
 
 
 def read_parts(shot: Shot) -> list[ShotPart]:

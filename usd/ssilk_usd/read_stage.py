@@ -18,11 +18,11 @@ from ssilk_core.files import sha256
 
 from .garment_api import register_schema
 from .memory import VARIABLE, allowed_gib, bounded_memory
+from .names import LAYER_SUFFIXES
 from .specs import free_when_closed
 
 Reader = TypeVar("Reader", bound=Callable[..., Any])
 StageLike: TypeAlias = str | Path | Usd.Stage
-LAYER_SUFFIXES = (".usdc", ".usd", ".usda")
 USD_SUFFIXES = (*LAYER_SUFFIXES, ".usdz")
 EARLIEST = Usd.TimeCode.EarliestTime()
 # Instance proxies are read too: a referenced character may be instanceable.
