@@ -54,7 +54,7 @@ LEVELS = [
 INPUTS, MOTION, SHOT = "bake", "motion.usdc", "shot.usdc"  # folder of a bake's inputs beside the model; files
 
 
-class Bake(tasks.OutsideOperator, bpy.types.Operator):
+class BakeGarment(tasks.OutsideOperator, bpy.types.Operator):
     """Bake the trained garment over the scene's frames, as bones and shape keys; what was baked before is replaced"""
 
     bl_idname = "ssilk.bake"
@@ -248,4 +248,4 @@ def inputs_folder(model: Path) -> Path:
     return folder
 
 
-CLASSES = (Bake, RemoveBake)
+CLASSES = (BakeGarment, RemoveBake)

@@ -38,7 +38,7 @@ def draw_work(layout: bpy.types.UILayout) -> None:
         draw_text(layout, work.text)
 
 
-class Panel:
+class SidebarPanel:
     """Base of all panels."""
 
     bl_space_type = "VIEW_3D"

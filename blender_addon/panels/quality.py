@@ -8,7 +8,7 @@ import bpy
 from ..scene.beside import beside
 from ..scene.garment import unusable
 from ..scene.heat import PENETRATION, STRETCH
-from .base import Panel
+from .base import SidebarPanel
 
 
 def draw_kind(layout: bpy.types.UILayout, kind: str, text: str) -> None:
@@ -18,7 +18,7 @@ def draw_kind(layout: bpy.types.UILayout, kind: str, text: str) -> None:
     row.operator("ssilk.find_worst", text="", icon="MARKER_HLT").kind = kind
 
 
-class QualityPanel(Panel, bpy.types.Panel):
+class QualityPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_quality"
     bl_label = "Quality"
     bl_options = {"DEFAULT_CLOSED"}

@@ -66,11 +66,11 @@ def apply_bake(garment: bpy.types.Object, armature: bpy.types.Object, joints: Jo
     order = joint_order(joints, baked.garment.joint_names, fewer_proxies=True)
     shapes = wear(garment, armature, joints, baked.garment, order)
     proxies = order[joints.character_count :] - joints.character_count
-    turns = np.tile([1.0, 0.0, 0.0, 0.0], (baked.pose.frame_count, len(proxies), 1))
     there = proxies >= 0
-    turns[:, there] = turns_from_rest(joints, baked.pose.rotations[:, proxies])[:, there]
+    rotations = np.tile(rest_rotations(joints), (baked.pose.frame_count, 1, 1))
+    rotations[:, there] = baked.pose.rotations[:, proxies[there]]
     moved = [
-        (armature, _turn_channels(joints.proxies, turns)),
+        (armature, _turn_channels(joints.proxies, turns_from_rest(joints, rotations))),
         (garment.data.shape_keys, _weight_channels(shapes, baked.pose.weights)),
     ]
     bake_keys(garment, round(baked.start), [(thing, channels) for thing, channels in moved if thing])
@@ -106,8 +106,13 @@ def turns_from_rest(joints: Joints, rotations: np.ndarray) -> np.ndarray:
     Args:
         rotations: of each proxy to its parent, unit quaternions (w, x, y, z), shape (F, P, 4).
     """
-    rests = local_transforms(joints.binds, joints.parents)[joints.character_count :, :3, :3]
-    return multiply_quaternions(quaternion_from_matrix(rests.swapaxes(-1, -2)), rotations)
+    return multiply_quaternions(rest_rotations(joints) * [1, -1, -1, -1], rotations)
+
+
+def rest_rotations(joints: Joints) -> np.ndarray:
+    """Return the rotations of the proxies to their parents at rest, unit quaternions (w, x, y, z), shape (P, 4)."""
+    local = local_transforms(joints.binds, joints.parents)[joints.character_count :]
+    return quaternion_from_matrix(local[:, :3, :3])
 
 
 def remove_bake(garment: bpy.types.Object, armature: bpy.types.Object) -> None:

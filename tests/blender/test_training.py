@@ -26,7 +26,7 @@ from ssilk_usd.units import StageUnits
 from ssilk_usd.read_stage import open_stage
 skeleton = read_character(sys.argv[1]).skeleton
 motion = read_motion(sys.argv[2], skeleton)
-units = StageUnits.of(open_stage(sys.argv[2]))
+units = StageUnits.of(open_stage(sys.argv[1]))
 worlds = units.transforms_from_core(motion_transforms(motion, skeleton.parents))
 print(json.dumps({"fps": motion.fps, "start": motion.start, "worlds": worlds.tolist()}))
 """

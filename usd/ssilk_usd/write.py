@@ -78,13 +78,17 @@ def write_motion(path: str | Path, motion: Motion, skeleton: Skeleton) -> None:
         stage.SetEndTimeCode(motion.start + motion.frame_count - 1)
         animation.CreateJointsAttr(Vt.TokenArray(skeleton.joint_names))
         animation.CreateScalesAttr(Vt.Vec3hArray(skeleton.joint_count, Gf.Vec3h(1)))
-        rotations, translations = animation.CreateRotationsAttr(), animation.CreateTranslationsAttr()
-        for frame in range(motion.frame_count):
-            time = motion.start + frame
-            imaginary_first = np.roll(motion.rotations[frame], -1, axis=1).astype(np.float32)
-            rotations.Set(Vt.QuatfArray.FromNumpy(imaginary_first), time)
-            translations.Set(Vt.Vec3fArray.FromNumpy(motion.translations[frame].astype(np.float32)), time)
-        save(stage.GetRootLayer(), path)
+        rotations, translations = (
+            attribute.GetPath() for attribute in (animation.CreateRotationsAttr(), animation.CreateTranslationsAttr())
+        )
+        layer = stage.GetRootLayer()
+        del stage, animation  # nobody has to hear of each sample
+        imaginary_first = np.roll(motion.rotations, -1, axis=-1).astype(np.float32)
+        places = motion.translations.astype(np.float32)
+        for frame, (turns, moves) in enumerate(zip(imaginary_first, places)):
+            layer.SetTimeSample(rotations, motion.start + frame, Vt.QuatfArray.FromNumpy(turns))
+            layer.SetTimeSample(translations, motion.start + frame, Vt.Vec3fArray.FromNumpy(moves))
+        save(layer, path)
 
 
 def _root_path(name: str) -> str:
