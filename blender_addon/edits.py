@@ -44,7 +44,7 @@ class Edits:
         return ", ".join(f"{count} {what}" for what, count in counts.items() if count)
 
 
-def takers(places: np.ndarray, edits: Edits) -> list[str | None]:
+def match_proxies(places: np.ndarray, edits: Edits) -> list[str | None]:
     """Return for each proxy of a new rig the bone that stands for it: an artist's, "" for a new one, None for none.
 
     Bones that were moved take the place of the new proxy nearest to where they had been generated, and proxies near

@@ -34,8 +34,8 @@ from ..scene.models import model_of
 from ..scene.motions import TIMELINE, Source
 from ..scene.objects import Pair
 from ..scene.sampling import need_company, prepare_takes, sample
+from ..scene.trained_weights import has_trained_weights
 from ..scene.units import scene_rate
-from ..scene.worn import is_worn
 from ..training_properties import RELATIVE
 from . import tasks
 from .reporting import ReportingOperator
@@ -189,7 +189,7 @@ class RemoveBake(ReportingOperator, bpy.types.Operator):
     def refusal(cls, context: bpy.types.Context) -> str:
         if reason := unusable_here(context):
             return reason
-        baked = has_keys(context.object) or is_worn(context.object)
+        baked = has_keys(context.object) or has_trained_weights(context.object)
         return "" if baked else f"Nothing was baked for '{context.object.name}'"
 
     def apply(self, context: bpy.types.Context) -> str:

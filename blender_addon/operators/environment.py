@@ -30,7 +30,7 @@ class CheckPython(tasks.OutsideOperator, bpy.types.Operator):
         return ask(interpreter(preferences(context)))
 
     def finish(self, context: bpy.types.Context, work: Work) -> str:
-        return greet(context, work)
+        return remember_handshake(context, work)
 
 
 class FindPython(tasks.OutsideOperator, bpy.types.Operator):
@@ -47,7 +47,7 @@ class FindPython(tasks.OutsideOperator, bpy.types.Operator):
         return ask(found[0])
 
     def finish(self, context: bpy.types.Context, work: Work) -> str:
-        return greet(context, work)
+        return remember_handshake(context, work)
 
 
 class CreateEnvironment(tasks.OutsideOperator, bpy.types.Operator):
@@ -80,7 +80,7 @@ class CreateEnvironment(tasks.OutsideOperator, bpy.types.Operator):
 
     def finish(self, context: bpy.types.Context, work: Work) -> str:
         preferences(context).python = str(pythons.venv_python(folder()))
-        return greet(context, work)
+        return remember_handshake(context, work)
 
 
 def source(context: bpy.types.Context) -> str:
@@ -94,7 +94,7 @@ def ask(python: str) -> Work:
     return Work("Asking the Python", lambda _: [pythons.probe_command(python)])
 
 
-def greet(context: bpy.types.Context, work: Work) -> str:
+def remember_handshake(context: bpy.types.Context, work: Work) -> str:
     """Remember what a Python said of itself; return it in one line.
 
     Raises:

@@ -21,7 +21,7 @@ from ..scene.handover import MOTIONS, REPAIRED, hand_over, inspect_command, load
 from ..scene.objects import Pair
 from ..scene.repairs import REPAIRS, apply_scale, push_points, repair_mesh
 from ..scene.selecting import select_bones, select_elements
-from ..scene.takes import Chosen
+from ..scene.takes import ChosenMotions
 from .reporting import ReportingOperator
 from .rig import RigOperator
 
@@ -69,7 +69,7 @@ class Inspect(InspectOperator, bpy.types.Operator):
         keep_findings(context, garment.name, findings)
         for finding in findings:
             raise SetupError(f"'{finding.prim}': {finding.found}; {finding.fix}.")
-        self.chosen, self.preset = Chosen.of(garment, armature_of(garment)), garment.ssilk.training.preset
+        self.chosen, self.preset = ChosenMotions.of(garment, armature_of(garment)), garment.ssilk.training.preset
         return super().prepare(context)
 
     def steps(self) -> Iterator[float]:

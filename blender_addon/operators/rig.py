@@ -14,10 +14,10 @@ from ..preferences import interpreter, preferences, unready
 from ..scene.apply import apply_classes, apply_rig
 from ..scene.armature import need_editable, proxy_names
 from ..scene.attributes import current_classes
+from ..scene.edit_tracking import find_edits
 from ..scene.follower import is_linked, make_follower
 from ..scene.garment import armature_of, unusable_here
 from ..scene.gather import gather
-from ..scene.handmade import find_edits
 from ..scene.handover import Handover, hand_over, loading_usd, rig_command
 from ..scene.objects import Pair
 from . import tasks

@@ -28,7 +28,7 @@ from ..scene.handover import MOTIONS, STAGE, hand_over
 from ..scene.models import job_of, relative
 from ..scene.motions import FILE, Source, sources
 from ..scene.objects import Pair
-from ..scene.takes import Chosen
+from ..scene.takes import ChosenMotions
 from . import tasks
 from .reporting import ReportingOperator
 
@@ -134,7 +134,7 @@ class Train(tasks.OutsideOperator, bpy.types.Operator):
             raise SetupError(f"'{garment.name}' has a budget in iterations and in minutes; set one of them to zero.")
         self.scene = gather(garment)
         need_trainable(garment, armature, self.scene)
-        self.chosen = Chosen.of(garment, armature)
+        self.chosen = ChosenMotions.of(garment, armature)
         self.pair = Pair.of(garment, armature)
         title, steps = f"Sampling motions for '{garment.name}'", self.steps()
         return Work(title, lambda _: (), parent=bpy.app.tempdir, steps=steps)

@@ -43,7 +43,7 @@ def findings(state: JobState, curve: Mapping[str, Any], *, moves: bool) -> list[
     score, plain = curve["points"][-1]["validation"], curve["plain"]
     share = 1 - score["total"] / plain["total"]
     found = [
-        (f"{abs(share):.1%} {'less' if share >= 0 else 'more'} energy than plain skinning", share < 0),
+        (f"{abs(share):.1%} {'less' if share >= 0 else 'more'} energy than linear blend skinning", share < 0),
         (f"{score['collisions']:.2%} of the vertices inside the body", False),
     ]
     if moves:

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import bpy
 
-from ..scene.beside import beside
 from ..scene.garment import unusable
 from ..scene.heat import PENETRATION, STRETCH
+from ..scene.lbs_copy import find_copy
 from .base import SidebarPanel
 
 
@@ -35,5 +35,5 @@ class QualityPanel(SidebarPanel, bpy.types.Panel):
         if context.object.ssilk.heat:
             row.operator("ssilk.hide_heat")
         row.operator("ssilk.clear_worst")
-        shown = beside(context.object) is not None
+        shown = find_copy(context.object) is not None
         layout.operator("ssilk.toggle_plain", depress=shown)

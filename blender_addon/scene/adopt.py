@@ -15,8 +15,8 @@ from ssilk_core.assets import Garment, ProxyRig, Skeleton
 
 from ..errors import SetupError
 from .armature import MADE, made_collection, proxy_names
+from .edit_tracking import remember_bones, remember_weights
 from .garment import armature_of
-from .handmade import remember_bones, remember_weights
 from .proxies import PALETTE
 from .weights import PLAIN, keep_weights, read_groups, read_kept
 

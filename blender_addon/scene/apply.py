@@ -13,11 +13,11 @@ from ..errors import SetupError
 from ..joints import Joints
 from .armature import need_editable, proxy_names
 from .attributes import write_classes
+from .edit_tracking import find_edits, generated, remember_weights
 from .gather import own_weights
-from .handmade import find_edits, generated, remember_weights
 from .proxies import replace_proxies
+from .trained_weights import discard_own_weights, own_groups
 from .weights import PLAIN, keep_weights, read_kept, write_groups
-from .worn import forget, own_groups
 
 
 def apply_classes(garment: bpy.types.Object, classes: np.ndarray) -> None:
@@ -93,7 +93,7 @@ def _give_weights(
         total = painted.sum(axis=1, keepdims=True)
         painted = np.divide(painted, total, out=made.copy(), where=total > 0)
         kept = np.where(repainted[:, None], painted, made)
-    forget(garment)
+    discard_own_weights(garment)
     write_groups(garment, kept, names, old)
     remember_weights(armature, garment, made, names)
 

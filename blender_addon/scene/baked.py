@@ -16,8 +16,8 @@ from ..joints import Joints, joint_order
 from .armature import proxy_names
 from .keys import Channel, bake_keys, remove_keys
 from .shapes import need_relative, remove_shapes, rest_points, write_shapes
+from .trained_weights import put_trained_weights, restore_own_weights
 from .units import scene_units
-from .worn import put_on, take_off
 
 MOVED = 1e-4  # how far rest points may be from those that were trained on, as a share of the garment's size
 TURNED = 1e-3  # how far the axes and places of bones may be
@@ -64,7 +64,7 @@ def apply_bake(garment: bpy.types.Object, armature: bpy.types.Object, joints: Jo
         SetupError: garment or bones are not those that it was trained with.
     """
     order = joint_order(joints, baked.garment.joint_names, fewer_proxies=True)
-    shapes = wear(garment, armature, joints, baked.garment, order)
+    shapes = apply_deformation(garment, armature, joints, baked.garment, order)
     proxies = order[joints.character_count :] - joints.character_count
     there = proxies >= 0
     rotations = np.tile(rest_rotations(joints), (baked.pose.frame_count, 1, 1))
@@ -76,7 +76,7 @@ def apply_bake(garment: bpy.types.Object, armature: bpy.types.Object, joints: Jo
     bake_keys(garment, round(baked.start), [(thing, channels) for thing, channels in moved if thing])
 
 
-def wear(
+def apply_deformation(
     garment: bpy.types.Object,
     armature: bpy.types.Object,
     joints: Joints,
@@ -94,8 +94,8 @@ def wear(
     to_trained = _moved_back(armature, joints, skinned, order) @ scene_units().matrix @ np.array(garment.matrix_world)
     _need_same_points(garment, to_trained, skinned)
     shapes = write_shapes(garment, skinned.shapes @ np.linalg.inv(to_trained[:3, :3]).T, skinned.shape_names)
-    weights = skinned.skin.dense(len(skinned.joint_names))
-    put_on(armature, garment, np.where(order >= 0, weights[:, order], 0).astype(np.float32), joints.names)
+    weights = np.where(order >= 0, skinned.skin.dense(len(skinned.joint_names))[:, order], 0)
+    put_trained_weights(armature, garment, weights.astype(np.float32), joints.names)
     _free(armature, joints.proxies)
     return shapes
 
@@ -119,7 +119,7 @@ def remove_bake(garment: bpy.types.Object, armature: bpy.types.Object) -> None:
     """Remove what was baked for a garment, and give it its own weights back. In object mode."""
     remove_keys(garment, animated(garment, armature))
     remove_shapes(garment)
-    take_off(armature, garment)
+    restore_own_weights(armature, garment)
     _free(armature, proxy_names(armature, garment))
 
 

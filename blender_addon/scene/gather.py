@@ -19,9 +19,9 @@ from ..names import identifiers
 from .armature import read_joints
 from .attributes import current_classes
 from .garment import armature_of, bodies_of, need_plain_shape, shaping_modifiers
+from .trained_weights import own_groups
 from .units import scene_units
 from .weights import PLAIN, read_groups, read_kept
-from .worn import own_groups
 
 ROOT, SKELETON = "/Character", "Skeleton"  # prims of the stage that is handed over
 

@@ -42,7 +42,7 @@ class HeatMap:
     def most(self) -> float:
         return float(self.values.max())
 
-    def told(self) -> str:
+    def summary(self) -> str:
         """Return the worst of it in words."""
         if self.kind == STRETCH:
             return f"{self.most:.0%} longer at most"

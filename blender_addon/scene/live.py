@@ -19,7 +19,7 @@ from ssilk_core.assets import Motion
 
 from ..errors import SetupError
 from .armature import read_joints
-from .baked import need_bakeable, turns_from_rest, wear
+from .baked import apply_deformation, need_bakeable, turns_from_rest
 from .garment import armature_of
 from .motions import TIMELINE, Source
 from .objects import found_again
@@ -139,7 +139,7 @@ class Live:
         garment, armature = self.objects()
         if not self.ready():
             raise SetupError(f"'{garment.name}' left Object Mode while its model was read; play it again.")
-        self.shapes = wear(garment, armature, self.joints, skinned, trained.order)
+        self.shapes = apply_deformation(garment, armature, self.joints, skinned, trained.order)
         self.trained, self.playback = trained, None
         yield 0.0
 

@@ -9,10 +9,10 @@ from mathutils import Matrix, Vector
 
 from ssilk_core.assets import ProxyRig
 
-from ..edits import Edits, takers
+from ..edits import Edits, match_proxies
 from ..joints import Joints
 from .armature import MADE, editing, made_collection, proxy_names
-from .handmade import remember_bones
+from .edit_tracking import remember_bones
 from .units import scene_units
 
 PALETTE = "THEME04"
@@ -33,7 +33,8 @@ def replace_proxies(
     """
     names = [path.rpartition("/")[2] for path in rig.joint_names]
     binds = scene_units().transforms_from_core(rig.bind_transforms)
-    carriers, standing, length = list(joints.names), takers(binds[:, :3, 3], edits), _length(binds, rig, joints)
+    carriers, length = list(joints.names), _length(binds, rig, joints)
+    standing = match_proxies(binds[:, :3, 3], edits)
     old = [name for name in proxy_names(armature, garment) if name not in edits.kept]
     with editing(armature):
         bones = armature.data.edit_bones

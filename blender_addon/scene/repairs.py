@@ -10,10 +10,12 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
+from ssilk_core.preflight.mesh import SAME_PLACE
+
 from ..errors import SetupError
 from .meshes import edited
 
-SAME_PLACE = 2e-6  # [m]; what ssilk takes to be one place
+MERGE = 2 * SAME_PLACE  # [m]; longer than the diagonal of a cell in which ssilk takes vertices for one
 Repair = Callable[[bmesh.types.BMesh, Sequence[int], float], None]
 
 
@@ -30,7 +32,7 @@ def repair_mesh(thing: bpy.types.Object, code: str, indices: Sequence[int]) -> N
         for sequence in (mesh.verts, mesh.faces):
             sequence.ensure_lookup_table()
         mesh.normal_update()
-        REPAIRS[code](mesh, indices, SAME_PLACE / scale)
+        REPAIRS[code](mesh, indices, MERGE / scale)
 
 
 def apply_scale(armature: bpy.types.Object) -> None:

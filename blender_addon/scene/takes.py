@@ -18,7 +18,7 @@ from .sampling import SampledTake, prepare_takes, sample
 
 
 @dataclass(frozen=True, eq=False)
-class Chosen:
+class ChosenMotions:
     """Motions to train on.
 
     Attributes:
@@ -30,7 +30,7 @@ class Chosen:
     files: list[Path]
 
     @classmethod
-    def of(cls, garment: bpy.types.Object, armature: bpy.types.Object) -> Chosen:
+    def of(cls, garment: bpy.types.Object, armature: bpy.types.Object) -> ChosenMotions:
         """Return what was chosen for a garment.
 
         Raises:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Heat maps against closed forms, worst frames, and plain skinning beside the garment."""
+"""Heat maps against closed forms, worst frames, and linear blend skinning beside the garment."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ def colors(garment) -> np.ndarray:
 
 
 def test_heat_is_shown_follows_frames_and_goes(bpy, dressed):
-    from blender_addon.scene import warming
+    from blender_addon.scene import heat_updates
 
     assert bpy.ops.ssilk.show_heat(kind="PENETRATION", deepest=0.02) == {"FINISHED"}
     expected = heat.colors_of(expected_depths(dressed), 0.02)
@@ -160,7 +160,7 @@ def test_heat_is_shown_follows_frames_and_goes(bpy, dressed):
     assert np.ptp(colors(dressed), axis=0)[:3].min() > 0.2
     dressed.scale = (3, 3, 1)
     bpy.context.scene.frame_set(5)
-    while warming.go_on() is not None:  # what a timer does as soon as the frame stands
+    while heat_updates.go_on() is not None:  # what a timer does as soon as the frame stands
         pass
     np.testing.assert_allclose(colors(dressed)[:, :3], np.tile(heat.GREY, (len(expected), 1)), atol=2e-3)
     assert bpy.ops.ssilk.hide_heat() == {"FINISHED"}

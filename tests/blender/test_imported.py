@@ -55,7 +55,7 @@ def test_a_rigged_stage_comes_in_with_its_proxies(ready, stage, ssilk_python, tm
 
 
 def test_what_was_adopted_is_known_when_it_is_edited(ready, stage):
-    from blender_addon.scene.handmade import find_edits
+    from blender_addon.scene.edit_tracking import find_edits
 
     ready.ops.wm.usd_import(filepath=str(stage))
     ready.ops.ssilk.adopt_rig(filepath=str(stage))

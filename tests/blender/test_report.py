@@ -37,14 +37,14 @@ def test_progress_is_one_line(state, told):
 def test_validations_say_what_is_learned():
     running = JobState("running", checkpoint=5)
     assert findings(running, CURVE, moves=True) == [
-        ("40.0% less energy than plain skinning", False),
+        ("40.0% less energy than linear blend skinning", False),
         ("1.23% of the vertices inside the body", False),
         ("Dynamics are being learned: 23 mm of motion of its own", False),
         ("Best model: from iteration 5; play it live or bake it to see it on your shot", False),
     ]
     stiff = {**CURVE, "points": [{"iteration": 5, "validation": {**SCORE, "total": 1.5, "dynamics": 0.0019}}]}
     told = findings(running, stiff, moves=True)
-    assert ("50.0% more energy than plain skinning", True) in told
+    assert ("50.0% more energy than linear blend skinning", True) in told
     assert ("Nothing dynamic is being learned: train longer, or check that the motions move", True) in told
     assert not any("ynamic" in text for text, _ in findings(running, stiff, moves=False))
     assert findings(running, {}, moves=True)[0][0].startswith("No validation yet")

@@ -14,8 +14,8 @@ import numpy as np
 
 from ..edits import Edits
 from .armature import MADE, collection_of, keys_of, made_collection, proxy_names
+from .trained_weights import own_groups
 from .weights import SAME_WEIGHTS, signature
-from .worn import own_groups
 
 SIGNATURE = "ssilk:made"  # attribute of points
 SAME_PLACE = 1e-3  # of a bone's length

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The garment as plain skinning has it, beside the garment as it is.
+"""A copy of a garment that linear blend skinning alone moves, shown beside it.
 
 The copy hangs on the same armature; an empty shows it moved to the side, after bones have moved it.
 """
@@ -21,12 +21,12 @@ OWNER = "ssilk_plain_of"  # custom property of the empty and the copy: the garme
 GAP = 1.3  # distance in widths of the garment
 
 
-def beside(garment: bpy.types.Object) -> bpy.types.Object | None:
+def find_copy(garment: bpy.types.Object) -> bpy.types.Object | None:
     """Return the empty that shows a garment's plain copy; None where there is none."""
     return next((thing for thing in bpy.data.objects if thing.type == "EMPTY" and thing.get(OWNER) == garment), None)
 
 
-def put_beside(garment: bpy.types.Object) -> None:
+def show_copy(garment: bpy.types.Object) -> None:
     """Show a copy without proxies and shapes to the side. In object mode.
 
     Raises:
@@ -44,7 +44,7 @@ def put_beside(garment: bpy.types.Object) -> None:
     garment.users_collection[0].objects.link(shown)
 
 
-def take_away(shown: bpy.types.Object) -> None:
+def remove_copy(shown: bpy.types.Object) -> None:
     """Remove the copy and what shows it."""
     collection = shown.instance_collection
     for copy in list(collection.objects):

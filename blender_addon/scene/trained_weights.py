@@ -20,18 +20,20 @@ WORN = "ssilk:worn"  # attribute of points: the signature of the trained weights
 SAME = 1e-6  # difference of weights
 
 
-def is_worn(garment: bpy.types.Object) -> bool:
+def has_trained_weights(garment: bpy.types.Object) -> bool:
     """Return whether a garment has trained weights on. Not in edit mode."""
     return WORN in garment.data.attributes
 
 
-def put_on(armature: bpy.types.Object, garment: bpy.types.Object, weights: np.ndarray, names: Sequence[str]) -> None:
+def put_trained_weights(
+    armature: bpy.types.Object, garment: bpy.types.Object, weights: np.ndarray, names: Sequence[str]
+) -> None:
     """Give a garment trained weights, shape (V, J), over joints with these names. In object mode."""
-    if is_worn(garment) and np.allclose(read_groups(garment, garment.data, names), weights, atol=SAME):
+    if has_trained_weights(garment) and np.allclose(read_groups(garment, garment.data, names), weights, atol=SAME):
         return
     own = own_groups(armature, garment, names)
     keys = keys_of(armature, names)
-    forget(garment)
+    discard_own_weights(garment)
     keep_weights(garment.data, OWN, own, keys)
     write_groups(garment, weights, names, ())
     attribute = garment.data.attributes.new(WORN, "FLOAT", "POINT")
@@ -40,7 +42,7 @@ def put_on(armature: bpy.types.Object, garment: bpy.types.Object, weights: np.nd
 
 def own_groups(armature: bpy.types.Object, garment: bpy.types.Object, names: Sequence[str]) -> np.ndarray:
     """Return a garment's own weights, those that are worn taken off, shape (V, len(names)). Not in edit mode."""
-    if not is_worn(garment):
+    if not has_trained_weights(garment):
         return read_groups(garment, garment.data, names)
     every = list(dict.fromkeys([*names, *(bone.name for bone in armature.data.bones if bone.use_deform)]))
     keys, found = keys_of(armature, every), read_groups(garment, garment.data, every)
@@ -52,17 +54,17 @@ def own_groups(armature: bpy.types.Object, garment: bpy.types.Object, names: Seq
     return found[:, : len(names)]
 
 
-def take_off(armature: bpy.types.Object, garment: bpy.types.Object) -> None:
+def restore_own_weights(armature: bpy.types.Object, garment: bpy.types.Object) -> None:
     """Give a garment its own weights back. In object mode."""
-    if is_worn(garment):
+    if has_trained_weights(garment):
         names = [bone.name for bone in armature.data.bones if bone.use_deform]
         own = own_groups(armature, garment, names)
-        forget(garment)
+        discard_own_weights(garment)
         write_groups(garment, own, names, ())
 
 
-def forget(garment: bpy.types.Object) -> None:
+def discard_own_weights(garment: bpy.types.Object) -> None:
     """Take what a garment has on for its own."""
     forget_kept(garment.data, OWN)
-    if is_worn(garment):
+    if has_trained_weights(garment):
         garment.data.attributes.remove(garment.data.attributes[WORN])
