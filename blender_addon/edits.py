@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What an artist changed on proxies by hand, and how a rig that is generated anew makes way for it."""
+"""Changes that an artist made to proxies by hand, and how a newly generated rig keeps them."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Edits:
 
 
 def match_proxies(places: np.ndarray, edits: Edits) -> list[str | None]:
-    """Return for each proxy of a new rig the bone that stands for it: an artist's, "" for a new one, None for none.
+    """Return which bone takes the place of each proxy of a new rig: a name, "" for a new bone, None for no bone.
 
     Bones that were moved take the place of the new proxy nearest to where they had been generated, and proxies near
     one that was deleted are not made again; nearer than half the spacing of the rig.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Names that USD allows for what Blender calls as it likes."""
+"""Valid USD names for the names of Blender's objects and bones."""
 
 from __future__ import annotations
 

@@ -74,5 +74,5 @@ def attach() -> None:
 
 
 def detach() -> None:
-    """Take it away."""
+    """Remove it."""
     del bpy.types.WindowManager.ssilk_preflight

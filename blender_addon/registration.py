@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Every class and property that Blender hears of, and their removal."""
+"""Register and unregister every class and property."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a garment remembers of its training."""
+"""Training settings that are stored with each garment object."""
 
 from __future__ import annotations
 

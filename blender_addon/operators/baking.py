@@ -117,7 +117,7 @@ class BakeGarment(tasks.OutsideOperator, bpy.types.Operator):
         write_motion(self.work.folder / MOTION, self.take.motion(self.character), self.character.skeleton(ROOT))
 
     def commands(self, folder: Path) -> list[list[str]]:
-        """Write what is baked from; return the command."""
+        """Write the inputs of the bake; return the command."""
         garment, armature = self.pair.objects()
         need_company(garment, armature, self.take)
         inputs = inputs_folder(self.model)
@@ -140,7 +140,7 @@ class BakeGarment(tasks.OutsideOperator, bpy.types.Operator):
         ]  # fmt: skip
 
     def closing(self) -> Iterator[float]:
-        """Read what was baked; writing it takes long enough by itself."""
+        """Read what was baked, before `finish` writes it: each takes time."""
         from ssilk_usd.read_shot import read_baked
 
         self.joints = self.bakeable_joints()
@@ -200,7 +200,7 @@ class RemoveBake(ReportingOperator, bpy.types.Operator):
 
 
 def lost(figures: Mapping[str, Any]) -> str:
-    """Return what bones and shape keys lose of a refined garment, in words; empty where nothing was put back."""
+    """Return in words how far bones and shape keys are from the refined vertices; empty where nothing was fitted."""
     typical, most = (figures.get(f"refined: joints lose, {which} [mm]") for which in ("RMS", "at most"))
     if typical is None:
         return ""
@@ -208,7 +208,7 @@ def lost(figures: Mapping[str, Any]) -> str:
 
 
 def reclassed(garment: bpy.types.Object, model: Path) -> str:
-    """Return in words that a garment has other classes than its model; empty where not, or where none can be read."""
+    """Return a note if a garment's classes differ from its model's; empty if not, or if either cannot be read."""
     try:
         trained, classes = load_model(model).scene.classes, current_classes(garment.data)
     except SsilkError:
@@ -219,7 +219,7 @@ def reclassed(garment: bpy.types.Object, model: Path) -> str:
 
 
 def usd_path(garment: bpy.types.Object, chosen: str) -> Path:
-    """Return where a shot goes.
+    """Return the file of a shot.
 
     Raises:
         SetupError: nothing was chosen, and the blend file has no place yet.
@@ -233,7 +233,7 @@ def usd_path(garment: bpy.types.Object, chosen: str) -> Path:
 
 
 def inputs_folder(model: Path) -> Path:
-    """Return the folder beside a model for what is baked from: shots say from there that they come.
+    """Return the folder beside a model for a bake's inputs, to which the shot's provenance points.
 
     Raises:
         SetupError: nothing can be written there.

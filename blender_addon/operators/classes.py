@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Painting vertex classes with Blender's own brushes, and taking the painting up."""
+"""Painting vertex classes with Blender's own brushes, and reading the painting back."""
 
 from __future__ import annotations
 

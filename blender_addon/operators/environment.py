@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Finding, checking and making the Python that has ssilk installed."""
+"""Finding, checking and creating the Python that has ssilk installed."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class CreateEnvironment(tasks.OutsideOperator, bpy.types.Operator):
 
 
 def source(context: bpy.types.Context) -> str:
-    """Return what ssilk is installed from: as chosen, else the wheel that came with the extension."""
+    """Return what ssilk is installed from: the choice in the preferences, else the wheel of the extension."""
     chosen = preferences(context).source
     return bpy.path.abspath(chosen) if chosen else pythons.bundled()
 
@@ -95,7 +95,7 @@ def ask(python: str) -> Work:
 
 
 def remember_handshake(context: bpy.types.Context, work: Work) -> str:
-    """Remember what a Python said of itself; return it in one line.
+    """Keep a Python's versions and device; return them in one line.
 
     Raises:
         SetupError: it does not fit.

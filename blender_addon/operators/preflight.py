@@ -50,7 +50,7 @@ class InspectOperator(RigOperator):
         return [inspect_command(self.python, folder, self.handover, self.words(folder))]
 
     def words(self, folder: Path) -> list[str]:
-        """Return what else `ssilk inspect` is told."""
+        """Return further arguments of `ssilk inspect`."""
         raise NotImplementedError
 
     def explain(self, work: Work) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Seeing how good a garment is: heat maps, the worst frames, and linear blend skinning (LBS) beside it."""
+"""Judging a garment: heat maps, the worst frames, and linear blend skinning (LBS) beside it."""
 
 from __future__ import annotations
 

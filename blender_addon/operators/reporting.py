@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators that tell what they did, or in one sentence why they could not or cannot now."""
+"""Operators that report what they did, or why they could not, in one sentence."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Work outside Blender, watched by a timer, one at a time; every other event passes meanwhile."""
+"""Work outside Blender, one at a time, polled by a timer while Blender stays usable."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class OutsideOperator(RefusingOperator):
         raise NotImplementedError
 
     def explain(self, work: Work) -> str:
-        """Return why the work failed; empty if it did what was wanted all the same."""
+        """Return why the work failed; empty if it succeeded nevertheless."""
         return work.error
 
     def execute(self, context: bpy.types.Context) -> set[str]:
@@ -57,7 +57,7 @@ class OutsideOperator(RefusingOperator):
         return {"RUNNING_MODAL"}
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Look at the work now and then."""
+        """Poll the work at each timer event."""
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
         redraw(context)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Training a garment: choosing motions, starting, cancelling, going on."""
+"""Training a garment: choosing motions, starting, cancelling, resuming."""
 
 from __future__ import annotations
 
@@ -250,7 +250,7 @@ def beside(path: Path, folder: Path) -> str:
 
 
 def watch() -> float:
-    """Draw panels again where a training went on, and play by its new model; return when to look next [s]."""
+    """Redraw panels when a training has progressed, and play its new model; return when to be called again [s]."""
     from ..panels.training import changed
 
     garments = [thing for thing in bpy.data.objects if thing.type == "MESH" and thing.ssilk.training.folder]
@@ -261,12 +261,12 @@ def watch() -> float:
 
 
 def start_watching() -> None:
-    """Look at trainings from now on, whatever file is open."""
+    """Start polling trainings, whatever file is open."""
     bpy.app.timers.register(watch, first_interval=LOOK, persistent=True)
 
 
 def stop_watching(context: bpy.types.Context) -> None:
-    """Look no more; end what this session began, if the preferences ask for it."""
+    """Stop polling; end the trainings of this session if the preferences ask for it."""
     if bpy.app.timers.is_registered(watch):
         bpy.app.timers.unregister(watch)
     if preferences(context).stop_trainings:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Trainings that outlive Blender: a folder each, and what their runner says of them in it."""
+"""Trainings that outlive Blender: a folder each, in which a runner keeps their state."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def resume(python: str, folder: Path) -> None:
 
 
 def _launch(python: str, folder: Path) -> None:
-    """Start a runner, which goes on without us."""
+    """Start a runner, which outlives Blender."""
     (folder / CANCEL).unlink(missing_ok=True)
     _write(folder / STATE, {**_read(folder / STATE), "state": "waiting", "beat": time.time(), "error": ""})
     try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a training's state and learning curve mean, in lines for people; the standard library alone."""
+"""What a training's state and learning curve mean, in lines for people."""
 
 from __future__ import annotations
 

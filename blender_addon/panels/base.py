@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What panels share."""
+"""Functions and the base class that all panels share."""
 
 from __future__ import annotations
 

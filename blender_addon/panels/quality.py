@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Seeing quality."""
+"""Quality: heat maps, worst frames and the LBS copy."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A rig from outside becomes bones, vertex groups and classes."""
+"""Apply a rig of `ssilk rig` as bones, vertex groups and classes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .weights import PLAIN, keep_weights, read_kept, write_groups
 
 
 def apply_classes(garment: bpy.types.Object, classes: np.ndarray) -> None:
-    """Give a garment classes, shape (V,), that were found for it.
+    """Write classes, shape (V,), to a garment.
 
     Raises:
         SetupError: it was edited meanwhile.
@@ -83,7 +83,7 @@ def _give_weights(
     repainted: np.ndarray,
     old: list[str],
 ) -> None:
-    """Write a rig's weights (V, J + P) to the bones that carry them, but for vertices that were repainted."""
+    """Write a rig's weights (V, J + P) to the bones that carry them, except at repainted vertices."""
     names = list(dict.fromkeys([*carriers, *proxy_names(armature, garment)]))
     made = np.zeros((len(weights), len(names)), dtype=np.float32)
     np.add.at(made.T, [names.index(name) for name in carriers], weights.T)

@@ -139,7 +139,7 @@ def _shrunk(armature: bpy.types.Object) -> Matrix:
 
 @contextmanager
 def editing(armature: bpy.types.Object) -> Iterator[None]:
-    """Be in edit mode of an armature, from object mode, and put the active object back afterwards."""
+    """Switch from object mode to edit mode of an armature, and restore mode and active object afterwards."""
     layer = bpy.context.view_layer
     before, selected = layer.objects.active, armature.select_get()
     layer.objects.active = armature

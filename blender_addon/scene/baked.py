@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A baked shot becomes weights, shape keys and keys on a garment and its proxies."""
+"""Apply a bake as weights, shape keys and keys on a garment and its proxies."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ def _size(skinned: SkinnedGarment) -> float:
 
 
 def _free(armature: bpy.types.Object, proxies: Sequence[str]) -> None:
-    """Put proxies at rest where no key says otherwise, to be turned by quaternions."""
+    """Put proxies without keys at rest, with quaternion rotation."""
     for name in proxies:
         bone = armature.pose.bones[name]
         bone.rotation_mode = "QUATERNION"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What Blender itself can tell of a garment that could not be handed over as it is."""
+"""Findings of Blender's own data, in scenes that ssilk cannot read."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SCALE = "unequal-scale"
 
 
 def scene_findings(garment: bpy.types.Object) -> list[Finding]:
-    """Return what has to be mended before ssilk can look at a garment; objects stand for prims.
+    """Return what must be fixed before ssilk can inspect a garment, with names of objects in place of prims.
 
     Raises:
         SetupError: it has no armature, or several.

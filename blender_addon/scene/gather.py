@@ -81,7 +81,7 @@ def gather(garment: bpy.types.Object, *, classes: bool = True, proxies: bool = T
 def own_weights(armature: bpy.types.Object, garment: bpy.types.Object, joints: Joints) -> np.ndarray | None:
     """Return the weights that the artist gave a garment over the character's joints, (V, J); None without.
 
-    Those kept beside a rig go first; a rig's own weights are nobody's.
+    Weights kept beside a rig have priority; the weights of a rig itself are not the artist's.
     """
     names = joints.character.names
     kept = read_kept(garment.data, PLAIN, names)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Penetration and stretch of a garment as it is seen now, and as colours on its mesh.
+"""Penetration and stretch of a garment in the frame that is shown, and their colours on its mesh.
 
 Both come a little at a time: to find what is nearest to 20,000 vertices takes a tenth of a second.
 """
@@ -43,7 +43,7 @@ class HeatMap:
         return float(self.values.max())
 
     def summary(self) -> str:
-        """Return the worst of it in words."""
+        """Return the worst value in words."""
         if self.kind == STRETCH:
             return f"{self.most:.0%} longer at most"
         inside = int((self.values > 0).sum())

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A trained garment played in Blender, by numpy alone: it follows the armature wherever the timeline stands.
+"""A trained garment played in Blender with numpy alone, following the armature at any frame of the timeline.
 
-What the armature does over the scene's frames is read once, a little at a time; latents are rolled over it as far as
-frames are looked at, in blocks, and kept. A frame therefore looks the same whether it was scrubbed or played to.
-Where the armature stands otherwise than was read, latents are kept up to there and rolled anew from there on.
+The armature's motion over the scene's frames is read once, a little at a time. Latents are rolled out in blocks, as
+far as frames are shown, and kept. A frame therefore looks the same whether it was scrubbed or played to. Where the
+armature differs from what was read, latents are kept up to that frame and rolled out again from there.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Live:
         self.refresh()
 
     def refresh(self) -> None:
-        """Read the motion anew; what was read goes on being played until that is done."""
+        """Read the motion again; the old one is played until that is done."""
         _, armature = self.objects()
         (take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
         self._steps = self._reading(take)
@@ -144,7 +144,7 @@ class Live:
         yield 0.0
 
     def _take_notice(self, armature: bpy.types.Object, index: int) -> None:
-        """Go on from a pose that is not the one that was read."""
+        """Roll out again from a pose that differs from the one that was read."""
         bones = [armature.pose.bones.find(name) for name in self.joints.character.names]
         placed = worlds(armature)[bones]
         if np.allclose(placed, self.placed[index], rtol=MOVED, atol=MOVED):

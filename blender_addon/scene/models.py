@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Where a garment's training and its model lie; what is stored is relative to the blend file."""
+"""Paths of a garment's training and model, stored relative to the blend file."""
 
 from __future__ import annotations
 

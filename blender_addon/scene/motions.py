@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which motions an armature has, and playing one of them for a moment."""
+"""The motions of an armature, and playing one of them temporarily."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Source:
 
 
 def sources(armature: bpy.types.Object) -> list[Source]:
-    """Return all motions that an armature has, but for what was baked."""
+    """Return all motions of an armature except baked ones."""
     if armature.library:  # of which nothing can be changed, not even for a moment
         return [Source(TIMELINE, "Timeline")]
     bones = set(armature.pose.bones.keys())
@@ -70,7 +70,7 @@ def frames_of(armature: bpy.types.Object, source: Source) -> range:
 
 @contextmanager
 def playing(armature: bpy.types.Object, source: Source) -> Iterator[None]:
-    """Let an armature play one of its motions for a moment; all is as it was afterwards.
+    """Play one motion of an armature temporarily, and restore everything afterwards.
 
     Raises:
         SetupError: it is gone.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Objects that are needed again after a while, in which they may be deleted, renamed or read anew by an undo."""
+"""Objects that are looked up again later, when they may have been deleted, renamed or replaced by an undo."""
 
 from __future__ import annotations
 

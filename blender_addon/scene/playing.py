@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which garments are played, and what Blender calls so that they are: when frames change, files open, renders run.
+"""The garments that are played live, and the handlers that update them on frame changes, loading and rendering.
 
 Nothing is written while Blender renders in another thread and its interface is not locked: both would write at once.
 """
@@ -59,7 +59,7 @@ def refresh(garment: bpy.types.Object) -> None:
 
 
 def take_up_models() -> None:
-    """Play trainings by the models that they have reached meanwhile."""
+    """Switch to the newest models of trainings that are played."""
     for uid, played in list(_played.items()):
         if played.renewed and played.done is None and _attempt(uid, played.ready):
             _attempt(uid, played.refresh)
@@ -67,13 +67,13 @@ def take_up_models() -> None:
 
 
 def start_listening() -> None:
-    """Have Blender call what is here."""
+    """Register the handlers."""
     for handlers, function in _handlers():
         handlers.append(function)
 
 
 def stop_listening() -> None:
-    """Leave nothing behind."""
+    """Remove handlers and timer, and stop playing."""
     _forget()
     for handlers, function in _handlers():
         if function in handlers:

@@ -22,7 +22,7 @@ ALONE = 0.05  # how long proxies are drawn that have none above
 def replace_proxies(
     armature: bpy.types.Object, garment: bpy.types.Object, joints: Joints, rig: ProxyRig, edits: Edits
 ) -> list[str]:
-    """Put a rig's proxies in place of the garment's older ones, all but the artist's.
+    """Replace the garment's older proxies by a rig's, except those that the artist made or changed.
 
     Args:
         joints: the character's joints that the rig's parents count from.
@@ -68,7 +68,7 @@ def replace_proxies(
 def _new_bone(
     armature: bpy.types.Object, garment: bpy.types.Object, name: str, above: str, bind: np.ndarray, length: float
 ) -> str:
-    """Make a bone at a place in the world; return its name, which is another one where there is such a bone."""
+    """Make a bone at a bind transform in Blender's world; return its name, which differs if `name` is taken."""
     bones = armature.data.edit_bones
     bone = bones.new(name)
     bone.tail = (0.0, length, 0.0)  # a bone without length takes no matrix

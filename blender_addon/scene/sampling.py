@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What an armature does, frame by frame, as Blender evaluates it with constraints and drivers, a little at a time.
+"""The motion of an armature, sampled as Blender evaluates it with constraints and drivers, a little at a time.
 
-A scene of its own, which holds nothing else, is made for each slice of time and removed at its end: nothing of the
-artist's scene is evaluated or moved, and nothing is left behind if the artist saves or undoes in between.
+Each slice of time uses a temporary scene that holds the armature alone. So nothing of the artist's scene is evaluated
+or moved, and nothing is left behind if the artist saves or undoes in between.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ BASIS = "ssilk_basis"  # custom property of shape keys whose basis came with a b
 
 
 def need_relative(garment: bpy.types.Object) -> None:
-    """Check that shape keys add up.
+    """Check that shape keys are relative, so that they add up.
 
     Raises:
         SetupError: those that are there are absolute.

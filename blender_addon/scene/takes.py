@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The motions that were chosen for a garment: taken from Blender, or in files of their own."""
+"""The motions chosen for a garment: sampled in Blender, or in USD files."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Trained weights that a bake or live playback puts on a garment, over its own, which come back when they go.
+"""Trained weights, which a bake or live playback writes to a garment, and its own weights, which are restored later.
 
-Its own are kept beside as attributes of points, one for each joint, with one number that tells vertices apart that
-were painted since: what is painted on top is the artist's.
+The garment's own weights are kept as point attributes, one for each joint. One more attribute holds a signature of
+the trained weights. A vertex whose signature differs was painted since, and keeps what was painted.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ SAME = 1e-6  # difference of weights
 
 
 def has_trained_weights(garment: bpy.types.Object) -> bool:
-    """Return whether a garment has trained weights on. Not in edit mode."""
+    """Return whether a garment has trained weights. Not in edit mode."""
     return WORN in garment.data.attributes
 
 
@@ -41,7 +41,7 @@ def put_trained_weights(
 
 
 def own_groups(armature: bpy.types.Object, garment: bpy.types.Object, names: Sequence[str]) -> np.ndarray:
-    """Return a garment's own weights, those that are worn taken off, shape (V, len(names)). Not in edit mode."""
+    """Return a garment's own weights, without trained ones, shape (V, len(names)). Not in edit mode."""
     if not has_trained_weights(garment):
         return read_groups(garment, garment.data, names)
     every = list(dict.fromkeys([*names, *(bone.name for bone in armature.data.bones if bone.use_deform)]))
@@ -64,7 +64,7 @@ def restore_own_weights(armature: bpy.types.Object, garment: bpy.types.Object) -
 
 
 def discard_own_weights(garment: bpy.types.Object) -> None:
-    """Take what a garment has on for its own."""
+    """Remove the record of a garment's own weights; its current ones become its own."""
     forget_kept(garment.data, OWN)
     if has_trained_weights(garment):
         garment.data.attributes.remove(garment.data.attributes[WORN])

@@ -22,7 +22,7 @@ from .units import StageUnits
 
 @dataclass(frozen=True)
 class Asset:
-    """Where the moving parts of an authored asset stand.
+    """Paths of the prims of an authored asset that a shot animates.
 
     Attributes:
         root: the SkelRoot.
@@ -180,7 +180,7 @@ def mark_garment(prim: Usd.Prim, classes: Ints | None, proxies: Sequence[str] | 
 
 
 def keep_plain_skin(prim: Usd.Prim, skin: SkinWeights, joints: Sequence[str]) -> None:
-    """Author a garment's weights over the character's joints alone, beside those of its rig."""
+    """Author a garment's weights over the character's joints alone, in addition to those of its rig."""
     _author_names(prim, PLAIN[2], joints)
     for name, rows in zip(PLAIN[:2], sorted_influences(skin)):
         _author_rows(prim, name, rows)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check a written shot: USD's validators, our own rules, and the points that UsdSkel makes of it."""
+"""Check a written shot: USD's validators, our own rules, and the points that UsdSkel computes."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def _world_box(shot: Shot, root: Usd.Prim, extent: Floats, time: float) -> tuple
 
 @dataclass(frozen=True)
 class Comparison:
-    """How far a shot is from what was computed, where it is nearest to its bound or furthest past it.
+    """Distance of a shot from the computed points, at the vertex that is nearest to its bound or furthest past it.
 
     Attributes:
         worst: distance [m]; bound: what is allowed there [m].

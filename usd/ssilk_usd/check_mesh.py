@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rules for skinned meshes that USD's own validators leave unchecked: arrays, influences, blendshapes."""
+"""Rules for skinned meshes that USD's own validators do not check: arrays, influences, blendshapes."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rules of UsdSkel that USD's own validators leave unchecked: skeletons and their animation."""
+"""Rules of UsdSkel that USD's own validators do not check: skeletons and their animation."""
 
 from __future__ import annotations
 

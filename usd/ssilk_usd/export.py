@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing a layer as a file, whole or not at all."""
+"""Write a layer as a file, completely or not at all."""
 
 from __future__ import annotations
 

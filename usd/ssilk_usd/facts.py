@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What files say beside the assets that are read from them: authored units, sampled times, animated joints."""
+"""Facts of files that assets do not hold: authored units, frame rate, sampled times, animated joints."""
 
 from __future__ import annotations
 

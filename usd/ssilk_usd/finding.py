@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a check of a shot has to say."""
+"""The findings of `check_shot`."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ STACK = 8 << 20  # bytes of each thread that USD may start meanwhile
 
 
 def allowed_gib() -> float:
-    """Return how many GiB reading may take, as the environment says it, or the usual amount."""
+    """Return how many GiB reading may take: from the environment, else the default."""
     text = os.environ.get(VARIABLE, str(USUAL))
     try:
         allowed = float(text)
@@ -30,7 +30,7 @@ def allowed_gib() -> float:
 
 @contextmanager
 def bounded_memory(gib: float | None = None) -> Iterator[None]:
-    """Let this process take so much more than it has, or `allowed_gib`; USD and numpy then refuse what does not fit.
+    """Limit how much more memory this process may take; USD and numpy then refuse what does not fit.
 
     Nothing changes where the system has no such bound (all but Linux), within a smaller bound, and inside Blender,
     whose other threads would meet the bound too.

@@ -27,7 +27,7 @@ FRAMES_PER_SAVE = 128  # 5 MB of points in memory for a garment of 3,000 vertice
 
 
 class PointCache:
-    """A file under way, whose frames may come in any order.
+    """A point cache that is being written; frames may come in any order.
 
     Attributes:
         shot: what the file holds.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Opening stages, naming what is in them, and asking prims for values: what every reader shares."""
+"""Functions that all readers share: opening stages, naming prims, and reading values."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _MISSING = (Pcp.ErrorInvalidAssetPath, Pcp.ErrorInvalidSublayerPath, Pcp.ErrorUn
 
 
 def needs_whole_files(read: Reader) -> Reader:
-    """Make a reader, whose first argument is its source, say in one sentence that USD finds a file damaged."""
+    """Decorate a reader, whose first argument is its source: a damaged file raises one `SsilkError`."""
 
     @wraps(read)
     def reader(source: StageLike, *args: Any, **options: Any) -> Any:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Proxy rigs in stages: joints appended to the skeleton, listed in the garment's `ssilk:proxyJoints`.
 
-A rig may be edited by hand. What the skeleton holds is what counts: a joint listed is a proxy wherever it moved
+A rig may be edited by hand. The skeleton decides: a joint listed is a proxy wherever it moved
 in the hierarchy (it is found by a leaf name that is unique), a joint removed is gone with its weights, and a joint
 that descends from a proxy is a proxy.
 """

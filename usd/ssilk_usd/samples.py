@@ -28,7 +28,7 @@ AT_REST = 1e-7  # by which entries of a joint's transform may differ and still c
 
 
 class Samples:
-    """The samples of a shot under way.
+    """The time samples of a shot that is being written.
 
     Args:
         layer: where they go; it holds specs of the SkelRoot and the SkelAnimation.

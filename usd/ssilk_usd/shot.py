@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write a baked garment as one self-contained UsdSkel shot, whatever its length in little memory."""
+"""Write a baked garment as one self-contained UsdSkel shot of any length, in little memory."""
 
 from __future__ import annotations
 
@@ -94,8 +94,10 @@ def write_samples(
     path: str | Path,
     provenance: Mapping[str, object] | None = None,
 ) -> None:
-    """Write the frames of a shot, checked, saving now and then, and last, what may have grown meanwhile, where it
-    came from; `path` is what messages call the file."""
+    """Check and write the frames of a shot, saving at intervals, then its provenance, which may have grown meanwhile.
+
+    Messages call the file `path`.
+    """
     for pose in _checked(poses, samples.deformer, samples.motion):
         samples.append(pose)
         if samples.unsaved_count >= FRAMES_PER_SAVE:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plain files of characters, garments and motions, as artists and motion libraries hand them over."""
+"""Write characters with garments, garments and motions as files of their own."""
 
 from __future__ import annotations
 
