@@ -73,13 +73,24 @@ def open_stage(source: StageLike) -> Usd.Stage:
     del quiet
     missing = [
         " ".join(str(error).split()).rstrip(".")
-        for error in stage.GetCompositionErrors()
+        for error in _composition_errors(stage)
         if isinstance(error, _MISSING)
     ]
     free_when_closed(stage.GetUsedLayers())
     if missing:
         fail(str(source), " and ".join(missing[:2]), "every layer must be found", "restore it or its path")
     return stage
+
+
+def _composition_errors(stage: Usd.Stage) -> list[Any]:
+    """Return what stays unresolved on a stage. Blender 4.2 has USD 24.5, which lists that by prim and layer stack."""
+    if hasattr(stage, "GetCompositionErrors"):
+        return list(stage.GetCompositionErrors())
+    root = stage.GetPseudoRoot()
+    found = list(root.GetPrimIndex().rootNode.layerStack.localErrors)
+    for prim in Usd.PrimRange(root, Usd.PrimAllPrimsPredicate):
+        found += prim.GetPrimIndex().localErrors
+    return found
 
 
 def content_hash(source: str | Path) -> str:
