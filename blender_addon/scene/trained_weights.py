@@ -16,13 +16,13 @@ from .armature import keys_of
 from .weights import SAME_WEIGHTS, forget_kept, keep_weights, read_groups, read_kept, signature, write_groups
 
 OWN = "ssilk:own:"  # begins the attributes that keep a garment's own weights, one for each joint
-WORN = "ssilk:worn"  # attribute of points: the signature of the trained weights
+SIGNATURE = "ssilk:worn"  # attribute of points: the signature of the trained weights
 SAME = 1e-6  # difference of weights
 
 
 def has_trained_weights(garment: bpy.types.Object) -> bool:
     """Return whether a garment has trained weights. Not in edit mode."""
-    return WORN in garment.data.attributes
+    return SIGNATURE in garment.data.attributes
 
 
 def put_trained_weights(
@@ -36,7 +36,7 @@ def put_trained_weights(
     discard_own_weights(garment)
     keep_weights(garment.data, OWN, own, keys)
     write_groups(garment, weights, names, ())
-    attribute = garment.data.attributes.new(WORN, "FLOAT", "POINT")
+    attribute = garment.data.attributes.new(SIGNATURE, "FLOAT", "POINT")
     attribute.data.foreach_set("value", signature(weights, keys))
 
 
@@ -47,7 +47,7 @@ def own_groups(armature: bpy.types.Object, garment: bpy.types.Object, names: Seq
     every = list(dict.fromkeys([*names, *(bone.name for bone in armature.data.bones if bone.use_deform)]))
     keys, found = keys_of(armature, every), read_groups(garment, garment.data, every)
     worn = np.empty(len(found), dtype=np.float32)
-    garment.data.attributes[WORN].data.foreach_get("value", worn)
+    garment.data.attributes[SIGNATURE].data.foreach_get("value", worn)
     untouched = np.abs(signature(found, keys) - worn) <= SAME_WEIGHTS
     kept = read_kept(garment.data, OWN, keys)
     found[untouched] = 0.0 if kept is None else kept[untouched]  # none: it had no weights at all
@@ -67,4 +67,4 @@ def discard_own_weights(garment: bpy.types.Object) -> None:
     """Remove the record of a garment's own weights; its current ones become its own."""
     forget_kept(garment.data, OWN)
     if has_trained_weights(garment):
-        garment.data.attributes.remove(garment.data.attributes[WORN])
+        garment.data.attributes.remove(garment.data.attributes[SIGNATURE])

@@ -232,7 +232,7 @@ def _define_blendshapes(mesh: UsdGeom.Mesh, names: Sequence[str], offsets: Float
     stage = mesh.GetPrim().GetStage()
     for name, shape in zip(names, offsets):
         rows = np.flatnonzero(shape.any(axis=1))
-        moved = np.asarray(units.vectors_from_core(shape[rows]), dtype=np.float32)
+        moved = np.asarray(units.points_from_core(shape[rows]), dtype=np.float32)
         prim = UsdSkel.BlendShape.Define(stage, path.AppendChild(name))
         prim.CreateOffsetsAttr(Vt.Vec3fArray.FromNumpy(moved))
         prim.CreatePointIndicesAttr(Vt.IntArray.FromNumpy(rows.astype(np.int32)))

@@ -69,12 +69,8 @@ class StageUnits:
         return self.matrix @ transforms @ scaling(1 / self.meters_per_unit)
 
     def points_from_core(self, points: Floats) -> Floats:
-        """Return points [m], y up, shape (..., 3), in the stage's units and axes."""
+        """Return points or offsets [m], y up, shape (..., 3), in the stage's units and axes."""
         return np.asarray(points) @ self.rotation / self.meters_per_unit
-
-    def vectors_from_core(self, vectors: Floats) -> Floats:
-        """Return offsets [m], y up, shape (..., 3), in the stage's units and axes."""
-        return self.points_from_core(vectors)
 
     def transforms_from_core(self, transforms: Floats) -> Floats:
         """Return rigid joint-to-world transforms [m], y up, shape (..., 4, 4), in the stage's units and axes."""
