@@ -26,11 +26,7 @@ def apply_classes(garment: bpy.types.Object, classes: np.ndarray) -> None:
     Raises:
         SetupError: it was edited meanwhile.
     """
-    count = len(garment.data.vertices)
-    if count != len(classes):
-        raise SetupError(
-            f"'{garment.name}' had {len(classes)} vertices when this began and has {count} now; start it again."
-        )
+    _need_same_vertices(garment, classes)
     write_classes(garment.data, classes)
 
 
@@ -54,7 +50,7 @@ def apply_rig(
     Raises:
         SetupError: the garment or the armature was edited meanwhile, or the armature cannot be edited.
     """
-    apply_classes(garment, classes)
+    _need_same_vertices(garment, classes)
     lost = [name for name in joints.names if name not in armature.data.bones]
     if lost:
         raise SetupError(f"'{armature.name}' lost {lost[:1]} while the rig was made; make it again.")
@@ -71,6 +67,7 @@ def apply_rig(
         carriers = replace_proxies(armature, garment, joints, rig, edits)
     weights = rig.skin.dense(len(names) + rig.proxy_count).astype(np.float32)
     _give_weights(garment, armature, weights, carriers, edits.repainted, old)
+    write_classes(garment.data, classes)
     _bind(garment, armature)
     return edits
 
@@ -96,6 +93,14 @@ def _give_weights(
     discard_own_weights(garment)
     write_groups(garment, kept, names, old)
     remember_weights(armature, garment, made, names)
+
+
+def _need_same_vertices(garment: bpy.types.Object, classes: np.ndarray) -> None:
+    count = len(garment.data.vertices)
+    if count != len(classes):
+        raise SetupError(
+            f"'{garment.name}' had {len(classes)} vertices when this began and has {count} now; start it again."
+        )
 
 
 def _bind(garment: bpy.types.Object, armature: bpy.types.Object) -> None:
