@@ -19,22 +19,23 @@ import bpy
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path.insert(0, str(Path(__file__).parents[1] / "usd"))
 
 from mathutils import Matrix
+from ssilk_usd.units import StageUnits
 
 from ssilk_core.assets import Scene
 from ssilk_core.checkpoint import load_model
 
 FRAMES = 300
+UNITS = StageUnits(1.0, "Z")  # of Blender's empty scene
 
 
 def build(path: Path) -> bpy.types.Object:
     """Make the garment of a model on its armature; return it, active."""
-    from blender_addon.contract.axes import points_from_core
-
     scene = load_model(path).scene
-    mesh = bpy.data.meshes.new("Garment")
-    mesh.from_pydata(points_from_core(scene.garment.mesh.points, 1.0).tolist(), [], scene.garment.mesh.faces.tolist())
+    mesh, points = bpy.data.meshes.new("Garment"), UNITS.points_from_core(scene.garment.mesh.points)
+    mesh.from_pydata(points.tolist(), [], scene.garment.mesh.faces.tolist())
     garment = bpy.data.objects.new("Garment", mesh)
     armature = bpy.data.objects.new("Rig", bpy.data.armatures.new("Rig"))
     for thing in (armature, garment):
@@ -47,13 +48,14 @@ def build(path: Path) -> bpy.types.Object:
 
 def add_bones(armature: bpy.types.Object, garment: bpy.types.Object, scene: Scene) -> None:
     """Make a bone of each joint, the proxies marked as the garment's."""
-    from blender_addon.contract.axes import from_core
     from blender_addon.scene.armature import made_collection
 
     bpy.context.view_layer.objects.active = armature
     bpy.ops.object.mode_set(mode="EDIT")
     bones: list[bpy.types.EditBone] = []
-    for path, parent, bind in zip(scene.joint_names, scene.parents, from_core(scene.bind_transforms, 1.0)):
+    for path, parent, bind in zip(
+        scene.joint_names, scene.parents, UNITS.transforms_from_core(scene.bind_transforms)
+    ):
         bone = armature.data.edit_bones.new(path.rpartition("/")[2])
         bone.tail, bone.parent = (0.0, 0.1, 0.0), bones[parent] if parent >= 0 else None
         bone.matrix = Matrix(bind)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What an artist changed on proxies by hand, and how a rig that is generated anew makes way for it."""
+"""Changes that an artist made to proxies by hand, and how a newly generated rig keeps them."""
 
 from __future__ import annotations
 
@@ -7,12 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .arrays import Rig
-
 
 @dataclass(frozen=True, eq=False)
 class Edits:
-    """Changes since proxies were generated.
+    """Changes since proxies were generated, in Blender's world.
 
     Attributes:
         changed: where each proxy that was moved or reparented had been generated, by its name now, each (3,).
@@ -46,13 +44,15 @@ class Edits:
         return ", ".join(f"{count} {what}" for what, count in counts.items() if count)
 
 
-def takers(rig: Rig, edits: Edits) -> list[str | None]:
-    """Return for each proxy of a new rig the bone that stands for it: an artist's, "" for a new one, None for none.
+def match_proxies(places: np.ndarray, edits: Edits) -> list[str | None]:
+    """Return which bone takes the place of each proxy of a new rig: a name, "" for a new bone, None for no bone.
 
     Bones that were moved take the place of the new proxy nearest to where they had been generated, and proxies near
     one that was deleted are not made again; nearer than half the spacing of the rig.
+
+    Args:
+        places: of the new proxies in Blender's world, shape (P, 3).
     """
-    places = rig.binds[:, :3, 3]
     found: list[str | None] = [""] * len(places)
     claims = [*((place, name) for name, place in edits.changed.items()), *((place, None) for place in edits.deleted)]
     for place, taker in claims:

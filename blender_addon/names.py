@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Names that USD allows for what Blender calls as it likes."""
+"""Valid USD names for the names of Blender's objects and bones."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def identifiers(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
     return found
 
 
-def joint_paths(names: Iterable[str], parents: Iterable[int]) -> list[str]:
+def joint_paths(names: Iterable[str], parents: Iterable[int]) -> tuple[str, ...]:
     """Return UsdSkel joint paths ("Hips/Spine"), with leaf names that are unique among all joints.
 
     Args:
@@ -30,4 +30,4 @@ def joint_paths(names: Iterable[str], parents: Iterable[int]) -> list[str]:
     paths: list[str] = []
     for leaf, parent in zip(identifiers(names), parents):
         paths.append(f"{paths[parent]}/{leaf}" if parent >= 0 else leaf)
-    return paths
+    return tuple(paths)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What proxies and their weights were like when they were generated, and what an artist changed since.
+"""Proxies and weights as they were generated, and the changes that an artist made since.
 
-The bone collection remembers each proxy as it was, under a key that its bone carries along when it is renamed. Each
-vertex remembers the signature of its weights.
+The bone collection stores each proxy under a key, which its bone keeps when it is renamed. Each vertex stores the
+signature of its weights.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from collections.abc import Sequence
 import bpy
 import numpy as np
 
-from ..contract.edits import Edits
+from ..edits import Edits
 from .armature import MADE, collection_of, keys_of, made_collection, proxy_names
+from .trained_weights import own_groups
 from .weights import SAME_WEIGHTS, signature
-from .worn import own_groups
 
 SIGNATURE = "ssilk:made"  # attribute of points
 SAME_PLACE = 1e-3  # of a bone's length

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Heat maps that follow the timeline: coloured anew once Blender has evaluated a frame, a little at a time.
+"""Heat maps that follow the timeline: they are updated after each frame change, a little at a time.
 
 While a large garment plays, its colours lag behind by as many frames as measuring takes.
 """
@@ -21,12 +21,12 @@ _outdated = False  # whether the frame changed since these steps began
 
 
 def start_listening() -> None:
-    """Have Blender call what is here."""
+    """Register the handler."""
     bpy.app.handlers.frame_change_post.append(_frame_changed)
 
 
 def stop_listening() -> None:
-    """Leave nothing behind."""
+    """Remove handler and timer."""
     global _steps, _outdated
     _steps, _outdated = iter(()), False
     if _frame_changed in bpy.app.handlers.frame_change_post:
