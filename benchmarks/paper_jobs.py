@@ -143,7 +143,8 @@ class Training:
         rates = (f"iterations={steps}", f"validate_every={max(1, steps // VALIDATIONS)}")
         settings = [*(RECIPES[self.garment] if own else ()), *rates, *self.settings]
         settings += [*REHEARSED, *(() if self._sets("batch") else ("batch=2",))] if plan.rehearse else []
-        begun = (*SSILK, "train") if own else (PYTHON, "benchmarks/baselines.py", self.method)
+        script = "train_baseline" if not own else "train_scheme" if self._sets("scheme") else ""
+        begun = (PYTHON, f"benchmarks/{script}.py", *(() if own else (self.method,))) if script else (*SSILK, "train")
         command = (
             *begun, str(plan.stage(self.stage or self.garment)), "--motions", *plan.files("train"), "--valid",
             *plan.files("valid"), "-o", str(plan.model(self.name)), "--preset", "final", "--device", plan.device,

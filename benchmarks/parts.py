@@ -66,7 +66,7 @@ def network_parts(at: Moment) -> list[Part]:
     model, batch, first, z = at.model, at.batch, 2 * at.batch, leaf(at.z)
     before, now, rest = at.target[:-first], at.target[batch:-batch], at.target[first:]
     poses, pose = at.bank.static_descriptor(at.frames, at.direction), at.pose[first:]
-    passes = 1 + model.integrator.centred  # what S would do at rest is taken off
+    passes = 2 - model.integrator.scheme.bias  # SpringVerlet subtracts what S gives at rest
     initial = tuple(model.initialiser.parameters())
     stepping = (*model.stepper.parameters(), *model.integrator.parameters())
     return [

@@ -9,7 +9,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from ssilk_core.baselines.files import KEY, load_network
+from baselines.files import KEY, load_network
+
 from ssilk_core.checkpoint import ModelFile
 from ssilk_core.devices import chosen_device, device_name
 from ssilk_core.errors import fail
@@ -79,11 +80,11 @@ def read_records(paths: Sequence[Path]) -> tuple[list[Row], dict[str, Settings],
     return rows, models, ", ".join(hardware)
 
 
-def with_truth(rows: Sequence[Row]) -> list[Row]:
-    """Return the rows of whole clips, where there are any, with what sequences told of the simulator."""
-    truth = {_key(row): row["figures"]["truth"] for row in rows if row["figures"]["truth"]}
+def with_reference(rows: Sequence[Row]) -> list[Row]:
+    """Return the rows of whole clips, where there are any, with the errors that sequences have to the simulator."""
+    errors = {_key(row): row["figures"]["reference"] for row in rows if row["figures"]["reference"]}
     whole = [row for row in rows if row["sequence"] is None] or rows
-    return [{**row, "figures": {**row["figures"], "truth": truth.get(_key(row))}} for row in whole]
+    return [{**row, "figures": {**row["figures"], "reference": errors.get(_key(row))}} for row in whole]
 
 
 def _key(row: Row) -> tuple[str, ...]:

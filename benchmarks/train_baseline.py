@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Train a baseline as 'ssilk train' trains a model: same scene, motions and energies, same validation.
 
-    python benchmarks/baselines.py ncs STAGE --motions FOLDER --valid FOLDER -o ncs.safetensors --minutes 30
+    python benchmarks/train_baseline.py ncs STAGE --motions FOLDER --valid FOLDER -o ncs.safetensors --minutes 30
 
 `ncs*` is NCS with the rotation augmentation of SSILK. All options of 'ssilk train' serve; `--set` changes the
 schedule below. Energies are computed of as many poses in a step as by default for a model: 640 windows of 18 poses,
@@ -14,8 +14,9 @@ from __future__ import annotations
 import argparse
 import math
 
-from ssilk_core.baselines.networks import BaselineConfig
-from ssilk_core.baselines.run import BaselineJob, train_baseline
+from baselines.networks import BaselineConfig
+from baselines.run import BaselineJob, train_baseline
+
 from ssilk_core.cli import train
 from ssilk_core.config import TrainConfig
 from ssilk_core.devices import chosen_device

@@ -11,16 +11,17 @@ from typing import Any
 
 import torch
 
-from ..devices import chosen_device
-from ..errors import fail
-from ..events import Checkpoint, Message, Progress, Reporter, Started
-from ..training.curve import CurvePoint, with_point
-from ..training.job import TrainJob
-from ..training.parts import build_parts
-from ..training.run_files import RunFiles
-from ..training.state import Best, RunState, load_state, restore
-from ..training.validation import Score
-from ..training.verdict import not_finite, verdict
+from ssilk_core.devices import chosen_device
+from ssilk_core.errors import fail
+from ssilk_core.events import Checkpoint, Message, Progress, Reporter, Started
+from ssilk_core.training.curve import CurvePoint, with_point
+from ssilk_core.training.job import TrainJob
+from ssilk_core.training.parts import build_parts
+from ssilk_core.training.run_files import RunFiles
+from ssilk_core.training.state import Best, RunState, load_state, restore
+from ssilk_core.training.validation import Score
+from ssilk_core.training.verdict import not_finite, verdict
+
 from .descriptors import joint_bank
 from .files import save_baseline
 from .networks import BaselineConfig, baseline

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..descriptors import RATE_TIME
-from ..motion_bank import MotionBank
+from ssilk_core.descriptors import RATE_TIME
+from ssilk_core.motion_bank import MotionBank
 
 STILL, MOVING, ROOT = 9, 12, 3
 """Features of a joint at rest and in motion, and of the root's motion."""

@@ -14,9 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..assets import PINNED, Ints, Scene
-from ..errors import fail
-from ..skinning import Skinning
+from ssilk_core.assets import PINNED, Ints, Scene
+from ssilk_core.errors import fail
+from ssilk_core.skinning import Skinning
+
 from .descriptors import MOVING, ROOT, STILL, split_features
 
 SHAPES = 1e-4  # [m], standard deviation of initial shapes: training starts close to linear blend skinning

@@ -6,13 +6,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from ..collision.body import CollisionBody
-from ..config import TrainConfig
-from ..energy import GarmentEnergy
-from ..errors import fail
-from ..training.objective import Objective, Terms, total
-from ..training.step import Stepper
-from ..training.windows import WindowSampler
+from ssilk_core.collision.body import CollisionBody
+from ssilk_core.config import TrainConfig
+from ssilk_core.energy import GarmentEnergy
+from ssilk_core.errors import fail
+from ssilk_core.training.objective import Objective, Terms, total
+from ssilk_core.training.step import Stepper
+from ssilk_core.training.windows import WindowSampler
+
 from .descriptors import JointBank
 from .networks import NCS, Baseline
 
