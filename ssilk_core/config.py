@@ -99,7 +99,8 @@ class TrainConfig:
         learning_rate_warmup: iterations over which the learning rate rises at the start of dynamic training.
         skin_learning_rate_scale: factor on the learning rate of skinning weights and of the integrator's parameters.
         shape_learning_rate_scale: factor on the learning rate of blendshapes, each of which moves many vertices.
-        ema_decay: of the exponential moving average of the parameters, which is validated and kept; 0 for none.
+        ema_decay: of the exponential moving average of the parameters, which is validated and kept; 0 for none. It
+            is smaller at first: `training.step.averaging_decay`.
         closest_point: body point that cloth meets: on the "triangles" around the nearest vertex, or that of
             "vertices" itself, which is faster and coarser.
         validate_every: iterations between validations.
