@@ -38,7 +38,7 @@ def learning_rate(config: TrainConfig, iteration: int) -> float:
 
 
 def averaging_decay(config: TrainConfig, iteration: int) -> float:
-    """Return the decay of the parameters' average at an iteration: min(d, (1 + t) / (10 + t)) at step t of a phase."""
+    """Return the decay of the average at an iteration: min(ema_decay, (1 + t) / (10 + t)) at step t of a phase."""
     # A constant decay d keeps d^n of the initial parameters after n steps: 9.5 % for 0.9995 and 4,706 steps. With
     # this warm-up they vanish, and in a short phase the average spans about its last ninth.
     static = config.static_iterations
