@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from plots import COLOURS, Panel, canvas, save
-from reports import RESULTS, table, write_results
-from subjects import Subject, arguments, clip_of, open_subject, parsed
+from helpers.plots import COLOURS, Panel, canvas, save
+from helpers.reports import RESULTS, table, write_results
+from helpers.subjects import Subject, arguments, clip_of, open_subject, parsed
 from torch import Tensor
 
 from ssilk_core.energy import TERMS

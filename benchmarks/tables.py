@@ -5,7 +5,7 @@
         --reference SHOTS --device cuda
 
 MODELS are files, or folders of them: those of 'ssilk train' and baselines, whose files say what they are. Models of
-one garment and method are taken as seeds, and shown as mean and standard deviation. SHOTS is what 'ssilk simulate'
+one garment and method count as seeds, shown as mean and standard deviation. SHOTS is what 'ssilk simulate'
 made of the clips, one folder for each garment.
 
     record    figures of models into a file (--output), from which the tables are made where there are no models
@@ -13,15 +13,12 @@ made of the clips, one folder for each garment.
     table1    every garment, split and method: total, collisions, excess over the simulator
     table2    the same of `inertia` and `flips`, beside the simulator
     table3    time of a single frame of one clip, in PyTorch
-    table4    weight of the regularisation of latents (Eq. 13)
-    table5    batch, window and latent size, one changed at a time
-    figure8   blendshapes alone, joints alone, and both
-    figure11  schemes of integration
-    figure12  numbers of blendshapes, and of proxies
+    ablations one setting changed at a time: decoder (Figure 8), integration scheme (Figure 11), blendshapes and
+              proxies (Figure 12), latent regularisation (Table 4), batch, window and latent size (Table 5)
 
-Records in place of models (`*.json`, or folders of them) need no stage and no motions: table1 takes totals from those
-of whole clips and the simulator from those of sequences. Figure 10 is drawn by `long_rollout.py`, the curves of
-Figure 11 by `curves.py`; `paper.py` trains and measures all that the tables need.
+Records in place of models (`*.json`, or folders of them) need no stage and no motions. table1 takes totals from those
+of whole clips and the errors to the simulator from those of sequences. `long_rollout.py` measures Figure 10 and
+`curves.py` the curves of Figure 11. `paper.py` trains and measures all that the tables need.
 """
 
 from __future__ import annotations
@@ -32,16 +29,16 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
-import paper_schemes
 import torch
 from baselines.files import load_network
-from records import with_reference, write_record
-from reports import table, write_results
-from seeds import Cell, cells, evaluated, measured
-from single_frames import frame_times
+from helpers import paper_schemes
+from helpers.records import with_reference, write_record
+from helpers.reports import table, write_results
+from helpers.seeds import Cell, cells, evaluated, measured
+from helpers.single_frames import frame_times
+from helpers.subjects import dressed_in
+from helpers.sweeps import ablations
 from ssilk_usd.read_motion import read_motion
-from subjects import dressed_in
-from sweeps import SWEEPS, sweep
 
 from ssilk_core.assets import Motion
 from ssilk_core.checkpoint import ModelFile
@@ -78,8 +75,17 @@ def methods_table(found: Mapping[tuple[str, str, str], Cell], splits: Sequence[s
     return table(["garment", "method", *(f"{split}: {name}" for split, name in columns)], rows)
 
 
+def figures_of(found: Mapping[tuple[str, str, str], Cell], shown: Columns = COLUMNS) -> list[dict[str, Any]]:
+    """Return the figures of each cell, a list with the values of all seeds under the last name of each path."""
+    names = ("garment", "method", "split")
+    values = {key: {path[-1]: cell.values(path) for path, _ in shown.values()} for key, cell in found.items()}
+    return [
+        dict(zip(names, key)) | {name: seeds for name, seeds in of.items() if seeds} for key, of in values.items()
+    ]
+
+
 def verdicts(found: Mapping[tuple[str, str, str], Cell]) -> list[str]:
-    """Return in how many cells the goals are met, where there is what they compare with."""
+    """Return in how many cells each goal is met."""
     ours = {(garment, split): cell for (garment, method, split), cell in found.items() if method == "ssilk"}
     lines = []
     for baseline in ("ncs", "ncs*", "snug"):
@@ -104,10 +110,19 @@ def _shares(text: str, met: Sequence[bool]) -> list[str]:
 
 
 def table1(options: argparse.Namespace) -> tuple[str, Any]:
-    rows = with_reference(measured(options)[0])
-    found = cells(rows)
+    rows, models = measured(options)
+    found = cells(with_reference(rows))
     notes = "".join(f"\n- {line}" for line in verdicts(found))
-    return methods_table(found, SPLITS) + notes + "\n", rows
+    trainings = [
+        {"garment": settings["garment"], "method": method, **settings["trained"]}
+        for name, settings in models.items()
+        if (
+            method := next(
+                (row["method"].partition(" (")[0] for row in rows if Path(row["model"] or "").stem == name), None
+            )
+        )
+    ]
+    return methods_table(found, SPLITS) + notes + "\n", {"figures": figures_of(found), "trainings": trainings}
 
 
 def table2(options: argparse.Namespace) -> tuple[str, Any]:
@@ -115,7 +130,8 @@ def table2(options: argparse.Namespace) -> tuple[str, Any]:
     rows = [row for row in simulated if row["split"] != "valid"]
     if not rows:
         fail("table2", "no simulator among the figures", "its shots are needed", "give --reference, or records of it")
-    return methods_table(cells(rows), SPLITS[1:], DYNAMICS), rows
+    found = cells(rows)
+    return methods_table(found, SPLITS[1:], DYNAMICS), {"figures": figures_of(found, DYNAMICS)}
 
 
 def everything(options: argparse.Namespace) -> tuple[str, Any]:
@@ -148,7 +164,7 @@ def record(options: argparse.Namespace) -> None:
 
 
 MADE: dict[str, Callable[[argparse.Namespace], tuple[str, Any]]] = {
-    "evaluate": everything, "table1": table1, "table2": table2, "table3": table3, **dict.fromkeys(SWEEPS, sweep),
+    "evaluate": everything, "table1": table1, "table2": table2, "table3": table3, "ablations": ablations,
 }  # fmt: skip
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 
-import paper_schemes
+from helpers import paper_schemes
 
 from ssilk_core.cli import main
 

@@ -155,9 +155,11 @@ def test_errors_against_a_reference_are_those_of_the_offset(dressed, take_set):
     found = reference_errors(tally, reference, dressed.weight)
     exact = [path, path.diff(dim=0) * FPS, path.diff(n=2, dim=0) * FPS**2]
     expected = [float(values[:, 1].square().mean()) ** 0.5 for values in exact]
-    np.testing.assert_allclose([found.position_error, found.velocity_error, found.acceleration_error], expected, rtol=2e-3)
+    errors = [found.position_error, found.velocity_error, found.acceleration_error]
+    np.testing.assert_allclose(errors, expected, rtol=2e-3)
     mass = float(dressed.energy.mass.sum())
-    assert found.gravity_excess == pytest.approx(mass * GRAVITY * float(path[:, 1].mean()) / dressed.weight, rel=1e-3)
+    lifted = mass * GRAVITY * float(path[:, 1].mean())
+    assert found.gravity_excess == pytest.approx(lifted / dressed.weight, rel=1e-3)
     own = figures(tally, reference, dressed.weight)
     assert found.total_excess == pytest.approx(own.total - found.reference_total) and found.frames == 40
     assert own.static_distance == pytest.approx(expected[0], rel=1e-3)

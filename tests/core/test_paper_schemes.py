@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from benchmarks.paper_schemes import PAPER_SCHEMES
+from benchmarks.helpers.paper_schemes import PAPER_SCHEMES
 from ssilk_core.checkpoint import load_model, model_file, save_model
 from ssilk_core.config import ModelConfig, TrainConfig
 from ssilk_core.errors import SsilkError

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an evaluation found, and of which models, as files: measured on one machine, made into tables on another."""
+"""Records: figures of models with the models' settings, measured on one machine and tabled on another."""
 
 from __future__ import annotations
 
@@ -36,14 +36,15 @@ def settings_of(path: Path) -> Settings:
     file, _ = load_network(path)
     told = file.provenance
     found = {"baseline": told[KEY]["method"]} if KEY in told else {name: of(file) for name, of in SETTINGS.items()}
-    trained = {
-        "iterations": told["train"].get("iterations"), "kept at": told.get("iteration"), "on": told.get("device"),
-    }  # fmt: skip
     curve = curve_path(path)
     points = json.loads(curve.read_text())["points"] if curve.is_file() else []
-    last = {"steps": points[-1]["iteration"], "seconds": points[-1]["seconds"]} if points else {}
+    trained = {
+        "seed": told["train"].get("seed"),
+        "iterations": points[-1]["iteration"] if points else told["train"].get("iterations"),
+        "seconds": points[-1]["seconds"] if points else None,
+    }
     garment = file.scene.garment.mesh.path.rpartition("/")[2]
-    return {"garment": garment, **found, "trained": {**trained, **last}}
+    return {"garment": garment, **found, "trained": trained}
 
 
 def write_record(options: argparse.Namespace, rows: Sequence[Row]) -> None:

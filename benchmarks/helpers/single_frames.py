@@ -10,12 +10,13 @@ from itertools import pairwise
 import torch
 from baselines.evaluation import method_over
 from baselines.networks import Baseline
-from clock import now
 from torch import Tensor
 
 from ssilk_core.evaluation.methods import Network, TakeSet
 from ssilk_core.model.network import GarmentModel
 from ssilk_core.motion_bank import LatentModel
+
+from .clock import now
 
 WARM_UP = 30  # frames that are not timed
 

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from floors import WARM, WINDOWS, Part, Tensors
-from moment import Moment
 from torch import Tensor, nn
 
 from ssilk_core import kernels
 from ssilk_core.constants import GRAVITY
+
+from .floors import WARM, WINDOWS, Part, Tensors
+from .moment import Moment
 
 # Operations for one element in one frame, counted on the formulas.
 TURN, COMPOSE, BLEND, TRANSFORM, NORMALISE = 15, 108, 24, 18, 9

@@ -9,13 +9,14 @@ from dataclasses import dataclass
 from statistics import mean, stdev
 
 from baselines.evaluation import open_network
-from records import Row, Settings, read_records, settings_of
 
 from ssilk_core.cli import evaluate as verb
 from ssilk_core.cli import parser
 from ssilk_core.errors import fail
 from ssilk_core.evaluation.tables import tables
 from ssilk_core.events import silent
+
+from .records import Row, Settings, read_records, settings_of
 
 
 def measured(options: argparse.Namespace) -> tuple[list[Row], dict[str, Settings]]:
