@@ -134,9 +134,10 @@ class Stepper:
     @torch.no_grad()
     def _average(self) -> None:
         """Move the average towards the parameters."""
-        averaged = [*self.averaged.parameters()]
+        averaged: list[Tensor] = [*self.averaged.parameters()]
+        parameters: list[Tensor] = [*self.model.parameters()]
         torch._foreach_mul_(averaged, self._decay)
-        torch._foreach_add_(averaged, torch._foreach_mul([*self.model.parameters()], 1 - self._decay))
+        torch._foreach_add_(averaged, [*torch._foreach_mul(parameters, 1 - self._decay)])
 
     def run(self, iteration: int) -> None:
         """Do the step of an iteration, in the phase that it belongs to."""
