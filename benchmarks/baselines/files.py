@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of trained baselines: those of models, with what the baseline is among their provenance."""
+"""Files of trained baselines: model files whose provenance says which baseline they hold."""
 
 from __future__ import annotations
 

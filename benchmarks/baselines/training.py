@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The training of a baseline: the energies, schedule, bounds and averages that a `GarmentModel` is trained with."""
+"""The training of a baseline, with the energies, schedule, bounds and averages of a `GarmentModel`'s training."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .networks import NCS, Baseline
 
 
 class BaselineObjective(Objective):
-    """Energies of the last frames of windows that begin with no memory.
+    """Energies of the last frames of windows that start from static states.
 
     The frames before them only fill the memory, as in both papers.
 
@@ -84,7 +84,7 @@ class BaselineObjective(Objective):
 
 
 class BaselineStepper(Stepper):
-    """Moves the parameters of a baseline as `Stepper` does those of a model, graphs and all."""
+    """Trains a baseline as `Stepper` trains a model."""
 
     objective: BaselineObjective
     averaged: Baseline  # type: ignore[assignment]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The folder of benchmarks is what its README says, and its results stay small."""
+"""The folder of benchmarks is what its README says."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from benchmarks.helpers.reports import indented, rounded
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 NAMED = re.findall(r"`([\w*]+\.\w+)`", (FOLDER / "README.md").read_text(encoding="utf-8"))
 RESULTS = sorted((FOLDER / "results").iterdir())
-LARGEST = 32 * 1024  # bytes of figures; images may be larger
 
 
 @pytest.mark.parametrize("folder", [FOLDER, FOLDER / "helpers"], ids=lambda folder: folder.name)
@@ -30,9 +29,8 @@ def test_the_readme_names_no_script_that_is_gone():
 
 
 @pytest.mark.parametrize("path", RESULTS, ids=lambda path: path.name)
-def test_results_are_small_and_some_script_makes_them(path):
+def test_some_script_makes_each_result(path):
     assert any(fnmatch(path.name, name) for name in NAMED), "benchmarks/README.md does not name it"
-    assert path.suffix == ".png" or path.stat().st_size <= LARGEST
 
 
 def test_result_files_hold_six_digits_and_lines_that_read():
