@@ -19,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from helpers.reports import table, write_results
 from pxr import Sdf
-from reports import table, write_results
 from ssilk_usd.play import Shot
 from ssilk_usd.read_character import read_character
 from ssilk_usd.read_motion import read_motion

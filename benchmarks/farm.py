@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from reports import table, write_results
+from helpers.reports import table, write_results
 from ssilk_usd.read_character import read_character
 from ssilk_usd.read_motion import read_motion
 from ssilk_usd.write import write_motion

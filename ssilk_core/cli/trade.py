@@ -127,7 +127,7 @@ class Bench:
 
     def meter(self, path: Path, file: ModelFile, *, only: str | None = None) -> VariantMeter:
         """Return what measures a model on all clips, cut for other motions; or on `only` one, cut for it."""
-        from ..evaluation.methods import reel_of
+        from ..evaluation.methods import build_take_set
         from ..evaluation.takes import takes_of
         from ..reduction import Reducer
         from ..trade.measure import VariantMeter
@@ -135,7 +135,7 @@ class Bench:
         dressed = self._dressed(file)
         clips = {only: self.clips[only]} if only else self.clips
         takes = [take for name, clip in clips.items() for take in takes_of(name, clip, dressed.fps)]
-        reel = reel_of(takes, dressed, file.joints)
+        reel = build_take_set(takes, dressed, file.joints)
         reducer = Reducer(file, [self.clips[only]] if only else self.others)
         return VariantMeter(path.stem, reducer, dressed, reel, self._weigh(path), self._reference(dressed, reel))
 
@@ -166,7 +166,7 @@ class Bench:
                 "each clip needs one",
                 "simulate them with 'ssilk simulate'",
             )
-        return CachedPoints("simulator", found.read, dressed, reel)
+        return CachedPoints(found.read, dressed, reel)
 
     def _weigh(self, path: Path) -> Weigh:
         """Return what tells how large a model's shots of the first clip are, without the body."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an evaluation found, and of which models, as files: measured on one machine, made into tables on another."""
+"""Records: figures of models with the models' settings, measured on one machine and tabled on another."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from ssilk_core.baselines.files import KEY, load_network
+from baselines.files import KEY, load_network
+
 from ssilk_core.checkpoint import ModelFile
 from ssilk_core.devices import chosen_device, device_name
 from ssilk_core.errors import fail
@@ -35,14 +36,15 @@ def settings_of(path: Path) -> Settings:
     file, _ = load_network(path)
     told = file.provenance
     found = {"baseline": told[KEY]["method"]} if KEY in told else {name: of(file) for name, of in SETTINGS.items()}
-    trained = {
-        "iterations": told["train"].get("iterations"), "kept at": told.get("iteration"), "on": told.get("device"),
-    }  # fmt: skip
     curve = curve_path(path)
     points = json.loads(curve.read_text())["points"] if curve.is_file() else []
-    last = {"steps": points[-1]["iteration"], "seconds": points[-1]["seconds"]} if points else {}
+    trained = {
+        "seed": told["train"].get("seed"),
+        "iterations": points[-1]["iteration"] if points else told["train"].get("iterations"),
+        "seconds": points[-1]["seconds"] if points else None,
+    }
     garment = file.scene.garment.mesh.path.rpartition("/")[2]
-    return {"garment": garment, **found, "trained": {**trained, **last}}
+    return {"garment": garment, **found, "trained": trained}
 
 
 def write_record(options: argparse.Namespace, rows: Sequence[Row]) -> None:
@@ -79,11 +81,11 @@ def read_records(paths: Sequence[Path]) -> tuple[list[Row], dict[str, Settings],
     return rows, models, ", ".join(hardware)
 
 
-def with_truth(rows: Sequence[Row]) -> list[Row]:
-    """Return the rows of whole clips, where there are any, with what sequences told of the simulator."""
-    truth = {_key(row): row["figures"]["truth"] for row in rows if row["figures"]["truth"]}
+def with_reference(rows: Sequence[Row]) -> list[Row]:
+    """Return the rows of whole clips, where there are any, with the errors that sequences have to the simulator."""
+    errors = {_key(row): row["figures"]["reference"] for row in rows if row["figures"]["reference"]}
     whole = [row for row in rows if row["sequence"] is None] or rows
-    return [{**row, "figures": {**row["figures"], "truth": truth.get(_key(row))}} for row in whole]
+    return [{**row, "figures": {**row["figures"], "reference": errors.get(_key(row))}} for row in whole]
 
 
 def _key(row: Row) -> tuple[str, ...]:

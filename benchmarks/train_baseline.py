@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Train a baseline as 'ssilk train' trains a model: same scene, motions and energies, same validation.
 
-    python benchmarks/baselines.py ncs STAGE --motions FOLDER --valid FOLDER -o ncs.safetensors --minutes 30
+    python benchmarks/train_baseline.py ncs STAGE --motions FOLDER --valid FOLDER -o ncs.safetensors --minutes 30
 
-`ncs*` is NCS with the rotation augmentation of SSILK. All options of 'ssilk train' serve; `--set` changes the
-schedule below. Energies are computed of as many poses in a step as by default for a model: 640 windows of 18 poses,
-of which the last two are judged and those before fill the memory (NCS: half a second, at least 512 windows). --resume
-goes on from the last validation.
+`ncs*` is NCS with the rotation augmentation of SSILK. It takes all options of 'ssilk train'; `--set` changes the
+schedule below. A step computes energies of as many poses as a model's does by default: it has 640 windows of 18
+poses, of which the last two have energies and those before fill the memory (NCS: half a second and at least 512
+windows).
+--resume continues from the last validation.
 """
 
 from __future__ import annotations
@@ -14,8 +15,9 @@ from __future__ import annotations
 import argparse
 import math
 
-from ssilk_core.baselines.networks import BaselineConfig
-from ssilk_core.baselines.run import BaselineJob, train_baseline
+from baselines.networks import BaselineConfig
+from baselines.run import BaselineJob, train_baseline
+
 from ssilk_core.cli import train
 from ssilk_core.config import TrainConfig
 from ssilk_core.devices import chosen_device

@@ -9,11 +9,11 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
+from baselines.descriptors import joint_bank
+from baselines.networks import Baseline, BaselineConfig, baseline
 from torch import Tensor
 
 from ssilk_core.assets import Motion
-from ssilk_core.baselines.descriptors import joint_bank
-from ssilk_core.baselines.networks import Baseline, BaselineConfig, baseline
 from ssilk_core.checkpoint import ModelFile, network
 from ssilk_core.model.batch import DOWN, driven
 from ssilk_core.model.network import GarmentModel

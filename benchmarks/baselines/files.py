@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of trained baselines: those of models, with what the baseline is among their provenance."""
+"""Files of trained baselines: model files whose provenance says which baseline they hold."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from typing import Any
 
 import torch
 
-from ..checkpoint import ModelFile, load_model, network, save_model
-from ..config import ModelConfig
-from ..fabrics import Fabric
-from ..model.network import GarmentModel
-from ..parameters import Shapes, parameter_shapes
+from ssilk_core.checkpoint import ModelFile, load_model, network, save_model
+from ssilk_core.config import ModelConfig
+from ssilk_core.fabrics import Fabric
+from ssilk_core.model.network import GarmentModel
+from ssilk_core.parameters import Shapes, parameter_shapes
+
 from .networks import Baseline, BaselineConfig, baseline
 
 KEY = "baseline"  # of the provenance

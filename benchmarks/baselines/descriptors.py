@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the baselines see of a motion: features of each joint by itself, from those of a bank.
+"""Pose descriptors of the baselines: features of each joint by itself, made from those of a motion bank.
 
-They have the symmetries of `model.descriptors`, so that turning gravity stands for turning the character here too:
-the root's orientation enters as gravity's direction in its frame, its heading and its place not at all.
+They have the symmetries of `ssilk_core.descriptors`, so that turning gravity replaces turning the character here too.
+The root's orientation enters as gravity's direction in its frame. Its heading and its place do not enter.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..descriptors import RATE_TIME
-from ..motion_bank import MotionBank
+from ssilk_core.descriptors import RATE_TIME
+from ssilk_core.motion_bank import MotionBank
 
 STILL, MOVING, ROOT = 9, 12, 3
 """Features of a joint at rest and in motion, and of the root's motion."""
@@ -32,7 +32,7 @@ class JointBank(MotionBank):
 
     Attributes:
         local: 6D local rotations, for roots the identity, shape (F, J, 6).
-        rates: first differences of those, for the first root its turning, and accelerations in each joint's own
+        rates: first differences of those, of the first root its rotation, and accelerations in each joint's own
             frame, shape (F, J, 9).
         turning: first differences of `down`, shape (F, J, 3, 3).
         velocity: of the first joint, in its own frame [m/s], shape (F, 3).
@@ -45,17 +45,17 @@ class JointBank(MotionBank):
 
     def static_descriptor(self, frames: Tensor, direction: Tensor) -> Tensor:
         """Return 6D rotation and gravity's direction in each joint's frame, shape (N, 9 J)."""
-        return torch.cat([self.local[frames], _seen_from(self.down[frames], direction)], dim=2).flatten(1)
+        return torch.cat([self.local[frames], _in_frames(self.down[frames], direction)], dim=2).flatten(1)
 
     def dynamic_descriptor(self, frames: Tensor, direction: Tensor) -> Tensor:
         """Return the static ones, then 12 rates of each joint (gravity's last), then the root's velocity."""
-        gravity = _seen_from(self.turning[frames], direction)
+        gravity = _in_frames(self.turning[frames], direction)
         moving = torch.cat([self.rates[frames], gravity], dim=2).flatten(1)
         return torch.cat([self.static_descriptor(frames, direction), moving, self.velocity[frames]], dim=1)
 
 
-def _seen_from(frames: Tensor, direction: Tensor) -> Tensor:
-    """Apply matrices (N, J, 3, 3) to one direction (N, 3) each; returns (N, J, 3)."""
+def _in_frames(frames: Tensor, direction: Tensor) -> Tensor:
+    """Return directions (N, 3) in the frames of joints, given as matrices (N, J, 3, 3), shape (N, J, 3)."""
     return torch.einsum("njab,nb->nja", frames, direction)
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The networks of NCS and SNUG, sized as in their papers, rolled and decoded as `model.network.GarmentModel` is.
+"""The networks of NCS and SNUG, sized as in their papers, with the interface of `model.network.GarmentModel`.
 
-Both move vertices in the rest pose and leave all else to the skeleton; pinned vertices stay where it puts them.
+Both move vertices in the rest pose and leave the rest to linear blend skinning, which alone moves pinned vertices.
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..assets import PINNED, Ints, Scene
-from ..errors import fail
-from ..skinning import Skinning
+from ssilk_core.assets import PINNED, Ints, Scene
+from ssilk_core.errors import fail
+from ssilk_core.skinning import Skinning
+
 from .descriptors import MOVING, ROOT, STILL, split_features
 
 SHAPES = 1e-4  # [m], standard deviation of initial shapes: training starts close to linear blend skinning
@@ -24,7 +25,7 @@ SHAPES = 1e-4  # [m], standard deviation of initial shapes: training starts clos
 
 @dataclass(frozen=True, kw_only=True)
 class BaselineConfig:
-    """What a baseline is: its method, "ncs" or "snug", and the rate at which it steps [1/s]."""
+    """A baseline's method, "ncs" or "snug", and the rate at which it steps [1/s]."""
 
     method: str
     fps: float = 30.0
@@ -38,7 +39,7 @@ class Baseline(nn.Module, ABC):
     """A recurrent network that turns poses into offsets of the rest shape.
 
     Args:
-        scene: what is dressed.
+        scene: character, garment and rig.
         config: of `method`, which the subclass implements.
         joints: the character's joints in the descriptors.
         codes: numbers that the offsets are linear in.
@@ -58,7 +59,7 @@ class Baseline(nn.Module, ABC):
 
     @abstractmethod
     def initial(self, static: Tensor) -> Tensor:
-        """Return the states (N, S) of poses that nothing came before, from static descriptors (N, 9 J)."""
+        """Return the states (N, S) of poses without a past, from static descriptors (N, 9 J)."""
 
     @abstractmethod
     def roll(self, states: list[Tensor], rest: Tensor, pose: Tensor) -> list[Tensor]:
@@ -84,8 +85,8 @@ class Baseline(nn.Module, ABC):
 class NCS(Baseline):
     """A static code of each pose plus a recurrent code of its motion, decoded together.
 
-    The motion's encoder has no biases: where nothing moves its code is zero, and the static code alone decides. That
-    is what keeps statics and dynamics apart. A state is both codes side by side.
+    The motion's encoder has no biases, which separates statics from dynamics: where nothing moves its code is zero.
+    A state is both codes side by side.
     """
 
     width = 512
@@ -116,7 +117,7 @@ class NCS(Baseline):
     def mixed(states: Tensor, count: int) -> Tensor:
         """Give the first `count` windows of states (F, batch, S) each other's motion, without gradients.
 
-        The paper's motion augmentation (its Section 4.4): the decoder meets pairs of codes that no clip holds.
+        The motion augmentation of the paper's Section 4.4: the decoder sees pairs of codes that no clip holds.
         """
         still, motion = states[:, :count].detach().chunk(2, dim=2)
         return torch.cat([torch.cat([still, motion.roll(1, dims=1)], dim=2), states[:, count:]], dim=1)
@@ -175,7 +176,7 @@ def baseline(scene: Scene, config: BaselineConfig, joints: Ints, seed: int = 0) 
     """Return an untrained network on the CPU.
 
     Args:
-        scene: what is dressed.
+        scene: character, garment and rig.
         config: says which network.
         joints: character joints in the descriptors, as `model.descriptors.joints_in_view` gives them.
         seed: of the initial parameters.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The training run of a baseline, to a number of iterations or to a time, in the frame of `training.run`."""
+"""The training run of a baseline, for a number of iterations or for a time, with the files of `training.run`."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from typing import Any
 
 import torch
 
-from ..devices import chosen_device
-from ..errors import fail
-from ..events import Checkpoint, Message, Progress, Reporter, Started
-from ..training.curve import CurvePoint, with_point
-from ..training.job import TrainJob
-from ..training.parts import build_parts
-from ..training.run_files import RunFiles
-from ..training.state import Best, RunState, load_state, restore
-from ..training.validation import Score
-from ..training.verdict import not_finite, verdict
+from ssilk_core.devices import chosen_device
+from ssilk_core.errors import fail
+from ssilk_core.events import Checkpoint, Message, Progress, Reporter, Started
+from ssilk_core.training.curve import CurvePoint, with_point
+from ssilk_core.training.job import TrainJob
+from ssilk_core.training.parts import build_parts
+from ssilk_core.training.run_files import RunFiles
+from ssilk_core.training.state import Best, RunState, load_state, restore
+from ssilk_core.training.validation import Score
+from ssilk_core.training.verdict import not_finite, verdict
+
 from .descriptors import joint_bank
 from .files import save_baseline
 from .networks import BaselineConfig, baseline
@@ -29,14 +30,14 @@ from .training import BaselineObjective, BaselineStepper
 
 @dataclass(frozen=True, kw_only=True)
 class BaselineJob:
-    """Everything that the training of a baseline needs.
+    """The inputs of a baseline's training.
 
     Attributes:
         base: scene, motions, fabric and schedule. The batch is never lowered.
         config: what is trained.
         judged, mixed: as in `training.BaselineObjective`.
-        seconds: time that all steps together may take, validations left out [s]; the schedule then ends with it
-            rather than with the iterations.
+        seconds: time for all steps together, without validations [s]; where it is finite, the schedule ends with
+            it rather than with the iterations.
     """
 
     base: TrainJob
@@ -53,12 +54,12 @@ class BaselineJob:
 
 
 class BaselineRun:
-    """A run that has been set up, or taken up where it stopped.
+    """A run, new or resumed.
 
     Attributes:
         state: what changes while the run goes on.
         batch: energies of the last batch before a validation [J].
-        iterations: steps to do in all; with a limit in time it is an estimate that gets better.
+        iterations: steps to do in all; with a limit in time an estimate, made anew at each validation.
     """
 
     def __init__(self, job: BaselineJob, report: Reporter) -> None:
@@ -80,7 +81,7 @@ class BaselineRun:
         self.iterations = base.train.iterations
         self.state, self.batch = RunState(job.identity()), dict[str, float]()
         if base.resume:
-            self._take_up()
+            self._resume()
         parameters = sum(value.numel() for value in self.model.parameters())
         shared = {name: value for name, value in parts.detail().items() if name not in ("proxies", "blendshapes")}
         report(Started(job.config.method, self.iterations, {**shared, "parameters": parameters}))
@@ -90,7 +91,7 @@ class BaselineRun:
         """Score of linear blend skinning."""
         return self.validator.lbs_score()
 
-    def _take_up(self) -> None:
+    def _resume(self) -> None:
         self.state, tensors = load_state(self.files.state, self.state.asked)
         restore(self.files.state, self.stepper, tensors)
         self.stepper.faults.count.fill_(self.state.undone)

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from clock import Rates
-from floors import WARM, WINDOWS, Floor
-from reports import table
+from .clock import Rates
+from .floors import WARM, WINDOWS, Floor
+from .reports import table
 
 Figures = dict[str, Any]
 

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from floors import WARM, WINDOWS, Part, Tensors
-from moment import Moment
 from torch import Tensor, nn
 
 from ssilk_core import kernels
 from ssilk_core.constants import GRAVITY
+
+from .floors import WARM, WINDOWS, Part, Tensors
+from .moment import Moment
 
 # Operations for one element in one frame, counted on the formulas.
 TURN, COMPOSE, BLEND, TRANSFORM, NORMALISE = 15, 108, 24, 18, 9
@@ -66,7 +67,7 @@ def network_parts(at: Moment) -> list[Part]:
     model, batch, first, z = at.model, at.batch, 2 * at.batch, leaf(at.z)
     before, now, rest = at.target[:-first], at.target[batch:-batch], at.target[first:]
     poses, pose = at.bank.static_descriptor(at.frames, at.direction), at.pose[first:]
-    passes = 1 + model.integrator.centred  # what S would do at rest is taken off
+    passes = 2 - model.integrator.scheme.bias  # SpringVerlet subtracts what S gives at rest
     initial = tuple(model.initialiser.parameters())
     stepping = (*model.stepper.parameters(), *model.integrator.parameters())
     return [

@@ -1,24 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The training of a baseline: the energies, schedule, bounds and averages that a `GarmentModel` is trained with."""
+"""The training of a baseline, with the energies, schedule, bounds and averages of a `GarmentModel`'s training."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
 
-from ..collision.body import CollisionBody
-from ..config import TrainConfig
-from ..energy import GarmentEnergy
-from ..errors import fail
-from ..training.objective import Objective, Terms, total
-from ..training.step import Stepper
-from ..training.windows import WindowSampler
+from ssilk_core.collision.body import CollisionBody
+from ssilk_core.config import TrainConfig
+from ssilk_core.energy import GarmentEnergy
+from ssilk_core.errors import fail
+from ssilk_core.training.objective import Objective, Terms, total
+from ssilk_core.training.step import Stepper
+from ssilk_core.training.windows import WindowSampler
+
 from .descriptors import JointBank
 from .networks import NCS, Baseline
 
 
 class BaselineObjective(Objective):
-    """Energies of the last frames of windows that begin with no memory.
+    """Energies of the last frames of windows that start from static states.
 
     The frames before them only fill the memory, as in both papers.
 
@@ -83,7 +84,7 @@ class BaselineObjective(Objective):
 
 
 class BaselineStepper(Stepper):
-    """Moves the parameters of a baseline as `Stepper` does those of a model, graphs and all."""
+    """Trains a baseline as `Stepper` trains a model."""
 
     objective: BaselineObjective
     averaged: Baseline  # type: ignore[assignment]

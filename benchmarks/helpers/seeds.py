@@ -1,22 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Evaluate many models by 'ssilk evaluate', and take those of one garment and method together as seeds."""
+"""Evaluate models and baselines as 'ssilk evaluate' does, and group those of one garment and method as seeds."""
 
 from __future__ import annotations
 
 import argparse
-import json
-import tempfile
 from collections.abc import Sequence
-from contextlib import redirect_stdout
 from dataclasses import dataclass
-from io import StringIO
-from pathlib import Path
 from statistics import mean, stdev
 
-from records import Row, Settings, read_records, settings_of
+from baselines.evaluation import open_network
 
-from ssilk_core.cli import main as ssilk
+from ssilk_core.cli import evaluate as verb
+from ssilk_core.cli import parser
 from ssilk_core.errors import fail
+from ssilk_core.evaluation.tables import tables
+from ssilk_core.events import silent
+
+from .records import Row, Settings, read_records, settings_of
 
 
 def measured(options: argparse.Namespace) -> tuple[list[Row], dict[str, Settings]]:
@@ -29,7 +29,7 @@ def measured(options: argparse.Namespace) -> tuple[list[Row], dict[str, Settings
 
 
 def evaluated(options: argparse.Namespace, *, probes: bool = False) -> tuple[list[Row], str]:
-    """Return the figures of 'ssilk evaluate' for all models, and its tables; stops and loops only for `probes`."""
+    """Return the figures of all models, and their tables; stops and loops only for `probes`."""
     if not options.models:
         fail(options.table, "no model", "this is measured on models", "name files of 'ssilk train'")
     names = [path.stem for path in options.models]
@@ -46,13 +46,9 @@ def evaluated(options: argparse.Namespace, *, probes: bool = False) -> tuple[lis
     ]
     words += ["--clips", *options.clips] if options.clips else []
     words += ["--loop", options.loop] if probes else ["--stops", 0, "--loop", 0]
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "figures.json"
-        with redirect_stdout(StringIO()) as shown:
-            code = ssilk([str(word) for word in ("evaluate", *options.models, *words, "--output", path)])
-        if code:
-            raise SystemExit(code)
-        return json.loads(path.read_text())["figures"], shown.getvalue()
+    asked = parser().parse_args([str(word) for word in ("evaluate", *options.models, *words)])
+    rows, found = verb.evaluated(asked, open_network, silent)
+    return found, tables(rows)
 
 
 @dataclass(frozen=True, eq=False)

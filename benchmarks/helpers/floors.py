@@ -13,8 +13,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import torch
-from clock import Rates
 from torch import Tensor
+
+from .clock import Rates
 
 Tensors = tuple[Tensor, ...]
 

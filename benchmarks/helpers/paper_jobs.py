@@ -12,7 +12,16 @@ from ssilk_core.evaluation.splits import read_index, splits_of
 
 GARMENTS = ("cape", "hooded_dress", "fringe_skirt", "tshirt", "long_sleeve", "pants")
 BASELINES = ("ncs", "ncs*", "snug")
-TABLES = ("table1", "equal", "seeds", "table4", "table5", "figure11", "figure12", "table3")  # in order of worth
+TABLES = (
+    "table1",
+    "equal",
+    "seeds",
+    "table4",
+    "table5",
+    "figure11",
+    "figure12",
+    "table3",
+)  # the most important first
 STEP = {
     "cape": 4.2,
     "hooded_dress": 4.9,
@@ -143,7 +152,8 @@ class Training:
         rates = (f"iterations={steps}", f"validate_every={max(1, steps // VALIDATIONS)}")
         settings = [*(RECIPES[self.garment] if own else ()), *rates, *self.settings]
         settings += [*REHEARSED, *(() if self._sets("batch") else ("batch=2",))] if plan.rehearse else []
-        begun = (*SSILK, "train") if own else (PYTHON, "benchmarks/baselines.py", self.method)
+        script = "train_baseline" if not own else "train_scheme" if self._sets("scheme") else ""
+        begun = (PYTHON, f"benchmarks/{script}.py", *(() if own else (self.method,))) if script else (*SSILK, "train")
         command = (
             *begun, str(plan.stage(self.stage or self.garment)), "--motions", *plan.files("train"), "--valid",
             *plan.files("valid"), "-o", str(plan.model(self.name)), "--preset", "final", "--device", plan.device,
@@ -219,7 +229,7 @@ def records(
 
 
 def jobs(plan: Plan) -> list[Job]:
-    """Return everything in order of worth; the simulator first, for others wait for it."""
+    """Return all jobs, the most important first, after the simulations, which others wait for."""
     asked = trainings(plan)
     simulated = {name: simulation(plan, name) for name in plan.garments} if "table1" in asked else {}
     found: list[Job] = list(simulated.values())
@@ -230,7 +240,7 @@ def jobs(plan: Plan) -> list[Job]:
     for garment in plan.garments:
         own = [job for job in first if job.name.startswith(garment)]
         found += records(plan, garment, garment, own, simulated.get(garment)) if own else []
-    # As many iterations as the baselines have had in their time.
+    # As many iterations as the baselines do in their time.
     equal = {t.garment: t.job(plan, plan.seconds * STEP[t.garment] / BASELINE_STEP) for t in asked.get("equal", [])}
     found += equal.values()
     for garment, job in equal.items():
@@ -244,7 +254,7 @@ def jobs(plan: Plan) -> list[Job]:
 
 
 def _timings(plan: Plan, models: Sequence[Job]) -> Job:
-    output = Path(__file__).parent / "results" / f"table3_{plan.device}.json"
+    output = Path(__file__).parents[1] / "results" / f"table3_{plan.device}.json"
     needs = tuple(path for job in models for path in job.outputs)
     command = (
         PYTHON, "benchmarks/tables.py", "table3", *map(str, needs), "--stage",
