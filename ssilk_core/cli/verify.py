@@ -1,19 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check a baked shot and compare it, re-skinned by UsdSkel alone, with the decoder's own vertices.
 
-The shot says which model, stage and motion it came from; name them anew where they have moved.
+The shot says which model, stage and motion it came from; say where they lie now if they have moved.
 """
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
 
-from ..errors import EXIT_OK, fail
-from ..events import Message, Reporter, Result, Started
-from .options import INPUTS
+from ..bake import INPUTS
+from ..bake import verify as verify_shot
+from ..errors import EXIT_OK
+from ..events import Reporter
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -26,37 +25,6 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Verify; raise `VerificationError` (exit code 3) when the file is not what was computed."""
-    from ssilk_usd.provenance import read_provenance
-
-    from ._baking import BakeRequest, open_bake
-
-    if not options.shot.is_file():
-        fail(str(options.shot), "there is no such shot", "a file written by 'ssilk bake' is needed")
-    provenance = read_provenance(options.shot)
-    carried: Any = provenance.get("request")
-    if not (isinstance(carried, dict) and set(INPUTS) <= carried.keys()):
-        fail(str(options.shot), "the file does not say how it was baked", "a shot written by 'ssilk bake' is needed")
-    known = {item.name for item in fields(BakeRequest)}
-    request = BakeRequest(**{key: value for key, value in carried.items() if key in known})
-    chosen = {name: getattr(options, name) or _found(options.shot, name, provenance) for name in INPUTS}
-    bake = open_bake(replace(request, **chosen, device=options.device or request.device))  # type: ignore[arg-type]
-    for name in ("model", "motion"):
-        if provenance.get(f"{name}_sha256") != bake.provenance[f"{name}_sha256"]:
-            report(Message(f"{chosen[name]}: the {name} has changed since the shot was baked from it", "warning"))
-    report(Started("verify", bake.motion.frame_count, {"shot": str(options.shot)}))
-    report(Result("verify", {"shot": str(options.shot), **bake.verify(options.shot, report)}))
+    moved = {name: getattr(options, name) for name in INPUTS}
+    verify_shot(options.shot, **moved, device=options.device, report=report)
     return EXIT_OK
-
-
-def _found(shot: Path, name: str, provenance: dict[str, Any]) -> str:
-    """Return where an input of the bake lies: where it lay then, or else where it lay as seen from the shot."""
-    from ssilk_usd.read_stage import split_location
-
-    path = Path(provenance["request"][name])
-    beside = shot.parent / provenance.get("beside", {}).get(name, path)
-    there = next(
-        (candidate for candidate in (path, beside) if Path(split_location(str(candidate))[0]).exists()), None
-    )
-    if there is None:
-        fail(str(shot), f"the {name} that it was baked from is not at {path}", f"--{name} says where it lies now")
-    return str(there)

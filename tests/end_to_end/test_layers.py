@@ -18,9 +18,8 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel
 from ssilk_usd.garment_api import SCHEMA, read_garment_record
 from ssilk_usd.play import Shot
 
+from ssilk_core.bake import BakeRequest, load_rollout, shot_bytes
 from ssilk_core.cli import main
-from ssilk_core.cli._baking import BakeRequest, open_bake
-from ssilk_core.cli._level import shot_bytes
 from ssilk_core.files import sha256
 from ssilk_core.kinematics import deform
 from ssilk_core.targets import TARGETS, capped
@@ -230,7 +229,7 @@ def test_targets_get_what_they_take_and_their_error_is_measured(copy, capsys, ta
 
 def test_four_influences_are_learned_and_not_just_the_heaviest(copy, capsys):
     _, *events = said(capsys, "--motion walk.usda --target game4 -o new.usdc")
-    whole = open_bake(BakeRequest(model="skirt.safetensors", stage="rigged.usda", motion="walk.usda"))
+    whole = load_rollout(BakeRequest(model="skirt.safetensors", stage="rigged.usda", motion="walk.usda"))
     heaviest = capped(whole.deformer, TARGETS["game4"])
     (pose,) = whole.poses()
     away = deform(heaviest, whole.motion, pose) - deform(whole.deformer, whole.motion, pose)
@@ -411,6 +410,6 @@ def test_the_manifest_is_of_the_inputs_contents_not_of_their_places(copy):
 
 def test_each_frame_of_a_short_shot_takes_bytes(copy):
     """Of 12 frames no two excerpts of 16 and 64 can be told apart."""
-    bake = open_bake(BakeRequest(model="skirt.safetensors", stage="rigged.usda", motion="walk.usda"))
-    taken = shot_bytes(bake, ".usdc", body=False)
+    rollout = load_rollout(BakeRequest(model="skirt.safetensors", stage="rigged.usda", motion="walk.usda"))
+    taken = shot_bytes(rollout, ".usdc", include_body=False)
     assert taken.frame > 4 * 20 and taken.asset > 1000

@@ -19,8 +19,9 @@ import torch
 from pxr import Gf, Sdf, Usd, UsdSkel, Vt
 from ssilk_usd.provenance import read_provenance
 
+from ssilk_core.bake import BakeRollout
 from ssilk_core.checkpoint import load_model, save_model
-from ssilk_core.cli import _baking, main
+from ssilk_core.cli import main
 
 EVENTS = {"started", "progress", "message", "checkpoint", "result", "failed"}
 SHOT = "bake model.safetensors --stage rigged.usda --motion clip.usda"
@@ -127,10 +128,10 @@ def test_the_same_bake_gives_the_same_bytes(world):
 def test_a_pre_roll_changes_poses_and_no_times(world):
     assert run(f"{SHOT} -o shot.usdc --no-verify") == 0
     assert run(f"{SHOT} -o settled.usdc --pre-roll 0.5") == 0
-    lbs, settled = Usd.Stage.Open("shot.usdc"), Usd.Stage.Open("settled.usdc")
+    direct, settled = Usd.Stage.Open("shot.usdc"), Usd.Stage.Open("settled.usdc")
     for read in (Usd.Stage.GetStartTimeCode, Usd.Stage.GetEndTimeCode):
-        assert read(lbs) == read(settled)
-    first = [np.array(animation(shot).GetRotationsAttr().Get(shot.GetStartTimeCode())) for shot in (lbs, settled)]
+        assert read(direct) == read(settled)
+    first = [np.array(animation(shot).GetRotationsAttr().Get(shot.GetStartTimeCode())) for shot in (direct, settled)]
     np.testing.assert_array_equal(first[0][:3], first[1][:3])
     assert np.abs(first[0][3:] - first[1][3:]).max() > 1e-4
     assert run("verify settled.usdc") == 0
@@ -142,12 +143,12 @@ def test_a_pre_roll_out_of_range_is_refused(world, capsys, seconds):
     assert "0 to 600 are allowed" in capsys.readouterr().err
 
 
-def test_plain_skinning_moves_with_the_body_alone(world):
-    assert run(f"{SHOT} -o plain.usdc --lbs") == 0
-    stage = Usd.Stage.Open("plain.usdc")
+def test_linear_blend_skinning_moves_with_the_body_alone(world):
+    assert run(f"{SHOT} -o lbs.usdc --lbs") == 0
+    stage = Usd.Stage.Open("lbs.usdc")
     assert len(animation(stage).GetJointsAttr().Get()) == 3
     assert not animation(stage).GetBlendShapesAttr().Get()
-    assert run("verify plain.usdc") == 0
+    assert run("verify lbs.usdc") == 0
 
 
 def test_a_tampered_rotation_fails_verification(world, capsys):
@@ -192,8 +193,8 @@ def test_of_several_animations_one_is_named(world, tmp_path):
 
 def test_a_shot_that_fails_its_proof_is_not_kept(world, monkeypatch, capsys):
     """The decoder is moved by 1 cm, so that no written file agrees with it."""
-    honest = _baking.Bake._decoded
-    monkeypatch.setattr(_baking.Bake, "_decoded", lambda bake, pose: honest(bake, pose) + 0.01)
+    honest = BakeRollout.decode
+    monkeypatch.setattr(BakeRollout, "decode", lambda rollout, pose: honest(rollout, pose) + 0.01)
     Path("shots").mkdir()
     Path("shots/shot.usdc").write_text("older")
     capsys.readouterr()
