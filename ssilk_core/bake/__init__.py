@@ -12,7 +12,7 @@ Work speaks through `ssilk_core.events`; bad input raises `SsilkError`, a file t
 from .character import on_character
 from .layers import LayerFolder, bake_layers
 from .load import LoadedGarment, load_garment, load_rollout, with_model
-from .request import INPUTS, BakeRequest
+from .request import BakeRequest
 from .result import BakeResult, FrameSpan, RefinementSummary, Verification
 from .rollout import BakeRollout
 from .sizing import shot_bytes
@@ -21,7 +21,7 @@ from .verification import verify
 from .write import bake
 
 __all__ = [
-    "INPUTS", "BakeRequest", "BakeResult", "BakeRollout", "BakeTask", "FrameSpan", "LayerFolder", "LoadedGarment",
+    "BakeRequest", "BakeResult", "BakeRollout", "BakeTask", "FrameSpan", "LayerFolder", "LoadedGarment",
     "RefinementSummary", "Verification", "bake", "bake_layers", "load_garment", "load_rollout", "on_character",
     "plan_layers", "shot_bytes", "verify", "with_model",
 ]  # fmt: skip

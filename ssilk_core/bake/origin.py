@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ..errors import fail
-from .request import INPUTS, BakeRequest
+from .request import BakeRequest
 from .rollout import BakeRollout
 
 
@@ -24,7 +24,7 @@ def _beside(request: BakeRequest, output: Path) -> dict[str, str]:
     """Return the inputs' paths relative to the output's folder: they hold when everything moves together."""
     folder = output.absolute().parent
     try:
-        return {name: os.path.relpath(getattr(request, name), folder) for name in INPUTS}
+        return {name: os.path.relpath(path, folder) for name, path in request.inputs.items()}
     except ValueError:  # on another drive
         return {}
 
@@ -68,12 +68,12 @@ def read_origin(shot: Path, elsewhere: Mapping[str, str | None]) -> ShotOrigin:
     beside = provenance.get("beside")
     folder = shot.parent
     found: dict[str, str] = {}
-    for name in INPUTS:
-        then = Path(getattr(stored, name))
+    for name, path in stored.inputs.items():
+        then = Path(path)
         near = folder / str(beside[name]) if isinstance(beside, Mapping) and name in beside else then
         found[name] = str(elsewhere.get(name) or _existing(shot, name, then, near))
     hashes = {name: provenance.get(f"{name}_sha256") for name in ("model", "motion")}
-    return ShotOrigin(BakeRequest(**{**vars(stored), **found}), hashes)
+    return ShotOrigin(replace(stored, model=found["model"], stage=found["stage"], motion=found["motion"]), hashes)
 
 
 def _existing(shot: Path, name: str, then: Path, near: Path) -> Path:

@@ -82,6 +82,11 @@ class BakeRequest:
             )
 
     @property
+    def inputs(self) -> dict[str, str]:
+        """The files that it is baked from, by their fields."""
+        return {name: getattr(self, name) for name in INPUTS}
+
+    @property
     def writes_points(self) -> bool:
         """Whether the garment is refined and written as points instead of joints."""
         return self.refine != 0 and self.refined_output == "points"

@@ -9,8 +9,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ..bake import INPUTS
-from ..bake import verify as verify_shot
+from .. import bake
 from ..errors import EXIT_OK
 from ..events import Reporter
 
@@ -18,13 +17,19 @@ from ..events import Reporter
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
     verb.add_argument("shot", type=Path, help="shot written by 'ssilk bake'")
-    for name in INPUTS:
+    for name in ("model", "stage", "motion"):
         verb.add_argument(f"--{name}", metavar="PATH", help=f"where the {name} lies now")
     verb.add_argument("--device", help="where the network runs (default: where it ran for the bake)")
 
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Verify; raise `VerificationError` (exit code 3) when the file is not what was computed."""
-    moved = {name: getattr(options, name) for name in INPUTS}
-    verify_shot(options.shot, **moved, device=options.device, report=report)
+    bake.verify(
+        options.shot,
+        model=options.model,
+        stage=options.stage,
+        motion=options.motion,
+        device=options.device,
+        report=report,
+    )
     return EXIT_OK

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
-from ..bake import INPUTS, BakeTask
+from ..bake import BakeTask
 from ..events import Event, Failed, GarmentEvent, Message, Progress, Result, Started, describe
 from ..files import replacing
 from .job import NAME, write_job
@@ -60,7 +60,7 @@ def _write(path: Path, document: dict[str, Any]) -> None:
 
 
 def _asset_references(tasks: Sequence[BakeTask], output: Path | None) -> dict[str, Any]:
-    files = sorted({getattr(task.request, name).partition(":/")[0] for task in tasks for name in INPUTS})
+    files = sorted({path.partition(":/")[0] for task in tasks for path in task.request.inputs.values()})
     folders = [] if output is None else [str(output.absolute())]
     return {
         "assetReferences": {"inputs": {"filenames": files, "directories": []}, "outputs": {"directories": folders}}

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shlex
 import shutil
 import signal
@@ -19,7 +20,7 @@ import torch
 from pxr import Gf, Sdf, Usd, UsdSkel, Vt
 from ssilk_usd.provenance import read_provenance
 
-from ssilk_core.bake import BakeRollout
+from ssilk_core.bake import BakeRollout, bake_layers
 from ssilk_core.checkpoint import load_model, save_model
 from ssilk_core.cli import main
 
@@ -248,3 +249,45 @@ def test_an_interrupted_training_goes_on_to_the_same_model(world):
     assert main([*train, "-o", "halved.safetensors", "--resume"]) == 0
     assert main([*train, "-o", "whole.safetensors"]) == 0
     assert Path("halved.safetensors").read_bytes() == Path("whole.safetensors").read_bytes()
+
+
+DOCUMENT = Path(__file__).parents[2] / "docs" / "pipeline.md"
+
+
+def test_the_python_example_runs_as_it_is_written(world, capsys):
+    (code,) = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), flags=re.DOTALL)
+    Path("model.safetensors").rename("cape.safetensors")
+    for name, frames in (("walk", 8), ("run", 6)):
+        world.write_clip(Path(f"{name}.usdc"), frames=frames)
+    Sdf.Layer.FindOrOpen("rigged.usda").Export("hero.usdc")
+    capsys.readouterr()
+    names: dict = {}
+    exec(compile(code, str(DOCUMENT), "exec"), names)
+    printed, reported = capsys.readouterr()
+    result, layers = names["result"], names["layers"]
+    assert (result.frames, result.fps, result.size_bytes) == (8, 30, Path("shot.usdc").stat().st_size)
+    assert result.verification.largest_error_m < result.verification.allowed_error_m
+    assert [layer.frames for layer in layers] == [8, 6] and all(layer.path.is_file() for layer in layers)
+    assert Path("layers/shots/run/shot.usda").is_file()
+    assert "8 frames at 30.0 fps" in printed and "shot.usdc" in reported
+    again = bake_layers([names["walk"]], "layers")[0]
+    assert again.current and replace(again, current=False) == layers[0]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"plain": True}, "'plain' is no field"),
+        ({"samples_per_frame": "many"}, "'samples_per_frame' is 'many'"),
+        ({"keep": "1,2"}, "not enough values"),
+    ],
+)
+def test_a_shot_of_other_settings_is_refused_and_not_misread(world, capsys, change, says):
+    layer = Sdf.Layer.FindOrOpen("shot.usda")
+    data = layer.customLayerData
+    data["ssilk"]["request"] = {**data["ssilk"]["request"], **change}
+    layer.customLayerData = data
+    layer.Save()
+    assert run("verify shot.usda") == 2
+    said = capsys.readouterr().err
+    assert "does not say how it was baked" in said and says in said and "bake it again" in said
