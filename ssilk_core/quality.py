@@ -21,7 +21,7 @@ ALL = 1_000_000  # more than any garment has
 
 @dataclass(frozen=True, kw_only=True)
 class Quality:
-    """A level of quality: what is kept of a trained garment, and what is done beyond it.
+    """A level of quality: what is kept of a trained garment, at what rate, and how much it is refined.
 
     Attributes:
         shapes, joints, influences: kept of what the model has.
@@ -52,7 +52,7 @@ QUALITIES = {
     for quality in (
         Quality(name="crowd", shapes=12, joints=8, influences=4, fps=15.0, about="many characters, far away"),
         Quality(name="game", shapes=32, joints=16, influences=4, fps=30.0, about="real time, four influences"),
-        Quality(name="film", shapes=48, about="what cannot be told from the whole model"),
+        Quality(name="film", shapes=48, about="no visible difference from the whole model"),
         Quality(name="hero", refine=4, about="the whole model, refined by the solver"),
     )
 }
@@ -186,7 +186,7 @@ def best_within(reducer: Reducer, budget: Budget, cost: Callable[[ModelFile], fl
 
 
 def _cheaper(reducer: Reducer, sizes: list[ModelSize], cost: Callable[[ModelFile], float]) -> Iterator[Choice]:
-    """Yield models by what they lose; skip those that keep at least as much as one that was too expensive."""
+    """Yield models by what they lose; skip those that keep at least as much as one before."""
     tried: list[ModelSize] = []
     for size in sorted(sizes, key=lambda size: (reducer.predicted(size), sum(vars(size).values()))):
         if not any(other.within(size) == other for other in tried):

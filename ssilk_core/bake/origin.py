@@ -34,7 +34,7 @@ class ShotOrigin:
     """What a shot says of its origin.
 
     Attributes:
-        request: what was baked, with the inputs where they lie now.
+        request: what was baked, with the present paths of its inputs.
         hashes: SHA-256 of "model" and "motion" when the shot was baked.
     """
 
@@ -46,8 +46,7 @@ def read_origin(shot: Path, elsewhere: Mapping[str, str | None]) -> ShotOrigin:
     """Read what a shot was baked from.
 
     Args:
-        elsewhere: where inputs lie now, for those that are not where they were, neither absolutely nor relative to
-            the shot.
+        elsewhere: new paths of inputs that have moved, and not together with the shot.
 
     Raises:
         SsilkError: no such shot, one that does not say how it was baked, or an input that is not found.
@@ -82,5 +81,5 @@ def _existing(shot: Path, name: str, then: Path, near: Path) -> Path:
 
     there = next((path for path in (then, near) if Path(split_location(str(path))[0]).exists()), None)
     if there is None:
-        fail(str(shot), f"the {name} that it was baked from is not at {then}", f"--{name} says where it lies now")
+        fail(str(shot), f"the {name} that it was baked from is not at {then}", f"--{name} gives its present path")
     return there

@@ -29,7 +29,7 @@ def verify(
 
     Args:
         shot: file written by `bake`, or animation layer written by `bake_layers`.
-        model, stage, motion: where an input lies now, if it has moved since and not together with the shot.
+        model, stage, motion: new path of an input that has moved, and not together with the shot.
         device: where the network runs; None for where it ran for the bake.
         report: takes events.
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check a baked shot and compare it, re-skinned by UsdSkel alone, with the decoder's own vertices.
 
-The shot says which model, stage and motion it came from; say where they lie now if they have moved.
+The shot says which model, stage and motion it was baked from. Give the present paths of those that have moved.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
     verb.add_argument("shot", type=Path, help="shot written by 'ssilk bake'")
     for name in ("model", "stage", "motion"):
-        verb.add_argument(f"--{name}", metavar="PATH", help=f"where the {name} lies now")
+        verb.add_argument(f"--{name}", metavar="PATH", help=f"present path of the {name}")
     verb.add_argument("--device", help="where the network runs (default: where it ran for the bake)")
 
 

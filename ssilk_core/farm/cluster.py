@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tasks of a job on a Python cluster: Ray starts them, and starts those anew whose worker died."""
+"""The tasks of a job on a Ray cluster, which restarts a task when its worker dies."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ def run_on_cluster(
     cores: int | None = None,
     gpu: bool = False,
 ) -> Iterator[TaskOutcome]:
-    """Yield the outcome of each task as it ends, on a cluster that is there or on the cores of this machine.
+    """Yield the outcome of each task as it ends, on an existing cluster or on the cores of this machine.
 
     Args:
         bake: what a worker does (`bake_here`), a function of a module that workers can import.
-        address: of the cluster, "auto" for the one that this machine is in; None starts one here.
-        cores: how many of this machine's, where a cluster is started here; None for all.
+        address: of the cluster; "auto" for the one that this machine is in; None starts one on this machine.
+        cores: of this machine, for a cluster that is started here; None for all.
         gpu: each task needs a GPU.
 
     Raises:

@@ -42,7 +42,7 @@ class BundleOptions:
 
 
 def write_bundle(folder: Path, tasks: Sequence[BakeTask], output: Path | None, options: BundleOptions) -> None:
-    """Write a job bundle: template, job, parameter values and the files that it takes and gives.
+    """Write a job bundle: template, job, parameter values and the files that go in and come out.
 
     Raises:
         SsilkError: it cannot be written.
