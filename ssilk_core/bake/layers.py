@@ -202,7 +202,7 @@ def _write_layer(layout: Layout, asset: Asset, rollout: BakeRollout, task: BakeT
         "units": rollout.units,
         "start": rollout.start,
         "samples_per_frame": task.request.samples_per_frame,
-        "lean": task.request.recipient.lean,
+        "lean": task.request.receiver.lean,
     }
     if task.points:
         layers.write_points(layout, asset, rollout.points(), rollout.deformer, rollout.motion, **common)

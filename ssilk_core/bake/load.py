@@ -115,8 +115,8 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
         request=request,
         file=file,
         model=model,
-        deformer=capped(deformer, request.recipient),
-        units=_units(stage, request.recipient),
+        deformer=capped(deformer, request.receiver),
+        units=_units(stage, request.receiver),
         provenance={"model_sha256": model_hash, "training": file.provenance.get("ssilk", "")},
         record=_record(file, model_hash),
     )
@@ -144,7 +144,7 @@ def _network_like(like: GarmentModel, file: ModelFile, request: BakeRequest) -> 
 
     model = network(file, replace(file.scene, character=like.scene.character))
     model.to(chosen_device(request.device))
-    return model, capped(model.deformer(), request.recipient)
+    return model, capped(model.deformer(), request.receiver)
 
 
 def _at_fps(motion: Motion, fps: float) -> Motion:

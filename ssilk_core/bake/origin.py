@@ -42,7 +42,7 @@ class ShotOrigin:
     hashes: Mapping[str, object]
 
 
-def read_origin(shot: Path, elsewhere: Mapping[str, str | None]) -> ShotOrigin:
+def read_origin(shot: Path, elsewhere: Mapping[str, str | os.PathLike[str] | None]) -> ShotOrigin:
     """Read what a shot was baked from.
 
     Args:

@@ -92,7 +92,7 @@ class BakeRequest:
         return self.refine != 0 and self.refined_output == "points"
 
     @property
-    def recipient(self) -> Target:
+    def receiver(self) -> Target:
         """Who receives the shot."""
         return TARGETS[self.target]
 

@@ -43,7 +43,7 @@ def load_sized(
     """
     request = _at_quality(request, quality, budget)
     rollout = load_rollout(request)
-    most = request.recipient.influences or rollout.influences
+    most = request.receiver.influences or rollout.influences
     if not (quality or budget or rollout.influences > most):
         return rollout
     if quality and request.fps is None:

@@ -90,14 +90,14 @@ def _need_for_layers(requests: Sequence[BakeRequest]) -> None:
                 "their assets are the same for all shots",
                 "bake models that 'ssilk reduce' made",
             )
-        if ".usdc" not in request.recipient.suffixes:
+        if ".usdc" not in request.receiver.suffixes:
             fail(
                 f"--target {request.target}",
                 "layers",
-                f"it takes {', '.join(request.recipient.suffixes)}",
+                f"it takes {', '.join(request.receiver.suffixes)}",
                 "bake one garment over one motion into such a file",
             )
-    capped = {(each.model, each.target) for each in requests if each.recipient.influences and not each.lbs}
+    capped = {(each.model, each.target) for each in requests if each.receiver.influences and not each.lbs}
     for model, target in sorted(capped):
         need_influences(load_model(model).scene.rig.skin.indices.shape[1], target, model)
 

@@ -19,9 +19,9 @@ from .rollout import BakeRollout
 def verify(
     shot: str | os.PathLike[str],
     *,
-    model: str | None = None,
-    stage: str | None = None,
-    motion: str | None = None,
+    model: str | os.PathLike[str] | None = None,
+    stage: str | os.PathLike[str] | None = None,
+    motion: str | os.PathLike[str] | None = None,
     device: str | None = None,
     report: Reporter = silent,
 ) -> Verification:

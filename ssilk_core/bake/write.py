@@ -83,7 +83,7 @@ def _check_output(request: BakeRequest, path: Path) -> None:
     """Raise `SsilkError` where the target does not take the file, or it cannot be written."""
     from ssilk_usd.read_stage import split_location
 
-    suffixes = request.recipient.suffixes
+    suffixes = request.receiver.suffixes
     if path.suffix not in suffixes:
         fail(str(path), f"the suffix is '{path.suffix}'", f"{request.target} takes {', '.join(suffixes)}")
     need_writable(path)
