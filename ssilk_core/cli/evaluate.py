@@ -164,8 +164,8 @@ def _dressed(file: ModelFile, options: argparse.Namespace, device: torch.device)
     """Put the garment of a model on the character of the stage."""
     from ssilk_usd.read_stage import open_stage
 
+    from ..bake import on_character
     from ..evaluation.methods import EvaluationScene
-    from ._baking import on_character
 
     scene = on_character(file, open_stage(options.stage), options.root)
     return EvaluationScene(scene, file.fabric, file.config.fps, device, exact=options.exact)

@@ -30,11 +30,11 @@ save_model(sys.argv[1], replace(file, parameters=parameters))
 DECODED = """
 import sys
 import numpy as np
-from ssilk_core.cli._baking import BakeRequest, open_bake
+from ssilk_core.bake import BakeRequest, load_rollout
 model, stage, motion, seconds, lbs, output = sys.argv[1:]
 request = BakeRequest(model=model, stage=stage, motion=motion, pre_roll=float(seconds), lbs=lbs == "lbs")
-bake = open_bake(request)
-np.save(output, [bake.units.points_from_core(points) for points in bake.vertices(lambda event: None)])
+bake = load_rollout(request)
+np.save(output, [bake.units.points_from_core(points) for points in bake.vertices()])
 """
 
 
