@@ -131,7 +131,10 @@ def table2(options: argparse.Namespace) -> tuple[str, Any]:
     if not rows:
         fail("table2", "no simulator among the figures", "its shots are needed", "give --reference, or records of it")
     found = cells(rows)
-    return methods_table(found, SPLITS[1:], DYNAMICS), {"figures": figures_of(found, DYNAMICS)}
+    return methods_table(found, SPLITS[1:], DYNAMICS), {
+        "frames of a sequence": rows[0]["sequence"],
+        "figures": figures_of(found, DYNAMICS),
+    }
 
 
 def everything(options: argparse.Namespace) -> tuple[str, Any]:

@@ -74,6 +74,6 @@ def ablations(options: argparse.Namespace) -> tuple[str, Any]:
         [row["setting"], row["value"], *(f"{mean(row[s]):.4g}" if s in row else "" for s in SPLITS)] for row in found
     ]
     (garment,) = {settings["garment"] for settings in models.values()}
-    iterations = sorted({settings["trained"]["iterations"] for settings in models.values()})
+    iterations = mode(settings["trained"]["iterations"] for settings in models.values())
     text = table(("setting", "value", *(f"{split}: L_tot [J]" for split in SPLITS)), lines)
     return text, {"garment": garment, "iterations": iterations, "total": found}
