@@ -10,6 +10,8 @@ demo's trained models (16 MB) stay behind: nothing in Blender uses them.
 
 from __future__ import annotations
 
+import hashlib
+import re
 import shutil
 import subprocess
 import sys
@@ -43,6 +45,7 @@ def build_wheel(folder: Path) -> None:
     """Build ssilk's wheel from a copy of its sources without what Blender has no use for."""
     with tempfile.TemporaryDirectory() as temporary:
         copy_project(Path(temporary))
+        stamp_version(Path(temporary))
         pip = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(folder)]
         subprocess.run([*pip, temporary], check=True)
 
@@ -58,6 +61,16 @@ def copy_project(target: Path) -> None:
             shutil.copy(source, target / name)
     for name in NOT_IN_BLENDER:
         shutil.rmtree(target / name)
+
+
+def stamp_version(project: Path) -> None:
+    """Add a hash of its sources to a project's version: Blender keeps an installed wheel of the same version."""
+    digest, settings = hashlib.sha256(), project / "pyproject.toml"
+    for path in sorted(project.rglob("*.py")):
+        digest.update(path.read_bytes())
+    text = settings.read_text(encoding="utf-8")
+    stamped = re.sub(r'^version = "(.+)"$', rf'version = "\1+g{digest.hexdigest()[:8]}"', text, count=1, flags=re.M)
+    settings.write_text(stamped, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import tomllib
@@ -71,13 +72,18 @@ def test_the_zip_is_valid_and_holds_what_it_needs(package):
 
 def test_the_wheel_for_blender_is_built_without_the_demos_models(tmp_path):
     sys.path.insert(0, str(ROOT / "tools"))
-    from stage_extension import copy_project
+    from stage_extension import copy_project, stamp_version
 
     copy_project(tmp_path)
     for folder in ("ssilk_core", "usd/ssilk_usd"):
         own = {path.relative_to(ROOT) for path in (ROOT / folder).rglob("*.py")}
         assert {path.relative_to(tmp_path) for path in (tmp_path / folder).rglob("*.py")} == own
     assert not list(tmp_path.rglob("*.safetensors")) and (tmp_path / "NOTICE").is_file()
+    stamp_version(tmp_path)
+    version, own = (
+        tomllib.loads((root / "pyproject.toml").read_text())["project"]["version"] for root in (tmp_path, ROOT)
+    )
+    assert re.fullmatch(rf"{re.escape(own)}\+g[0-9a-f]{{8}}", version)  # or Blender would keep an older wheel
 
 
 def test_the_manifest_says_what_the_code_says():
