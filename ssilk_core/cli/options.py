@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,14 +13,14 @@ from ..events import Reporter
 from ..fabrics import FABRICS, Fabric, fabric_named
 from ..farm.tasks import BakeTask, plan
 from ..files import need_writable
-from ..setup.classes import ClassOptions
-from ..setup.rig import RigOptions
 from ..targets import TARGETS, need_influences
 
 INPUTS = ("model", "stage", "motion")  # what a shot is baked from
 
 if TYPE_CHECKING:
     from ..assets import Character, Garment, ProxyRig, Scene
+    from ..setup.classes import ClassOptions
+    from ..setup.rig import RigOptions
 
 
 def add_scene(verb: argparse.ArgumentParser) -> None:
@@ -38,23 +37,6 @@ def add_scene(verb: argparse.ArgumentParser) -> None:
         default=[],
         help="body mesh (repeatable; default: all under the SkelRoot)",
     )
-
-
-def add_setup(verb: argparse.ArgumentParser) -> None:
-    """Add the options of automatic classes and proxies."""
-    group = verb.add_argument_group("automatic classes and rig")
-    group.add_argument(
-        "--proxies", type=int, default=RigOptions.proxies, help="proxy joints on the loose part (default %(default)s)"
-    )
-    for name, kind in (("classes", ClassOptions), ("rig", RigOptions)):
-        names = ", ".join(f"{key}={value:g}" for key, value in vars(kind()).items())
-        group.add_argument(
-            f"--{name}",
-            action="append",
-            default=[],
-            metavar="NAME=VALUE",
-            help=f"change a threshold (repeatable): {names}",
-        )
 
 
 def add_fabric(verb: argparse.ArgumentParser) -> None:
@@ -204,18 +186,15 @@ def read(options: argparse.Namespace, report: Reporter) -> tuple[Character, Garm
     return read_scene(options.stage, root=options.root, bodies=options.body, garment=options.garment, report=report)
 
 
-def load_scene(options: argparse.Namespace, report: Reporter, *, anew: bool = False) -> Scene:
-    """Read and prepare a scene; what is missing (weights, classes, rig) is made and announced."""
+def load_scene(
+    options: argparse.Namespace,
+    report: Reporter,
+    *,
+    classes: ClassOptions | None = None,
+    rigging: RigOptions | None = None,
+) -> Scene:
+    """Read a scene and make the weights, classes and rig that it lacks, as `classes` and `rigging` say."""
     from ..setup.prepare import prepare_scene
 
     character, garment, rig = read(options, report)
-    if anew:
-        garment, rig = replace(garment, classes=None), None
-    return prepare_scene(
-        character,
-        garment,
-        rig,
-        class_options=overridden(ClassOptions(), options.classes),
-        rig_options=overridden(RigOptions(proxies=options.proxies), options.rig),
-        report=report,
-    )
+    return prepare_scene(character, garment, rig, class_options=classes, rig_options=rigging, report=report)

@@ -35,8 +35,6 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     add_level(verb, "6MB for the file")
     verb.add_argument("--motions", type=Path, nargs="+", default=[], metavar="PATH",
                       help="motion files or folders to do well (default: the training's)")  # fmt: skip
-    verb.add_argument("--precision", choices=("int16", "float32"), default="int16",
-                      help="of matrices in the file (default int16, which halves it)")  # fmt: skip
 
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
@@ -56,7 +54,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     figures = lost(reducer.whole, found)
     told = {"model": str(options.model), "motions": [motion.path for motion in motions], **figures}
     provenance = {**file.provenance, "reduced": told}
-    save_model(options.output, replace(found.file, provenance=provenance), pack=options.precision == "int16")
+    save_model(options.output, replace(found.file, provenance=provenance), pack=True)
     detail = {"model": str(options.output), **figures, "bytes": options.output.stat().st_size}
     report(Result("reduce", detail))
     return EXIT_OK
@@ -87,5 +85,4 @@ def _chosen(options: argparse.Namespace, reducer: Reducer, motions: list[Motion]
     size = replace(level_size(options.quality, reducer.whole), **named)
     if not options.budget:
         return reducer.reduced(size)
-    pack = options.precision == "int16"
-    return spent(options.budget, reducer, size, motions[0], lambda file: model_bytes(file, pack=pack), report)
+    return spent(options.budget, reducer, size, motions[0], lambda file: model_bytes(file, pack=True), report)

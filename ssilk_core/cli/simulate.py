@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
     shared.add_scene(verb)
-    shared.add_setup(verb)
     verb.add_argument(
         "--motion", type=Path, nargs="+", required=True, metavar="SHOT[:/PRIM]", help="USD files with motions"
     )
@@ -44,18 +43,14 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     shared.add_fabric(verb)
     verb.add_argument("--fps", type=float, default=30.0, help="frames per second (default 30, as models are trained)")
-    verb.add_argument("--substeps", type=int, default=1, help="steps in each frame (default 1)")
     verb.add_argument("--tolerance", type=float, default=1e-2, metavar="G",
                       help="accelerations that may be out of balance, in units of g (default 0.01)")  # fmt: skip
     verb.add_argument("--iterations", type=int, default=100, metavar="N",
                       help="of the solver in each step, at most (default 100)")  # fmt: skip
-    verb.add_argument("--precision", choices=("float64", "float32"), default="float64",
-                      help="of positions and energies (default float64)")  # fmt: skip
     verb.add_argument("--batch", type=int, default=64, help="motions that advance together (default 64)")
     verb.add_argument("--sequence", type=int, metavar="FRAMES",
                       help="start anew after so many, as 'ssilk evaluate' may (default: never)")  # fmt: skip
     verb.add_argument("--no-body", action="store_true", help="leave the body meshes out")
-    verb.add_argument("--again", action="store_true", help="simulate what is there and current, too (folders)")
     verb.add_argument("--device", default="cpu", help="where it runs (default cpu)")
 
 
@@ -75,10 +70,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     fabric = shared.fabric(options)
     settings = SimulationOptions(
         fps=options.fps,
-        substeps=options.substeps,
         batch=options.batch,
         sequence=options.sequence,
-        precision=options.precision,
         solver=SolverOptions(tolerance=options.tolerance, iterations=options.iterations),
         rest=SolverOptions(tolerance=options.tolerance, iterations=150),
     )
@@ -87,7 +80,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         _Shot(output, motion, _provenance(options, path))
         for output, motion, path in zip(outputs, motions, options.motion)
     ]
-    missing = [shot for shot in shots if options.again or outputs == [options.output] or not shot.is_done]
+    missing = [shot for shot in shots if outputs == [options.output] or not shot.is_done]
     found = _written(options, missing, scene, fabric, settings, device, report) if missing else {}
     left = {"current": len(shots) - len(missing)} if len(missing) < len(shots) else {}
     report(Result("simulate", {"shots": ", ".join(map(str, outputs)), **left, **found}))
@@ -208,8 +201,7 @@ def _provenance(options: argparse.Namespace, motion: Path) -> dict[str, str | fl
     from ssilk_usd.read_stage import content_hash, split_location
 
     garment, _ = shared.wardrobe(options)
-    names = ("fabric", "fps", "substeps", "tolerance", "iterations", "precision", "proxies", "no_body")
-    lists = ("material", "body", "classes", "rig")
+    names, lists = ("fabric", "fps", "tolerance", "iterations", "no_body"), ("material", "body")
     return {
         "stage": str(options.stage),
         "motion": str(motion),

@@ -21,7 +21,6 @@ from . import options as shared
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
     shared.add_scene(verb)
-    shared.add_setup(verb)
     verb.add_argument(
         "--motions", type=Path, nargs="+", required=True, metavar="PATH", help="motion files or folders to train on"
     )
@@ -50,14 +49,13 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     shared.add_fabric(verb)
     verb.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1, ... (default auto)")
     verb.add_argument("--resume", action="store_true", help="go on from the state beside the model")
-    verb.add_argument("--seed", type=int, default=0, help="of everything random (default 0)")
     verb.add_argument(
         "--set",
         action="append",
         default=[],
         metavar="NAME=VALUE",
         dest="settings",
-        help="change one setting of the preset (repeatable)",
+        help="change one setting of the preset, such as iterations=20000 or seed=1 (repeatable)",
     )
 
 
@@ -133,13 +131,11 @@ def configured(options: argparse.Namespace) -> tuple[ModelConfig, TrainConfig, F
         SsilkError: a setting that does not exist, or a value that it cannot have.
     """
     preset = preset_named(options.preset)
-    model, train = _settings(options.settings, preset.model, preset.train, options.seed)
+    model, train = _settings(options.settings, preset.model, preset.train)
     return model, train, shared.fabric(options)
 
 
-def _settings(
-    settings: list[str], model: ModelConfig, train: TrainConfig, seed: int
-) -> tuple[ModelConfig, TrainConfig]:
+def _settings(settings: list[str], model: ModelConfig, train: TrainConfig) -> tuple[ModelConfig, TrainConfig]:
     """Apply "name=value" settings to whichever of the two has the name."""
     known = [*ModelConfig.__dataclass_fields__, *TrainConfig.__dataclass_fields__]
     for setting in settings:
@@ -148,4 +144,4 @@ def _settings(
             fail(where, "no such setting", f"settings are {', '.join(known)}")
     own = [setting for setting in settings if setting.partition("=")[0] in ModelConfig.__dataclass_fields__]
     others = [setting for setting in settings if setting not in own]
-    return overridden(model, own), overridden(train, [f"seed={seed}", *others])
+    return overridden(model, own), overridden(train, others)

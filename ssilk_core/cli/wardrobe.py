@@ -12,7 +12,7 @@ LIST is a TOML file with a table for each garment, and [defaults] for all; its p
     garment = "cape.usdc"
     set = { iterations = 100000 }
 
-Other keys are valid, fabric, material and seed. FOLDER gets NAME.safetensors and NAME.log for each garment. The same
+Other keys are valid, fabric and material. FOLDER gets NAME.safetensors and NAME.log for each garment. The same
 command goes on where it stopped: what is finished is skipped unless something else is asked now, what was interrupted
 is resumed. Ctrl-C stops all gently, a second one at once. A garment that fails does not stop the others.
 """

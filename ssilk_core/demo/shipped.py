@@ -61,10 +61,11 @@ def need_trained_on(mesh: Mesh, file: ModelFile, path: Path) -> None:
 def origin(file: ModelFile) -> str:
     """Return in words how a shipped model came to be."""
     made, shipped = file.provenance, file.provenance["shipped"]
+    lbs = shipped.get("linear blend skinning [J]", shipped.get("plain skinning [J]"))  # the latter in format 3
     return (
         f"{made['iteration']:,} iterations on {len(made['motions'])} motions, seed {made['seed']}, {made['device']}, "
         f"ssilk {made['ssilk']}, {shipped['date']}; on {shipped['held-out clips']} motions that it never saw "
-        f"{shipped['energy [J]']:.3g} J against linear blend skinning's {shipped['lbs skinning [J]']:.3g} J, "
+        f"{shipped['energy [J]']:.3g} J against linear blend skinning's {lbs:.3g} J, "
         f"{shipped['inside the body']:.2%} of its vertices inside the body; stored to 16 bits, "
         f"no vertex more than {1000 * shipped['largest error [m]']:.1g} mm off"
     )

@@ -43,10 +43,6 @@ def _is_texts(value: Any) -> bool:
     return _is_text(value) or (isinstance(value, list) and value != [] and all(map(_is_text, value)))
 
 
-def _is_whole(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
-
-
 def _is_scalars(value: Any) -> bool:
     return isinstance(value, dict) and all(isinstance(item, str | int | float | list) for item in value.values())
 
@@ -60,7 +56,6 @@ KEYS = {
     "fabric": Key("--fabric", lambda value: value in [*FABRICS], f"one of {', '.join(FABRICS)}"),
     "material": Key("--material", _is_scalars, "a table of values, like { drag = 0.3 },"),
     "set": Key("--set", _is_scalars, "a table of values, like { iterations = 20000 },"),
-    "seed": Key("--seed", _is_whole, "a whole number"),
 }
 NEEDED = ("stage", "motions")
 

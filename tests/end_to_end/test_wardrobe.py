@@ -32,12 +32,19 @@ LIST = """
 stage = "rigged.usda"
 motions = ["clip.usda"]
 preset = "draft"
-set = { latent = 8, widths = [16], shapes = 4, iterations = 240, static_fraction = 0.5, batch = 2,
-        pretraining_batch = 4, window = 4 }
+
+[defaults.set]
+latent = 8
+widths = [16]
+shapes = 4
+iterations = 240
+static_fraction = 0.5
+batch = 2
+pretraining_batch = 4
+window = 4
 
 [skirt]
-seed = 3
-set = { valid_frames = 8 }
+set = { valid_frames = 8, seed = 3 }
 
 [torn]
 motions = "torn.usda"
@@ -60,7 +67,7 @@ def test_a_garment_has_its_own_keys_and_the_defaults(tmp_path):
     )
     settings += "--set pretraining_batch=4 --set window=4"
     assert shlex.join(skirt.words) == (
-        f"rigged.usda --motions clip.usda --preset draft {settings} --set valid_frames=8 --seed 3"
+        f"rigged.usda --motions clip.usda --preset draft {settings} --set valid_frames=8 --set seed=3"
     )
     material = "--material drag=0.2 --material damp=true"
     assert shlex.join(torn.words) == (
@@ -71,13 +78,12 @@ def test_a_garment_has_its_own_keys_and_the_defaults(tmp_path):
 WRONG = {
     "no TOML": ("[cape", "list.toml: not a TOML file"),
     "nothing": ("", "list.toml: it names no garment"),
-    "loose key": ("seed = 1\n[cape]", "key 'seed': it stands in no table; each key belongs to"),
+    "loose key": ('fabric = "silk"\n[cape]', "key 'fabric': it stands in no table; each key belongs to"),
     "name": ('["../cape"]', "table '../cape': its name would be the name of files; letters"),
     "unknown": ("[cape]\nsteps = 3", "table 'cape', key 'steps': no such key; keys are stage, garment, motions"),
     "default": ("[defaults]\nstage = 3\n[cape]", "table 'defaults', key 'stage': 3; the path of a stage is needed"),
     "missing": ('[cape]\nstage = "a"', "table 'cape', key 'motions': missing; it stands here or in"),
     "preset": ('[cape]\npreset = "fast"', "key 'preset': 'fast'; one of draft, preview, final is needed"),
-    "seed": ("[cape]\nseed = true", "key 'seed': True; a whole number is needed"),
     "set": ('[cape]\nset = "batch=3"', "key 'set': 'batch=3'; a table of values, like { iterations = 20000 }, is"),
     "motions": ("[cape]\nmotions = []", "key 'motions': []; a path or a list of paths is needed"),
 }
