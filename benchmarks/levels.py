@@ -78,7 +78,7 @@ def main() -> None:
     rows: list[list[str]] = []
     found: dict[str, Any] = {}
     for path in options.models:
-        bench = Bench(Namespace(**{**vars(options), "models": [path], "root": None, "reference": None}))
+        bench = Bench(Namespace(**{**vars(options), "models": [path], "root": None}))
         for level in measured(bench, path, bench.files[path]):
             rows.append(level.row())
             found.setdefault(path.stem, {})[level.other.variant] = asdict(level)

@@ -10,11 +10,11 @@ from pathlib import Path
 from statistics import mean, mode
 from typing import Any
 
-from plots import COLOURS, Panel, canvas, save
 from records import SETTINGS, Settings
 from reports import RESULTS, table
 from seeds import Cell, measured
 
+from ssilk_core.charts import ChartPanel, write_chart
 from ssilk_core.errors import fail
 from ssilk_core.evaluation.splits import SPLITS
 
@@ -84,15 +84,9 @@ def draw_sweep(options: argparse.Namespace, found: Totals) -> None:
     several = {name: values for name, values in found.items() if len(values) > 1 and not isinstance(min(values), str)}
     if not several:
         return
-    image, pen = canvas(440 * len(several), 300)
-    for place, (name, values) in enumerate(several.items()):
-        curves = {split: [(x, mean(of[split])) for x, of in values.items() if of[split]] for split in SPLITS}
-        heights = [y for points in curves.values() for _, y in points]
-        box = (440 * place + 60, 40, 440 * place + 420, 250)
-        panel = Panel(pen, box, (min(values), max(values)), (min(0.0, *heights), max(heights)))
-        panel.title(f"L_tot [J] over {name}")
-        panel.grid()
-        for number, (split, points) in enumerate(curves.items()):
-            panel.curve(points, COLOURS[number])
-            pen.text((440 * place + 60 + 100 * number, 278), split, fill=COLOURS[number])
-    save(image, RESULTS / f"{options.name}.png")
+    panels = []
+    for name, values in several.items():
+        kept = {split: [value for value, of in values.items() if of[split]] for split in SPLITS}
+        curves = {split: (xs, [mean(values[x][split]) for x in xs]) for split, xs in kept.items()}
+        panels.append(ChartPanel(x=name, y="L_tot [J]", curves=curves))
+    write_chart(RESULTS / f"{options.name}.png", [panels], size=(4.0, 2.8))

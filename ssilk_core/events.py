@@ -59,7 +59,7 @@ Said = Started | Progress | Message | Checkpoint | Result | Failed
 
 @dataclass(frozen=True)
 class GarmentEvent:
-    """What one of several trainings says."""
+    """What one of several trainings, bakes or other tasks says."""
 
     name: str
     said: Said
@@ -89,8 +89,9 @@ class JsonReporter:
 
 
 def _document(event: Event) -> dict[str, Any]:
-    own = {"said": _document(event.said)} if isinstance(event, GarmentEvent) else {}
-    return {"event": type(event).__name__.lower(), **finite(asdict(event)), **own}
+    if isinstance(event, GarmentEvent):
+        return {"event": "garment", "name": event.name, "said": _document(event.said)}
+    return {"event": type(event).__name__.lower(), **finite(asdict(event))}
 
 
 def read_event(line: str) -> Said:

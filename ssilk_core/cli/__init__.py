@@ -62,16 +62,17 @@ EXTRAS = {
     "bake": "bake",
     "simulate": "train",
     "evaluate": "train",
-    "trade": "all",
+    "trade": "report",
     "stress": "train",
-    "report": "all",
+    "report": "report",
     "verify": "bake",
     "view": "view",
     "farm": "farm",
     "task": "bake",
     "demo": "all",
 }
-OPTIONAL = ("torch", "pxr", "igl", "scipy", "trimesh", "embreex", "imageio_ffmpeg", "PIL", "ray", "onnxscript")
+OPTIONAL = ("torch", "pxr", "igl", "scipy", "trimesh", "embreex", "imageio_ffmpeg", "PIL", "matplotlib", "ray",
+            "onnxscript")  # fmt: skip
 
 
 class Parser(argparse.ArgumentParser):

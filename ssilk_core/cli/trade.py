@@ -24,7 +24,7 @@ from . import options as shared
 if TYPE_CHECKING:
     from ..assets import Motion
     from ..checkpoint import ModelFile
-    from ..evaluation.methods import EvaluationScene, Method, TakeSet
+    from ..evaluation.methods import EvaluationScene
     from ..trade.measure import VariantMeter, Weigh
     from ._baking import Bake
 
@@ -41,7 +41,6 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--clips", nargs="+", default=[], metavar="NAME", help="measure on these (default: the first two)"
     )
-    verb.add_argument("--reference", type=Path, metavar="FOLDER", help="shots of 'ssilk simulate' of these clips")
     verb.add_argument("--no-refine", action="store_true", help="leave the solver out, which takes most of the time")
     verb.add_argument("-o", "--output", type=Path, help="figures to write (.json), and a plot beside them (.png)")
     verb.add_argument("--device", default="cpu", help="where PyTorch and the solver run (default cpu)")
@@ -49,8 +48,9 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Sweep; return 0."""
+    from ..charts import write_chart
     from ..trade.judging import judged
-    from ..trade.plot import write_plot
+    from ..trade.plot import trade_panels
     from ..trade.sweep import Results, sweep
     from ..trade.table import judging_table, table
     from ..trade.variants import variants
@@ -74,7 +74,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
             )
     finally:  # an interrupted sweep shows what it has
         if results.points and options.output:
-            write_plot(options.output.with_suffix(".png"), results.points)
+            write_chart(options.output.with_suffix(".png"), trade_panels(results.points), size=(4.6, 3.6))
         if not options.json:
             print(table(results.points), judging_table(results.judging), sep="\n")
     report(Result("trade", {"points": [asdict(point) for point in results.points]} if options.json else {}))
@@ -120,7 +120,6 @@ class Bench:
             "models": {str(path): sha256(path) for path in options.models},
             "stage": sha256(options.stage),
             "clips": list(self.clips),
-            "reference": options.reference and str(options.reference),
             "hardware": f"{platform.processor() or platform.machine()}, {self.device}",
             "ssilk": __version__,
         }
@@ -137,7 +136,7 @@ class Bench:
         takes = [take for name, clip in clips.items() for take in takes_of(name, clip, dressed.fps)]
         reel = reel_of(takes, dressed, file.joints)
         reducer = Reducer(file, [self.clips[only]] if only else self.others)
-        return VariantMeter(path.stem, reducer, dressed, reel, self._weigh(path), self._reference(dressed, reel))
+        return VariantMeter(path.stem, reducer, dressed, reel, self._weigh(path))
 
     def _dressed(self, file: ModelFile) -> EvaluationScene:
         """Put a garment on the character of the stage."""
@@ -148,25 +147,6 @@ class Bench:
 
         scene = on_character(file, open_stage(self.options.stage), self.options.root)
         return EvaluationScene(scene, file.fabric, file.config.fps, self.device)
-
-    def _reference(self, dressed: EvaluationScene, reel: TakeSet) -> Method | None:
-        """Return what the simulator made of the clips, where a folder of that is named."""
-        from ..evaluation.methods import CachedPoints
-        from ._reference import References
-
-        folder: Path | None = self.options.reference
-        if folder is None:
-            return None
-        found = References(folder, dressed.name, dressed.scene.garment.mesh.vertex_count, dressed.fps)
-        missing = sorted(self.clips.keys() - found.clips)
-        if missing:
-            fail(
-                str(folder),
-                f"no shot of {', '.join(missing)}",
-                "each clip needs one",
-                "simulate them with 'ssilk simulate'",
-            )
-        return CachedPoints("simulator", found.read, dressed, reel)
 
     def _weigh(self, path: Path) -> Weigh:
         """Return what tells how large a model's shots of the first clip are, without the body."""

@@ -15,24 +15,21 @@ from ..view.render import Image
 # Nothing is fetched and nothing runs, whatever a name or a message in the figures may contain.
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 STYLE = """
-:root { color-scheme: light dark; --ink: #22262b; --paper: #fff; --faint: #d9dde2; --line: #2f6f9f; --bad: #b03a48; }
+:root { color-scheme: light dark; --ink: #22262b; --paper: #fff; --faint: #d9dde2; --bad: #b03a48; }
 @media (prefers-color-scheme: dark) {
-  :root { --ink: #dfe3e8; --paper: #17191c; --faint: #3a3f46; --line: #6fb1e0; --bad: #ef8792; }
+  :root { --ink: #dfe3e8; --paper: #17191c; --faint: #3a3f46; --bad: #ef8792; }
 }
 body { font: 15px/1.5 system-ui, sans-serif; color: var(--ink); background: var(--paper); max-width: 60rem;
        margin: 2rem auto; padding: 0 1rem; }
 h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2.2rem; border-bottom: 1px solid var(--faint); }
-svg { width: 100%; height: auto; display: block; } text { font: 11px system-ui, sans-serif; fill: var(--ink); }
-text.title { font-weight: 600; font-size: 12px; } text.end { text-anchor: end; } text.small { opacity: .75; }
-.axis { stroke: var(--faint); } .line { fill: none; stroke: var(--line); stroke-width: 1.2; }
-.front { fill: none; stroke: var(--ink); stroke-dasharray: 4 3; } .mark { fill: var(--bad); }
+svg { width: 100%; height: auto; display: block; }
 .scroll { overflow-x: auto; } table { border-collapse: collapse; font-size: 13px; }
 td, th { padding: .2rem .6rem; text-align: left; border-bottom: 1px solid var(--faint); vertical-align: top; }
 td.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
 tr.bad td { color: var(--bad); }
 td:first-child { white-space: nowrap; }
 .pictures { display: flex; flex-wrap: wrap; gap: 1rem; } figure { margin: 0; width: 13rem; } img { width: 100%; }
-figcaption, .legend, .note { font-size: 13px; opacity: .8; }
+figcaption, .note { font-size: 13px; opacity: .8; }
 """
 
 

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..assets import Floats, Mesh
+from ..charts import ChartPanel, svg_chart
 from ..events import Progress, Reporter, silent
 from ..fabrics import Fabric
 from ..view.camera import follow_cameras
 from ..view.player import ShotPlayer
 from ..view.render import Image, render
 from ..view.shots import shot_surfaces
-from .charts import strip
 from .page import Section, figure, table
 from .terms import SHARE, UNITS, TermsMeter, worst_frames
 
@@ -67,7 +67,14 @@ def _sections(player: ShotPlayer, garment: ShotGarment, meter: TermsMeter) -> li
     worst = worst_frames(bad, PICTURES, max(1, round(APART * player.fps)))
     times, marks = np.arange(len(values["total"])) / player.fps, dict(zip(worst, LETTERS))
     shown = [name for name in UNITS if meter.body or name not in ("collision", SHARE)]
-    charts = "".join(strip(name, UNITS[name], times, values[name], marks) for name in shown)
+    panels = [
+        ChartPanel(
+            title=name, x="time [s]", y=UNITS[name], curves={"": (times, values[name])},
+            marks={letter: (times[frame], values[name][frame]) for frame, letter in marks.items()},
+        )
+        for name in shown
+    ]  # fmt: skip
+    charts = svg_chart(f"{', '.join(shown)} over time", [[panel] for panel in panels])
     rows = [[f"{name} [{UNITS[name]}]", *_spread(values[name])] for name in shown]
     name = player.meshes[garment.index].name
     pictures = "".join(

@@ -37,7 +37,6 @@ class VariantMeter:
     Args:
         name: of the model; reducer: cuts it; dressed, reel: what it is judged on.
         weigh: tells how large its shots are.
-        reference: what energies are compared with; the model as trained without one.
     """
 
     def __init__(
@@ -47,11 +46,10 @@ class VariantMeter:
         dressed: EvaluationScene,
         reel: TakeSet,
         weigh: Weigh,
-        reference: Method | None = None,
     ) -> None:
         self.name, self.reducer, self.dressed, self.reel, self.weigh = name, reducer, dressed, reel, weigh
         self.whole = Played(name, reducer.player, dressed, reel, fps=dressed.fps)
-        self.base = self._tally(reference or self.whole).totals().mean()
+        self.base = self._tally(self.whole).totals().mean()
         self._cut = lru_cache(1)(lambda size: reducer.reduced(size).file)
         self._torch = lru_cache(1)(self._torch_time)
 

@@ -20,7 +20,7 @@ class TradePoint:
         torch: milliseconds of a frame of the network and decoder in PyTorch, on the device; None if not measured.
         operations: multiply-adds of a frame; memory: bytes held.
         model_bytes: of the model's file; shot_bytes: of a shot of `SECONDS`, garment and skeleton.
-        total: the paper's L_tot [J]; excess: over what it is compared with [J].
+        total: the paper's L_tot [J]; excess: over the model as trained [J].
         collisions: share of the vertices inside the body.
         position, velocity: RMS errors against the whole model [m], [m/s].
     """
