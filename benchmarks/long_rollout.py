@@ -92,7 +92,7 @@ def draw(path: Path, title: str, looped: Looped, span: float = 0.05) -> None:
     )  # fmt: skip
     frames = ChartPanel(
         title="each frame (the paper's Figure 10)", x="frame", y="total [J]",
-        curves={"total": (range(len(totals)), totals.tolist())},
+        curves={"": (range(len(totals)), totals.tolist())},
     )  # fmt: skip
     write_chart(path, [[loops], [frames]], size=(6.5, 2.6))
 

@@ -88,5 +88,7 @@ def draw_sweep(options: argparse.Namespace, found: Totals) -> None:
     for name, values in several.items():
         kept = {split: [value for value, of in values.items() if of[split]] for split in SPLITS}
         curves = {split: (xs, [mean(values[x][split]) for x in xs]) for split, xs in kept.items()}
-        panels.append(ChartPanel(x=name, y="L_tot [J]", curves=curves))
+        heights = [height for _, ys in curves.values() for height in ys]
+        span = min(0.0, *heights), 1.05 * max(heights)
+        panels.append(ChartPanel(x=name, y="L_tot [J]", curves=curves, span=span))
     write_chart(RESULTS / f"{options.name}.png", [panels], size=(4.0, 2.8))

@@ -28,7 +28,7 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 INK = "#22262b"  # text and axes; in a page they take the colour of the text around them
 COLUMNS = 600  # a longer curve shows the largest and the smallest value of each of so many parts
-FEW = 24  # points of a curve whose points are marked
+MARKED = 12  # points of a named curve, about, that have a marker
 PLACES = ((5, 3, "left", "bottom"), (5, -3, "left", "top"), (-5, 3, "right", "bottom"), (-5, -3, "right", "top"))
 """Where words stand beside a point: a distance [points] and their alignment."""
 BESIDE = 40  # pixels that words may reach beyond the axes
@@ -135,7 +135,9 @@ def _draw(axes: Axes, panel: ChartPanel, looks: Mapping[str, tuple[str, str]], *
         axes.axhline(level, color=INK, linewidth=0.6, zorder=1)
     for name, (x, y) in panel.curves.items():
         (colour, marker), shown = looks[name], peaks(np.asarray(y))
-        axes.plot(np.asarray(x)[shown], np.asarray(y)[shown], color=colour, marker=marker if len(shown) < FEW else "")
+        marker = marker if name or len(shown) == 1 else ""
+        places = np.asarray(x)[shown], np.asarray(y)[shown]
+        axes.plot(*places, color=colour, marker=marker, markevery=-(-len(shown) // MARKED))
     if panel.front:
         axes.plot(*zip(*panel.front), color=INK, linestyle="--", linewidth=0.8, zorder=1)
     for name, group in panel.points.items():
@@ -149,8 +151,8 @@ def _draw(axes: Axes, panel: ChartPanel, looks: Mapping[str, tuple[str, str]], *
 
 
 def _scale(axes: Axes, panel: ChartPanel) -> None:
-    """Set logarithmic scales where they are asked for, with plain numbers at their ticks."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+    """Set the scales that are asked for, with round and plain numbers at their ticks."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
     plain = FuncFormatter(lambda value, _: f"{value:g}")
     if panel.log_x:
@@ -158,6 +160,8 @@ def _scale(axes: Axes, panel: ChartPanel) -> None:
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.xaxis.set_major_formatter(plain)
         axes.xaxis.set_minor_formatter(NullFormatter())
+    else:
+        axes.xaxis.set_major_locator(MaxNLocator(nbins="auto", steps=(1, 2, 5, 10)))
     if panel.linear_below is not None:
         axes.set_yscale("symlog", linthresh=panel.linear_below)
         axes.yaxis.set_major_formatter(plain)
