@@ -32,7 +32,7 @@ MARKED = 12  # points of a named curve, about, that have a marker
 PLACES = ((5, 3, "left", "bottom"), (5, -3, "left", "top"), (-5, 3, "right", "bottom"), (-5, -3, "right", "top"))
 """Where words stand beside a point: a distance [points] and their alignment."""
 BESIDE = 40  # pixels that words may reach beyond the axes
-STYLE: dict[str, Any] = {
+STYLE: Any = {
     "font.size": 8.5, "axes.titlesize": 9, "axes.titlelocation": "left", "axes.titleweight": "bold",
     "text.color": INK, "axes.labelcolor": INK, "axes.edgecolor": INK, "xtick.color": INK, "ytick.color": INK,
     "axes.spines.top": False, "axes.spines.right": False, "axes.linewidth": 0.6,
@@ -170,7 +170,7 @@ def _scale(axes: Axes, panel: ChartPanel) -> None:
 def _name_points(axes: Axes, panel: ChartPanel) -> None:
     """Write the words of points beside them, the last group first; words that find no room are left out."""
     taken: list[Any] = []
-    for x, y, text in (point for group in reversed(panel.points.values()) for point in group if point[2]):
+    for x, y, text in (point for group in reversed([*panel.points.values()]) for point in group if point[2]):
         for across, up, to, at in PLACES:
             words = axes.annotate(
                 text, (x, y), xytext=(across, up), textcoords="offset points", ha=to, va=at, fontsize=7
@@ -187,7 +187,7 @@ def _legend(figure: Figure, looks: Mapping[str, tuple[str, str]], *, lines: bool
     from matplotlib.lines import Line2D
 
     named = {name: look for name, look in looks.items() if name}
-    style = "-" if lines else ""
+    style: Any = "-" if lines else ""
     handles = [Line2D([], [], color=colour, marker=marker, linestyle=style) for colour, marker in named.values()]
     figure.legend(handles, list(named), loc="outside lower center", ncols=max(1, min(len(named), 8)))
 
