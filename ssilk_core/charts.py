@@ -83,7 +83,7 @@ def write_chart(path: Path, rows: Sequence[Sequence[ChartPanel]], *, size: tuple
     """
     figure = _figure(rows, size)
     with replacing(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=120, facecolor="white", metadata={"Software": None})
+        figure.savefig(temporary, format="png", dpi=100, facecolor="white", metadata={"Software": None})
 
 
 def svg_chart(label: str, rows: Sequence[Sequence[ChartPanel]], *, size: tuple[float, float] = (9.0, 1.15)) -> str:

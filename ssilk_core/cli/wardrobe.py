@@ -26,12 +26,12 @@ from pathlib import Path
 
 from ..errors import SsilkError, fail
 from ..events import Failed, GarmentEvent, Message, Reporter, Result, Said, Started
-from ..files import need_writable
+from ..files import need_writable, sha256
 from ..wardrobe.listing import WardrobeEntry, read_list
 from ..wardrobe.panel import ProgressTable, table
 from ..wardrobe.queue import End, Queue, Slot
-from ..wardrobe.record import request_hash
 from ..wardrobe.training import GarmentTraining
+from ..work_record import request_key
 from . import options as shared
 from . import train
 
@@ -90,8 +90,8 @@ def _train(
         if training.plan:
             tell(name, Message(training.plan))
     with interruptible() as stop:
-        waiting = (training for training in trainings if training.state == "waiting")
-        Queue(slots, tell, ended).run((training.begin(source, device) for training in waiting), stop)
+        tasks = (training.begin(source, device) for training in trainings if training.state == "waiting")
+        Queue(slots, tell, ended).run(lambda: next(tasks, None), stop)
 
 
 def _slots(device: str, jobs: int | None) -> tuple[str, list[Slot]]:
@@ -132,7 +132,7 @@ def _request(entry: WardrobeEntry, path: Path) -> str:
     for file in files:
         if not file.is_file():
             fail(where, f"there is no file {file}", "paths are relative to the folder of the list")
-    return request_hash(entry.words, files)
+    return request_key(entry.words, [(file.name, sha256(file)) for file in files])
 
 
 def _inputs(options: argparse.Namespace, folder: Path) -> list[Path]:
