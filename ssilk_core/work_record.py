@@ -69,5 +69,9 @@ def read_record(path: Path) -> WorkRecord | None:
         found = "a value of another type"
     except (OSError, ValueError, TypeError, RecursionError) as error:
         found = str(error)
-    fail(str(path), f"this record of finished work is damaged ({found})", "it tells what need not be done again",
-         "delete it to do the work again")  # fmt: skip
+    return fail(
+        str(path),
+        f"this record of finished work is damaged ({found})",
+        "it says what need not be done again",
+        "delete it to do the work again",
+    )

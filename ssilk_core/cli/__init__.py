@@ -51,7 +51,7 @@ VERBS = (
     demo,
 )
 
-# The extra of the distribution that brings all that a verb needs.
+# The extra of the distribution that installs everything a verb needs.
 EXTRAS = {
     "inspect": "train",
     "rig": "setup",
@@ -76,7 +76,7 @@ OPTIONAL = ("torch", "pxr", "igl", "scipy", "trimesh", "embreex", "imageio_ffmpe
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that complains as everything else does, in one sentence."""
+    """A parser whose errors are one sentence, as all others are."""
 
     def error(self, message: str) -> NoReturn:
         """Raise `SsilkError`."""

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Film a garment that ships trained beside linear blend skinning, then train a draft of it and film that beside both.
+"""Film a garment that ships trained beside linear blend skinning, then train a draft of it and film all three.
 
-Everything the demo does is a command that can be typed: each is printed before it runs. --pretrained leaves the
-training out.
+The demo consists of commands that can be typed; each is printed before it runs. --pretrained leaves out the training.
 """
 
 from __future__ import annotations
@@ -28,9 +27,9 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         help="folder for everything that the demo writes (default demo_out)",
     )  # fmt: skip
     verb.add_argument(
-        "--garment", choices=("cape", "fringe_skirt", "hooded_dress"), default="cape", help="what to show"
+        "--garment", choices=("cape", "fringe_skirt", "hooded_dress"), default="cape", help="garment (default cape)"
     )
-    verb.add_argument("--pretrained", action="store_true", help="show the shipped model and train nothing")
+    verb.add_argument("--pretrained", action="store_true", help="show the shipped model only")
     verb.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", dest="settings", help="as in 'ssilk train'"
     )
@@ -65,7 +64,7 @@ def _shipped(options: argparse.Namespace) -> list[list[str]]:
     return [
         [*bake, "-o", shots["linear blend skinning"], "--lbs"],
         [*bake, "-o", shots["shipped"]],
-        # The film after the training has every frame of these two shots; until then half of them will do.
+        # The film after the training has every frame of these shots; half of them are enough until then.
         *_views(
             options.output / "shipped",
             {name: shots[name] for name in ("linear blend skinning", "shipped")},
@@ -88,7 +87,7 @@ def _trained(options: argparse.Namespace) -> list[list[str]]:
 
 
 def _shots(options: argparse.Namespace) -> dict[str, str]:
-    """Return the shots by what their panels are called, in the order of the film."""
+    """Return the shots by the captions of their panels, in the order of the film."""
     files = {"linear blend skinning": "plain", PRESET: f"{options.garment}_{PRESET}"}
     files["shipped"] = f"{options.garment}_shipped"
     return {name: str(options.output / f"{file}.usdc") for name, file in files.items()}

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def add_scene(verb: argparse.ArgumentParser) -> None:
-    """Add the options that say which character and garment are meant."""
+    """Add the options that name the character and the garment."""
     verb.add_argument("stage", type=Path, help="USD file with the character (SkelRoot, Skeleton, body meshes)")
     verb.add_argument(
         "--garment", metavar="FILE[:/PRIM]|PRIM", help="garment: a file of its own, or a mesh of the stage"
@@ -40,7 +40,7 @@ def add_scene(verb: argparse.ArgumentParser) -> None:
 
 
 def add_fabric(verb: argparse.ArgumentParser) -> None:
-    """Add the options that say what a garment is made of."""
+    """Add the options of the fabric."""
     verb.add_argument("--fabric", choices=FABRICS, default="default", help="material (default: that of the paper)")
     verb.add_argument(
         "--material",
@@ -52,7 +52,7 @@ def add_fabric(verb: argparse.ArgumentParser) -> None:
 
 
 def fabric(options: argparse.Namespace) -> Fabric:
-    """Return the fabric that the options ask for; raise `SsilkError` for a property that it does not have."""
+    """Return the fabric that the options ask for; raise `SsilkError` for an unknown property or a bad value."""
     return overridden(fabric_named(options.fabric), options.material)
 
 
@@ -158,7 +158,7 @@ def is_folder(output: Path) -> bool:
 
 
 def wardrobe(options: argparse.Namespace) -> tuple[Path, str | None]:
-    """Return the file that the garment stands in, and the prim that was asked for."""
+    """Return the file that holds the garment, and the prim that was asked for."""
     from ssilk_usd.read_stage import USD_SUFFIXES, split_location
 
     file, prim = split_location(options.garment) if options.garment else ("", None)
@@ -166,7 +166,7 @@ def wardrobe(options: argparse.Namespace) -> tuple[Path, str | None]:
 
 
 def check_output(output: Path, *inputs: Path | str | None) -> None:
-    """Check before any work that `output` can be written and is none of the `inputs`.
+    """Check that `output` can be written and is none of the `inputs`.
 
     Raises:
         SsilkError: it cannot, or it is.

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Train a garment on motions and write a model.
 
-The stage may be plain (character and garment); weights, classes and a proxy rig are then made as 'ssilk rig'
-does. Interrupt with Ctrl-C: the best model and the state are kept, and --resume goes on from there.
+Where the stage lacks weights, classes or a proxy rig, they are made as 'ssilk rig' makes them by default.
+Ctrl-C stops the training and keeps the best model and the state. --resume continues from there.
 """
 
 from __future__ import annotations
@@ -42,13 +42,12 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         "--minutes",
         type=float,
         metavar="M",
-        help="wall time to fill in place of the preset's iterations, from when the scene is set up: a few steps are "
-        "timed, and the schedule is stretched or shrunk to as many as fit; the same seed then gives the same model "
-        "only where as many do",
+        help="wall time after the setup, in place of the preset's iterations: a few steps are timed, and the "
+        "schedule is scaled to the number that fits; one seed gives one model only for one such number",
     )
     shared.add_fabric(verb)
     verb.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1, ... (default auto)")
-    verb.add_argument("--resume", action="store_true", help="go on from the state beside the model")
+    verb.add_argument("--resume", action="store_true", help="continue from the state beside the model")
     verb.add_argument(
         "--set",
         action="append",
@@ -69,7 +68,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         fail(str(options.output), "not a name for a model", "it ends in .safetensors")
     shared.check_output(options.output)
     if not (options.minutes is None or 0 < options.minutes < inf):
-        fail("--minutes", f"{options.minutes}", "a time is more than nothing")
+        fail("--minutes", f"{options.minutes}", "a positive number is needed")
     with joined(options.device) as (group, device), interruptible() as stop:
         report = report if group.first else silent
         trained = train(training_job(options, device, report), report, stop, group)
@@ -89,7 +88,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         )
     )
     if not trained.finished:
-        report(Message(f"stopped at iteration {trained.iterations}; --resume goes on from there."))
+        report(Message(f"stopped at iteration {trained.iterations}; --resume continues from there."))
         return EXIT_INTERRUPTED
     return EXIT_OK
 
@@ -125,7 +124,7 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
 
 
 def configured(options: argparse.Namespace) -> tuple[ModelConfig, TrainConfig, Fabric]:
-    """Return what the options say about network, schedule and fabric.
+    """Return the network, the schedule and the fabric that the options ask for.
 
     Raises:
         SsilkError: a setting that does not exist, or a value that it cannot have.

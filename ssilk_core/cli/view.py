@@ -19,11 +19,9 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
     verb.add_argument("shots", type=Path, nargs="+", metavar="SHOT", help="shots of one length and rate")
     verb.add_argument("-o", "--output", type=Path, required=True, help="film (.mp4) or contact sheet (.png)")
-    verb.add_argument("--label", action="append", default=[], help="a word for each shot (repeatable)")
-    verb.add_argument(
-        "--fps", type=float, default=30.0, help="at most so many frames per second of film (default 30)"
-    )
-    verb.add_argument("--columns", type=int, default=6, help="moments in a row of the sheet (default 6)")
+    verb.add_argument("--label", action="append", default=[], help="caption of a shot (repeatable)")
+    verb.add_argument("--fps", type=float, default=30.0, help="most frames per second of a film (default 30)")
+    verb.add_argument("--columns", type=int, default=6, help="moments that the sheet shows (default 6)")
     verb.add_argument("--azimuth", type=float, default=None, help="side from which the camera looks [degrees]")
     verb.add_argument("--size", metavar="WxH", help="pixels of one panel")
 

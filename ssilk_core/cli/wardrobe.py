@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Train a list of garments, each as 'ssilk train' does, one on each GPU at a time.
+"""Train a list of garments as 'ssilk train' does, one at a time on each GPU.
 
 LIST is a TOML file with a table for each garment, and [defaults] for all; its paths are relative to its folder:
 
@@ -13,8 +13,9 @@ LIST is a TOML file with a table for each garment, and [defaults] for all; its p
     set = { iterations = 100000 }
 
 Other keys are valid, fabric and material. FOLDER gets NAME.safetensors and NAME.log for each garment. The same
-command goes on where it stopped: what is finished is skipped unless something else is asked now, what was interrupted
-is resumed. Ctrl-C stops all gently, a second one at once. A garment that fails does not stop the others.
+command, given again, skips what is finished and resumes what was interrupted; a garment whose entry or inputs have
+changed is trained again. Ctrl-C stops all trainings after their current step, a second Ctrl-C at once. A garment that
+fails does not stop the others.
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 def _train(
     trainings: Sequence[GarmentTraining], source: Path, device: str, slots: Sequence[Slot], show: Reporter
 ) -> None:
-    """Train what waits, the paths of the list being relative to `source`."""
+    """Train all garments that wait; paths of the list are relative to `source`."""
     from ..training.signals import interruptible
 
     named = {training.entry.name: training for training in trainings}

@@ -18,20 +18,20 @@ from .terms import SHARE
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file; raise `SsilkError` for one that is none."""
+    """Read a JSON file; raise `SsilkError` where it is missing or not JSON."""
     if not path.is_file():
         fail(str(path), "there is no such file", "figures in JSON are needed")
     try:
         return json.loads(path.read_text())
     except ValueError as error:
-        raise SsilkError(f"{path}: this is no JSON ({error}); name a file that ssilk wrote.") from error
+        raise SsilkError(f"{path}: not a JSON file ({error}); name a file that ssilk wrote.") from error
 
 
 def section_of(path: Path) -> Section:
-    """Return what a file of figures says, by what it holds.
+    """Return the section of a file of figures, chosen by what it holds.
 
     Raises:
-        SsilkError: it is none that 'ssilk stress', 'trade' or 'evaluate' writes.
+        SsilkError: the file is not one of 'ssilk stress', 'ssilk trade' or 'ssilk evaluate'.
     """
     document = read_json(path)
     kinds = {"outcomes": extremes, "points": trade, "figures": evaluation}
@@ -39,18 +39,18 @@ def section_of(path: Path) -> Section:
     if not kind:
         fail(
             str(path),
-            "none of the figures that are known",
+            "not figures of a known kind",
             f"a document with {' or '.join(kinds)} is needed",
-            "name what 'ssilk stress', 'ssilk trade' or 'ssilk evaluate' wrote",
+            "name a file that 'ssilk stress', 'ssilk trade' or 'ssilk evaluate' wrote",
         )
     return _made(path, kinds[str(kind)], document)
 
 
 def learning_of(path: Path) -> list[Section]:
-    """Return what the learning curve beside a model says; nothing where there is none, or no validation in it.
+    """Return the section of the learning curve beside a model; none without a curve, or without validations.
 
     Raises:
-        SsilkError: the file is no learning curve.
+        SsilkError: the file is not a learning curve.
     """
     document = read_json(path) if path.is_file() else {"points": []}
     return [_made(path, learning, document)] if document.get("points", True) else []
@@ -87,14 +87,14 @@ def evaluation(document: Mapping[str, Any]) -> Section:
 
 
 def records(found: Sequence[Mapping[str, Any]]) -> str:
-    """Return records as a table with a column for each name that any has."""
+    """Return records as a table with a column for each name that occurs."""
     flat = [flattened(record) for record in found]
     names = list(dict.fromkeys(name for record in flat for name in record))
     return table(names, [[record.get(name, "") for name in names] for record in flat])
 
 
 def learning(document: Mapping[str, Any]) -> Section:
-    """Return the learning curve that a training leaves beside its model."""
+    """Return the section of the learning curve that a training writes beside its model."""
     points, lbs = document["points"], document["lbs"]
     best = min(range(len(points)), key=lambda number: points[number]["validation"]["total"])
     times = [point["seconds"] for point in points]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A page of HTML that is whole by itself: its style, charts and pictures are in it, and it may load nothing else."""
+"""A self-contained page of HTML: style, charts and pictures are inside it, and it loads nothing."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 from ..view.render import Image
 
-# Nothing is fetched and nothing runs, whatever a name or a message in the figures may contain.
+# Whatever a name or a message in the figures contains, the browser fetches nothing and runs nothing.
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 STYLE = """
 :root { color-scheme: light dark; --ink: #22262b; --paper: #fff; --faint: #d9dde2; --bad: #b03a48; }
@@ -53,7 +53,7 @@ def page(title: str, sections: Sequence[Section]) -> str:
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]], bad: Sequence[int] = ()) -> str:
-    """Return a table; figures stand to the right, and rows whose numbers are in `bad` stand out."""
+    """Return a table; figures are aligned to the right, and rows whose numbers are in `bad` are highlighted."""
     lines = []
     for number, row in enumerate(rows):
         kind = ' class="bad"' if number in bad else ""

@@ -13,19 +13,18 @@ COSTS = {
     "shot_bytes": (f"shot of {SECONDS} s [MB]", 1e-6),
     "model_bytes": ("model [MB]", 1e-6),
 }
-# What the y axes show, in which unit, and below which value they are linear: nothing is lost at zero.
+# Label, unit, and the value below which the axis is linear, so that zero has a place on it.
 ERRORS = {
     "position": ("RMS distance from the whole model [mm]", 1e3, 0.1),
     "excess": ("energy above the whole model [J]", 1.0, 1e-3),
 }
-WHOLE_NAMED = ("as trained", "level", "refinement")  # what is swept under these names has words beside each point
+NAMED = ("as trained", "level", "refinement")  # sweeps whose points all have their names beside them
 
 
 def trade_panels(points: Sequence[TradePoint]) -> list[list[ChartPanel]]:
-    """Return a row of panels for each error and in it a panel for each cost.
+    """Return a row of panels for each error, with a panel for each cost.
 
-    Points have one colour for each thing that was swept. The whole model, levels, refined variants and points of the
-    front have their names beside them.
+    Each sweep has a colour. The whole model, levels, refined variants and points of the front have names beside them.
     """
     return [[_panel(points, cost, error) for cost in COSTS] for error in ERRORS]
 
@@ -36,7 +35,7 @@ def _panel(points: Sequence[TradePoint], cost: str, error: str) -> ChartPanel:
     best = front(places)
     groups: dict[str, list[tuple[float, float, str]]] = {}
     for index, (point, place) in enumerate(zip(points, places)):
-        named = index in best or point.swept in WHOLE_NAMED
+        named = index in best or point.swept in NAMED
         groups.setdefault(point.swept, []).append((*place, point.variant if named else ""))
     return ChartPanel(
         x=x, y=y, points=groups, front=[places[index] for index in best], log_x=True, linear_below=linear

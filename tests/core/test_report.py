@@ -127,7 +127,7 @@ def test_figures_become_sections_by_what_they_hold(tmp_path, title):
 
 @pytest.mark.parametrize(
     ("text", "said"),
-    [("{", "this is no JSON"), ("[1]", "none of the figures"), ('{"points": [{}]}', "incomplete ('model')"),
+    [("{", "not a JSON file"), ("[1]", "not figures of a known kind"), ('{"points": [{}]}', "incomplete ('model')"),
      ('{"outcomes": [{"name": 1}]}', "incomplete ('measured')")],
 )  # fmt: skip
 def test_other_files_are_refused(tmp_path, text, said):

@@ -200,7 +200,7 @@ def test_a_sweep_that_was_stopped_goes_on(meter, points, tmp_path, monkeypatch):
 @pytest.mark.parametrize("text", ["", "[]", '{"asked": 1}', '{"asked": {}, "points": [{"model": "m"}]}'])
 def test_files_that_hold_something_else_are_refused(tmp_path, text):
     (tmp_path / "other.json").write_text(text)
-    with pytest.raises(SsilkError, match=r"other.json: these are no figures of a trade"):
+    with pytest.raises(SsilkError, match=r"other.json: not figures of 'ssilk trade'"):
         Results(tmp_path / "other.json", {}).resume(lambda event: None)
 
 

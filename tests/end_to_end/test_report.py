@@ -85,8 +85,8 @@ def test_a_browser_draws_the_page_and_fetches_nothing(pages, name, tmp_path):
         ("{shot} -o {out}.html --stage {stage} --motion {clip}", "shots hold their character"),
         ("{model} -o {out}.html --stage {stage}", "one of --stage and --motion"),
         ("{out}/none.usda -o {out}.html", "there is no such file"),
-        ("{stage} -o {out}.html --figures {stage}", "this is no JSON"),
-        ("{shot} -o {out}.html --figures {other}", "none of the figures that are known"),
+        ("{stage} -o {out}.html --figures {stage}", "not a JSON file"),
+        ("{shot} -o {out}.html --figures {other}", "not figures of a known kind"),
     ],
 )
 def test_bad_input_is_one_sentence(toy, tmp_path, capsys, words, said):

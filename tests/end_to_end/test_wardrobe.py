@@ -76,12 +76,12 @@ def test_a_garment_has_its_own_keys_and_the_defaults(tmp_path):
 
 WRONG = {
     "no TOML": ("[cape", "list.toml: not a TOML file"),
-    "nothing": ("", "list.toml: it names no garment"),
-    "loose key": ('fabric = "silk"\n[cape]', "key 'fabric': it stands in no table; each key belongs to"),
+    "nothing": ("", "list.toml: no garment in it"),
+    "loose key": ('fabric = "silk"\n[cape]', "key 'fabric': it belongs to no table; each key belongs to"),
     "name": ('["../cape"]', "table '../cape': its name would be the name of files; letters"),
     "unknown": ("[cape]\nsteps = 3", "table 'cape', key 'steps': no such key; keys are stage, garment, motions"),
     "default": ("[defaults]\nstage = 3\n[cape]", "table 'defaults', key 'stage': 3; the path of a stage is needed"),
-    "missing": ('[cape]\nstage = "a"', "table 'cape', key 'motions': missing; it stands here or in"),
+    "missing": ('[cape]\nstage = "a"', "table 'cape', key 'motions': missing; it is needed here or in"),
     "preset": ('[cape]\npreset = "fast"', "key 'preset': 'fast'; one of draft, preview, final is needed"),
     "set": ('[cape]\nset = "batch=3"', "key 'set': 'batch=3'; a table of values, like { iterations = 20000 }, is"),
     "motions": ("[cape]\nmotions = []", "key 'motions': []; a path or a list of paths is needed"),
