@@ -44,7 +44,7 @@ STYLE: Any = {
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ChartPanel:
-    """A pair of axes and what is drawn in them.
+    """A pair of axes with curves and points.
 
     Attributes:
         x, y: what the axes show, with units.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Records beside the files of finished work: what was asked and what came of it, so that nobody does it twice."""
+"""Records of finished work beside its files: the request and the results, so that nothing is done twice."""
 
 from __future__ import annotations
 

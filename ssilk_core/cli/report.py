@@ -86,9 +86,9 @@ def _shot(path: Path, report: Reporter) -> list[Section]:
         if mesh.is_garment
     ]
     if not garments:
-        fail(str(path), "no mesh is marked as a garment", "one at least is needed", "see 'ssilk rig'")
+        fail(str(path), "no mesh is marked as a garment", "at least one is needed", "see 'ssilk rig'")
     if not shot.frame_times:
-        fail(str(path), "the shot has no frames", "one at least is needed")
+        fail(str(path), "the shot has no frames", "at least one is needed")
     bodies = {index: part.mesh for index, part in enumerate(parts) if not shot.meshes[index].is_garment}
     sections = shot_sections(shot, garments, bodies, report)
     records = {str(part.mesh.path): asdict(part.record) for part in parts if part.record}

@@ -3,7 +3,7 @@
 
 Every frame minimises, over all vertices, the energy that networks are trained with. The result is a shot with the
 garment as time-sampled points, beside the moving body. Several motions advance together, each into a file of its own
-in a folder; a GPU takes hardly longer for many than for one. Each file appears when its shot is finished. The same
+in a folder: a GPU takes about as long for many as for one. Each file appears when its shot is finished. The same
 command, given again after an interruption, simulates only what is missing; delete a file to simulate it again.
 """
 

@@ -171,7 +171,7 @@ class Bench:
 
         folder: Path = self.options.motions
         if not folder.is_dir():
-            fail(str(folder), "there is no such folder", "one of motion files is needed")
+            fail(str(folder), "there is no such folder", "a folder of motion files is needed")
         files = {path.stem: path for path in motion_files([folder])}
         names = self.options.clips or list(files)[:CLIPS]
         missing = sorted(set(names) - files.keys())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Short trials of training and simulation on a scene, and what single precision costs its energies."""
+"""Short trials of training and simulation on a scene, and the error of single precision in its energies."""
 
 from __future__ import annotations
 

@@ -38,8 +38,8 @@ class GarmentTraining:
         self.figures, self.error = self.record.detail["result"] if finished else {}, ""
         self.plan = (
             "finished before; skipped" if finished
-            else "goes on from where it stopped" if self.resumed
-            else "something else was asked before; trains anew" if before is not None and not same
+            else "resumes where it stopped" if self.resumed
+            else "its entry or inputs have changed; trains again" if before is not None and not same
             else ""
         )  # fmt: skip
 

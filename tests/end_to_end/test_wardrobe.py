@@ -237,7 +237,7 @@ def test_what_is_finished_is_skipped_unless_something_else_is_asked(tmp_path):
     model.write_bytes(b"another model")
     assert GarmentTraining(entry, tmp_path, "request").state == "waiting"
     changed = GarmentTraining(entry, tmp_path, "another request")
-    assert changed.state == "waiting" and not changed.resumed and "something else" in changed.plan
+    assert changed.state == "waiting" and not changed.resumed and "have changed" in changed.plan
     changed.begin(tmp_path, "cpu")
     assert not (tmp_path / "cape.resume.safetensors").exists()  # it belongs to what was asked before
     changed.end(End(-9, 1.0, None))
