@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from reports import RESULTS, table, write_results
+from helpers.reports import RESULTS, table, write_results
 
 from ssilk_core.charts import COLOURS, ChartPanel, write_chart
 from ssilk_core.energy import TERMS

@@ -3,12 +3,12 @@
 
     python benchmarks/paper.py OUT --stages STAGES --motions FOLDER --index FOLDER/index.json --gpus 4 --until 570
     python benchmarks/tables.py table1 OUT/records
-    python benchmarks/tables.py table5 OUT/sweeps
+    python benchmarks/tables.py ablations OUT/sweeps
 
 STAGES holds the rigged garments of `paper_jobs.GARMENTS`, and the cape with other numbers of proxies. A job is done
-when its outputs exist: the same command, given again, runs what is missing. No job begins that is predicted to end
-after --until. --list shows all jobs and runs none. Trainings side by side on one GPU hide the start of each other.
-Each has as many steps as take --seconds on a GPU of its own, whatever its method.
+when its outputs exist, so the same command again continues with what is missing. No job begins that is predicted to
+end after --until. --list shows all jobs and runs none. Trainings on one GPU overlap, which hides their start. Each
+has as many steps as take --seconds on a GPU of its own, whatever its method.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from paper_jobs import GARMENTS, PYTHON, TABLES, Job, Plan, jobs, without_models
-from reports import table
+from helpers.paper_jobs import GARMENTS, PYTHON, TABLES, Job, Plan, jobs, without_models
+from helpers.reports import table
 
 from ssilk_core.errors import SsilkError
 from ssilk_core.training.signals import interruptible

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the latent state advances: the paper's Eqs. 3, 11 and 12 behind one call."""
+"""How the latent state advances: the integrators of the schemes in `ssilk_core.schemes`."""
 
 from __future__ import annotations
 
+import importlib
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -11,7 +12,16 @@ import torch
 from torch import Tensor, nn
 
 from .. import kernels
-from ..config import DISTANCE_SCALE, MOST_GIVEN, OWN_SHARE, RATE_SHARE, REACH, VELOCITY_SCALE, ModelConfig
+from ..config import (
+    DISTANCE_SCALE,
+    MAX_OUTPUT,
+    OUTPUT_SCALE,
+    RATE_ALLOWANCE,
+    STATE_ALLOWANCE,
+    VELOCITY_SCALE,
+    ModelConfig,
+)
+from ..schemes import SCHEMES
 
 SMALLEST = 1e-12  # far below any length that counts; its square's inverse is finite in float32
 
@@ -19,8 +29,8 @@ SMALLEST = 1e-12  # far below any length that counts; its square's inverse is fi
 def limited(values: Tensor, bound: float) -> Tensor:
     """Return values kept within a bound b; unlimited for a bound of zero.
 
-    The identity up to b / 2, so that a state well within its bound is not drawn towards zero step by step; from
-    there it bends smoothly, h + h tanh((|v| - h) / h) with h = b / 2, and never passes b.
+    The identity up to h = b / 2, so that steps do not draw a state well within its bound towards zero. Beyond, it is
+    h + h tanh((|v| - h) / h), which is smooth and never passes b.
     """
     if not bound:
         return values
@@ -42,24 +52,19 @@ def shortened(vectors: Tensor, longest: Tensor) -> Tensor:
 class Integrator(nn.Module, ABC):
     """Advances z from two past states.
 
-    With `config.latent_bound` each new state is limited, so that it can never leave the range where the decoder was
-    trained, however long the rollout.
+    `config.latent_bound` limits each new state, so that no rollout leaves the range that the decoder was trained on.
 
     Args:
         config: bounds and sizes.
         rates: how many of the last entries of a dynamic descriptor are zero while the character holds still.
 
     Attributes:
-        states: latent vectors that the stepper S sees beside the pose.
-        centred: whether only differences of what S gives are used, so that a bias of its last layer would do nothing.
+        scheme: its entry in `schemes.SCHEMES`.
     """
-
-    states = 2
-    centred = False
 
     def __init__(self, config: ModelConfig, rates: int = 0) -> None:
         super().__init__()
-        self.config, self.rates = config, rates
+        self.config, self.rates, self.scheme = config, rates, SCHEMES[config.scheme]
 
     def forward(self, stepper: nn.Module, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor) -> Tensor:
         """Return z_t, shape (batch, latent).
@@ -70,40 +75,23 @@ class Integrator(nn.Module, ABC):
             rest: the quasi-static state P(theta_t) of the pose at t.
             pose: dynamic descriptor at t.
         """
-        return self.follow(stepper, before, now, self.known(stepper, rest, pose))
+        return self.follow(stepper, before, now, self.precomputed(stepper, rest, pose))
 
-    def known(self, stepper: nn.Module, rest: Tensor, pose: Tensor) -> tuple[Tensor, ...]:
-        """Return what steps need that no state decides, rows of any number of frames at once."""
+    def precomputed(self, stepper: nn.Module, rest: Tensor, pose: Tensor) -> tuple[Tensor, ...]:
+        """Return what steps need and no past state decides, rows of any number of frames at once."""
         return rest, pose
 
-    def follow(self, stepper: nn.Module, before: Tensor, now: Tensor, known: Sequence[Tensor]) -> Tensor:
-        """Return z_t, shape (batch, latent), from the two states before and what is `known` of the frame."""
-        return self.bounded(self.advance(stepper, before, now, *known))
+    def follow(self, stepper: nn.Module, before: Tensor, now: Tensor, precomputed: Sequence[Tensor]) -> Tensor:
+        """Return z_t, shape (batch, latent), from the two states before and a frame's rows of `precomputed`."""
+        return self.bounded(self.advance(stepper, before, now, *precomputed))
 
     def bounded(self, z: Tensor) -> Tensor:
         """Return states within their bound."""
         return limited(z, self.config.latent_bound)
 
     @abstractmethod
-    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *known: Tensor) -> Tensor: ...
-
-
-class Verlet(Integrator):
-    """z_t = zbar + S([zbar, z_{t-1}, pose]) with zbar = alpha z_{t-1} + beta (z_{t-1} - z_{t-2}) (Eqs. 2, 3).
-
-    With `config.max_latent_step` what S adds in a step, a latent acceleration, is limited: the state cannot be flung.
-    """
-
-    def __init__(self, config: ModelConfig, rates: int = 0) -> None:
-        super().__init__(config, rates)
-        self.alpha = nn.Parameter(torch.full((config.latent,), 1.0))
-        # 1 would turn noise on the first two states into a steady drift; 0.9 lets it die within a second.
-        self.beta = nn.Parameter(torch.full((config.latent,), 0.9))
-
-    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *known: Tensor) -> Tensor:
-        _, pose = known
-        forward = self.alpha * now + self.beta * (now - before)
-        return forward + limited(stepper(torch.cat([forward, now, pose], dim=1)), self.config.max_latent_step)
+    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *precomputed: Tensor) -> Tensor:
+        """Return z_t before it is limited, shape (batch, latent)."""
 
 
 class SpringVerlet(Integrator):
@@ -112,28 +100,26 @@ class SpringVerlet(Integrator):
         zbar = z_{t-1} + beta v,    v = z_{t-1} - z_{t-2},    f = k (p - zbar)
         z_t = zbar + f + u,         u = s (S(z_{t-1}, v, p - zbar, pose) - S(p, 0, 0, pose held still))
 
-    Without S every dimension is a damped spring, stable for any k in (0, 1]; S learns what such a spring misses.
-    What S would do to a garment at rest under a character that holds still is taken off, so that the garment rests
-    at p exactly: where gravity alone pulls, an error of a millimetre a frame is a tenth of gravity, and no loss
-    that also holds stretch and collisions can see it. Stiffnesses start spread from slow swings to quick following
-    and stay under `config.stiffness`; spring and S together are limited by `config.max_latent_step`.
+    Without S every dimension is a damped spring, stable for any k in (0, 1]. S learns what such a spring misses.
+    The output of S for a garment at rest under a still character is subtracted, so that p is an equilibrium. The
+    loss cannot enforce this: an error of a millimetre a frame is a tenth of gravity, and stretch and collisions
+    hide it. Stiffnesses start spread from slow swings to quick following and stay under `config.stiffness`.
+    `config.max_latent_step` limits spring and S together.
 
-    And it rests nowhere else, whatever S has learnt: S may give half of what the spring gives, and more only
-    while something moves,
+    p is the only equilibrium, whatever S has learnt, because S gives at most half of what the spring gives, and
+    more only while something moves:
 
-        |u| <= (|f| + |v|) / 2 + |rates of the pose| / 20,
+        |u| <= (|f| + |v|) / 2 + |rates of the pose| / 20
 
-    which motion seldom comes near. Eq. 2's alpha is one: a larger one would undo the spring.
+    Motion seldom reaches this limit. Eq. 2's alpha is one: a larger one would undo the spring.
 
-    S sees velocities and distances themselves, scaled to order one: given as states side by side they would be
-    small differences of large inputs, and those are learnt last. `reach` s scales S to what it has to give.
+    S sees velocities and distances, scaled to order one. Given as states side by side they would be small
+    differences of large inputs, which networks learn last. `output_scale` is s.
     """
 
-    states = 3
-    centred = True
     slowest = 0.01
-    velocity_scale, distance_scale, reach = VELOCITY_SCALE, DISTANCE_SCALE, REACH
-    most, own_share, rate_share = MOST_GIVEN, OWN_SHARE, RATE_SHARE
+    velocity_scale, distance_scale, output_scale = VELOCITY_SCALE, DISTANCE_SCALE, OUTPUT_SCALE
+    max_output, state_allowance, rate_allowance = MAX_OUTPUT, STATE_ALLOWANCE, RATE_ALLOWANCE
 
     def __init__(self, config: ModelConfig, rates: int = 0) -> None:
         super().__init__(config, rates)
@@ -143,70 +129,51 @@ class SpringVerlet(Integrator):
         self.beta = nn.Parameter(torch.full((config.latent,), 0.7))
         self.share = nn.Parameter(torch.logit(start / config.stiffness))
 
-    def known(self, stepper: nn.Module, rest: Tensor, pose: Tensor) -> tuple[Tensor, ...]:
-        """Return the quasi-static state, the pose, what S would do to a garment at rest there, and |rates| / 20."""
+    def precomputed(self, stepper: nn.Module, rest: Tensor, pose: Tensor) -> tuple[Tensor, ...]:
+        """Return the quasi-static state, the pose, the output of S at rest there, and |rates| / 20."""
         static, rates = pose.tensor_split([pose.shape[1] - self.rates], dim=1)
         nothing = torch.zeros_like(rest)
-        held = self._of(stepper, rest, nothing, nothing, static, torch.zeros_like(rates))
-        return rest, pose, held, self.rate_share * length(rates)
+        at_rest = self._of(stepper, rest, nothing, nothing, static, torch.zeros_like(rates))
+        return rest, pose, at_rest, self.rate_allowance * length(rates)
 
-    def follow(self, stepper: nn.Module, before: Tensor, now: Tensor, known: Sequence[Tensor]) -> Tensor:
+    def follow(self, stepper: nn.Module, before: Tensor, now: Tensor, precomputed: Sequence[Tensor]) -> Tensor:
         if torch.is_grad_enabled() or torch.compiler.is_compiling() or not kernels.serve(now):
-            return super().follow(stepper, before, now, known)
+            return super().follow(stepper, before, now, precomputed)
         from ..kernels.spring import next_kernel, seen_kernel
 
-        rest, pose, held, roused = known
+        rest, pose, at_rest, rate_allowance = precomputed
         moved = stepper(seen_kernel(before, now, rest, pose, self.beta, (self.velocity_scale, self.distance_scale)))
-        stiffness, push, bound = self.config.stiffness, self.config.max_latent_step, self.config.latent_bound
-        limits = stiffness, self.most, self.reach, self.own_share, push, bound
-        return next_kernel((before, now), rest, (moved, held), roused, (self.beta, self.share), limits)
+        stiffness, max_step, bound = self.config.stiffness, self.config.max_latent_step, self.config.latent_bound
+        limits = stiffness, self.max_output, self.output_scale, self.state_allowance, max_step, bound
+        return next_kernel((before, now), rest, (moved, at_rest), rate_allowance, (self.beta, self.share), limits)
 
-    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *known: Tensor) -> Tensor:
-        rest, pose, held, roused = known
+    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *precomputed: Tensor) -> Tensor:
+        rest, pose, at_rest, rate_allowance = precomputed
         velocity = now - before
         forward = now + self.beta * velocity
         away = rest - forward
         moved = self._of(stepper, now, self.velocity_scale * velocity, self.distance_scale * away, pose)
         spring = self.config.stiffness * torch.sigmoid(self.share) * away
-        allowed = self.own_share * (length(spring) + length(velocity)) + roused
+        allowed = self.state_allowance * (length(spring) + length(velocity)) + rate_allowance
         return forward + limited(
-            spring + shortened(self.reach * (moved - held), allowed), self.config.max_latent_step
+            spring + shortened(self.output_scale * (moved - at_rest), allowed), self.config.max_latent_step
         )
 
     def _of(self, stepper: nn.Module, *seen: Tensor) -> Tensor:
-        return stepper(torch.cat(seen, dim=1)).clamp(-self.most, self.most)
-
-
-class Direct(Integrator):
-    """z_t = S([z_{t-2}, z_{t-1}, pose]) (Eq. 11)."""
-
-    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *known: Tensor) -> Tensor:
-        return stepper(torch.cat([before, now, known[1]], dim=1))
-
-
-class DirectResidual(Integrator):
-    """z_t = z_{t-1} + S([z_{t-2}, z_{t-1}, pose]) (Eq. 12)."""
-
-    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *known: Tensor) -> Tensor:
-        return now + stepper(torch.cat([before, now, known[1]], dim=1))
+        return stepper(torch.cat(seen, dim=1)).clamp(-self.max_output, self.max_output)
 
 
 class QuasiStatic(Integrator):
-    """z_t = P(theta_t): no stepper and no past, for garments with nothing loose, which P alone dresses as well."""
+    """z_t = P(theta_t), with no stepper and no past, for garments without loose parts."""
 
-    states = 0
+    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *precomputed: Tensor) -> Tensor:
+        return precomputed[0]
 
-    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *known: Tensor) -> Tensor:
-        return known[0]
-
-    def follow(self, stepper: nn.Module, before: Tensor, now: Tensor, known: Sequence[Tensor]) -> Tensor:
-        return self.advance(stepper, before, now, *known)  # within its bound already
+    def follow(self, stepper: nn.Module, before: Tensor, now: Tensor, precomputed: Sequence[Tensor]) -> Tensor:
+        return self.advance(stepper, before, now, *precomputed)  # within its bound already
 
 
-INTEGRATORS: dict[str, type[Integrator]] = {
-    "spring_verlet": SpringVerlet,
-    "verlet": Verlet,
-    "direct": Direct,
-    "direct_residual": DirectResidual,
-    "quasi_static": QuasiStatic,
-}
+def integrator(config: ModelConfig, rates: int = 0) -> Integrator:
+    """Return the integrator of a network's scheme; `rates` as in `Integrator`."""
+    module, _, name = SCHEMES[config.scheme].integrator.partition(":")
+    return getattr(importlib.import_module(module), name)(config, rates)

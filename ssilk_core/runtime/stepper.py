@@ -20,18 +20,18 @@ from numpy.typing import NDArray
 from ..config import (
     DISTANCE_SCALE,
     LOST,
-    MOST_GIVEN,
-    OWN_SHARE,
-    RATE_SHARE,
-    REACH,
+    MAX_OUTPUT,
+    OUTPUT_SCALE,
+    RATE_ALLOWANCE,
     RECOVERY,
+    STATE_ALLOWANCE,
     VELOCITY_SCALE,
     ModelConfig,
 )
 from .networks import Layer, Parameters, continued, layers, single
 
-GIVEN = REACH * MOST_GIVEN  # the most that S gives
-SAFE = GIVEN**2  # no entry of a vector with a smaller square passes it
+LARGEST = OUTPUT_SCALE * MAX_OUTPUT  # of each scaled output of S
+SAFE = LARGEST**2  # no entry of a vector with a smaller square passes it
 
 
 def lost(states: NDArray) -> NDArray:
@@ -89,14 +89,14 @@ class StepperInputs:
     Attributes:
         history: p of frame t and z_{t-2} in row t, so that one subtraction gives w and v, shape (F + 2, 2, latent).
         driven: what the pose adds to the sums of S's first layer, shape (F, hidden).
-        held: s S(0, 0, pose held still), shape (F, latent).
+        at_rest: s S(0, 0, pose held still), shape (F, latent).
         allowed: what the pose's rates allow S to give, shape (F,).
         first: frame that the stepper begins with; those before it are at rest.
     """
 
     history: NDArray
     driven: NDArray
-    held: NDArray
+    at_rest: NDArray
     allowed: NDArray
     first: int
 
@@ -117,7 +117,7 @@ class SpringStepper:
         speed, away = VELOCITY_SCALE * of_speed, DISTANCE_SCALE * of_away
         self.bias, self.of_still = first.bias, np.hstack([of_now, of_static])
         self.first = single(np.hstack([of_now - away, speed - away * beta]).T)
-        self.later = [*hidden, Layer(single(REACH * last.rows))]
+        self.later = [*hidden, Layer(single(OUTPUT_SCALE * last.rows))]
         self.beta = beta.astype(np.float32)
         self.stiffness = (config.stiffness / (1 + np.exp(-share))).astype(np.float32)
         self.config = config
@@ -131,21 +131,21 @@ class SpringStepper:
         """
         still = self.of_still @ np.hstack([rest, static]).T + self.bias
         driven = np.ascontiguousarray((still + self.of_rates @ rates.T).T)
-        held = np.ascontiguousarray(continued(self.later, still).T.clip(-GIVEN, GIVEN))
-        allowed = RATE_SHARE * np.linalg.norm(rates, axis=1)
+        at_rest = np.ascontiguousarray(continued(self.later, still).T.clip(-LARGEST, LARGEST))
+        allowed = RATE_ALLOWANCE * np.linalg.norm(rates, axis=1)
         history = np.empty((len(rest) + 2, 2, rest.shape[1]), dtype=np.float32)
         history[:-2, 0] = rest
         if before is None:
             history[2:4, 1] = rest[:2]
-            return StepperInputs(history, driven, held, allowed, 2)
+            return StepperInputs(history, driven, at_rest, allowed, 2)
         history[:2, 1] = before
-        return StepperInputs(history, driven, held, allowed, 0)
+        return StepperInputs(history, driven, at_rest, allowed, 0)
 
-    def rolled(self, course: StepperInputs) -> NDArray:
-        """Return the latents of all frames (F, latent), written into `course`."""
-        z, rest, start = course.history[2:, 1], course.history[:-2, 0], course.first
+    def rolled(self, inputs: StepperInputs) -> NDArray:
+        """Return the latents of all frames (F, latent), written into `inputs`."""
+        z, rest, start = inputs.history[2:, 1], inputs.history[:-2, 0], inputs.first
         while start < len(z):
-            self._advance(course, start)
+            self._advance(inputs, start)
             bad = lost(z[start:])
             if not bad.any():
                 break
@@ -154,15 +154,15 @@ class SpringStepper:
             z[first:start] = rest[first:start]
         return z
 
-    def _advance(self, course: StepperInputs, start: int) -> None:
-        z, history = self.config.latent, course.history[start:]
+    def _advance(self, inputs: StepperInputs, start: int) -> None:
+        z, history = self.config.latent, inputs.history[start:]
         rooms = [Room(rows) for rows in (self.first, *(layer.rows for layer in self.later[:-1]))]
         differences = np.empty((2, z), np.float32)
         along, pull, own = (np.empty(z, np.float32) for _ in range(3))
         state, (away, velocity) = differences.reshape(-1), differences
         sums, last = rooms[0].sums, self.later[-1].rows
-        push, bound = Limit(self.config.max_latent_step, (z,)), Limit(self.config.latent_bound, (z,))
-        poses = course.driven[start:], course.held[start:], course.allowed[start:].tolist()
+        limit_step, limit_state = Limit(self.config.max_latent_step, (z,)), Limit(self.config.latent_bound, (z,))
+        poses = inputs.driven[start:], inputs.at_rest[start:], inputs.allowed[start:].tolist()
         frames = zip(history[:-2], history[:-2, 0], history[1:-1, 1], history[2:, 1], *poses)
         with np.errstate(over="ignore", invalid="ignore"):  # `rolled` looks for lost states
             for past, rest, now, new, drive, calm, turning in frames:
@@ -175,17 +175,17 @@ class SpringStepper:
                     seen = room.activate()
                 np.dot(seen, last, own)
                 if not own.dot(own) < SAFE:
-                    np.clip(own, -GIVEN, GIVEN, own)
+                    np.clip(own, -LARGEST, LARGEST, own)
                 np.multiply(self.beta, velocity, along)
                 np.add(along, away, along)
                 np.multiply(self.stiffness, along, pull)
                 np.subtract(own, calm, own)
-                most = OWN_SHARE * (sqrt(pull.dot(pull)) + sqrt(velocity.dot(velocity))) + turning
+                most = STATE_ALLOWANCE * (sqrt(pull.dot(pull)) + sqrt(velocity.dot(velocity))) + turning
                 size = sqrt(own.dot(own))
                 if size > most:
                     np.multiply(own, most / size, own)
                 np.subtract(own, pull, own)
-                push(own)
+                limit_step(own)
                 np.add(own, along, own)
                 np.add(own, rest, new)
-                bound(new)
+                limit_state(new)

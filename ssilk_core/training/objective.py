@@ -81,7 +81,7 @@ class Objective:
         static = bank.static_descriptor(times, down)
         pose = torch.cat([static, bank.dynamic[times]], dim=1).reshape(length, batch, -1)
         # An initialiser with a stepper learns rest states from their own energy, not what helps later frames.
-        with torch.set_grad_enabled(not model.integrator.states):
+        with torch.set_grad_enabled(not model.integrator.scheme.states):
             target = model.initial(static).reshape(length, batch, -1)
             start = torch.where(sampler.carried[None, :, None], sampler.latents, target[:2])
         with torch.set_grad_enabled(sampler.config.bptt):

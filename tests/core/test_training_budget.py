@@ -34,8 +34,8 @@ def test_a_stretched_schedule_has_the_same_shape(iterations):
         rates = [learning_rate(config, int(share * config.iterations)) for config in (found, PLAN)]
         assert rates[0] == pytest.approx(rates[1], rel=0.02)
     # What the running average still holds of the first parameters in the end.
-    assert found.average**iterations == pytest.approx(PLAN.ema_decay**1000, rel=1e-6)
-    assert shaped(replace(PLAN, ema_decay=0.0), iterations).average == 0
+    assert found.ema_decay**iterations == pytest.approx(PLAN.ema_decay**1000, rel=1e-6)
+    assert shaped(replace(PLAN, ema_decay=0.0), iterations).ema_decay == 0
 
 
 class Clocked:
