@@ -13,7 +13,7 @@ BLENDER_TOOL = $(wildcard $(BLENDER_VENV)/lib/python3.11/site-packages/bpy/*/scr
 .PHONY: demo test lint extension test-blender clean
 
 demo: $(STAMP)
-	$(BIN)/ssilk demo --out demo_out
+	$(BIN)/ssilk demo --output demo_out
 
 test: $(STAMP) lint
 	$(BIN)/python -m pytest

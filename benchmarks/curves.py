@@ -17,16 +17,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from helpers.plots import COLOURS, Panel, canvas, save
 from helpers.reports import RESULTS, table, write_results
 
+from ssilk_core.charts import COLOURS, ChartPanel, write_chart
 from ssilk_core.energy import TERMS
 from ssilk_core.errors import fail
 from ssilk_core.events import format_seconds
 from ssilk_core.training.curve import curve_path
 
 PANELS = ("total", *TERMS, "collisions")
-WIDTH, HEIGHT, MARGIN = 460, 190, 60  # of a panel and of what is around it [pixels]
 SHOWN = 0.9  # share of the values that a panel shows: the first ones would flatten all others
 
 
@@ -86,21 +85,16 @@ def bounds(values: Iterable[np.ndarray]) -> tuple[float, float]:
 
 def draw(path: Path, runs: list[Run]) -> None:
     """Draw each value of all runs, over iterations on the left and over minutes on the right, as a PNG."""
-    image, pen = canvas(2 * WIDTH, len(PANELS) * HEIGHT + 40)
-    for row, key in enumerate(PANELS):
-        span = bounds(run.values[key] for run in runs)
-        for column, unit in enumerate(("iterations", "minutes")):
-            places = [run.seconds / 60 if column else run.iterations for run in runs]
-            left, top = column * WIDTH + MARGIN, row * HEIGHT + 30
-            box = (left, top, left + WIDTH - MARGIN - 25, top + HEIGHT - MARGIN)
-            panel = Panel(pen, box, (0.0, max(float(place[-1]) for place in places)), span)
-            panel.title(f"{key}{'' if key == 'collisions' else ' [J]'} over {unit}")
-            panel.grid()
-            for run, place, colour in zip(runs, places, COLOURS):
-                panel.curve(zip(place, run.values[key]), colour)
-    for index, (run, colour) in enumerate(zip(runs, COLOURS)):
-        pen.text((MARGIN + 100 * index, len(PANELS) * HEIGHT + 15), run.name, fill=colour)
-    save(image, path)
+    rows = []
+    for key in PANELS:
+        unit, span = "share of vertices" if key == "collisions" else "J", bounds(run.values[key] for run in runs)
+        along = {"iterations": [run.iterations for run in runs], "minutes": [run.seconds / 60 for run in runs]}
+        rows.append([
+            ChartPanel(title=key, x=x, y=unit, span=span,
+                       curves={run.name: (place, run.values[key]) for run, place in zip(runs, places)})
+            for x, places in along.items()
+        ])  # fmt: skip
+    write_chart(path, rows, size=(4.2, 1.6))
 
 
 def compare(runs: list[Run], totals: list[float]) -> str:

@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from helpers.plots import COLOURS, Panel, canvas, save
 from helpers.reports import RESULTS, table, write_results
 from helpers.subjects import Subject, arguments, clip_of, open_subject, parsed
 from torch import Tensor
 
+from ssilk_core.charts import ChartPanel, write_chart
 from ssilk_core.energy import TERMS
 from ssilk_core.evaluation.methods import Network, build_take_set
 from ssilk_core.evaluation.record import recorded
@@ -83,21 +83,18 @@ def rows_of(garment: str, clip: str, means: dict[str, Tensor], length: int) -> l
 
 def draw(path: Path, title: str, looped: Looped, span: float = 0.05) -> None:
     """Draw each term's loop means relative to the second loop, within +- `span`, and all totals, as a PNG."""
-    image, pen = canvas(640, 540)
     means, totals = looped.means, looped.totals
-    panel = Panel(pen, (60, 40, 630, 260), (0, len(means["stretch"]) - 1), (-span, span))
-    panel.title(f"{title}: mean of each loop, relative to the second")
-    for level in (-span, -0.01, 0, 0.01, span):
-        panel.across(level, f"{level:+.0%}", "#dddddd" if level else "#888888")
-    for place, (name, colour) in enumerate(zip(TERMS, COLOURS)):
-        change = (means[name] - means[name][1]) / means[name][1].abs()
-        panel.curve(enumerate(change.tolist()), colour)
-        pen.text((60 + 110 * place, 278), name, fill=colour)
-    panel = Panel(pen, (60, 325, 630, 510), (0, len(totals)), (min(0.0, float(totals.min())), float(totals.max())))
-    panel.title("total of each frame [J] (the paper's Figure 10)")
-    panel.grid()
-    panel.curve(enumerate(totals.tolist()), "#2c3e50")
-    save(image, path)
+    change = {name: 100 * (means[name] - means[name][1]) / means[name][1].abs() for name in TERMS}
+    loops = ChartPanel(
+        title=f"{title}: mean of each loop", x="loop", y="change since the second loop [%]", levels=(0.0,),
+        span=(-100 * span, 100 * span),
+        curves={name: (range(len(values)), values.tolist()) for name, values in change.items()},
+    )  # fmt: skip
+    frames = ChartPanel(
+        title="each frame (the paper's Figure 10)", x="frame", y="total [J]",
+        curves={"": (range(len(totals)), totals.tolist())},
+    )  # fmt: skip
+    write_chart(path, [[loops], [frames]], size=(6.5, 2.6))
 
 
 def main() -> None:

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import subprocess
 import sys
 import threading
 import time
@@ -27,82 +26,72 @@ from helpers.paper_jobs import GARMENTS, PYTHON, TABLES, Job, Plan, jobs, withou
 from helpers.reports import table
 
 from ssilk_core.errors import SsilkError
+from ssilk_core.training.signals import interruptible
+from ssilk_core.wardrobe.queue import CommandTask, End, Queue
 
-WAIT = 0.2  # [s] between looks for a job that can begin
 ROOT = Path(__file__).parent.parent
 PATHS = (ROOT, ROOT / "usd", ROOT / "benchmarks")
 
 
 @dataclass
-class Queue:
-    """Jobs, the most important first. Workers take each as soon as the jobs that it needs have ended, well or not."""
+class Backlog:
+    """Jobs by priority; each can begin once what it needs has ended, well or not.
+
+    Attributes:
+        left: jobs that have not begun; running: those that have, by name.
+        until: no job begins that would end later than this [s], as predicted.
+        failed: names of jobs that left an output out or ended with an error.
+    """
 
     left: list[Job]
+    folder: Path
     until: float
-    running: list[Job] = field(default_factory=list)
+    running: dict[str, Job] = field(default_factory=dict)
     failed: list[str] = field(default_factory=list)
-    lock: threading.Lock = field(default_factory=threading.Lock)
     began: float = field(default_factory=time.monotonic)
 
     @property
     def elapsed(self) -> float:
         return time.monotonic() - self.began
 
-    def take(self) -> Job | None:
-        """Return the next job that can begin and end in time, or nothing; it counts as running."""
-        with self.lock:
-            pending = {path for job in (*self.left, *self.running) for path in job.outputs}
-            for job in self.left:
-                if not pending & set(job.needs) and self.elapsed + job.seconds <= self.until:
-                    self.left.remove(job)
-                    self.running.append(job)
-                    return job
+    def take(self) -> CommandTask | None:
+        """Return the next job that can begin now and end in time, as a task; None where there is none."""
+        pending = {path for job in (*self.left, *self.running.values()) for path in job.outputs}
+        for job in self.left:
+            if not pending & set(job.needs) and self.elapsed + job.seconds <= self.until:
+                self.left.remove(job)
+                self.running[job.name] = job
+                return self._task(without_models(job))
         return None
 
-    @property
-    def is_over(self) -> bool:
-        """Whether nothing is running and nothing more can begin."""
-        with self.lock:
-            waiting = [job for job in self.left if self.elapsed + job.seconds <= self.until]
-            return not self.running and not self._can_begin(waiting)
+    def _task(self, job: Job) -> CommandTask:
+        words = [sys.executable if word == PYTHON else word for word in job.command]
+        log = self._log(job)
+        log.parent.mkdir(parents=True, exist_ok=True)
+        log.unlink(missing_ok=True)
+        for output in job.outputs:
+            output.parent.mkdir(parents=True, exist_ok=True)
+        return CommandTask(job.name, words, ROOT, log)
 
-    def _can_begin(self, waiting: Sequence[Job]) -> bool:
-        pending = {path for job in self.left for path in job.outputs}
-        return any(not pending & set(job.needs) for job in waiting)
+    def _log(self, job: Job) -> Path:
+        return self.folder / "logs" / f"{job.name}.log"
 
-    def ended(self, job: Job, told: str) -> None:
-        """Say how a job ended, and let those go on that wait for it."""
-        with self.lock:
-            self.running.remove(job)
-            self.failed += [] if job.is_done else [job.name]
-        print(f"[{self.elapsed:5.0f} s] {job.name}: {told}", flush=True)
-
-
-def work(queue: Queue, plan: Plan, gpu: int | None) -> None:
-    """Run jobs on one GPU until there is none left."""
-    while not queue.is_over:
-        if job := queue.take():
-            queue.ended(job, _run(without_models(job), plan.folder, gpu))
-        else:
-            time.sleep(WAIT)
+    def ended(self, name: str, end: End) -> None:
+        """Say how a job ended."""
+        job = self.running.pop(name)
+        told = f"{end.seconds:.0f} s (predicted {job.seconds:.0f})"
+        if end.code or not job.is_done:
+            self.failed.append(name)
+            last = (self._log(job).read_text().strip().splitlines() or ["no output"])[-1]
+            told = f"FAILED with code {end.code} after {told}: {last}"
+        print(f"[{self.elapsed:5.0f} s] {name}: {told}", flush=True)
 
 
-def _run(job: Job, folder: Path, gpu: int | None) -> str:
-    """Run a job with its output in a log; return how it ended."""
-    words = [sys.executable if word == PYTHON else word for word in job.command]
-    places = os.pathsep.join([*map(str, PATHS), *filter(None, [os.environ.get("PYTHONPATH")])])
-    own = {} if gpu is None else {"CUDA_VISIBLE_DEVICES": str(gpu)}
-    log, began = folder / "logs" / f"{job.name}.log", time.monotonic()
-    log.parent.mkdir(parents=True, exist_ok=True)
-    for output in job.outputs:
-        output.parent.mkdir(parents=True, exist_ok=True)
-    with log.open("w") as stream:
-        code = subprocess.run(
-            words, cwd=ROOT, stdout=stream, stderr=subprocess.STDOUT, env={**os.environ, "PYTHONPATH": places, **own}
-        ).returncode  # fmt: skip
-    taken = f"{time.monotonic() - began:.0f} s (predicted {job.seconds:.0f})"
-    last = (log.read_text().strip().splitlines() or ["no output"])[-1]
-    return f"{taken} on GPU {gpu}" if job.is_done and code == 0 else f"FAILED with code {code} after {taken}: {last}"
+def run(backlog: Backlog, gpus: Sequence[int | None], stop: threading.Event) -> None:
+    """Run what can be run, one job at a time for each entry of `gpus`; None stands for the processor."""
+    paths = os.pathsep.join([*map(str, PATHS), *filter(None, [os.environ.get("PYTHONPATH")])])
+    slots = [{"PYTHONPATH": paths, **({} if gpu is None else {"CUDA_VISIBLE_DEVICES": str(gpu)})} for gpu in gpus]
+    Queue(slots, lambda name, event: None, backlog.ended).run(backlog.take, stop)
 
 
 def parsed() -> argparse.Namespace:
@@ -171,18 +160,15 @@ def main() -> int:
     if options.list:
         print(listed(found, max(1, options.gpus) * options.per_gpu))
         return 0
-    queue = Queue([job for job in found if not job.is_done], options.until)
+    backlog = Backlog([job for job in found if not job.is_done], plan.folder, options.until)
     gpus: list[int | None] = [*range(options.gpus)] or [None]
-    workers = [threading.Thread(target=work, args=(queue, plan, gpu)) for gpu in gpus * options.per_gpu]
-    for worker in workers:
-        worker.start()
-    for worker in workers:
-        worker.join()
+    with interruptible() as stop:
+        run(backlog, gpus * options.per_gpu, stop)
     print(
-        f"{len(found) - len(queue.left) - len(queue.failed)} of {len(found)} jobs are done; failed: "
-        f"{', '.join(queue.failed) or 'none'}; not begun: {', '.join(job.name for job in queue.left) or 'none'}"
+        f"{len(found) - len(backlog.left) - len(backlog.failed)} of {len(found)} jobs are done; failed: "
+        f"{', '.join(backlog.failed) or 'none'}; not begun: {', '.join(job.name for job in backlog.left) or 'none'}"
     )
-    return 1 if queue.failed else 0
+    return 1 if backlog.failed else 0
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What long work says while it runs: a closed set of events, as JSON lines or as text for people."""
+"""Events of long work: a closed set, written as JSON lines or as text for people."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ Said = Started | Progress | Message | Checkpoint | Result | Failed
 
 @dataclass(frozen=True)
 class GarmentEvent:
-    """What one of several trainings says."""
+    """What one of several trainings, bakes or other tasks says."""
 
     name: str
     said: Said
@@ -69,13 +69,13 @@ Event = Said | GarmentEvent
 
 
 class Reporter(Protocol):
-    """Anything that takes events."""
+    """A function that takes events."""
 
     def __call__(self, event: Event) -> None: ...
 
 
 def silent(event: Event) -> None:
-    """Take an event and say nothing."""
+    """Ignore an event."""
 
 
 class JsonReporter:
@@ -89,12 +89,13 @@ class JsonReporter:
 
 
 def _document(event: Event) -> dict[str, Any]:
-    own = {"said": _document(event.said)} if isinstance(event, GarmentEvent) else {}
-    return {"event": type(event).__name__.lower(), **finite(asdict(event)), **own}
+    if isinstance(event, GarmentEvent):
+        return {"event": "garment", "name": event.name, "said": _document(event.said)}
+    return {"event": type(event).__name__.lower(), **finite(asdict(event))}
 
 
 def read_event(line: str) -> Said:
-    """Return the event of a line that `JsonReporter` wrote, one training alone speaking.
+    """Return the event of a line that `JsonReporter` wrote; events of several tasks (`GarmentEvent`) are refused.
 
     Raises:
         ValueError: it is no such line.
@@ -120,7 +121,7 @@ def finite(value: Any) -> Any:
 
 
 class TextReporter:
-    """A line that renews itself on a terminal; one line every ten seconds elsewhere."""
+    """Text for people: one line that is rewritten on a terminal, a line every ten seconds elsewhere."""
 
     def __init__(self, stream: TextIO | None = None) -> None:
         self.stream = stream or sys.stderr
@@ -160,7 +161,7 @@ def describe_progress(event: Progress) -> str:
 
 
 def describe(event: Event) -> str:
-    """Return an event as one line for people; empty for events they need not see."""
+    """Return an event as text for people; empty for events that they need not see."""
     match event:
         case Started():
             return f"{event.task} ..."

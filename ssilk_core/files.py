@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files appear whole or not at all: written under a temporary name beside the target, then renamed."""
+"""Writing files whole or not at all: under a temporary name beside the target, then renamed."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def replacing(target: str | Path, *, keep_same: bool = False) -> Iterator[Path]:
 
     With `keep_same` a target that holds the same bytes already is left alone, its time of change included.
 
-    The temporary name keeps the suffix of `target`, because USD chooses the file format by it. Errors raised
-    meanwhile that name the temporary file name `target` instead: nobody knows the other.
+    The temporary name keeps the suffix of `target`, because USD chooses the file format by it. Errors that name the
+    temporary file are raised again with `target` in its place.
 
     Raises:
         SsilkError: `target` cannot be written (no such folder, no permission, no space).
@@ -59,19 +59,19 @@ def replacing(target: str | Path, *, keep_same: bool = False) -> Iterator[Path]:
 
 
 def remove_unfinished(target: str | Path) -> None:
-    """Remove what processes that were killed while they wrote `target` have left beside it.
+    """Remove temporary files that killed processes left beside `target`.
 
-    Nobody else may be writing `target` meanwhile.
+    No other process may be writing `target` at the same time.
     """
     target = Path(target)
     name = glob.escape(UNFINISHED.format(target.stem))
-    for prefix in (name, f".{name}"):  # the latter of files that were written for one that is not yet proven
+    for prefix in (name, f".{name}"):  # the latter from writing the temporary file of a file
         for path in target.parent.glob(f"{prefix}*{glob.escape(target.suffix)}"):
             path.unlink(missing_ok=True)
 
 
 def need_writable(target: str | Path) -> None:
-    """Check before long work that `target` can be written at its end; nothing is left behind.
+    """Check that `target` can be written, before long work; nothing is left behind.
 
     Raises:
         SsilkError: `target` is a folder, or its folder cannot be made or written to.

@@ -150,14 +150,14 @@ class Training:
         step = (STEP[self.garment] if own else BASELINE_STEP) / 1000
         steps = max(100, round(seconds / step))
         rates = (f"iterations={steps}", f"validate_every={max(1, steps // VALIDATIONS)}")
-        settings = [*(RECIPES[self.garment] if own else ()), *rates, *self.settings]
+        settings = [f"seed={self.seed}", *(RECIPES[self.garment] if own else ()), *rates, *self.settings]
         settings += [*REHEARSED, *(() if self._sets("batch") else ("batch=2",))] if plan.rehearse else []
         script = "train_baseline" if not own else "train_scheme" if self._sets("scheme") else ""
         begun = (PYTHON, f"benchmarks/{script}.py", *(() if own else (self.method,))) if script else (*SSILK, "train")
         command = (
             *begun, str(plan.stage(self.stage or self.garment)), "--motions", *plan.files("train"), "--valid",
             *plan.files("valid"), "-o", str(plan.model(self.name)), "--preset", "final", "--device", plan.device,
-            "--seed", str(self.seed), *(word for setting in settings for word in ("--set", setting)),
+            *(word for setting in settings for word in ("--set", setting)),
         )  # fmt: skip
         taken = START + VALIDATIONS * VALIDATION + steps * step * (self._cost() if own else 1.0)
         return Job(self.name, (plan.model(self.name),), command, taken)

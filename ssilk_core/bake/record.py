@@ -3,14 +3,13 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from .. import __version__
-from ..files import replacing, sha256
+from .. import __version__, work_record
+from ..errors import SsilkError
+from ..work_record import WorkRecord, request_key
 from .plain import from_plain
 from .request import INPUTS
 from .result import BakeResult
@@ -43,15 +42,13 @@ def task_key(task: BakeTask, contents: Mapping[str, str]) -> str:
     options = asdict(task)
     for name in INPUTS:
         del options["request"][name]
-    document = {"ssilk": __version__, "options": options, "contents": {name: contents[name] for name in INPUTS}}
-    return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
+    return request_key({"ssilk": __version__, "options": options}, [(name, contents[name]) for name in INPUTS])
 
 
 def write_record(folder: Path, record: TaskRecord) -> None:
     """Write a record into the folder of its files, last of all."""
-    document = {"key": record.key, "files": dict(record.files), "result": _portable(record.result)}
-    with replacing(folder / RECORD, keep_same=True) as temporary:
-        temporary.write_text(json.dumps(document, indent=1, sort_keys=True) + "\n")
+    written = WorkRecord(key=record.key, files=dict(record.files), detail=_portable(record.result))
+    work_record.write_record(folder / RECORD, written)
 
 
 def _portable(result: BakeResult) -> dict[str, object]:
@@ -62,11 +59,12 @@ def _portable(result: BakeResult) -> dict[str, object]:
 def read_record(folder: Path) -> TaskRecord | None:
     """Return the record of a folder; None where none can be read, so that its task is done again."""
     try:
-        document = json.loads((folder / RECORD).read_text())
-        stored = document["result"]
-        result = from_plain(BakeResult, {**stored, "path": folder / stored["path"]})
-        return TaskRecord(key=document["key"], files=dict(document["files"]), result=result)
-    except (OSError, ValueError, TypeError, KeyError, RecursionError):
+        found = work_record.read_record(folder / RECORD)
+        if found is None:
+            return None
+        result = from_plain(BakeResult, {**found.detail, "path": folder / found.detail["path"]})
+        return TaskRecord(key=found.key, files=found.files, result=result)
+    except (SsilkError, ValueError, TypeError, KeyError):
         return None
 
 
@@ -75,9 +73,4 @@ def current_record(folder: Path, key: str) -> TaskRecord | None:
     record = read_record(folder)
     if record is None or record.key != key:
         return None
-    same = all(_same(folder / name, digest) for name, digest in record.files.items())
-    return record if same else None
-
-
-def _same(path: Path, digest: str) -> bool:
-    return path.is_file() and sha256(path) == digest
+    return record if WorkRecord(key=key, files=record.files).is_done(folder) else None

@@ -51,7 +51,7 @@ VERBS = (
     demo,
 )
 
-# The extra of the distribution that brings all that a verb needs.
+# The extra of the distribution that installs everything a verb needs.
 EXTRAS = {
     "inspect": "train",
     "rig": "setup",
@@ -62,20 +62,21 @@ EXTRAS = {
     "bake": "bake",
     "simulate": "train",
     "evaluate": "train",
-    "trade": "all",
+    "trade": "report",
     "stress": "train",
-    "report": "all",
+    "report": "report",
     "verify": "bake",
     "view": "view",
     "farm": "farm",
     "task": "bake",
     "demo": "all",
 }
-OPTIONAL = ("torch", "pxr", "igl", "scipy", "trimesh", "embreex", "imageio_ffmpeg", "PIL", "ray", "onnxscript")
+OPTIONAL = ("torch", "pxr", "igl", "scipy", "trimesh", "embreex", "imageio_ffmpeg", "PIL", "matplotlib", "ray",
+            "onnxscript")  # fmt: skip
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that complains as everything else does, in one sentence."""
+    """A parser whose errors are one sentence, as all others are."""
 
     def error(self, message: str) -> NoReturn:
         """Raise `SsilkError`."""

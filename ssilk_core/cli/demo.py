@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Film a garment that ships trained beside linear blend skinning, then train a draft of it and film that beside both.
+"""Film a garment that ships trained beside linear blend skinning, then train a draft of it and film all three.
 
-Everything the demo does is a command that can be typed: each is printed before it runs. --pretrained leaves the
-training out.
+The demo consists of commands that can be typed; each is printed before it runs. --pretrained leaves out the training.
 """
 
 from __future__ import annotations
@@ -18,15 +17,19 @@ from ..events import Message, Reporter, Result
 if TYPE_CHECKING:
     from ..assets import Mesh
 
+PRESET = "draft"  # of the training: the only one that a processor finishes while someone waits
+
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
-    verb.add_argument("--out", type=Path, default=Path("demo_out"), help="folder for all of it (default demo_out)")
     verb.add_argument(
-        "--garment", choices=("cape", "fringe_skirt", "hooded_dress"), default="cape", help="what to show"
+        "-o", "--output", type=Path, default=Path("demo_out"), metavar="FOLDER",
+        help="folder for everything that the demo writes (default demo_out)",
+    )  # fmt: skip
+    verb.add_argument(
+        "--garment", choices=("cape", "fringe_skirt", "hooded_dress"), default="cape", help="garment (default cape)"
     )
-    verb.add_argument("--pretrained", action="store_true", help="show the shipped model and train nothing")
-    verb.add_argument("--preset", default="draft", help="schedule of the training (default draft)")
+    verb.add_argument("--pretrained", action="store_true", help="show the shipped model only")
     verb.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", dest="settings", help="as in 'ssilk train'"
     )
@@ -37,7 +40,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     from ..demo.shipped import open_shipped, origin
     from . import main
 
-    wardrobe = _make_inputs(options.out, report)
+    wardrobe = _make_inputs(options.output, report)
     shipped = open_shipped(options.garment, wardrobe[options.garment])
     report(Message(f"shipped {options.garment}: {origin(shipped)}"))
     commands = _shipped(options) + ([] if options.pretrained else _trained(options))
@@ -46,8 +49,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         code = main([*command, "--json"] if options.json else command)
         if code != EXIT_OK:
             return code
-    shown = ["shipped"] if options.pretrained else ["shipped", options.preset]
-    report(Result("demo", {f"{name} film": str(options.out / f"{name}.mp4") for name in shown}))
+    shown = ["shipped"] if options.pretrained else ["shipped", PRESET]
+    report(Result("demo", {f"{name} film": str(options.output / f"{name}.mp4") for name in shown}))
     return EXIT_OK
 
 
@@ -57,13 +60,13 @@ def _shipped(options: argparse.Namespace) -> list[list[str]]:
 
     shots = _shots(options)
     bake = ["bake", str(shipped_path(options.garment)), "--stage", str(_body())]
-    bake += ["--motion", str(options.out / "shot.usdc")]
+    bake += ["--motion", str(options.output / "shot.usdc")]
     return [
         [*bake, "-o", shots["linear blend skinning"], "--lbs"],
         [*bake, "-o", shots["shipped"]],
-        # The film after the training has every frame of these two shots; until then half of them will do.
+        # The film after the training has every frame of these shots; half of them are enough until then.
         *_views(
-            options.out / "shipped",
+            options.output / "shipped",
             {name: shots[name] for name in ("linear blend skinning", "shipped")},
             fps=30 if options.pretrained else 15,
         ),
@@ -72,22 +75,22 @@ def _shipped(options: argparse.Namespace) -> list[list[str]]:
 
 def _trained(options: argparse.Namespace) -> list[list[str]]:
     """Return the commands that rig the garment, train it, and film it beside LBS and the shipped model."""
-    out, garment, preset, shots = options.out, options.garment, options.preset, _shots(options)
-    stage, model = str(out / f"{garment}_stage.usdc"), str(out / f"{garment}_{preset}.safetensors")
+    out, garment, shots = options.output, options.garment, _shots(options)
+    stage, model = str(out / f"{garment}_stage.usdc"), str(out / f"{garment}_{PRESET}.safetensors")
     settings = [word for setting in options.settings for word in ("--set", setting)]
     return [
         ["rig", str(_body()), "--garment", str(out / "wardrobe" / f"{garment}.usdc"), "-o", stage],
-        ["train", stage, "--motions", str(out / "motions"), "-o", model, "--preset", preset, *settings],
-        ["bake", model, "--stage", stage, "--motion", str(out / "shot.usdc"), "-o", shots[preset]],
-        *_views(out / preset, shots, fps=30),
+        ["train", stage, "--motions", str(out / "motions"), "-o", model, "--preset", PRESET, *settings],
+        ["bake", model, "--stage", stage, "--motion", str(out / "shot.usdc"), "-o", shots[PRESET]],
+        *_views(out / PRESET, shots, fps=30),
     ]
 
 
 def _shots(options: argparse.Namespace) -> dict[str, str]:
-    """Return the shots by what their panels are called, in the order of the film."""
-    files = {"linear blend skinning": "plain", options.preset: f"{options.garment}_{options.preset}"}
+    """Return the shots by the captions of their panels, in the order of the film."""
+    files = {"linear blend skinning": "plain", PRESET: f"{options.garment}_{PRESET}"}
     files["shipped"] = f"{options.garment}_shipped"
-    return {name: str(options.out / f"{file}.usdc") for name, file in files.items()}
+    return {name: str(options.output / f"{file}.usdc") for name, file in files.items()}
 
 
 def _views(stem: Path, shots: dict[str, str], fps: int) -> list[list[str]]:

@@ -2,8 +2,8 @@
 """Check a character, a garment and motions before training (preflight).
 
 Every finding names the prim, the count, what was found, why it matters and what to do. --fix writes a copy of the
-garment's file in which everything is repaired that is safe to repair, and reports what is left. The exit code is 0
-when nothing is worse than a warning, and 2 when there are errors.
+garment's file with all safe repairs made, and reports what is left. The exit code is 2 when there are errors, and 0
+otherwise.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def _fix(options: argparse.Namespace, world: Inspected) -> list[str]:
 
 
 def _corrected_units(world: Inspected) -> tuple[StageUnits, list[str]]:
-    """Return what the garment's file should state, and in words what it did not."""
+    """Return the units that the garment's file should state, and in words those that it did not."""
     from ssilk_usd.units import StageUnits
 
     from ..preflight.fit import misplacement

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,16 +14,16 @@ from ..events import Reporter
 from ..fabrics import FABRICS, Fabric, fabric_named
 from ..files import need_not_input, need_writable
 from ..quality import QUALITIES
-from ..setup.classes import ClassOptions
-from ..setup.rig import RigOptions
 from ..targets import TARGETS
 
 if TYPE_CHECKING:
     from ..assets import Character, Garment, ProxyRig, Scene
+    from ..setup.classes import ClassOptions
+    from ..setup.rig import RigOptions
 
 
 def add_scene(verb: argparse.ArgumentParser) -> None:
-    """Add the options that say which character and garment are meant."""
+    """Add the options that name the character and the garment."""
     verb.add_argument("stage", type=Path, help="USD file with the character (SkelRoot, Skeleton, body meshes)")
     verb.add_argument(
         "--garment", metavar="FILE[:/PRIM]|PRIM", help="garment: a file of its own, or a mesh of the stage"
@@ -39,25 +38,8 @@ def add_scene(verb: argparse.ArgumentParser) -> None:
     )
 
 
-def add_setup(verb: argparse.ArgumentParser) -> None:
-    """Add the options of automatic classes and proxies."""
-    group = verb.add_argument_group("automatic classes and rig")
-    group.add_argument(
-        "--proxies", type=int, default=RigOptions.proxies, help="proxy joints on the loose part (default %(default)s)"
-    )
-    for name, kind in (("classes", ClassOptions), ("rig", RigOptions)):
-        names = ", ".join(f"{key}={value:g}" for key, value in vars(kind()).items())
-        group.add_argument(
-            f"--{name}",
-            action="append",
-            default=[],
-            metavar="NAME=VALUE",
-            help=f"change a threshold (repeatable): {names}",
-        )
-
-
 def add_fabric(verb: argparse.ArgumentParser) -> None:
-    """Add the options that say what a garment is made of."""
+    """Add the options of the fabric."""
     verb.add_argument("--fabric", choices=FABRICS, default="default", help="material (default: that of the paper)")
     verb.add_argument(
         "--material",
@@ -69,7 +51,7 @@ def add_fabric(verb: argparse.ArgumentParser) -> None:
 
 
 def fabric(options: argparse.Namespace) -> Fabric:
-    """Return the fabric that the options ask for; raise `SsilkError` for a property that it does not have."""
+    """Return the fabric that the options ask for; raise `SsilkError` for an unknown property or a bad value."""
     return overridden(fabric_named(options.fabric), options.material)
 
 
@@ -167,7 +149,7 @@ def is_folder(output: Path) -> bool:
 
 
 def wardrobe(options: argparse.Namespace) -> tuple[Path, str | None]:
-    """Return the file that the garment stands in, and the prim that was asked for."""
+    """Return the file that holds the garment, and the prim that was asked for."""
     from ssilk_usd.read_stage import USD_SUFFIXES, split_location
 
     file, prim = split_location(options.garment) if options.garment else ("", None)
@@ -175,7 +157,7 @@ def wardrobe(options: argparse.Namespace) -> tuple[Path, str | None]:
 
 
 def check_output(output: Path, *inputs: Path | str | None) -> None:
-    """Check before any work that `output` can be written and is none of the `inputs`.
+    """Check that `output` can be written and is none of the `inputs`.
 
     Raises:
         SsilkError: it cannot, or it is.
@@ -193,18 +175,15 @@ def read(options: argparse.Namespace, report: Reporter) -> tuple[Character, Garm
     return read_scene(options.stage, root=options.root, bodies=options.body, garment=options.garment, report=report)
 
 
-def load_scene(options: argparse.Namespace, report: Reporter, *, anew: bool = False) -> Scene:
-    """Read and prepare a scene; what is missing (weights, classes, rig) is made and announced."""
+def load_scene(
+    options: argparse.Namespace,
+    report: Reporter,
+    *,
+    classes: ClassOptions | None = None,
+    rigging: RigOptions | None = None,
+) -> Scene:
+    """Read a scene and make the weights, classes and rig that it lacks, as `classes` and `rigging` say."""
     from ..setup.prepare import prepare_scene
 
     character, garment, rig = read(options, report)
-    if anew:
-        garment, rig = replace(garment, classes=None), None
-    return prepare_scene(
-        character,
-        garment,
-        rig,
-        class_options=overridden(ClassOptions(), options.classes),
-        rig_options=overridden(RigOptions(proxies=options.proxies), options.rig),
-        report=report,
-    )
+    return prepare_scene(character, garment, rig, class_options=classes, rig_options=rigging, report=report)

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cut a trained model down to fewer blendshapes, proxy joints and influences, without training it again.
 
-Each is the best of its number for the motions given (default: those it was trained with, where they still lie):
-blendshapes by reduced-rank regression weighted by mass, influences by least squares, proxies by what is missed least.
---quality takes a level's numbers; --budget picks the model that loses least of those that are fast or small enough:
-0.3ms for each frame played on this processor, or 6MB for the file. What is cut feeds nothing back: what it loses does
-not add up over time.
+What is kept is the best of its size for the given motions (default: those of the training, if their files are still
+there): blendshapes by reduced-rank regression weighted by mass, influences by least squares, proxies by the smallest
+error without them. --quality takes the numbers of a level. --budget takes the model with the smallest error that is
+fast or small enough: 0.3ms for each frame on this processor, or 6MB for the file. Only the decoder is cut, so the
+error does not accumulate over time.
 """
 
 from __future__ import annotations
@@ -36,9 +36,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         verb.add_argument(f"--{name}", type=int, metavar="N", help=f"{what} to keep (default: all)")
     shared.add_level(verb, "6MB for the file")
     verb.add_argument("--motions", type=Path, nargs="+", default=[], metavar="PATH",
-                      help="motion files or folders to do well (default: the training's)")  # fmt: skip
-    verb.add_argument("--precision", choices=("int16", "float32"), default="int16",
-                      help="of matrices in the file (default int16, which halves it)")  # fmt: skip
+                      help="motion files or folders to keep exact (default: the training's)")  # fmt: skip
 
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
@@ -58,14 +56,14 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     figures = SizeReduction.of(reducer.whole, found).to_metadata()
     told = {"model": str(options.model), "motions": [motion.path for motion in motions], **figures}
     provenance = {**file.provenance, "reduced": told}
-    save_model(options.output, replace(found.file, provenance=provenance), pack=options.precision == "int16")
+    save_model(options.output, replace(found.file, provenance=provenance), pack=True)
     detail = {"model": str(options.output), **figures, "bytes": options.output.stat().st_size}
     report(Result("reduce", detail))
     return EXIT_OK
 
 
 def _motions(file: ModelFile, options: argparse.Namespace) -> list[Motion]:
-    """Read the motions that were named, or those of the training where they still lie."""
+    """Read the motions that were named, or those of the training whose files are still there."""
     from ssilk_usd.read_motion import read_motions
     from ssilk_usd.read_stage import split_location
 
@@ -75,7 +73,7 @@ def _motions(file: ModelFile, options: argparse.Namespace) -> list[Motion]:
         fail(
             str(options.model),
             "the motions of its training are not where they were",
-            "some are needed to tell what is missed least",
+            "motions are needed to measure what each part contributes",
             "name motion files or folders with --motions",
         )
     return read_motions(options.motions or there, file.scene.character.skeleton)
@@ -89,5 +87,4 @@ def _chosen(options: argparse.Namespace, reducer: Reducer, motions: list[Motion]
     size = replace(size_at(options.quality, reducer.whole), **named)
     if not options.budget:
         return reducer.reduced(size)
-    pack = options.precision == "int16"
-    return spend(options.budget, reducer, size, motions[0], lambda file: model_bytes(file, pack=pack), report)
+    return spend(options.budget, reducer, size, motions[0], lambda file: model_bytes(file, pack=True), report)

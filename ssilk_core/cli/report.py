@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write one page (.html) about a shot or a model: energies over time, worst frames, tables, provenance.
 
-A shot is measured as its file plays, whoever computed it. A model shows how it was trained; with --stage and --motion
-it is baked and shown as a shot as well. --figures adds what 'ssilk stress', 'ssilk trade' and 'ssilk evaluate' wrote
-with --output. The page holds everything in itself and loads nothing.
+A shot is measured from the points that its file plays, whatever program computed them. The page of a model shows its
+training; with --stage and --motion it is also baked and shown as a shot. --figures adds files that 'ssilk stress',
+'ssilk trade' and 'ssilk evaluate' wrote with --output. The page loads nothing from elsewhere.
 """
 
 from __future__ import annotations
@@ -86,9 +86,9 @@ def _shot(path: Path, report: Reporter) -> list[Section]:
         if mesh.is_garment
     ]
     if not garments:
-        fail(str(path), "no mesh is marked as a garment", "one at least is needed", "see 'ssilk rig'")
+        fail(str(path), "no mesh is marked as a garment", "at least one is needed", "see 'ssilk rig'")
     if not shot.frame_times:
-        fail(str(path), "the shot has no frames", "one at least is needed")
+        fail(str(path), "the shot has no frames", "at least one is needed")
     bodies = {index: part.mesh for index, part in enumerate(parts) if not shot.meshes[index].is_garment}
     sections = shot_sections(shot, garments, bodies, report)
     records = {str(part.mesh.path): asdict(part.record) for part in parts if part.record}
@@ -96,7 +96,7 @@ def _shot(path: Path, report: Reporter) -> list[Section]:
 
 
 def _fabric(record: GarmentRecord | None) -> Fabric:
-    """Return what a garment is made of, as it says itself; the default where it does not."""
+    """Return the fabric that a garment states, or the default fabric."""
     if record is None:
         return Fabric("default")
     known = {item.name for item in fields(Fabric)}
@@ -127,7 +127,7 @@ def _model(options: argparse.Namespace, report: Reporter) -> list[Section]:
 
 
 def _baked(options: argparse.Namespace, report: Reporter) -> list[Section]:
-    """Bake a model, and return what there is to say about the shot but its provenance."""
+    """Bake a model and return the sections of the shot without its provenance."""
     from ssilk_usd.shot import write_shot
 
     from ..bake import BakeRequest, load_rollout

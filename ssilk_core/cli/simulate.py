@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Simulate a garment over motions, without a network: the accurate and slow end, and the reference for models.
+"""Simulate a garment over motions without a network: slow and accurate, the reference for models.
 
-Every frame minimises the energy that networks are trained with, for every vertex. The result is a shot whose garment
-has its points at each frame, with the body playing beside it. Several motions advance together, which a GPU takes
-hardly longer for, into one file each in a folder. A file appears as soon as its shot is done; what an interrupted
-simulation has finished is left alone by the next one that asks for the same.
+Every frame minimises, over all vertices, the energy that networks are trained with. The result is a shot with the
+garment as time-sampled points, beside the moving body. Several motions advance together, each into a file of its own
+in a folder: a GPU takes about as long for many as for one. Each file appears when its shot is finished. The same
+command, given again after an interruption, simulates only what is missing; delete a file to simulate it again.
 """
 
 from __future__ import annotations
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
     shared.add_scene(verb)
-    shared.add_setup(verb)
     verb.add_argument(
         "--motion", type=Path, nargs="+", required=True, metavar="SHOT[:/PRIM]", help="USD files with motions"
     )
@@ -44,18 +43,15 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     shared.add_fabric(verb)
     verb.add_argument("--fps", type=float, default=30.0, help="frames per second (default 30, as models are trained)")
-    verb.add_argument("--substeps", type=int, default=1, help="steps in each frame (default 1)")
     verb.add_argument("--tolerance", type=float, default=1e-2, metavar="G",
-                      help="accelerations that may be out of balance, in units of g (default 0.01)")  # fmt: skip
+                      help="largest residual acceleration of a vertex, in units of g (default 0.01)")  # fmt: skip
     verb.add_argument("--iterations", type=int, default=100, metavar="N",
-                      help="of the solver in each step, at most (default 100)")  # fmt: skip
-    verb.add_argument("--precision", choices=("float64", "float32"), default="float64",
-                      help="of positions and energies (default float64)")  # fmt: skip
+                      help="most iterations of the solver in each frame (default 100)")  # fmt: skip
     verb.add_argument("--batch", type=int, default=64, help="motions that advance together (default 64)")
     verb.add_argument("--sequence", type=int, metavar="FRAMES",
-                      help="start anew after so many, as 'ssilk evaluate' may (default: never)")  # fmt: skip
+                      help="restart from rest after so many frames, as 'ssilk evaluate --sequence' does "
+                      "(default: never)")  # fmt: skip
     verb.add_argument("--no-body", action="store_true", help="leave the body meshes out")
-    verb.add_argument("--again", action="store_true", help="simulate what is there and current, too (folders)")
     verb.add_argument("--device", default="cpu", help="where it runs (default cpu)")
 
 
@@ -75,10 +71,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     fabric = shared.fabric(options)
     settings = SimulationOptions(
         fps=options.fps,
-        substeps=options.substeps,
         batch=options.batch,
         sequence=options.sequence,
-        precision=options.precision,
         solver=SolverOptions(tolerance=options.tolerance, iterations=options.iterations),
         rest=SolverOptions(tolerance=options.tolerance, iterations=150),
     )
@@ -87,7 +81,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         _Shot(output, motion, _provenance(options, path))
         for output, motion, path in zip(outputs, motions, options.motion)
     ]
-    missing = [shot for shot in shots if options.again or outputs == [options.output] or not shot.is_done]
+    missing = [shot for shot in shots if outputs == [options.output] or not shot.is_done]
     found = _written(options, missing, scene, fabric, settings, device, report) if missing else {}
     left = {"current": len(shots) - len(missing)} if len(missing) < len(shots) else {}
     report(Result("simulate", {"shots": ", ".join(map(str, outputs)), **left, **found}))
@@ -96,7 +90,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
 @dataclass(frozen=True, eq=False)
 class _Shot:
-    """A shot to be simulated: its file, the character's motion, and what the file says of its origin."""
+    """A shot to simulate: its file, the character's motion, and the provenance that the file states."""
 
     output: Path
     motion: Motion
@@ -141,7 +135,7 @@ def _written(
     device: torch.device,
     report: Reporter,
 ) -> dict[str, object]:
-    """Simulate into open files, frame by frame, and return figures of the whole."""
+    """Simulate into open files, frame by frame; return figures for people."""
     from ..simulate import Simulator, shots_of
 
     simulator, motions = Simulator(scene, fabric, settings, device=device), [shot.motion for shot in shots]
@@ -159,7 +153,7 @@ def _written(
 
 
 class _Caches:
-    """The point caches of shots under way: each is opened by its first frame, and a file once it has all of them."""
+    """The point caches of shots being simulated: the first frame opens one, and the last makes it a file."""
 
     def __init__(
         self,
@@ -204,12 +198,11 @@ class _Caches:
 
 
 def _provenance(options: argparse.Namespace, motion: Path) -> dict[str, str | float]:
-    """Return all that decides what a shot's file holds."""
+    """Return everything that decides what a shot's file holds."""
     from ssilk_usd.read_stage import content_hash, split_location
 
     garment, _ = shared.wardrobe(options)
-    names = ("fabric", "fps", "substeps", "tolerance", "iterations", "precision", "proxies", "no_body")
-    lists = ("material", "body", "classes", "rig")
+    names, lists = ("fabric", "fps", "tolerance", "iterations", "no_body"), ("material", "body")
     return {
         "stage": str(options.stage),
         "motion": str(motion),
@@ -224,7 +217,7 @@ def _provenance(options: argparse.Namespace, motion: Path) -> dict[str, str | fl
 
 
 class _Figures:
-    """What a simulation came to."""
+    """Figures of a simulation."""
 
     def __init__(self, tolerance: float) -> None:
         self.tolerance, self.solved, self.iterations, self.fixed = tolerance, 0, 0, 0

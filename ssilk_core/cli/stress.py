@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Put a trained garment under extreme motions, rates, sizes, fabrics, meshes and precisions, and tabulate it.
+"""Test a trained garment under extreme motions, rates, sizes, fabrics, meshes and precisions.
 
-Each case says whether all stays bounded, how far it goes, how its energy grows, what it is off by, and what becomes
-of it: it works, falls back to rest, or is refused with a sentence. Where anything else happens the exit code is 3.
+A table says for each case whether all values stay bounded, how far vertices go, how the energy grows, how large the
+error is, and what happens: it works, falls back to rest, or is refused with a sentence. The exit code is 3 where
+anything else happens.
 """
 
 from __future__ import annotations
@@ -31,13 +32,13 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         "--motion",
         type=Path,
         metavar="SHOT[:/PRIM]",
-        help="USD file with the motion to begin from (default: joints that turn to and fro)",
+        help="USD file with the motion that cases change (default: joints that sway)",
     )
     verb.add_argument(
-        "--quick", action="store_true", help="a tenth of the frames, small trials: minutes, not an hour"
+        "--quick", action="store_true", help="a tenth of the frames and smaller trials: minutes instead of an hour"
     )
     verb.add_argument(
-        "--only", nargs="+", default=[], metavar="WORD", help="cases whose name contains a word, such as 'rate:'"
+        "--only", nargs="+", default=[], metavar="WORD", help="run cases whose name has such a word, as 'rate:'"
     )
     verb.add_argument("-o", "--output", type=Path, help="JSON file for the figures")
 

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measure what speed and size cost in accuracy, for all that can be changed without training again.
+"""Measure what speed and size cost in accuracy, for everything that can be changed without training again.
 
-Blendshapes, proxies, influences, precision, frame rate, refinement and the quality levels are tried one after the
-other, and several models (of other latent sizes or widths) side by side: time and memory to play, bytes of model and
-shot, against energy, collisions, and the distance of vertices and velocities from the whole model. Times are of this
-machine and of the first clip. --output keeps each point as it comes: a sweep that was interrupted goes on from there.
+Blendshapes, proxies, influences, precision, frame rate, refinement and quality levels are varied one at a time.
+Several models of one garment can be compared. Costs are the time and memory of playing and the sizes of model and
+shot. Accuracy is energy, collisions, and the distance of vertices and velocities from the whole model. Times are of
+this machine and of the first clip. --output writes each point when it is measured; an interrupted sweep continues
+from there.
 """
 
 from __future__ import annotations
@@ -25,10 +26,10 @@ if TYPE_CHECKING:
     from ..assets import Motion
     from ..bake import BakeRollout
     from ..checkpoint import ModelFile
-    from ..evaluation.methods import EvaluationScene, Method, TakeSet
+    from ..evaluation.methods import EvaluationScene
     from ..trade.measure import VariantMeter, Weigh
 
-CLIPS = 2  # that are measured on where none are named
+CLIPS = 2  # are measured on where --clips names none
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -37,20 +38,20 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--stage", type=Path, required=True, help="USD file with the character")
     verb.add_argument("--root", metavar="PRIM", help="SkelRoot of the character, where the stage has several")
     verb.add_argument("--motions", type=Path, required=True, metavar="FOLDER",
-                      help="motion files; what is measured on some is cut to be best on the others")  # fmt: skip
+                      help="motion files; models are measured on --clips and reduced to fit the others")  # fmt: skip
     verb.add_argument(
         "--clips", nargs="+", default=[], metavar="NAME", help="measure on these (default: the first two)"
     )
-    verb.add_argument("--reference", type=Path, metavar="FOLDER", help="shots of 'ssilk simulate' of these clips")
-    verb.add_argument("--no-refine", action="store_true", help="leave the solver out, which takes most of the time")
+    verb.add_argument("--no-refine", action="store_true", help="leave out the solver, which takes most of the time")
     verb.add_argument("-o", "--output", type=Path, help="figures to write (.json), and a plot beside them (.png)")
     verb.add_argument("--device", default="cpu", help="where PyTorch and the solver run (default cpu)")
 
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Sweep; return 0."""
+    from ..charts import write_chart
     from ..trade.judging import judged
-    from ..trade.plot import write_plot
+    from ..trade.plot import trade_panels
     from ..trade.sweep import Results, sweep
     from ..trade.table import judging_table, table
     from ..trade.variants import variants
@@ -74,7 +75,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
             )
     finally:  # an interrupted sweep shows what it has
         if results.points and options.output:
-            write_plot(options.output.with_suffix(".png"), results.points)
+            write_chart(options.output.with_suffix(".png"), trade_panels(results.points), size=(4.6, 3.6))
         if not options.json:
             print(table(results.points), judging_table(results.judging), sep="\n")
     report(Result("trade", {"points": [asdict(point) for point in results.points]} if options.json else {}))
@@ -82,11 +83,12 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
 
 class Bench:
-    """What all models of a sweep are measured on.
+    """The scene and the motions that all models of a sweep are measured on.
 
     Attributes:
-        clips: motions to measure on, by name; others: motions that models are cut for.
-        asked: what tells one sweep from another.
+        clips: motions to measure on, by name.
+        others: motions that models are reduced for.
+        asked: what distinguishes one sweep from another.
     """
 
     def __init__(self, options: argparse.Namespace) -> None:
@@ -102,7 +104,7 @@ class Bench:
             fail(
                 ", ".join(map(str, self.files)),
                 "several models have one name",
-                "points are told apart by the model's file name",
+                "points are identified by the model's file name",
                 "rename a file",
             )
         for path, file in self.files.items():
@@ -112,7 +114,7 @@ class Bench:
                     str(path),
                     "a model of another garment, or rate",
                     "models of one garment are compared",
-                    "sweep it by itself",
+                    "measure it by itself",
                 )
         self.paths, self.others = self._motions(first)
         self.clips = {name: self._read(path, first) for name, path in self.paths.items()}
@@ -120,13 +122,12 @@ class Bench:
             "models": {str(path): sha256(path) for path in options.models},
             "stage": sha256(options.stage),
             "clips": list(self.clips),
-            "reference": options.reference and str(options.reference),
             "hardware": f"{platform.processor() or platform.machine()}, {self.device}",
             "ssilk": __version__,
         }
 
     def meter(self, path: Path, file: ModelFile, *, only: str | None = None) -> VariantMeter:
-        """Return what measures a model on all clips, cut for other motions; or on `only` one, cut for it."""
+        """Return the meter of a model on all clips, reduced for other motions; or on `only` one, reduced for it."""
         from ..evaluation.methods import build_take_set
         from ..evaluation.takes import takes_of
         from ..reduction import Reducer
@@ -137,7 +138,7 @@ class Bench:
         takes = [take for name, clip in clips.items() for take in takes_of(name, clip, dressed.fps)]
         reel = build_take_set(takes, dressed, file.joints)
         reducer = Reducer(file, [self.clips[only]] if only else self.others)
-        return VariantMeter(path.stem, reducer, dressed, reel, self._weigh(path), self._reference(dressed, reel))
+        return VariantMeter(path.stem, reducer, dressed, reel, self._weigh(path))
 
     def _dressed(self, file: ModelFile) -> EvaluationScene:
         """Put a garment on the character of the stage."""
@@ -149,27 +150,8 @@ class Bench:
         scene = on_character(file, open_stage(self.options.stage), self.options.root)
         return EvaluationScene(scene, file.fabric, file.config.fps, self.device)
 
-    def _reference(self, dressed: EvaluationScene, reel: TakeSet) -> Method | None:
-        """Return what the simulator made of the clips, where a folder of that is named."""
-        from ..evaluation.methods import CachedPoints
-        from ._reference import References
-
-        folder: Path | None = self.options.reference
-        if folder is None:
-            return None
-        found = References(folder, dressed.name, dressed.scene.garment.mesh.vertex_count, dressed.fps)
-        missing = sorted(self.clips.keys() - found.clips)
-        if missing:
-            fail(
-                str(folder),
-                f"no shot of {', '.join(missing)}",
-                "each clip needs one",
-                "simulate them with 'ssilk simulate'",
-            )
-        return CachedPoints(found.read, dressed, reel)
-
     def _weigh(self, path: Path) -> Weigh:
-        """Return what tells how large a model's shots of the first clip are, without the body."""
+        """Return a function that gives the size of a model's shots of the first clip, without the body."""
         from ..bake import BakeRequest, load_rollout, shot_bytes, with_model
 
         motion, stage = str(next(iter(self.paths.values()))), str(self.options.stage)
@@ -183,12 +165,12 @@ class Bench:
         return lambda file, fps: shot_bytes(with_model(rollout(fps), file), ".usdc", include_body=False)
 
     def _motions(self, file: ModelFile) -> tuple[dict[str, Path], list[Motion]]:
-        """Return the files of the clips to measure on, and the motions to cut models for: the others, or the same."""
+        """Return the files of the clips to measure on, and the motions to reduce models for: the others, if any."""
         from ssilk_usd.read_motion import motion_files
 
         folder: Path = self.options.motions
         if not folder.is_dir():
-            fail(str(folder), "there is no such folder", "one of motion files is needed")
+            fail(str(folder), "there is no such folder", "a folder of motion files is needed")
         files = {path.stem: path for path in motion_files([folder])}
         names = self.options.clips or list(files)[:CLIPS]
         missing = sorted(set(names) - files.keys())

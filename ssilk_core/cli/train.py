@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Train a garment on motions and write a model.
 
-The stage may be plain (character and garment); weights, classes and a proxy rig are then made as 'ssilk rig'
-does. Interrupt with Ctrl-C: the best model and the state are kept, and --resume goes on from there.
+Where the stage lacks weights, classes or a proxy rig, they are made as 'ssilk rig' makes them by default.
+Ctrl-C stops the training and keeps the best model and the state. --resume continues from there.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from . import options as shared
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
     shared.add_scene(verb)
-    shared.add_setup(verb)
     verb.add_argument(
         "--motions", type=Path, nargs="+", required=True, metavar="PATH", help="motion files or folders to train on"
     )
@@ -43,21 +42,19 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         "--minutes",
         type=float,
         metavar="M",
-        help="wall time to fill in place of the preset's iterations, from when the scene is set up: a few steps are "
-        "timed, and the schedule is stretched or shrunk to as many as fit; the same seed then gives the same model "
-        "only where as many do",
+        help="wall time after the setup, in place of the preset's iterations: a few steps are timed, and the "
+        "schedule is scaled to the number that fits; one seed gives one model only for one such number",
     )
     shared.add_fabric(verb)
     verb.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1, ... (default auto)")
-    verb.add_argument("--resume", action="store_true", help="go on from the state beside the model")
-    verb.add_argument("--seed", type=int, default=0, help="of everything random (default 0)")
+    verb.add_argument("--resume", action="store_true", help="continue from the state beside the model")
     verb.add_argument(
         "--set",
         action="append",
         default=[],
         metavar="NAME=VALUE",
         dest="settings",
-        help="change one setting of the preset (repeatable)",
+        help="change one setting of the preset, such as iterations=20000 or seed=1 (repeatable)",
     )
 
 
@@ -71,7 +68,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         fail(str(options.output), "not a name for a model", "it ends in .safetensors")
     shared.check_output(options.output)
     if not (options.minutes is None or 0 < options.minutes < inf):
-        fail("--minutes", f"{options.minutes}", "a time is more than nothing")
+        fail("--minutes", f"{options.minutes}", "a positive number is needed")
     with joined(options.device) as (group, device), interruptible() as stop:
         report = report if group.first else silent
         trained = train(training_job(options, device, report), report, stop, group)
@@ -91,7 +88,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         )
     )
     if not trained.finished:
-        report(Message(f"stopped at iteration {trained.iterations}; --resume goes on from there."))
+        report(Message(f"stopped at iteration {trained.iterations}; --resume continues from there."))
         return EXIT_INTERRUPTED
     return EXIT_OK
 
@@ -127,19 +124,17 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
 
 
 def configured(options: argparse.Namespace) -> tuple[ModelConfig, TrainConfig, Fabric]:
-    """Return what the options say about network, schedule and fabric.
+    """Return the network, the schedule and the fabric that the options ask for.
 
     Raises:
         SsilkError: a setting that does not exist, or a value that it cannot have.
     """
     preset = preset_named(options.preset)
-    model, train = _settings(options.settings, preset.model, preset.train, options.seed)
+    model, train = _settings(options.settings, preset.model, preset.train)
     return model, train, shared.fabric(options)
 
 
-def _settings(
-    settings: list[str], model: ModelConfig, train: TrainConfig, seed: int
-) -> tuple[ModelConfig, TrainConfig]:
+def _settings(settings: list[str], model: ModelConfig, train: TrainConfig) -> tuple[ModelConfig, TrainConfig]:
     """Apply "name=value" settings to whichever of the two has the name."""
     known = [*ModelConfig.__dataclass_fields__, *TrainConfig.__dataclass_fields__]
     for setting in settings:
@@ -148,4 +143,4 @@ def _settings(
             fail(where, "no such setting", f"settings are {', '.join(known)}")
     own = [setting for setting in settings if setting.partition("=")[0] in ModelConfig.__dataclass_fields__]
     others = [setting for setting in settings if setting not in own]
-    return overridden(model, own), overridden(train, [f"seed={seed}", *others])
+    return overridden(model, own), overridden(train, others)

@@ -7,6 +7,7 @@ Works without a display and without a GPU.
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 
 from ..errors import EXIT_OK, fail
@@ -18,15 +19,11 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
     verb.add_argument("shots", type=Path, nargs="+", metavar="SHOT", help="shots of one length and rate")
     verb.add_argument("-o", "--output", type=Path, required=True, help="film (.mp4) or contact sheet (.png)")
-    verb.add_argument("--label", action="append", default=[], help="a word for each shot (repeatable)")
-    verb.add_argument(
-        "--fps", type=float, default=30.0, help="at most so many frames per second of film (default 30)"
-    )
-    verb.add_argument("--columns", type=int, default=6, help="moments in a row of the sheet (default 6)")
-    verb.add_argument("--rows", type=int, default=1, help="rows of the sheet (default 1)")
+    verb.add_argument("--label", action="append", default=[], help="caption of a shot (repeatable)")
+    verb.add_argument("--fps", type=float, default=30.0, help="most frames per second of a film (default 30)")
+    verb.add_argument("--columns", type=int, default=6, help="moments that the sheet shows (default 6)")
     verb.add_argument("--azimuth", type=float, default=None, help="side from which the camera looks [degrees]")
     verb.add_argument("--size", metavar="WxH", help="pixels of one panel")
-    verb.add_argument("--workers", type=int, default=2, help="threads that draw (default 2)")
 
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
@@ -49,7 +46,6 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
             players,
             labels=labels,
             columns=options.columns,
-            rows=options.rows,
             look=look,
             report=report,
         )
@@ -67,4 +63,4 @@ def _look(options: argparse.Namespace, film: bool):  # type: ignore[no-untyped-d
             fail(f"--size {options.size}", "not a size", "WIDTHxHEIGHT in pixels is needed")
         width, height = int(parts[0]), int(parts[1])
     azimuth = Look.azimuth if options.azimuth is None else options.azimuth
-    return Look(width=width, height=height, azimuth=azimuth, workers=options.workers)
+    return Look(width=width, height=height, azimuth=azimuth, workers=os.cpu_count() or 1)

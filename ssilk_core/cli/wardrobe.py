@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Train a list of garments, each as 'ssilk train' does, one on each GPU at a time.
+"""Train a list of garments as 'ssilk train' does, one at a time on each GPU.
 
 LIST is a TOML file with a table for each garment, and [defaults] for all; its paths are relative to its folder:
 
@@ -12,9 +12,10 @@ LIST is a TOML file with a table for each garment, and [defaults] for all; its p
     garment = "cape.usdc"
     set = { iterations = 100000 }
 
-Other keys are valid, fabric, material and seed. FOLDER gets NAME.safetensors and NAME.log for each garment. The same
-command goes on where it stopped: what is finished is skipped unless something else is asked now, what was interrupted
-is resumed. Ctrl-C stops all gently, a second one at once. A garment that fails does not stop the others.
+Other keys are valid, fabric and material. FOLDER gets NAME.safetensors and NAME.log for each garment. The same
+command, given again, skips what is finished and resumes what was interrupted; a garment whose entry or inputs have
+changed is trained again. Ctrl-C stops all trainings after their current step, a second Ctrl-C at once. A garment that
+fails does not stop the others.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ from pathlib import Path
 
 from ..errors import SsilkError, fail
 from ..events import Failed, GarmentEvent, Message, Reporter, Result, Said, Started
-from ..files import need_writable
+from ..files import need_writable, sha256
 from ..wardrobe.listing import WardrobeEntry, read_list
 from ..wardrobe.panel import ProgressTable, table
 from ..wardrobe.queue import End, Queue, Slot
-from ..wardrobe.record import request_hash
 from ..wardrobe.training import GarmentTraining
+from ..work_record import request_key
 from . import options as shared
 from . import train
 
@@ -71,7 +72,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 def _train(
     trainings: Sequence[GarmentTraining], source: Path, device: str, slots: Sequence[Slot], show: Reporter
 ) -> None:
-    """Train what waits, the paths of the list being relative to `source`."""
+    """Train all garments that wait; paths of the list are relative to `source`."""
     from ..training.signals import interruptible
 
     named = {training.entry.name: training for training in trainings}
@@ -90,8 +91,8 @@ def _train(
         if training.plan:
             tell(name, Message(training.plan))
     with interruptible() as stop:
-        waiting = (training for training in trainings if training.state == "waiting")
-        Queue(slots, tell, ended).run((training.begin(source, device) for training in waiting), stop)
+        tasks = (training.begin(source, device) for training in trainings if training.state == "waiting")
+        Queue(slots, tell, ended).run(lambda: next(tasks, None), stop)
 
 
 def _slots(device: str, jobs: int | None) -> tuple[str, list[Slot]]:
@@ -132,7 +133,7 @@ def _request(entry: WardrobeEntry, path: Path) -> str:
     for file in files:
         if not file.is_file():
             fail(where, f"there is no file {file}", "paths are relative to the folder of the list")
-    return request_hash(entry.words, files)
+    return request_key(entry.words, [(file.name, sha256(file)) for file in files])
 
 
 def _inputs(options: argparse.Namespace, folder: Path) -> list[Path]:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One page about a model or a shot, with nothing outside it: energies over time, worst frames, tables, provenance."""
+"""One self-contained page about a model or a shot: energies over time, worst frames, tables, provenance."""

@@ -8,31 +8,30 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from ..charts import ChartPanel, svg_chart
 from ..errors import SsilkError, fail
 from ..stress.outcome import HEADER, CaseOutcome
-from ..trade.point import front
-from .charts import scatter, strip
+from ..trade.plot import trade_panels
+from ..trade.point import TradePoint
 from .page import Section, facts, flattened, table
 from .terms import SHARE
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file; raise `SsilkError` for one that is none."""
+    """Read a JSON file; raise `SsilkError` where it is missing or not JSON."""
     if not path.is_file():
         fail(str(path), "there is no such file", "figures in JSON are needed")
     try:
         return json.loads(path.read_text())
     except ValueError as error:
-        raise SsilkError(f"{path}: this is no JSON ({error}); name a file that ssilk wrote.") from error
+        raise SsilkError(f"{path}: not a JSON file ({error}); name a file that ssilk wrote.") from error
 
 
 def section_of(path: Path) -> Section:
-    """Return what a file of figures says, by what it holds.
+    """Return the section of a file of figures, chosen by what it holds.
 
     Raises:
-        SsilkError: it is none that 'ssilk stress', 'trade' or 'evaluate' writes.
+        SsilkError: the file is not one of 'ssilk stress', 'ssilk trade' or 'ssilk evaluate'.
     """
     document = read_json(path)
     kinds = {"outcomes": extremes, "points": trade, "figures": evaluation}
@@ -40,18 +39,18 @@ def section_of(path: Path) -> Section:
     if not kind:
         fail(
             str(path),
-            "none of the figures that are known",
+            "not figures of a known kind",
             f"a document with {' or '.join(kinds)} is needed",
-            "name what 'ssilk stress', 'ssilk trade' or 'ssilk evaluate' wrote",
+            "name a file that 'ssilk stress', 'ssilk trade' or 'ssilk evaluate' wrote",
         )
     return _made(path, kinds[str(kind)], document)
 
 
 def learning_of(path: Path) -> list[Section]:
-    """Return what the learning curve beside a model says; nothing where there is none, or no validation in it.
+    """Return the section of the learning curve beside a model; none without a curve, or without validations.
 
     Raises:
-        SsilkError: the file is no learning curve.
+        SsilkError: the file is not a learning curve.
     """
     document = read_json(path) if path.is_file() else {"points": []}
     return [_made(path, learning, document)] if document.get("points", True) else []
@@ -73,19 +72,12 @@ def extremes(document: Mapping[str, Any]) -> Section:
 
 
 def trade(document: Mapping[str, Any]) -> Section:
-    """Return the table and the plot of 'ssilk trade'."""
-    points = document["points"]
-    groups: dict[str, list[tuple[float, float, str]]] = {}
-    for point in points:
-        words = f"{point['variant']} ({point['milliseconds']:.3g} ms, {1000 * point['position']:.3g} mm)"
-        groups.setdefault(point["swept"], []).append((point["milliseconds"], 1000 * point["position"], words))
-    chart = ""
-    if points:
-        places = [(x, y) for group in groups.values() for x, y, _ in group]
-        best = [places[index] for index in front(places)]
-        chart = scatter("Time against distance from the whole model", ("ms a frame", "RMS [mm]"), groups, best)
+    """Return the charts and the tables of 'ssilk trade'."""
+    names = TradePoint.__dataclass_fields__
+    points = [TradePoint(**{name: each[name] for name in names}) for each in document["points"]]
+    chart = svg_chart("errors over costs", trade_panels(points), size=(4.0, 3.4)) if points else ""
     judged = records(document.get("judging", ()))
-    return Section("Trade", chart + records(points) + judged + facts(document["asked"]))
+    return Section("Trade", chart + records(document["points"]) + judged + facts(document["asked"]))
 
 
 def evaluation(document: Mapping[str, Any]) -> Section:
@@ -95,19 +87,26 @@ def evaluation(document: Mapping[str, Any]) -> Section:
 
 
 def records(found: Sequence[Mapping[str, Any]]) -> str:
-    """Return records as a table with a column for each name that any has."""
+    """Return records as a table with a column for each name that occurs."""
     flat = [flattened(record) for record in found]
     names = list(dict.fromkeys(name for record in flat for name in record))
     return table(names, [[record.get(name, "") for name in names] for record in flat])
 
 
 def learning(document: Mapping[str, Any]) -> Section:
-    """Return the learning curve that a training leaves beside its model."""
+    """Return the section of the learning curve that a training writes beside its model."""
     points, lbs = document["points"], document["lbs"]
     best = min(range(len(points)), key=lambda number: points[number]["validation"]["total"])
-    times = np.array([point["seconds"] for point in points])
+    times = [point["seconds"] for point in points]
     totals, inside = ([point["validation"][name] for point in points] for name in ("total", "collisions"))
-    words = f"linear blend skinning: {lbs['total']:.4g} J, {lbs['collisions']:.2%} inside the body"
-    charts = strip("total at validation", "J", times, np.array(totals), {best: "best"})
-    charts += strip(SHARE, "%", times, 100.0 * np.array(inside), {best: "best"})
-    return Section("Training", charts + f'<p class="note">{words}</p>')
+    shown = {"total at validation": ("J", totals), SHARE: ("%", [100 * share for share in inside])}
+    rows = [
+        [ChartPanel(title=title, x="training time [s]", y=unit, curves={"": (times, values)},
+                    marks={"best": (times[best], values[best])})]
+        for title, (unit, values) in shown.items()
+    ]  # fmt: skip
+    words = (
+        f"Best: {totals[best]:.4g} J at {times[best]:.0f} s. "
+        f"Linear blend skinning: {lbs['total']:.4g} J, {lbs['collisions']:.2%} inside the body."
+    )
+    return Section("Training", svg_chart("validations during training", rows) + f'<p class="note">{words}</p>')

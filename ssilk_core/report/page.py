@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A page of HTML that is whole by itself: its style, charts and pictures are in it, and it may load nothing else."""
+"""A self-contained page of HTML: style, charts and pictures are inside it, and it loads nothing."""
 
 from __future__ import annotations
 
@@ -12,27 +12,24 @@ from typing import Any
 
 from ..view.render import Image
 
-# Nothing is fetched and nothing runs, whatever a name or a message in the figures may contain.
+# Whatever a name or a message in the figures contains, the browser fetches nothing and runs nothing.
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 STYLE = """
-:root { color-scheme: light dark; --ink: #22262b; --paper: #fff; --faint: #d9dde2; --line: #2f6f9f; --bad: #b03a48; }
+:root { color-scheme: light dark; --ink: #22262b; --paper: #fff; --faint: #d9dde2; --bad: #b03a48; }
 @media (prefers-color-scheme: dark) {
-  :root { --ink: #dfe3e8; --paper: #17191c; --faint: #3a3f46; --line: #6fb1e0; --bad: #ef8792; }
+  :root { --ink: #dfe3e8; --paper: #17191c; --faint: #3a3f46; --bad: #ef8792; }
 }
 body { font: 15px/1.5 system-ui, sans-serif; color: var(--ink); background: var(--paper); max-width: 60rem;
        margin: 2rem auto; padding: 0 1rem; }
 h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2.2rem; border-bottom: 1px solid var(--faint); }
-svg { width: 100%; height: auto; display: block; } text { font: 11px system-ui, sans-serif; fill: var(--ink); }
-text.title { font-weight: 600; font-size: 12px; } text.end { text-anchor: end; } text.small { opacity: .75; }
-.axis { stroke: var(--faint); } .line { fill: none; stroke: var(--line); stroke-width: 1.2; }
-.front { fill: none; stroke: var(--ink); stroke-dasharray: 4 3; } .mark { fill: var(--bad); }
+svg { width: 100%; height: auto; display: block; }
 .scroll { overflow-x: auto; } table { border-collapse: collapse; font-size: 13px; }
 td, th { padding: .2rem .6rem; text-align: left; border-bottom: 1px solid var(--faint); vertical-align: top; }
 td.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
 tr.bad td { color: var(--bad); }
 td:first-child { white-space: nowrap; }
 .pictures { display: flex; flex-wrap: wrap; gap: 1rem; } figure { margin: 0; width: 13rem; } img { width: 100%; }
-figcaption, .legend, .note { font-size: 13px; opacity: .8; }
+figcaption, .note { font-size: 13px; opacity: .8; }
 """
 
 
@@ -56,7 +53,7 @@ def page(title: str, sections: Sequence[Section]) -> str:
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]], bad: Sequence[int] = ()) -> str:
-    """Return a table; figures stand to the right, and rows whose numbers are in `bad` stand out."""
+    """Return a table; figures are aligned to the right, and rows whose numbers are in `bad` are highlighted."""
     lines = []
     for number, row in enumerate(rows):
         kind = ' class="bad"' if number in bad else ""

@@ -9,24 +9,24 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..assets import Floats, Mesh
+from ..charts import ChartPanel, svg_chart
 from ..events import Progress, Reporter, silent
 from ..fabrics import Fabric
 from ..view.camera import follow_cameras
 from ..view.player import ShotPlayer
 from ..view.render import Image, render
 from ..view.shots import shot_surfaces
-from .charts import strip
 from .page import Section, figure, table
 from .terms import SHARE, UNITS, TermsMeter, worst_frames
 
-PICTURES, APART = 4, 0.5  # worst frames to show, and how far they are from each other at least [s]
+PICTURES, APART = 4, 0.5  # worst frames to show, and the least time between them [s]
 WIDTH, HEIGHT = 300, 400  # of a picture [pixels]
 LETTERS = "ABCDEFGH"
 
 
 @dataclass(frozen=True, eq=False)
 class ShotGarment:
-    """A garment of a shot: which of the player's meshes it is, at rest, and what it is made of."""
+    """A garment of a shot: its index among the player's meshes, its mesh at rest, and its fabric."""
 
     index: int
     mesh: Mesh
@@ -39,8 +39,9 @@ def shot_sections(
     """Return the sections about a shot.
 
     Args:
-        player: the shot; garments: those to measure.
-        bodies: the meshes at rest that garments meet, by their index in the player.
+        player: the shot.
+        garments: those to measure.
+        bodies: the meshes that garments collide with, at rest, by their index in the player.
     """
     meters = [TermsMeter(each.mesh, joined(list(bodies.values())), each.fabric, player.fps) for each in garments]
     for number, time in enumerate(player.frame_times):
@@ -63,11 +64,18 @@ def joined(meshes: Sequence[Mesh]) -> Mesh | None:
 
 def _sections(player: ShotPlayer, garment: ShotGarment, meter: TermsMeter) -> list[Section]:
     values = {name: np.array(found) for name, found in meter.values.items()}
-    bad = values["total"] - values["gravity"]  # height is no fault
+    bad = values["total"] - values["gravity"]  # a raised garment is no worse
     worst = worst_frames(bad, PICTURES, max(1, round(APART * player.fps)))
     times, marks = np.arange(len(values["total"])) / player.fps, dict(zip(worst, LETTERS))
     shown = [name for name in UNITS if meter.body or name not in ("collision", SHARE)]
-    charts = "".join(strip(name, UNITS[name], times, values[name], marks) for name in shown)
+    panels = [
+        ChartPanel(
+            title=name, x="time [s]", y=UNITS[name], curves={"": (times, values[name])},
+            marks={letter: (times[frame], values[name][frame]) for frame, letter in marks.items()},
+        )
+        for name in shown
+    ]  # fmt: skip
+    charts = svg_chart(f"{', '.join(shown)} over time", [[panel] for panel in panels])
     rows = [[f"{name} [{UNITS[name]}]", *_spread(values[name])] for name in shown]
     name = player.meshes[garment.index].name
     pictures = "".join(
@@ -86,7 +94,7 @@ def _spread(values: Floats) -> list[str]:
 
 
 def picture(player: ShotPlayer, frame: int) -> Image:
-    """Return one frame of a shot, the figure filling it."""
+    """Return a picture of one frame of a shot, framed to the figure."""
     surfaces = shot_surfaces(player, frame)
     points = np.concatenate([surface.points for surface in surfaces])
     (camera,) = follow_cameras([points], player.fps, WIDTH / HEIGHT)

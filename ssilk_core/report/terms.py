@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Energies of a shot's garment in each frame, from its points alone, whoever computed them."""
+"""Energies of a shot's garment in each frame, from its points alone."""
 
 from __future__ import annotations
 
@@ -22,14 +22,17 @@ UNITS = {"total": "J", "stretch": "J", "bending": "J", "gravity": "J", "inertia"
 
 @dataclass(eq=False)
 class TermsMeter:
-    """Takes the frames of a shot in order and keeps the energies of each.
+    """Measures the energies of a shot's frames, given in order.
+
+    The energy of gravity counts heights above the middle of the body, relative to the garment at rest. A shot does
+    not say which cloth is tight, so all cloth collides with the whole body here. In training tight cloth collides
+    only with the patch under it.
 
     Attributes:
-        garment: at rest; body: at rest, all meshes as one, or None.
-        fps: frames per second of what is given.
-        values: by name, one for each frame: energies [J], and the share of vertices inside the body [%]. Gravity
-            counts heights over the body's middle, from what they are at rest. A shot does not tell what of its
-            garment is tight: all of it meets the whole body here, where training lets tight cloth meet one patch.
+        garment: the mesh at rest.
+        body: all body meshes at rest as one, or None.
+        fps: frames per second.
+        values: by name, one for each frame: energies [J], and the share of vertices inside the body [%].
     """
 
     garment: Mesh
@@ -67,7 +70,7 @@ class TermsMeter:
             self.values[name].append(value)
 
     def _height(self, points: Floats, body: Floats | None) -> float:
-        """Return the garment's weight times its height over the middle of the body, or over the ground [J]."""
+        """Return the garment's weight times its height above the middle of the body, or above y = 0 [J]."""
         ground = 0.0 if body is None else float(body[:, 1].mean())
         return GRAVITY * float(self.energy.mass.numpy() @ (points[:, 1] - ground))
 
@@ -91,7 +94,7 @@ class TermsMeter:
 
 
 def worst_frames(values: Floats, count: int, apart: int) -> list[int]:
-    """Return up to `count` frames of the largest values, the worst first, each so many frames from the others."""
+    """Return up to `count` frames with the largest values, the worst first, at least `apart` frames apart."""
     found: list[int] = []
     for frame in np.argsort(-np.asarray(values), kind="stable").tolist():
         if len(found) == count:

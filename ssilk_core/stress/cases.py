@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every extreme: what is done, and what may come of it."""
+"""The extremes that a garment is tested under, and the outcomes that each may have."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ class Case:
     """One extreme.
 
     Attributes:
-        group, name: what it is called.
-        measure: does it and returns what was found; a refusal is an `SsilkError`.
-        allowed: what the product may do; anything else is a fault.
+        group, name: of the table's line.
+        measure: runs the case; it raises `SsilkError` to refuse.
+        allowed: verdicts that are no fault.
     """
 
     group: str
@@ -58,7 +58,7 @@ class Case:
         return not words or any(word in f"{self.group}: {self.name}" for word in words)
 
     def run(self, subject: StressSubject) -> CaseOutcome:
-        """Do it and say what came of it."""
+        """Run the case and return its outcome."""
         began = time.perf_counter()
         verdict, said, measured = self._tried(subject)
         return CaseOutcome(self.name, self.group, verdict, said, measured, time.perf_counter() - began)

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motions as functions of time, so that any number of frames takes the memory of one block; and what is done to them.
+"""Motions as functions of time, and functions that change them.
 
-A drive is sampled when it is played. What changes one (a spin, a teleport) wraps it and returns another.
+A motion of any length takes the memory of one block, because it is sampled when it is played. A change, such as a
+spin or a teleport, wraps a motion and returns another.
 """
 
 from __future__ import annotations
@@ -48,12 +49,12 @@ class ProceduralMotion:
             yield self.motion(start, start + size)
 
     def lasting(self, seconds: float, fps: float | None = None) -> ProceduralMotion:
-        """Return the drive for so many seconds, at another rate."""
+        """Return the drive for some seconds, at another rate."""
         fps = fps or self.fps
         return replace(self, fps=fps, frames=round(seconds * fps) + 1)
 
     def looping(self, seconds: float) -> ProceduralMotion:
-        """Return the drive for at least so many seconds and three of its loops, ended by a whole one."""
+        """Return the drive for whole loops, at least three, that take at least some seconds."""
         loops = max(3, int(np.ceil(seconds / self.loop)))
         return self.lasting(loops * self.loop)
 
@@ -63,7 +64,7 @@ class ProceduralMotion:
 
 
 def sway(skeleton: Skeleton, fps: float) -> ProceduralMotion:
-    """Return a drive for want of a motion: every joint turns by sines of its own about the bind pose, in a loop."""
+    """Return a made-up motion: every joint turns by its own sines about the bind pose, in a loop."""
     random, loop = np.random.default_rng(0), SWAY
     local = local_transforms(skeleton.bind_transforms, skeleton.parents)
     rest, places = quaternion_from_matrix(local[:, :3, :3]), local[:, :3, 3]
@@ -81,7 +82,7 @@ def sway(skeleton: Skeleton, fps: float) -> ProceduralMotion:
 
 
 def looped(motion: Motion, fps: float) -> ProceduralMotion:
-    """Return a clip played to and fro without end, slowing at both ends; a loop has whole frames at `fps`."""
+    """Return a clip played forward and backward, slowing at both ends; a loop has whole frames at `fps`."""
     last = motion.frame_count - 1
     loop = max(1, round(np.pi * last / motion.fps * fps)) / fps  # at the clip's own speed in its middle
 
@@ -113,7 +114,7 @@ def rotated(quaternions: Floats, vectors: Floats) -> Floats:
 
 
 def about(axis: tuple[float, float, float], speed: float = 0.0, angle: float = 0.0) -> Turn:
-    """Return a turn about a unit axis by an angle [rad] that grows with a speed [rad/s]."""
+    """Return a turn about a unit axis: an angle [rad] that grows by a speed [rad/s]."""
 
     def turn(times: Floats) -> Floats:
         half = (angle + speed * times)[:, None] / 2
@@ -135,12 +136,12 @@ def carried(drive: ProceduralMotion, path: Callable[[Floats], Floats], skeleton:
 
 
 def stopping(drive: ProceduralMotion, time: float) -> ProceduralMotion:
-    """Return the drive with its pose at a time [s] held from then on, at once."""
+    """Return the drive stopped at a time [s]: it keeps the pose of that moment."""
     return replace(drive, at=lambda times: drive.at(np.minimum(times, time)))
 
 
 def contorted(drive: ProceduralMotion, skeleton: Skeleton, every: float) -> ProceduralMotion:
-    """Return a drive in which each joint but the roots turns at will: uniform on SO(3), anew `every` so often [s]."""
+    """Return the drive with random rotations of all joints but the roots: uniform on SO(3), new each `every` [s]."""
     random, inner = np.random.default_rng(1), skeleton.parents >= 0
     keys = random.normal(size=(64, skeleton.joint_count, 4))
     keys /= np.linalg.norm(keys, axis=-1, keepdims=True)
@@ -165,5 +166,5 @@ def broken(drive: ProceduralMotion, frame: int) -> ProceduralMotion:
 
 
 def enlarged(drive: ProceduralMotion, scale: float) -> ProceduralMotion:
-    """Return the drive of a character that is so many times as large."""
+    """Return the drive of a character that is `scale` times as large."""
     return drive.then(lambda times, rotations, translations: (rotations, scale * translations))

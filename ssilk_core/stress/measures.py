@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is done to a garment at an extreme, and what is measured of it; each function returns one that does it."""
+"""Measures of extremes: each changes the world of a garment and measures what follows."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ Measure = Callable[[StressSubject], CaseMeasurement]
 
 
 def driven(change: Callable[[StressSubject, ProceduralMotion], ProceduralMotion]) -> Measure:
-    """Return what rolls the model over a changed motion."""
+    """Return a measure that rolls the model out over a changed motion."""
     return lambda subject: CaseMeasurement(extent(subject.model, subject.fabric, change(subject, subject.base)))
 
 
 def lasting(frames: int) -> Measure:
-    """Return what rolls the model over so many frames."""
+    """Return a measure that rolls the model out over a number of frames."""
 
     def measure(subject: StressSubject) -> CaseMeasurement:
         count = round(frames * subject.effort.frames)
@@ -42,7 +42,7 @@ def lasting(frames: int) -> Measure:
 
 
 def at_rate(fps: int) -> Measure:
-    """Return what bakes at another rate; the error is the distance from the bake at the model's rate [m]."""
+    """Return a measure that bakes at another rate; the error is the distance from a bake at the model's rate [m]."""
 
     def measure(subject: StressSubject) -> CaseMeasurement:
         base = subject.base
@@ -64,57 +64,57 @@ def rate_error(subject: StressSubject, drive: ProceduralMotion) -> float:
 
 
 def turned(axis: tuple[float, float, float], speed: float = 0.0, angle: float = 0.0) -> Measure:
-    """Return what turns the character about its root, at a speed [rad/s] or by an angle [rad]."""
+    """Return a measure that turns the character about its root, at a speed [rad/s] or by an angle [rad]."""
     turn = drives.about(axis, speed, angle)
     return driven(lambda subject, base: drives.turned(base, subject.scene.character.skeleton, turn))
 
 
 def moved(path: Callable[[Floats], Floats]) -> Measure:
-    """Return what moves the character along a path."""
+    """Return a measure that moves the character along a path."""
     return driven(lambda subject, base: drives.carried(base, path, subject.scene.character.skeleton))
 
 
 def contorted(every: float) -> Measure:
-    """Return what turns every joint anywhere, anew every so often [s]."""
+    """Return a measure that turns every joint at random, to a new rotation after each interval [s]."""
     return driven(lambda subject, base: drives.contorted(base, subject.scene.character.skeleton, every))
 
 
 def interrupted(frame: int) -> Measure:
-    """Return what puts NaN into all rotations of a frame."""
+    """Return a measure that puts NaN into all rotations of a frame."""
     return driven(lambda subject, base: drives.broken(base, frame))
 
 
 def weighed(factor: float) -> Measure:
-    """Return what simulates under so many times gravity: networks know its direction alone."""
+    """Return a measure that simulates under a multiple of gravity; networks know only its direction."""
     return lambda subject: solved(subject, patch(subject), subject.fabric, factor * GRAVITY)
 
 
 def solved_of(stiffness: float) -> Measure:
-    """Return what simulates a fabric of so many N/m."""
+    """Return a measure that simulates a fabric of some stiffness [N/m]."""
     return lambda subject: solved(subject, patch(subject), membrane(subject.fabric, stiffness))
 
 
 def solved_with(height: float) -> Measure:
-    """Return what simulates slivers so many times as high as long."""
+    """Return a measure that simulates slivers, `height` times as high as long."""
     return lambda subject: solved(subject, worlds.pinched(patch(subject), height), subject.fabric)
 
 
 def patch(subject: StressSubject) -> Scene:
-    """Return as much of a garment as is simulated."""
+    """Return the part of a garment that is simulated."""
     return worlds.resized(subject.scene, min(PATCH, subject.effort.vertices))
 
 
 def solved(subject: StressSubject, scene: Scene, fabric: Fabric, gravity: float = GRAVITY) -> CaseMeasurement:
-    """Simulate some frames; the error is how far out of balance the solver stopped at worst [g]."""
+    """Simulate some frames; the error is the largest residual at which the solver stopped [g]."""
     motion = subject.base.motion(0, subject.effort.simulated)
-    found, imbalance = simulated(scene, fabric, motion, gravity)
+    found, residual = simulated(scene, fabric, motion, gravity)
     return CaseMeasurement(
-        found, imbalance, "g", f"simulated, {found.recovered} of {found.frames} frames not to tolerance"
+        found, residual, "g", f"simulated, {found.recovered} of {found.frames} frames not to tolerance"
     )
 
 
 def membrane(fabric: Fabric, stiffness: float) -> Fabric:
-    """Return a fabric with so many N/m for each constant of its membranes."""
+    """Return a fabric with one stiffness [N/m] for each constant of its membranes."""
     return replace(fabric, lame_mu=stiffness, lame_lambda=stiffness, stretch=stiffness, shear=stiffness)
 
 
@@ -131,7 +131,7 @@ def measured(trial: Trial, note: str = "") -> CaseMeasurement:
 
 
 def sized(metres: float) -> Measure:
-    """Return what trains a garment of another size, with everything around it."""
+    """Return a measure that trains a garment of another size, on a body and motion scaled with it."""
 
     def measure(subject: StressSubject) -> CaseMeasurement:
         scale = metres / worlds.garment_size(subject.scene)
@@ -144,7 +144,7 @@ def sized(metres: float) -> Measure:
 
 
 def made_of(stiffness: float) -> Measure:
-    """Return what trains with a fabric of so many N/m in each of its membranes' constants."""
+    """Return a measure that trains with one stiffness [N/m] for each constant of the membranes."""
 
     def measure(subject: StressSubject) -> CaseMeasurement:
         fabric = membrane(subject.fabric, stiffness)
@@ -154,7 +154,7 @@ def made_of(stiffness: float) -> Measure:
 
 
 def meshed(height: float) -> Measure:
-    """Return what trains with slivers among the triangles, so many times as high as long."""
+    """Return a measure that trains with slivers among the triangles, `height` times as high as long."""
 
     def measure(subject: StressSubject) -> CaseMeasurement:
         scene = worlds.pinched(subject.scene, height)
@@ -164,7 +164,7 @@ def meshed(height: float) -> Measure:
 
 
 def counted(vertices: int) -> Measure:
-    """Return what trains a garment of about so many vertices."""
+    """Return a measure that trains a garment of about a number of vertices."""
 
     def measure(subject: StressSubject) -> CaseMeasurement:
         scene = worlds.resized(subject.scene, min(vertices, subject.effort.vertices))
@@ -178,7 +178,7 @@ def counted(vertices: int) -> Measure:
 
 
 def in_precision(dtype: torch.dtype) -> Measure:
-    """Return what rolls and skins in a precision; the error is the distance from float64 [m]."""
+    """Return a measure that rolls out and skins in a precision; the error is the distance from float64 [m]."""
 
     def measure(subject: StressSubject) -> CaseMeasurement:
         model, exact = subject.in_precision(dtype), subject.in_precision(torch.float64)
@@ -190,7 +190,7 @@ def in_precision(dtype: torch.dtype) -> Measure:
 
 
 def jumps(times: Floats) -> Floats:
-    """Return a path that is 30 m elsewhere every second [m]."""
+    """Return a path that jumps by 30 m every second [m]."""
     return 30.0 * np.outer(np.floor(times) % 2, (1, 0, 0))
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a rolled garment is measured by: latents, speeds, distance from linear blend skinning, energies."""
+"""Measuring rollouts: latents, speeds, distances from linear blend skinning, energies."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from .drives import ProceduralMotion
 from .worlds import garment_size
 
 ENERGY_EVERY = 4  # frames: energies take ten times as long as all else
-FAR = 2.0  # times the garment's own size from linear blend skinning: cloth that hangs the other way is no further off
-LONG = 4096  # frames; more are streamed, and only so many of them decoded
+FAR = 2.0  # garment sizes from linear blend skinning, the bound: cloth that hangs the other way stays within it
+LONG = 4096  # frames; longer rollouts are streamed, and about this number of frames is decoded
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,9 @@ class Extent:
         distance: largest of any vertex from linear blend skinning [m].
         allowed: largest distance that still counts as bounded [m].
         latent: largest entry of any latent.
-        growth: mean elastic and kinetic energy in the last loop of the motion over that in the second, the first one
-            being the transient's; 1 where there are not three.
-        recovered: frames at which the rollout was lost, or a solver stopped out of balance.
+        growth: mean elastic and kinetic energy in the last loop of the motion over that in the second; the first loop
+            holds the transient. 1 where there are fewer than three loops.
+        recovered: frames at which the state was lost, or a solver missed its tolerance.
     """
 
     frames: int
@@ -57,7 +57,7 @@ class Extent:
 
 @dataclass(eq=False)
 class Latents:
-    """Largest latent that a model decodes while it is watched; a hook, so that the rollout is the product's own."""
+    """Largest latent that a model decodes, watched by a hook so that the rollout itself is the product's."""
 
     largest: float = 0.0
 
@@ -70,7 +70,7 @@ class Latents:
 
 
 class ExtentMeter:
-    """Takes blocks of frames of one garment and keeps what an `Extent` needs; energies in `spans` of frames alone."""
+    """Measures an `Extent` from blocks of frames of one garment; energies only in `spans` of frames."""
 
     def __init__(self, scene: Scene, fabric: Fabric, fps: float, spans: Sequence[range] = ()) -> None:
         self.scene, self.fps, self.spans = scene, fps, [span[::ENERGY_EVERY] for span in spans]
@@ -108,13 +108,13 @@ class ExtentMeter:
         return float(np.mean(self.energies[-1]) / np.mean(self.energies[0]))
 
     def extent(self, frames: int, *, latent: float = 0.0, recovered: int = 0, far: float = FAR) -> Extent:
-        """Return what was measured, with what others know; bounded means within `far` times the garment's size."""
+        """Return the extent; a garment is bounded within `far` times its size."""
         allowed = far * garment_size(self.scene)
         return Extent(frames, self.finite, self.speed, self.distance, allowed, latent, self.growth, recovered)
 
 
 def compared_loops(drive: ProceduralMotion) -> tuple[range, ...]:
-    """Return the frames of a drive's second loop and of its last; nothing where there are not three."""
+    """Return the frames of a drive's second and last loops; nothing where it has fewer than three."""
     length = round(drive.loop * drive.fps)
     loops = drive.frames // length if length else 0
     return tuple(range(loop * length, (loop + 1) * length) for loop in (1, loops - 1)) if loops >= 3 else ()
@@ -132,7 +132,7 @@ def matrices_about_root(motion: Motion, scene: Scene) -> tuple[Tensor, Floats]:
 
 @dataclass(eq=False)
 class StressRollout:
-    """A drive as a model plays it, block by block: the motion of a block and the garment's pose on it."""
+    """The rollout of a model over a drive, as blocks of the motion and the garment's poses."""
 
     model: GarmentModel
     drive: ProceduralMotion
@@ -143,7 +143,7 @@ class StressRollout:
         return self._streamed() if steady and self.drive.frames > LONG else self._baked()
 
     def _baked(self) -> Iterator[tuple[Motion, GarmentPose]]:
-        """Yield what a bake of the whole motion writes."""
+        """Yield the poses that a bake of the whole motion writes."""
         motion = self.drive.motion()
         for pose in garment_poses(self.model, motion, motion.fps, on_recovery=self.recovered.append):
             yield motion.clip(pose.start, pose.start + pose.frame_count), replace(pose, start=0)
@@ -157,8 +157,9 @@ class StressRollout:
 
 
 def extent(model: GarmentModel, fabric: Fabric, drive: ProceduralMotion) -> Extent:
-    """Roll a model over a drive and measure it; of more than `LONG` frames some blocks are decoded, evenly spread,
-    and those of the compared loops.
+    """Roll a model out over a drive and measure it.
+
+    Of more than `LONG` frames, evenly spread blocks and those of the compared loops are decoded.
 
     Raises:
         SsilkError: the motion cannot be played.
@@ -188,7 +189,7 @@ def positions(model: GarmentModel, drive: ProceduralMotion) -> Floats:
 
 
 def precision_errors(model: GarmentModel, exact: GarmentModel, drive: ProceduralMotion) -> tuple[float, float]:
-    """Return how far any vertex is off [m]: by the networks of `model` alone, and by its skinning as well."""
+    """Return the largest error of a vertex [m]: of the networks of `model` alone, and with its skinning."""
     networks, whole = 0.0, 0.0
     for (motion, pose), (_, true) in zip(StressRollout(model, drive), StressRollout(exact, drive)):
         expected = decode(exact, motion, true)

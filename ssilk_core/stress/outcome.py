@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What came of one extreme, and tables of many."""
+"""The outcome of one extreme, and tables of outcomes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ HEADER = ("extreme", "what happens", "frames", "bounded", "speed [m/s]", "off li
 
 @dataclass(frozen=True)
 class CaseMeasurement:
-    """What a case found: an extent where there was a rollout, an error and its unit, and words to add."""
+    """Figures of a case: an extent where there was a rollout, an error with its unit, and a note."""
 
     extent: Extent | None = None
     error: float | None = None
@@ -39,10 +39,10 @@ class CaseOutcome:
 
     Attributes:
         name, group: of the case.
-        verdict: what the product does; "breaks" is a fault.
-        said: the sentence of a refusal, or what there is to add.
+        verdict: what the product did; "breaks" is always a fault.
+        said: the sentence of a refusal, or a note.
         measured: figures; empty for a refusal.
-        seconds: that the case took.
+        seconds: duration of the case.
     """
 
     name: str
@@ -54,7 +54,7 @@ class CaseOutcome:
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> CaseOutcome:
-        """Return an outcome that was written as JSON, where None stands for what is not finite."""
+        """Return an outcome from its JSON document, in which None stands for values that are not finite."""
         found = dict(document["measured"])
         if found["extent"]:
             figures: dict[str, Any] = {k: nan if value is None else value for k, value in found["extent"].items()}

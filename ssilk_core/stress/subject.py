@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is put under stress: a trained garment on its character, a motion to begin from, and how much to try."""
+"""The subject of a stress test: a trained garment on its character, a base motion, and the effort to spend."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from .drives import ProceduralMotion, looped, sway
 
 @dataclass(frozen=True, kw_only=True)
 class Effort:
-    """How much is tried.
+    """How much each case tries.
 
     Attributes:
-        seconds: of motion in most cases.
-        frames: of the long cases, as a share of what they are called.
-        steps: of trial trainings; simulated: frames of trial simulations.
-        vertices: most that a trial garment may have.
+        seconds: length of the motion in most cases.
+        frames: share of the frames that long cases are named after.
+        steps: of trial trainings.
+        simulated: frames of trial simulations.
+        vertices: the most of a trial garment.
     """
 
     seconds: float = 20.0
@@ -39,7 +40,7 @@ QUICK = Effort(seconds=3.0, frames=0.1, steps=12, simulated=3, vertices=20_000)
 
 @dataclass(frozen=True, eq=False)
 class StressSubject:
-    """A model file, its scene with the bodies of the character, and a clip; none for a made-up motion."""
+    """A model file, its scene with the character's bodies, and a clip; without a clip the motion is made up."""
 
     file: ModelFile
     scene: Scene

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Short trials of training and simulation on a scene, and what single precision costs its energies."""
+"""Short trials of training and simulation on a scene, and the error of single precision in its energies."""
 
 from __future__ import annotations
 
@@ -25,15 +25,13 @@ from .drives import ProceduralMotion
 from .meter import Extent, ExtentMeter, extent, matrices_about_root
 
 SMALL = ModelConfig(latent=16, widths=(32, 32), shapes=8)
-WIGGLE = (
-    1e-3  # of the garment's size: by how much points are moved off linear blend skinning to have energies compared
-)
-ELASTIC = 1e4  # times its size: how far the softest fabric may hang, which is physics
+PERTURBATION = 1e-3  # of points, relative to the garment's size, where energies of two precisions are compared
+ELASTIC = 1e4  # garment sizes that the softest fabric may stretch, as physics has it
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What came of a short training: how far its rollout goes, steps that were undone, and precision's error."""
+    """The outcome of a short training: the extent of its rollout, undone steps, and the error of single precision."""
 
     extent: Extent
     undone: int
@@ -42,7 +40,7 @@ class Trial:
 
 
 def trained(scene: Scene, fabric: Fabric, drive: ProceduralMotion, steps: int, *, windows: int = 2) -> Trial:
-    """Train a small network for some steps, roll it over the same drive, and compare energies' precisions.
+    """Train a small network for some steps, roll it out over the same drive, and compare the energies' precisions.
 
     Raises:
         SsilkError: the scene, the fabric or the motion is refused.
@@ -85,17 +83,19 @@ def simulated(scene: Scene, fabric: Fabric, motion: Motion, gravity: float = GRA
 
 
 def gradient_error(scene: Scene, fabric: Fabric, motion: Motion) -> float:
-    """Return how far single precision is off in the force of stretch and bending, relative to it, in the norm.
+    """Return the relative error, in the norm, of the force of stretch and bending in single precision.
 
-    Forces are those on linear blend skinning in the first frame, its points moved at random by a thousandth of the
-    garment.
+    Forces are taken at linear blend skinning in the first frame, with points moved at random by a thousandth of the
+    garment's size.
     """
     matrices, _ = matrices_about_root(motion, scene)
     skin, rest = Skinning(scene.lbs_skin).double(), torch.tensor(scene.garment.mesh.points)
     x = skin(rest, None, skin.weights, matrices[..., :1])
     size = float((rest.amax(0) - rest.amin(0)).norm())
     free = torch.tensor(scene.classes != PINNED)[:, None, None]
-    x = x + WIGGLE * size * free * torch.randn(x.shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype)
+    x = x + PERTURBATION * size * free * torch.randn(
+        x.shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype
+    )
     exact, single = (_force(scene, fabric, x.to(dtype)).double() for dtype in (torch.float64, torch.float32))
     return float((single - exact).norm() / exact.norm().clamp_min(1e-300))
 

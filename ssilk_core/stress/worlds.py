@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenes that are larger, smaller, finer, coarser or worse meshed than the one they are made from."""
+"""Scenes made larger, smaller, finer, coarser or worse meshed."""
 
 from __future__ import annotations
 
@@ -54,9 +54,9 @@ def _scaled(mesh: Mesh, scale: float) -> Mesh:
 
 
 def pinched(scene: Scene, height: float, every: int = 100) -> Scene:
-    """Return a scene with one triangle in `every` made a sliver: so many times as high as its base is long.
+    """Return a scene in which one triangle of `every` is a sliver, `height` times as high as its base is long.
 
-    The tip of each is put beside the middle of the opposite edge; only tips that no other sliver uses are moved.
+    Its tip is moved next to the middle of the opposite edge. Slivers share no vertices.
     """
     mesh = scene.garment.mesh
     points, used = np.array(mesh.points), np.zeros(mesh.vertex_count, dtype=bool)
@@ -72,7 +72,7 @@ def pinched(scene: Scene, height: float, every: int = 100) -> Scene:
 
 
 def resized(scene: Scene, count: int) -> Scene:
-    """Return a scene whose garment has about `count` vertices: a patch of it, subdivided as often as that takes."""
+    """Return a scene whose garment has about `count` vertices: a patch of it, subdivided as often as needed."""
     skin, rig, faces = scene.lbs_skin, scene.rig.skin, scene.garment.mesh.faces
     lbs, whole = skin.dense(scene.character.skeleton.joint_count), rig.dense(len(scene.joint_names))
     cloth = Cloth(scene.garment.mesh.points, lbs, whole, scene.classes)
@@ -82,7 +82,7 @@ def resized(scene: Scene, count: int) -> Scene:
 
 
 def _subdivided(cloth: Cloth, faces: Ints) -> tuple[Cloth, Ints]:
-    """Split every triangle in four; new vertices lie between old ones, and are as loose as the looser."""
+    """Split every triangle in four; a new vertex is the mean of two, and as loose as the looser of them."""
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     pairs, index = np.unique(edges, axis=0, return_inverse=True)
     ab, bc, ca = (index.reshape(-1, 3) + len(cloth.points)).T
@@ -98,7 +98,7 @@ def _subdivided(cloth: Cloth, faces: Ints) -> tuple[Cloth, Ints]:
 
 
 def _patch(cloth: Cloth, faces: Ints, count: int) -> tuple[Cloth, Ints]:
-    """Keep the faces nearest to where held cloth turns loose, as many as have `count` vertices."""
+    """Keep the faces nearest to the border of loose cloth, as many as have `count` vertices."""
     points, classes = cloth.points, cloth.classes
     mixed = faces[np.ptp(classes[faces], axis=1) > 0]
     seed = points[mixed[0, 0] if len(mixed) else faces[0, 0]]

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The trade of speed and size for accuracy, measured."""
+"""Measuring the trade of speed and size for accuracy."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What it costs to tell collisions, with the body as a surface or as points, whole or thinned out.
+"""The cost of detecting collisions with the body as a surface or as points, all of them or a subset.
 
-Playing needs no body at all: this is what training, refining and measuring pay.
+Training, refining and measuring pay it; playing needs no body.
 """
 
 from __future__ import annotations
@@ -17,17 +17,18 @@ from ..collision.contacts import Contacts
 from ..evaluation.methods import EvaluationScene, Method, TakeSet
 
 BODIES = (("triangles", True, 1), ("vertices", False, 1), ("every 4th vertex", False, 4))
-FRAMES = 64  # that are judged
+FRAMES = 64  # that are measured
 
 
 @dataclass(frozen=True)
 class Judged:
-    """Collisions as one body has them.
+    """Collisions with one representation of the body.
 
     Attributes:
-        body: what the nearest point is looked for on; vertices: of it.
-        milliseconds: of a frame, to pose the body and find the garment's distances from it.
-        collision: energy [J], of tight vertices with the part of the body that they lie over.
+        body: name of the representation.
+        vertices: of the body.
+        milliseconds: of a frame, to pose the body and compute the garment's distances from it.
+        collision: energy [J]; tight vertices collide with the part of the body under them.
         inside: share of the garment's vertices inside any part of the body.
     """
 
@@ -40,7 +41,7 @@ class Judged:
 
 @torch.no_grad()
 def judged(dressed: EvaluationScene, reel: TakeSet, method: Method) -> list[Judged]:
-    """Judge the first frames of the first take with each body."""
+    """Measure the first frames of the first take with each representation of the body."""
     frames = range(min(FRAMES, reel.takes[0].frame_count))
     x, character = method.vertices(0, frames), reel.character(0, frames)
     whole, joints = dressed.scene.character.merged_body(), dressed.scene.character.skeleton.joint_count

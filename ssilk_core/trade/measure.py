@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measure variants of a model: what they cost, and what they do to the garment."""
+"""Measure variants of a model: their costs, and their errors."""
 
 from __future__ import annotations
 
@@ -28,16 +28,17 @@ HALVES = ("float16", "bfloat16")  # two bytes on disk for each parameter
 
 
 Weigh = Callable[[ModelFile, float], ShotBytes]
-"""Tells how large shots of a model are at a frame rate."""
+"""Gives the size of a model's shots at a frame rate."""
 
 
 class VariantMeter:
     """Measures variants of one model on takes.
 
     Args:
-        name: of the model; reducer: cuts it; dressed, reel: what it is judged on.
-        weigh: tells how large its shots are.
-        reference: what energies are compared with; the model as trained without one.
+        name: of the model.
+        reducer: reduces it.
+        dressed, reel: the scene and the takes that it is measured on.
+        weigh: gives the size of its shots.
     """
 
     def __init__(
@@ -47,11 +48,10 @@ class VariantMeter:
         dressed: EvaluationScene,
         reel: TakeSet,
         weigh: Weigh,
-        reference: Method | None = None,
     ) -> None:
         self.name, self.reducer, self.dressed, self.reel, self.weigh = name, reducer, dressed, reel, weigh
         self.whole = Played(name, reducer.player, dressed, reel, fps=dressed.fps)
-        self.base = self._tally(reference or self.whole).totals().mean()
+        self.base = self._tally(self.whole).totals().mean()
         self._cut = lru_cache(1)(lambda size: reducer.reduced(size).file)
         self._torch = lru_cache(1)(self._torch_time)
 
@@ -87,7 +87,7 @@ class VariantMeter:
 
     @property
     def motion(self) -> Motion:
-        """What is timed."""
+        """The motion that is timed."""
         return self.reel.takes[0].motion
 
     def _tally(self, method: Method, truth: Method | None = None) -> Tally:
@@ -101,7 +101,7 @@ class VariantMeter:
         return play_time(method.player, resample(self.motion, variant.fps))
 
     def _torch_time(self, size: ModelSize) -> float:
-        """Return the milliseconds that a frame takes in PyTorch, of the second of two passes over a clip."""
+        """Return the time of a frame in PyTorch [ms], measured in the second of two passes over a clip."""
         model = network(self._cut(size)).to(self.dressed.device)
         for _ in range(2):
             begun = time.perf_counter()
@@ -117,7 +117,7 @@ class VariantMeter:
 
 
 def _bytes(file: ModelFile, precision: str) -> int:
-    """Return how large a model's file is in a precision."""
+    """Return the size of a model's file in a precision."""
     if precision in HALVES:
         parameters = {name: value.astype(np.float16) for name, value in file.parameters.items()}
         file = replace(file, parameters=parameters)

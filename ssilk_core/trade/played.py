@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Garments as they are played, for the evaluation: at any frame rate, refined or not."""
+"""Garments as readers play them, for the evaluation: at any frame rate, refined or not."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class Played:
     """A `Method` of the evaluation: a garment over takes, as a reader of its shot shows it.
 
     Args:
-        fps: of the shot. Between its frames poses of garment and character are interpolated, as USD does.
-        refine: solver iterations in each frame; none for zero.
+        fps: of the shot. Poses of garment and character are interpolated between its frames, as USD does.
+        refine: solver iterations in each frame; 0 leaves the solver out.
     """
 
     def __init__(
@@ -36,7 +36,7 @@ class Played:
     ) -> None:
         self.name, self.player, self.dressed, self.reel, self.fps = name, player, dressed, reel, fps
         self.options = RefineOptions(iterations=refine) if refine else None
-        self.milliseconds: list[float] = []  # that a frame of each take took, as far as they were asked for
+        self.milliseconds: list[float] = []  # of a frame, for each take that was computed
         self._points = lru_cache(1)(self._take)
 
     def vertices(self, take: int, frames: range) -> Tensor:
@@ -45,7 +45,7 @@ class Played:
         return torch.as_tensor(points.transpose(1, 2, 0).copy(), dtype=torch.float32, device=self.dressed.device)
 
     def still(self, take: int, frames: range) -> None:
-        """Return nothing: it is how shots move that is compared."""
+        """Return None: only moving shots are compared."""
 
     def _take(self, take: int) -> Floats:
         """Return all frames of a take, shape (N, V, 3)."""
@@ -55,7 +55,7 @@ class Played:
         return points - motion.translations[0, 0]
 
     def _finished(self, motion: Motion) -> Floats:
-        """Return the vertices at the frames of a motion [m], refined where that is asked for, shape (N, V, 3)."""
+        """Return the vertices at the frames of a motion [m], refined if asked for, shape (N, V, 3)."""
         points, dressed = self.shown(motion), self.dressed
         if self.options is None:
             return points
@@ -63,7 +63,7 @@ class Played:
         return np.stack([frame.points for frame in refiner.frames(motion, points)])
 
     def shown(self, motion: Motion) -> Floats:
-        """Return the vertices at the frames of a motion as the network gives them [m], shape (N, V, 3)."""
+        """Return the vertices at the frames of a motion before refinement [m], shape (N, V, 3)."""
         if abs(self.fps - motion.fps) < 1e-6:
             playback = self.player.play(motion)
             return np.stack([playback.vertices(frame) for frame in range(motion.frame_count)])

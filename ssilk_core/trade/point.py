@@ -1,26 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What was measured of one variant, and which variants no other beats."""
+"""The measurements of one variant, and the front of variants that no other beats."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-SECONDS = 10  # of the shots whose bytes are compared
+SECONDS = 10  # length of the shots whose sizes are compared
 
 
 @dataclass(frozen=True, kw_only=True)
 class TradePoint:
-    """One variant of one model; SI units but for times.
+    """One variant of one model, in SI units except for times.
 
     Attributes:
-        model, swept, variant: the model's name, what was tried, and its name.
+        model, swept, variant: names of the model, of the sweep, and of the variant.
         shapes, joints, influences, precision, fps, refine: as in `variants.Variant`.
-        milliseconds, high: of a frame of the shot on the processor, numpy runtime: median and 95 % quantile.
-        torch: milliseconds of a frame of the network and decoder in PyTorch, on the device; None if not measured.
-        operations: multiply-adds of a frame; memory: bytes held.
-        model_bytes: of the model's file; shot_bytes: of a shot of `SECONDS`, garment and skeleton.
-        total: the paper's L_tot [J]; excess: over what it is compared with [J].
+        milliseconds, high: median and 95 % quantile of a frame's time in the numpy runtime, on the processor.
+        torch: time of a frame of network and decoder in PyTorch, on the device [ms]; None if not measured.
+        operations: multiply-adds of a frame.
+        memory: bytes that playing holds.
+        model_bytes: size of the model's file.
+        shot_bytes: size of a shot of `SECONDS`, garment and skeleton.
+        total: the paper's L_tot [J].
+        excess: over the model as trained [J].
         collisions: share of the vertices inside the body.
         position, velocity: RMS errors against the whole model [m], [m/s].
     """

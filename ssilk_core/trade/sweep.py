@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A sweep over variants of models that can stop at any time and go on where it stopped."""
+"""A sweep over variants of models that can be interrupted and continued."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from .variants import Variant
 
 @dataclass
 class Results:
-    """Points in a file, which is whole after each of them.
+    """Points of a sweep, written to a file after each of them.
 
     Attributes:
-        path: where they are kept, or None.
-        asked: what was measured on what; points of another question do not count.
-        judging: what telling collisions costs, on the first model.
+        path: the file, or None.
+        asked: what was measured on what; points of a file with another value are not used.
+        judging: costs of detecting collisions, for the first model.
     """
 
     path: Path | None
@@ -34,7 +34,7 @@ class Results:
     points: list[TradePoint] = field(default_factory=list)
 
     def resume(self, report: Reporter) -> None:
-        """Take over what an earlier run with the same question has measured."""
+        """Read the points that an earlier run of the same sweep has measured."""
         if self.path is None or not self.path.exists():
             return
         try:
@@ -42,17 +42,17 @@ class Results:
             points = [TradePoint(**point) for point in document["points"]]
             same = document["asked"] == json.loads(json.dumps(self.asked))
         except (ValueError, TypeError, KeyError) as error:
-            raise SsilkError(f"{self.path}: these are no figures of a trade ({error}); name another file.") from error
+            raise SsilkError(f"{self.path}: not figures of 'ssilk trade' ({error}); name another file.") from error
         self.points = points if same else []
         if self.points:
-            report(Message(f"{len(self.points)} variants were measured before, and are kept"))
+            report(Message(f"{len(self.points)} variants were measured before and are kept"))
 
     def found(self, model: str, variant: Variant) -> bool:
         """Return whether a variant was measured."""
         return any((p.model, p.swept, p.variant) == (model, variant.swept, variant.name) for p in self.points)
 
     def add(self, point: TradePoint) -> None:
-        """Keep a point."""
+        """Add a point and write the file."""
         self.points.append(point)
         if self.path is not None:
             document = {
@@ -66,7 +66,7 @@ class Results:
 
 
 def sweep(meter: VariantMeter, variants: Iterable[Variant], results: Results, report: Reporter = silent) -> None:
-    """Measure a model's variants but for those that were measured before, and keep each as it comes."""
+    """Measure the variants of a model that `results` lacks, and add each when it is measured."""
     tried = list(variants)
     for done, variant in enumerate(tried):
         report(Progress(done, len(tried)))

@@ -16,14 +16,14 @@ MARKS = {"milliseconds": "time", "shot_bytes": "shot", "model_bytes": "model"}
 
 
 def table(points: Sequence[TradePoint]) -> str:
-    """Return a line for each point; "best at" says for which costs no other is nearer to the whole model."""
+    """Return a line for each point; "best at" names the costs at which no other is nearer to the whole model."""
     best = {mark: front([(getattr(p, cost), p.position) for p in points]) for cost, mark in MARKS.items()}
     rows = [_cells(point, [mark for mark, own in best.items() if row in own]) for row, point in enumerate(points)]
     return aligned(HEADER, rows, 3)
 
 
 def judging_table(found: Sequence[Judged]) -> str:
-    """Return a line for each body that collisions were told with."""
+    """Return a line for each representation of the body."""
     header = ("collisions with", "vertices", "ms a frame", "collision [J]", "inside")
     rows = [
         [j.body, f"{j.vertices:,}", f"{j.milliseconds:.3g}", f"{j.collision:.3g}", f"{j.inside:.2%}"] for j in found

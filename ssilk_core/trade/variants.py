@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a sweep tries: one thing changed at a time, and the quality levels, which change several."""
+"""The variants that a sweep tries: one change at a time, and the quality levels, which change several things."""
 
 from __future__ import annotations
 
@@ -56,11 +56,12 @@ class Variant:
 
 
 def variants(whole: ModelSize, fps: float, *, refined: bool = True) -> Iterator[Variant]:
-    """Yield the whole model first, then what each sweep tries, then the quality levels.
+    """Yield the whole model, then the variants of each sweep, then the quality levels.
 
     Args:
-        whole: what the model has; fps: at which it steps.
-        refined: try the solver too, which takes a thousand times as long as all else.
+        whole: size of the model.
+        fps: frame rate of the model.
+        refined: include the solver, which takes a thousand times as long as everything else.
     """
     base = Variant(swept=WHOLE, name=WHOLE, size=whole, fps=fps)
     yield base

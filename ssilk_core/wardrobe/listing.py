@@ -14,13 +14,13 @@ from ..config import PRESETS
 from ..errors import fail
 from ..fabrics import FABRICS
 
-DEFAULTS = "defaults"  # the table whose keys hold for every garment that does not say otherwise
-TABLES = ("material", "set")  # keys whose values are joined with those of the defaults
+DEFAULTS = "defaults"  # the table whose keys every garment inherits
+TABLES = ("material", "set")  # keys whose values are merged with those of the defaults
 
 
 @dataclass(frozen=True)
 class WardrobeEntry:
-    """A garment of a list: its name, and the words after 'ssilk train' that say what is trained."""
+    """A garment of a list: its name, and its arguments for 'ssilk train'."""
 
     name: str
     words: tuple[str, ...]
@@ -28,7 +28,7 @@ class WardrobeEntry:
 
 @dataclass(frozen=True)
 class Key:
-    """What a key may hold, and how that is said to 'ssilk train'; the option "" stands for a plain argument."""
+    """The values that a key may have, and its option of 'ssilk train'; "" stands for a positional argument."""
 
     option: str
     fits: Callable[[Any], bool]
@@ -41,10 +41,6 @@ def _is_text(value: Any) -> bool:
 
 def _is_texts(value: Any) -> bool:
     return _is_text(value) or (isinstance(value, list) and value != [] and all(map(_is_text, value)))
-
-
-def _is_whole(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
 
 
 def _is_scalars(value: Any) -> bool:
@@ -60,7 +56,6 @@ KEYS = {
     "fabric": Key("--fabric", lambda value: value in [*FABRICS], f"one of {', '.join(FABRICS)}"),
     "material": Key("--material", _is_scalars, "a table of values, like { drag = 0.3 },"),
     "set": Key("--set", _is_scalars, "a table of values, like { iterations = 20000 },"),
-    "seed": Key("--seed", _is_whole, "a whole number"),
 }
 NEEDED = ("stage", "motions")
 
@@ -69,7 +64,7 @@ def read_list(path: Path) -> list[WardrobeEntry]:
     """Return the garments of a list in its order; paths in it are relative to its folder.
 
     Raises:
-        SsilkError: the file is missing or no TOML, or an entry says what cannot be.
+        SsilkError: the file is missing or not TOML, or an entry is wrong.
     """
     if not path.is_file():
         fail(str(path), "there is no such file", "a TOML file with one table for each garment is needed")
@@ -81,16 +76,16 @@ def read_list(path: Path) -> list[WardrobeEntry]:
         _need_table(path, name, table)
     defaults = tables.pop(DEFAULTS, {})
     if not tables:
-        fail(str(path), "it names no garment", "a list holds one table for each garment", "add [name]")
+        fail(str(path), "no garment in it", "a list holds one table for each garment", "add [name]")
     return [WardrobeEntry(name, _words(path, name, _joined(defaults, table))) for name, table in tables.items()]
 
 
 def _need_table(path: Path, name: str, table: Any) -> None:
-    """Raise `SsilkError` unless a name is fit for files and its table holds known keys with values of their kinds."""
+    """Raise `SsilkError` unless a name suits files and its table holds known keys with values of their types."""
     if not isinstance(table, dict):
         fail(
             f"{path}: key '{name}'",
-            "it stands in no table",
+            "it belongs to no table",
             f"each key belongs to [{DEFAULTS}] or to the table of a garment",
         )
     if not re.fullmatch(r"\w[\w.-]*", name):
@@ -115,7 +110,7 @@ def _joined(defaults: dict[str, Any], table: dict[str, Any]) -> dict[str, Any]:
 def _words(path: Path, name: str, table: dict[str, Any]) -> tuple[str, ...]:
     for key in NEEDED:
         if key not in table:
-            fail(f"{path}: table '{name}', key '{key}'", "missing", f"it stands here or in [{DEFAULTS}]")
+            fail(f"{path}: table '{name}', key '{key}'", "missing", f"it is needed here or in [{DEFAULTS}]")
     said = [(key.option, table[name]) for name, key in KEYS.items() if name in table]
     return tuple(word for option, value in said for word in _option(option, value))
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Showing several trainings at once: a line for each that renews itself, or plain lines, and a table at the end."""
+"""Showing several trainings at once: one line for each that is redrawn, or plain lines, and a final table."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from typing import TextIO
 
 from ..events import Event, GarmentEvent, Progress, Result, Said, describe, describe_progress, format_seconds
 
-RENEWED = 0.1  # seconds between two renewals of the lines
-TOLD = 60.0  # seconds between two plain lines about the progress of one garment
+REDRAW = 0.1  # seconds between two drawings of the lines
+REPEAT = 60.0  # seconds between two plain lines about the progress of one garment
 
 
 class ProgressTable:
-    """A reporter with one line for each garment on a terminal that has room for them; elsewhere plain lines."""
+    """A reporter with one line for each garment on a terminal with enough rows, and plain lines elsewhere."""
 
     def __init__(self, names: Sequence[str], stream: TextIO | None = None) -> None:
         self.stream = stream or sys.stderr
@@ -36,9 +36,9 @@ class ProgressTable:
         text = describe_progress(said) if isinstance(said, Progress) else describe(said)
         if self.live:
             self.lines[name] = text or self.lines[name]
-            if self._is_due("", RENEWED) or not isinstance(said, Progress):
+            if self._is_due("", REDRAW) or not isinstance(said, Progress):
                 self.draw()
-        elif text and (not isinstance(said, Progress) or self._is_due(name, TOLD)):
+        elif text and (not isinstance(said, Progress) or self._is_due(name, REPEAT)):
             self._print(f"{name}: {text}")
 
     def _is_due(self, what: str, seconds: float) -> bool:
@@ -53,7 +53,7 @@ class ProgressTable:
         self._drawn = False
 
     def draw(self) -> None:
-        """Draw the lines, over those that were drawn before."""
+        """Draw the lines over the last drawing."""
         width = max(map(len, self.lines))
         rows = (f"{name:<{width}}  {text}"[: self.columns - 1] for name, text in self.lines.items())
         up = f"\x1b[{len(self.lines)}A" if self._drawn else ""
@@ -64,7 +64,7 @@ class ProgressTable:
 def table(rows: Sequence[Mapping[str, object]]) -> str:
     """Return rows with the same keys as aligned columns: the first and the last to the left, the others to the right.
 
-    The column "time" is in seconds; nothing is shown for None.
+    The column "time" is in seconds; None is shown as an empty cell.
     """
     cells = [[*rows[0]], *([_cell(name, value) for name, value in row.items()] for row in rows)]
     widths = [max(map(len, column)) for column in zip(*cells)]

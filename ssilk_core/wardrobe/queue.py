@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trainings side by side, each a process of its own, one at a time in each slot."""
+"""Commands side by side, each a process of its own, one at a time in each slot."""
 
 from __future__ import annotations
 
@@ -10,19 +10,23 @@ import subprocess
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from ..events import Failed, Result, Said, read_event
 
-Slot = Mapping[str, str]  # environment variables that give a training its device
+Slot = Mapping[str, str]  # environment variables that give a task its device
+Take = Callable[[], "CommandTask | None"]
 LOOK = 0.2  # seconds between two looks at whether to stop
 
 
 @dataclass(frozen=True)
 class CommandTask:
-    """A command that prints events as JSON lines, the folder to run it in, and the log that it is written to."""
+    """A command, the folder to run it in, and the log of all that it prints.
+
+    Lines that it prints are events as `events.JsonReporter` writes them; other lines go to the log alone.
+    """
 
     name: str
     command: Sequence[str]
@@ -32,7 +36,7 @@ class CommandTask:
 
 @dataclass(frozen=True)
 class End:
-    """How a task ended: its exit code (negative for a signal), the time it took [s], and its last result."""
+    """How a task ended: its exit code (negative for a signal), its time [s], and the last `Result` it reported."""
 
     code: int
     seconds: float
@@ -61,11 +65,11 @@ class _Running:
 
 
 class Queue:
-    """Runs tasks in their order, as many at once as there are slots.
+    """Runs tasks, as many at once as there are slots.
 
     Args:
-        tell: given each event of a task after the task's name; one that dies without a word gets a `Failed`.
-        ended: given how each task ended.
+        tell: called with a task's name and each of its events; a task that dies without a `Failed` is given one.
+        ended: called with a task's name and how it ended.
     """
 
     def __init__(
@@ -75,15 +79,19 @@ class Queue:
         self._running: dict[str, _Running] = {}
         self._heard: queue.Queue[tuple[str, Said | None]] = queue.Queue()
 
-    def run(self, tasks: Iterable[CommandTask], stop: threading.Event) -> None:
-        """Run all tasks, each taken when a slot is free; once `stop` is set, ask those that run to stop, and end.
+    def run(self, take: Take, stop: threading.Event) -> None:
+        """Run tasks until none is left.
 
-        Whatever else ends this call, a second interrupt above all, ends them at once.
+        Whatever else ends this call, such as a second interrupt, kills the tasks that run.
+
+        Args:
+            take: returns the next task, or None where none can begin now. It is called whenever a slot is free, and
+                again after each event, as long as any task runs.
+            stop: once it is set, no task begins, and those that run are asked to stop.
         """
-        waiting = iter(tasks)
         try:
             while True:
-                while self._free and not stop.is_set() and (task := next(waiting, None)):
+                while self._free and not stop.is_set() and (task := take()):
                     self._start(task)
                 if not self._running:
                     return
@@ -140,6 +148,6 @@ class Queue:
         code, task = running.process.wait(), running.task
         if code and not running.explained and not running.stopping:
             how = f"signal {-code}" if code < 0 else f"exit code {code}"
-            self.tell(task.name, Failed(f"{task.log}: the training ended by {how}; its last lines say more."))
+            self.tell(task.name, Failed(f"{task.log}: it ended by {how}; the last lines of this log say more."))
         self._free.append(running.slot)
         self.ended(task.name, End(code, time.monotonic() - running.began, running.result))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One garment of a list among the files of its folder: what there is to do, and how it went."""
+"""The training of one garment of a list: what is left to do, and how it ended."""
 
 from __future__ import annotations
 
@@ -8,36 +8,38 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..errors import EXIT_INTERNAL, EXIT_INTERRUPTED, EXIT_OK
+from ..files import sha256
+from ..work_record import WorkRecord, read_record, write_record
 from .listing import WardrobeEntry
 from .queue import CommandTask, End
-from .record import TrainingRecord, load_record, save_record
 
 COLUMNS = ("garment", "iterations", "total [J]", "lower by", "collisions", "time", "state")
 
 
 class GarmentTraining:
-    """One garment of a list.
+    """The training of one garment, with its model, state, log and record in a folder.
 
     Attributes:
-        state: "waiting", "training", "finished", "stopped" or "failed".
-        code: exit code of its training; that of an interrupt where it was not begun.
+        state: "waiting", "finished", "stopped" or "failed".
+        code: exit code of the training; that of an interrupt where it did not begin.
         error: why it failed.
-        plan: what is done about it, in words; nothing where it just waits.
+        plan: a sentence about what happens to it; empty for a training that begins from nothing.
     """
 
     def __init__(self, entry: WardrobeEntry, folder: Path, request: str) -> None:
         self.entry, self.folder = entry, folder
-        before = load_record(self._file(".json"))
-        same = before is not None and before.asked == request
-        self.record = before if before is not None and same else TrainingRecord(request)
-        finished = self.record.result is not None and self._file(".safetensors").exists()
+        before = read_record(self._file(".json"))
+        same = before is not None and before.key == request
+        self.record = before if before is not None and same else WorkRecord(key=request)
+        finished = self.record.is_done(folder)
         self.resumed = same and not finished and self._file(".resume.safetensors").exists()
         self.state, self.code = ("finished", EXIT_OK) if finished else ("waiting", EXIT_INTERRUPTED)
-        self.figures, self.error = self.record.result or {}, ""
+        self.seconds = float(self.record.detail.get("seconds", 0.0))
+        self.figures, self.error = self.record.detail["result"] if finished else {}, ""
         self.plan = (
             "finished before; skipped" if finished
-            else "goes on from where it stopped" if self.resumed
-            else "something else was asked before; trains anew" if before is not None and not same
+            else "resumes where it stopped" if self.resumed
+            else "its entry or inputs have changed; trains again" if before is not None and not same
             else ""
         )  # fmt: skip
 
@@ -45,9 +47,9 @@ class GarmentTraining:
         return self.folder / f"{self.entry.name}{suffix}"
 
     def begin(self, source: Path, device: str) -> CommandTask:
-        """Return the training as a task, run in the folder `source` that the list's paths are relative to."""
+        """Return the training as a task that runs in `source`, the folder that the list's paths are relative to."""
         model, log = self._file(".safetensors").absolute(), self._file(".log")
-        save_record(self._file(".json"), replace(self.record, result=None))
+        write_record(self._file(".json"), replace(self.record, files={}))
         if not self.resumed:
             for old in (log, self._file(".resume.safetensors")):
                 old.unlink(missing_ok=True)
@@ -55,17 +57,20 @@ class GarmentTraining:
         return CommandTask(self.entry.name, [sys.executable, "-m", "ssilk_core", "train", *words], source, log)
 
     def end(self, end: End) -> None:
-        """Take note of how it ended."""
+        """Record how it ended."""
         self.code = end.code if end.code >= 0 else EXIT_INTERNAL
         self.state = {EXIT_OK: "finished", EXIT_INTERRUPTED: "stopped"}.get(end.code, "failed")
         self.figures = {} if end.result is None else end.result.detail
-        result = self.figures if self.state == "finished" else None
-        self.record = replace(self.record, seconds=self.record.seconds + end.seconds, result=result)
-        save_record(self._file(".json"), self.record)
+        self.seconds += end.seconds
+        model = self._file(".safetensors")
+        files = {model.name: sha256(model)} if self.state == "finished" else {}
+        detail = {"seconds": self.seconds, "result": self.figures}
+        self.record = WorkRecord(key=self.record.key, files=files, detail=detail)
+        write_record(self._file(".json"), self.record)
 
     def row(self) -> dict[str, object]:
-        """Return what is said of it at the end, by the names in `COLUMNS`; the time is in seconds."""
+        """Return its line of the final table, by the names in `COLUMNS`; the time is in seconds."""
         found = self.figures
         lower = found.get("lower by") or (f"-{found['higher by']}" if "higher by" in found else None)
         figures = [found.get("iterations"), found.get("total [J]"), lower, found.get("collisions")]
-        return dict(zip(COLUMNS, [self.entry.name, *figures, round(self.record.seconds, 1), self.state]))
+        return dict(zip(COLUMNS, [self.entry.name, *figures, round(self.seconds, 1), self.state]))

@@ -62,6 +62,12 @@ def test_line_breaks_within_an_event_do_not_break_its_line():
     assert lines(Failed("one\ntwo"))[0]["error"] == "one\ntwo"
 
 
+def test_an_event_of_one_of_several_is_named():
+    (found,) = lines(events.GarmentEvent("cape", Progress(1, 2, None, {"stretch": float("inf")})))
+    said = {"event": "progress", "done": 1, "total": 2, "seconds_left": None, "terms": {"stretch": None}}
+    assert found == {"event": "garment", "name": "cape", "said": said}
+
+
 def test_text_for_people():
     assert describe(EVERY[0]) == "train ..."
     assert describe(Message("careful", "warning")) == "warning: careful"

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-HEAVY = ("torch", "pxr", "igl", "scipy", "trimesh", "PIL", "embreex", "imageio_ffmpeg", "anny", "bpy", "triton")
+HEAVY = ("torch", "pxr", "igl", "scipy", "trimesh", "PIL", "embreex", "imageio_ffmpeg", "anny", "bpy", "triton",
+         "matplotlib")  # fmt: skip
 ROOT = Path(__file__).parents[2]
 CORE, USD = ROOT / "ssilk_core", ROOT / "usd" / "ssilk_usd"
 
@@ -20,7 +21,7 @@ LAYERS = (
     {"errors"},
     {"schemes"},
     {"assets", "config", "devices", "fabrics", "events", "files", "packing", "tensors"},
-    {"mesh", "kinematics", "kernels", "descriptors", "parameters", "sampling", "targets"},
+    {"mesh", "kinematics", "kernels", "descriptors", "parameters", "sampling", "targets", "charts", "work_record"},
     {"model", "energy"},
     {"checkpoint"},
     {"demo", "view", "simulate", "training", "rollout", "preflight", "setup", "wardrobe", "runtime", "farm"},

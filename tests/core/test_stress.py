@@ -139,12 +139,12 @@ def test_stopped_contorted_and_broken_motions_are_what_they_say(scene, base):
 # What is measured
 
 
-def test_a_garment_on_plain_skinning_is_nowhere_else_and_moves_as_it_does(scene, base):
+def test_a_garment_on_linear_blend_skinning_is_nowhere_else_and_moves_as_it_does(scene, base):
     """Pinned to a root that spins, a vertex at a distance r from the axis moves at r w."""
     held = drives.turned(drives.stopping(base, 0.0), scene.character.skeleton, drives.about((0, 1, 0), speed=6.0))
     motion = held.motion(0, 20)
     matrices, origin = meter.matrices_about_root(motion, scene)
-    tool = meter.Meter(scene, FABRIC, 30.0, [range(1, 5), range(10, 20)])
+    tool = meter.ExtentMeter(scene, FABRIC, 30.0, [range(1, 5), range(10, 20)])
     lbs = tool.skin(tool.rest, None, tool.skin.weights, matrices).permute(2, 0, 1).numpy() + origin
     tool.add(motion, lbs)
     radius = np.linalg.norm((lbs - origin)[0][:, [0, 2]], axis=1).max()
@@ -197,7 +197,7 @@ def test_a_larger_scene_is_the_same_but_larger(scene, base, scale):
     assert worlds.garment_size(large) == pytest.approx(scale * worlds.garment_size(scene))
     pair = []
     for world, drive in ((scene, base), (large, drives.enlarged(base, scale))):
-        tool = meter.Meter(world, FABRIC, 30.0)
+        tool = meter.ExtentMeter(world, FABRIC, 30.0)
         pair.append(
             tool.skin(tool.rest, None, tool.skin.weights, meter.matrices_about_root(drive.motion(0, 3), world)[0])
         )
@@ -225,7 +225,7 @@ def test_slivers_are_as_high_as_asked(scene, height):
 
 def stretched(world: Scene, motion: Motion) -> float:
     """Stretch energy of linear blend skinning whose points are moved at random by a millimetre."""
-    tool = meter.Meter(world, FABRIC, 30.0)
+    tool = meter.ExtentMeter(world, FABRIC, 30.0)
     x = tool.skin(tool.rest, None, tool.skin.weights, meter.matrices_about_root(motion, world)[0])
     noise = torch.randn(x.shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype)
     return float(tool.energy.stretch(x + 1e-3 * noise))

@@ -20,7 +20,7 @@ from ssilk_core.cli import main
 JOINTS = ("Hips", "Hips/Spine", "Hips/Spine/Head")
 HEIGHTS = (0.8, 1.2, 1.5)  # of the joints [m]
 TRAINING = shlex.split(
-    "--preset draft --device cpu --proxies 4 --set latent=8 --set widths=16 --set shapes=4 --set iterations=6 "
+    "--preset draft --device cpu --set latent=8 --set widths=16 --set shapes=4 --set iterations=6 "
     "--set static_fraction=0.5 --set batch=2 --set pretraining_batch=4 --set window=4 --set validate_every=3 "
     "--set valid_frames=8"
 )

@@ -55,7 +55,7 @@ def brief(monkeypatch: pytest.MonkeyPatch) -> None:
 def rigged(garment: str, folder: Path) -> Scene:
     """Return the scene of the stage that the demo's own command rigs."""
     write_garment(folder / "wardrobe" / f"{garment}.usdc", wardrobe()[garment].mesh)
-    chosen = Namespace(out=folder, garment=garment, preset="draft", settings=[])
+    chosen = Namespace(output=folder, garment=garment, settings=[])
     rig = demo._trained(chosen)[0]
     assert rig[0] == "rig" and main(rig) == 0
     return load_scene(parser().parse_args(["rig", rig[-1], "-o", "unused"]), silent)
@@ -107,7 +107,7 @@ def typed(said: str) -> list[list[str]]:
 
 @pytest.mark.usefixtures("brief")
 def test_the_shipped_model_is_filmed_without_any_training(tmp_path, capsys):
-    assert main(["demo", "--pretrained", "--out", str(tmp_path)]) == 0
+    assert main(["demo", "--pretrained", "-o", str(tmp_path)]) == 0
     said = capsys.readouterr().err
     assert [command[0] for command in typed(said)] == ["bake", "bake", "view", "view"]
     made = load_model(shipped.shipped_path("cape")).provenance
@@ -119,7 +119,7 @@ def test_the_shipped_model_is_filmed_without_any_training(tmp_path, capsys):
 
 @pytest.mark.usefixtures("brief")
 def test_the_draft_is_trained_and_filmed_beside_what_ships(tmp_path, capsys):
-    assert main(["demo", "--out", str(tmp_path), *SHORT]) == 0
+    assert main(["demo", "-o", str(tmp_path), *SHORT]) == 0
     commands = typed(capsys.readouterr().err)
     assert [command[0] for command in commands[4:]] == ["rig", "train", "bake", "view", "view"]
     names = ("plain.usdc", "cape_draft.usdc", "cape_shipped.usdc")
@@ -156,7 +156,7 @@ def test_a_shipped_model_that_is_missing_or_of_another_garment_is_refused(
     monkeypatch.setattr(shipped, "FOLDER", tmp_path)
     if change:
         save_model(shipped.shipped_path("cape"), change(model))
-    assert main(["demo", "--pretrained", "--out", str(tmp_path / "out")]) == 2
+    assert main(["demo", "--pretrained", "-o", str(tmp_path / "out")]) == 2
     error = next(line for line in capsys.readouterr().err.splitlines() if line.startswith("error: "))
     assert words in error and str(tmp_path) in error and error.endswith(".")
     assert not (tmp_path / "out" / "shipped.mp4").exists()

@@ -405,11 +405,11 @@ OPTIONS = [
     Case("NaN rate", f"{TRAIN} --set learning_rate=nan", ("'learning_rate'", "nan", "between")),
     Case("infinite noise", f"{TRAIN} --set noise=inf", ("noise", "inf")),
     Case("negative rate", f"{TRAIN} --set learning_rate=-1", ("learning_rate", "-1")),
-    Case("huge seed", f"{TRAIN} --seed 99999999999999999999999", ("seed",)),
+    Case("huge seed", f"{TRAIN} --set seed=99999999999999999999999", ("seed",)),
     Case("unknown property of the fabric", f"{TRAIN} --material silkiness=1", ("silkiness", "density")),
     Case("negative density", f"{TRAIN} --material density=-1", ("density", "-1")),
-    Case("unknown threshold", f"{RIG} --classes magic=1", ("magic", "tight_distance")),
-    Case("negative threshold", f"{RIG} --classes tight_distance=-1", ("tight_distance", "negative")),
+    Case("negative distance", f"{RIG} --tight-distance -1", ("tight_distance", "negative")),
+    Case("no roots", f"{RIG} --roots 0", ("roots_per_cluster = 0", "at least 1")),
     Case("negative proxies", f"{RIG} --proxies -3", ("proxies = -3", "at least 0")),
     Case("no such device to train", f"{TRAIN} --device abacus", ("--device abacus", "'cpu'")),
     Case("no such device to bake", f"{BAKE} --device abacus", ("--device abacus", "'cpu'")),
@@ -424,7 +424,6 @@ OPTIONS = [
     Case("picture of no size", f"{VIEW} --size 0x0", ("0 x 0 pixels", "16")),
     Case("enormous picture", f"{VIEW} --size 999999x999999", ("999999 pixels", "8192")),
     Case("sheet without columns", f"{VIEW} --columns 0", ("columns", "at least 1")),
-    Case("no workers", f"{VIEW} --workers 0", ("workers = 0", "at least 1")),
     Case("view from nowhere", f"{VIEW} --azimuth nan", ("azimuth = nan", "finite")),
 ]
 

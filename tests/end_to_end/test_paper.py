@@ -38,13 +38,9 @@ def writing(paper, folder: Path, name: str, needs: tuple[str, ...] = (), code: s
 
 
 def run(paper, plan, jobs: list, until: float = 100.0, workers: int = 2):
-    queue = paper.Queue([job for job in jobs if not job.is_done], until)
-    threads = [threading.Thread(target=paper.work, args=(queue, plan, None)) for _ in range(workers)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(60)
-    return queue
+    backlog = paper.Backlog([job for job in jobs if not job.is_done], plan.folder, until)
+    paper.run(backlog, [None] * workers, threading.Event())
+    return backlog
 
 
 def test_a_job_waits_for_what_it_needs_even_if_that_fails(paper, plan, tmp_path, capfd):
@@ -53,8 +49,8 @@ def test_a_job_waits_for_what_it_needs_even_if_that_fails(paper, plan, tmp_path,
         writing(paper, tmp_path, "first", code="time.sleep(0.3)"),
         writing(paper, tmp_path, "broken", code="raise SystemExit('no luck')"),
     ]
-    queue = run(paper, plan, jobs)
-    assert queue.failed == ["broken"] and not queue.left
+    backlog = run(paper, plan, jobs)
+    assert backlog.failed == ["broken"] and not backlog.left
     assert float((tmp_path / "first").read_text()) < float((tmp_path / "last").read_text())
     assert "broken: FAILED with code 1" in (told := capfd.readouterr().out) and "no luck" in told
 
@@ -67,9 +63,9 @@ def test_what_is_done_is_not_done_again_and_what_takes_too_long_is_not_begun(pap
         writing(paper, tmp_path, "after", ("long",)),
         writing(paper, tmp_path, "short"),
     ]
-    queue = run(paper, plan, jobs)
+    backlog = run(paper, plan, jobs)
     assert (tmp_path / "old").read_text() == "old" and (tmp_path / "short").is_file()
-    assert [job.name for job in queue.left] == ["long", "after"] and not queue.failed
+    assert [job.name for job in backlog.left] == ["long", "after"] and not backlog.failed
 
 
 def test_every_command_is_understood_and_every_need_is_made(paper, plan):

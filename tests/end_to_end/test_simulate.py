@@ -99,8 +99,7 @@ def test_what_an_interrupted_simulation_finished_is_not_done_again(stage, monkey
     assert main(words) == 0 and asked == [2, 1]
     assert (stage / "caches" / "brief.usdc").stat().st_mtime_ns == written
     assert main(words) == 0 and asked == [2, 1] and "current: 2" in capsys.readouterr().err
-    assert main([*words, "--material", "density=0.2"]) == 0 and main([*words, "--again"]) == 0
-    assert asked == [2, 1, 2, 2]
+    assert main([*words, "--material", "density=0.2"]) == 0 and asked == [2, 1, 2]
 
 
 @pytest.mark.parametrize(
@@ -108,7 +107,6 @@ def test_what_an_interrupted_simulation_finished_is_not_done_again(stage, monkey
     [
         ("--motion brief.usda short.usda -o one.usdc", "one file for 2 motions"),
         ("--motion brief.usda ./brief.usda -o caches", "several files are called brief"),
-        ("--motion brief.usda -o one.usdc --substeps 0", "substeps = 0"),
         ("--motion brief.usda -o one.usdc --fps -3", "positive rate"),
         ("--motion brief.usda -o one.usdc --tolerance 0", "tolerance = 0"),
         ("--motion nowhere.usda -o one.usdc", "there is no such file"),

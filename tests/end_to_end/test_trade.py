@@ -50,19 +50,17 @@ def test_a_sweep_is_written_drawn_and_taken_up_again(world, capsys, no_clock):
     assert json.loads((world / "trade.json").read_text()) == document
 
 
-def test_models_are_put_on_one_table_and_judged_by_a_simulation(world, capsys, no_clock, monkeypatch):
+def test_models_are_put_on_one_table(world, capsys, no_clock, monkeypatch):
     monkeypatch.setattr("ssilk_core.trade.variants.SHAPES", (0.5,))
     for name in ("JOINTS", "INFLUENCES", "RATES"):
         monkeypatch.setattr(f"ssilk_core.trade.variants.{name}", ())
     shutil.copy("model.safetensors", "again.safetensors")
-    clip = "simulate rigged.usda --motion motions/short.usda -o simulated/short.usdc --tolerance 1"
-    assert run(clip) == 0
     command = TRADE.replace("trade model", "trade model.safetensors again", 1)
-    assert run(f"{command} --clips short --reference simulated --no-refine --json") == 0
+    assert run(f"{command} --clips short --no-refine --json") == 0
     points = json.loads(capsys.readouterr().out.splitlines()[-1])["detail"]["points"]
     first, second = ([p for p in points if p["model"] == name] for name in ("model", "again"))
     assert [p["total"] for p in first] == pytest.approx([p["total"] for p in second])
-    assert first[0]["excess"] > 0  # a few iterations of training are no match for a solver
+    assert first[0]["excess"] == 0
 
 
 @pytest.mark.parametrize(
@@ -71,8 +69,6 @@ def test_models_are_put_on_one_table_and_judged_by_a_simulation(world, capsys, n
         ("--clips nothing", "no clip is called nothing; it holds long, other, short and so on"),
         ("-o trade.txt", "it ends in .json"),
         ("-o model.json --stage nowhere.usda", "nowhere.usda: there is no such file"),
-        ("--clips long --reference motions", "no visible mesh"),
-        ("--clips long --reference nowhere", "nowhere: there is no such folder"),
         ("--motions clip.usda", "clip.usda: there is no such folder"),
     ],
 )

@@ -24,7 +24,6 @@ from ssilk_core.events import GarmentEvent, JsonReporter, Message, Progress, Sai
 from ssilk_core.wardrobe.listing import WardrobeEntry, read_list
 from ssilk_core.wardrobe.panel import ProgressTable, table
 from ssilk_core.wardrobe.queue import CommandTask, End, Queue
-from ssilk_core.wardrobe.record import request_hash
 from ssilk_core.wardrobe.training import GarmentTraining
 
 LIST = """
@@ -32,12 +31,19 @@ LIST = """
 stage = "rigged.usda"
 motions = ["clip.usda"]
 preset = "draft"
-set = { latent = 8, widths = [16], shapes = 4, iterations = 240, static_fraction = 0.5, batch = 2,
-        pretraining_batch = 4, window = 4 }
+
+[defaults.set]
+latent = 8
+widths = [16]
+shapes = 4
+iterations = 240
+static_fraction = 0.5
+batch = 2
+pretraining_batch = 4
+window = 4
 
 [skirt]
-seed = 3
-set = { valid_frames = 8 }
+set = { valid_frames = 8, seed = 3 }
 
 [torn]
 motions = "torn.usda"
@@ -60,7 +66,7 @@ def test_a_garment_has_its_own_keys_and_the_defaults(tmp_path):
     )
     settings += "--set pretraining_batch=4 --set window=4"
     assert shlex.join(skirt.words) == (
-        f"rigged.usda --motions clip.usda --preset draft {settings} --set valid_frames=8 --seed 3"
+        f"rigged.usda --motions clip.usda --preset draft {settings} --set valid_frames=8 --set seed=3"
     )
     material = "--material drag=0.2 --material damp=true"
     assert shlex.join(torn.words) == (
@@ -70,14 +76,13 @@ def test_a_garment_has_its_own_keys_and_the_defaults(tmp_path):
 
 WRONG = {
     "no TOML": ("[cape", "list.toml: not a TOML file"),
-    "nothing": ("", "list.toml: it names no garment"),
-    "loose key": ("seed = 1\n[cape]", "key 'seed': it stands in no table; each key belongs to"),
+    "nothing": ("", "list.toml: no garment in it"),
+    "loose key": ('fabric = "silk"\n[cape]', "key 'fabric': it belongs to no table; each key belongs to"),
     "name": ('["../cape"]', "table '../cape': its name would be the name of files; letters"),
     "unknown": ("[cape]\nsteps = 3", "table 'cape', key 'steps': no such key; keys are stage, garment, motions"),
     "default": ("[defaults]\nstage = 3\n[cape]", "table 'defaults', key 'stage': 3; the path of a stage is needed"),
-    "missing": ('[cape]\nstage = "a"', "table 'cape', key 'motions': missing; it stands here or in"),
+    "missing": ('[cape]\nstage = "a"', "table 'cape', key 'motions': missing; it is needed here or in"),
     "preset": ('[cape]\npreset = "fast"', "key 'preset': 'fast'; one of draft, preview, final is needed"),
-    "seed": ("[cape]\nseed = true", "key 'seed': True; a whole number is needed"),
     "set": ('[cape]\nset = "batch=3"', "key 'set': 'batch=3'; a table of values, like { iterations = 20000 }, is"),
     "motions": ("[cape]\nmotions = []", "key 'motions': []; a path or a list of paths is needed"),
 }
@@ -128,7 +133,8 @@ class Heard:
         self.said.append((name, event))
 
     def run(self, *tasks: CommandTask) -> dict[str, End]:
-        self.queue.run(iter(tasks), self.stop)
+        waiting = iter(tasks)
+        self.queue.run(lambda: next(waiting, None), self.stop)
         return self.ends
 
 
@@ -155,8 +161,21 @@ def test_a_failure_stops_no_other_and_a_death_without_a_word_is_explained(tmp_pa
     assert ends["good"].result.detail == {"iterations": 5}
     failures = [(name, event.error) for name, event in heard.said if type(event).__name__ == "Failed"]
     assert failures[0] == ("bad", "no cloth.") and len(failures) == 2
-    assert failures[1][1].endswith("killed.log: the training ended by signal 9; its last lines say more.")
+    assert failures[1][1].endswith("killed.log: it ended by signal 9; the last lines of this log say more.")
     assert "noise" in (tmp_path / "good.log").read_text()
+
+
+def test_a_task_that_cannot_begin_yet_is_taken_when_another_ends(tmp_path):
+    heard = Heard([{}, {}])
+    first, second = (task(tmp_path, name, "time.sleep(0.2)") for name in ("first", "second"))
+    waiting = [first, second]
+
+    def take() -> CommandTask | None:
+        ready = bool(waiting) and (waiting[0] is first or "first" in heard.ends)
+        return waiting.pop(0) if ready else None
+
+    heard.queue.run(take, heard.stop)
+    assert list(heard.ends) == ["first", "second"]
 
 
 GENTLE = """
@@ -214,26 +233,18 @@ def test_what_is_finished_is_skipped_unless_something_else_is_asked(tmp_path):
         "garment": "cape", "iterations": 5, "total [J]": None, "lower by": "-3.0%", "collisions": None,
         "time": 5.0, "state": "finished",
     }  # fmt: skip
+    model = tmp_path / "cape.safetensors"
+    model.write_bytes(b"another model")
+    assert GarmentTraining(entry, tmp_path, "request").state == "waiting"
     changed = GarmentTraining(entry, tmp_path, "another request")
-    assert changed.state == "waiting" and not changed.resumed and "something else" in changed.plan
+    assert changed.state == "waiting" and not changed.resumed and "have changed" in changed.plan
     changed.begin(tmp_path, "cpu")
     assert not (tmp_path / "cape.resume.safetensors").exists()  # it belongs to what was asked before
     changed.end(End(-9, 1.0, None))
     assert (changed.state, changed.code) == ("failed", 1)
     (tmp_path / "cape.json").write_text("{")
-    with pytest.raises(SsilkError, match=r"cape.json: the record of a training is damaged .*delete it"):
+    with pytest.raises(SsilkError, match=r"cape.json: this record of finished work is damaged .*delete it"):
         GarmentTraining(entry, tmp_path, "request")
-
-
-def test_a_request_changes_with_words_and_contents(tmp_path):
-    file = tmp_path / "a.usda"
-    file.write_text("one")
-    before = request_hash(["a"], [file])
-    assert request_hash(["b"], [file]) != before
-    moved = file.rename(tmp_path.joinpath("elsewhere").mkdir() or tmp_path / "elsewhere" / "a.usda")
-    assert request_hash(["a"], [moved]) == before
-    moved.write_text("two")
-    assert request_hash(["a"], [moved]) != before
 
 
 # --- what is shown ------------------------------------------------------------------------------------------------

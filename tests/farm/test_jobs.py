@@ -120,7 +120,7 @@ def test_a_record_tells_the_result_again_wherever_its_folder_goes(tmp_path):
 
 @pytest.mark.parametrize("text", [
     "", "{", "[]", '{"key": 1}', '{"key": "k", "files": 3}', "[" * 100_000,
-    '{"key": "k", "files": {}, "result": {"path": "anim.usdc", "frames": "9"}}',
+    '{"key": "k", "files": {}, "detail": {"path": "anim.usdc", "frames": "9"}}',
 ])  # fmt: skip
 def test_a_damaged_record_means_that_the_task_is_done_again(tmp_path, text):
     (tmp_path / RECORD).write_text(text)
