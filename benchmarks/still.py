@@ -39,7 +39,7 @@ def measure(subject: Subject, clip: str, stop: float, options: Any) -> dict[str,
     take, last = Take(clip, 0, motion), range(motion.frame_count - 1, motion.frame_count)
     reel = reel_of([take], dressed, subject.model.joints)
     network = Network("ssilk", subject.model, reel)
-    settings = SimulationOptions(fps=dressed.fps, rest=SolverOptions(iterations=options.iterations))
+    settings = SimulationOptions(fps=dressed.fps, quasi_static_solver=SolverOptions(iterations=options.iterations))
     simulator = Simulator(dressed.scene, dressed.fabric, settings, device=dressed.device)
     hold = held(dressed, reel, network, [first])[0]
     rest, still = (minima(simulator, [take], at(0, last)) for at in (network.vertices, network.still))

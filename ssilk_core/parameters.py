@@ -25,7 +25,7 @@ def parameter_shapes(scene: Scene, config: ModelConfig, joints: Ints) -> Shapes:
     static, dynamic = descriptor_sizes(scene, joints)
     seen, own, bias = SCHEMES[config.scheme]
     z, widths = config.latent, config.widths
-    reduced: Shapes = {"decoder.readout": (config.shapes, config.given), "decoder.offset": (free, 3)}
+    reduced: Shapes = {"decoder.readout": (config.shapes, config.activation_count), "decoder.offset": (free, 3)}
     return {
         "decoder.skin_offset": (free, scene.rig.skin.indices.shape[1]),
         "decoder.shapes": (free, 3, config.shapes),
@@ -33,7 +33,7 @@ def parameter_shapes(scene: Scene, config: ModelConfig, joints: Ints) -> Shapes:
         **{f"integrator.{name}": (z,) for name in own},
         **_layers("initialiser", (static, *widths, z)),
         **(_layers("stepper", (seen * z + static + dynamic, *widths, z), bias) if seen else {}),
-        **_layers("output", (z, *widths, config.given + 6 * proxies)),
+        **_layers("output", (z, *widths, config.activation_count + 6 * proxies)),
     }
 
 

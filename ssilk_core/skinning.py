@@ -16,17 +16,17 @@ from .assets import Ints, SkinWeights
 PARTS = 16  # programs that share the gradient of a joint's matrix, so that few joints fill a GPU too
 
 
-def blended(weights: Tensor, matrices: Tensor) -> Tensor:
+def blend_matrices(weights: Tensor, matrices: Tensor) -> Tensor:
     """Blend skinning matrices (J, 3, 4, N) by dense weights (V, J) to one for each vertex, (V, 3, 4, N)."""
     return (weights @ matrices.flatten(1)).reshape(-1, *matrices.shape[1:])
 
 
-def transformed(affine: Tensor, points: Tensor) -> Tensor:
+def transform_points(affine: Tensor, points: Tensor) -> Tensor:
     """Apply an affine transform (V, 3, 4, N) to each point (V, 3, N or 1); returns (V, 3, N)."""
-    return turned(affine, points) + affine[:, :, 3]
+    return transform_directions(affine, points) + affine[:, :, 3]
 
 
-def turned(affine: Tensor, directions: Tensor) -> Tensor:
+def transform_directions(affine: Tensor, directions: Tensor) -> Tensor:
     """Apply the linear part of an affine transform (V, 3, 4, N) to each direction (V, 3, N or 1)."""
     return (affine[:, :, :3] * directions[:, None]).sum(2)
 
@@ -87,7 +87,7 @@ class Skinning(nn.Module):
             movers = (self.first_trainable, self.entries, self.starts)
             return skin_kernel(rest, offsets, weights, matrices, (self.joints, self.counts), movers)
         points = rest[:, :, None] if offsets is None else rest[:, :, None] + offsets
-        return transformed(blended(self.dense(weights), matrices[self.used]), points)
+        return transform_points(blend_matrices(self.dense(weights), matrices[self.used]), points)
 
     def surface(self, points: Tensor, normals: Tensor, matrices: Tensor) -> tuple[Tensor, Tensor]:
         """Return skinned points and unit normals (V, 3, N) of points and normals (V, 3); without gradients."""
@@ -95,11 +95,11 @@ class Skinning(nn.Module):
             from .kernels.skinning import skin_surface_kernel
 
             return skin_surface_kernel(points, normals, self.weights, matrices, (self.joints, self.counts))
-        affine = blended(self.dense(self.weights), matrices[self.used])
-        direction = turned(affine, normals[:, :, None])
-        return transformed(affine, points[:, :, None]), direction / direction.norm(dim=1, keepdim=True).clamp_min(
-            1e-8
-        )
+        affine = blend_matrices(self.dense(self.weights), matrices[self.used])
+        direction = transform_directions(affine, normals[:, :, None])
+        return transform_points(affine, points[:, :, None]), direction / direction.norm(
+            dim=1, keepdim=True
+        ).clamp_min(1e-8)
 
 
 def by_joint(indices: Ints, support: np.ndarray, trainable: range) -> tuple[Ints, Ints]:

@@ -73,10 +73,10 @@ class BaselineObjective(Objective):
             past = self.model.vertices(states[before], self.bank.character(times[before]))
         character = self.bank.character(times[now])
         x = self.model.vertices(states[now], character)
-        terms = self.potential(x, down[now], character)
+        terms = self.quasi_static_terms(x, down[now], character)
         path = torch.cat([past, x[..., : len(times[now]) - batch].detach()], dim=-1)
         root = self.bank.root[times].T[:, -(self.judged + 1) * batch :]
-        terms["inertia"], terms["drag"] = self.energy.kinetic(
+        terms["inertia"], terms["drag"] = self.energy.inertia_and_drag(
             x, path[..., batch:], path[..., :-batch], root[:, batch:] - root[:, :-batch], self.dt
         )
         return terms

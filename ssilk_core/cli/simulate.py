@@ -80,7 +80,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         sequence=options.sequence,
         precision=options.precision,
         solver=SolverOptions(tolerance=options.tolerance, iterations=options.iterations),
-        rest=SolverOptions(tolerance=options.tolerance, iterations=150),
+        quasi_static_solver=SolverOptions(tolerance=options.tolerance, iterations=150),
     )
     motions = [read_motion(str(path), scene.character.skeleton) for path in options.motion]
     shots = [

@@ -44,10 +44,10 @@ def bending_energy(angle: Tensor, rest_angle: Tensor, stiffness: Tensor) -> Tens
 
     `stiffness` is k_b l^2 / (8 (A_1 + A_2)) of the rest shape, shape (H, 1), as `rest_angle`.
     """
-    return stiffness * bent(angle, rest_angle) ** 2
+    return stiffness * wrapped_difference(angle, rest_angle) ** 2
 
 
-def bent(angle: Tensor, rest_angle: Tensor) -> Tensor:
+def wrapped_difference(angle: Tensor, rest_angle: Tensor) -> Tensor:
     """Return how far a hinge is turned from its rest, the shorter way round, in [-pi, pi].
 
     An angle jumps from pi to -pi where a hinge that is folded flat goes on: the energy must not.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All energies of frames in a row, as validation and evaluation tell them."""
+"""All energies of consecutive frames, for validation and evaluation."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ..collision.distance import PosedBody
 from ..constants import GRAVITY
 from .garment import GarmentEnergy
 
-DECODED_AT_ONCE = 256  # frames in memory
+FRAMES_PER_CHUNK = 256  # frames in memory
 
 
 def energy_terms(
@@ -40,6 +40,6 @@ def energy_terms(
         "bending": energy.bending(x),
         "gravity": energy.gravity(x - lbs, GRAVITY * down[:, None]),
         "inertia": torch.cat([inertia.new_zeros(x.shape[-1] - len(inertia)), inertia]),
-        "collision": energy.collision_of(met),
+        "collision": energy.collision_at(met),
         "collisions": (nearest < 0).double().mean(0),
     }

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All energies of one garment, with its rest shape prepared once."""
+"""All energies of one garment."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from .. import kernels
 from ..assets import Floats, Ints, Mesh
-from ..collision.distance import PosedBody, signed, signed_distance
+from ..collision.distance import PosedBody, signed_distance, signed_distance_to_planes
 from ..fabrics import Fabric
 from ..kernels.corners import elastic_tables
 from ..mesh import topology
@@ -78,21 +78,21 @@ class GarmentEnergy:
         return weight @ ((x - carried.detach()) ** 2).sum(1) / (2 * dt)
 
     def collision(self, x: Tensor, body: PosedBody) -> Tensor:
-        return self.collision_of(signed_distance(x, body))
+        return self.collision_at(signed_distance(x, body))
 
-    def collision_of(self, distance: Tensor) -> Tensor:
+    def collision_at(self, distance: Tensor) -> Tensor:
         """Return the penalty of given signed distances (V, N)."""
         return collision_energy(distance, self.fabric.collision, self.fabric.margin).sum(0)
 
     def elastic(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Return stretch and bending; this and the next two use fused kernels where there are any."""
-        if not kernels.serve(x):
+        if not kernels.supports(x):
             return self.stretch(x), self.bending(x)
         from ..kernels.elastic import elastic_kernel
 
         return elastic_kernel(x, self._tables, self.fabric)
 
-    def potential(
+    def gravity_and_collision(
         self, x: Tensor, root: Tensor, gravity: Tensor, normal: Tensor, offset: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return gravity, of heights over `root` (3, N), and the collision with one plane for each vertex.
@@ -100,28 +100,30 @@ class GarmentEnergy:
         Neither the planes, unit normals (V, 3, N) and offsets (V, N), nor `root` carry a gradient.
         """
         normal, offset, root = normal.detach(), offset.detach(), root.detach()
-        if not kernels.serve(x):
-            return self.gravity(x - root, gravity), self.collision_of(signed(x, normal, offset))
-        from ..kernels.pointwise import potential_kernel
+        if not kernels.supports(x):
+            return self.gravity(x - root, gravity), self.collision_at(signed_distance_to_planes(x, normal, offset))
+        from ..kernels.pointwise import gravity_and_collision_kernel
 
-        return potential_kernel(
+        return gravity_and_collision_kernel(
             x, self.mass, root, gravity, (normal, offset), self.fabric.collision, self.fabric.margin
         )
 
-    def kinetic(self, x: Tensor, last: Tensor, before: Tensor, shift: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+    def inertia_and_drag(
+        self, x: Tensor, last: Tensor, before: Tensor, shift: Tensor, dt: float
+    ) -> tuple[Tensor, Tensor]:
         """Return inertia and drag of the first M frames of x (V, 3, N); neither the past nor the air has a gradient.
 
         Args:
             last, before: positions one and two frames ago (V, 3, M).
             shift: how far the air went since (3, M), with the character's root.
         """
-        if not kernels.serve(x):
+        if not kernels.supports(x):
             moving = x[..., : last.shape[-1]]
             return self.inertia(moving, 2 * last - before, dt), self.drag(moving, last + shift, dt)
-        from ..kernels.pointwise import kinetic_kernel
+        from ..kernels.pointwise import inertia_and_drag_kernel
 
         weights = 1 / (dt * dt), self.fabric.drag / self.fabric.density / dt
-        return kinetic_kernel(x, self.mass, last, before, shift, *weights)
+        return inertia_and_drag_kernel(x, self.mass, last, before, shift, *weights)
 
 
 def _hinge_shapes(mesh: Mesh, hinges: Ints) -> Floats:

@@ -59,9 +59,9 @@ class Decoder(nn.Module):
     def __init__(self, scene: Scene, shapes: int, generator: torch.Generator, activations: int = 0) -> None:
         super().__init__()
         rig = scene.rig
-        self.proxy_count, self.shape_count, self.given = rig.proxy_count, shapes, activations or shapes
+        self.proxy_count, self.shape_count, self.activation_count = rig.proxy_count, shapes, activations or shapes
         self.is_reduced = activations > 0
-        self.above = tuple(rig.parents.tolist())  # as numbers too, which need not be fetched from a GPU
+        self.parent_indices = tuple(rig.parents.tolist())  # as numbers too, which need not be fetched from a GPU
         self.skin = Skinning(rig.skin, range(scene.character.skeleton.joint_count, len(scene.joint_names)))
         free = np.flatnonzero(scene.classes != PINNED)
         self._constant("rest", scene.garment.mesh.points)
@@ -74,7 +74,7 @@ class Decoder(nn.Module):
         self._constant("identity", np.array([1.0, 0, 0, 0, 1, 0]))
         self.skin_offset = nn.Parameter(torch.zeros(len(free), weights.shape[1]))
         self.shapes = nn.Parameter(1e-3 * torch.randn(len(free), 3, shapes, generator=generator))
-        self.register_buffer("readout", torch.eye(shapes, self.given), persistent=self.is_reduced)
+        self.register_buffer("readout", torch.eye(shapes, self.activation_count), persistent=self.is_reduced)
         self.register_buffer("offset", torch.zeros(len(free), 3), persistent=self.is_reduced)
 
     def _constant(self, name: str, values: np.ndarray) -> None:
@@ -90,12 +90,12 @@ class Decoder(nn.Module):
     @property
     def output_count(self) -> int:
         """Numbers the network must give for each frame: blendshape activations and 6 P for the proxies."""
-        return self.given + 6 * self.proxy_count
+        return self.activation_count + 6 * self.proxy_count
 
     @property
     def has_constant(self) -> bool:
         """Whether a file needs one more shape, of constant weight."""
-        return self.given > 0
+        return self.activation_count > 0
 
     def activations(self, output: Tensor) -> tuple[Tensor, Tensor]:
         """Split network output (N, K + 6 P) into activations (K, N) in [-1, 1] and rotations (P, 3, 3, N)."""
@@ -103,8 +103,8 @@ class Decoder(nn.Module):
         return activation, rotation_from_six_d(six_d)
 
     def _split(self, output: Tensor) -> tuple[Tensor, Tensor]:
-        delta = output[:, self.given :].T.reshape(self.proxy_count, 6, output.shape[0])
-        activation = torch.tanh(output[:, : self.given].T)
+        delta = output[:, self.activation_count :].T.reshape(self.proxy_count, 6, output.shape[0])
+        activation = torch.tanh(output[:, : self.activation_count].T)
         return self.readout @ activation if self.is_reduced else activation, self.identity[:, None] + delta
 
     def _influence_weights(self) -> Tensor:
@@ -125,7 +125,7 @@ class Decoder(nn.Module):
         offset = self.pivots[:, :, None] - torch.einsum("pabn,pb->pan", rotations, self.pivots)
         own = torch.cat([rotations, offset[:, :, None]], dim=2)
         matrices = [*character]
-        for parent, turn in zip(self.above, own):
+        for parent, turn in zip(self.parent_indices, own):
             matrices.append(compose(matrices[parent], turn))
         return torch.stack(matrices)
 

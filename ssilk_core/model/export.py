@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The network as one ONNX graph, for engines: a frame in, what bones and blendshapes do out."""
+"""The network as an ONNX graph for game engines: one frame in, joint rotations and weights out."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ OUTPUTS = ("state", "weights", "rotations")
 class FrameNetwork(nn.Module):
     """One frame of a garment in N characters; what deforms the mesh is outside, for engines skin by themselves."""
 
-    above: Tensor
-    own: Tensor
+    parent_rotations: Tensor
+    bind_rotations: Tensor
 
     def __init__(self, model: GarmentModel) -> None:
         super().__init__()
         self.model = model
         joints, bind = model.scene.character.skeleton.joint_count, model.scene.bind_transforms[:, :3, :3]
-        self.register_buffer("above", torch.tensor(bind[model.scene.rig.parents]).float())
-        self.register_buffer("own", torch.tensor(bind[joints:]).float())
+        self.register_buffer("parent_rotations", torch.tensor(bind[model.scene.rig.parents]).float())
+        self.register_buffer("bind_rotations", torch.tensor(bind[joints:]).float())
 
     def forward(
         self, before: Tensor, now: Tensor, static: Tensor, rates: Tensor, begins: Tensor
@@ -52,8 +52,8 @@ class FrameNetwork(nn.Module):
         if model.decoder.has_constant:
             weights = torch.cat([weights, torch.ones_like(z[:, :1])], dim=1)
         # Rotations of no proxies come of nothing: engines refuse to load what reshapes them.
-        turned = rotations.permute(3, 0, 1, 2) if len(self.own) else z.new_zeros(z.shape[0], 0, 3, 3)
-        local = self.above.mT @ turned @ self.own
+        by_frame = rotations.permute(3, 0, 1, 2) if len(self.bind_rotations) else z.new_zeros(z.shape[0], 0, 3, 3)
+        local = self.parent_rotations.mT @ by_frame @ self.bind_rotations
         return z, weights.clamp(0, 1), local
 
 

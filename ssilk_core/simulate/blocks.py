@@ -20,10 +20,10 @@ from torch import Tensor
 from .. import kernels
 from ..assets import Ints
 from ..energy.operators import SparseOperator
-from .conjugate import CHECK_EVERY, inverse_blocks, solve
+from .conjugate_gradient import CHECK_EVERY, inverse_blocks, solve
 
 if TYPE_CHECKING:
-    from ..kernels.conjugate import BlockTable
+    from ..kernels.conjugate_gradient import BlockTable
 
 
 def adjoint(operator: SparseOperator, y: Tensor) -> Tensor:
@@ -52,11 +52,14 @@ class BlockMatrix:
         return torch.mv(self.rows, vectors.reshape(-1)).reshape(vectors.shape)
 
     def solve(self, right: Tensor, reduction: float, iterations: int) -> tuple[Tensor, int]:
-        """Solve approximately for right sides (U, 3, N); arguments and result are those of `conjugate.solve`."""
+        """Solve approximately for right sides (U, 3, N).
+
+        Arguments and result are those of `conjugate_gradient.solve`.
+        """
         diagonal = self.blocks[: self.pattern.count].permute(3, 0, 1, 2)
         inverse = inverse_blocks(diagonal.contiguous())
         if kernels.available(right.device):
-            from ..kernels.conjugate import solve_kernel
+            from ..kernels.conjugate_gradient import solve_kernel
 
             inverse, table = inverse.permute(1, 2, 3, 0), self.pattern.table
             return solve_kernel(self.blocks, table, inverse, right, reduction, iterations, CHECK_EVERY)
@@ -120,7 +123,7 @@ class BlockPattern:
     @cached_property
     def table(self) -> BlockTable:
         """Return the blocks of each row, for kernels."""
-        from ..kernels.conjugate import BlockTable
+        from ..kernels.conjugate_gradient import BlockTable
 
         row, column, stored, below = self._blocks()
         counts = np.bincount(row, minlength=self.count)

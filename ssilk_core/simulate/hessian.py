@@ -15,7 +15,7 @@ from .blocks import BlockMatrix, BlockPattern
 from .hinges import Hinges
 from .membrane import Membrane, outer
 
-HELD = 1e6  # times as stiff
+FIXED_STIFFNESS_FACTOR = 1e6  # times as stiff
 
 
 class Hessian:
@@ -88,7 +88,9 @@ class Hessian:
             diagonal += contact.float()
         if fixed is not None:
             stiff = (
-                HELD * diagonal.square().sum((1, 2)).sqrt()[:, None, None] * torch.eye(3, device=x.device)[..., None]
+                FIXED_STIFFNESS_FACTOR
+                * diagonal.square().sum((1, 2)).sqrt()[:, None, None]
+                * torch.eye(3, device=x.device)[..., None]
             )
             diagonal.copy_(torch.where(fixed[:, None, None], stiff, diagonal))
         return BlockMatrix(self.pattern, blocks)

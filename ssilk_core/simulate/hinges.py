@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..assets import Ints
 from ..energy import GarmentEnergy
-from ..energy.bending import bending_energy, bent, cross, dihedral_angles
+from ..energy.bending import bending_energy, cross, dihedral_angles, wrapped_difference
 from ..energy.operators import difference_operator
 from .blocks import adjoint
 
@@ -34,7 +34,7 @@ class Hinges:
     def gradient(self, x: Tensor) -> Tensor:
         """Return the gradient [N], shape (V, 3, N)."""
         arms = self.operator(x).chunk(3)
-        moment = 2 * self.stiffness * bent(dihedral_angles(*arms), self.rest)
+        moment = 2 * self.stiffness * wrapped_difference(dihedral_angles(*arms), self.rest)
         return adjoint(self.operator, torch.cat([moment[:, None] * slope for slope in angle_gradients(*arms)]))
 
     def slopes(self, x: Tensor) -> Tensor:

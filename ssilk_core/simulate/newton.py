@@ -115,7 +115,7 @@ class State:
             self.x[..., frames], self.body_distance and self.body_distance.select(frames), self.energy[frames]
         )
 
-    def replaced(self, frames: Tensor, other: State) -> State:
+    def replace_frames(self, frames: Tensor, other: State) -> State:
         """Return the state with the frames of indices (M,) taken from another."""
         x, energy, *body_distance = (
             own.index_copy(-1, frames, new) for own, new in zip(self.tensors(), other.tensors(), strict=True)
@@ -275,7 +275,7 @@ def line_search(
         fallen = trial.energy <= (state.energy + ARMIJO * length * slope)[left]
         rows = fallen.nonzero()[:, 0]
         if len(rows):
-            found = found.replaced(left[rows], trial.select(rows))
+            found = found.replace_frames(left[rows], trial.select(rows))
             lengths[left[rows]] = length
         if length <= SHORT_STEP:
             cost = excess_collision(potential, state.select(left), trial, length * step[..., left])

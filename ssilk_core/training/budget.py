@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A schedule for a wall time: as many iterations as fit into it on this machine, shaped like those asked for."""
+"""Training for a given wall time: scale the schedule to the iterations that fit."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The learning curve of a run: what each validation found, and when."""
+"""The learning curve of a run: the validations and when they took place."""
 
 from __future__ import annotations
 

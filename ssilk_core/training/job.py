@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a training run is asked to do."""
+"""The inputs of a training run."""
 
 from __future__ import annotations
 

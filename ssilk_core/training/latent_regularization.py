@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far distances between garments are from distances between their latents (paper, Eq. 13)."""
+"""Regularisation of distances between latents by distances between garments (paper, Eq. 13)."""
 
 from __future__ import annotations
 

@@ -41,24 +41,26 @@ class Objective:
             self.contacts = Contacts(model.scene, vertices=body.vertices, pinned=False, device=device)
         self.dt = 1 / model.config.fps
 
-    def potential(self, x: Tensor, direction: Tensor, character: Tensor) -> Terms:
+    def quasi_static_terms(self, x: Tensor, direction: Tensor, character: Tensor) -> Terms:
         """Return every term but inertia of positions x (V, 3, N) under gravity directions (N, 3)."""
         energy, root = self.energy, character[0, :, 3]  # heights over the root keep the value of gravity small
         stretch, bending = energy.elastic(x)
-        gravity, collision = energy.potential(x, root, GRAVITY * direction.T, *self._planes(x.detach(), character))
+        gravity, collision = energy.gravity_and_collision(
+            x, root, GRAVITY * direction.T, *self._planes(x.detach(), character)
+        )
         return {"stretch": stretch, "bending": bending, "gravity": gravity, "collision": collision}
 
     def _planes(self, x: Tensor, character: Tensor) -> tuple[Tensor, Tensor]:
         """Return the plane that each vertex of x (V, 3, N) may meet: normals (V, 3, N) and offsets (V, N)."""
         if self.body is None:
             return no_planes(x)
-        return self.contacts.planes(x, self.body.posed(character, surface=self.surface))
+        return self.contacts.planes(x, self.body.pose(character, surface=self.surface))
 
     def static(self, frames: Tensor, direction: Tensor) -> Terms:
         """Return the terms of the initialiser's quasi-static states on single poses (Section 3.1)."""
         z = self.model.initial(self.bank.static_descriptor(frames, direction))
         character = self.bank.character(frames)
-        return self.potential(self.model.vertices(z, character), direction, character)
+        return self.quasi_static_terms(self.model.vertices(z, character), direction, character)
 
     def window(
         self, sampler: WindowSampler, noise: Tensor, frames: Tensor, direction: Tensor
@@ -99,13 +101,13 @@ class Objective:
         # The windows from the third frame on and the initialiser's own states share one decoding.
         character = bank.character(torch.cat([times[2 * batch :], frames]))
         x = model.vertices(torch.cat([rolled, quiet]), character)
-        terms = self.potential(x, torch.cat([down[2 * batch :], direction]), character)
+        terms = self.quasi_static_terms(x, torch.cat([down[2 * batch :], direction]), character)
         count = (length - 2) * batch
         dynamic = {name: value[:count] for name, value in terms.items()}
         static_batch = {name: value[count:] for name, value in terms.items()}
         path = torch.cat([past, x[..., : count - batch].detach()], dim=-1)
         root = bank.root[times].T
-        dynamic["inertia"], dynamic["drag"] = self.energy.kinetic(
+        dynamic["inertia"], dynamic["drag"] = self.energy.inertia_and_drag(
             x, path[..., batch:], path[..., :-batch], root[:, 2 * batch :] - root[:, batch:-batch], self.dt
         )
         if weight := sampler.config.latent_regularization:

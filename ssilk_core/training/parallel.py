@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several processes that train one garment together, each on its part of the batch (data parallel)."""
+"""Data-parallel training: several processes train one garment, each on its part of the batch."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run leaves on disk: the best model, the state to resume from, the learning curve, and what went wrong."""
+"""The files of a training run: best model, state to resume from, learning curve, non-finite step."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Asking a run to stop from outside."""
+"""Stopping a run with SIGINT or SIGTERM."""
 
 from __future__ import annotations
 

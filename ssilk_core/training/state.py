@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The state of a training run on disk, so that it goes on exactly where it stopped."""
+"""The saved state of a training run, from which it resumes exactly."""
 
 from __future__ import annotations
 

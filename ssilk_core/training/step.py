@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One optimiser step of each phase, eager or replayed as a CUDA graph."""
+"""One optimiser step of either phase, eager or replayed as a CUDA graph."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good a model is on whole clips: each term by itself, beside linear blend skinning."""
+"""Energies of a model on whole clips, and those of linear blend skinning."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..assets import Scene
 from ..collision.body import CollisionBody
 from ..collision.contacts import Contacts
 from ..energy import TERMS, GarmentEnergy
-from ..energy.frames import DECODED_AT_ONCE, energy_terms
+from ..energy.frames import FRAMES_PER_CHUNK, energy_terms
 from ..motion_bank import LatentModel, MotionBank, roll_states
 from ..skinning import Skinning
 from .parallel import SINGLE_PROCESS, ProcessGroup
@@ -100,8 +100,8 @@ class Validator:
     def _clip_terms(self, clip: range, model: LatentModel | None, states: Tensor | None) -> dict[str, Tensor]:
         frames = torch.arange(clip.start, clip.stop, device=self.rest.device)
         parts, tail = [], None
-        for start in range(0, len(frames), DECODED_AT_ONCE):
-            window = slice(start, start + DECODED_AT_ONCE)
+        for start in range(0, len(frames), FRAMES_PER_CHUNK):
+            window = slice(start, start + FRAMES_PER_CHUNK)
             character = self.bank.character(frames[window])
             lbs = self.lbs_vertices(character)
             x, still = lbs, lbs
@@ -111,7 +111,7 @@ class Validator:
                 quiet = model.initial(self.bank.static_descriptor(frames[window], direction))
                 still = model.vertices(quiet, character)
             joined = x if tail is None else torch.cat([tail, x], dim=-1)
-            posed = self.body.posed(character)
+            posed = self.body.pose(character)
             terms = energy_terms(self.energy, x, lbs, self.contacts, posed, joined, self.fps, self.down)
             parts.append({**terms, "dynamics": ((x - still) ** 2).sum(1).mean(0)})
             tail = joined[..., -2:]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which frames each slot of a batch trains on, and the states carried from window to window."""
+"""The windows that each slot of a batch trains on, and the states carried from window to window."""
 
 from __future__ import annotations
 

@@ -108,7 +108,7 @@ def test_energies_are_those_of_the_validation(scene, dressed, toy_motion, toy_mo
     network = Network(kind, model, reel)
     validator = Validator(network.reel.bank, dressed.energy, dressed.body, scene, dressed.rest, FPS, clip.frame_count)
     expected = validator.frame_terms(range(23), model)
-    monkeypatch.setattr("ssilk_core.evaluation.record.DECODED_AT_ONCE", 9)
+    monkeypatch.setattr("ssilk_core.evaluation.record.FRAMES_PER_CHUNK", 9)
     found = recorded(dressed, reel, network, 0).values
     for name in (*TERMS, "collisions"):
         np.testing.assert_allclose(found[name], expected[name].double(), rtol=1e-4, atol=1e-7)
@@ -121,7 +121,7 @@ def test_a_record_in_blocks_is_that_of_the_whole(dressed, reel, monkeypatch):
     offsets = 0.01 * torch.randn(40, 3, generator=torch.Generator().manual_seed(1))
     method, truth = Still(dressed, reel, offsets), Plain(dressed, reel)
     whole = recorded(dressed, reel, method, 0, truth)
-    monkeypatch.setattr("ssilk_core.evaluation.record.DECODED_AT_ONCE", 2)
+    monkeypatch.setattr("ssilk_core.evaluation.record.FRAMES_PER_CHUNK", 2)
     parts = recorded(dressed, reel, method, 0, truth)
     assert whole.values.keys() == parts.values.keys() and torch.equal(whole.stretches, parts.stretches)
     for name, values in whole.values.items():
@@ -161,8 +161,8 @@ def test_collisions_can_be_with_the_whole_body(scene, dressed, reel):
     near, whole = (EvaluationScene(spiked, dressed.fabric, FPS, CPU, exact=exact) for exact in (False, True))
     found = [recorded(one, reel, Plain(one, reel), 0).values["collision"] for one in (near, whole)]
     character = reel.character(0, range(40))
-    distance = signed_distance(whole.lbs(character), whole.body.posed(character, exact=True))
-    np.testing.assert_allclose(found[1], whole.energy.collision_of(distance), rtol=1e-5)
+    distance = signed_distance(whole.lbs(character), whole.body.pose(character, exact=True))
+    np.testing.assert_allclose(found[1], whole.energy.collision_at(distance), rtol=1e-5)
     assert (found[0] - found[1]).abs().max() > 1e-3
 
 

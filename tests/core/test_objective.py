@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from ssilk_core.collision.distance import signed
+from ssilk_core.collision.distance import signed_distance_to_planes
 from ssilk_core.config import SCHEMES, TrainConfig
 from ssilk_core.constants import GRAVITY
 from ssilk_core.training.objective import Objective, total
@@ -41,7 +41,9 @@ def at_frame(objective: Objective, z: torch.Tensor, frame: torch.Tensor, down: t
         "stretch": energy.stretch(x),
         "bending": energy.bending(x),
         "gravity": energy.gravity(x - character[0, :, 3], GRAVITY * down.T),
-        "collision": energy.collision_of(signed(x, *objective.contacts.planes(x, objective.body.posed(character)))),
+        "collision": energy.collision_at(
+            signed_distance_to_planes(x, *objective.contacts.planes(x, objective.body.pose(character)))
+        ),
     }
     return x, terms
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Characters in motion: the spans of several motions, and their poses at one step of all of them."""
+"""Posed characters for the simulator, and the spans of their motions between cuts."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ..kinematics import (
     split_at_cuts,
     world_transforms,
 )
-from ..skinning import blended, transformed
+from ..skinning import blend_matrices, transform_points
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,9 @@ class MotionSpan:
         return (self.motion.frame_count - 1) // self.substeps + 1
 
 
-def spans_of(motion: Motion, shot: int, fps: float, substeps: int, longest: int | None = None) -> list[MotionSpan]:
+def split_into_spans(
+    motion: Motion, shot: int, fps: float, substeps: int, longest: int | None = None
+) -> list[MotionSpan]:
     """Return the spans of a motion between its cuts, of `longest` frames at most, those of a shot at `fps`."""
     spans, first, source = [], 0, 0
     for part in split_at_cuts(motion):
@@ -62,7 +64,7 @@ def spans_of(motion: Motion, shot: int, fps: float, substeps: int, longest: int 
     return spans
 
 
-def played(motion: Motion, spans: Sequence[MotionSpan]) -> Motion:
+def join_spans(motion: Motion, spans: Sequence[MotionSpan]) -> Motion:
     """Return the motion as its spans play it: the character of a shot, frame by frame."""
     fps, substeps = spans[0].motion.fps / spans[0].substeps, spans[0].substeps
     parts = [span.motion for span in spans]
@@ -86,7 +88,7 @@ class PosedCharacters:
     lbs: Tensor
 
 
-class Actors:
+class CharacterPoser:
     """Poses the character and the linearly skinned garment of a scene."""
 
     def __init__(self, scene: Scene, device: torch.device, dtype: torch.dtype) -> None:
@@ -96,21 +98,21 @@ class Actors:
         self.weights = torch.as_tensor(scene.lbs_skin.dense(joints), dtype=dtype, device=device)
         self.rest = torch.as_tensor(np.array(scene.garment.mesh.points), dtype=dtype, device=device)[:, :, None]
 
-    def poses(self, spans: Sequence[MotionSpan], step: int) -> PosedCharacters:
+    def poses_at(self, spans: Sequence[MotionSpan], step: int) -> PosedCharacters:
         """Return the poses of all spans at a step."""
         rotations = np.stack([span.motion.rotations[step] for span in spans])
-        return self.posed(rotations, np.stack([span.motion.translations[step] for span in spans]))
+        return self.pose(rotations, np.stack([span.motion.translations[step] for span in spans]))
 
-    def posed(self, rotations: Floats, translations: Floats) -> PosedCharacters:
+    def pose(self, rotations: Floats, translations: Floats) -> PosedCharacters:
         """Return poses of local joint rotations (N, J, 4) and translations (N, J, 3)."""
         world = world_transforms(rigid(matrix_from_quaternion(rotations), translations), self.skeleton.parents)
         root = world[:, 0, :3, 3].copy()
         world[:, :, :3, 3] -= root[:, None]
         matrices = skinning_matrices(world, self.skeleton.bind_transforms)[:, :, :3].transpose(1, 2, 3, 0)
         character = torch.as_tensor(matrices.copy(), dtype=self.dtype, device=self.rest.device)
-        lbs = transformed(blended(self.weights, character), self.rest)
+        lbs = transform_points(blend_matrices(self.weights, character), self.rest)
         return PosedCharacters(
             torch.as_tensor(root.T.copy(), device=self.rest.device),
-            self.body.posed(character.float(), exact=True),
+            self.body.pose(character.float(), exact=True),
             lbs,
         )
