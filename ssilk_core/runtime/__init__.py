@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Play a trained garment with numpy alone: the fastest way on a processor, without PyTorch.
 
-    from ..runtime import Player
+    from ssilk_core.runtime import Player
     playback = Player.load("cape.safetensors").play(motion)
     playback.vertices(12)   # (V, 3) [m], any frame in any order
 

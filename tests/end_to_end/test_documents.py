@@ -14,15 +14,17 @@ from ssilk_core.cli import parser
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = ("docs/pipeline.md", "docs/farm.md")
+WITH_COMMANDS = (*DOCUMENTS, "README.md", "docs/results.md", "docs/training.md")
 
 
 def blocks(document: str, language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", (ROOT / document).read_text(), flags=re.DOTALL)
 
 
-@pytest.mark.parametrize("document", DOCUMENTS)
+@pytest.mark.parametrize("document", WITH_COMMANDS)
 def test_commands_are_understood(document):
-    lines = [line for block in blocks(document, "sh") for line in block.splitlines() if line.startswith("ssilk ")]
+    commands = "".join(blocks(document, "sh")).replace("\\\n", " ")
+    lines = [line for line in commands.splitlines() if line.startswith("ssilk ")]
     assert lines
     for line in lines:
         words = shlex.split(

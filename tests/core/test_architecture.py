@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The code has the layers, and the public names, that docs/architecture.md promises."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+CORE, USD, ADDON = ROOT / "ssilk_core", ROOT / "usd" / "ssilk_usd", ROOT / "blender_addon"
+DOCUMENT = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+WIDEST = 6  # names in a row of the table
+JOIN_CORE_AND_USD = {"bake", "cli"}
+
+
+def section(title: str) -> str:
+    """Return the text of a section of the document."""
+    return DOCUMENT.partition(f"## {title}\n")[2].partition("\n## ")[0]
+
+
+def rows(title: str) -> list[list[str]]:
+    """Return the names in backticks in the first column of a section's table, row by row."""
+    lines = [line for line in section(title).splitlines() if line.startswith("| `")]
+    return [re.findall(r"`([\w.]+)`", line.split("|")[1]) for line in lines]
+
+
+LAYERS = rows("Layers of the core")
+USED_BY_USD = {name for row in rows("What ssilk_usd takes from the core") for name in row}
+PUBLIC = [name for row in rows("Public packages") for name in row]
+LAYER_OF = {name: number for number, row in enumerate(LAYERS) for name in row}
+
+
+def modules(folder: Path) -> list[tuple[Path, tuple[str, ...]]]:
+    """Return each module under a package's folder with the package that it is in."""
+    return [(path, path.relative_to(folder.parent).parts[:-1]) for path in sorted(folder.rglob("*.py"))]
+
+
+def imports(path: Path, package: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+    """Yield what a module imports anywhere in its code, as dotted parts, except for types alone."""
+    for node in executed(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (tuple(alias.name.split(".")) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) + 1 - node.level] if node.level else ()
+            start = (*base, *(node.module.split(".") if node.module else ()))
+            yield from ((*start, alias.name) for alias in node.names)
+
+
+def executed(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield all nodes except those under `if TYPE_CHECKING`."""
+    yield node
+    for child in ast.iter_child_nodes(node):
+        if not (isinstance(child, ast.If) and ast.unparse(child.test) == "TYPE_CHECKING"):
+            yield from executed(child)
+
+
+def public_classes(folder: Path) -> Iterator[tuple[str, str]]:
+    """Yield the name of each public class at the top of a module under a folder, and the module's path."""
+    for path, _ in modules(folder):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                yield node.name, str(path.relative_to(ROOT))
+
+
+def test_every_part_of_the_core_stands_in_one_narrow_layer():
+    parts = {path.name.removesuffix(".py") for path in CORE.iterdir() if path.suffix == ".py" or path.is_dir()}
+    named = Counter(name for row in LAYERS for name in row)
+    assert set(named) == parts - {"__init__", "__pycache__"}
+    assert max(named.values()) == 1
+    assert max(map(len, LAYERS)) <= WIDEST
+
+
+@pytest.mark.parametrize(("path", "package"), modules(CORE), ids=lambda value: getattr(value, "stem", None))
+def test_the_core_imports_from_inner_layers_alone(path, package):
+    own = path.relative_to(CORE).parts[0].removesuffix(".py")
+    for target in imports(path, package):
+        assert target[0] not in ("pxr", "bpy"), target
+        assert target[0] != "ssilk_usd" or own in JOIN_CORE_AND_USD, target
+        if target[0] == "ssilk_core" and target[1] not in (own, "__version__"):
+            assert own != "__init__" and LAYER_OF[target[1]] < LAYER_OF[own], target
+
+
+@pytest.mark.parametrize(("path", "package"), modules(CORE), ids=lambda value: getattr(value, "stem", None))
+def test_imports_within_the_core_are_relative(path, package):
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom):
+            assert node.level or (node.module or "").split(".")[0] != "ssilk_core", ast.unparse(node)
+
+
+@pytest.mark.parametrize(("path", "package"), modules(USD), ids=lambda value: getattr(value, "stem", None))
+def test_usd_needs_little_of_the_core(path, package):
+    for target in imports(path, package):
+        assert target[0] not in ("torch", "bpy"), target
+        assert target[0] != "ssilk_core" or target[1] in USED_BY_USD, target
+
+
+def test_baking_needs_no_training():
+    for path, package in modules(CORE / "bake"):
+        targets = imports(path, ("ssilk_core", *package))
+        assert not [target for target in targets if target[:2] == ("ssilk_core", "training")], path
+
+
+def test_no_public_class_name_is_used_twice():
+    homes = defaultdict(list)
+    for folder in (CORE, USD, ADDON):
+        for name, home in public_classes(folder):
+            homes[name].append(home)
+    assert {name: found for name, found in homes.items() if len(found) > 1} == {}
+
+
+@pytest.mark.parametrize("package", PUBLIC)
+def test_a_public_package_says_what_is_public(package):
+    found = importlib.import_module(package)
+    assert found.__all__ == sorted(found.__all__) or package == "ssilk_core.assets"
+    assert all(hasattr(found, name) for name in found.__all__)
+
+
+def test_one_path_leads_to_each_public_name():
+    """No name is public in two packages, and nobody reaches past a package for what it makes public."""
+    homes = Counter(name for package in PUBLIC for name in importlib.import_module(package).__all__)
+    assert [name for name, count in homes.items() if count > 1] == []
+    past = []
+    for folder in (CORE, USD, ROOT / "benchmarks"):
+        for path, package in modules(folder):
+            for target in imports(path, package):
+                home = next((public for public in PUBLIC if ".".join(target).startswith(f"{public}.")), None)
+                if home is None or ".".join(package).startswith(home):
+                    continue
+                names = importlib.import_module(home).__all__
+                if len(target) > len(home.split(".")) + 1 and target[-1] in names:
+                    past.append((str(path.relative_to(ROOT)), ".".join(target)))
+    assert past == []
+
+
+def test_imports_are_seen_through_relative_names_and_functions(tmp_path):
+    code = "from ..errors import fail\nfrom . import sibling\ndef f():\n    import torch.nn\n"
+    code += "if TYPE_CHECKING:\n    import pxr\n"
+    (tmp_path / "module.py").write_text(code)
+    found = set(imports(tmp_path / "module.py", ("ssilk_core", "view")))
+    assert found == {
+        ("ssilk_core", "errors", "fail"),
+        ("ssilk_core", "view", "sibling"),
+        ("torch", "nn"),
+    }

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `benchmarks/results` and the shipped models hold, and the forms that documents show it in."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Sequence
+from functools import cache
+from math import floor, log10
+from pathlib import Path
+from statistics import mean, stdev
+from typing import Any
+
+from safetensors import safe_open
+
+from ssilk_core.config import ModelConfig, TrainConfig
+
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "benchmarks" / "results"
+GARMENTS = {
+    "Cape": "cape",
+    "HoodedDress": "hooded dress",
+    "FringeSkirt": "fringe skirt",
+    "tshirt": "T-shirt",
+    "long_sleeve": "long sleeve",
+    "pants": "pants",
+}
+METHODS = {"plain": "LBS", "ncs": "NCS", "ncs*": "NCS*", "snug": "SNUG", "ssilk": "SSILK"}
+SPLITS = ("valid", "inertia", "flips")
+
+read: set[str] = set()  # names of the files that `result` has read
+
+
+@cache
+def document(name: str) -> dict[str, Any]:
+    """Return a file of results."""
+    read.add(name)
+    return json.loads((RESULTS / f"{name}.json").read_text())
+
+
+def result(name: str) -> Any:
+    """Return what a benchmark measured."""
+    return document(name)["measured"]
+
+
+@cache
+def cells(name: str) -> dict[tuple[str, str, str], dict[str, list[float]]]:
+    """Return the figures of all seeds of a comparison, by garment, method and split."""
+    return {(row["garment"], row["method"], row["split"]): row for row in result(name)["figures"]}
+
+
+@cache
+def evaluated(model: str) -> dict[str, dict[str, Any]]:
+    """Return the figures of `ssilk evaluate` for a model, by split."""
+    rows = document(f"evaluate_{model}")["figures"]
+    return {row["split"]: row["figures"] for row in rows if row["method"] == "ssilk"}
+
+
+@cache
+def shipped(model: str) -> dict[str, Any]:
+    """Return what the file of a shipped model says about itself."""
+    with safe_open(ROOT / "ssilk_core" / "demo" / "models" / f"{model}.safetensors", "np") as file:
+        return json.loads(file.metadata()["ssilk"])
+
+
+def default(setting: str) -> Any:
+    """Return the default of a setting of the model or of its training."""
+    config = ModelConfig() if hasattr(ModelConfig, setting) else TrainConfig()
+    return getattr(config, setting)
+
+
+def digits(value: float, count: int = 3) -> str:
+    """Return a number with so many significant digits, without an exponent: 0.0200, 16.4, 1,230."""
+    rounded = float(f"{value:.{count}g}")
+    places = 0 if abs(rounded) >= 10 ** (count - 1) else count - 1 - floor(log10(abs(rounded))) if rounded else 0
+    return signed(f"{rounded:,.{places}f}")
+
+
+def signed(text: str) -> str:
+    """Return a formatted number with a minus sign in place of a hyphen, and a zero without either."""
+    return text.replace("-", "−") if re.search("[1-9]", text) else text.lstrip("-")
+
+
+def spread(values: Sequence[float], count: int = 3) -> str:
+    """Return the mean, with the standard deviation where there are several seeds."""
+    return digits(mean(values), count) + (f" ± {stdev(values):.1g}" if len(values) > 1 else "")
+
+
+def percent(values: Sequence[float] | float, places: int = 2) -> str:
+    """Return a share, or the mean of several, in per cent and without the sign."""
+    return signed(f"{100 * (values if isinstance(values, float) else mean(values)):.{places}f}")
+
+
+def duration(seconds: float) -> str:
+    """Return a time as 25 s or 4 min 03 s."""
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
+
+
+def row(*values: object) -> str:
+    """Return a row of a Markdown table."""
+    return f"| {' | '.join(map(str, values))} |"
+
+
+def series(values: Iterable[object]) -> str:
+    return ", ".join(map(str, values))

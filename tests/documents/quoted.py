@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What documents say of measurements: every line or phrase with a figure, made from the file that it comes from.
+
+A function for each document yields its text, piece by piece; `test_figures.py` finds each piece in the document, and
+no figure outside of them. After a new measurement the failing test shows the line as it ought to be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from ssilk_usd import memory
+
+from ssilk_core.config import PRESETS
+from ssilk_core.fabrics import Fabric
+from ssilk_core.farm.openjd import BundleOptions
+
+from .measured import default, digits, result, row, series, shipped
+from .quoted_results import results
+from .shared import Text, cache_share, default_step, extremes, frame_time, preset_minutes, two_gpus
+
+# README.md
+
+
+def readme() -> Text:
+    preview, final = (preset_minutes(PRESETS[name]) for name in ("preview", "final"))
+    yield f"about {60 * preview:.0f} seconds on an H200 and `--preset final` about {final:.0f} minutes"
+    yield f"{two_gpus('Windows of 32', 1024):.1f} times as fast with 1,024 windows of 32 poses in a batch"
+    yield f"{two_gpus('Windows of 32', 64):.2f} times as fast with 64 windows"
+
+
+# docs/training.md
+
+PAPER = {
+    "latent_bound": "none",
+    "max_latent_step": "none",
+    "window": 32,
+    "batch": 32,
+    "state_reuse": 0,
+    "rotated_fraction": 1,
+    "recombinations": 0,
+    "noise_correlation": 0,
+    "noise_probability": "not stated",
+    "static_fraction": 0,
+    "static_batch": 0,
+    "learning_rate": "not stated",
+    "skin_learning_rate_scale": "not stated",
+    "shape_learning_rate_scale": "not stated",
+    "ema_decay": "none",
+    "latent_regularization": 0,
+}
+"""What the paper has for our settings (Sections 3.5 to 3.7, Tables 4 and 5)."""
+
+
+def training() -> Text:
+    sizes = {
+        "draft": "a first look, on a CPU",
+        "preview": "a look on a GPU",
+        "final": "the paper's number of iterations",
+    }
+    for name, purpose in sizes.items():
+        preset = PRESETS[name]
+        model, train = preset.model, preset.train
+        yield row(
+            f"`{name}`", model.latent, model.shapes, series(model.widths), f"{train.iterations:,}",
+            f"{train.batch} of {train.window}", purpose,
+        )  # fmt: skip
+    for setting, paper in PAPER.items():
+        yield f"| `{setting}` | {default(setting):g} | {paper} |"
+    yield f"| `drag` (material) [kg/(m² s)] | {Fabric('default').drag:g} |"
+    yield f"{default('fps'):g} times a second"
+    yield f"`final` takes {PRESETS['final'].train.ema_decay:g}"
+    yield default_step()
+    preview, final = (preset_minutes(PRESETS[name]) for name in ("preview", "final"))
+    yield f"{60 * preview:.0f} s for `preview` and {final:.0f} minutes for `final`"
+
+
+# docs/farm.md
+
+
+def farm() -> Text:
+    start = result("farm")["start"]
+    python, model = (
+        start[f"seconds to {what}"] for what in ("start Python and its modules", "load the model and its character")
+    )
+    chunk = BundleOptions.seconds
+    yield f"{python:.1f} s to start and {model:.2f} s to load model and character"
+    yield f"{100 * (python + model) / chunk:.1f} % of a chunk of {chunk} s"
+    cluster = result("farm")["cluster"]
+    rows = {
+        "shots": "shots", "workers killed": "workers killed", "shots lost": "shots lost",
+        "shots baked twice": "shots ended twice", "files half written": "half-written files",
+        "shots compared with an undisturbed bake": "shots compared",
+        "of these, shots that differ": "shots that differ from an undisturbed bake",
+    }  # fmt: skip
+    for text, key in rows.items():
+        yield row(text, cluster[key])
+    cores = result("farm_cores")["cores"]
+    for count in (1, 2, 4):
+        yield row(
+            f"shots of 60 frames a second on {count} core{'s' if count > 1 else ''}",
+            f"{cores[f'shots per second, cores: {count}']:.1f}",
+        )
+    soak = result("farm_soak")["soak"]
+    memories = [soak[f"memory after {count},000 bakes [MiB]"] for count in (1, 3, 10)]
+    for count, value in zip(("1,000", "3,000", "10,000"), memories, strict=True):
+        yield row(f"memory after {count} bakes in one process [MiB]", f"{value:.0f}")
+    yield f"file handles stay at {soak['file handles, least and most'].partition(',')[0]}"
+    yield f"at most {memory.USUAL:g} GiB more"
+    yield row(
+        "`SSILK_READ_GIB`",
+        f"the most memory that reading a file may take [GiB], {memory.USUAL:g} where it is not set",
+    )
+
+
+# docs/pipeline.md
+
+
+def pipeline() -> Text:
+    rows = {line["name"]: line for line in result("compact")["rows"]}
+    targets = {
+        "usd": ("all", "the stage's", "layers or a file"),
+        "blender": ("all", "z up, metres", "layers or a file"),
+        "game8": ("8", "y up, metres (as glTF)", "layers or a file"),
+        "game4": ("4", "y up, metres", "layers or a file"),
+        "arkit": ("4", "y up, metres", "one `.usdz`"),
+    }
+    for name, texts in targets.items():
+        line = rows[f"one file for {name}, garment alone"]
+        yield row(f"`{name}`", *texts, *(digits(1000 * line[key], 2) for key in ("largest", "mean")))
+    heaviest = rows["for comparison: the 4 heaviest influences, nothing learned"]
+    yield f"The 4 heaviest influences alone would be up to {1000 * heaviest['largest']:.0f} mm off"
+    yield f"takes 1/{cache_share():.0f} of the point cache"
+    yield f"{1e6 * rows['anim.usdc, the shot']['largest']:.1f} µm"
+
+
+# CHANGELOG.md
+
+
+def changelog() -> Text:
+    yield f"Model files have format {shipped('cape')['format']}"
+    yield extremes()
+    yield f"{frame_time():.2f} ms a frame"
+    yield default_step()
+    yield f"at most {memory.USUAL:g} GiB"
+
+
+QUOTED: dict[str, Callable[[], Text]] = {
+    "README.md": readme,
+    "CHANGELOG.md": changelog,
+    "docs/results.md": results,
+    "docs/training.md": training,
+    "docs/farm.md": farm,
+    "docs/pipeline.md": pipeline,
+    "docs/architecture.md": lambda: iter(()),
+    "docs/artist_guide.md": lambda: iter(()),
+}
+"""Text with figures, by document."""
