@@ -19,7 +19,7 @@ from ssilk_core.model.batch import DOWN, motion_inputs
 from ssilk_core.model.network import GarmentModel
 from ssilk_core.motion_bank import build_bank
 from ssilk_core.runtime.character import character_frames
-from ssilk_core.runtime.playback import BLOCK, POSED
+from ssilk_core.runtime.playback import BLOCK, VERTEX_BLOCK
 from ssilk_core.runtime.player import Player
 from ssilk_core.runtime.skinning import skin_garment
 from ssilk_core.skinning import Skinning, blend_matrices, transform_points
@@ -75,7 +75,7 @@ def with_numpy(player: Player, motion: Motion) -> Laps:
         monitor.lap(DECODER)
         matrices = player.kinematics.matrices(rotations, given.matrices)
         monitor.lap(KINEMATICS)
-        for part in spans(len(states), POSED):
+        for part in spans(len(states), VERTEX_BLOCK):
             skin_garment(player.tiles, activations[:, part], matrices[..., part], given.origins[part])
         monitor.lap(SKINNING)
     return monitor.laps
@@ -119,7 +119,7 @@ def with_torch(model: GarmentModel, skinner: Skinner, motion: Motion, chunk: int
         character = given.character[frames, ..., 0].permute(1, 2, 3, 0)
         matrices = model.decoder.proxy_matrices(rotations, character)
         monitor.lap(KINEMATICS)
-        for part in spans(len(rest), POSED):
+        for part in spans(len(rest), VERTEX_BLOCK):
             skinner(activations[:, part], matrices[..., part])
         monitor.lap(SKINNING)
     return monitor.laps

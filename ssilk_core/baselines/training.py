@@ -86,7 +86,7 @@ class BaselineStepper(Stepper):
     """Moves the parameters of a baseline as `Stepper` does those of a model, graphs and all."""
 
     objective: BaselineObjective
-    averaged: Baseline  # type: ignore[assignment]
+    ema_model: Baseline  # type: ignore[assignment]
 
     def __init__(self, objective: BaselineObjective, config: TrainConfig, generator: torch.Generator) -> None:
         if not config.window >= objective.judged + 2:
@@ -97,11 +97,11 @@ class BaselineStepper(Stepper):
             )
         sampler = WindowSampler(objective.bank, config, 0, generator)  # no state goes from window to window
         super().__init__(objective.model, objective, sampler, config)  # type: ignore[arg-type]
-        for module in self.averaged.modules():
+        for module in self.ema_model.modules():
             if isinstance(module, nn.GRU):
                 module.flatten_parameters()  # a copy's are scattered
 
-    def windows(self) -> None:
+    def dynamic_step(self) -> None:
         """Train everything on one window of every slot."""
         terms = self.objective.rolled(self.sampler)
         means = {name: value.mean() for name, value in terms.items()}

@@ -122,8 +122,8 @@ class Playback:
         rolled, start = self.rolled_spans[span], number * self.block
         stop = min(start + self.block, self.spans[span].frame_count)
         if self._steps_with_frames:
-            decoded, character = rolled.decoded(number), rolled.character(number)
-            character, origins = character.matrices, character.origins
+            decoded, frames = rolled.decoded(number), rolled.character(number)
+            character, origins = frames.matrices, frames.origins
         else:
             decoded = self._interpolate(rolled, np.arange(start, stop) * self.rate)
             character, origins = character_matrices(self.spans[span].clip(start, stop), self.player.skeleton)

@@ -26,7 +26,7 @@ class Score:
     Attributes:
         terms: each energy [J]; gravity is relative to linear blend skinning.
         collisions: share of garment vertices inside the body.
-        dynamics: RMS distance between the rollout and the quasi-static state of the same pose [m].
+        dynamics: RMS distance between the rollout and the quasi-static states of the same poses [m].
     """
 
     terms: dict[str, float]
@@ -75,7 +75,7 @@ class Validator:
         return self._mean(None)
 
     def _mean(self, model: LatentModel | None) -> Score:
-        """Return the mean over all clips, dealt out to the processes of the group; all get the same score."""
+        """Return the mean over all clips, distributed over the processes of the group; all get the same score."""
         clips = self.clips[self.group.rank :: self.group.size]
         states = self._states(clips, model)
         own = [self._clip_terms(clip, model, latents) for clip, latents in zip(clips, states)]
@@ -85,15 +85,14 @@ class Validator:
         return Score({name: joined[name] for name in TERMS}, joined["collisions"], joined["dynamics"] ** 0.5)
 
     def frame_terms(self, clip: range, model: LatentModel | None) -> dict[str, Tensor]:
-        """Return what `Score` averages for each frame of a range of the bank, shape (N,).
+        """Return the values that `Score` averages for each frame of a range of the bank, shape (N,).
 
-        Without a model it is linear blend skinning that is scored. Distances to the quasi-static state come squared
-        [m2].
+        Without a model, linear blend skinning is scored. "dynamics" is a squared distance [m2].
         """
         return self._clip_terms(clip, model, self._states([clip], model)[0])
 
     def _states(self, clips: Sequence[range], model: LatentModel | None) -> Sequence[Tensor | None]:
-        """Return the states of each clip; of a group, one may have none to roll."""
+        """Return the states of each clip; a process of a group may have no clips."""
         return roll_states(model, self.bank, clips, self.down) if model and clips else [None] * len(clips)
 
     @torch.no_grad()

@@ -77,7 +77,7 @@ def test_a_pinned_garment_has_nothing_to_learn(scene, toy_motion, tmp_path):
 
 def test_a_garment_with_anything_free_learns_as_asked(scene, toy_motion):
     asked = job_of(scene, toy_motion(scene, 30))
-    assert asked.learns and asked.model.latent == 8 and asked.train.iterations == 40
+    assert asked.is_trainable and asked.model.latent == 8 and asked.train.iterations == 40
 
 
 def test_a_body_out_of_reach_costs_no_collisions_and_no_posing(scene, toy_motion):

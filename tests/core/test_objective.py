@@ -164,13 +164,13 @@ def test_a_step_weighs_every_frame_the_same(objective):
     length = torch.cat([value.flatten() for value in expected.values()]).norm()  # only directions count
     stepper = Stepper(objective.model, objective, sampler, sampler.config)
     sampler.poses = lambda count: POSES
-    stepper.windows()
+    stepper.dynamic_step()
     for name, value in objective.model.named_parameters():
         assert value.grad is not None
         direction = expected[name] / length
         np.testing.assert_allclose(value.grad, direction, atol=1e-5 * float(direction.abs().max()) + 1e-12)
     assert stepper.terms["inertia"].item() == pytest.approx(dynamic["inertia"].mean().item(), rel=1e-5)
-    assert all(value.is_leaf and not value.requires_grad for value in stepper.averaged.parameters())  # no history
+    assert all(value.is_leaf and not value.requires_grad for value in stepper.ema_model.parameters())  # no history
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1e6])

@@ -67,7 +67,7 @@ def test_between_two_walls_it_is_the_norm_of_their_distances(angle: float) -> No
     expected = (wall.double() ** -SMOOTHING_EXPONENT).sum(0) ** (-1 / SMOOTHING_EXPONENT)
     torch.testing.assert_close(rounded(x.to(DEVICE), body)[:, 0].cpu(), expected.float(), rtol=1e-5, atol=0)
     middle = smoothed_planes(x.to(DEVICE), body).normal[4, :, 0].cpu()
-    shorter = float(np.sin(angle / 2)) * 2 ** (-1 / SMOOTHING_EXPONENT)  # the walls push against each other across the fold
+    shorter = float(np.sin(angle / 2)) * 2 ** (-1 / SMOOTHING_EXPONENT)  # across the fold both walls count
     torch.testing.assert_close(middle, torch.tensor([0.0, 0.0, shorter]), rtol=0, atol=1e-4)
 
 
