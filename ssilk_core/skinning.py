@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from . import kernels
 from .assets import Ints, SkinWeights
 
-PARTS = 16  # programs that share the gradient of a joint's matrix, so that few joints fill a GPU too
+PARTS = 16  # programs that share the gradient of a joint's matrix, so that few joints use a whole GPU
 
 
 def blend_matrices(weights: Tensor, matrices: Tensor) -> Tensor:
@@ -32,11 +32,11 @@ def transform_directions(affine: Tensor, directions: Tensor) -> Tensor:
 
 
 class Skinning(nn.Module):
-    """The influences of a mesh, in the orders in which skinning and its gradients go through them.
+    """Linear blend skinning of one mesh.
 
     Args:
-        skin: joints of each vertex; weights of zero stand for no influence.
-        trainable: consecutive joints whose matrices may carry a gradient. Others count as constant.
+        skin: joints and weights of each vertex; zero weights mean no influence.
+        trainable: consecutive joints whose matrices may have a gradient; all others are constant.
 
     Attributes:
         weights: those of `skin`, shape (V, I).
@@ -62,7 +62,7 @@ class Skinning(nn.Module):
             "used": used.astype(np.int64),
             "columns": np.searchsorted(used, skin.indices).clip(max=len(used) - 1),
             "joints": skin.indices.copy(),
-            # Influences after a vertex's last one are skipped; others of zero weight add nothing.
+            # Influences after a vertex's last one are skipped; other zero weights add nothing.
             "counts": (support.shape[1] - support[:, ::-1].argmax(axis=1)).astype(np.int32),
             "entries": entries,
             "starts": starts,
@@ -103,13 +103,13 @@ class Skinning(nn.Module):
 
 
 def by_joint(indices: Ints, support: np.ndarray, trainable: range) -> tuple[Ints, Ints]:
-    """Sort influences by joint and split each joint's evenly.
+    """Sort influences by joint and split those of each joint evenly.
 
     Args:
-        indices: joints (V, I); support: which of them count (V, I); trainable: consecutive joints, T of them.
+        indices: joints (V, I); support: which of them count (V, I); trainable: T consecutive joints.
 
     Returns:
-        Flat influences of these joints (E,), and where their parts begin and the last one ends (T, PARTS + 1); int32.
+        Flat indices of these joints' influences (E,), and the boundaries of their parts (T, PARTS + 1); int32.
     """
     chosen = np.flatnonzero(support & np.isin(indices, trainable))
     joint = indices.reshape(-1)[chosen]

@@ -18,19 +18,19 @@ from .descriptors import gravity_features
 from .network import GarmentModel
 
 DOWN = (0.0, -1.0, 0.0)
-REST_FRAMES = 2  # frames at rest with which a shot begins, or goes on after a cut
-GRAPH_WARMUP_CALLS = 3  # calls before a graph is captured, in which libraries settle what they will do
+REST_FRAMES = 2  # frames at rest at the start of a shot and after a cut
+GRAPH_WARMUP_CALLS = 3  # before a graph is captured
 
 
 @dataclass(frozen=True, eq=False)
 class MotionInputs:
-    """What N motions of F frames say.
+    """Inputs of the model from N motions of F frames.
 
     Attributes:
         rest: quasi-static latents, shape (F, N, latent); pose: dynamic descriptors, shape (F, N, D).
-        character: skinning matrices about each root, shape (F, J, 3, 4, N).
-        origins: where each root is [m], shape (F, 3, N), float64.
-        begins: frames with which a shot begins, or goes on after a cut: the garment is at rest, shape (F, N, 1).
+        character: skinning matrices relative to each root, shape (F, J, 3, 4, N).
+        origins: positions of the roots [m], shape (F, 3, N), float64.
+        begins: first frames of a shot and after a cut, in which the garment is at rest, shape (F, N, 1).
     """
 
     rest: Tensor
@@ -42,7 +42,7 @@ class MotionInputs:
 
 @torch.no_grad()
 def motion_inputs(model: GarmentModel, motions: Sequence[Motion]) -> MotionInputs:
-    """Return what motions say, on the model's device; the shorter ones hold their last pose.
+    """Return the inputs from motions, on the model's device; shorter motions hold their last pose.
 
     Raises:
         SsilkError: a motion is not at the model's rate.
@@ -60,7 +60,7 @@ def motion_inputs(model: GarmentModel, motions: Sequence[Motion]) -> MotionInput
 
 
 def _span_inputs(model: GarmentModel, motion: Motion) -> tuple[Tensor, ...]:
-    """Return what `MotionInputs` holds of one motion without cuts, frames first."""
+    """Return the tensors of `MotionInputs` for one motion without cuts, frames first."""
     skeleton, parameter = model.scene.character.skeleton, next(model.parameters())
     world = motion_transforms(motion, skeleton.parents)
     features = pose_features(motion, skeleton, model.joints, world)
@@ -79,12 +79,12 @@ def _span_inputs(model: GarmentModel, motion: Motion) -> tuple[Tensor, ...]:
 
 
 class BatchPlayer:
-    """Advances one garment in N shots, all of them by a frame in each call.
+    """Advances one garment in N shots by one frame per call.
 
     Args:
-        model: on the device where everything is to run.
-        like: motions of N shots, for their shapes.
-        vertices: whether to decode to vertices; without, a step gives what the decoder's network does.
+        model: on the device to use.
+        like: inputs of N shots, for their shapes.
+        vertices: whether to decode to vertices; otherwise a step returns the output of the decoder's network.
     """
 
     def __init__(self, model: GarmentModel, like: MotionInputs, *, vertices: bool = True) -> None:
@@ -96,7 +96,7 @@ class BatchPlayer:
         self.advance = self._capture_graph() if self.rest.is_cuda else self._advance
 
     def play(self, shots: MotionInputs) -> Iterator[Tensor]:
-        """Yield vertices about each root (V, 3, N) [m], or network output (N, K + 6 P), of frame after frame.
+        """Yield vertices relative to each root (V, 3, N) [m], or network output (N, K + 6 P), frame by frame.
 
         On a GPU each result is overwritten by the next one.
         """
@@ -105,7 +105,7 @@ class BatchPlayer:
 
     @torch.no_grad()
     def step(self, shots: MotionInputs, frame: int) -> Tensor:
-        """Return what `play` yields of a frame, the one after the last that was asked for, or the first."""
+        """Return the result of `play` for a frame; frames must be requested in order."""
         for name in ("rest", "pose", "character", "begins"):
             getattr(self, name).copy_(getattr(shots, name)[frame])
         return self.advance()
@@ -123,7 +123,7 @@ class BatchPlayer:
 
     @torch.no_grad()
     def _capture_graph(self) -> Callable[[], Tensor]:
-        """Record a step as a graph; return what runs it again."""
+        """Capture a step as a CUDA graph; return a function that replays it."""
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream):

@@ -27,11 +27,11 @@ from ..skinning import blend_matrices, transform_points
 
 @dataclass(frozen=True, eq=False)
 class MotionSpan:
-    """A part of a shot without cuts, at the rate of the solver's steps.
+    """A part of a shot without cuts, sampled at the solver's steps.
 
     Attributes:
-        shot: index of the motion that it is of.
-        first: frame of the shot that it begins with.
+        shot: index of its motion.
+        first: its first frame in the shot.
         substeps: steps for each frame of the shot.
         motion: its poses, one for each step.
     """
@@ -43,14 +43,14 @@ class MotionSpan:
 
     @property
     def frame_count(self) -> int:
-        """Frames of the shot that it covers."""
+        """Number of frames of the shot in this span."""
         return (self.motion.frame_count - 1) // self.substeps + 1
 
 
 def split_into_spans(
     motion: Motion, shot: int, fps: float, substeps: int, longest: int | None = None
 ) -> list[MotionSpan]:
-    """Return the spans of a motion between its cuts, of `longest` frames at most, those of a shot at `fps`."""
+    """Return the spans of a motion between its cuts, each at most `longest` frames of a shot at `fps`."""
     spans, first, source = [], 0, 0
     for part in split_at_cuts(motion):
         stop = frames_at(source + part.frame_count, motion.fps, fps)
@@ -65,7 +65,7 @@ def split_into_spans(
 
 
 def join_spans(motion: Motion, spans: Sequence[MotionSpan]) -> Motion:
-    """Return the motion as its spans play it: the character of a shot, frame by frame."""
+    """Return the motion of a shot from its spans, one pose per frame."""
     fps, substeps = spans[0].motion.fps / spans[0].substeps, spans[0].substeps
     parts = [span.motion for span in spans]
     rotations = np.concatenate([part.rotations[::substeps] for part in parts])
@@ -75,7 +75,7 @@ def join_spans(motion: Motion, spans: Sequence[MotionSpan]) -> Motion:
 
 @dataclass(frozen=True, eq=False)
 class PosedCharacters:
-    """Characters at one step, each about its own root.
+    """Posed characters, each relative to its own root.
 
     Attributes:
         root: position of the first joint [m], float64, shape (3, N).
@@ -89,7 +89,7 @@ class PosedCharacters:
 
 
 class CharacterPoser:
-    """Poses the character and the linearly skinned garment of a scene."""
+    """Poses the character of a scene, and its garment under linear blend skinning."""
 
     def __init__(self, scene: Scene, device: torch.device, dtype: torch.dtype) -> None:
         self.skeleton, self.dtype = scene.character.skeleton, dtype
@@ -104,7 +104,7 @@ class CharacterPoser:
         return self.pose(rotations, np.stack([span.motion.translations[step] for span in spans]))
 
     def pose(self, rotations: Floats, translations: Floats) -> PosedCharacters:
-        """Return poses of local joint rotations (N, J, 4) and translations (N, J, 3)."""
+        """Return characters with local joint rotations (N, J, 4) and translations (N, J, 3)."""
         world = world_transforms(rigid(matrix_from_quaternion(rotations), translations), self.skeleton.parents)
         root = world[:, 0, :3, 3].copy()
         world[:, :, :3, 3] -= root[:, None]
