@@ -25,7 +25,6 @@ lint: $(STAMP)
 extension: $(BLENDER_STAMP)
 	mkdir -p dist
 	$(BLENDER_VENV)/bin/python tools/stage_extension.py build/extension
-	$(BLENDER_VENV)/bin/python -m pip wheel --quiet --no-deps --wheel-dir build/extension/wheel .
 	$(BLENDER_VENV)/bin/python $(BLENDER_TOOL) build --source-dir build/extension --output-dir dist
 
 test-blender: $(STAMP) $(BLENDER_STAMP)

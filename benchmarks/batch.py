@@ -15,9 +15,9 @@ import time
 from pathlib import Path
 
 import numpy as np
-import synthetic
 import torch
-from reports import table, write_results
+from helpers import synthetic
+from helpers.reports import table, write_results
 
 from ssilk_core.config import ModelConfig
 from ssilk_core.devices import chosen_device

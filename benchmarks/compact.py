@@ -19,18 +19,16 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from helpers.reports import table, write_results
 from pxr import Sdf
-from reports import table, write_results
 from ssilk_usd.play import Shot
 from ssilk_usd.read_character import read_character
 from ssilk_usd.read_motion import read_motion
 from ssilk_usd.write import write_motion
 
 from ssilk_core.assets import Floats
+from ssilk_core.bake import BakeRequest, BakeTask, LayerFolder
 from ssilk_core.cli import main
-from ssilk_core.cli._layers import Wardrobe, bake_task, layout_of
-from ssilk_core.events import silent
-from ssilk_core.farm.tasks import BakeTask
 from ssilk_core.kinematics import deform
 from ssilk_core.targets import TARGETS, capped
 
@@ -54,14 +52,13 @@ def measure() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         motion = _motion(options, folder)
-        task = BakeTask(
-            garment="garment", shot="shot", model=options.model, stage=options.stage, motion=str(motion), points=True
-        )
-        wardrobe = Wardrobe()
-        bake_task(task, folder / "usd", wardrobe, silent)
-        bake_task(replace(task, target="blender"), folder / "blender", wardrobe, silent)
-        exact = np.stack(list(wardrobe.dressed(task).over(task.motion).vertices(silent)))
-        rows = [*_rows(task, folder, exact), *_targets(task, folder, exact), _heaviest(wardrobe, task, exact)]
+        request = BakeRequest(model=options.model, stage=options.stage, motion=str(motion))
+        task = BakeTask(garment="garment", shot="shot", request=request, points=True)
+        layers = LayerFolder(folder / "usd")
+        layers.bake(task)
+        LayerFolder(folder / "blender").bake(replace(task, request=replace(request, target="blender")))
+        exact = np.stack(list(layers.garment(task).over(request.motion).vertices()))
+        rows = [*_rows(task, folder, exact), *_targets(request, folder, exact), _heaviest(layers, task, exact)]
     cache = exact.size * 4
     cells = [
         [row.name, *_share(row.size, cache), f"{1e3 * row.errors.max():.2g}",
@@ -98,7 +95,7 @@ def _motion(options: argparse.Namespace, folder: Path) -> Path:
 
 
 def _rows(task: BakeTask, folder: Path, exact: Floats) -> Iterator[Row]:
-    lean, full = layout_of(task, folder / "usd"), layout_of(task, folder / "blender")
+    lean, full = (LayerFolder(folder / name).layout(task) for name in ("usd", "blender"))
     errors = _errors(lean.animation, exact)
     yield Row(name="points.usdc, the point cache", size=lean.points.stat().st_size, errors=_rounding(exact))
     yield Row(name="anim.usdc, the shot", size=lean.animation.stat().st_size, errors=errors)
@@ -114,12 +111,12 @@ def _rows(task: BakeTask, folder: Path, exact: Floats) -> Iterator[Row]:
         yield Row(name=name, size=_deflated(rounded), errors=_errors(rounded, exact))
 
 
-def _targets(task: BakeTask, folder: Path, exact: Floats) -> Iterator[Row]:
+def _targets(request: BakeRequest, folder: Path, exact: Floats) -> Iterator[Row]:
     """Yield the shot as one file for each target, garment alone."""
     for name, target in TARGETS.items():
         path = folder / f"{name}{target.suffixes[0]}"
-        main(["bake", task.model, "--stage", task.stage, "--motion", task.motion, "--target", name, "--no-body",
-              "-o", str(path)])  # fmt: skip
+        main(["bake", request.model, "--stage", request.stage, "--motion", request.motion, "--target", name,
+              "--no-body", "-o", str(path)])  # fmt: skip
         yield Row(name=f"one file for {name}, garment alone", size=path.stat().st_size, errors=_errors(path, exact))
 
 
@@ -127,11 +124,11 @@ def _share(size: int, cache: int) -> tuple[str, str]:
     return (f"{size:,}", f"1 / {cache / size:.1f}") if size else ("", "")
 
 
-def _heaviest(wardrobe: Wardrobe, task: BakeTask, exact: Floats) -> Row:
+def _heaviest(layers: LayerFolder, task: BakeTask, exact: Floats) -> Row:
     """Return what capping influences alone would cost: the heaviest of each vertex, with nothing learned."""
-    bake = wardrobe.dressed(task).over(task.motion)
-    deformer = capped(bake.deformer, TARGETS["game4"])
-    points = np.concatenate([deform(deformer, bake.motion, pose) for pose in bake.poses()])
+    rollout = layers.garment(task).over(task.request.motion)
+    deformer = capped(rollout.deformer, TARGETS["game4"])
+    points = np.concatenate([deform(deformer, rollout.motion, pose) for pose in rollout.poses()])
     errors = np.linalg.norm(points - exact, axis=-1)
     return Row(name="for comparison: the 4 heaviest influences, nothing learned", size=0, errors=errors)
 

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from plots import COLOURS, Panel, canvas, save
-from reports import RESULTS, table, write_results
+from helpers.plots import COLOURS, Panel, canvas, save
+from helpers.reports import RESULTS, table, write_results
 
 from ssilk_core.energy import TERMS
 from ssilk_core.errors import fail

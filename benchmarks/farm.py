@@ -27,17 +27,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from reports import table, write_results
+from helpers.reports import table, write_results
 from ssilk_usd.read_character import read_character
 from ssilk_usd.read_motion import read_motion
 from ssilk_usd.write import write_motion
 
 from ssilk_core.assets import Motion
-from ssilk_core.cli._layers import Wardrobe, bake_task, clear, is_done, layout_of
-from ssilk_core.cli.farm import bake_here
-from ssilk_core.events import silent
-from ssilk_core.farm.cluster import run_on_cluster
-from ssilk_core.farm.tasks import BakeTask, plan
+from ssilk_core.bake import BakeRequest, BakeTask, LayerFolder, plan_layers
+from ssilk_core.farm.cluster import bake_here, run_on_cluster
 from ssilk_core.files import sha256
 
 PERIOD = 10.0  # seconds from one kill to the next; a worker takes a few to start
@@ -103,7 +100,7 @@ def main() -> None:
     options = _options()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        tasks = plan([(options.model, None)], _shots(options, folder), _like(options))
+        tasks = plan_layers(_requests(options, folder))
         measured: dict[str, dict[str, Any]] = {}
         if "cluster" in options.parts:
             measured["cluster"] = _on_cluster(tasks, folder)
@@ -133,8 +130,10 @@ def _options() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def _like(options: argparse.Namespace) -> BakeTask:
-    return BakeTask(garment="", shot="", motion="", model=options.model, stage=str(Path(options.stage).absolute()))
+def _requests(options: argparse.Namespace, folder: Path) -> list[BakeRequest]:
+    stage = str(Path(options.stage).absolute())
+    shots = _shots(options, folder)
+    return [BakeRequest(model=options.model, stage=stage, motion=motion) for motion in shots]
 
 
 def _shots(options: argparse.Namespace, folder: Path) -> list[str]:
@@ -162,7 +161,8 @@ def _on_cluster(tasks: Sequence[BakeTask], folder: Path) -> dict[str, Any]:
     began = time.perf_counter()
     outcomes = list(run_on_cluster(tasks, folder / "cluster", bake_here))
     seconds = time.perf_counter() - began
-    clear(tasks, folder / "cluster")
+    cluster = LayerFolder(folder / "cluster")
+    cluster.remove_unfinished(tasks)
     killer.over.set()
     monitor.join()
     names = Counter(outcome.task.name for outcome in outcomes if not outcome.error)
@@ -171,7 +171,7 @@ def _on_cluster(tasks: Sequence[BakeTask], folder: Path) -> dict[str, Any]:
         "shots": len(tasks),
         "seconds": round(seconds, 1),
         "workers killed": killer.killed,
-        "shots lost": len(tasks) - sum(is_done(task, folder / "cluster") for task in tasks),
+        "shots lost": len(tasks) - sum(cluster.is_done(task) for task in tasks),
         "shots ended twice": sum(count > 1 for count in names.values()),
         "shots that differ from an undisturbed bake": _differing(tasks, folder),
         "shots compared": min(SHARE, len(tasks)),
@@ -183,10 +183,10 @@ def _on_cluster(tasks: Sequence[BakeTask], folder: Path) -> dict[str, Any]:
 
 def _differing(tasks: Sequence[BakeTask], folder: Path) -> int:
     """Return how many of a share of the tasks hold other bytes than one process makes undisturbed."""
-    wardrobe, differing = Wardrobe(), 0
+    single, cluster, differing = LayerFolder(folder / "single"), LayerFolder(folder / "cluster"), 0
     for task in random.Random(1).sample(list(tasks), min(SHARE, len(tasks))):
-        bake_task(task, folder / "single", wardrobe, silent)
-        places = [layout_of(task, folder / name) for name in ("single", "cluster")]
+        single.bake(task)
+        places = [layers.layout(task) for layers in (single, cluster)]
         there = places[1].animation.is_file()  # those that are not are counted as lost
         differing += there and len({sha256(place.animation) for place in places}) > 1
     return differing
@@ -207,13 +207,13 @@ def _cores(tasks: Sequence[BakeTask], folder: Path, cores: Sequence[int]) -> dic
 
 def _start(task: BakeTask, folder: Path) -> dict[str, Any]:
     """Return what a process takes before its first shot, and for a shot then [s]."""
-    words = "import torch, ssilk_usd.shot, ssilk_usd.check, ssilk_core.cli._layers"
-    wardrobe, taken = Wardrobe(), [time.perf_counter()]
+    words = "import torch, ssilk_usd.shot, ssilk_usd.check, ssilk_core.bake"
+    layers, taken = LayerFolder(folder / "first"), [time.perf_counter()]
     for work in (
         lambda: subprocess.run([sys.executable, "-c", words], check=True),
-        lambda: wardrobe.dressed(task),
-        lambda: bake_task(task, folder / "first", wardrobe, silent),
-        lambda: bake_task(task, folder / "first", wardrobe, silent, again=True),
+        lambda: layers.garment(task),
+        lambda: layers.bake(task),
+        lambda: layers.bake(task, again=True),
     ):
         work()
         taken.append(time.perf_counter())
@@ -224,10 +224,10 @@ def _start(task: BakeTask, folder: Path) -> dict[str, Any]:
 
 def _soak(task: BakeTask, folder: Path, bakes: int) -> dict[str, Any]:
     """Bake one shot again and again; return memory ten times, how it grows between, and file handles."""
-    wardrobe, step = Wardrobe(), max(bakes // 10, 1)
+    layers, step = LayerFolder(folder / "soak"), max(bakes // 10, 1)
     memory, handles = {}, {}
     for count in range(1, bakes + 1):
-        bake_task(task, folder / "soak", wardrobe, silent, again=True)
+        layers.bake(task, again=True)
         if count % step == 0:
             memory[count], handles[count] = resident(os.getpid()), len(os.listdir("/proc/self/fd"))
     slope = np.polyfit(list(memory)[1:], list(memory.values())[1:], 1)[0] * 1024  # once everything is warm

@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from plots import COLOURS, Panel, canvas, save
-from reports import RESULTS, table, write_results
-from subjects import Subject, arguments, clip_of, open_subject, parsed
+from helpers.plots import COLOURS, Panel, canvas, save
+from helpers.reports import RESULTS, table, write_results
+from helpers.subjects import Subject, arguments, clip_of, open_subject, parsed
 from torch import Tensor
 
 from ssilk_core.energy import TERMS
-from ssilk_core.evaluation.methods import Network, reel_of
+from ssilk_core.evaluation.methods import Network, build_take_set
 from ssilk_core.evaluation.record import recorded
 from ssilk_core.evaluation.takes import Take, back_and_forth
 
@@ -59,8 +59,8 @@ def rolled(subject: Subject, clip: str, frames: int, options: Any) -> Looped:
     """Roll a model over a looped clip."""
     dressed = subject.dressed
     motion, length = back_and_forth(clip_of(options, clip, subject), dressed.fps, frames)
-    reel = reel_of([Take(clip, 0, motion)], dressed, subject.model.joints)
-    network = Network(subject.name, subject.model, reel)
+    reel = build_take_set([Take(clip, 0, motion)], dressed, subject.model.joints)
+    network = Network(subject.model, reel)
     values = recorded(dressed, reel, network, 0).values
     return Looped({name: values[name] for name in TERMS}, length, float(network.states[0].abs().max()))
 

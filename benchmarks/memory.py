@@ -11,11 +11,11 @@ import argparse
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import torch
-from reports import table, write_results
+from helpers.peak import Peak
+from helpers.reports import table, write_results
 
 from ssilk_core.assets import (
     LOOSE,
@@ -109,31 +109,6 @@ def stepper(whole: Scene, config: TrainConfig, device: torch.device) -> Stepper:
     return Stepper(
         network, Objective(network, energy, body, bank, config.closest_point == "triangles"), sampler, config
     )
-
-
-class Peak:
-    """The most memory held since it was built [bytes]: of the device, or resident in this process (Linux)."""
-
-    def __init__(self, device: torch.device) -> None:
-        self.device = device
-        if device.type == "cuda":
-            torch.cuda.synchronize()
-            torch.cuda.empty_cache()
-            torch.cuda.reset_peak_memory_stats()
-            self.before = torch.cuda.memory_allocated()
-        else:
-            Path("/proc/self/clear_refs").write_text("5")  # resets the high-water mark
-            self.before = self._status("VmRSS")
-
-    def bytes(self) -> int:
-        if self.device.type == "cuda":
-            return torch.cuda.max_memory_reserved() - self.before
-        return self._status("VmHWM") - self.before
-
-    @staticmethod
-    def _status(name: str) -> int:
-        lines = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
-        return int(lines[name].split()[0]) * 1024
 
 
 def measure(vertices: int, body_vertices: int, frames: int, surface: str, device: torch.device) -> dict[str, int]:

@@ -3,12 +3,12 @@
 
     python benchmarks/paper.py OUT --stages STAGES --motions FOLDER --index FOLDER/index.json --gpus 4 --until 570
     python benchmarks/tables.py table1 OUT/records
-    python benchmarks/tables.py table5 OUT/sweeps
+    python benchmarks/tables.py ablations OUT/sweeps
 
-STAGES holds the rigged garments of `paper_jobs.GARMENTS`, and the cape with other numbers of proxies. What a job
-writes tells that it is done: the same command once more goes on with what is missing. No job begins that would, as
-predicted, end after --until; --list shows all of them and runs none. Trainings on one GPU side by side hide each
-other's start, and each has as many steps as take --seconds on a GPU of its own, whichever method it is of.
+STAGES holds the rigged garments of `paper_jobs.GARMENTS`, and the cape with other numbers of proxies. A job is done
+when its outputs exist, so the same command again continues with what is missing. No job begins that is predicted to
+end after --until. --list shows all jobs and runs none. Trainings on one GPU overlap, which hides their start. Each
+has as many steps as take --seconds on a GPU of its own, whatever its method.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from paper_jobs import GARMENTS, PYTHON, TABLES, Job, Plan, jobs, without_models
-from reports import table
+from helpers.paper_jobs import GARMENTS, PYTHON, TABLES, Job, Plan, jobs, without_models
+from helpers.reports import table
 
 from ssilk_core.errors import SsilkError
 
@@ -35,7 +35,7 @@ PATHS = (ROOT, ROOT / "usd", ROOT / "benchmarks")
 
 @dataclass
 class Queue:
-    """Jobs in order of worth, taken by workers: each as soon as what it needs has ended, well or not."""
+    """Jobs, the most important first. Workers take each as soon as the jobs that it needs have ended, well or not."""
 
     left: list[Job]
     until: float

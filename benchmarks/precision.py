@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from reports import table, write_results
+from helpers.reports import table, write_results
+from helpers.subjects import Subject, arguments, clip_of, open_subject, parsed
 from safetensors import safe_open
-from subjects import Subject, arguments, clip_of, open_subject, parsed
 from torch import Tensor
 
 from ssilk_core.assets import Motion

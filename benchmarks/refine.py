@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from reports import table, write_results
-from subjects import Subject, arguments, clip_of, open_subject, parsed
+from helpers.reports import table, write_results
+from helpers.subjects import Subject, arguments, clip_of, open_subject, parsed
 
 from ssilk_core.assets import Floats, GarmentPose, Motion
 from ssilk_core.kinematics import deform, resample

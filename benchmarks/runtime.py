@@ -25,11 +25,11 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import synthetic
-from playing import BLOCK, PARTS, SKINNING, TOTALS, Times, measured, spread, ways, with_numpy
-from reports import table, write_results
+from helpers import synthetic
+from helpers.playing import BLOCK, PARTS, SKINNING, TOTALS, Times, measured, spread, ways, with_numpy
+from helpers.reports import table, write_results
+from helpers.subjects import arguments, open_subject, parsed
 from ssilk_usd.read_motion import read_motion
-from subjects import arguments, open_subject, parsed
 
 from ssilk_core.assets import PINNED, Motion, Scene
 from ssilk_core.checkpoint import ModelFile, model_file
@@ -46,7 +46,7 @@ VERTICES = (500, 2_500, 10_000, 30_000, 100_000)
 NETWORKS = ((32, (128, 128)), (64, (256, 256)), (128, (256, 256, 256)), (128, (256, 512, 512)))
 GROWTH_FRAMES = 64
 ALL, CHUNKS = {"in chunks": BLOCK, "frame by frame": 1}, {"in chunks": BLOCK}
-CLOTH, LIVE = (Path(__file__).with_name(f"blender_{name}.py") for name in ("cloth", "live"))
+CLOTH, LIVE = (Path(__file__).parent / "helpers" / f"blender_{name}.py" for name in ("cloth", "live"))
 
 
 def times_table(found: Times) -> str:

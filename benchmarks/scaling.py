@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from reports import table, write_results
+from helpers.reports import table, write_results
 
 from ssilk_core.cli import parser as ssilk_parser
 from ssilk_core.cli.train import training_job

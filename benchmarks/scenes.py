@@ -21,10 +21,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import synthetic
 import torch
-from memory import Peak
-from reports import table, write_results
+from helpers import synthetic
+from helpers.peak import Peak
+from helpers.reports import table, write_results
 from ssilk_usd.shot import write_shot
 from ssilk_usd.units import StageUnits
 

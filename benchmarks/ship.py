@@ -16,6 +16,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from helpers.reports import table, write_results
+from helpers.subjects import Subject, arguments, open_subject, parsed
 from precision import (
     HELD_OUT,
     LOSS_HEADER,
@@ -29,9 +31,7 @@ from precision import (
     means,
     packed_subject,
 )
-from reports import table, write_results
 from ssilk_usd.read_stage import split_location
-from subjects import Subject, arguments, open_subject, parsed
 
 from ssilk_core.assets import Motion, Scene
 from ssilk_core.checkpoint import ModelFile, save_model

@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from clock import now
-from reports import table, write_results
+from helpers.clock import now
+from helpers.reports import table, write_results
+from helpers.subjects import parsed
 from ssilk_usd.read_motion import read_motion
 from ssilk_usd.read_scene import read_scene
-from subjects import parsed
 from torch import Tensor
 
 from ssilk_core.assets import Motion, Scene

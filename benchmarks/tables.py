@@ -5,23 +5,20 @@
         --reference SHOTS --device cuda
 
 MODELS are files, or folders of them: those of 'ssilk train' and baselines, whose files say what they are. Models of
-one garment and method are taken as seeds, and shown as mean and standard deviation. SHOTS is what 'ssilk simulate'
+one garment and method count as seeds, shown as mean and standard deviation. SHOTS is what 'ssilk simulate'
 made of the clips, one folder for each garment.
 
     record    figures of models into a file (--output), from which the tables are made where there are no models
-    evaluate  all that 'ssilk evaluate' tells
+    evaluate  all figures of 'ssilk evaluate'
     table1    every garment, split and method: total, collisions, excess over the simulator
     table2    the same of `inertia` and `flips`, beside the simulator
     table3    time of a single frame of one clip, in PyTorch
-    table4    weight of the regularisation of latents (Eq. 13)
-    table5    batch, window and latent size, one changed at a time
-    figure8   blendshapes alone, joints alone, and both
-    figure11  schemes of integration
-    figure12  numbers of blendshapes, and of proxies
+    ablations one setting changed at a time: decoder (Figure 8), integration scheme (Figure 11), blendshapes and
+              proxies (Figure 12), latent regularisation (Table 4), batch, window and latent size (Table 5)
 
-Records in place of models (`*.json`, or folders of them) need no stage and no motions: table1 takes totals from those
-of whole clips and the simulator from those of sequences. Figure 10 is drawn by `long_rollout.py`, the curves of
-Figure 11 by `curves.py`; `paper.py` trains and measures all that the tables need.
+Records in place of models (`*.json`, or folders of them) need no stage and no motions. table1 takes totals from those
+of whole clips and the errors to the simulator from those of sequences. `long_rollout.py` measures Figure 10 and
+`curves.py` the curves of Figure 11. `paper.py` trains and measures all that the tables need.
 """
 
 from __future__ import annotations
@@ -33,19 +30,20 @@ from statistics import mean
 from typing import Any
 
 import torch
-from records import with_truth, write_record
-from reports import table, write_results
-from seeds import Cell, cells, evaluated, measured
-from single_frames import frame_times
+from baselines.files import load_network
+from helpers import paper_schemes
+from helpers.records import with_reference, write_record
+from helpers.reports import table, write_results
+from helpers.seeds import Cell, cells, evaluated, measured
+from helpers.single_frames import frame_times
+from helpers.subjects import dressed_in
+from helpers.sweeps import ablations
 from ssilk_usd.read_motion import read_motion
-from subjects import dressed_in
-from sweeps import SWEEPS, sweep
 
 from ssilk_core.assets import Motion
-from ssilk_core.baselines.files import load_network
 from ssilk_core.checkpoint import ModelFile
 from ssilk_core.errors import SsilkError, fail
-from ssilk_core.evaluation.methods import reel_of
+from ssilk_core.evaluation.methods import build_take_set
 from ssilk_core.evaluation.run import SIMULATOR
 from ssilk_core.evaluation.splits import SPLITS
 from ssilk_core.evaluation.takes import takes_of
@@ -55,14 +53,14 @@ Columns = Mapping[str, tuple[tuple[str, ...], str]]
 
 COLUMNS: Columns = {
     "L_tot [J]": (("total",), ".4g"),
-    "collisions": (("collisions",), ".2%"),
-    "excess [J]": (("truth", "excess"), ".4g"),
-    "floats, of m g L": (("truth", "floats"), "+.1%"),
+    "vertices inside the body": (("collisions",), ".2%"),
+    "L_tot excess [J]": (("reference", "total_excess"), ".4g"),
+    "gravity excess [m g L]": (("reference", "gravity_excess"), "+.1%"),
 }
 DYNAMICS: Columns = {
     **COLUMNS,
-    "velocity off [m/s]": (("truth", "velocity"), ".3g"),
-    "acceleration off [m/s2]": (("truth", "acceleration"), ".3g"),
+    "RMS velocity error [m/s]": (("reference", "velocity_error"), ".3g"),
+    "RMS acceleration error [m/s2]": (("reference", "acceleration_error"), ".3g"),
 }
 
 
@@ -77,21 +75,32 @@ def methods_table(found: Mapping[tuple[str, str, str], Cell], splits: Sequence[s
     return table(["garment", "method", *(f"{split}: {name}" for split, name in columns)], rows)
 
 
+def figures_of(found: Mapping[tuple[str, str, str], Cell], shown: Columns = COLUMNS) -> list[dict[str, Any]]:
+    """Return the figures of each cell, a list with the values of all seeds under the last name of each path."""
+    names = ("garment", "method", "split")
+    values = {key: {path[-1]: cell.values(path) for path, _ in shown.values()} for key, cell in found.items()}
+    return [
+        dict(zip(names, key)) | {name: seeds for name, seeds in of.items() if seeds} for key, of in values.items()
+    ]
+
+
 def verdicts(found: Mapping[tuple[str, str, str], Cell]) -> list[str]:
-    """Return in how many cells the goals are met, where there is what they compare with."""
+    """Return in how many cells each goal is met."""
     ours = {(garment, split): cell for (garment, method, split), cell in found.items() if method == "ssilk"}
     lines = []
     for baseline in ("ncs", "ncs*", "snug"):
         pairs = [(cell, found[g, baseline, s]) for (g, s), cell in ours.items() if (g, baseline, s) in found]
         lower = sum(mean(a.values(["total"])) < mean(b.values(["total"])) for a, b in pairs)
         lines += [f"ssilk's total is lower than {baseline}'s in {lower} of {len(pairs)} cells"] if pairs else []
-    lines += _shares("the excess on flips is at most half of ncs's", [
-        mean(cell.values(["truth", "excess"])) <= 0.5 * mean(other.values(["truth", "excess"]))
+    lines += _shares("the L_tot excess on flips is at most half of ncs's", [
+        mean(own) <= 0.5 * mean(other.values(["reference", "total_excess"]))
         for (garment, split), cell in ours.items()
-        if split == "flips" and (other := found.get((garment, "ncs", split))) and cell.values(["truth", "excess"])
+        if split == "flips"
+        and (other := found.get((garment, "ncs", split)))
+        and (own := cell.values(["reference", "total_excess"]))
     ])  # fmt: skip
-    floats = [mean(values) for cell in ours.values() if (values := cell.values(["truth", "floats"]))]
-    lines += _shares("at most 5 % of m g L over the simulator's gravity", [value <= 0.05 for value in floats])
+    excesses = [mean(values) for cell in ours.values() if (values := cell.values(["reference", "gravity_excess"]))]
+    lines += _shares("gravity excess over the simulator of at most 5 % of m g L", [v <= 0.05 for v in excesses])
     lines += _shares("collisions under 0.5 %", [mean(cell.values(["collisions"])) < 0.005 for cell in ours.values()])
     return lines
 
@@ -101,18 +110,28 @@ def _shares(text: str, met: Sequence[bool]) -> list[str]:
 
 
 def table1(options: argparse.Namespace) -> tuple[str, Any]:
-    rows = with_truth(measured(options)[0])
-    found = cells(rows)
+    rows, models = measured(options)
+    found = cells(with_reference(rows))
     notes = "".join(f"\n- {line}" for line in verdicts(found))
-    return methods_table(found, SPLITS) + notes + "\n", rows
+    trainings = [
+        {"garment": settings["garment"], "method": method, **settings["trained"]}
+        for name, settings in models.items()
+        if (
+            method := next(
+                (row["method"].partition(" (")[0] for row in rows if Path(row["model"] or "").stem == name), None
+            )
+        )
+    ]
+    return methods_table(found, SPLITS) + notes + "\n", {"figures": figures_of(found), "trainings": trainings}
 
 
 def table2(options: argparse.Namespace) -> tuple[str, Any]:
-    simulated = [row for row in measured(options)[0] if row["figures"]["truth"] or row["method"] == SIMULATOR]
+    simulated = [row for row in measured(options)[0] if row["figures"]["reference"] or row["method"] == SIMULATOR]
     rows = [row for row in simulated if row["split"] != "valid"]
     if not rows:
         fail("table2", "no simulator among the figures", "its shots are needed", "give --reference, or records of it")
-    return methods_table(cells(rows), SPLITS[1:], DYNAMICS), rows
+    found = cells(rows)
+    return methods_table(found, SPLITS[1:], DYNAMICS), {"figures": figures_of(found, DYNAMICS)}
 
 
 def everything(options: argparse.Namespace) -> tuple[str, Any]:
@@ -126,7 +145,7 @@ def table3(options: argparse.Namespace) -> tuple[str, Any]:
         file, model = load_network(path)
         dressed = dressed_in(file, options.stage, options.device)
         takes = takes_of(options.clip, clip_of(options, file), dressed.fps)
-        times = frame_times(model.to(dressed.device), reel_of(takes[:1], dressed, file.joints), options.frames)
+        times = frame_times(model.to(dressed.device), build_take_set(takes[:1], dressed, file.joints), options.frames)
         found[path.stem] = vars(times)
         spans = [f"{1000 * value:.2f} ± {1000 * spread:.2f}" for value, spread in (times.full, times.model)]
         rows.append([path.stem, *spans, f"{1000 * (times.full[0] - times.model[0]):.2f}"])
@@ -145,7 +164,7 @@ def record(options: argparse.Namespace) -> None:
 
 
 MADE: dict[str, Callable[[argparse.Namespace], tuple[str, Any]]] = {
-    "evaluate": everything, "table1": table1, "table2": table2, "table3": table3, **dict.fromkeys(SWEEPS, sweep),
+    "evaluate": everything, "table1": table1, "table2": table2, "table3": table3, "ablations": ablations,
 }  # fmt: skip
 
 
@@ -186,6 +205,7 @@ def parsed() -> argparse.Namespace:
 
 def main() -> None:
     options = parsed()
+    paper_schemes.register()
     try:
         if not (options.models or options.records):
             fail("MODELS", "no model and no record", "'ssilk train' writes models")

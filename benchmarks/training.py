@@ -9,7 +9,7 @@ one size at a time is changed; the batch that training has by default is a case 
 CUDA graph of its own, timed with cold caches; the reference implementation of the nearest body point, and with it the
 plain step, cannot be captured and are launched as they are. Each time is a median over repeats. A floor is the larger
 of bytes over the rate of a copy and operations over the rate of a float32 matrix product, both measured in the same
-run (benchmarks/floors.py); that of the nearest body point counts brute force.
+run (helpers/floors.py); that of the nearest body point counts brute force.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from typing import Any
 from unittest import mock
 
 import torch
-from clock import Clock, Rates, Span, Work, side_stream
-from floors import WARM, WINDOWS, Floor
-from memory import Peak
-from moment import Moment
-from parts import all_parts
-from reports import save_results, write_results
-from synthetic import Size, stepper
-from training_tables import tables
+from helpers.clock import Clock, Rates, Span, Work, side_stream
+from helpers.floors import WARM, WINDOWS, Floor
+from helpers.moment import Moment
+from helpers.parts import all_parts
+from helpers.peak import Peak
+from helpers.reports import save_results, write_results
+from helpers.synthetic import Size, stepper
+from helpers.training_tables import tables
 
 from ssilk_core import kernels
 from ssilk_core.config import TrainConfig
@@ -49,7 +49,7 @@ SIZES = {
     "batch": (32, 16, 64),
     "static_batch": (64,),
 }
-PLAIN, KERNELS = "plain", "kernels"
+REFERENCE, KERNELS = "reference", "kernels"
 
 Figures = dict[str, Any]
 
@@ -125,7 +125,7 @@ def measure_all(options: argparse.Namespace) -> Figures:
     Each case has a process of its own, so that nothing of one is left when the next begins.
     """
     device = chosen_device(options.device)
-    variants = [PLAIN, KERNELS] if kernels.available(device) else [PLAIN]
+    variants = [REFERENCE, KERNELS] if kernels.available(device) else [REFERENCE]
     measured: Figures = {"triton": version("triton") if KERNELS in variants else None, "cases": {}}
     spawned = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=spawned, max_tasks_per_child=1) as processes:
@@ -136,8 +136,27 @@ def measure_all(options: argparse.Namespace) -> Figures:
             measured["cases"][name] = {"size": asdict(size), **case}
             steps = (f"{kind} {figures['steps'][WINDOWS]['median']:.3g} ms" for kind, figures in case.items())
             print(f"{name}: a step {', '.join(steps)}", flush=True)
-            save_results(options, tables(measured), measured)
+            save_results(options, kept(measured))
     return measured
+
+
+def kept(measured: Figures) -> Figures:
+    """Return medians of steps and memory in each case, and medians of the parts of the base case."""
+    cases = {
+        name: {
+            variant: {
+                "steps [ms]": {phase: span["median"] for phase, span in of["steps"].items()},
+                "peak [bytes]": of["peak"],
+            } if variant != "size" else of
+            for variant, of in case.items()
+        }
+        for name, case in measured["cases"].items()
+    }  # fmt: skip
+    base = {variant: of["parts"] for variant, of in measured["cases"]["base"].items() if variant != "size"}
+    parts = {
+        name: {f"{variant} [ms]": of[name]["median"] for variant, of in base.items()} for name in base[REFERENCE]
+    }
+    return {"triton": measured["triton"], "cases": cases, "parts of the base case": parts}
 
 
 def main() -> None:
@@ -152,7 +171,7 @@ def main() -> None:
                         help="leave out the batch that training has by default")  # fmt: skip
     options = parser.parse_args()
     measured = measure_all(options)
-    write_results(options, tables(measured), measured)
+    write_results(options, tables(measured), kept(measured))
 
 
 if __name__ == "__main__":

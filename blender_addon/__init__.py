@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""SSILK in Blender: paint vertex classes, make proxy rigs; what is heavy runs in a Python of its own.
+"""SSILK in Blender: paint vertex classes, rig, train, bake and play garments.
 
-`outside` and `contract` (and `classes`) know nothing of Blender; `scene` reads and changes Blender's data;
-`operators` and `panels` are what artists see. Nothing here imports `bpy` before Blender registers the extension.
+`scene` reads and changes Blender's data. `operators` and `panels` are what artists see. `outside` runs ssilk in
+another Python. `ssilk_core` and `ssilk_usd`, which come as a wheel, hold scenes and models and know the layout of
+stages. Nothing imports `bpy` before Blender registers the extension.
 """
 
 from __future__ import annotations

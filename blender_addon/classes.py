@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 import numpy as np
+from ssilk_usd.names import CLASS
 
-PINNED, TIGHT, LOOSE = 0, 1, 2
+from ssilk_core.assets import LOOSE, PINNED
+
 COLORS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # sRGB, by class
-ATTRIBUTE = "ssilk:class"  # as the stage names the primvar; Blender's USD importer keeps the name
+ATTRIBUTE = CLASS.removeprefix("primvars:")  # Blender's USD importer keeps the name
 COLOR_ATTRIBUTE = "SSILK Classes"
 
 

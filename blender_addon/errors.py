@@ -1,14 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What an artist can mend: one sentence that names the object, what was found and what to do."""
+"""Errors that an artist can fix: one sentence that names the object, what was found and what to do."""
 
 from __future__ import annotations
 
-
-class SetupError(Exception):
-    """A scene, a setting or a process is not as it must be; operators report it and change nothing."""
+from ssilk_core.errors import SsilkError
 
 
-def need(condition: object, sentence: str) -> None:
-    """Raise `SetupError` with `sentence` unless `condition` holds."""
-    if not condition:
-        raise SetupError(sentence)
+class SetupError(SsilkError):
+    """A scene, a setting or a process is wrong; operators report it and change nothing."""

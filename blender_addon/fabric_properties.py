@@ -3,19 +3,26 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import fields
+
 import bpy
 from bpy.props import EnumProperty, FloatProperty
 
-from . import fabrics
+from ssilk_core.fabrics import FABRICS, Fabric
 
-CHOICES = [
-    ("default", "Default", "The paper's: light and soft"),
-    ("silk", "Silk", "Light and very soft, 80 g/m²"),
-    ("cotton", "Cotton", "A shirt, 150 g/m²"),
-    ("denim", "Denim", "Stiff and heavy, 400 g/m²"),
-    ("wool", "Wool", "A coat, soft and heavy, 300 g/m²"),
-    ("leather", "Leather", "Very stiff and heavy, 600 g/m²"),
-]
+NUMBERS = [field.name for field in fields(Fabric) if field.name not in ("name", "stretch_model")]
+SAME = 1e-5  # relative difference that single precision makes
+
+ABOUT = {
+    "default": "The paper's: light and soft",
+    "silk": "Light and very soft, 80 g/m²",
+    "cotton": "A shirt, 150 g/m²",
+    "denim": "Stiff and heavy, 400 g/m²",
+    "wool": "A coat, soft and heavy, 300 g/m²",
+    "leather": "Very stiff and heavy, 600 g/m²",
+}
+CHOICES = [(name, name.capitalize(), ABOUT[name]) for name in FABRICS]
 MODELS = [
     ("stvk", "St. Venant-Kirchhoff", "Membrane with Lamé parameters"),
     ("baraff_witkin", "Baraff-Witkin", "Stretch along the threads and shear across, by texture coordinates"),
@@ -24,8 +31,13 @@ MODELS = [
 
 def take_preset(fabric: FabricSettings, _: object = None) -> None:
     """Set all values to those of the preset."""
-    for name, value in fabrics.PRESETS[fabric.preset].items():
-        fabric[name if name != "margin" else "margin_meters"] = value
+    for name in NUMBERS:
+        fabric[_property(name)] = getattr(FABRICS[fabric.preset], name)
+
+
+def _property(name: str) -> str:
+    """Return the property that holds one of a fabric's numbers in SI units."""
+    return "margin_meters" if name == "margin" else name
 
 
 def _meters_per_unit() -> float:
@@ -42,7 +54,7 @@ def _set_margin(fabric: FabricSettings, value: float) -> None:
 
 def _number(name: str, label: str, description: str, least: float = 0.0, precision: int = 3):  # type: ignore[no-untyped-def]
     return FloatProperty(
-        name=label, description=description, default=fabrics.PRESETS["default"][name], min=least, precision=precision
+        name=label, description=description, default=getattr(FABRICS["default"], name), min=least, precision=precision
     )
 
 
@@ -61,7 +73,9 @@ class FabricSettings(bpy.types.PropertyGroup):
     bending: _number("bending", "Bending", "Stiffness of folds, in N m", precision=6)
     collision: _number("collision", "Collision", "How hard the body pushes each vertex away, in N/m")
     margin_meters: FloatProperty(
-        description="Distance at which the body begins to push, in m", default=0.004, options={"HIDDEN"}
+        description="Distance at which the body begins to push, in m",
+        default=FABRICS["default"].margin,
+        options={"HIDDEN"},
     )
     margin: FloatProperty(
         name="Margin", description="Distance at which the body begins to push", subtype="DISTANCE", min=0.0,
@@ -72,8 +86,14 @@ class FabricSettings(bpy.types.PropertyGroup):
 
 def fabric_options(fabric: FabricSettings) -> list[str]:
     """Return the options by which `ssilk train` takes a garment's fabric."""
-    values = {name: getattr(fabric, name) for name in fabrics.PRESETS["default"] if name != "margin"}
-    return fabrics.options(fabric.preset, fabric.stretch_model, {**values, "margin": fabric.margin_meters})
+    preset, given = FABRICS[fabric.preset], ["--fabric", fabric.preset]
+    if fabric.stretch_model != preset.stretch_model:
+        given += ["--material", f"stretch_model={fabric.stretch_model}"]
+    for name in NUMBERS:
+        value = getattr(fabric, _property(name))
+        if not math.isclose(value, getattr(preset, name), rel_tol=SAME):
+            given += ["--material", f"{name}={value:.7g}"]
+    return given
 
 
 CLASSES = (FabricSettings,)

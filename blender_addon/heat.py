@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How far cloth is stretched or inside a body, which frames are worst, and the colours of it; numpy alone."""
+"""Stretch of cloth, penetration depth, the worst frames and the colours of a heat map, with numpy alone."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def colors_of(values: np.ndarray, largest: float) -> np.ndarray:
 
 
 def elongations(rest: np.ndarray, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Return how much longer the cloth is at each vertex than at rest, of its triangles the most, shape (V,).
+    """Return the largest elongation of each vertex's triangles since rest, shape (V,).
 
     That of a triangle is the larger principal stretch less one: the larger singular value of the deformation
     gradient, from the plane of the triangle at rest to space.

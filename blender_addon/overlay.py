@@ -24,14 +24,14 @@ def shown() -> bool:
 
 
 def show() -> None:
-    """Draw it from now on; there is nothing to draw on without windows."""
+    """Start drawing the overlay; do nothing without windows."""
     global _handle
     if _handle is None and not bpy.app.background:
         _handle = bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_VIEW")
 
 
 def hide() -> None:
-    """Draw it no longer."""
+    """Stop drawing the overlay."""
     global _handle
     if _handle is not None:
         bpy.types.SpaceView3D.draw_handler_remove(_handle, "WINDOW")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The extension's preferences: which Python has ssilk, and what it said of itself."""
+"""The extension's preferences: which Python has ssilk, with its versions and device."""
 
 from __future__ import annotations
 

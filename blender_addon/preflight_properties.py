@@ -8,13 +8,13 @@ from collections.abc import Sequence
 import bpy
 from bpy.props import BoolProperty, CollectionProperty, IntProperty, PointerProperty, StringProperty
 
-from .contract.findings import Finding
+from ssilk_core.preflight.finding import Finding
 
 INDICES = "indices"  # custom property: what the finding is about
 
 
 class FindingItem(bpy.types.PropertyGroup):
-    """A finding; see `contract.findings.Finding`."""
+    """A finding; see `findings`."""
 
     severity: StringProperty(description="How bad it is")
     code: StringProperty(description="What kind it is of")
@@ -47,10 +47,10 @@ def keep_findings(context: bpy.types.Context, garment: str, findings: Sequence[F
     preflight.garment, preflight.active = garment, 0
     for finding in findings:
         item = preflight.findings.add()
-        for name in ("severity", "code", "target", "found", "why", "fix", "fixable", "elements"):
+        for name in ("severity", "code", "found", "why", "fix", "fixable", "elements"):
             setattr(item, name, getattr(finding, name))
-        item[INDICES] = finding.indices
-        item.size = size_of(finding.target)
+        item.target, item[INDICES] = finding.prim, finding.indices
+        item.size = size_of(finding.prim)
 
 
 def shown_finding(context: bpy.types.Context) -> FindingItem | None:
@@ -74,5 +74,5 @@ def attach() -> None:
 
 
 def detach() -> None:
-    """Take it away."""
+    """Remove it."""
     del bpy.types.WindowManager.ssilk_preflight

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a garment object remembers."""
+"""Settings that are stored with each garment object."""
 
 from __future__ import annotations
 
@@ -51,5 +51,5 @@ def attach() -> None:
 
 
 def detach() -> None:
-    """Take them away; what was chosen stays in the file."""
+    """Remove them; chosen values stay in the file."""
     del bpy.types.Object.ssilk

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Every class and property that Blender hears of, and their removal."""
+"""Register and unregister every class and property."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .operators import (
 )
 from .operators import overlay as overlay_switch
 from .panels import plot
-from .scene import playing, saving, warming
+from .scene import heat_updates, playing, saving
 
 CLASSES = (
     *properties.CLASSES,
@@ -55,7 +55,7 @@ def register() -> None:
     training.start_watching()
     playing.start_listening()
     saving.start_listening()
-    warming.start_listening()
+    heat_updates.start_listening()
     quality_view.add_key()
 
 
@@ -64,7 +64,7 @@ def unregister() -> None:
     tasks.stop()
     overlay.hide()
     quality_view.remove_key()
-    warming.stop_listening()
+    heat_updates.stop_listening()
     saving.stop_listening()
     playing.stop_listening()
     training.stop_watching(bpy.context)

@@ -1,21 +1,24 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a garment remembers of its training."""
+"""Training settings that are stored with each garment object."""
 
 from __future__ import annotations
 
 import bpy
 from bpy.props import BoolProperty, CollectionProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
+from ssilk_core.config import PRESETS
+
 from .scene.motions import KINDS
 
 # Paths may begin with "//", the folder of the blend file; Blender wants to be told since 4.5.
 RELATIVE = {"ANIMATABLE", "PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) else {"ANIMATABLE"}
 
-PRESETS = [
-    ("draft", "Draft", "A first look, after minutes on any machine"),
-    ("preview", "Preview", "Nearly the final quality, after minutes on a GPU"),
-    ("final", "Final", "The paper's schedule, after a quarter of an hour on a fast GPU"),
-]
+ABOUT = {
+    "draft": "A first look, after minutes on any machine",
+    "preview": "Nearly the final quality, after minutes on a GPU",
+    "final": "The paper's schedule, after a quarter of an hour on a fast GPU",
+}
+CHOICES = [(name, name.capitalize(), ABOUT[name]) for name in PRESETS]
 
 
 class MotionChoice(bpy.types.PropertyGroup):
@@ -30,7 +33,7 @@ class TrainingSettings(bpy.types.PropertyGroup):
     """Choices for the training of one garment."""
 
     motions: CollectionProperty(type=MotionChoice, name="Motions", description="What can be trained on")
-    preset: EnumProperty(name="Preset", items=PRESETS, default="preview")
+    preset: EnumProperty(name="Preset", items=CHOICES, default="preview")
     iterations: IntProperty(
         name="Iterations",
         description="Optimiser steps; zero for as many as the preset has",

@@ -33,6 +33,8 @@ FORMAT = 4
 # Settings that format 3 stored under other names; older formats held other networks.
 RENAMED_SINCE_3 = {
     "config": {"bound": "latent_bound", "push": "max_latent_step"},
+    "model": {"bound": "latent_bound", "push": "max_latent_step"},
+    "shipped": {"plain skinning [J]": "linear blend skinning [J]"},
     "train": {
         "warm": "static_fraction",
         "warm_batch": "pretraining_batch",
@@ -205,14 +207,14 @@ def _from_format_3(document: dict[str, Any]) -> dict[str, Any]:
     """Return the header of a model of format 3 as format 4 has it; what is damaged in it stays so."""
 
     def renamed(values: object, part: str) -> object:
-        names = RENAMED_SINCE_3[part]
+        names = RENAMED_SINCE_3.get(part, {})
         return (
             {names.get(name, name): value for name, value in values.items()} if isinstance(values, dict) else values
         )
 
     provenance = document.get("provenance")
-    if isinstance(provenance, dict) and "train" in provenance:
-        provenance = {**provenance, "train": renamed(provenance["train"], "train")}
+    if isinstance(provenance, dict):
+        provenance = {part: renamed(value, part) for part, value in provenance.items()}
     return {**document, "config": renamed(document.get("config"), "config"), "provenance": provenance}
 
 

@@ -7,15 +7,15 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
 from .errors import fail
+from .schemes import need_scheme
 
 CLOSEST_POINTS = ("triangles", "vertices")
-SCHEMES = ("spring_verlet", "verlet", "direct", "direct_residual", "quasi_static")
 NO_BOUND = 1e9  # of anything that has no other bound
 
-# Of "spring_verlet", as `model.integrators.SpringVerlet` explains them, for all that play it.
-VELOCITY_SCALE, DISTANCE_SCALE, STEPPER_OUTPUT_SCALE = 10.0, 3.0, 0.1
-MAX_STEPPER_OUTPUT = 100.0  # of what S gives; far beyond what a push lets through, and finite
-FORCE_ALLOWANCE, RATE_ALLOWANCE = 0.5, 0.05
+# Constants of `model.integrators.SpringVerlet`, which explains them, shared with the numpy runtime.
+VELOCITY_SCALE, DISTANCE_SCALE, OUTPUT_SCALE = 10.0, 3.0, 0.1
+MAX_OUTPUT = 100.0  # of each output of S: finite, and far above what `max_latent_step` lets through
+STATE_ALLOWANCE, RATE_ALLOWANCE = 0.5, 0.05
 DIVERGENCE_BOUND = 1e3  # of a latent: trained ones stay below ten, and no decoder knows what this means
 RECOVERY_FRAMES = 15  # frames at rest after a lost state, half a second of the usual rate
 
@@ -37,8 +37,8 @@ class ModelConfig:
         widths: hidden layers of the initialiser P, the stepper S and the decoder D.
         shapes: blendshapes K; zero leaves proxies alone to deform the garment.
         activations: what D gives for them, where it is more than K ("ssilk reduce"); zero for K itself.
-        scheme: how z is integrated: "verlet" (Eq. 3), "direct" (Eq. 11), "direct_residual" (Eq. 12), or
-            "spring_verlet", which is Eq. 3 with a spring to the quasi-static state, or "quasi_static", that state.
+        scheme: name of the integration scheme in `schemes.SCHEMES`: "spring_verlet" is Eq. 3 with a spring to the
+            quasi-static state, "quasi_static" is that state itself.
         latent_bound: soft bound on each latent dimension; zero for none, as in the paper.
         max_latent_step: soft bound on the sum of S and the spring in each dimension in one step; zero for none.
         stiffness: largest spring constant of "spring_verlet", in (0, 1].
@@ -57,8 +57,7 @@ class ModelConfig:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "widths", tuple(self.widths))
-        if self.scheme not in SCHEMES:
-            fail("model", f"integration scheme '{self.scheme}'", f"it is one of {', '.join(SCHEMES)}")
+        need_scheme(self.scheme)
         if not min(self.widths) > 0:
             fail("model", f"widths = {self.widths}", "each is at least 1")
         _need_between(self, 1, NO_BOUND, "latent", "fps")
@@ -100,7 +99,8 @@ class TrainConfig:
         learning_rate_warmup: iterations over which the learning rate rises at the start of dynamic training.
         skin_learning_rate_scale: factor on the learning rate of skinning weights and of the integrator's parameters.
         shape_learning_rate_scale: factor on the learning rate of blendshapes, each of which moves many vertices.
-        ema_decay: of the exponential moving average of the parameters, which is validated and kept; 0 for none.
+        ema_decay: of the exponential moving average of the parameters, which is validated and kept; 0 for none. It
+            is smaller at first: `training.step.averaging_decay`.
         closest_point: body point that cloth meets: on the "triangles" around the nearest vertex, or that of
             "vertices" itself, which is faster and coarser.
         validate_every: iterations between validations.

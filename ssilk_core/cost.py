@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The cost model: what a trained garment takes in time, operations, memory and on disk.
 
-Times are measured here and now; all else follows from sizes. Each frame costs, in multiply-adds,
+Times are measured on this machine. All other costs follow from sizes. Each frame costs, in multiply-adds,
 
     P, S, D         the weights of the networks; retraining alone changes P, S and all but D's last layer
     readout         shapes * activations, in reduced models
     blendshapes     3 V shapes
     skinning        12 V influences to blend matrices, 9 V to apply them
 
-so that blendshapes and influences weigh the more the finer the mesh, and the networks the coarser it is.
+The share of blendshapes and influences grows with the vertices of the mesh, and that of the networks falls.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Time:
 
 @dataclass(frozen=True)
 class ShotBytes:
-    """Bytes of a shot: what lies there before its first frame, and what each frame adds."""
+    """Bytes of a shot: those of its asset, without any frame, and those that each frame adds."""
 
     asset: float
     frame: float
@@ -95,7 +95,7 @@ def _weights(file: ModelFile, network: str) -> int:
 
 
 def memory(player: Player) -> int:
-    """Return the bytes that playing holds for good: parameters, and what skinning makes of shapes and weights."""
+    """Return the bytes that playing keeps in memory: parameters, and the tiles of shapes and weights for skinning."""
     parameters = (value.size * 4 for name, value in player.file.parameters.items() if name not in TILED)
     tiles = (tile.shapes.nbytes + tile.weights.nbytes + tile.joints.nbytes for tile in player.tiles)
     return sum(parameters) + sum(tiles)

@@ -28,9 +28,3 @@ class VerificationError(SsilkError):
 def fail(where: str, found: str, allowed: str, todo: str = "") -> NoReturn:
     """Raise `SsilkError` as one sentence: where, what was found, what is allowed, what to do."""
     raise SsilkError(f"{where}: {found}; {allowed}" + (f"; {todo}" if todo else "") + ".")
-
-
-def need(condition: object, where: str, found: str, allowed: str, todo: str = "") -> None:
-    """Raise `SsilkError` unless `condition` holds; the words are those of `fail`."""
-    if not condition:
-        fail(where, found, allowed, todo)

@@ -87,6 +87,14 @@ def need_writable(target: str | Path) -> None:
         fail(str(target), f"cannot be written ({error.strerror or error})", WRITABLE)
 
 
+def need_not_input(target: str | Path, *inputs: Path | str | None) -> None:
+    """Raise `SsilkError` where `target` is one of the `inputs`: they are never overwritten."""
+    target = Path(target)
+    same = target.exists() and any(Path(path).exists() and target.samefile(path) for path in inputs if path)
+    if same:
+        fail(str(target), "the output is also an input", "inputs are never overwritten", "name another file")
+
+
 def sha256(path: str | Path) -> str:
     """Return the SHA-256 of a file's bytes as hexadecimal text."""
     digest = hashlib.sha256()

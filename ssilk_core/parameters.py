@@ -7,32 +7,28 @@ from itertools import pairwise
 
 from .assets import PINNED, Ints, Scene
 from .config import ModelConfig
+from .schemes import SCHEMES
 
 Shapes = dict[str, tuple[int, ...]]
-# Of each scheme: latents that the stepper sees, parameters of its own, whether the stepper ends in a bias.
-SCHEMES: dict[str, tuple[int, tuple[str, ...], bool]] = {
-    "spring_verlet": (3, ("beta", "share"), False),
-    "verlet": (2, ("alpha", "beta"), True),
-    "direct": (2, (), True),
-    "direct_residual": (2, (), True),
-    "quasi_static": (0, (), False),  # no stepper
-}
 
 
 def parameter_shapes(scene: Scene, config: ModelConfig, joints: Ints) -> Shapes:
     """Return the shape of each parameter of `model.network.GarmentModel` by name."""
     free, proxies = int((scene.classes != PINNED).sum()), scene.rig.proxy_count
     static, dynamic = descriptor_sizes(scene, joints)
-    seen, own, bias = SCHEMES[config.scheme]
-    z, widths = config.latent, config.widths
+    scheme, z, widths = SCHEMES[config.scheme], config.latent, config.widths
     reduced: Shapes = {"decoder.readout": (config.shapes, config.activation_count), "decoder.offset": (free, 3)}
     return {
         "decoder.skin_offset": (free, scene.rig.skin.indices.shape[1]),
         "decoder.shapes": (free, 3, config.shapes),
         **(reduced if config.activations else {}),
-        **{f"integrator.{name}": (z,) for name in own},
+        **{f"integrator.{name}": (z,) for name in scheme.parameters},
         **_layers("initialiser", (static, *widths, z)),
-        **(_layers("stepper", (seen * z + static + dynamic, *widths, z), bias) if seen else {}),
+        **(
+            _layers("stepper", (scheme.states * z + static + dynamic, *widths, z), scheme.bias)
+            if scheme.states
+            else {}
+        ),
         **_layers("output", (z, *widths, config.activation_count + 6 * proxies)),
     }
 

@@ -8,20 +8,24 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import product
 
+from .assets import Motion
 from .checkpoint import ModelFile
+from .cost import play_time
 from .errors import fail
+from .events import Message, Reporter
 from .reduction import ModelSize, Reduced, Reducer
+from .runtime import Player
 
 ALL = 1_000_000  # more than any garment has
 
 
 @dataclass(frozen=True, kw_only=True)
 class Quality:
-    """A level of quality: what is kept of a trained garment, and what is done beyond it.
+    """A level of quality: what is kept of a trained garment, at what rate, and how much it is refined.
 
     Attributes:
         shapes, joints, influences: kept of what the model has.
-        fps: most frames per second of a shot; None for those of its motion.
+        fps: most frames per second of a shot [1/s]; None for those of its motion.
         refine: solver iterations for each frame, from the network's state.
         about: one line for people.
     """
@@ -39,7 +43,7 @@ class Quality:
         return ModelSize(shapes=self.shapes, joints=self.joints, influences=self.influences)
 
     def rate(self, fps: float) -> float:
-        """Return the frames per second of a shot whose motion has `fps`."""
+        """Return the frames per second [1/s] of a shot whose motion has `fps`."""
         return fps if self.fps is None else min(self.fps, fps)
 
 
@@ -48,7 +52,7 @@ QUALITIES = {
     for quality in (
         Quality(name="crowd", shapes=12, joints=8, influences=4, fps=15.0, about="many characters, far away"),
         Quality(name="game", shapes=32, joints=16, influences=4, fps=30.0, about="real time, four influences"),
-        Quality(name="film", shapes=48, about="what cannot be told from the whole model"),
+        Quality(name="film", shapes=48, about="no visible difference from the whole model"),
         Quality(name="hero", refine=4, about="the whole model, refined by the solver"),
     )
 }
@@ -59,6 +63,41 @@ def quality_named(name: str) -> Quality:
     if name not in QUALITIES:
         fail(f"quality '{name}'", "no such level", f"it is one of {', '.join(QUALITIES)}")
     return QUALITIES[name]
+
+
+def size_at(quality: str | None, whole: ModelSize) -> ModelSize:
+    """Return what a level keeps of a model, or all of it without a level; raise `SsilkError` for an unknown name."""
+    return quality_named(quality).size.within(whole) if quality else whole
+
+
+@dataclass(frozen=True, kw_only=True)
+class SizeReduction:
+    """What is kept of a model, and what that loses.
+
+    Attributes:
+        whole, kept: sizes of the model before and after.
+        rms_mm, max_mm: distance of its vertices from the whole model's over the motions [mm]; RMS over the mass.
+    """
+
+    whole: ModelSize
+    kept: ModelSize
+    rms_mm: float
+    max_mm: float
+
+    @classmethod
+    def of(cls, whole: ModelSize, found: Reduced) -> SizeReduction:
+        """Return what a reduced model keeps of a whole one."""
+        return cls(whole=whole, kept=found.size, rms_mm=1000 * found.rms, max_mm=1000 * found.largest)
+
+    def to_metadata(self) -> dict[str, object]:
+        """Return figures, as files store them."""
+        return {
+            "blendshapes": f"{self.kept.shapes} of {self.whole.shapes}",
+            "proxies": f"{self.kept.joints} of {self.whole.joints}",
+            "influences": f"{self.kept.influences} of {self.whole.influences}",
+            "loses [mm RMS]": round(self.rms_mm, 3),
+            "loses at most [mm]": round(self.max_mm, 2),
+        }
 
 
 @dataclass(frozen=True)
@@ -99,13 +138,13 @@ def budget_of(text: str) -> Budget:
     return Budget(amount, "ms") if found[2] == "ms" else Budget(amount * BYTES[found[2]], "bytes")
 
 
-# What is tried, as shares of what there is, and as numbers.
+# Candidate sizes: shares of the model's blendshapes and proxy joints, and numbers of influences.
 SHAPES, JOINTS, INFLUENCES = (1.0, 0.75, 0.5, 0.375, 0.25, 0.125, 0.0), (1.0, 0.5, 0.25, 0.0), (ALL, 4)
 
 
 def candidates(whole: ModelSize) -> list[ModelSize]:
-    """Return the sizes that a budget is spent on, from all to nothing."""
-    grid = product(JOINTS, INFLUENCES, SHAPES)  # shapes last: what others need is worked out once
+    """Return the sizes that are tried within a budget, from the whole model to none of it."""
+    grid = product(JOINTS, INFLUENCES, SHAPES)  # shapes vary fastest: the reducer caches what the others need
     sizes = [
         ModelSize(shapes=round(share * whole.shapes), joints=round(joints * whole.joints), influences=most).within(
             whole
@@ -117,18 +156,18 @@ def candidates(whole: ModelSize) -> list[ModelSize]:
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """The model that a budget buys, and what it costs in the budget's unit."""
+    """The best model within a budget, and what it costs in the budget's unit."""
 
     reduced: Reduced
     cost: float
 
 
 def best_within(reducer: Reducer, budget: Budget, cost: Callable[[ModelFile], float], most: ModelSize) -> Choice:
-    """Return the model that loses least, as predicted, of those that cost no more than a budget, as measured.
+    """Return the model with the least predicted loss among those whose measured cost is within a budget.
 
     Args:
         most: what may be kept.
-        cost: measures a model in the budget's unit; it does not fall where more is kept.
+        cost: measures a model in the budget's unit; keeping more never lowers it.
 
     Raises:
         SsilkError: not even the smallest model fits.
@@ -147,10 +186,41 @@ def best_within(reducer: Reducer, budget: Budget, cost: Callable[[ModelFile], fl
 
 
 def _cheaper(reducer: Reducer, sizes: list[ModelSize], cost: Callable[[ModelFile], float]) -> Iterator[Choice]:
-    """Yield models by what they lose, each without those that hold no less than one before."""
+    """Yield models by what they lose; skip those that keep at least as much as one before."""
     tried: list[ModelSize] = []
     for size in sorted(sizes, key=lambda size: (reducer.predicted(size), sum(vars(size).values()))):
         if not any(other.within(size) == other for other in tried):
             tried.append(size)
             reduced = reducer.reduced(size)
             yield Choice(reduced, cost(reduced.file))
+
+
+def spend(
+    text: str,
+    reducer: Reducer,
+    most: ModelSize,
+    motion: Motion,
+    size_bytes: Callable[[ModelFile], float],
+    report: Reporter,
+) -> Reduced:
+    """Return the best model within a budget, and report what it keeps and costs.
+
+    Args:
+        text: the budget, as `budget_of` reads it.
+        most: what may be kept.
+        motion: models are timed on it.
+        size_bytes: gives the bytes on disk that a model takes.
+
+    Raises:
+        SsilkError: nothing fits, or the text is no budget.
+    """
+    budget = budget_of(text)
+
+    def cost(file: ModelFile) -> float:
+        return size_bytes(file) if budget.unit == "bytes" else play_time(Player(file), motion).median
+
+    choice = best_within(reducer, budget, cost, most)
+    kept = choice.reduced.size
+    report(Message(f"within {budget}: {kept.shapes} blendshapes, {kept.joints} proxies and {kept.influences} "
+                   f"influences take {in_units(choice.cost, budget.unit)}"))  # fmt: skip
+    return choice.reduced

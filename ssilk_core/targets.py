@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What those who receive a bake can read: influences, units, axes, packaging."""
+"""Targets of a bake: the influences, units, axes and packaging that each receiver reads."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 from .assets import Body, Deformer, SkinWeights
 from .errors import fail
@@ -11,25 +12,26 @@ from .errors import fail
 
 @dataclass(frozen=True, kw_only=True)
 class Target:
-    """A kind of receiver.
+    """What one kind of receiver reads.
 
     Attributes:
-        influences: the most joints that move a vertex, or None for as many as the garment uses.
-        meters_per_unit, up_axis: units and up axis of the file, or None for those of the character's stage.
-        lean: leave joints that stay at rest out of the animation, and store the root's path as a translation of the
-            SkelRoot: smaller, and exact far from the origin, but for readers that compose transforms as USD does.
-        suffixes: of the files it takes.
+        influences: most joints that may move a vertex; None for as many as the garment has.
+        meters_per_unit, up_axis: units [m] and up axis of the file; None for those of the character's stage.
+        lean: leave joints at rest out of the animation, and store the root's path as a translation of the SkelRoot.
+            The layer is smaller, and exact far from the origin. The receiver must compose transforms as USD does.
+        suffixes: of the files that it takes; layers need ".usdc".
         about: one line for people.
     """
 
     influences: int | None = None
     meters_per_unit: float | None = None
-    up_axis: str | None = None
+    up_axis: Literal["Y", "Z"] | None = None
     lean: bool = False
     suffixes: tuple[str, ...] = (".usdc", ".usd", ".usda", ".usdz")
     about: str = ""
 
 
+# A new target is one more entry: options, checks, bakes and their tests read it here.
 TARGETS = {
     "usd": Target(lean=True, about="film pipelines and renderers: the stage's units, nothing capped"),
     "blender": Target(meters_per_unit=1.0, up_axis="Z", about="metres, z up, every joint animated"),
@@ -42,22 +44,22 @@ TARGETS = {
 
 
 def need_influences(found: int, name: str, model: str) -> None:
-    """Raise `SsilkError` where `found` joints move a vertex of a model, which are more than target `name` takes."""
+    """Raise `SsilkError` where `found` joints move a vertex of a model and target `name` takes fewer."""
     most = TARGETS[name].influences
     if not (most is None or found <= most):
         fail(
             model,
             f"{found} joints move a vertex",
             f"--target {name} takes {most}",
-            f"learn what fewer can do: 'ssilk reduce --influences {most}' with the motions of the shots",
+            f"fit fewer to the shots: 'ssilk reduce --influences {most}' with the motions of the shots",
         )
 
 
 def capped(deformer: Deformer, target: Target) -> Deformer:
     """Return a garment and its character's bodies with each vertex moved by its heaviest influences alone.
 
-    What is left of a vertex's weights is scaled to a sum of one, as exporters do it. A trained garment has no more
-    than its target takes by then (`need_influences`); what is capped are bodies, and linear blend skinning.
+    The remaining weights of a vertex are scaled to a sum of one. This is for bodies and linear blend skinning: a
+    trained garment was already fitted to what its target takes, or refused (`need_influences`).
     """
     most = target.influences
     if most is None:

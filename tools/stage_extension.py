@@ -1,71 +1,64 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Put the Blender extension together in a folder: its own sources, and of the core what plays a garment in Blender.
+"""Put the Blender extension together in a folder: its own sources, and ssilk itself as a wheel.
 
-    python tools/stage_extension.py dist/extension
+    python tools/stage_extension.py build/extension [WHEEL]
 
-Nothing of the core is copied but the modules that `ssilk_core.runtime` imports when it is imported; they need numpy
-alone.
+Blender puts the wheels that the manifest lists on its path, so that the extension imports `ssilk_core` and
+`ssilk_usd` by their names. "Create Environment" installs the same wheel. It is built here unless one is given. The
+demo's trained models (16 MB) stay behind: nothing in Blender uses them.
 """
 
 from __future__ import annotations
 
-import ast
 import shutil
+import subprocess
 import sys
-from collections.abc import Iterator
+import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-ADDON, CORE, VENDOR = ROOT / "blender_addon", ROOT / "ssilk_core", "vendor"
-KEPT = {".py", ".toml", ""}  # suffixes of the extension's own files; LICENSE has none
+ADDON, MANIFEST, WHEELS = ROOT / "blender_addon", "blender_manifest.toml", "wheels"
+PROJECT = ("pyproject.toml", "README.md", "LICENSE", "NOTICE", "ssilk_core", "usd/ssilk_usd")
+JUNK = shutil.ignore_patterns("__pycache__", ".*")
+NOT_IN_BLENDER = ("ssilk_core/demo/models",)
 
 
-def stage(target: Path) -> None:
+def stage(target: Path, wheel: Path | None = None) -> None:
     """Write the extension into a folder, in place of what was there."""
     shutil.rmtree(target, ignore_errors=True)
-    for path in sorted(ADDON.rglob("*")):
-        if path.is_file() and path.suffix in KEPT and "__pycache__" not in path.parts:
-            _copy(path, target / path.relative_to(ADDON))
-    for path in sorted(needed(CORE / "runtime" / "__init__.py")):
-        _copy(path, target / VENDOR / path.relative_to(ROOT))
-    for name in ("LICENSE", "NOTICE"):
-        _copy(ROOT / name, target / VENDOR / name)
+    shutil.copytree(ADDON, target, ignore=JUNK)
+    wheels = target / WHEELS
+    wheels.mkdir()
+    if wheel is None:
+        build_wheel(wheels)
+    else:
+        shutil.copy(wheel, wheels)
+    listed = ", ".join(f'"./{WHEELS}/{path.name}"' for path in sorted(wheels.iterdir()))
+    manifest = target / MANIFEST
+    own, table, rest = manifest.read_text(encoding="utf-8").partition("\n[permissions]\n")
+    manifest.write_text(f"{own}wheels = [{listed}]\n{table}{rest}", encoding="utf-8")
 
 
-def needed(start: Path) -> set[Path]:
-    """Return the modules of the core that a module loads, itself and the packages around it included."""
-    found, waiting = set(), [start]
-    while waiting:
-        path = waiting.pop()
-        if path not in found:
-            found.add(path)
-            waiting += [*_around(path), *_imported(path)]
-    return found
+def build_wheel(folder: Path) -> None:
+    """Build ssilk's wheel from a copy of its sources without what Blender has no use for."""
+    with tempfile.TemporaryDirectory() as temporary:
+        copy_project(Path(temporary))
+        pip = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(folder)]
+        subprocess.run([*pip, temporary], check=True)
 
 
-def _around(path: Path) -> Iterator[Path]:
-    for folder in path.parents:
-        if folder == ROOT:
-            return
-        yield folder / "__init__.py"
-
-
-def _imported(path: Path) -> Iterator[Path]:
-    """Yield what a module imports at its top level; all imports within the core are relative."""
-    for node in ast.parse(path.read_text(encoding="utf-8")).body:
-        if not isinstance(node, ast.ImportFrom) or not node.level:
-            continue
-        base = path.parents[node.level - 1].joinpath(*(node.module or "").split("."))
-        modules = [base, *(base / alias.name for alias in node.names)]
-        for candidate in (*(module.with_suffix(".py") for module in modules), base / "__init__.py"):
-            if candidate.is_file():
-                yield candidate
-
-
-def _copy(path: Path, target: Path) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(path, target)
+def copy_project(target: Path) -> None:
+    """Copy what a wheel of ssilk for Blender is built from."""
+    for name in PROJECT:
+        source = ROOT / name
+        (target / name).parent.mkdir(parents=True, exist_ok=True)
+        if source.is_dir():
+            shutil.copytree(source, target / name, ignore=JUNK)
+        else:
+            shutil.copy(source, target / name)
+    for name in NOT_IN_BLENDER:
+        shutil.rmtree(target / name)
 
 
 if __name__ == "__main__":
-    stage(Path(sys.argv[1]))
+    stage(*map(Path, sys.argv[1:3]))

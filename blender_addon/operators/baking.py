@@ -12,41 +12,49 @@ from typing import Any
 import bpy
 import numpy as np
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
+from ssilk_usd.names import LAYER_SUFFIXES
 
-from ..contract.arrays import Joints
-from ..core import core
-from ..errors import SetupError, need
+from ssilk_core.checkpoint import load_model
+from ssilk_core.errors import SsilkError
+from ssilk_core.quality import QUALITIES
+
+from ..errors import SetupError
+from ..joints import Joints, joint_order
 from ..outside.work import Work
 from ..preferences import interpreter, preferences, unready
 from ..scene import playing
 from ..scene.armature import read_joints
 from ..scene.attributes import current_classes
-from ..scene.baked import animated, apply_shot, need_bakeable, remove_bake
+from ..scene.baked import animated, apply_bake, need_bakeable, remove_bake
 from ..scene.garment import armature_of, unusable_here
-from ..scene.gather import character_joints, gather
+from ..scene.gather import ROOT, gather
 from ..scene.handover import STAGE, hand_over, loading_usd
 from ..scene.keys import has_keys, need_tracks
 from ..scene.models import model_of
 from ..scene.motions import TIMELINE, Source
 from ..scene.objects import Pair
-from ..scene.sampling import need_company, prepare_takes, sample, scene_rate
-from ..scene.worn import is_worn
+from ..scene.sampling import need_company, prepare_takes, sample
+from ..scene.trained_weights import has_trained_weights
+from ..scene.units import scene_rate
 from ..training_properties import RELATIVE
 from . import tasks
 from .reporting import ReportingOperator
 
-WHOLE, HERO = "WHOLE", "hero"
-QUALITIES = [
+WHOLE = "WHOLE"
+ABOUT = {
+    "crowd": "For many characters, far away: few shapes and proxies, four influences",
+    "game": "For real time: some shapes and proxies, four influences",
+    "film": "What cannot be told from the whole model",
+    "hero": "Refined by a solver: points to USD alone; on the timeline bones and shape keys nearest to them",
+}
+LEVELS = [
     (WHOLE, "Whole", "All that the model has"),
-    ("crowd", "Crowd", "For many characters, far away: few shapes and proxies, four influences"),
-    ("game", "Game", "For real time: some shapes and proxies, four influences"),
-    ("film", "Film", "What cannot be told from the whole model"),
-    (HERO, "Hero", "Refined by a solver: points to USD alone; on the timeline bones and shape keys nearest to them"),
+    *((name, name.capitalize(), ABOUT[name]) for name in QUALITIES),
 ]
 INPUTS, MOTION, SHOT = "bake", "motion.usdc", "shot.usdc"  # folder of a bake's inputs beside the model; files
 
 
-class Bake(tasks.OutsideOperator, bpy.types.Operator):
+class BakeGarment(tasks.OutsideOperator, bpy.types.Operator):
     """Bake the trained garment over the scene's frames, as bones and shape keys; what was baked before is replaced"""
 
     bl_idname = "ssilk.bake"
@@ -61,7 +69,7 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
         name="USD File", description="Shot to write; named like the garment, beside the blend file, when empty",
         subtype="FILE_PATH", options=RELATIVE,
     )  # fmt: skip
-    quality: EnumProperty(name="Quality", items=QUALITIES)
+    quality: EnumProperty(name="Quality", items=LEVELS)
     pre_roll: FloatProperty(
         name="Pre-Roll",
         description="How long the garment settles in the first pose before the first frame",
@@ -82,17 +90,18 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
 
     def prepare(self, context: bpy.types.Context) -> Work:
         garment = context.object
-        need(self.to_timeline or self.to_usd, "Choose where to bake to: the timeline, USD, or both.")
+        if not self.to_timeline and not self.to_usd:
+            raise SetupError("Choose where to bake to: the timeline, USD, or both.")
         self.model, armature = model_of(garment), armature_of(garment)
         joints = read_joints(armature, garment)
         need_bakeable(garment, armature, joints)
         need_tracks(animated(garment, armature))
         (self.take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
-        self.dressed = None if (self.model.parent / STAGE).exists() else gather(garment)
+        self.scene = None if (self.model.parent / STAGE).exists() else gather(garment)
         self.pair = Pair.of(garment, armature)
         self.shot = usd_path(garment, self.filepath) if self.to_usd else None
         self.python = interpreter(preferences(context))
-        self.character = character_joints(joints)
+        self.character = joints.character
         closing = self.closing() if self.to_timeline else None
         return Work(
             f"Baking '{garment.name}'", self.commands, parent=bpy.app.tempdir, steps=self.steps(), closing=closing
@@ -103,23 +112,23 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
         _, armature = self.pair.objects()
         yield from sample(armature, self.character, [self.take])
         yield from loading_usd()
-        from ..contract.motion import write_motion
+        from ssilk_usd.write import write_motion
 
-        yield from write_motion(self.work.folder / MOTION, self.character, self.take.motion())
+        write_motion(self.work.folder / MOTION, self.take.motion(self.character), self.character.skeleton(ROOT))
 
     def commands(self, folder: Path) -> list[list[str]]:
-        """Write what is baked from; return the command."""
+        """Write the inputs of the bake; return the command."""
         garment, armature = self.pair.objects()
         need_company(garment, armature, self.take)
         inputs = inputs_folder(self.model)
         shutil.copyfile(folder / MOTION, inputs / MOTION)
         stage = self.model.parent / STAGE
-        if self.dressed:
-            hand_over(self.dressed, self.pair, inputs)
+        if self.scene:
+            hand_over(self.scene, self.pair, inputs)
             stage = inputs / STAGE
         self.shot = self.shot or folder / SHOT
         level = [] if self.quality == WHOLE else ["--quality", self.quality]
-        if self.quality == HERO and self.to_timeline:
+        if level and QUALITIES[self.quality].refine and self.to_timeline:
             level += ["--refined-output", "joints"]
         rate = ["--fps", repr(scene_rate())] if self.to_timeline else []  # a level may have fewer frames
         return [
@@ -131,11 +140,11 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
         ]  # fmt: skip
 
     def closing(self) -> Iterator[float]:
-        """Read what was baked; writing it takes long enough by itself."""
-        from ..contract.shot import read_shot
+        """Read what was baked, before `finish` writes it: each takes time."""
+        from ssilk_usd.read_shot import read_baked
 
         self.joints = self.bakeable_joints()
-        self.baked = read_shot(self.shot, self.joints)
+        self.baked = read_baked(self.shot)
         yield 0.5
         self.reclassed = reclassed(self.pair.objects()[0], self.model)
         yield 1.0
@@ -157,11 +166,14 @@ class Bake(tasks.OutsideOperator, bpy.types.Operator):
         """Put keys in place of those baked before; return what was done."""
         garment, armature = self.pair.objects()
         joints, read = self.bakeable_joints(), self.joints
-        same = joints.names == read.names and np.array_equal(joints.parents, read.parents)
-        need(same, f"Bones of '{armature.name}' were changed while '{garment.name}' was baked; bake it again.")
+        if joints.names != read.names or not np.array_equal(joints.parents, read.parents):
+            raise SetupError(
+                f"Bones of '{armature.name}' were changed while '{garment.name}' was baked; bake it again."
+            )
         playing.stop(garment)
-        apply_shot(garment, armature, joints, self.baked)
-        left = self.baked.left_out
+        apply_bake(garment, armature, joints, self.baked)
+        order = joint_order(joints, self.baked.garment.joint_names, fewer_proxies=True)
+        left = int(np.count_nonzero(order < 0))
         still = f" ({left} proxies are not in it and stay at rest)" if left else ""
         return f"frames {self.take.frames[0]} to {self.take.frames[-1]}{still}{self.reclassed}"
 
@@ -177,7 +189,7 @@ class RemoveBake(ReportingOperator, bpy.types.Operator):
     def refusal(cls, context: bpy.types.Context) -> str:
         if reason := unusable_here(context):
             return reason
-        baked = has_keys(context.object) or is_worn(context.object)
+        baked = has_keys(context.object) or has_trained_weights(context.object)
         return "" if baked else f"Nothing was baked for '{context.object.name}'"
 
     def apply(self, context: bpy.types.Context) -> str:
@@ -188,7 +200,7 @@ class RemoveBake(ReportingOperator, bpy.types.Operator):
 
 
 def lost(figures: Mapping[str, Any]) -> str:
-    """Return what bones and shape keys lose of a refined garment, in words; empty where nothing was put back."""
+    """Return in words how far bones and shape keys are from the refined vertices; empty where nothing was fitted."""
     typical, most = (figures.get(f"refined: joints lose, {which} [mm]") for which in ("RMS", "at most"))
     if typical is None:
         return ""
@@ -196,10 +208,10 @@ def lost(figures: Mapping[str, Any]) -> str:
 
 
 def reclassed(garment: bpy.types.Object, model: Path) -> str:
-    """Return in words that a garment has other classes than its model; empty where not, or where none can be read."""
+    """Return a note if a garment's classes differ from its model's; empty if not, or if either cannot be read."""
     try:
-        trained, classes = core("checkpoint").load_model(model).scene.classes, current_classes(garment.data)
-    except (core("errors").SsilkError, SetupError):
+        trained, classes = load_model(model).scene.classes, current_classes(garment.data)
+    except SsilkError:
         return ""
     if classes is None or np.array_equal(trained, classes):
         return ""
@@ -207,20 +219,21 @@ def reclassed(garment: bpy.types.Object, model: Path) -> str:
 
 
 def usd_path(garment: bpy.types.Object, chosen: str) -> Path:
-    """Return where a shot goes.
+    """Return the file of a shot.
 
     Raises:
         SetupError: nothing was chosen, and the blend file has no place yet.
     """
-    need(chosen or bpy.data.filepath, "Save the file first, or choose a USD file.")
+    if not chosen and not bpy.data.filepath:
+        raise SetupError("Save the file first, or choose a USD file.")
     path = Path(bpy.path.abspath(chosen or f"//{bpy.path.clean_name(garment.name)}.usdc"))
-    allowed = path.suffix in (".usd", ".usda", ".usdc")
-    need(allowed, f"'{path.name}' is no name for a shot; it ends in .usdc, .usd or .usda.")
+    if path.suffix not in LAYER_SUFFIXES:
+        raise SetupError(f"'{path.name}' is no name for a shot; it ends in .usdc, .usd or .usda.")
     return path
 
 
 def inputs_folder(model: Path) -> Path:
-    """Return the folder beside a model for what is baked from: shots say from there that they come.
+    """Return the folder beside a model for a bake's inputs, to which the shot's provenance points.
 
     Raises:
         SetupError: nothing can be written there.
@@ -230,8 +243,9 @@ def inputs_folder(model: Path) -> Path:
         folder.mkdir(exist_ok=True)
     except OSError as error:
         raise SetupError(f"{folder} cannot be made ({error.strerror or error}); move the model.") from error
-    need(os.access(folder, os.W_OK), f"Nothing can be written into {folder}; move the model.")
+    if not os.access(folder, os.W_OK):
+        raise SetupError(f"Nothing can be written into {folder}; move the model.")
     return folder
 
 
-CLASSES = (Bake, RemoveBake)
+CLASSES = (BakeGarment, RemoveBake)

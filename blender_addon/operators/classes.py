@@ -1,24 +1,27 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Painting vertex classes with Blender's own brushes, and taking the painting up."""
+"""Painting vertex classes with Blender's own brushes, and reading the painting back."""
 
 from __future__ import annotations
 
 import bpy
 from bpy.props import EnumProperty, FloatProperty
 
+from ssilk_core.assets import CLASS_NAMES
+
 from .. import classes as palette
-from ..errors import need
+from ..errors import SetupError
 from ..scene import attributes
 from ..scene.garment import unusable
 from ..scene.painting import choose_color, offer_palette
 from ..scene.symmetry import partners_across
 from .reporting import ReportingOperator
 
-CHOICES = [
-    ("PINNED", "Pinned", "Rigidly follows the skeleton, black: belts, collars, what is sewn on"),
-    ("TIGHT", "Tight", "Follows the body closely, red"),
-    ("LOOSE", "Loose", "Moves freely, green: moved by proxy joints and the network"),
-]
+ABOUT = {
+    "pinned": "Rigidly follows the skeleton, black: belts, collars, what is sewn on",
+    "tight": "Follows the body closely, red",
+    "loose": "Moves freely, green: moved by proxy joints and the network",
+}
+CHOICES = [(name.upper(), name.capitalize(), ABOUT[name]) for name in CLASS_NAMES]  # in the order of their numbers
 VALUES = {name: value for value, (name, *_) in enumerate(CHOICES)}
 
 
@@ -58,7 +61,8 @@ class TakeUpPainting(ClassOperator, bpy.types.Operator):
     def apply(self, context: bpy.types.Context) -> str:
         thing = context.object
         painted = palette.COLOR_ATTRIBUTE in thing.data.attributes
-        need(painted, f"'{thing.name}' has no painted classes; choose Paint Classes first.")
+        if not painted:
+            raise SetupError(f"'{thing.name}' has no painted classes; choose Paint Classes first.")
         return f"{attributes.take_up_painting(thing.data)} vertices of '{thing.name}' changed class."
 
 
@@ -115,7 +119,8 @@ class MirrorClasses(ClassOperator, bpy.types.Operator):
     def apply(self, context: bpy.types.Context) -> str:
         thing = context.object
         values = attributes.current_classes(thing.data)
-        need(values is not None, f"'{thing.name}' has no classes; paint it first.")
+        if values is None:
+            raise SetupError(f"'{thing.name}' has no classes; paint it first.")
         points, partners = partners_across(thing.data, self.distance)
         mirrored = palette.mirrored(values, points, partners, from_left=self.source == "LEFT")
         attributes.write_classes(thing.data, mirrored)

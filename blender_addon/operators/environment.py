@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Finding, checking and making the Python that has ssilk installed."""
+"""Finding, checking and creating the Python that has ssilk installed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import bpy
 
-from ..errors import SetupError, need
+from ..errors import SetupError
 from ..outside import python as pythons
 from ..outside.work import Work
 from ..preferences import ROOT, handshake, interpreter, preferences, state
@@ -30,7 +30,7 @@ class CheckPython(tasks.OutsideOperator, bpy.types.Operator):
         return ask(interpreter(preferences(context)))
 
     def finish(self, context: bpy.types.Context, work: Work) -> str:
-        return greet(context, work)
+        return remember_handshake(context, work)
 
 
 class FindPython(tasks.OutsideOperator, bpy.types.Operator):
@@ -41,12 +41,13 @@ class FindPython(tasks.OutsideOperator, bpy.types.Operator):
 
     def prepare(self, context: bpy.types.Context) -> Work:
         found = pythons.find(places())
-        need(found, "No Python with ssilk was found; choose it, or create an environment.")
+        if not found:
+            raise SetupError("No Python with ssilk was found; choose it, or create an environment.")
         preferences(context).python = found[0]
         return ask(found[0])
 
     def finish(self, context: bpy.types.Context, work: Work) -> str:
-        return greet(context, work)
+        return remember_handshake(context, work)
 
 
 class CreateEnvironment(tasks.OutsideOperator, bpy.types.Operator):
@@ -70,7 +71,8 @@ class CreateEnvironment(tasks.OutsideOperator, bpy.types.Operator):
 
     def prepare(self, context: bpy.types.Context) -> Work:
         wheel = source(context)
-        need(Path(wheel).exists(), f"'{wheel}' does not exist; choose a wheel or a project folder of ssilk.")
+        if not Path(wheel).exists():
+            raise SetupError(f"'{wheel}' does not exist; choose a wheel or a project folder of ssilk.")
         made = folder()
         python = str(pythons.venv_python(made))
         commands = [*pythons.venv_commands(sys.executable, made, wheel), pythons.probe_command(python)]
@@ -78,11 +80,11 @@ class CreateEnvironment(tasks.OutsideOperator, bpy.types.Operator):
 
     def finish(self, context: bpy.types.Context, work: Work) -> str:
         preferences(context).python = str(pythons.venv_python(folder()))
-        return greet(context, work)
+        return remember_handshake(context, work)
 
 
 def source(context: bpy.types.Context) -> str:
-    """Return what ssilk is installed from: as chosen, else the wheel that came with the extension."""
+    """Return what ssilk is installed from: the choice in the preferences, else the wheel of the extension."""
     chosen = preferences(context).source
     return bpy.path.abspath(chosen) if chosen else pythons.bundled()
 
@@ -92,15 +94,16 @@ def ask(python: str) -> Work:
     return Work("Asking the Python", lambda _: [pythons.probe_command(python)])
 
 
-def greet(context: bpy.types.Context, work: Work) -> str:
-    """Remember what a Python said of itself; return it in one line.
+def remember_handshake(context: bpy.types.Context, work: Work) -> str:
+    """Keep a Python's versions and device; return them in one line.
 
     Raises:
         SetupError: it does not fit.
     """
     settings = preferences(context)
     settings.handshake = json.dumps(work.result)
-    need(not handshake(settings).mismatch, handshake(settings).mismatch)
+    if handshake(settings).mismatch:
+        raise SetupError(handshake(settings).mismatch)
     return state(settings)[0]
 
 

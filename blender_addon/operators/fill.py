@@ -6,7 +6,7 @@ from __future__ import annotations
 import bpy
 from bpy.props import EnumProperty
 
-from ..errors import need
+from ..errors import SetupError
 from ..scene.editing import fill_selected
 from ..scene.garment import unusable
 from .classes import CHOICES, VALUES
@@ -29,7 +29,8 @@ class FillClass(ReportingOperator, bpy.types.Operator):
     def apply(self, context: bpy.types.Context) -> str:
         thing = context.object
         filled = fill_selected(thing.data, VALUES[self.value])
-        need(filled, f"No vertex of '{thing.name}' is selected.")
+        if not filled:
+            raise SetupError(f"No vertex of '{thing.name}' is selected.")
         return f"{filled} vertices of '{thing.name}' are {self.value.lower()}."
 
 

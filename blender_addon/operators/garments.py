@@ -6,7 +6,7 @@ from __future__ import annotations
 import bpy
 from bpy.props import StringProperty
 
-from ..errors import need
+from ..errors import SetupError
 from ..scene.selecting import select_object
 from .reporting import ReportingOperator
 
@@ -22,8 +22,10 @@ class ChooseGarment(ReportingOperator, bpy.types.Operator):
 
     def apply(self, context: bpy.types.Context) -> str:
         garment = context.view_layer.objects.get(self.garment)
-        need(garment, f"'{self.garment}' is not in this view layer; show its collection.")
-        need(garment.visible_get(), f"'{self.garment}' is hidden; show it.")
+        if not garment:
+            raise SetupError(f"'{self.garment}' is not in this view layer; show its collection.")
+        if not garment.visible_get():
+            raise SetupError(f"'{self.garment}' is hidden; show it.")
         select_object(garment)
         return ""
 

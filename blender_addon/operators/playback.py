@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..errors import need
+from ..errors import SetupError
 from ..scene import playing
 from ..scene.garment import unusable, unusable_here
 from ..scene.models import model_of
@@ -27,7 +27,8 @@ class PlayLive(ReportingOperator, bpy.types.Operator):
 
     def apply(self, context: bpy.types.Context) -> str:
         playing.play(context.object)
-        need(playing.live(context.object), playing.reason(context.object))
+        if not playing.live(context.object):
+            raise SetupError(playing.reason(context.object))
         return f"'{context.object.name}' plays {model_of(context.object).name}."
 
 

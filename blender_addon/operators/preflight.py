@@ -8,20 +8,20 @@ from pathlib import Path
 
 import bpy
 
-from ..contract.findings import Clip, read_findings
-from ..errors import SetupError, need
+from ..errors import SetupError
+from ..findings import Clip, read_findings
 from ..outside.work import Work
 from ..preferences import interpreter, preferences
 from ..preflight_properties import FindingItem, keep_findings, shown_finding, size_of
 from ..scene.armature import read_joints
 from ..scene.checks import SCALE, scene_findings
 from ..scene.garment import armature_of
-from ..scene.gather import character_joints, gather
+from ..scene.gather import gather
 from ..scene.handover import MOTIONS, REPAIRED, hand_over, inspect_command, loading_usd
 from ..scene.objects import Pair
 from ..scene.repairs import REPAIRS, apply_scale, push_points, repair_mesh
 from ..scene.selecting import select_bones, select_elements
-from ..scene.takes import Chosen
+from ..scene.takes import ChosenMotions
 from .reporting import ReportingOperator
 from .rig import RigOperator
 
@@ -33,7 +33,7 @@ class InspectOperator(RigOperator):
 
     def prepare(self, context: bpy.types.Context) -> Work:
         garment = context.object
-        self.pair, self.dressed = Pair.of(garment, armature_of(garment)), gather(garment)
+        self.pair, self.scene = Pair.of(garment, armature_of(garment)), gather(garment)
         self.python = interpreter(preferences(context))
         return Work(
             f"Inspecting '{garment.name}'", self.commands, parent=bpy.app.tempdir, steps=self.steps(),
@@ -46,11 +46,11 @@ class InspectOperator(RigOperator):
 
     def commands(self, folder: Path) -> list[list[str]]:
         """Write what is inspected; return the command."""
-        self.handover = hand_over(self.dressed, self.pair, folder)
+        self.handover = hand_over(self.scene, self.pair, folder)
         return [inspect_command(self.python, folder, self.handover, self.words(folder))]
 
     def words(self, folder: Path) -> list[str]:
-        """Return what else `ssilk inspect` is told."""
+        """Return further arguments of `ssilk inspect`."""
         raise NotImplementedError
 
     def explain(self, work: Work) -> str:
@@ -68,13 +68,13 @@ class Inspect(InspectOperator, bpy.types.Operator):
         findings = scene_findings(garment)
         keep_findings(context, garment.name, findings)
         for finding in findings:
-            raise SetupError(f"'{finding.target}': {finding.found}; {finding.fix}.")
-        self.chosen, self.preset = Chosen.of(garment, armature_of(garment)), garment.ssilk.training.preset
+            raise SetupError(f"'{finding.prim}': {finding.found}; {finding.fix}.")
+        self.chosen, self.preset = ChosenMotions.of(garment, armature_of(garment)), garment.ssilk.training.preset
         return super().prepare(context)
 
     def steps(self) -> Iterator[float]:
         _, armature = self.pair.objects()
-        yield from self.chosen.writing(armature, character_joints(self.dressed.joints), self.work.folder / MOTIONS)
+        yield from self.chosen.writing(armature, self.scene.joints.character, self.work.folder / MOTIONS)
 
     def words(self, folder: Path) -> list[str]:
         motions = [*(str(folder / MOTIONS / name) for name in self.chosen.names), *map(str, self.chosen.files)]
@@ -84,7 +84,7 @@ class Inspect(InspectOperator, bpy.types.Operator):
         taken = [Clip(take.source.name, take.frames.start) for take in self.chosen.takes]
         clips = dict(zip((str(work.folder / MOTIONS / name) for name in self.chosen.names), taken))
         clips |= {str(path): Clip(path.name) for path in self.chosen.files}
-        findings = read_findings(work.result["findings"], self.dressed, self.handover.prims, clips)
+        findings = read_findings(work.result["findings"], self.handover.name, self.scene.meshes, clips)
         keep_findings(context, self.handover.name, findings)
         bad = sum(finding.severity != "info" for finding in findings)
         return (
@@ -156,12 +156,12 @@ class PushOut(InspectOperator, bpy.types.Operator):
         return ["--fix", str(folder / REPAIRED)]
 
     def finish(self, context: bpy.types.Context, work: Work) -> str:
-        from ..contract.read import read_points
-
         garment, _ = self.handover.pair.objects()
-        points = read_points(work.folder / REPAIRED, self.handover.prims[self.handover.name])
-        fits = len(points) == len(garment.data.vertices)
-        need(fits, f"'{garment.name}' has other findings to fix first: vertices would be merged or removed.")
+        points = self.handover.repaired_points(work.folder)
+        if len(points) != len(garment.data.vertices):
+            raise SetupError(
+                f"'{garment.name}' has other findings to fix first: vertices would be merged or removed."
+            )
         moved = push_points(garment, points)
         forget(context)
         return f"{moved} vertices of '{garment.name}' were pushed out; inspect it again."
@@ -182,7 +182,8 @@ def find_target(name: str) -> bpy.types.Object:
         SetupError: it was deleted or renamed.
     """
     thing = bpy.data.objects.get(name)
-    need(thing, f"'{name}' was deleted or renamed; inspect the garment again.")
+    if not thing:
+        raise SetupError(f"'{name}' was deleted or renamed; inspect the garment again.")
     return thing
 
 
@@ -193,7 +194,8 @@ def unchanged(item: FindingItem) -> bpy.types.Object:
         SetupError: it has other vertices by now.
     """
     thing = find_target(item.target)
-    need(size_of(item.target) == item.size, f"'{thing.name}' has changed since it was inspected; inspect it again.")
+    if size_of(item.target) != item.size:
+        raise SetupError(f"'{thing.name}' has changed since it was inspected; inspect it again.")
     return thing
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Seeing how good a garment is: heat maps, the worst frames, and plain skinning beside it."""
+"""Judging a garment: heat maps, the worst frames, and linear blend skinning (LBS) beside it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bpy.props import EnumProperty, FloatProperty, IntProperty
 from .. import overlay
 from ..heat import worst_frames
 from ..outside.work import Work
-from ..scene import beside, heat
+from ..scene import heat, lbs_copy
 from ..scene.garment import unusable_here
 from ..scene.objects import found_again
 from . import tasks
@@ -85,7 +85,7 @@ class ShowHeat(MeasuringOperator, bpy.types.Operator):
         overlay.hide()  # classes would tint the heat
         if context.space_data and context.space_data.type == "VIEW_3D":
             context.space_data.shading.color_type = "VERTEX"
-        return f"'{self.called}', frame {self.frame}: {self.measured.told()}."
+        return f"'{self.called}', frame {self.frame}: {self.measured.summary()}."
 
 
 class HideHeat(QualityOperator, bpy.types.Operator):
@@ -133,11 +133,11 @@ class FindWorst(MeasuringOperator, bpy.types.Operator):
         worst = worst_frames(values, self.count, max(1, round(APART * fps)))
         clear_markers(scene)
         for index in worst:
-            scene.timeline_markers.new(f"{MARKER}{self.found[index].told()}", frame=scene.frame_start + index)
+            scene.timeline_markers.new(f"{MARKER}{self.found[index].summary()}", frame=scene.frame_start + index)
         if not worst:
             return f"'{self.called}' is fine in every frame."
         first = worst[0]
-        return f"'{self.called}' is worst in frame {scene.frame_start + first}: {self.found[first].told()}."
+        return f"'{self.called}' is worst in frame {scene.frame_start + first}: {self.found[first].summary()}."
 
 
 class ClearWorst(ReportingOperator, bpy.types.Operator):
@@ -151,19 +151,19 @@ class ClearWorst(ReportingOperator, bpy.types.Operator):
         return f"{clear_markers(context.scene)} markers removed."
 
 
-class ToggleBeside(QualityOperator, bpy.types.Operator):
-    """Show the garment as plain skinning has it, beside it, or take that away"""
+class ToggleLbsCopy(QualityOperator, bpy.types.Operator):
+    """Show beside the garment how linear blend skinning alone would move it, or remove that"""
 
-    bl_idname = "ssilk.toggle_plain"
-    bl_label = "Plain Skinning Beside"
+    bl_idname = "ssilk.toggle_lbs"
+    bl_label = "Linear Blend Skinning Beside"
 
     def apply(self, context: bpy.types.Context) -> str:
         garment = context.object
-        shown = beside.beside(garment)
+        shown = lbs_copy.find_copy(garment)
         if shown:
-            beside.take_away(shown)
+            lbs_copy.remove_copy(shown)
         else:
-            beside.put_beside(garment)
+            lbs_copy.show_copy(garment)
         return ""
 
 
@@ -179,11 +179,11 @@ _keys: list[tuple[bpy.types.KeyMap, bpy.types.KeyMapItem]] = []
 
 
 def add_key() -> None:
-    """Let Ctrl Alt P toggle plain skinning in 3D views; without windows there are no keys."""
+    """Let Ctrl Alt P toggle linear blend skinning in 3D views; without windows there are no keys."""
     configuration = bpy.context.window_manager.keyconfigs.addon
     if configuration:
         keymap = configuration.keymaps.new(name="3D View", space_type="VIEW_3D")
-        _keys.append((keymap, keymap.keymap_items.new(ToggleBeside.bl_idname, "P", "PRESS", ctrl=True, alt=True)))
+        _keys.append((keymap, keymap.keymap_items.new(ToggleLbsCopy.bl_idname, "P", "PRESS", ctrl=True, alt=True)))
 
 
 def remove_key() -> None:
@@ -193,4 +193,4 @@ def remove_key() -> None:
         keymap.keymap_items.remove(item)
 
 
-CLASSES = (ShowHeat, HideHeat, FindWorst, ClearWorst, ToggleBeside)
+CLASSES = (ShowHeat, HideHeat, FindWorst, ClearWorst, ToggleLbsCopy)

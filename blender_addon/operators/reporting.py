@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators that tell what they did, or in one sentence why they could not or cannot now."""
+"""Operators that report what they did, or why they could not, in one sentence."""
 
 from __future__ import annotations
 
 import bpy
 
-from ..errors import SetupError
+from ssilk_core.errors import SsilkError
 
 
 class RefusingOperator:
@@ -35,7 +35,7 @@ class ReportingOperator(RefusingOperator):
         """Do the work and report it."""
         try:
             told = self.apply(context)
-        except SetupError as error:
+        except SsilkError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         if told:

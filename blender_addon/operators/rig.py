@@ -8,16 +8,16 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, IntProperty
 
-from ..errors import SetupError, need
+from ..errors import SetupError
 from ..outside.work import Work
 from ..preferences import interpreter, preferences, unready
 from ..scene.apply import apply_classes, apply_rig
 from ..scene.armature import need_editable, proxy_names
 from ..scene.attributes import current_classes
+from ..scene.edit_tracking import find_edits
 from ..scene.follower import is_linked, make_follower
 from ..scene.garment import armature_of, unusable_here
 from ..scene.gather import gather
-from ..scene.handmade import find_edits
 from ..scene.handover import Handover, hand_over, loading_usd, rig_command
 from ..scene.objects import Pair
 from . import tasks
@@ -35,11 +35,11 @@ class RigOperator(tasks.OutsideOperator):
     def begin(self, context: bpy.types.Context, title: str, *, classes: bool, options: tuple[str, ...]) -> Work:
         """Write the garment without its proxies, and start `ssilk rig`."""
         garment = context.object
-        dressed = gather(garment, classes=classes, proxies=False)
+        scene = gather(garment, classes=classes, proxies=False)
         pair, python = Pair.of(garment, armature_of(garment)), interpreter(preferences(context))
 
         def commands(folder: Path) -> list[list[str]]:
-            self.handover = hand_over(dressed, pair, folder)
+            self.handover = hand_over(scene, pair, folder)
             return [rig_command(python, folder, self.handover, options)]
 
         return Work(title, commands, parent=bpy.app.tempdir, steps=loading_usd(), rephrase=self.rephrase)
@@ -64,7 +64,8 @@ class Classify(RigOperator, bpy.types.Operator):
 
     def finish(self, context: bpy.types.Context, work: Work) -> str:
         garment, _ = self.handover.pair.objects()
-        apply_classes(garment, self.handover.rig(work.folder))
+        found, _ = self.handover.rig(work.folder)
+        apply_classes(garment, found.classes)
         return f"'{garment.name}' is classified."
 
 
@@ -107,17 +108,19 @@ class GenerateRig(RigOperator, bpy.types.Operator):
         armature, classes = armature_of(garment), current_classes(garment.data)
         if not is_linked(armature):
             need_editable(armature)
-        need(classes is not None, f"'{garment.name}' has no classes; classify or paint it first.")
+        if classes is None:
+            raise SetupError(f"'{garment.name}' has no classes; classify or paint it first.")
         options = ("--proxies", str(self.proxies), "--rig", f"roots_per_cluster={self.roots}")
         return self.begin(context, f"Rigging '{garment.name}'", classes=True, options=options)
 
     def finish(self, context: bpy.types.Context, work: Work) -> str:
         garment, armature = self.handover.pair.objects()
-        rig = self.handover.rig(work.folder)
-        if is_linked(armature) and rig.names:
+        found, rig = self.handover.rig(work.folder)
+        if is_linked(armature) and rig.proxy_count:
             armature = make_follower(garment, armature)
-        edits = apply_rig(garment, armature, self.handover.joints, rig, keep_edits=self.keep_edits)
-        if not rig.names:
+        joints = self.handover.scene.joints
+        edits = apply_rig(garment, armature, joints, found.classes, rig, keep_edits=self.keep_edits)
+        if not rig.proxy_count:
             return f"Nothing of '{garment.name}' is loose; it follows '{armature.name}' without proxies."
         kept = f"; kept by hand: {edits.summary}" if edits.summary else ""
         return f"'{armature.name}' has {len(proxy_names(armature, garment))} proxies for '{garment.name}'{kept}."

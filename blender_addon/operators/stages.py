@@ -8,7 +8,7 @@ from pathlib import Path
 import bpy
 from bpy.props import StringProperty
 
-from ..errors import need
+from ..errors import SetupError
 from ..scene.adopt import adopt
 from ..scene.garment import not_in_object_mode
 from ..scene.handover import expose_usd
@@ -37,14 +37,17 @@ class StageOperator(ReportingOperator):
     def adopted(self) -> tuple[str, float | None]:
         """Mark the proxies of all garments in the file; return what to tell, and its frames per second."""
         path = Path(bpy.path.abspath(self.filepath))
-        need(path.is_file(), f"There is no file '{path}'; choose a stage that `ssilk rig` wrote.")
+        if not path.is_file():
+            raise SetupError(f"There is no file '{path}'; choose a stage that `ssilk rig` wrote.")
         expose_usd()
-        from ..contract.read import read_staged
+        from ssilk_usd.facts import playback_rate
+        from ssilk_usd.read_scene import read_rigged
 
-        staged, rate = read_staged(path)
-        need(staged, f"No mesh of '{path.name}' has proxies; rig a garment, here or with `ssilk rig`.")
-        names = ", ".join(f"{len(item.proxies)} proxies of '{adopt(item).name}'" for item in staged)
-        return f"{names} were recognised.", rate
+        rigged = read_rigged(path)
+        if not rigged:
+            raise SetupError(f"No mesh of '{path.name}' has proxies; rig a garment, here or with `ssilk rig`.")
+        names = ", ".join(f"{rig.proxy_count} proxies of '{adopt(*of, rig).name}'" for *of, rig in rigged)
+        return f"{names} were recognised.", playback_rate(path)
 
 
 class AdoptRig(StageOperator, bpy.types.Operator):
@@ -65,8 +68,10 @@ class ImportStage(StageOperator, bpy.types.Operator):
 
     def apply(self, context: bpy.types.Context) -> str:
         path = bpy.path.abspath(self.filepath)
-        need(Path(path).is_file(), f"There is no file '{path}'; choose a stage that `ssilk rig` wrote.")
-        need(hasattr(bpy.ops.wm, "usd_import"), "This Blender was built without USD; take one from blender.org.")
+        if not Path(path).is_file():
+            raise SetupError(f"There is no file '{path}'; choose a stage that `ssilk rig` wrote.")
+        if not hasattr(bpy.ops.wm, "usd_import"):
+            raise SetupError("This Blender was built without USD; take one from blender.org.")
         bpy.ops.wm.usd_import(filepath=path)
         told, rate = self.adopted()
         if rate:

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Work outside Blender, watched by a timer, one at a time; every other event passes meanwhile."""
+"""Work outside Blender, one at a time, polled by a timer while Blender stays usable."""
 
 from __future__ import annotations
 
 import time
 
 import bpy
+
+from ssilk_core.errors import SsilkError
 
 from ..errors import SetupError
 from ..outside.work import Work
@@ -39,7 +41,7 @@ class OutsideOperator(RefusingOperator):
         raise NotImplementedError
 
     def explain(self, work: Work) -> str:
-        """Return why the work failed; empty if it did what was wanted all the same."""
+        """Return why the work failed; empty if it succeeded nevertheless."""
         return work.error
 
     def execute(self, context: bpy.types.Context) -> set[str]:
@@ -55,7 +57,7 @@ class OutsideOperator(RefusingOperator):
         return {"RUNNING_MODAL"}
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Look at the work now and then."""
+        """Poll the work at each timer event."""
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
         redraw(context)
@@ -78,7 +80,7 @@ class OutsideOperator(RefusingOperator):
         global current
         try:
             self.work = self.prepare(context)
-        except SetupError as error:
+        except SsilkError as error:
             self.report({"ERROR"}, str(error))
             return False
         current = self.work
@@ -92,7 +94,7 @@ class OutsideOperator(RefusingOperator):
             if reason:
                 raise SetupError(reason)
             self.report({"INFO"}, self.finish(context, work))
-        except SetupError as error:
+        except SsilkError as error:
             self.report({"WARNING" if work.cancelled else "ERROR"}, str(error))
             return {"CANCELLED"}
         finally:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Training a garment: choosing motions, starting, cancelling, going on."""
+"""Training a garment: choosing motions, starting, cancelling, resuming."""
 
 from __future__ import annotations
 
@@ -9,14 +9,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import bpy
-import numpy as np
 from bpy.props import CollectionProperty, IntProperty, StringProperty
 
-from ..classes import LOOSE
-from ..contract.arrays import Dressed
-from ..contract.names import identifiers
-from ..errors import need
+from ssilk_core.assets import LOOSE
+
+from ..errors import SetupError
 from ..fabric_properties import fabric_options
+from ..names import identifiers
 from ..outside import jobs
 from ..outside.work import Work
 from ..preferences import interpreter, preferences, unready
@@ -24,12 +23,12 @@ from ..scene import playing
 from ..scene.baked import need_bakeable
 from ..scene.follower import leader_of
 from ..scene.garment import armature_of, unusable, unusable_here
-from ..scene.gather import character_joints, gather
+from ..scene.gather import GatheredScene, gather
 from ..scene.handover import MOTIONS, STAGE, hand_over
 from ..scene.models import job_of, relative
 from ..scene.motions import FILE, Source, sources
 from ..scene.objects import Pair
-from ..scene.takes import Chosen
+from ..scene.takes import ChosenMotions
 from . import tasks
 from .reporting import ReportingOperator
 
@@ -88,7 +87,8 @@ class AddMotionFiles(MotionOperator, bpy.types.Operator):
         listed = {item.name for item in garment.ssilk.training.motions if item.kind == FILE}
         for file in self.files:
             path = relative(Path(self.directory, file.name))
-            need(Path(bpy.path.abspath(path)).is_file(), f"There is no file {path}; choose a USD file.")
+            if not Path(bpy.path.abspath(path)).is_file():
+                raise SetupError(f"There is no file {path}; choose a USD file.")
             if path not in listed:
                 add_motion(garment, Source(FILE, path))
         return ""
@@ -104,7 +104,8 @@ class RemoveMotion(MotionOperator, bpy.types.Operator):
 
     def apply(self, context: bpy.types.Context) -> str:
         motions = context.object.ssilk.training.motions
-        need(self.index < len(motions), f"There are only {len(motions)} motions.")
+        if self.index >= len(motions):
+            raise SetupError(f"There are only {len(motions)} motions.")
         motions.remove(self.index)
         return ""
 
@@ -125,14 +126,15 @@ class Train(tasks.OutsideOperator, bpy.types.Operator):
         garment = context.object
         armature, settings, folder = armature_of(garment), garment.ssilk.training, job_of(garment)
         running = folder and jobs.read_state(folder)
-        need(not (running and running.alive), f"'{garment.name}' is being trained already; cancel that first.")
-        chosen = any(item.use for item in settings.motions)
-        need(chosen, f"No motion is chosen for '{garment.name}'; find motions, or add files of motions.")
-        both = settings.iterations and settings.minutes
-        need(not both, f"'{garment.name}' has a budget in iterations and in minutes; set one of them to zero.")
-        self.dressed = gather(garment)
-        need_trainable(garment, armature, self.dressed)
-        self.chosen = Chosen.of(garment, armature)
+        if running and running.alive:
+            raise SetupError(f"'{garment.name}' is being trained already; cancel that first.")
+        if not any(item.use for item in settings.motions):
+            raise SetupError(f"No motion is chosen for '{garment.name}'; find motions, or add files of motions.")
+        if settings.iterations and settings.minutes:
+            raise SetupError(f"'{garment.name}' has a budget in iterations and in minutes; set one of them to zero.")
+        self.scene = gather(garment)
+        need_trainable(garment, armature, self.scene)
+        self.chosen = ChosenMotions.of(garment, armature)
         self.pair = Pair.of(garment, armature)
         title, steps = f"Sampling motions for '{garment.name}'", self.steps()
         return Work(title, lambda _: (), parent=bpy.app.tempdir, steps=steps)
@@ -140,12 +142,12 @@ class Train(tasks.OutsideOperator, bpy.types.Operator):
     def steps(self) -> Iterator[float]:
         """Sample the motions and write them."""
         _, armature = self.pair.objects()
-        yield from self.chosen.writing(armature, character_joints(self.dressed.joints), self.work.folder / MOTIONS)
+        yield from self.chosen.writing(armature, self.scene.joints.character, self.work.folder / MOTIONS)
 
     def finish(self, context: bpy.types.Context, work: Work) -> str:
         (garment, _), name = self.pair.objects(), self.pair.name
         folder = jobs.create(Path(bpy.data.filepath).parent / "ssilk", identifiers([name])[0])
-        prim = hand_over(self.dressed, self.pair, folder).prims[name]
+        prim = hand_over(self.scene, self.pair, folder).prim
         shutil.move(work.folder / MOTIONS, folder / MOTIONS)
         files = [beside(path, folder) for path in self.chosen.files]
         command = train_command(garment, prim, self.chosen.names, files)
@@ -213,23 +215,18 @@ def add_motion(garment: bpy.types.Object, source: Source) -> bpy.types.PropertyG
     return item
 
 
-def need_trainable(garment: bpy.types.Object, armature: bpy.types.Object, dressed: Dressed) -> None:
+def need_trainable(garment: bpy.types.Object, armature: bpy.types.Object, scene: GatheredScene) -> None:
     """Check that a garment is complete, and that Blender will show what is trained.
 
     Raises:
         SetupError: it is not; the sentence says what is missing.
     """
-    need(dressed.classes is not None, f"'{garment.name}' has no classes; classify or paint it first.")
-    rigged = dressed.joints.proxy_count or not (dressed.classes == LOOSE).any()
-    need(rigged, f"'{garment.name}' is loose but has no proxies; generate its rig first.")
-    weights = dressed.garment.weights
-    bare = 0 if weights is None else int(np.count_nonzero(~weights.any(axis=1)))
-    need(
-        not bare,
-        f"{bare} vertices of '{garment.name}' have no bone's weight, as where a proxy was deleted; generate its rig "
-        "again, or paint them.",
-    )
-    need_bakeable(garment, armature, dressed.joints)
+    classes = scene.garment.classes
+    if classes is None:
+        raise SetupError(f"'{garment.name}' has no classes; classify or paint it first.")
+    if scene.rig is None and (classes == LOOSE).any():
+        raise SetupError(f"'{garment.name}' is loose but has no proxies; generate its rig first.")
+    need_bakeable(garment, armature, scene.joints)
 
 
 def train_command(garment: bpy.types.Object, prim: str, takes: Sequence[str], files: Sequence[str]) -> list[str]:
@@ -253,7 +250,7 @@ def beside(path: Path, folder: Path) -> str:
 
 
 def watch() -> float:
-    """Draw panels again where a training went on, and play by its new model; return when to look next [s]."""
+    """Redraw panels when a training has progressed, and play its new model; return when to be called again [s]."""
     from ..panels.training import changed
 
     garments = [thing for thing in bpy.data.objects if thing.type == "MESH" and thing.ssilk.training.folder]
@@ -264,12 +261,12 @@ def watch() -> float:
 
 
 def start_watching() -> None:
-    """Look at trainings from now on, whatever file is open."""
+    """Start polling trainings, whatever file is open."""
     bpy.app.timers.register(watch, first_interval=LOOK, persistent=True)
 
 
 def stop_watching(context: bpy.types.Context) -> None:
-    """Look no more; end what this session began, if the preferences ask for it."""
+    """Stop polling; end the trainings of this session if the preferences ask for it."""
     if bpy.app.timers.is_registered(watch):
         bpy.app.timers.unregister(watch)
     if preferences(context).stop_trainings:

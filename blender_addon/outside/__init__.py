@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What runs in another process, and what it says; the standard library alone."""
+"""Work in other processes: commands, trainings and their reports. No module here imports `bpy`."""

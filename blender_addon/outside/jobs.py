@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Trainings that outlive Blender: a folder each, and what their runner says of them in it."""
+"""Trainings that outlive Blender: a folder each, in which a runner keeps their state."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..errors import SetupError, need
+from ..errors import SetupError
 from .process import environment
 from .runner import BEAT, CANCEL, ORDER, STATE
 
@@ -112,14 +112,16 @@ def resume(python: str, folder: Path) -> None:
         SetupError: it works already, its files are gone, or the Python cannot be started.
     """
     state, order = read_state(folder), _read(folder / ORDER)
-    need(order, f"There is no training in {folder} any more; train again.")
-    need(not (state and state.alive), "The training is under way already.")
+    if not order:
+        raise SetupError(f"There is no training in {folder} any more; train again.")
+    if state and state.alive:
+        raise SetupError("The training is under way already.")
     _write(folder / ORDER, {"command": [*(word for word in order["command"] if word != "--resume"), "--resume"]})
     _launch(python, folder)
 
 
 def _launch(python: str, folder: Path) -> None:
-    """Start a runner, which goes on without us."""
+    """Start a runner, which outlives Blender."""
     (folder / CANCEL).unlink(missing_ok=True)
     _write(folder / STATE, {**_read(folder / STATE), "state": "waiting", "beat": time.time(), "error": ""})
     try:
@@ -161,7 +163,7 @@ def stamp(folder: Path) -> float:
 
 
 def read_curve(folder: Path) -> dict[str, Any]:
-    """Return the curve beside a job's model, {"plain": score, "points": [...]}; empty before there is one."""
+    """Return the curve beside a job's model, {"lbs": score, "points": [...]}; empty before there is one."""
     return _read(folder / CURVE)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Prints, as one line of JSON, what a Python has for ssilk. Run by that Python: `python probe.py`."""
+"""Print as one line of JSON which versions and device a Python has. Run by that Python: `python probe.py`."""
 
 import importlib.metadata
 import json

@@ -9,11 +9,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-NEEDED = (0, 1)  # major and minor version of ssilk that this extension speaks with
+from ssilk_core import __version__
+
+NEEDED = tuple(map(int, __version__.split(".")[:2]))  # of ssilk: major and minor version
 REQUIRED = ("usd-core", "libigl", "scipy")  # what classes and rigs need beside ssilk itself
 EXTRAS = "train,bake"
 PROBE = Path(__file__).with_name("probe.py")
-WHEELS = Path(__file__).parents[1] / "wheel"  # of the zip: ssilk itself, as `make extension` packs it
+WHEELS = Path(__file__).parents[1] / "wheels"  # of the zip: ssilk itself, as `make extension` packs it
 VENV_NAMES = (".venv", "venv", "env", ".env")
 
 

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a training's state and learning curve mean, in lines for people; the standard library alone."""
+"""What a training's state and learning curve mean, in lines for people."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-from .jobs import JobState
+from ssilk_core.events import format_seconds
+from ssilk_core.training.verdict import ADVICE, NO_DYNAMICS
 
-NO_DYNAMICS = 2e-3  # [m]; a garment that moves less of its own has learned no dynamics, as ssilk has it
+from .jobs import JobState
 
 ENDED = {
     "done": "Trained for {done} iterations",
@@ -26,7 +27,7 @@ def progress(state: JobState) -> str:
         return ENDED[state.state].format(done=state.done, total=state.total)
     if not state.total:
         return "Prepares the training"
-    left = "" if state.seconds_left is None else f", {duration(state.seconds_left)} left"
+    left = "" if state.seconds_left is None else f", {format_seconds(state.seconds_left)} left"
     return f"Iteration {state.done} of {state.total}{left}"
 
 
@@ -39,10 +40,10 @@ def findings(state: JobState, curve: Mapping[str, Any], *, moves: bool) -> list[
     """
     if not curve.get("points"):
         return [("No validation yet: too early to say what is being learned", False)] if state.alive else []
-    score, plain = curve["points"][-1]["validation"], curve["plain"]
-    share = 1 - score["total"] / plain["total"]
+    score, lbs = curve["points"][-1]["validation"], curve["lbs"]
+    share = 1 - score["total"] / lbs["total"]
     found = [
-        (f"{abs(share):.1%} {'less' if share >= 0 else 'more'} energy than plain skinning", share < 0),
+        (f"{abs(share):.1%} {'less' if share >= 0 else 'more'} energy than linear blend skinning", share < 0),
         (f"{score['collisions']:.2%} of the vertices inside the body", False),
     ]
     if moves:
@@ -61,15 +62,5 @@ def dynamics(moved: float) -> tuple[str, bool]:
         moved: how far the garment is from hanging still, in the mean [m].
     """
     if moved < NO_DYNAMICS:
-        return ("Nothing dynamic is learned yet: train longer, or check that the motions move", True)
+        return (ADVICE[0].upper() + ADVICE[1:], True)
     return (f"Dynamics are being learned: {moved * 1000:.0f} mm of motion of its own", False)
-
-
-def duration(seconds: float) -> str:
-    """Return a duration as people say it: "42 s", "3 min 05 s", "2 h 10 min"."""
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60:02d} s"
-    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"

@@ -31,7 +31,7 @@ else:
     NEW_GROUP, INTERRUPT = 0, signal.SIGINT
 
 
-class Record:
+class StateFile:
     """The state of a job: what its training said last, written whole."""
 
     def __init__(self, folder):
@@ -184,7 +184,7 @@ def last_words(folder):
 
 def main(folder, queue_folder):
     """Wait and train; the state says how it ended."""
-    record = Record(folder)
+    record = StateFile(folder)
     record.write(state="waiting")
     with place_in(queue_folder) as our_turn:
         if not wait(folder, record, our_turn):

@@ -9,8 +9,10 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..errors import SetupError, need
-from .events import Event, parse
+from ssilk_core.errors import SsilkError
+from ssilk_core.events import Failed, Message, Progress, Result, read_event
+
+from ..errors import SetupError
 from .process import Process
 
 Command = Sequence[str]
@@ -72,7 +74,7 @@ class Work:
             return self._steps is None
         running = self._process.running
         for line in self._process.lines():
-            self._hear(parse(line))
+            self._hear(line)
         if running:
             return False
         self._end(self._process)
@@ -95,27 +97,35 @@ class Work:
         """Do steps for a moment; after the last one start the commands, unless these have been."""
         until, first = time.monotonic() + SLICE, steps is not self._closing
         try:
-            need(not self.cancelled, f"{self.title} was cancelled.")
+            if self.cancelled:
+                raise SetupError(f"{self.title} was cancelled.")
             for self.fraction in steps:
                 if time.monotonic() >= until:
                     return
             self._steps = self.fraction = None
             if first:
                 self._begin()
-        except SetupError as error:
+        except SsilkError as error:
             self._steps, self.error = None, str(error)
 
     def _begin(self) -> None:
         self._waiting = list(self._commands(self.folder))
         self._go_on()
 
-    def _hear(self, event: Event) -> None:
-        self.text = self._rephrase(event.text) or self.text
-        self.fraction = event.fraction if event.fraction is not None else self.fraction
-        if event.kind == "result":
-            self.result = event.fields.get("detail", {})
-        elif event.kind == "failed":
-            self.error = event.text
+    def _hear(self, line: str) -> None:
+        try:
+            event = read_event(line)
+        except ValueError:  # another program speaks, such as pip
+            event = Message(line.strip())
+        match event:
+            case Message():
+                self.text = self._rephrase(event.text) or self.text
+            case Progress() if event.total > 0:
+                self.fraction = min(max(event.done / event.total, 0.0), 1.0)
+            case Result():
+                self.result = event.detail
+            case Failed():
+                self.text, self.error = self._rephrase(event.error), event.error
 
     def _end(self, process: Process) -> None:
         self._process = None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What is drawn in the sidebar of 3D views, one module for each panel; what it says is found elsewhere."""
+"""Panels in the sidebar of 3D views, one module each; they only draw what other modules find."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ import bpy
 from ..errors import SetupError
 from ..scene.garment import unusable
 from ..scene.models import model_of
-from .base import Panel, draw_text
+from .base import SidebarPanel, draw_text
 
 
 def model_line(garment: bpy.types.Object) -> str:
@@ -19,7 +19,7 @@ def model_line(garment: bpy.types.Object) -> str:
         return str(error)
 
 
-class BakingPanel(Panel, bpy.types.Panel):
+class BakingPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_baking"
     bl_label = "Baking"
 

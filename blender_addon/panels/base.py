@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What panels share."""
+"""Functions and the base class that all panels share."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def draw_work(layout: bpy.types.UILayout) -> None:
         draw_text(layout, work.text)
 
 
-class Panel:
+class SidebarPanel:
     """Base of all panels."""
 
     bl_space_type = "VIEW_3D"

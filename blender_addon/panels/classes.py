@@ -12,7 +12,7 @@ from ..overlay import shown
 from ..scene.attributes import current_classes
 from ..scene.editing import edited_counts
 from ..scene.garment import unusable
-from .base import Panel, draw_text
+from .base import SidebarPanel, draw_text
 
 
 def class_counts(thing: bpy.types.Object) -> tuple[int, int, int] | None:
@@ -27,7 +27,7 @@ def class_counts(thing: bpy.types.Object) -> tuple[int, int, int] | None:
     return None if values is None else counts(values)
 
 
-class ClassesPanel(Panel, bpy.types.Panel):
+class ClassesPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_classes"
     bl_label = "Classes"
 

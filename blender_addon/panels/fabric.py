@@ -6,12 +6,12 @@ from __future__ import annotations
 import bpy
 
 from ..scene.garment import unusable
-from .base import Panel
+from .base import SidebarPanel
 
 MEMBRANE = {"stvk": ("lame_mu", "lame_lambda"), "baraff_witkin": ("stretch", "shear")}  # values of each model
 
 
-class FabricPanel(Panel, bpy.types.Panel):
+class FabricPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_fabric"
     bl_label = "Fabric"
     bl_parent_id = "SSILK_PT_garment"

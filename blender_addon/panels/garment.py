@@ -8,7 +8,7 @@ import bpy
 from ..errors import SetupError
 from ..preferences import unready
 from ..scene.garment import armature_of, garments_of, unusable
-from .base import Panel, draw_text, draw_work
+from .base import SidebarPanel, draw_text, draw_work
 
 
 def draw_garments(layout: bpy.types.UILayout, shown: bpy.types.Object) -> None:
@@ -25,7 +25,7 @@ def draw_garments(layout: bpy.types.UILayout, shown: bpy.types.Object) -> None:
         chosen.garment = garment.name
 
 
-class GarmentPanel(Panel, bpy.types.Panel):
+class GarmentPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_garment"
     bl_label = "Garment"
 

@@ -7,7 +7,7 @@ import bpy
 
 from ..scene import playing
 from ..scene.garment import unusable
-from .base import Panel
+from .base import SidebarPanel
 
 
 def live_line(garment: bpy.types.Object) -> str:
@@ -20,7 +20,7 @@ def live_line(garment: bpy.types.Object) -> str:
     return "The motion changed since it was read" if played.stale else "Follows the armature"
 
 
-class PlaybackPanel(Panel, bpy.types.Panel):
+class PlaybackPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_playback"
     bl_label = "Live Playback"
 

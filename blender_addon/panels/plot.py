@@ -28,7 +28,7 @@ def swatch(index: int) -> int:
 
 
 def forget() -> None:
-    """Give all pictures back."""
+    """Free all pictures."""
     global _pictures
     if _pictures is not None:
         bpy.utils.previews.remove(_pictures)

@@ -8,7 +8,7 @@ import bpy
 from ..operators.preflight import fixer
 from ..preflight_properties import shown_finding
 from ..scene.garment import unusable
-from .base import Panel, draw_text
+from .base import SidebarPanel, draw_text
 
 ICONS = {"error": "CANCEL", "warning": "ERROR", "info": "INFO"}
 
@@ -20,7 +20,7 @@ class FindingList(bpy.types.UIList):
         layout.label(text=line(item), icon=ICONS.get(item.severity, "INFO"), translate=False)
 
 
-class PreflightPanel(Panel, bpy.types.Panel):
+class PreflightPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_preflight"
     bl_label = "Preflight"
     bl_options = {"DEFAULT_CLOSED"}

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Seeing quality."""
+"""Quality: heat maps, worst frames and the LBS copy."""
 
 from __future__ import annotations
 
 import bpy
 
-from ..scene.beside import beside
 from ..scene.garment import unusable
 from ..scene.heat import PENETRATION, STRETCH
-from .base import Panel
+from ..scene.lbs_copy import find_copy
+from .base import SidebarPanel
 
 
 def draw_kind(layout: bpy.types.UILayout, kind: str, text: str) -> None:
@@ -18,7 +18,7 @@ def draw_kind(layout: bpy.types.UILayout, kind: str, text: str) -> None:
     row.operator("ssilk.find_worst", text="", icon="MARKER_HLT").kind = kind
 
 
-class QualityPanel(Panel, bpy.types.Panel):
+class QualityPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_quality"
     bl_label = "Quality"
     bl_options = {"DEFAULT_CLOSED"}
@@ -35,5 +35,5 @@ class QualityPanel(Panel, bpy.types.Panel):
         if context.object.ssilk.heat:
             row.operator("ssilk.hide_heat")
         row.operator("ssilk.clear_worst")
-        shown = beside(context.object) is not None
-        layout.operator("ssilk.toggle_plain", depress=shown)
+        shown = find_copy(context.object) is not None
+        layout.operator("ssilk.toggle_lbs", depress=shown)

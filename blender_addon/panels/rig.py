@@ -10,7 +10,7 @@ from ..errors import SetupError
 from ..scene.armature import proxy_names
 from ..scene.attributes import read_classes
 from ..scene.garment import armature_of, unusable
-from .base import Panel, draw_text
+from .base import SidebarPanel, draw_text
 
 
 def rig_line(garment: bpy.types.Object) -> str:
@@ -27,7 +27,7 @@ def rig_line(garment: bpy.types.Object) -> str:
     return f"No proxies yet on '{armature.name}'"
 
 
-class RigPanel(Panel, bpy.types.Panel):
+class RigPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_rig"
     bl_label = "Proxy Rig"
 

@@ -14,7 +14,7 @@ from ..scene.armature import proxy_names
 from ..scene.garment import armature_of, unusable
 from ..scene.models import job_of
 from ..scene.motions import FILE
-from .base import Panel, draw_text
+from .base import SidebarPanel, draw_text
 from .plot import plot, swatch
 
 ICONS = {"TIMELINE": "TIME", "ACTION": "ACTION", "STRIP": "NLA", "FILE": "FILE"}
@@ -63,7 +63,7 @@ def draw_state(layout: bpy.types.UILayout, folder: Path, state: JobState, *, mov
         layout.label(text=f"{name}: {values[-1, 1]:.3g} J", icon_value=swatch(index))
 
 
-class TrainingPanel(Panel, bpy.types.Panel):
+class TrainingPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_training"
     bl_label = "Training"
 

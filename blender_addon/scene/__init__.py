@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Blender's data: reading a dressed character from a scene, and putting classes and rigs into it."""
+"""Blender's data: reading a garment with its character, and applying classes, rigs and bakes."""

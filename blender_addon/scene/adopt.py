@@ -9,17 +9,19 @@ from __future__ import annotations
 import re
 
 import bpy
+import numpy as np
 
-from ..contract.arrays import Staged
-from ..errors import need
+from ssilk_core.assets import Garment, ProxyRig, Skeleton
+
+from ..errors import SetupError
 from .armature import MADE, made_collection, proxy_names
+from .edit_tracking import remember_bones, remember_weights
 from .garment import armature_of
-from .handmade import remember_bones, remember_weights
 from .proxies import PALETTE
 from .weights import PLAIN, keep_weights, read_groups, read_kept
 
 
-def adopt(staged: Staged) -> bpy.types.Object:
+def adopt(skeleton: Skeleton, staged: Garment, rig: ProxyRig) -> bpy.types.Object:
     """Mark the proxies of an imported garment, and keep the weights beside its rig; return the garment.
 
     Raises:
@@ -27,31 +29,34 @@ def adopt(staged: Staged) -> bpy.types.Object:
     """
     garment = _imported(staged)
     armature = armature_of(garment)
-    lost = [name for name in staged.proxies if name not in armature.data.bones]
-    need(
-        not lost, f"'{armature.name}' has no bone '{lost[0] if lost else ''}' of '{garment.name}'; import them again."
-    )
-    for name in staged.proxies:
+    proxies, joints = ([path.rpartition("/")[2] for path in of.joint_names] for of in (rig, skeleton))
+    lost = [name for name in proxies if name not in armature.data.bones]
+    if lost:
+        raise SetupError(f"'{armature.name}' has no bone '{lost[0]}' of '{garment.name}'; import them again.")
+    for name in proxies:
         bone = armature.data.bones[name]
         made_collection(armature.data, garment).assign(bone)
         bone.color.palette = PALETTE
     _remember(armature, garment)
-    if staged.plain is not None and read_kept(garment.data, PLAIN, staged.plain_joints) is None:
-        keep_weights(garment.data, PLAIN, staged.plain, staged.plain_joints)
+    if staged.skin is not None and read_kept(garment.data, PLAIN, joints) is None:
+        keep_weights(garment.data, PLAIN, staged.skin.dense(len(joints)).astype(np.float32), joints)
     return garment
 
 
-def _imported(staged: Staged) -> bpy.types.Object:
+def _imported(staged: Garment) -> bpy.types.Object:
     """Return the object that was made of a prim; the active one among several."""
-    fitting = [thing for thing in bpy.context.scene.objects if _fits(thing, staged)]
-    need(fitting, f"No mesh of this scene is '{staged.name}' of that file, with its vertices; import it first.")
+    prim = staged.mesh.path.rpartition("/")[2]
+    fitting = [
+        thing
+        for thing in bpy.context.scene.objects
+        if thing.type == "MESH"
+        and re.sub(r"\.\d{3,}$", "", thing.name) == prim
+        and len(thing.data.vertices) == staged.mesh.vertex_count
+    ]
+    if not fitting:
+        raise SetupError(f"No mesh of this scene is '{prim}' of that file, with its vertices; import it first.")
     active = bpy.context.view_layer.objects.active
     return active if active in fitting else fitting[-1]
-
-
-def _fits(thing: bpy.types.Object, staged: Staged) -> bool:
-    named = re.sub(r"\.\d{3,}$", "", thing.name) == staged.name
-    return named and thing.type == "MESH" and (staged.plain is None or len(thing.data.vertices) == len(staged.plain))
 
 
 def _remember(armature: bpy.types.Object, garment: bpy.types.Object) -> None:

@@ -1,37 +1,47 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A rig from outside becomes bones, vertex groups and classes."""
+"""Apply a rig of `ssilk rig` as bones, vertex groups and classes."""
 
 from __future__ import annotations
 
 import bpy
 import numpy as np
 
-from ..contract.arrays import Joints, Rig
-from ..contract.edits import Edits
-from ..errors import need
+from ssilk_core.assets import ProxyRig
+
+from ..edits import Edits
+from ..errors import SetupError
+from ..joints import Joints
 from .armature import need_editable, proxy_names
 from .attributes import write_classes
+from .edit_tracking import find_edits, generated, remember_weights
 from .gather import own_weights
-from .handmade import find_edits, generated, remember_weights
 from .proxies import replace_proxies
+from .trained_weights import discard_own_weights, own_groups
 from .weights import PLAIN, keep_weights, read_kept, write_groups
-from .worn import forget, own_groups
 
 
-def apply_classes(garment: bpy.types.Object, rig: Rig) -> None:
-    """Give a garment the classes of a rig.
+def apply_classes(garment: bpy.types.Object, classes: np.ndarray) -> None:
+    """Write classes, shape (V,), to a garment.
 
     Raises:
         SetupError: it was edited meanwhile.
     """
-    _need_same(garment, rig)
-    write_classes(garment.data, rig.classes)
+    _need_same_vertices(garment, classes)
+    write_classes(garment.data, classes)
 
 
 def apply_rig(
-    garment: bpy.types.Object, armature: bpy.types.Object, joints: Joints, rig: Rig, *, keep_edits: bool = True
+    garment: bpy.types.Object,
+    armature: bpy.types.Object,
+    joints: Joints,
+    classes: np.ndarray,
+    rig: ProxyRig,
+    *,
+    keep_edits: bool = True,
 ) -> Edits:
-    """Give a garment the proxies, weights and classes of a rig; return what was kept of the artist's. In object mode.
+    """Give a garment the proxies and weights of a rig, and classes; return what was kept of the artist's.
+
+    In object mode.
 
     Args:
         joints: the character's joints that the rig was made for.
@@ -40,22 +50,24 @@ def apply_rig(
     Raises:
         SetupError: the garment or the armature was edited meanwhile, or the armature cannot be edited.
     """
-    _need_same(garment, rig)
+    _need_same_vertices(garment, classes)
     lost = [name for name in joints.names if name not in armature.data.bones]
-    need(not lost, f"'{armature.name}' lost {lost[:1]} while the rig was made; make it again.")
+    if lost:
+        raise SetupError(f"'{armature.name}' lost {lost[:1]} while the rig was made; make it again.")
     old, names = proxy_names(armature, garment), joints.names
     if not old and read_kept(garment.data, PLAIN, names) is None:
         own = own_weights(armature, garment, joints)
         if own is not None:
             keep_weights(garment.data, PLAIN, own, names)
     old += generated(armature, garment)  # groups stay behind where their bones were deleted
-    edits = find_edits(armature, garment) if keep_edits else Edits.none(len(rig.classes))
+    edits = find_edits(armature, garment) if keep_edits else Edits.none(len(classes))
     carriers = list(names)
-    if old or rig.names:
+    if old or rig.proxy_count:
         need_editable(armature)
         carriers = replace_proxies(armature, garment, joints, rig, edits)
-    _give_weights(garment, armature, rig, carriers, edits.repainted, old)
-    write_classes(garment.data, rig.classes)
+    weights = rig.skin.dense(len(names) + rig.proxy_count).astype(np.float32)
+    _give_weights(garment, armature, weights, carriers, edits.repainted, old)
+    write_classes(garment.data, classes)
     _bind(garment, armature)
     return edits
 
@@ -63,32 +75,32 @@ def apply_rig(
 def _give_weights(
     garment: bpy.types.Object,
     armature: bpy.types.Object,
-    rig: Rig,
+    weights: np.ndarray,
     carriers: list[str],
     repainted: np.ndarray,
     old: list[str],
 ) -> None:
-    """Write a rig's weights to the bones that carry them, but for vertices that were repainted."""
+    """Write a rig's weights (V, J + P) to the bones that carry them, except at repainted vertices."""
     names = list(dict.fromkeys([*carriers, *proxy_names(armature, garment)]))
-    made = np.zeros((len(rig.weights), len(names)), dtype=np.float32)
-    np.add.at(made.T, [names.index(name) for name in carriers], rig.weights.T)
+    made = np.zeros((len(weights), len(names)), dtype=np.float32)
+    np.add.at(made.T, [names.index(name) for name in carriers], weights.T)
     kept = made
     if repainted.any():
         painted = own_groups(armature, garment, names)
         total = painted.sum(axis=1, keepdims=True)
         painted = np.divide(painted, total, out=made.copy(), where=total > 0)
         kept = np.where(repainted[:, None], painted, made)
-    forget(garment)
+    discard_own_weights(garment)
     write_groups(garment, kept, names, old)
     remember_weights(armature, garment, made, names)
 
 
-def _need_same(garment: bpy.types.Object, rig: Rig) -> None:
+def _need_same_vertices(garment: bpy.types.Object, classes: np.ndarray) -> None:
     count = len(garment.data.vertices)
-    need(
-        count == len(rig.classes),
-        f"'{garment.name}' had {len(rig.classes)} vertices when this began and has {count} now; start it again.",
-    )
+    if count != len(classes):
+        raise SetupError(
+            f"'{garment.name}' had {len(classes)} vertices when this began and has {count} now; start it again."
+        )
 
 
 def _bind(garment: bpy.types.Object, armature: bpy.types.Object) -> None:

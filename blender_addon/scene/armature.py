@@ -14,8 +14,9 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ..contract.arrays import Joints, orthonormal
-from ..errors import need
+from ..errors import SetupError
+from ..joints import Joints
+from .units import scene_units
 
 OWNER = "ssilk_garment"  # custom property of a bone collection: the garment object
 MADE = "ssilk_made"  # custom property of a generated bone: its key; of the collection: the proxies by key
@@ -32,14 +33,18 @@ def read_joints(armature: bpy.types.Object, garment: bpy.types.Object) -> Joints
     bones = [bone for bone in armature.data.bones if bone.use_deform]  # Blender keeps parents before children
     own = [bone for bone in bones if bone.name not in owners]
     proxies = [bone for bone in bones if owners.get(bone.name) == garment]
-    need(own, f"No bone of '{armature.name}' deforms; switch on Deform for the bones that move the character.")
+    if not own:
+        raise SetupError(
+            f"No bone of '{armature.name}' deforms; switch on Deform for the bones that move the character."
+        )
     ordered = [*own, *proxies]
     index = {bone.name: joint for joint, bone in enumerate(ordered)}
     return Joints(
         names=tuple(index),
         parents=np.array([_parent(bone, index) for bone in ordered], dtype=np.int64),
-        # Blender's axes are orthonormal to 1e-5 only, which far from a bone is more than vertices may be off.
-        binds=orthonormal([_rigid(armature) @ bone.matrix_local @ _shrunk(armature) for bone in ordered]),
+        binds=scene_units().transforms_to_core(
+            _orthonormal([_rigid(armature) @ bone.matrix_local @ _shrunk(armature) for bone in ordered])
+        ),
         proxy_count=len(proxies),
     )
 
@@ -62,7 +67,10 @@ def need_editable(armature: bpy.types.Object) -> None:
         SetupError: the armature cannot be reached in this view layer.
     """
     visible = armature.name in bpy.context.view_layer.objects and armature.visible_get()
-    need(visible, f"'{armature.name}' is hidden or excluded from the view layer; show it, so that it can be edited.")
+    if not visible:
+        raise SetupError(
+            f"'{armature.name}' is hidden or excluded from the view layer; show it, so that it can be edited."
+        )
 
 
 def owners_of(armature: bpy.types.Armature) -> dict[str, object]:
@@ -107,10 +115,21 @@ def is_evenly_scaled(armature: bpy.types.Object) -> bool:
     return max(scale) - min(scale) <= UNEQUAL * abs(max(scale)) and armature.matrix_world.determinant() > 0
 
 
+def _orthonormal(transforms: list[Matrix]) -> np.ndarray:
+    """Return nearly rigid transforms, shape (J, 4, 4), with the rotations that are nearest to their axes.
+
+    Blender's axes are orthonormal to 1e-5 only. Far from a bone that is more than vertices may be off.
+    """
+    rigid = np.array(transforms, dtype=np.float64)
+    left, _, right = np.linalg.svd(rigid[:, :3, :3])
+    rigid[:, :3, :3] = left @ right
+    return rigid
+
+
 def _rigid(armature: bpy.types.Object) -> Matrix:
     """Return the armature's placement; its scale must be uniform."""
-    uneven = f"'{armature.name}' is scaled unequally or mirrored; apply its scale (Ctrl A)."
-    need(is_evenly_scaled(armature), uneven)
+    if not is_evenly_scaled(armature):
+        raise SetupError(f"'{armature.name}' is scaled unequally or mirrored; apply its scale (Ctrl A).")
     return armature.matrix_world
 
 
@@ -120,7 +139,7 @@ def _shrunk(armature: bpy.types.Object) -> Matrix:
 
 @contextmanager
 def editing(armature: bpy.types.Object) -> Iterator[None]:
-    """Be in edit mode of an armature, from object mode, and put the active object back afterwards."""
+    """Switch from object mode to edit mode of an armature, and restore mode and active object afterwards."""
     layer = bpy.context.view_layer
     before, selected = layer.objects.active, armature.select_get()
     layer.objects.active = armature

@@ -10,8 +10,10 @@ from __future__ import annotations
 import bpy
 import numpy as np
 
+from ssilk_core.assets import TIGHT
+
 from .. import classes as palette
-from ..errors import need
+from ..errors import SetupError
 
 
 def read_classes(mesh: bpy.types.Mesh) -> np.ndarray | None:
@@ -23,17 +25,18 @@ def read_classes(mesh: bpy.types.Mesh) -> np.ndarray | None:
     attribute = mesh.attributes.get(palette.ATTRIBUTE)
     if attribute is None:
         return None
-    need(
-        attribute.domain == "POINT" and attribute.data_type in {"INT", "INT8"},
-        f"The attribute '{palette.ATTRIBUTE}' of '{mesh.name}' is {attribute.data_type} on {attribute.domain}; "
-        "integers on points are needed: remove it and paint again.",
-    )
+    if attribute.domain != "POINT" or attribute.data_type not in {"INT", "INT8"}:
+        raise SetupError(
+            f"The attribute '{palette.ATTRIBUTE}' of '{mesh.name}' is {attribute.data_type} on {attribute.domain}; "
+            "integers on points are needed: remove it and paint again."
+        )
     values = np.empty(len(mesh.vertices), dtype=np.int32)
     attribute.data.foreach_get("value", values)
-    need(
-        palette.in_range(values),
-        f"The attribute '{palette.ATTRIBUTE}' of '{mesh.name}' holds values besides 0, 1 and 2; paint these again.",
-    )
+    if not palette.in_range(values):
+        raise SetupError(
+            f"The attribute '{palette.ATTRIBUTE}' of '{mesh.name}' holds values besides 0, 1 and 2; paint these "
+            "again."
+        )
     return values
 
 
@@ -54,7 +57,7 @@ def show_classes(mesh: bpy.types.Mesh) -> None:
     """Make the active colours of a mesh those of its classes; all is tight where there are none yet."""
     values = read_classes(mesh)
     if values is None:
-        values = np.full(len(mesh.vertices), palette.TIGHT, dtype=np.int32)
+        values = np.full(len(mesh.vertices), TIGHT, dtype=np.int32)
         write_classes(mesh, values)
     layer = mesh.color_attributes.get(palette.COLOR_ATTRIBUTE)
     if layer and layer.domain != "POINT":

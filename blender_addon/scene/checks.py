@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What Blender itself can tell of a garment that could not be handed over as it is."""
+"""Findings of Blender's own data, in scenes that ssilk cannot read."""
 
 from __future__ import annotations
 
 import bpy
 
-from ..contract.findings import Finding
+from ssilk_core.preflight.finding import Finding
+
 from .armature import is_evenly_scaled
 from .garment import armature_of, shaping_modifiers
 
@@ -13,7 +14,7 @@ SCALE = "unequal-scale"
 
 
 def scene_findings(garment: bpy.types.Object) -> list[Finding]:
-    """Return what has to be mended before ssilk can look at a garment.
+    """Return what must be fixed before ssilk can inspect a garment, with names of objects in place of prims.
 
     Raises:
         SetupError: it has no armature, or several.
@@ -21,12 +22,12 @@ def scene_findings(garment: bpy.types.Object) -> list[Finding]:
     armature, found = armature_of(garment), []
     if not is_evenly_scaled(armature):
         found.append(Finding(
-            severity="error", code=SCALE, target=armature.name, found="its bones are scaled unequally or mirrored",
+            severity="error", code=SCALE, prim=armature.name, found="its bones are scaled unequally or mirrored",
             why="joints turn and move, they have no scale", fix="apply its scale (Ctrl A)", fixable=True,
         ))  # fmt: skip
     found += [
         Finding(
-            severity="error", code="shaping-modifier", target=garment.name,
+            severity="error", code="shaping-modifier", prim=garment.name,
             found=f"its modifier '{modifier.name}' shapes it before bones move it",
             why="what is trained are the vertices that bones move", fix="apply the modifier",
         )

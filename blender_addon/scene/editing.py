@@ -8,6 +8,8 @@ from collections import Counter
 import bmesh
 import bpy
 
+from ssilk_core.assets import LOOSE, PINNED, TIGHT
+
 from .. import classes as palette
 
 
@@ -24,7 +26,7 @@ def fill_selected(mesh: bpy.types.Mesh, value: int) -> int:
     if layer is None:
         layer = edited.verts.layers.int.new(palette.ATTRIBUTE)
         for vertex in edited.verts:
-            vertex[layer] = palette.TIGHT
+            vertex[layer] = TIGHT
     colors = edited.verts.layers.color.get(palette.COLOR_ATTRIBUTE)
     edited.verts.ensure_lookup_table()
     for index in selected:
@@ -42,4 +44,4 @@ def edited_counts(mesh: bpy.types.Mesh) -> tuple[int, int, int] | None:
     if layer is None:
         return None
     found = Counter(vertex[layer] for vertex in edited.verts)
-    return found[palette.PINNED], found[palette.TIGHT], found[palette.LOOSE]
+    return found[PINNED], found[TIGHT], found[LOOSE]

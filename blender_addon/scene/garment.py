@@ -6,7 +6,7 @@ from __future__ import annotations
 import bpy
 
 from ..classes import ATTRIBUTE
-from ..errors import SetupError, need
+from ..errors import SetupError
 from .follower import leader_of
 
 # Modifiers that leave points where they are, and those that may come after the armature's.
@@ -56,8 +56,10 @@ def armature_of(garment: bpy.types.Object) -> bpy.types.Object:
         return chosen
     found = [thing for thing in bpy.context.scene.objects if thing.type == "ARMATURE" and leader_of(thing) == thing]
     names = ", ".join(f"'{thing.name}'" for thing in found)
-    need(found, f"There is no armature for '{garment.name}'; a garment needs a character with bones.")
-    need(len(found) == 1, f"'{garment.name}' could belong to {names}; choose its armature in the Garment panel.")
+    if not found:
+        raise SetupError(f"There is no armature for '{garment.name}'; a garment needs a character with bones.")
+    if len(found) != 1:
+        raise SetupError(f"'{garment.name}' could belong to {names}; choose its armature in the Garment panel.")
     return found[0]
 
 
@@ -86,7 +88,8 @@ def bodies_of(garment: bpy.types.Object, armature: bpy.types.Object) -> list[bpy
     loose = [thing.name for thing in meshes if thing not in bound] if chosen else []
     if loose:
         raise SetupError(f"'{loose[0]}' is not bound to '{armature.name}'; bind it, or take it from '{chosen.name}'.")
-    need(bound, f"No body is bound to '{armature.name}'; give the character's mesh an Armature modifier.")
+    if not bound:
+        raise SetupError(f"No body is bound to '{armature.name}'; give the character's mesh an Armature modifier.")
     return bound
 
 
@@ -99,7 +102,7 @@ def shaping_modifiers(thing: bpy.types.Object) -> list[bpy.types.Modifier]:
     return [modifier for modifier in before if modifier.show_viewport and modifier.type not in passed]
 
 
-def need_plain_shape(garment: bpy.types.Object) -> None:
+def need_undeformed_shape(garment: bpy.types.Object) -> None:
     """Check that a garment's own vertices are those that its armature moves.
 
     Raises:

@@ -1,24 +1,51 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A dressed character from Blender's data, at rest."""
+"""A garment with its character from Blender's data, at rest."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 import bpy
 import numpy as np
+from ssilk_usd.units import StageUnits
 
-from ..contract.arrays import Dressed, Joints, Shape
-from ..errors import need
+from ssilk_core.assets import Body, Character, Garment, Mesh, ProxyRig, SkinWeights
+
+from ..errors import SetupError
+from ..joints import Joints
+from ..names import identifiers
 from .armature import read_joints
 from .attributes import current_classes
-from .garment import armature_of, bodies_of, need_plain_shape, shaping_modifiers
+from .garment import armature_of, bodies_of, need_undeformed_shape, shaping_modifiers
+from .trained_weights import own_groups
+from .units import scene_units
 from .weights import PLAIN, read_groups, read_kept
-from .worn import own_groups
+
+ROOT, SKELETON = "/Character", "Skeleton"  # prims of the stage that is handed over
 
 
-def gather(garment: bpy.types.Object, *, classes: bool = True, proxies: bool = True) -> Dressed:
+@dataclass(frozen=True, eq=False)
+class GatheredScene:
+    """A garment with its character as ssilk has them: metres, y up.
+
+    Attributes:
+        units: of Blender's scene.
+        joints: the bones that were gathered.
+        character, garment, rig: at the bind pose; no rig where there are no proxies.
+        meshes: by the name of its object each mesh, whose path is its prim's: the garment, then the bodies.
+    """
+
+    units: StageUnits
+    joints: Joints
+    character: Character
+    garment: Garment
+    rig: ProxyRig | None
+    meshes: dict[str, Mesh]
+
+
+def gather(garment: bpy.types.Object, *, classes: bool = True, proxies: bool = True) -> GatheredScene:
     """Return a garment with its armature and bodies. In object mode.
 
     Args:
@@ -29,36 +56,34 @@ def gather(garment: bpy.types.Object, *, classes: bool = True, proxies: bool = T
         SetupError: something is missing or cannot be used; the sentence names the object.
     """
     armature = armature_of(garment)
-    need_plain_shape(garment)
+    need_undeformed_shape(garment)
     joints = read_joints(armature, garment)
-    own = joints if proxies else character_joints(joints)
-    bodies = bodies_of(garment, armature)
-    plain = own_weights(armature, garment, joints)
-    weights = plain
-    if proxies and joints.proxy_count:
-        weights = own_groups(armature, garment, joints.names)
-    return Dressed(
-        meters_per_unit=bpy.context.scene.unit_settings.scale_length,
-        joints=own,
-        bodies=tuple(_body(thing, armature, own) for thing in bodies),
-        garment=_shape(garment, garment.data, weights),
-        classes=current_classes(garment.data) if classes else None,
-        plain=plain if own.proxy_count else None,
+    things = [garment, *bodies_of(garment, armature)]
+    paths = [f"{ROOT}/{name}" for name in identifiers((thing.name for thing in things), taken=(SKELETON,))]
+    lbs = own_weights(armature, garment, joints)
+    mesh = _read_mesh(garment, garment.data, paths[0])
+    rig = _proxy_rig(armature, garment, joints, paths[0]) if proxies and joints.proxy_count else None
+    bodies = [_read_body(thing, armature, joints.character, path) for thing, path in zip(things[1:], paths[1:])]
+    return GatheredScene(
+        units=scene_units(),
+        joints=joints if rig else joints.character,
+        character=Character(ROOT, joints.skeleton(f"{ROOT}/{SKELETON}"), tuple(bodies)),
+        garment=Garment(
+            mesh,
+            None if lbs is None else SkinWeights.from_dense(paths[0], lbs),
+            current_classes(garment.data) if classes else None,
+        ),
+        rig=rig,
+        meshes=dict(zip((thing.name for thing in things), (mesh, *(body.mesh for body in bodies)))),
     )
 
 
-def character_joints(joints: Joints) -> Joints:
-    """Return the joints without proxies."""
-    count = joints.character_count
-    return Joints(joints.names[:count], joints.parents[:count], joints.binds[:count])
-
-
 def own_weights(armature: bpy.types.Object, garment: bpy.types.Object, joints: Joints) -> np.ndarray | None:
-    """Return the weights that the artist gave a garment over the character's joints; None without.
+    """Return the weights that the artist gave a garment over the character's joints, (V, J); None without.
 
-    Those kept beside a rig go first; a rig's own weights are nobody's.
+    Weights kept beside a rig have priority; the weights of a rig itself are not the artist's.
     """
-    names = joints.names[: joints.character_count]
+    names = joints.character.names
     kept = read_kept(garment.data, PLAIN, names)
     if kept is not None or joints.proxy_count:
         return kept
@@ -66,31 +91,44 @@ def own_weights(armature: bpy.types.Object, garment: bpy.types.Object, joints: J
     bare = int(np.count_nonzero(~weights.any(axis=1)))
     if bare == len(weights):
         return None
-    need(
-        not bare,
-        f"{bare} of {len(weights)} vertices of '{garment.name}' have no bone's weight; paint these, or remove the "
-        "vertex groups so that all weights are taken from the body.",
-    )
+    if bare:
+        raise SetupError(
+            f"{bare} of {len(weights)} vertices of '{garment.name}' have no bone's weight; paint these, or remove "
+            "the vertex groups so that all weights are taken from the body."
+        )
     return weights
 
 
-def _body(thing: bpy.types.Object, armature: bpy.types.Object, joints: Joints) -> Shape:
+def _proxy_rig(armature: bpy.types.Object, garment: bpy.types.Object, joints: Joints, path: str) -> ProxyRig:
+    weights = own_groups(armature, garment, joints.names)
+    bare = int(np.count_nonzero(~weights.any(axis=1)))
+    if bare:
+        raise SetupError(
+            f"{bare} vertices of '{garment.name}' have no bone's weight, as where a proxy was deleted; generate its "
+            "rig again, or paint them."
+        )
+    proxies, skin = slice(joints.character_count, None), SkinWeights.from_dense(path, weights)
+    return ProxyRig(path, joints.paths[proxies], joints.parents[proxies], joints.binds[proxies], skin)
+
+
+def _read_body(thing: bpy.types.Object, armature: bpy.types.Object, joints: Joints, path: str) -> Body:
     """Return a body at rest; evaluated where modifiers shape it before its armature does."""
     if not shaping_modifiers(thing):
-        return _bound(thing, thing.data, joints.names)
+        return _bound(thing, thing.data, joints, path)
     with _at_rest(armature) as depsgraph:
         evaluated = thing.evaluated_get(depsgraph)
         try:
-            return _bound(thing, evaluated.to_mesh(), joints.names)
+            return _bound(thing, evaluated.to_mesh(), joints, path)
         finally:
             evaluated.to_mesh_clear()
 
 
-def _bound(thing: bpy.types.Object, mesh: bpy.types.Mesh, names: Sequence[str]) -> Shape:
-    weights = read_groups(thing, mesh, names)
+def _bound(thing: bpy.types.Object, mesh: bpy.types.Mesh, joints: Joints, path: str) -> Body:
+    weights = read_groups(thing, mesh, joints.names)
     bare = int(np.count_nonzero(~weights.any(axis=1)))
-    need(not bare, f"{bare} of {len(weights)} vertices of '{thing.name}' have no bone's weight; paint these.")
-    return _shape(thing, mesh, weights)
+    if bare:
+        raise SetupError(f"{bare} of {len(weights)} vertices of '{thing.name}' have no bone's weight; paint these.")
+    return Body(_read_mesh(thing, mesh, path), SkinWeights.from_dense(path, weights))
 
 
 @contextmanager
@@ -103,18 +141,24 @@ def _at_rest(armature: bpy.types.Object) -> Iterator[bpy.types.Depsgraph]:
         armature.data.pose_position = before
 
 
-def _shape(thing: bpy.types.Object, mesh: bpy.types.Mesh, weights: np.ndarray | None) -> Shape:
+def _read_mesh(thing: bpy.types.Object, mesh: bpy.types.Mesh, path: str) -> Mesh:
     world = np.array(thing.matrix_world)
     points = _values(mesh.vertices, "co", 3).reshape(-1, 3) @ world[:3, :3].T + world[:3, 3]
+    counts = _values(mesh.polygons, "loop_total", 1, np.int32)
+    corners = np.arange(len(mesh.loops))
+    mesh.calc_loop_triangles()
+    faces = _values(mesh.loop_triangles, "vertices", 3, np.int32).reshape(-1, 3)
+    if np.linalg.det(world[:3, :3]) < 0:  # mirrored: its faces would turn the other way
+        faces = faces[:, ::-1]
+        corners = np.repeat(2 * (np.cumsum(counts) - counts) + counts - 1, counts) - corners
     layer = mesh.uv_layers.active
-    return Shape(
-        name=thing.name,
-        points=points,
-        counts=_values(mesh.polygons, "loop_total", 1, np.int32),
-        corners=_values(mesh.loops, "vertex_index", 1, np.int32),
-        inside_out=bool(np.linalg.det(world[:3, :3]) < 0),
-        uvs=_values(layer.uv, "vector", 2).reshape(-1, 2) if layer else None,
-        weights=weights,
+    return Mesh(
+        path,
+        scene_units().points_to_core(points),
+        faces,
+        counts,
+        _values(mesh.loops, "vertex_index", 1, np.int32)[corners],
+        _values(layer.uv, "vector", 2).reshape(-1, 2)[corners] if layer else None,
     )
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A garment out to `ssilk rig`, and its answer back."""
+"""A garment out to `ssilk rig` and `ssilk inspect`, and their answers back."""
 
 from __future__ import annotations
 
@@ -10,29 +10,27 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
+import numpy as np
 
-from ..contract.arrays import Dressed, Joints, Rig
-from ..errors import need
+from ssilk_core.assets import Garment, ProxyRig
+
+from ..errors import SetupError
+from .gather import GatheredScene
 from .objects import Pair
 
 STAGE, RIGGED, REPAIRED = "dressed.usdc", "rigged.usdc", "repaired.usdc"
 MOTIONS = "motions"  # folder of the sampled motions beside them
-USD = ("Tf", "Ar", "Sdf", "Usd", "UsdGeom", "UsdSkel")  # modules of `pxr`, the ones that others need first
+# Modules that are imported one after another, those that others need first.
+USD = ("pxr.Tf", "pxr.Ar", "pxr.Sdf", "pxr.Usd", "pxr.UsdGeom", "pxr.UsdSkel", "pxr.UsdUtils", "ssilk_usd.write",
+       "ssilk_usd.read_shot")  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Handover:
-    """What was given away: whose it was, and what its prims are called.
-
-    Attributes:
-        joints: the character's joints as they were written.
-        prims: path of each mesh in the stage by the name of its object.
-        stage: the file.
-    """
+    """What was given away: whose it was, and the file."""
 
     pair: Pair
-    joints: Joints
-    prims: dict[str, str]
+    scene: GatheredScene
     stage: Path
 
     @property
@@ -40,42 +38,62 @@ class Handover:
         """The name that the garment had."""
         return self.pair.name
 
-    def rig(self, folder: Path) -> Rig:
-        """Return what was made of it."""
-        from ..contract.read import read_rig
+    @property
+    def prim(self) -> str:
+        """The path of the garment's prim."""
+        return self.scene.garment.mesh.path
 
-        return read_rig(folder / RIGGED, self.prims[self.name], self.joints)
+    def rig(self, folder: Path) -> tuple[Garment, ProxyRig]:
+        """Return the garment with classes, and the rig, that were made of it."""
+        from ssilk_usd.read_garment import read_garment
+        from ssilk_usd.rig_io import read_proxy_rig
+
+        path, skeleton = folder / RIGGED, self.scene.character.skeleton
+        rig = read_proxy_rig(path, skeleton, garment=self.prim)
+        assert rig is not None  # `ssilk rig` always writes one
+        return read_garment(path, skeleton, garment=self.prim), rig
+
+    def repaired_points(self, folder: Path) -> np.ndarray:
+        """Return the points of the garment, repaired, in Blender's world, shape (V, 3)."""
+        from ssilk_usd.read_garment import read_garment
+
+        repaired = read_garment(folder / REPAIRED, self.scene.character.skeleton, garment=self.prim)
+        return self.scene.units.points_from_core(repaired.mesh.points)
 
     def in_blender_words(self, sentence: str) -> str:
         """Return a sentence with names of objects in place of files and prims."""
-        for name, prim in sorted(self.prims.items(), key=lambda pair: -len(pair[1])):
-            sentence = sentence.replace(f"{self.stage}:{prim}", f"'{name}'")
+        for name, mesh in sorted(self.scene.meshes.items(), key=lambda pair: -len(pair[1].path)):
+            sentence = sentence.replace(f"{self.stage}:{mesh.path}", f"'{name}'")
         return sentence.replace(f"{self.stage}:", "").replace(str(self.stage), "the character")
 
 
-def hand_over(dressed: Dressed, pair: Pair, folder: Path) -> Handover:
-    """Write a dressed character into a folder."""
-    expose_usd()
-    from ..contract.write import write_stage
+def hand_over(scene: GatheredScene, pair: Pair, folder: Path) -> Handover:
+    """Write a garment with its character into a folder.
 
-    return Handover(pair, dressed.joints, write_stage(dressed, folder / STAGE), folder / STAGE)
+    Blender's own exporter would not do: it renames `primvars:ssilk:class`, drops modifiers after the armature and
+    knows no proxies.
+    """
+    expose_usd()
+    from ssilk_usd.write import write_scene
+
+    write_scene(folder / STAGE, scene.character, scene.garment, scene.rig, units=scene.units)
+    return Handover(pair, scene, folder / STAGE)
 
 
 def rig_command(python: str, folder: Path, handover: Handover, options: Sequence[str]) -> list[str]:
     """Return the command that rigs what was handed over."""
     stage, rigged = str(folder / STAGE), str(folder / RIGGED)
-    prim = handover.prims[handover.name]
-    return [python, "-m", "ssilk_core", "rig", stage, "--garment", prim, "-o", rigged, "--json", *options]
+    return [python, "-m", "ssilk_core", "rig", stage, "--garment", handover.prim, "-o", rigged, "--json", *options]
 
 
 def inspect_command(python: str, folder: Path, handover: Handover, options: Sequence[str]) -> list[str]:
     """Return the command that inspects what was handed over."""
-    prim = handover.prims[handover.name]
-    return [python, "-m", "ssilk_core", "inspect", str(folder / STAGE), "--garment", prim, "--json", *options]
+    stage = str(folder / STAGE)
+    return [python, "-m", "ssilk_core", "inspect", stage, "--garment", handover.prim, "--json", *options]
 
 
 def loading_usd() -> Iterator[float]:
-    """Import Blender's own `pxr` module by module, yielding the part that is done: at once it takes 0.1 s.
+    """Import what writes and reads stages module by module, yielding the part that is done: at once it takes 0.3 s.
 
     Raises:
         SetupError: as `expose_usd` does.
@@ -83,7 +101,7 @@ def loading_usd() -> Iterator[float]:
     expose_usd()
     for done, name in enumerate(USD):
         yield done / len(USD)
-        importlib.import_module(f"pxr.{name}")
+        importlib.import_module(name)
 
 
 def expose_usd() -> None:
@@ -95,5 +113,5 @@ def expose_usd() -> None:
     expose = getattr(bpy.utils, "expose_bundled_modules", None)
     if expose:
         expose()
-    built = importlib.util.find_spec("pxr")
-    need(built, "This Blender was built without USD; take one from blender.org.")
+    if not importlib.util.find_spec("pxr"):
+        raise SetupError("This Blender was built without USD; take one from blender.org.")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Penetration and stretch of a garment as it is seen now, and as colours on its mesh.
+"""Penetration and stretch of a garment in the frame that is shown, and their colours on its mesh.
 
 Both come a little at a time: to find what is nearest to 20,000 vertices takes a tenth of a second.
 """
@@ -15,7 +15,7 @@ import numpy as np
 from mathutils.bvhtree import BVHTree
 
 from .. import heat
-from ..errors import SetupError, need
+from ..errors import SetupError
 from .garment import armature_of, bodies_of
 from .shapes import rest_points
 
@@ -27,7 +27,7 @@ Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class HeatMap:
     """A garment in one frame.
 
     Attributes:
@@ -42,8 +42,8 @@ class Measured:
     def most(self) -> float:
         return float(self.values.max())
 
-    def told(self) -> str:
-        """Return the worst of it in words."""
+    def summary(self) -> str:
+        """Return the worst value in words."""
         if self.kind == STRETCH:
             return f"{self.most:.0%} longer at most"
         inside = int((self.values > 0).sum())
@@ -52,7 +52,7 @@ class Measured:
 
 def measuring(
     garment: bpy.types.Object, kind: str, depsgraph: bpy.types.Depsgraph
-) -> Generator[float, None, Measured]:
+) -> Generator[float, None, HeatMap]:
     """Measure a garment in the frame that is shown, yielding the part that is done; return what was measured.
 
     All that it needs of the frame is read before the first yield.
@@ -65,12 +65,12 @@ def measuring(
     if kind == STRETCH:
         world = np.array(garment.matrix_world)[:3, :3]
         rest = rest_points(garment) @ world.T
-        return Measured(kind, heat.elongations(rest, points, _triangles(garment.data)))
+        return HeatMap(kind, heat.elongations(rest, points, _triangles(garment.data)))
     scale, depths = bpy.context.scene.unit_settings.scale_length, []
     surfaces = [_surface(body.evaluated_get(depsgraph)) for body in bodies_of(garment, armature_of(garment))]
     for surface in surfaces:
         depths.append((yield from scaled(_depths(points, *surface), len(depths) / len(surfaces), 1 / len(surfaces))))
-    return Measured(kind, scale * np.max(depths, axis=0))
+    return HeatMap(kind, scale * np.max(depths, axis=0))
 
 
 def scaled(steps: Generator[float, None, Result], start: float, share: float) -> Generator[float, None, Result]:
@@ -95,7 +95,7 @@ def showing(garment: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Iterat
             _paint(thing.data, measured, thing.ssilk.heat_red)
 
 
-def show(garment: bpy.types.Object, measured: Measured, red: float) -> None:
+def show(garment: bpy.types.Object, measured: HeatMap, red: float) -> None:
     """Colour a garment by what was measured, and anew at each frame from now on.
 
     Args:
@@ -105,7 +105,8 @@ def show(garment: bpy.types.Object, measured: Measured, red: float) -> None:
         SetupError: it has other vertices by now.
     """
     same = len(garment.data.vertices) == len(measured.values)
-    need(same, f"'{garment.name}' was edited while it was measured; look again.")
+    if not same:
+        raise SetupError(f"'{garment.name}' was edited while it was measured; look again.")
     garment.ssilk.heat, garment.ssilk.heat_red = measured.kind, red
     _paint(garment.data, measured, red)
 
@@ -117,7 +118,7 @@ def hide(garment: bpy.types.Object) -> None:
         colors.remove(colors[ATTRIBUTE])
 
 
-def _paint(mesh: bpy.types.Mesh, measured: Measured, red: float) -> None:
+def _paint(mesh: bpy.types.Mesh, measured: HeatMap, red: float) -> None:
     layer = mesh.color_attributes.get(ATTRIBUTE) or mesh.color_attributes.new(ATTRIBUTE, "FLOAT_COLOR", "POINT")
     colors = heat.colors_of(measured.values, red).astype(np.float32)
     layer.data.foreach_set("color_srgb", colors.reshape(-1))
@@ -127,10 +128,11 @@ def _paint(mesh: bpy.types.Mesh, measured: Measured, red: float) -> None:
 
 def _need_same_vertices(garment: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> None:
     shown, count = len(garment.evaluated_get(depsgraph).data.vertices), len(garment.data.vertices)
-    need(
-        shown == count,
-        f"A modifier gives '{garment.name}' {shown} vertices where its mesh has {count}; switch it off in viewports.",
-    )
+    if shown != count:
+        raise SetupError(
+            f"A modifier gives '{garment.name}' {shown} vertices where its mesh has {count}; switch it off in "
+            "viewports."
+        )
 
 
 def _world_points(thing: bpy.types.Object) -> np.ndarray:

@@ -13,7 +13,7 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..errors import need
+from ..errors import SetupError
 
 OWNER = "ssilk_garment"  # custom property of an action that was baked: the garment object
 SLOTS = hasattr(bpy.types, "ActionSlot")  # since Blender 4.4
@@ -68,9 +68,11 @@ def need_tracks(things: Sequence[Any]) -> None:
         animation = thing.animation_data
         if animation:
             name = f"'{thing.name}'"
-            need(not animation.use_tweak_mode, f"A strip of {name} is being tweaked; leave tweak mode (Tab) first.")
+            if animation.use_tweak_mode:
+                raise SetupError(f"A strip of {name} is being tweaked; leave tweak mode (Tab) first.")
             off = len(animation.nla_tracks) and not animation.use_nla
-            need(not off, f"The NLA tracks of {name} are switched off; switch them on in the NLA editor.")
+            if off:
+                raise SetupError(f"The NLA tracks of {name} are switched off; switch them on in the NLA editor.")
 
 
 def bake_keys(garment: bpy.types.Object, start: int, moved: Sequence[tuple[Any, Sequence[Channel]]]) -> None:

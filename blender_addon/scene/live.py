@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A trained garment played in Blender, by numpy alone: it follows the armature wherever the timeline stands.
+"""A trained garment played in Blender with numpy alone, following the armature at any frame of the timeline.
 
-What the armature does over the scene's frames is read once, a little at a time; latents are rolled over it as far as
-frames are looked at, in blocks, and kept. A frame therefore looks the same whether it was scrubbed or played to.
-Where the armature stands otherwise than was read, latents are kept up to there and rolled anew from there on.
+The armature's motion over the scene's frames is read once, a little at a time. Latents are rolled out in blocks, as
+far as frames are shown, and kept. A frame therefore looks the same whether it was scrubbed or played to. Where the
+armature differs from what was read, latents are kept up to that frame and rolled out again from there.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ from pathlib import Path
 
 import bpy
 import numpy as np
+from ssilk_usd.skinned import SkinnedGarment
 
-from ..contract.axes import to_core
-from ..core import core
-from ..errors import need
+from ssilk_core.assets import Motion
+
+from ..errors import SetupError
 from .armature import read_joints
-from .baked import need_bakeable, turns_from_rest, wear
+from .baked import apply_deformation, need_bakeable, turns_from_rest
 from .garment import armature_of
-from .gather import character_joints
 from .motions import TIMELINE, Source
 from .objects import found_again
-from .sampling import Take, need_company, prepare_takes, sample, worlds
-from .trained import Trained
+from .sampling import SampledTake, motion_of, need_company, prepare_takes, sample, worlds
+from .trained import TrainedGarment
 
 BLOCK = 16  # frames rolled at once: few, so that an edit costs little at each frame that follows
 PRE_ROLL = 1.0  # seconds in which the garment settles before the first frame, as a bake has it
@@ -55,7 +55,7 @@ class Live:
         self.refresh()
 
     def refresh(self) -> None:
-        """Read the motion anew; what was read goes on being played until that is done."""
+        """Read the motion again; the old one is played until that is done."""
         _, armature = self.objects()
         (take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
         self._steps = self._reading(take)
@@ -101,7 +101,7 @@ class Live:
         pose = self.playback.pose(index)
         self._need_all(garment, armature)
         turns = turns_from_rest(self.joints, pose.rotations[:, self.trained.proxies])[0]
-        for name, turn in zip(self.joints.names[self.joints.character_count :], turns.tolist()):
+        for name, turn in zip(self.joints.proxies, turns.tolist()):
             armature.pose.bones[name].rotation_quaternion = turn
         blocks = garment.data.shape_keys.key_blocks if self.shapes else ()
         for name, weight in zip(self.shapes, pose.weights[0].tolist()):
@@ -112,14 +112,15 @@ class Live:
         keys = garment.data.shape_keys
         lost = [name for name in self.joints.names if name not in armature.pose.bones]
         lost += [name for name in self.shapes if not keys or name not in keys.key_blocks]
-        need(not lost, f"'{lost[0] if lost else ''}' was deleted while '{garment.name}' was played; play it again.")
+        if lost:
+            raise SetupError(f"'{lost[0]}' was deleted while '{garment.name}' was played; play it again.")
 
-    def _reading(self, take: Take) -> Iterator[float]:
+    def _reading(self, take: SampledTake) -> Iterator[float]:
         """Read the motion, then roll over it, so that scrubbing waits for nothing; yield the part that is done."""
         if self.trained is None or self.renewed:
             yield from self._dressing()
         _, armature = self.objects()
-        yield from (READING * done for done in sample(armature, character_joints(self.joints), [take]))
+        yield from (READING * done for done in sample(armature, self.joints.character, [take]))
         need_company(*self.objects(), take)
         placed = np.array(take.worlds)
         playback = self.trained.player.play(self._motion(placed), pre_roll=PRE_ROLL, block=BLOCK)
@@ -131,33 +132,29 @@ class Live:
     def _dressing(self) -> Iterator[float]:
         """Read the model and give the garment its shapes and weights; it is held until it is played by them."""
         self._written = _written(self.model)
-        trained = Trained(self.model, self.joints, bpy.context.scene.unit_settings.scale_length)
+        trained = TrainedGarment(self.model, self.joints)
         yield 0.0
-        shot = trained.shot()
+        skinned = SkinnedGarment.of(trained.player.deformer())
         yield 0.0
         garment, armature = self.objects()
-        need(self.ready(), f"'{garment.name}' left Object Mode while its model was read; play it again.")
-        self.shapes = wear(garment, armature, self.joints, shot)
+        if not self.ready():
+            raise SetupError(f"'{garment.name}' left Object Mode while its model was read; play it again.")
+        self.shapes = apply_deformation(garment, armature, self.joints, skinned, trained.order)
         self.trained, self.playback = trained, None
         yield 0.0
 
     def _take_notice(self, armature: bpy.types.Object, index: int) -> None:
-        """Go on from a pose that is not the one that was read."""
-        bones = [armature.pose.bones.find(name) for name in self.joints.names[: self.joints.character_count]]
+        """Roll out again from a pose that differs from the one that was read."""
+        bones = [armature.pose.bones.find(name) for name in self.joints.character.names]
         placed = worlds(armature)[bones]
         if np.allclose(placed, self.placed[index], rtol=MOVED, atol=MOVED):
             return
         self.placed[index] = placed
         self.playback, self.stale = self.playback.with_motion(self._motion(self.placed), index), True
 
-    def _motion(self, placed: np.ndarray) -> object:
+    def _motion(self, placed: np.ndarray) -> Motion:
         """Return joints of the armature to the world, shape (F, J, 4, 4), as a motion of the model's skeleton."""
-        scene, kinematics = bpy.context.scene, core("kinematics")
-        own = to_core(placed[:, self.trained.own], self.trained.meters)
-        local = kinematics.local_transforms(own, self.trained.player.skeleton.parents)
-        rotations = kinematics.quaternion_from_matrix(local[..., :3, :3])
-        fps = scene.render.fps / scene.render.fps_base
-        return core("assets").Motion("the timeline", fps, rotations, local[..., :3, 3])
+        return motion_of(placed[:, self.trained.own], self.trained.player.skeleton.parents, "the timeline")
 
 
 def _written(path: Path) -> float:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Meshes opened as a BMesh, in which Python reads and writes lists of each vertex many times faster."""
+"""Meshes opened as a BMesh, where Python reads and writes per-vertex lists many times faster."""
 
 from __future__ import annotations
 

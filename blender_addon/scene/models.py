@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Where a garment's training and its model lie; what is stored is relative to the blend file."""
+"""Paths of a garment's training and model, stored relative to the blend file."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import bpy
 
-from ..errors import need
+from ..errors import SetupError
 from ..outside.jobs import MODEL
 
 
@@ -24,10 +24,12 @@ def model_of(garment: bpy.types.Object) -> Path:
         SetupError: there is none.
     """
     job, chosen = job_of(garment), garment.ssilk.model
-    need(chosen or job, f"'{garment.name}' has no trained model; train it, or choose a model in the Baking panel.")
+    if not chosen and not job:
+        raise SetupError(f"'{garment.name}' has no trained model; train it, or choose a model in the Baking panel.")
     path = Path(bpy.path.abspath(chosen)) if chosen else job / MODEL
     todo = "choose another" if chosen else "wait for the training's first validation, or resume it"
-    need(path.is_file(), f"'{garment.name}' has no model at {path}; {todo}.")
+    if not path.is_file():
+        raise SetupError(f"'{garment.name}' has no model at {path}; {todo}.")
     return path
 
 

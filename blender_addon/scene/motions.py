@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which motions an armature has, and playing one of them for a moment."""
+"""The motions of an armature, and playing one of them temporarily."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import bpy
 
-from ..errors import SetupError, need
+from ..errors import SetupError
 from .keys import SLOTS, curves_of, is_baked
 
 TIMELINE, ACTION, STRIP, FILE = "TIMELINE", "ACTION", "STRIP", "FILE"
@@ -37,7 +37,7 @@ class Source:
 
 
 def sources(armature: bpy.types.Object) -> list[Source]:
-    """Return all motions that an armature has, but for what was baked."""
+    """Return all motions of an armature except baked ones."""
     if armature.library:  # of which nothing can be changed, not even for a moment
         return [Source(TIMELINE, "Timeline")]
     bones = set(armature.pose.bones.keys())
@@ -70,7 +70,7 @@ def frames_of(armature: bpy.types.Object, source: Source) -> range:
 
 @contextmanager
 def playing(armature: bpy.types.Object, source: Source) -> Iterator[None]:
-    """Let an armature play one of its motions for a moment; all is as it was afterwards.
+    """Play one motion of an armature temporarily, and restore everything afterwards.
 
     Raises:
         SetupError: it is gone.
@@ -109,7 +109,8 @@ def _bone(path: str) -> str:
 
 def _action(source: Source) -> bpy.types.Action:
     action = bpy.data.actions.get(source.name)
-    need(action, f"The action '{source.name}' is gone; find the motions again.")
+    if not action:
+        raise SetupError(f"The action '{source.name}' is gone; find the motions again.")
     return action
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Objects that are needed again after a while, in which they may be deleted, renamed or read anew by an undo."""
+"""Objects that are looked up again later, when they may have been deleted, renamed or replaced by an undo."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import bpy
 
-from ..errors import need
+from ..errors import SetupError
 
 
 def found_again(uid: int, name: str) -> bpy.types.Object:
@@ -17,7 +17,8 @@ def found_again(uid: int, name: str) -> bpy.types.Object:
         SetupError: it was deleted, though others may still refer to it; the sentence calls it `name`.
     """
     thing = next((thing for thing in bpy.data.objects if thing.session_uid == uid and thing.users_scene), None)
-    need(thing, f"'{name}' was deleted meanwhile; nothing was changed.")
+    if not thing:
+        raise SetupError(f"'{name}' was deleted meanwhile; nothing was changed.")
     return thing
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which garments are played, and what Blender calls so that they are: when frames change, files open, renders run.
+"""The garments that are played live, and the handlers that update them on frame changes, loading and rendering.
 
 Nothing is written while Blender renders in another thread and its interface is not locked: both would write at once.
 """
@@ -9,8 +9,8 @@ from __future__ import annotations
 import bpy
 from bpy.app.handlers import persistent
 
-from ..core import core
-from ..errors import SetupError
+from ssilk_core.errors import SsilkError
+
 from .live import Live
 from .models import model_of
 
@@ -59,7 +59,7 @@ def refresh(garment: bpy.types.Object) -> None:
 
 
 def take_up_models() -> None:
-    """Play trainings by the models that they have reached meanwhile."""
+    """Switch to the newest models of trainings that are played."""
     for uid, played in list(_played.items()):
         if played.renewed and played.done is None and _attempt(uid, played.ready):
             _attempt(uid, played.refresh)
@@ -67,13 +67,13 @@ def take_up_models() -> None:
 
 
 def start_listening() -> None:
-    """Have Blender call what is here."""
+    """Register the handlers."""
     for handlers, function in _handlers():
         handlers.append(function)
 
 
 def stop_listening() -> None:
-    """Leave nothing behind."""
+    """Remove handlers and timer, and stop playing."""
     _forget()
     for handlers, function in _handlers():
         if function in handlers:
@@ -126,7 +126,7 @@ def _attempt(uid: int, call, *arguments: object) -> object:  # type: ignore[no-u
     """Return what a call gives; a garment for which it fails is played no longer, and the panel says why."""
     try:
         return call(*arguments)
-    except (SetupError, core("errors").SsilkError) as error:
+    except SsilkError as error:
         _played.pop(uid, None)
         _reasons[uid] = str(error)
         return None

@@ -7,19 +7,22 @@ import bpy
 import numpy as np
 from mathutils import Matrix, Vector
 
-from ..contract.arrays import Joints, Rig
-from ..contract.edits import Edits, takers
+from ssilk_core.assets import ProxyRig
+
+from ..edits import Edits, match_proxies
+from ..joints import Joints
 from .armature import MADE, editing, made_collection, proxy_names
-from .handmade import remember_bones
+from .edit_tracking import remember_bones
+from .units import scene_units
 
 PALETTE = "THEME04"
 ALONE = 0.05  # how long proxies are drawn that have none above
 
 
 def replace_proxies(
-    armature: bpy.types.Object, garment: bpy.types.Object, joints: Joints, rig: Rig, edits: Edits
+    armature: bpy.types.Object, garment: bpy.types.Object, joints: Joints, rig: ProxyRig, edits: Edits
 ) -> list[str]:
-    """Put a rig's proxies in place of the garment's older ones, all but the artist's.
+    """Replace the garment's older proxies by a rig's, except those that the artist made or changed.
 
     Args:
         joints: the character's joints that the rig's parents count from.
@@ -28,7 +31,10 @@ def replace_proxies(
         The bone that carries the weights of each joint of the rig, the character's first: for a proxy that an
         artist deleted its parent's.
     """
-    carriers, standing = list(joints.names), takers(rig, edits)
+    names = [path.rpartition("/")[2] for path in rig.joint_names]
+    binds = scene_units().transforms_from_core(rig.bind_transforms)
+    carriers, length = list(joints.names), _length(binds, rig, joints)
+    standing = match_proxies(binds[:, :3, 3], edits)
     old = [name for name in proxy_names(armature, garment) if name not in edits.kept]
     with editing(armature):
         bones = armature.data.edit_bones
@@ -37,24 +43,37 @@ def replace_proxies(
             bones.remove(bones[name])
         for proxy, taker in enumerate(standing):
             above = carriers[rig.parents[proxy]]
-            name = above if taker is None else taker or _new_bone(armature, garment, rig, proxy, above)
+            name = above if taker is None else taker
+            if taker == "":
+                name = _new_bone(armature, garment, names[proxy], above, binds[proxy], length)
             carriers.append(name)
             if taker is not None:
-                bones[name][MADE] = rig.names[proxy]
+                bones[name][MADE] = names[proxy]
         for name in set(edits.kept) - set(carriers):
             bones[name].pop(MADE, None)
         fresh = [bones[name] for name, taker in zip(carriers[len(joints.names) :], standing) if taker == ""]
         _hang_again(bones, hung, fresh)
-    remember_bones(armature, garment, _records(armature, joints, rig))
+    keys = [*joints.names, *names]
+    remember_bones(
+        armature,
+        garment,
+        {
+            name: {"matrix": [value for row in _in_armature(armature, bind) for value in row], "parent": keys[parent]}
+            for name, parent, bind in zip(names, rig.parents, binds)
+        },
+    )
     return carriers
 
 
-def _new_bone(armature: bpy.types.Object, garment: bpy.types.Object, rig: Rig, proxy: int, above: str) -> str:
-    bones, length = armature.data.edit_bones, _length(rig)
-    bone = bones.new(rig.names[proxy])
+def _new_bone(
+    armature: bpy.types.Object, garment: bpy.types.Object, name: str, above: str, bind: np.ndarray, length: float
+) -> str:
+    """Make a bone at a bind transform in Blender's world; return its name, which differs if `name` is taken."""
+    bones = armature.data.edit_bones
+    bone = bones.new(name)
     bone.tail = (0.0, length, 0.0)  # a bone without length takes no matrix
     bone.parent = bones[above]
-    bone.matrix = _in_armature(armature, rig.binds[proxy])
+    bone.matrix = _in_armature(armature, bind)
     bone.length = length / armature.matrix_world.median_scale
     bone.color.palette = PALETTE
     made_collection(armature.data, garment).assign(bone)
@@ -75,24 +94,15 @@ def _hang_again(bones: bpy.types.ArmatureEditBones, hung: dict[str, Vector], fre
             bones[name].parent = above
 
 
-def _records(armature: bpy.types.Object, joints: Joints, rig: Rig) -> dict[str, dict[str, object]]:
-    """Return a rig's proxies as they were generated, by key."""
-    keys = [*joints.names, *rig.names]
-    return {
-        name: {"matrix": [value for row in _in_armature(armature, bind) for value in row], "parent": keys[parent]}
-        for name, parent, bind in zip(rig.names, rig.parents, rig.binds)
-    }
-
-
 def _in_armature(armature: bpy.types.Object, bind: np.ndarray) -> Matrix:
     """Return a place in the world as one in the armature, without its scale."""
     place, turn, _ = (armature.matrix_world.inverted() @ Matrix(bind)).decompose()
     return Matrix.LocRotScale(place, turn, None)
 
 
-def _length(rig: Rig) -> float:
+def _length(binds: np.ndarray, rig: ProxyRig, joints: Joints) -> float:
     """Return how long proxies are drawn, in world units: half the mean way to the next one."""
-    places, above = rig.binds[:, :3, 3], rig.parents - (rig.weights.shape[1] - len(rig.binds))
+    places, above = binds[:, :3, 3], rig.parents - len(joints.names)
     chained = above >= 0
     steps = np.linalg.norm(places[chained] - places[above[chained]], axis=1)
     return float(steps.mean() / 2) if len(steps) else ALONE

@@ -10,10 +10,12 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ..errors import need
+from ssilk_core.preflight.mesh import SAME_PLACE
+
+from ..errors import SetupError
 from .meshes import edited
 
-SAME_PLACE = 2e-6  # [m]; what ssilk takes to be one place
+MERGE = 2 * SAME_PLACE  # [m]; longer than the diagonal of a cell in which ssilk takes vertices for one
 Repair = Callable[[bmesh.types.BMesh, Sequence[int], float], None]
 
 
@@ -23,13 +25,14 @@ def repair_mesh(thing: bpy.types.Object, code: str, indices: Sequence[int]) -> N
     Raises:
         SetupError: the mesh is linked.
     """
-    need(not thing.data.library, f"'{thing.name}' is linked from another file; repair it there.")
+    if thing.data.library:
+        raise SetupError(f"'{thing.name}' is linked from another file; repair it there.")
     scale = bpy.context.scene.unit_settings.scale_length * max(map(abs, thing.matrix_world.to_scale()))
     with edited(thing.data) as mesh:
         for sequence in (mesh.verts, mesh.faces):
             sequence.ensure_lookup_table()
         mesh.normal_update()
-        REPAIRS[code](mesh, indices, SAME_PLACE / scale)
+        REPAIRS[code](mesh, indices, MERGE / scale)
 
 
 def apply_scale(armature: bpy.types.Object) -> None:
@@ -39,12 +42,14 @@ def apply_scale(armature: bpy.types.Object) -> None:
         SetupError: it is linked, mirrored, animated, or shares its bones.
     """
     name, data = armature.name, armature.data
-    need(not (armature.library or data.library), f"'{name}' is linked from another file; apply its scale there.")
-    need(min(armature.scale) > 0, f"'{name}' is mirrored; apply its scale by hand and look at its bones.")
-    need(
-        not armature.animation_data, f"'{name}' is animated; its keys hold for bones of this scale: apply it by hand."
-    )
-    need(data.users == 1, f"'{name}' shares its bones with other objects; make them single-user first.")
+    if armature.library or data.library:
+        raise SetupError(f"'{name}' is linked from another file; apply its scale there.")
+    if not min(armature.scale) > 0:
+        raise SetupError(f"'{name}' is mirrored; apply its scale by hand and look at its bones.")
+    if armature.animation_data:
+        raise SetupError(f"'{name}' is animated; its keys hold for bones of this scale: apply it by hand.")
+    if data.users != 1:
+        raise SetupError(f"'{name}' shares its bones with other objects; make them single-user first.")
     children = {child: child.matrix_world.copy() for child in armature.children}
     data.transform(Matrix.Diagonal(armature.scale).to_4x4())
     armature.scale = (1.0, 1.0, 1.0)

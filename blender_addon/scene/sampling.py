@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What an armature does, frame by frame, as Blender evaluates it with constraints and drivers, a little at a time.
+"""The motion of an armature, sampled as Blender evaluates it with constraints and drivers, a little at a time.
 
-A scene of its own, which holds nothing else, is made for each slice of time and removed at its end: nothing of the
-artist's scene is evaluated or moved, and nothing is left behind if the artist saves or undoes in between.
+Each slice of time uses a temporary scene that holds the armature alone. So nothing of the artist's scene is evaluated
+or moved, and nothing is left behind if the artist saves or undoes in between.
 """
 
 from __future__ import annotations
@@ -15,11 +15,15 @@ from dataclasses import dataclass, field
 import bpy
 import numpy as np
 
-from ..contract.arrays import Joints, Motion
-from ..errors import SetupError, need
+from ssilk_core.assets import Motion
+from ssilk_core.kinematics import local_transforms, quaternion_from_matrix
+
+from ..errors import SetupError
+from ..joints import Joints
 from .follower import leader_of
 from .motions import Source, frames_of, playing
 from .objects import found_again
+from .units import scene_rate, scene_units
 
 SLICE = 0.04  # seconds that Blender waits for us at a time
 STILL = 1e-6  # how far an armature that stays in place may move, as a share of its size
@@ -27,11 +31,11 @@ UNEVEN = 1e-3  # how far a bone's axes may be from unit length and right angles,
 
 
 @dataclass(eq=False)
-class Take:
+class SampledTake:
     """A motion that is being sampled.
 
     Attributes:
-        worlds: joint to world of the frames that were sampled yet, rigid, shape (J, 4, 4) each.
+        worlds: joint to world of the frames that were sampled yet, rigid, in Blender's units, shape (J, 4, 4) each.
         placements: object to world of the armature at these frames, shape (4, 4) each.
     """
 
@@ -44,31 +48,33 @@ class Take:
     def complete(self) -> bool:
         return len(self.worlds) == len(self.frames)
 
-    def motion(self) -> Motion:
-        """Return what was sampled, at the scene's rate and in its units."""
-        scale = bpy.context.scene.unit_settings.scale_length
-        return Motion(np.array(self.worlds), self.frames.start, scene_rate(), scale)
+    def motion(self, joints: Joints) -> Motion:
+        """Return what was sampled of these joints, at the scene's rate; frames are counted as the timeline does."""
+        return motion_of(np.array(self.worlds), joints.parents, self.source.name, self.frames.start)
 
 
-def scene_rate() -> float:
-    """Return the scene's frames per second [1/s]."""
-    render = bpy.context.scene.render
-    return render.fps / render.fps_base
+def motion_of(placed: np.ndarray, parents: np.ndarray, name: str, start: int = 0) -> Motion:
+    """Return joints to world in Blender's units, shape (F, J, 4, 4), as a motion at the scene's rate."""
+    local = local_transforms(scene_units().transforms_to_core(placed), parents)
+    return Motion(name, scene_rate(), quaternion_from_matrix(local[..., :3, :3]), local[..., :3, 3], start)
 
 
-def prepare_takes(armature: bpy.types.Object, chosen: Sequence[Source]) -> list[Take]:
+def prepare_takes(armature: bpy.types.Object, chosen: Sequence[Source]) -> list[SampledTake]:
     """Return takes to sample.
 
     Raises:
         SetupError: a motion is gone, or the armature cannot be evaluated.
     """
-    posed = armature.data.pose_position == "POSE"
-    need(posed, f"'{armature.name}' shows its rest position; switch to Pose Position in its data properties.")
-    need(not armature.hide_viewport, f"'{armature.name}' is disabled in viewports; enable it in the outliner.")
-    return [Take(source, frames_of(leader_of(armature), source)) for source in chosen]
+    if armature.data.pose_position != "POSE":
+        raise SetupError(
+            f"'{armature.name}' shows its rest position; switch to Pose Position in its data properties."
+        )
+    if armature.hide_viewport:
+        raise SetupError(f"'{armature.name}' is disabled in viewports; enable it in the outliner.")
+    return [SampledTake(source, frames_of(leader_of(armature), source)) for source in chosen]
 
 
-def need_company(garment: bpy.types.Object, armature: bpy.types.Object, take: Take) -> None:
+def need_company(garment: bpy.types.Object, armature: bpy.types.Object, take: SampledTake) -> None:
     """Check that a garment moves along where its armature moves as an object, besides its bones.
 
     Raises:
@@ -78,13 +84,13 @@ def need_company(garment: bpy.types.Object, armature: bpy.types.Object, take: Ta
     above = garment.parent
     while above and above != armature:
         above = above.parent
-    need(
-        still or above,
-        f"'{armature.name}' moves as an object and leaves '{garment.name}' behind; make it the parent.",
-    )
+    if not still and not above:
+        raise SetupError(
+            f"'{armature.name}' moves as an object and leaves '{garment.name}' behind; make it the parent."
+        )
 
 
-def sample(armature: bpy.types.Object, joints: Joints, takes: Sequence[Take]) -> Iterator[float]:
+def sample(armature: bpy.types.Object, joints: Joints, takes: Sequence[SampledTake]) -> Iterator[float]:
     """Fill takes, yielding the part that is done after each slice of time.
 
     Args:
@@ -100,9 +106,10 @@ def sample(armature: bpy.types.Object, joints: Joints, takes: Sequence[Take]) ->
             yield sum(len(take.worlds) for take in takes) / total
 
 
-def _sample_slice(armature: bpy.types.Object, joints: Joints, take: Take) -> None:
+def _sample_slice(armature: bpy.types.Object, joints: Joints, take: SampledTake) -> None:
     lost = [name for name in joints.names if name not in armature.pose.bones]
-    need(not lost, f"'{armature.name}' lost the bone '{lost[0] if lost else ''}' meanwhile; begin again.")
+    if lost:
+        raise SetupError(f"'{armature.name}' lost the bone '{lost[0]}' meanwhile; begin again.")
     columns = [armature.pose.bones.find(name) for name in joints.names]
     until = time.monotonic() + SLICE
     with playing(leader_of(armature), take.source), _alone(armature) as scene:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Paths that are relative to the blend file stay true when it is saved in another folder; a copy gets its own."""
+"""Keep relative paths valid when the blend file, or a copy of it, is saved in another folder."""
 
 from __future__ import annotations
 
@@ -48,14 +48,14 @@ def after_saving(path: str, *_: object) -> None:
 
 
 def start_listening() -> None:
-    """Ask Blender to tell when files are saved."""
+    """Register the handlers."""
     bpy.app.handlers.save_pre.append(before_saving)
     bpy.app.handlers.save_post.append(after_saving)
     bpy.app.handlers.save_post_fail.append(after_saving)
 
 
 def stop_listening() -> None:
-    """Ask it no longer."""
+    """Remove the handlers."""
     bpy.app.handlers.save_pre.remove(before_saving)
     bpy.app.handlers.save_post.remove(after_saving)
     bpy.app.handlers.save_post_fail.remove(after_saving)

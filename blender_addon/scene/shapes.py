@@ -8,20 +8,21 @@ from collections.abc import Sequence
 import bpy
 import numpy as np
 
-from ..errors import need
+from ..errors import SetupError
 
 PREFIX = "SSILK "  # begins the names of shape keys that were baked
 BASIS = "ssilk_basis"  # custom property of shape keys whose basis came with a bake
 
 
 def need_relative(garment: bpy.types.Object) -> None:
-    """Check that shape keys add up.
+    """Check that shape keys are relative, so that they add up.
 
     Raises:
         SetupError: those that are there are absolute.
     """
     keys = garment.data.shape_keys
-    need(not keys or keys.use_relative, f"The shape keys of '{garment.name}' are absolute; make them Relative.")
+    if keys and not keys.use_relative:
+        raise SetupError(f"The shape keys of '{garment.name}' are absolute; make them Relative.")
 
 
 def rest_points(garment: bpy.types.Object) -> np.ndarray:

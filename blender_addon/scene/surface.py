@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A garment's surface as it is seen now, with the colours of its classes."""
+"""A garment's evaluated surface with the colours of its classes."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The motions that were chosen for a garment: taken from Blender, or in files of their own."""
+"""The motions chosen for a garment: sampled in Blender, or in USD files."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ from pathlib import Path
 
 import bpy
 
-from ..contract.arrays import Joints
-from ..contract.names import identifiers
+from ..joints import Joints
+from ..names import identifiers
+from .gather import ROOT
 from .handover import loading_usd
 from .motions import FILE, Source
-from .sampling import Take, prepare_takes, sample
+from .sampling import SampledTake, prepare_takes, sample
 
 
 @dataclass(frozen=True, eq=False)
-class Chosen:
+class ChosenMotions:
     """Motions to train on.
 
     Attributes:
@@ -25,11 +26,11 @@ class Chosen:
         files: those that lie in USD files.
     """
 
-    takes: list[Take]
+    takes: list[SampledTake]
     files: list[Path]
 
     @classmethod
-    def of(cls, garment: bpy.types.Object, armature: bpy.types.Object) -> Chosen:
+    def of(cls, garment: bpy.types.Object, armature: bpy.types.Object) -> ChosenMotions:
         """Return what was chosen for a garment.
 
         Raises:
@@ -56,8 +57,9 @@ class Chosen:
         """
         yield from sample(armature, joints, self.takes)
         yield from loading_usd()
-        from ..contract.motion import write_motion
+        from ssilk_usd.write import write_motion
 
         folder.mkdir()
-        for name, take in zip(self.names, self.takes):
-            yield from write_motion(folder / name, joints, take.motion())
+        for done, (name, take) in enumerate(zip(self.names, self.takes)):
+            yield done / len(self.takes)
+            write_motion(folder / name, take.motion(joints), joints.skeleton(ROOT))

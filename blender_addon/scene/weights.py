@@ -10,7 +10,6 @@ from itertools import islice
 import bpy
 import numpy as np
 
-from ..contract.arrays import influences
 from .meshes import edited, opened
 
 PLAIN = "ssilk:plain:"  # begins the attributes that keep weights over the character's bones, beside a rig
@@ -61,7 +60,7 @@ def write_groups(thing: bpy.types.Object, weights: np.ndarray, names: Sequence[s
         group = thing.vertex_groups.get(name)
         if group:
             thing.vertex_groups.remove(group)
-    indices, values = influences(weights)
+    indices, values = _heaviest_first(weights)
     groups = np.zeros(len(names), dtype=int)
     for joint in np.unique(indices[values > 0]):
         groups[joint] = thing.vertex_groups.new(name=names[joint]).index
@@ -73,6 +72,13 @@ def write_groups(thing: bpy.types.Object, weights: np.ndarray, names: Sequence[s
             element = vertex[layer]
             for group, share in islice(elements, count):
                 element[group] = share
+
+
+def _heaviest_first(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return joints and weights of each vertex, shape (V, I), of dense weights (V, J) whose rows may be empty."""
+    width = max(int((weights > 0).sum(axis=1).max(initial=0)), 1)
+    order = np.argsort(-weights, axis=1, kind="stable")[:, :width]
+    return order, np.take_along_axis(weights, order, axis=1)
 
 
 def read_kept(mesh: bpy.types.Mesh, prefix: str, names: Sequence[str]) -> np.ndarray | None:

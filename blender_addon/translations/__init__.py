@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the interface says in other languages, one module for each; sentences about objects stay English."""
+"""Translations of the interface, one module for each language; messages about objects stay English."""
 
 from __future__ import annotations
 
@@ -23,5 +23,5 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Take them away again."""
+    """Remove the translations."""
     bpy.app.translations.unregister(ROOT)

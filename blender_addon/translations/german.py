@@ -322,8 +322,8 @@ WORDS = {
     ),
     "Clear Marks": "Marken entfernen",
     "Remove the markers of worst frames": "Die Marken der schlechtesten Bilder entfernen",
-    "Plain Skinning Beside": "Einfaches Skinning daneben",
-    "Show the garment as plain skinning has it, beside it, or take that away": (
-        "Das Kleidungsstück mit einfachem Skinning daneben zeigen, oder das wieder entfernen"
+    "Linear Blend Skinning Beside": "Lineares Skinning daneben",
+    "Show beside the garment how linear blend skinning alone would move it, or remove that": (
+        "Daneben zeigen, wie lineares Skinning allein das Kleidungsstück bewegt, oder das wieder entfernen"
     ),
 }

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Point caches of clips, as the reference that garments are compared with."""
+"""Simulated clips as point caches: the reference that garments are compared with."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ OPEN = 4  # shots at once; clips are read one after the other
 
 
 class References:
-    """Shots of one garment in a folder, or in its subfolder of the garment's name, called as the clips are.
+    """Shots of one garment, named after their clips, in a folder or in its subfolder named after the garment.
 
     Attributes:
-        clips: names of the clips that there are shots of.
+        clips: names of the clips with a shot.
     """
 
     def __init__(self, folder: Path, garment: str, vertex_count: int, fps: float) -> None:

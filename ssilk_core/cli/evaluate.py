@@ -1,20 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measure trained garments on whole clips: energies, against the simulator, and what energies hide.
 
-Models of 'ssilk train' and baselines are measured side by side, with linear blend skinning, on the character that
-they were trained with. Gravity is relative to linear blend skinning. --reference compares with what the reference
-simulator makes
-of the same clips: a folder of shots written by 'ssilk simulate', named after the clips, or one such folder for each
-garment, under its name. Beside the clips, poses are held after stops, and the clips' first seconds are looped: a
-garment should come to rest where its own quasi-static state P is, and repeat itself.
+Models of one garment share their tables with linear blend skinning, on the character that they were trained with.
+Gravity is relative to linear blend skinning. --reference compares with the reference simulator. It names a folder of
+shots of the same clips, written by 'ssilk simulate' and named after the clips, or one with such a folder for each
+garment, under its name. Two probes follow. Poses are held after stops: a garment should come to rest at its own
+static state. The first seconds of clips are looped: a garment should repeat itself.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,16 +27,14 @@ from . import options as shared
 if TYPE_CHECKING:
     import torch
 
-    from ..baselines.networks import Baseline
     from ..checkpoint import ModelFile
-    from ..evaluation.methods import EvaluationScene
-    from ..evaluation.run import EvaluatedModel, EvaluationClips, EvaluationOptions, ResultRow
-    from ..model.network import GarmentModel
+    from ..evaluation.methods import EvaluatedMethod, EvaluationScene, Method, TakeSet
+    from ..evaluation.run import EvaluationClips, EvaluationOptions, ResultRow
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
-    verb.add_argument("models", type=Path, nargs="+", metavar="MODEL", help="models of 'ssilk train', or baselines")
+    verb.add_argument("models", type=Path, nargs="+", metavar="MODEL", help="files written by 'ssilk train'")
     verb.add_argument("--stage", type=Path, required=True, help="USD file with the character")
     verb.add_argument("--root", metavar="PRIM", help="SkelRoot of the character, where the stage has several")
     verb.add_argument("--motions", type=Path, required=True, metavar="FOLDER", help="folder of motion files")
@@ -45,14 +44,16 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--by-clip", action="store_true", help="show each clip by itself too")
     verb.add_argument("--reference", type=Path, metavar="FOLDER", help="shots of 'ssilk simulate' to compare with")
     verb.add_argument("--trained-on", type=Path, nargs="+", default=[], metavar="PATH",
-                      help="motions trained on, to tell unfamiliar poses (default: train of --index)")  # fmt: skip
-    verb.add_argument("--sequence", type=int, metavar="FRAMES", help="start clips anew after so many (paper: 512)")
-    verb.add_argument("--stops", type=int, default=2, help="stops in each clip to hold poses after (default 2)")
+                      help="training motions, to tell how new poses are (default: train of --index)")  # fmt: skip
+    verb.add_argument("--sequence", type=int, metavar="FRAMES", help="restart clips after so many (paper: 512)")
+    verb.add_argument(
+        "--stops", type=int, default=2, help="stops in each clip after which poses are held (default 2)"
+    )
     verb.add_argument("--hold", type=float, default=3.0, metavar="S", help="how long poses are held (default 3)")
     verb.add_argument("--minimum", action="store_true",
-                      help="minimise the energy of held poses without the network (slow on a CPU)")  # fmt: skip
+                      help="compare held poses with a minimum of the static energy (slow on a CPU)")  # fmt: skip
     verb.add_argument("--simulate-stops", action="store_true",
-                      help="simulate the stops too, beside --reference (slow on a CPU)")  # fmt: skip
+                      help="with --reference, simulate the stops too (slow on a CPU)")  # fmt: skip
     verb.add_argument("--loop", type=int, default=2000, metavar="FRAMES",
                       help="length of loops, none for 0 (default 2000)")  # fmt: skip
     verb.add_argument("--exact", action="store_true",
@@ -63,34 +64,70 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Evaluate; return 0."""
-    from ..baselines.files import load_network
-    from ..devices import chosen_device
-    from ..evaluation.run import evaluate
     from ..evaluation.tables import tables
 
     if options.output:
         if options.output.suffix != ".json":
             fail(str(options.output), "not a name for figures", "it ends in .json")
         shared.check_output(options.output, *options.models, options.index)
-    asked = _asked(options)
-    device = chosen_device(options.device)
-    opened = [Opened(path, *load_network(path)) for path in options.models]
-    rows: list[ResultRow] = []
-    found: list[dict[str, Any]] = []
-    for models in _by_garment(opened):
-        dressed, subjects = _dressed(models[0].file, options, device), _subjects(models, device)
-        playlist = _playlist(options, dressed)
-        report(Started("evaluate", len(playlist.clips), {"garment": dressed.name, "clips": list(playlist.clips)}))
-        paths = {subject.name: str(one.path) for subject, one in zip(subjects, models)}
-        for row in evaluate(dressed, subjects, playlist, asked, report):
-            rows.append(row)
-            found.append({"model": paths.get(row.method), **asdict(row)})
+    rows, found = evaluated(options, open_model, report)
     if options.output:
-        _write(options, asked, opened, found)
+        _write(options, found)
     if not options.json:
         print(tables(rows))
     report(Result("evaluate", {"figures": found} if options.json else {}))
     return EXIT_OK
+
+
+@dataclass(frozen=True, eq=False)
+class OpenedModel:
+    """A model to evaluate: its file, the name of its method, and what returns that method over takes."""
+
+    path: Path
+    file: ModelFile
+    name: str
+    on: Callable[[TakeSet], Method]
+
+    @property
+    def garment(self) -> tuple[object, ...]:
+        """What models must share to be measured on the same takes: mesh, fabric and rate."""
+        mesh = self.file.scene.garment.mesh
+        return mesh.path.rpartition("/")[2], mesh.points.tobytes(), self.file.fabric, self.file.config.fps
+
+
+Opener = Callable[[Path, "torch.device"], OpenedModel]
+"""Opens a file on a device."""
+
+
+def open_model(path: Path, device: torch.device) -> OpenedModel:
+    """Open a model of 'ssilk train'; raise `SsilkError` as `checkpoint.load_model` does."""
+    from ..checkpoint import load_model, network
+    from ..evaluation.methods import Network
+
+    file = load_model(path)
+    return OpenedModel(path, file, "ssilk", partial(Network, network(file).to(device)))
+
+
+def evaluated(
+    options: argparse.Namespace, opener: Opener, report: Reporter
+) -> tuple[list[ResultRow], list[dict[str, Any]]]:
+    """Evaluate the models that options name; return the rows, and the same as files hold them."""
+    from ..devices import chosen_device
+    from ..evaluation.run import evaluate
+
+    asked, device = _asked(options), chosen_device(options.device)
+    opened = [opener(path, device) for path in options.models]
+    rows: list[ResultRow] = []
+    found: list[dict[str, Any]] = []
+    for models in _by_garment(opened):
+        dressed, methods = _dressed(models[0].file, options, device), _methods(models)
+        playlist = _playlist(options, dressed)
+        report(Started("evaluate", len(playlist.clips), {"garment": dressed.name, "clips": list(playlist.clips)}))
+        paths = {method.name: str(one.path) for method, one in zip(methods, models)}
+        for row in evaluate(dressed, methods, playlist, asked, report):
+            rows.append(row)
+            found.append({"model": paths.get(row.method), **asdict(row)})
+    return rows, found
 
 
 def _asked(options: argparse.Namespace) -> EvaluationOptions:
@@ -106,65 +143,36 @@ def _asked(options: argparse.Namespace) -> EvaluationOptions:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Opened:
-    """A model's file and its network."""
-
-    path: Path
-    file: ModelFile
-    model: GarmentModel | Baseline
-
-    @property
-    def method(self) -> str:
-        """What the network is: "ssilk", "snug", "ncs", or "ncs*" where it was trained with rotations."""
-        from ..baselines.files import KEY
-
-        told = self.file.provenance
-        if KEY not in told:
-            return "ssilk"
-        rotated = told.get("train", {}).get("rotated_fraction", 0) > 0
-        return told[KEY]["method"] + "*" * rotated
-
-    @property
-    def garment(self) -> tuple[object, ...]:
-        """What models must share to be measured side by side: mesh, fabric and rate."""
-        mesh = self.file.scene.garment.mesh
-        return mesh.path.rpartition("/")[2], mesh.points.tobytes(), self.file.fabric, self.model.config.fps
-
-
-def _by_garment(opened: Iterable[Opened]) -> list[list[Opened]]:
+def _by_garment(opened: Iterable[OpenedModel]) -> list[list[OpenedModel]]:
     """Return the models of each garment, in the order of the first of each."""
-    groups: dict[tuple[object, ...], list[Opened]] = {}
+    groups: dict[tuple[object, ...], list[OpenedModel]] = {}
     for one in opened:
         groups.setdefault(one.garment, []).append(one)
     return list(groups.values())
 
 
-def _subjects(models: list[Opened], device: torch.device) -> list[EvaluatedModel]:
-    """Return the networks of one garment, called after their files where several are of one method."""
-    from ..evaluation.run import EvaluatedModel
+def _methods(models: Sequence[OpenedModel]) -> list[EvaluatedMethod]:
+    """Return the methods of one garment, named after their files where several have one name."""
+    from ..evaluation.methods import EvaluatedMethod
 
-    methods = [one.method for one in models]
-    names = [
-        method if methods.count(method) == 1 else f"{method} ({one.path.stem})"
-        for method, one in zip(methods, models)
-    ]
-    return [EvaluatedModel(name, one.model.to(device), one.file.joints) for name, one in zip(names, models)]
+    count = Counter(one.name for one in models)
+    names = [one.name if count[one.name] == 1 else f"{one.name} ({one.path.stem})" for one in models]
+    return [EvaluatedMethod(name, one.file.joints, one.on) for name, one in zip(names, models)]
 
 
 def _dressed(file: ModelFile, options: argparse.Namespace, device: torch.device) -> EvaluationScene:
     """Put the garment of a model on the character of the stage."""
     from ssilk_usd.read_stage import open_stage
 
+    from ..bake import on_character
     from ..evaluation.methods import EvaluationScene
-    from ._baking import on_character
 
     scene = on_character(file, open_stage(options.stage), options.root)
     return EvaluationScene(scene, file.fabric, file.config.fps, device, exact=options.exact)
 
 
 def _playlist(options: argparse.Namespace, dressed: EvaluationScene) -> EvaluationClips:
-    """Read the clips that are asked for, and what there is to compare with."""
+    """Read the clips that options name, and find the simulator's shots of them."""
     from ssilk_usd.read_motion import read_motion, read_motions
 
     from ..evaluation.run import EvaluationClips
@@ -212,10 +220,8 @@ def _splits(options: argparse.Namespace) -> tuple[dict[str, list[str]], dict[str
     return splits | single, files, seen
 
 
-def _write(
-    options: argparse.Namespace, asked: EvaluationOptions, opened: list[Opened], rows: list[dict[str, Any]]
-) -> None:
-    """Write the figures with where they come from."""
+def _write(options: argparse.Namespace, rows: list[dict[str, Any]]) -> None:
+    """Write the figures with their provenance."""
     import torch
 
     from .. import __version__
@@ -224,10 +230,10 @@ def _write(
 
     document = {
         "units": "SI",
-        "models": {str(one.path): sha256(one.path) for one in opened},
+        "models": {str(path): sha256(path) for path in options.models},
         "stage": {str(options.stage): sha256(options.stage)},
         "reference": options.reference and str(options.reference),
-        "options": {**asdict(asked), "clips": options.clips, "exact": options.exact},
+        "options": {**asdict(_asked(options)), "clips": options.clips, "exact": options.exact},
         "hardware": device_name(chosen_device(options.device)),
         "versions": {"ssilk": __version__, "torch": torch.__version__},
         "figures": rows,

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write a trained model's network as ONNX, for engines that play it themselves.
 
-One call is one frame of any number of characters. It takes the latents of the two frames before, the descriptors of
-the pose (static ones and rates, as ssilk_core/descriptors.py has them) and whether the garment begins there; it
-gives the new latents, the weights of the blendshapes and the local rotations of the proxy joints, as shots hold them.
+One call computes one frame of any number of characters. Inputs are the latents of the two previous frames, the
+descriptors of the pose (static ones and rates, see ssilk_core/descriptors.py) and a flag for the first frame. Outputs
+are the new latents, the weights of the blendshapes and the local rotations of the proxy joints, as in a shot.
 Blendshapes and skinning weights are those of any baked shot.
 """
 
@@ -24,7 +24,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
-    """Write the network; say what goes in and comes out."""
+    """Write the network; report its inputs and outputs."""
     from ..checkpoint import load_model, network
     from ..model.export import export_onnx
     from ..parameters import descriptor_sizes

@@ -2,7 +2,7 @@
 """Bake many shots on a farm: write a job bundle of Open Job Description, or run its tasks on a Ray cluster.
 
 The bundle runs unchanged with 'openjd run' on one machine and with 'deadline bundle submit' on Deadline Cloud. Each
-task is one garment in one shot; what is done already is left alone, however often and wherever a job is run.
+task is one garment in one shot. Running a job again, anywhere, leaves finished tasks alone.
 """
 
 from __future__ import annotations
@@ -10,19 +10,17 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..bake import BakeTask, LayerFolder, plan_layers
 from ..errors import EXIT_OK, EXIT_TASKS, fail
-from ..events import Failed, GarmentEvent, Progress, Reporter, Result, Started, silent
+from ..events import Failed, GarmentEvent, Progress, Reporter, Result, Started
 from ..farm.openjd import TEMPLATE, BundleOptions, write_bundle
-from ..farm.tasks import BakeTask
-from .options import add_bake, layer_tasks
+from .options import add_bake, layer_options, requests_of
 
 if TYPE_CHECKING:
     from ..farm.cluster import TaskOutcome
-    from ._layers import Wardrobe
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -38,10 +36,10 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     defaults = BundleOptions()
     group.add_argument("--name", default=defaults.name, help="of the job (default '%(default)s')")
     for name, about in (
-        ("chunk", "tasks that a worker takes at once, to begin with"),
-        ("seconds", "how long a chunk should take, to which farms adapt its size"),
+        ("chunk", "tasks that a worker takes at once, at first"),
+        ("seconds", "how long a chunk should take; farms adapt its size to it"),
         ("memory", "MiB that a host needs"),
-        ("timeout", "seconds after which a chunk is given up"),
+        ("timeout", "seconds after which a chunk is cancelled"),
     ):
         group.add_argument(
             f"--{name}", type=int, default=getattr(defaults, name), help=f"{about} (default %(default)s)"
@@ -51,7 +49,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Write the bundle, or run the tasks."""
-    tasks = [_absolute(task) for task in layer_tasks(options)]
+    tasks = [_absolute(task) for task in plan_layers(requests_of(options), **layer_options(options))]
     if options.bundle:
         return _write(tasks, options, report)
     if not (options.cores or 1) > 0:
@@ -62,14 +60,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
 
 def _absolute(task: BakeTask) -> BakeTask:
-    """Return a task whose inputs are named from the root: workers start elsewhere."""
-    from ssilk_usd.read_stage import split_location
-
-    file, prim = split_location(task.motion)
-    motion = f"{Path(file).absolute()}{f':{prim}' if prim else ''}"
-    return replace(
-        task, model=str(Path(task.model).absolute()), stage=str(Path(task.stage).absolute()), motion=motion
-    )
+    """Return a task whose inputs have absolute paths: workers start elsewhere."""
+    return replace(task, request=task.request.relocated(lambda path: str(Path(path).absolute())))
 
 
 def _write(tasks: Sequence[BakeTask], options: argparse.Namespace, report: Reporter) -> int:
@@ -92,8 +84,7 @@ def _write(tasks: Sequence[BakeTask], options: argparse.Namespace, report: Repor
 
 
 def _run(tasks: Sequence[BakeTask], options: argparse.Namespace, report: Reporter) -> int:
-    from ..farm.cluster import run_on_cluster
-    from ._layers import clear, write_stages
+    from ..farm.cluster import bake_here, run_on_cluster
 
     report(Started("farm", len(tasks), {"output": str(options.output)}))
     ended: list[TaskOutcome] = []
@@ -103,23 +94,10 @@ def _run(tasks: Sequence[BakeTask], options: argparse.Namespace, report: Reporte
         if outcome.error:
             report(GarmentEvent(outcome.task.name, Failed(outcome.error)))
         report(Progress(len(ended), len(tasks)))
-    clear(tasks, options.output)
-    done = [outcome for outcome in ended if not outcome.error]
-    write_stages([outcome.task for outcome in done], options.output, report)
-    current, failed = sum("current" in outcome.detail for outcome in done), len(ended) - len(done)
-    report(Result("farm", {"baked": len(done) - current, "current": current, "failed": failed}))
+    layers = LayerFolder(options.output)
+    layers.remove_unfinished(tasks)
+    layers.write_stages([outcome.task for outcome in ended if outcome.result], report)
+    results = [outcome.result for outcome in ended if outcome.result]
+    current, failed = sum(result.current for result in results), len(ended) - len(results)
+    report(Result("farm", {"baked": len(results) - current, "current": current, "failed": failed}))
     return EXIT_TASKS if failed else EXIT_OK
-
-
-def bake_here(task: BakeTask, folder: Path) -> dict[str, object]:
-    """Bake a task in this process, which keeps the garment of the last one."""
-    from ._layers import bake_task
-
-    return bake_task(task, folder, _wardrobe(), silent)
-
-
-@lru_cache(maxsize=1)
-def _wardrobe() -> Wardrobe:
-    from ._layers import Wardrobe
-
-    return Wardrobe()

@@ -8,17 +8,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..bake import BakeRequest
 from ..config import overridden
 from ..errors import fail
 from ..events import Reporter
 from ..fabrics import FABRICS, Fabric, fabric_named
-from ..farm.tasks import BakeTask, plan
-from ..files import need_writable
+from ..files import need_not_input, need_writable
+from ..quality import QUALITIES
 from ..setup.classes import ClassOptions
 from ..setup.rig import RigOptions
-from ..targets import TARGETS, need_influences
-
-INPUTS = ("model", "stage", "motion")  # what a shot is baked from
+from ..targets import TARGETS
 
 if TYPE_CHECKING:
     from ..assets import Character, Garment, ProxyRig, Scene
@@ -124,50 +123,42 @@ def _add_output(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--device", default="cpu", help="where the network runs (default cpu)")
 
 
-def tasks_of(options: argparse.Namespace) -> list[BakeTask]:
-    """Return the tasks that the options of `add_bake` ask for."""
+def add_level(verb: argparse.ArgumentParser, size: str) -> None:
+    """Add --quality and --budget; `size` says of what a budget in bytes is."""
+    levels = "; ".join(f"{level.name}: {level.about}" for level in QUALITIES.values())
+    verb.add_argument("--quality", choices=QUALITIES, help=f"level of quality ({levels})")
+    verb.add_argument("--budget", metavar="AMOUNT", help=f"keep the most within 0.3ms for each frame, or {size}")
+
+
+def requests_of(options: argparse.Namespace) -> list[BakeRequest]:
+    """Return a request for each model over each motion, as the options of `add_bake` say."""
     from ssilk_usd.read_stage import split_location
 
     named = [split_location(model) for model in options.model]
-    like = BakeTask(
-        garment="", shot="", model="", motion="",
-        stage=str(options.stage),
-        fps=options.fps,
-        samples=options.samples_per_frame,
-        pre_roll=options.pre_roll,
-        target=options.target,
-        lbs=options.lbs,
-        body=not options.no_body,
-        points=options.points or (options.refine > 0 and options.refined_output == "points"),
-        refine=options.refine,
-        feedback=options.feedback,
-        refined=options.refined_output,
-        verify=not options.no_verify,
-        device=options.device,
-    )  # fmt: skip
-    return plan([(model, root or options.root) for model, root in named], options.motion, like)
-
-
-def layer_tasks(options: argparse.Namespace) -> list[BakeTask]:
-    """Return the tasks that the options of `add_bake` ask for, as layers.
-
-    Raises:
-        SsilkError: the target takes no layers, or fewer influences than a model has: all shots share its weights.
-    """
-    from ..checkpoint import load_model
-
-    target = TARGETS[options.target]
-    if ".usdc" not in target.suffixes:
-        fail(
-            f"--target {options.target}",
-            "layers",
-            f"it takes {', '.join(target.suffixes)}",
-            "bake one garment over one motion into such a file",
+    return [
+        BakeRequest(
+            model=model,
+            stage=options.stage,
+            motion=motion,
+            root=root or options.root,
+            fps=options.fps,
+            samples_per_frame=options.samples_per_frame,
+            pre_roll=options.pre_roll,
+            target=options.target,
+            lbs=options.lbs,
+            refine=options.refine,
+            feedback=options.feedback,
+            refined_output=options.refined_output,
+            device=options.device,
         )
-    tasks = tasks_of(options)
-    for model in sorted({task.model for task in tasks if target.influences and not task.lbs}):
-        need_influences(load_model(model).scene.rig.skin.indices.shape[1], options.target, model)
-    return tasks
+        for model, root in named
+        for motion in options.motion
+    ]
+
+
+def layer_options(options: argparse.Namespace) -> dict[str, bool]:
+    """Return what `plan_layers` takes beside requests, as the options of `add_bake` say."""
+    return {"include_body": not options.no_body, "points": options.points, "verify": not options.no_verify}
 
 
 def is_folder(output: Path) -> bool:
@@ -190,9 +181,7 @@ def check_output(output: Path, *inputs: Path | str | None) -> None:
         SsilkError: it cannot, or it is.
     """
     need_writable(output)
-    same = output.exists() and any(Path(path).exists() and output.samefile(path) for path in inputs if path)
-    if same:
-        fail(str(output), "the output is also an input", "inputs are never overwritten", "name another file")
+    need_not_input(output, *inputs)
 
 
 def read(options: argparse.Namespace, report: Reporter) -> tuple[Character, Garment, ProxyRig | None]:

@@ -17,8 +17,10 @@ from typing import TYPE_CHECKING
 
 from ..errors import EXIT_OK, fail
 from ..events import Reporter, Result
+from ..quality import SizeReduction, size_at, spend
 from . import options as shared
-from ._quality import NUMBERS, add_level, level_size, lost, spent
+
+NUMBERS = ("shapes", "joints", "influences")
 
 if TYPE_CHECKING:
     from ..assets import Motion
@@ -32,7 +34,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("-o", "--output", type=Path, required=True, help="model to write (.safetensors)")
     for name, what in zip(NUMBERS, ("blendshapes", "proxy joints", "joints that move one vertex")):
         verb.add_argument(f"--{name}", type=int, metavar="N", help=f"{what} to keep (default: all)")
-    add_level(verb, "6MB for the file")
+    shared.add_level(verb, "6MB for the file")
     verb.add_argument("--motions", type=Path, nargs="+", default=[], metavar="PATH",
                       help="motion files or folders to do well (default: the training's)")  # fmt: skip
     verb.add_argument("--precision", choices=("int16", "float32"), default="int16",
@@ -53,7 +55,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     motions = _motions(file, options)
     reducer = Reducer(file, motions)
     found = _chosen(options, reducer, motions, report)
-    figures = lost(reducer.whole, found)
+    figures = SizeReduction.of(reducer.whole, found).to_metadata()
     told = {"model": str(options.model), "motions": [motion.path for motion in motions], **figures}
     provenance = {**file.provenance, "reduced": told}
     save_model(options.output, replace(found.file, provenance=provenance), pack=options.precision == "int16")
@@ -84,8 +86,8 @@ def _chosen(options: argparse.Namespace, reducer: Reducer, motions: list[Motion]
     from ..cost import model_bytes
 
     named = {name: value for name in NUMBERS if (value := getattr(options, name)) is not None}
-    size = replace(level_size(options.quality, reducer.whole), **named)
+    size = replace(size_at(options.quality, reducer.whole), **named)
     if not options.budget:
         return reducer.reduced(size)
     pack = options.precision == "int16"
-    return spent(options.budget, reducer, size, motions[0], lambda file: model_bytes(file, pack=pack), report)
+    return spend(options.budget, reducer, size, motions[0], lambda file: model_bytes(file, pack=pack), report)

@@ -130,11 +130,13 @@ def _baked(options: argparse.Namespace, report: Reporter) -> list[Section]:
     """Bake a model, and return what there is to say about the shot but its provenance."""
     from ssilk_usd.shot import write_shot
 
-    from ._baking import BakeRequest, open_bake
+    from ..bake import BakeRequest, load_rollout
 
     model, stage, motion = (str(path) for path in (options.subject, options.stage, options.motion))
-    bake = open_bake(BakeRequest(model=model, stage=stage, motion=motion, root=options.root))
+    rollout = load_rollout(BakeRequest(model=model, stage=stage, motion=motion, root=options.root))
     with tempfile.TemporaryDirectory() as folder:
         shot = Path(folder) / f"{options.subject.stem}.usdc"
-        write_shot(shot, bake.deformer, bake.motion, bake.poses(), units=bake.units, record=bake.record)
+        write_shot(
+            shot, rollout.deformer, rollout.motion, rollout.poses(), units=rollout.units, record=rollout.record
+        )
         return _shot(shot, report)[:-1]

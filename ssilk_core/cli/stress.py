@@ -78,9 +78,9 @@ def _subject(options: argparse.Namespace) -> StressSubject:
     from ssilk_usd.read_motion import read_motion
     from ssilk_usd.read_stage import open_stage
 
+    from ..bake import on_character
     from ..checkpoint import load_model
     from ..stress.subject import FULL, QUICK, StressSubject
-    from ._baking import on_character
 
     file = load_model(options.model)
     scene = on_character(file, open_stage(options.stage), options.root)

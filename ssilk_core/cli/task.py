@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bake some tasks of a job that 'ssilk farm' wrote, or check that all are done; this is what a farm's workers run.
 
-What is done already is left alone. A task with bad input fails alone: the others are baked, and the exit code is 4.
+Tasks that are done are left alone. A task with bad input fails alone: the others are baked, and the exit code is 4.
 --check writes the stage of each shot, and its exit code is 3 unless every task is done and every file as written.
 """
 
@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import argparse
 import signal
-from collections.abc import Sequence
 from pathlib import Path
 
-from ..errors import EXIT_OK, EXIT_TASKS, SsilkError, VerificationError
-from ..events import Event, Failed, GarmentEvent, Message, Progress, Reporter, Result, Started
+from ..errors import EXIT_OK, EXIT_TASKS
+from ..events import Reporter
 from ..farm.job import numbers, read_job
 from ..farm.openjd import OpenJdReporter
-from ..farm.tasks import BakeTask
+from ..farm.work import bake_tasks, check_tasks
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -38,65 +37,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     report = OpenJdReporter() if options.openjd else report
     tasks = read_job(options.job, options.path_mapping)
     if options.check:
-        return _check(tasks, options.output, report)
+        check_tasks(tasks, options.output, report)
+        return EXIT_OK
     chosen = [tasks[number] for number in numbers(options.tasks or f"0-{len(tasks) - 1}", len(tasks))]
-    return _bake(chosen, options, report)
-
-
-def _bake(tasks: Sequence[BakeTask], options: argparse.Namespace, report: Reporter) -> int:
-    from ._layers import Wardrobe, bake_task
-
-    wardrobe, failed = Wardrobe(), 0
-    for index, task in enumerate(tasks):
-        report(GarmentEvent(task.name, Started("bake", 1)))
-        part = _part(report, index, len(tasks))
-        try:
-            report(
-                GarmentEvent(
-                    task.name, Result("bake", bake_task(task, options.output, wardrobe, part, again=options.again))
-                )
-            )
-        except SsilkError as error:
-            failed += 1
-            report(GarmentEvent(task.name, Failed(str(error))))
-        report(Progress(index + 1, len(tasks)))
+    failed = bake_tasks(chosen, options.output, report, again=options.again)
     return EXIT_TASKS if failed else EXIT_OK
-
-
-def _part(report: Reporter, index: int, count: int) -> Reporter:
-    """Return a reporter for one of several tasks, whose progress is a part of the whole."""
-
-    def part(event: Event) -> None:
-        if isinstance(event, Progress):
-            report(Progress(index * event.total + event.done, count * event.total))
-        else:
-            report(event)
-
-    return part
-
-
-def _check(tasks: Sequence[BakeTask], output: Path, report: Reporter) -> int:
-    """Write the stages of the shots and raise `VerificationError` unless everything is there."""
-    from ._layers import clear, write_stages
-
-    clear(tasks, output)
-    done = [task for task in tasks if _is_done(task, output, report)]
-    write_stages(done, output, report)
-    missing = [task.name for task in set(tasks).difference(done)]
-    if missing:
-        raise VerificationError(
-            f"{output}: {len(missing)} of {len(tasks)} tasks are not done, or their files are not as they were "
-            f"written ({', '.join(sorted(missing)[:5])}); run them again."
-        )
-    report(Result("check", {"tasks": len(tasks), "output": str(output)}))
-    return EXIT_OK
-
-
-def _is_done(task: BakeTask, output: Path, report: Reporter) -> bool:
-    from ._layers import is_done
-
-    try:
-        return is_done(task, output)
-    except SsilkError as error:  # an input that cannot be read
-        report(Message(f"{task.name}: {error}", "warning"))
-        return False

@@ -23,10 +23,10 @@ from . import options as shared
 
 if TYPE_CHECKING:
     from ..assets import Motion
+    from ..bake import BakeRollout
     from ..checkpoint import ModelFile
     from ..evaluation.methods import EvaluationScene, Method, TakeSet
     from ..trade.measure import VariantMeter, Weigh
-    from ._baking import Bake
 
 CLIPS = 2  # that are measured on where none are named
 
@@ -127,7 +127,7 @@ class Bench:
 
     def meter(self, path: Path, file: ModelFile, *, only: str | None = None) -> VariantMeter:
         """Return what measures a model on all clips, cut for other motions; or on `only` one, cut for it."""
-        from ..evaluation.methods import reel_of
+        from ..evaluation.methods import build_take_set
         from ..evaluation.takes import takes_of
         from ..reduction import Reducer
         from ..trade.measure import VariantMeter
@@ -135,7 +135,7 @@ class Bench:
         dressed = self._dressed(file)
         clips = {only: self.clips[only]} if only else self.clips
         takes = [take for name, clip in clips.items() for take in takes_of(name, clip, dressed.fps)]
-        reel = reel_of(takes, dressed, file.joints)
+        reel = build_take_set(takes, dressed, file.joints)
         reducer = Reducer(file, [self.clips[only]] if only else self.others)
         return VariantMeter(path.stem, reducer, dressed, reel, self._weigh(path), self._reference(dressed, reel))
 
@@ -143,8 +143,8 @@ class Bench:
         """Put a garment on the character of the stage."""
         from ssilk_usd.read_stage import open_stage
 
+        from ..bake import on_character
         from ..evaluation.methods import EvaluationScene
-        from ._baking import on_character
 
         scene = on_character(file, open_stage(self.options.stage), self.options.root)
         return EvaluationScene(scene, file.fabric, file.config.fps, self.device)
@@ -166,22 +166,21 @@ class Bench:
                 "each clip needs one",
                 "simulate them with 'ssilk simulate'",
             )
-        return CachedPoints("simulator", found.read, dressed, reel)
+        return CachedPoints(found.read, dressed, reel)
 
     def _weigh(self, path: Path) -> Weigh:
         """Return what tells how large a model's shots of the first clip are, without the body."""
-        from ._baking import BakeRequest, open_bake
-        from ._level import shot_bytes
+        from ..bake import BakeRequest, load_rollout, shot_bytes, with_model
 
         motion, stage = str(next(iter(self.paths.values()))), str(self.options.stage)
 
         @lru_cache(4)
-        def bake(fps: float) -> Bake:
-            return open_bake(
+        def rollout(fps: float) -> BakeRollout:
+            return load_rollout(
                 BakeRequest(model=str(path), stage=stage, motion=motion, fps=fps, root=self.options.root)
             )
 
-        return lambda file, fps: shot_bytes(bake(fps).wearing(file), ".usdc", body=False)
+        return lambda file, fps: shot_bytes(with_model(rollout(fps), file), ".usdc", include_body=False)
 
     def _motions(self, file: ModelFile) -> tuple[dict[str, Path], list[Motion]]:
         """Return the files of the clips to measure on, and the motions to cut models for: the others, or the same."""

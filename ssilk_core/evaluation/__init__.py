@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good a garment is, by any method: energies, against the reference simulator, and what energies hide."""
+"""Evaluation of garments by any method: energies, errors to the reference simulator, settling and drift."""

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an evaluation comes to: figures of one method on one split, in SI units."""
+"""The results of an evaluation: figures of one method on one split, in SI units.
+
+Gravity excesses are differences of potential energy in units of m g L, the garment's weight times its rest height.
+"""
 
 from __future__ import annotations
 
@@ -7,106 +10,111 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True, kw_only=True)
-class Against:
-    """A method beside the reference simulator, on the frames that both have.
+class ReferenceErrors:
+    """A method compared with the reference simulator, on the frames that both have.
 
     Attributes:
         frames: how many.
-        total: of the simulator [J].
-        excess: total over the simulator's [J].
-        floats: gravity over the simulator's, as a share of m g L.
-        position, velocity, acceleration: RMS errors over mass and frames [m], [m/s], [m/s2].
-        jitter: RMS third derivative, relative to the simulator's.
+        reference_total: the simulator's total [J].
+        total_excess: total above the simulator's [J].
+        gravity_excess: gravity energy above the simulator's [m g L].
+        position_error, velocity_error, acceleration_error: RMS over mass and frames [m], [m/s], [m/s2].
+        jerk_ratio: RMS jerk relative to the simulator's.
     """
 
     frames: int
-    total: float
-    excess: float
-    floats: float
-    position: float
-    velocity: float
-    acceleration: float
-    jitter: float
+    reference_total: float
+    total_excess: float
+    gravity_excess: float
+    position_error: float
+    velocity_error: float
+    acceleration_error: float
+    jerk_ratio: float
 
 
 @dataclass(frozen=True, kw_only=True)
 class PoseNovelty:
-    """How far poses are from those trained on, and what that costs.
+    """How far poses are from the nearest training poses, and what that costs.
 
     Attributes:
-        mean, high: angle for each joint to the nearest pose, its mean and 95 % quantile over frames [rad].
-        familiar, unfamiliar: total of the nearest half of the frames, and of the furthest tenth [J].
+        mean_distance, p95_distance: angle for each joint, its mean and 95th percentile over frames [rad].
+        nearest_half_total, furthest_tenth_total: total of the nearest half of the frames, of the furthest tenth [J].
     """
 
-    mean: float
-    high: float
-    familiar: float
-    unfamiliar: float
+    mean_distance: float
+    p95_distance: float
+    nearest_half_total: float
+    furthest_tenth_total: float
 
 
 @dataclass(frozen=True, kw_only=True)
-class Holds:
-    """Poses held still after a stop; means over stops.
+class Settling:
+    """What a garment does after its character stops; means over stops.
 
-    Attributes:
-        stops: how many.
-        begun, kinetic: kinetic energy at the stop and at the end of the hold [J].
-        settled: share of stops after which the garment becomes calm.
-        settling: median time until it is calm for good [s]; infinite where fewer than half settle.
-        distance: RMS from the method's own quasi-static state at the end [m]; `furthest`: of the worst stop.
-        above: static energy above that state's at the end [J].
-        floats: gravity above that state's at the end, as a share of m g L.
-    """
-
-    stops: int
-    begun: float
-    kinetic: float
-    settled: float
-    settling: float
-    distance: float
-    furthest: float
-    above: float
-    floats: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class Hung:
-    """Where garments were at the end of holds, beside the minimum of the static energy near there.
+    The static state is the method's own for the final pose.
 
     Attributes:
         stops: how many.
-        above: energy over the minimum's [J].
-        floats, lbs: gravity over the minimum's, of the garment and of linear blend skinning, as shares of m g L.
-        distance: RMS from the minimum [m].
-        imbalance: what the solver left out of balance, at most [g].
+        initial_kinetic_energy, final_kinetic_energy: at the stop, and at the end of the hold [J].
+        settled_share: share of stops after which the garment comes to rest.
+        settling_time: median time to rest [s]; infinite where fewer than half settle.
+        static_distance: RMS distance to the static state at the end [m].
+        max_static_distance: the largest of these over stops [m].
+        static_energy_excess: static energy above that of the static state at the end [J].
+        gravity_excess: gravity energy above that of the static state at the end [m g L].
     """
 
     stops: int
-    above: float
-    floats: float
-    lbs: float
-    distance: float
-    imbalance: float
+    initial_kinetic_energy: float
+    final_kinetic_energy: float
+    settled_share: float
+    settling_time: float
+    static_distance: float
+    max_static_distance: float
+    static_energy_excess: float
+    gravity_excess: float
 
 
 @dataclass(frozen=True, kw_only=True)
-class Loops:
-    """Clips looped seamlessly; the second loop, which no start disturbs, beside the last.
+class MinimumErrors:
+    """Garments at the end of holds, compared with a minimum of the static energy nearby; means over stops.
+
+    Attributes:
+        stops: how many.
+        static_energy_excess: static energy above the minimum's [J].
+        gravity_excess, lbs_gravity_excess: gravity energy above the minimum's, of the garment and of linear blend
+            skinning [m g L].
+        minimum_distance: RMS distance to the minimum [m].
+        max_residual: largest residual that the solver left at a minimum [g].
+    """
+
+    stops: int
+    static_energy_excess: float
+    gravity_excess: float
+    lbs_gravity_excess: float
+    minimum_distance: float
+    max_residual: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoopDrift:
+    """Seamlessly looped clips: the last loop compared with the second, which the start no longer disturbs.
 
     Attributes:
         clips, frames: how many clips, each of at least so many frames.
-        second, last: totals of these loops [J].
-        drift: change from one to the other [J]; `most`: of the clip that changes most, signed.
-        apart: RMS distance between both at equal phases [m].
+        second_loop_total, last_loop_total: mean totals of these loops [J].
+        total_drift: change from one to the other [J].
+        max_total_drift: of the clip that changes most, signed [J].
+        loop_distance: RMS distance between both loops at equal phases [m].
     """
 
     clips: int
     frames: int
-    second: float
-    last: float
-    drift: float
-    most: float
-    apart: float
+    second_loop_total: float
+    last_loop_total: float
+    total_drift: float
+    max_total_drift: float
+    loop_distance: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,16 +123,15 @@ class Figures:
 
     Attributes:
         clips, frames: how many.
-        total: the paper's L_tot [J], of `terms`; gravity is relative to linear blend skinning.
+        total: the paper's L_tot [J], the sum of `terms`; gravity is relative to linear blend skinning.
         collisions: share of vertices inside the body.
         clip_totals: smallest, median and largest total of a clip [J].
-        lift: gravity relative to linear blend skinning, as a share of m g L: weight times height of the garment.
-        kinetic: kinetic energy [J].
-        motion: RMS distance to the method's own quasi-static state of each pose [m].
-        jitter: RMS third derivative over mass and frames [m/s3]; `jitter_of_plain`: relative to linear blend
-            skinning's.
-        stretches: 50, 95 and 99 % quantiles and the largest of the larger principal stretch.
-        truth, poses, holds, hung, loops: what else was asked for, where the method has it.
+        gravity_excess: gravity energy above that of linear blend skinning [m g L].
+        kinetic_energy: [J].
+        static_distance: RMS distance to the method's own static state of each pose [m].
+        jerk: RMS jerk over mass and frames [m/s3]; `jerk_ratio`: relative to that of linear blend skinning.
+        stretch_quantiles: 50, 95 and 99 % quantiles and the maximum of the larger principal stretch.
+        reference, pose_novelty, settling, minimum, loop_drift: what else was measured, where the method has it.
     """
 
     clips: int
@@ -133,14 +140,14 @@ class Figures:
     terms: dict[str, float]
     collisions: float
     clip_totals: tuple[float, float, float]
-    lift: float
-    kinetic: float
-    motion: float | None
-    jitter: float
-    jitter_of_lbs: float
-    stretches: tuple[float, ...]
-    truth: Against | None = None
-    poses: PoseNovelty | None = None
-    holds: Holds | None = None
-    hung: Hung | None = None
-    loops: Loops | None = None
+    gravity_excess: float
+    kinetic_energy: float
+    static_distance: float | None
+    jerk: float
+    jerk_ratio: float
+    stretch_quantiles: tuple[float, ...]
+    reference: ReferenceErrors | None = None
+    pose_novelty: PoseNovelty | None = None
+    settling: Settling | None = None
+    minimum: MinimumErrors | None = None
+    loop_drift: LoopDrift | None = None

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Everything that dresses a character, behind one call: networks, linear blend skinning, and point caches."""
+"""What can be evaluated, behind one protocol: networks, linear blend skinning, point caches and the simulator."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
@@ -13,8 +13,6 @@ import torch
 from torch import Tensor
 
 from ..assets import PINNED, Floats, Scene
-from ..baselines.descriptors import joint_bank
-from ..baselines.networks import Baseline
 from ..collision.body import CollisionBody
 from ..collision.contacts import Contacts
 from ..constants import GRAVITY
@@ -28,24 +26,36 @@ from ..skinning import Skinning
 from .minimum import minima
 from .takes import Take
 
-SAME = 0.02  # [m] that pinned vertices of a point cache may be away from the skeleton of the motion
+PINNED_TOLERANCE = 0.02  # [m], of pinned vertices of a point cache
 
 Reader = Callable[[str, range], Floats]
 """Returns the points of frames of a clip in the world [m], shape (frames, V, 3)."""
 
 
 class Method(Protocol):
-    """A garment over takes. Positions are about the root of each take's first frame, as those of a bank are."""
-
-    name: str
+    """A garment over takes. Positions are relative to the root of each take's first frame, as in a motion bank."""
 
     def vertices(self, take: int, frames: range) -> Tensor:
         """Return positions [m] of consecutive frames of a take, shape (V, 3, N)."""
         ...
 
     def still(self, take: int, frames: range) -> Tensor | None:
-        """Return the method's own quasi-static states of these poses [m], (V, 3, N); None where it has none."""
+        """Return the method's own static states of these poses [m], (V, 3, N); None where it has none."""
         ...
+
+
+@dataclass(frozen=True, eq=False)
+class EvaluatedMethod:
+    """A method under a name.
+
+    Attributes:
+        joints: of the character, which the takes' descriptors are of.
+        on: returns the method over takes.
+    """
+
+    name: str
+    joints: np.ndarray
+    on: Callable[[TakeSet], Method]
 
 
 class EvaluationScene:
@@ -58,7 +68,7 @@ class EvaluationScene:
             around the nearest vertex, as training does.
 
     Attributes:
-        columns: from positions to both columns of all deformation gradients.
+        columns: maps positions to both columns of all deformation gradients.
         weight: m g L, the garment's weight times its height at rest [J].
     """
 
@@ -113,8 +123,8 @@ class TakeSet:
         return torch.as_tensor(local.transpose(1, 2, 0).copy(), dtype=torch.float32, device=self.bank.root.device)
 
 
-def reel_of(takes: Sequence[Take], dressed: EvaluationScene, joints: np.ndarray) -> TakeSet:
-    """Return takes with what networks that have these joints in view see of them.
+def build_take_set(takes: Sequence[Take], dressed: EvaluationScene, joints: np.ndarray) -> TakeSet:
+    """Return takes with their descriptors of these joints.
 
     Raises:
         SsilkError: there is no take.
@@ -128,11 +138,11 @@ def reel_of(takes: Sequence[Take], dressed: EvaluationScene, joints: np.ndarray)
 
 
 class Network:
-    """A trained model or a baseline, rolled over all takes side by side, each from its quasi-static start."""
+    """A recurrent network, rolled over all takes in one batch, each from its static state."""
 
-    def __init__(self, name: str, model: LatentModel, reel: TakeSet) -> None:
-        self.name, self.model, self.reel = name, model, _seen_by(model, reel)
-        bank = self.reel.bank
+    def __init__(self, model: LatentModel, take_set: TakeSet) -> None:
+        self.model, self.take_set = model, take_set
+        bank = self.take_set.bank
         self.down = torch.tensor([0.0, -1.0, 0.0], device=bank.root.device)
         clips = [range(int(start), int(stop)) for start, stop in zip(bank.starts, bank.stops)]
         self.states = roll_states(model, bank, clips, self.down)
@@ -140,71 +150,60 @@ class Network:
     @torch.no_grad()
     def vertices(self, take: int, frames: range) -> Tensor:
         states = self.states[take][frames.start : frames.stop]
-        return self.model.vertices(states, self.reel.character(take, frames))
+        return self.model.vertices(states, self.take_set.character(take, frames))
 
     @torch.no_grad()
     def still(self, take: int, frames: range) -> Tensor:
-        bank, index = self.reel.bank, self.reel.frames(take, frames)
+        bank, index = self.take_set.bank, self.take_set.frames(take, frames)
         quiet = self.model.initial(bank.static_descriptor(index, self.down.expand(len(index), 3)))
-        return self.model.vertices(quiet, self.reel.character(take, frames))
+        return self.model.vertices(quiet, self.take_set.character(take, frames))
 
 
-def _seen_by(model: LatentModel, reel: TakeSet) -> TakeSet:
-    """Return a reel with the descriptors of a network."""
-    if not isinstance(model, Baseline):
-        return reel
-    parents = model.scene.character.skeleton.parents[model.joints]
-    inner = torch.as_tensor(parents >= 0, device=reel.bank.root.device)
-    return replace(reel, bank=joint_bank(reel.bank, inner, model.config.fps))
+class LinearBlendSkinning:
+    """The LBS baseline."""
 
-
-class Plain:
-    """Linear blend skinning."""
-
-    name = "LBS"
-
-    def __init__(self, dressed: EvaluationScene, reel: TakeSet) -> None:
-        self.dressed, self.reel = dressed, reel
+    def __init__(self, dressed: EvaluationScene, take_set: TakeSet) -> None:
+        self.dressed, self.take_set = dressed, take_set
 
     def vertices(self, take: int, frames: range) -> Tensor:
-        return self.dressed.lbs(self.reel.character(take, frames))
+        return self.dressed.lbs(self.take_set.character(take, frames))
 
     def still(self, take: int, frames: range) -> None:
         return None
 
 
 class CachedPoints:
-    """Points that were written frame by frame, by a simulator or by anything else.
+    """Points from files, written by a simulator or by anything else.
 
     Args:
         read: gives the points of a clip at the rate of the takes.
     """
 
-    def __init__(self, name: str, read: Reader, dressed: EvaluationScene, reel: TakeSet) -> None:
-        self.name, self.read, self.dressed, self.reel = name, read, dressed, reel
+    def __init__(self, read: Reader, dressed: EvaluationScene, take_set: TakeSet) -> None:
+        self.read, self.dressed, self.take_set = read, dressed, take_set
         self.pinned = torch.as_tensor((dressed.scene.classes == PINNED).nonzero()[0], device=dressed.device)
 
     def vertices(self, take: int, frames: range) -> Tensor:
-        """Return positions as above.
+        """Return positions as `Method.vertices` does.
 
         Raises:
-            SsilkError: pinned vertices are not where the skeleton has them: it is another motion.
+            SsilkError: pinned vertices are not where the skeleton puts them, because the cache is of another motion.
         """
-        played = self.reel.takes[take]
+        played = self.take_set.takes[take]
         points = self.read(played.clip, range(played.first + frames.start, played.first + frames.stop))
-        x = self.reel.local(take, points)
+        x = self.take_set.local(take, points)
         self._check(x, take, frames)
         return x
 
     def _check(self, x: Tensor, take: int, frames: range) -> None:
-        lbs = self.dressed.lbs(self.reel.character(take, frames))
+        lbs = self.dressed.lbs(self.take_set.character(take, frames))
         away = (x - lbs)[self.pinned].norm(dim=1)
         far = float(away.max()) if away.numel() else 0.0
-        if not far < SAME:
+        if not far < PINNED_TOLERANCE:
             fail(
-                self.reel.takes[take].clip,
-                f"in the point cache, pinned vertices are {far:.3g} m from where this motion has them",
-                f"{SAME:g} m are allowed",
+                self.take_set.takes[take].clip,
+                f"in the point cache, pinned vertices are {far:.3g} m from where this motion puts them",
+                f"{PINNED_TOLERANCE:g} m are allowed",
                 "simulate this motion on this character",
             )
 
@@ -213,19 +212,19 @@ class CachedPoints:
 
 
 class Simulated:
-    """The reference simulator itself, over all takes side by side."""
+    """The reference simulator itself, over all takes in one batch."""
 
-    def __init__(self, name: str, dressed: EvaluationScene, reel: TakeSet) -> None:
-        self.name, self.dressed, self.reel = name, dressed, reel
-        scene, motions = dressed.scene, [take.motion for take in reel.takes]
+    def __init__(self, dressed: EvaluationScene, take_set: TakeSet) -> None:
+        self.dressed, self.take_set = dressed, take_set
+        scene, motions = dressed.scene, [take.motion for take in take_set.takes]
         options, device = dressed.simulator.options, dressed.device
         self.points = simulate(scene, dressed.fabric, motions, options, device=device)
 
     def vertices(self, take: int, frames: range) -> Tensor:
-        return self.reel.local(take, self.points[take][frames.start : frames.stop])
+        return self.take_set.local(take, self.points[take][frames.start : frames.stop])
 
     def still(self, take: int, frames: range) -> Tensor:
-        motion = self.reel.takes[take].motion
+        motion = self.take_set.takes[take].motion
         ends = [Take("", 0, motion.clip(0, frame + 1)) for frame in frames]
         found = minima(self.dressed.simulator, ends, self.vertices(take, frames))
         origin = torch.as_tensor(motion.translations[0, 0].copy(), device=self.dressed.device)

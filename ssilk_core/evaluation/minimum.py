@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where cloth in held poses would be at rest: minima of its static energy, found without any network."""
+"""Minima of the static energy of cloth in held poses, found without any network."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..simulate import Simulator
 from ..simulate.characters import PosedCharacters
-from .figures import Hung
+from .figures import MinimumErrors
 from .metrics import mean_square
 from .takes import Take
 
@@ -21,12 +21,12 @@ from .takes import Take
 class Minima:
     """Minima of the static energy in N poses; positions (V, 3, N) [m] are about the roots.
 
-    A garment hangs with many folds, each a minimum. These are the ones that searches from `start` lead to.
+    A garment has many minima, one for each set of folds. These are the ones that searches from `start` reach.
 
     Attributes:
         start: where the searches began.
         x: the minima.
-        residual: what the solver left out of balance [g], shape (N,).
+        residual: of the solver [g], shape (N,).
     """
 
     simulator: Simulator
@@ -35,16 +35,16 @@ class Minima:
     x: Tensor
     residual: Tensor
 
-    def over(self) -> Tensor:
-        """Return the energy of the starts over that of the minima [J], shape (N,)."""
+    def energy_excess(self) -> Tensor:
+        """Return the static energy of the starts above that of the minima [J], shape (N,)."""
         potential, inputs = self.simulator.potential, self.simulator.inputs(self.poses, None)
         start, lowest = (
             potential.energy(x, inputs, potential.body_distance(x, inputs)) for x in (self.start, self.x)
         )
         return start - lowest
 
-    def floats(self, x: Tensor) -> Tensor:
-        """Return how much more gravity has to gain from x than from the minima [J], shape (N,)."""
+    def gravity_excess(self, x: Tensor) -> Tensor:
+        """Return the gravity energy of x (V, 3, N) above that of the minima [J], shape (N,)."""
         return (self.simulator.potential.mass * ((self.x - x) * self.simulator.gravity).sum(1)).sum(0)
 
     def inside(self, x: Tensor) -> Tensor:
@@ -72,9 +72,9 @@ def minima(simulator: Simulator, takes: Sequence[Take], x: Tensor) -> Minima:
     return Minima(simulator, poses, start, found.x, found.residual)
 
 
-def hung(found: Minima, weight: float) -> list[Hung]:
+def minimum_errors(found: Minima, weight: float) -> list[MinimumErrors]:
     """Return the figures of each pose, for a garment of m g L [J]."""
-    floats, lbs = (found.floats(x) / weight for x in (found.start, found.poses.lbs))
-    columns = (found.over(), floats, lbs, found.distance(), found.residual)
-    names = ("above", "floats", "lbs", "distance", "residual")
-    return [Hung(stops=1, **dict(zip(names, row))) for row in torch.stack(columns, dim=1).tolist()]
+    garment, lbs = (found.gravity_excess(x) / weight for x in (found.start, found.poses.lbs))
+    columns = (found.energy_excess(), garment, lbs, found.distance(), found.residual)
+    names = ("static_energy_excess", "gravity_excess", "lbs_gravity_excess", "minimum_distance", "max_residual")
+    return [MinimumErrors(stops=1, **dict(zip(names, row))) for row in torch.stack(columns, dim=1).tolist()]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What energies of moving clips hide: whether a garment comes to rest, and whether it drifts."""
+"""Two probes that energies of moving clips do not replace: does a garment come to rest, and does it drift?"""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .figures import Holds, Hung, Loops
+from .figures import LoopDrift, MinimumErrors, Settling
 from .methods import EvaluationScene, Method, TakeSet
 from .metrics import kinetic_energy, mean_square, ratio, settling_time
 from .record import frame_energies
 from .takes import EASE, Take, back_and_forth, stopped
 
-CALM = 0.01  # [m/s], RMS over the mass
+REST_SPEED = 0.01  # [m/s], RMS over the mass
 RUN_UP = 4.0  # [s] that are played before a stop, and of a clip that loops
 LOOPS = 3
 STATIC = ("stretch", "bending", "gravity", "collision")
 
 
-def stops(takes: Sequence[Take], fps: float, count: int, hold: float) -> tuple[list[Take], list[int]]:
+def stopped_takes(takes: Sequence[Take], fps: float, count: int, hold: float) -> tuple[list[Take], list[int]]:
     """Return takes that stop `count` times in each given one, spread evenly, and their first frames at rest."""
     found, first = [], []
     for take in takes:
@@ -37,31 +37,31 @@ def stops(takes: Sequence[Take], fps: float, count: int, hold: float) -> tuple[l
 
 
 @torch.no_grad()
-def held(dressed: EvaluationScene, reel: TakeSet, method: Method, first: Sequence[int]) -> list[Holds]:
-    """Return what happens after each stop; a take of the reel is at rest from its frame `first` on."""
-    return [_held(dressed, reel, method, take, at_rest) for take, at_rest in enumerate(first)]
+def settling(dressed: EvaluationScene, take_set: TakeSet, method: Method, first: Sequence[int]) -> list[Settling]:
+    """Return what happens after each stop; the character of a take holds still from its frame `first` on."""
+    return [_settling(dressed, take_set, method, take, at_rest) for take, at_rest in enumerate(first)]
 
 
-def _held(dressed: EvaluationScene, reel: TakeSet, method: Method, take: int, first: int) -> Holds:
-    count, mass, fps = reel.takes[take].frame_count, dressed.energy.mass, dressed.fps
+def _settling(dressed: EvaluationScene, take_set: TakeSet, method: Method, take: int, first: int) -> Settling:
+    count, mass, fps = take_set.takes[take].frame_count, dressed.energy.mass, dressed.fps
     path = method.vertices(take, range(first, count))
     kinetic = kinetic_energy(path, mass, fps)
-    calm = float(settling_time((2 * kinetic / mass.sum()).sqrt(), CALM, fps))
+    time = float(settling_time((2 * kinetic / mass.sum()).sqrt(), REST_SPEED, fps))
     last = range(count - 1, count)
     x, still = path[..., -1:], method.still(take, last)
     assert still is not None
-    ours, theirs = (frame_energies(dressed, reel, take, last, at) for at in (x, still))
+    ours, theirs = (frame_energies(dressed, take_set, take, last, at) for at in (x, still))
     distance = float(mean_square(x - still, mass)) ** 0.5
-    return Holds(
+    return Settling(
         stops=1,
-        begun=float(kinetic[0]),
-        kinetic=float(kinetic[-1]),
-        settled=float(calm < torch.inf),
-        settling=calm,
-        distance=distance,
-        furthest=distance,
-        above=sum(float(ours[name] - theirs[name]) for name in STATIC),
-        floats=ratio(float(ours["gravity"] - theirs["gravity"]), dressed.weight),
+        initial_kinetic_energy=float(kinetic[0]),
+        final_kinetic_energy=float(kinetic[-1]),
+        settled_share=float(time < torch.inf),
+        settling_time=time,
+        static_distance=distance,
+        max_static_distance=distance,
+        static_energy_excess=sum(float(ours[name] - theirs[name]) for name in STATIC),
+        gravity_excess=ratio(float(ours["gravity"] - theirs["gravity"]), dressed.weight),
     )
 
 
@@ -71,26 +71,35 @@ def last_frames(method: Method, takes: Sequence[Take]) -> Tensor:
     return torch.cat([method.vertices(number, last) for number, last in enumerate(ends)], dim=-1)
 
 
-def joined_holds(single: Sequence[Holds]) -> Holds | None:
+def joined_settling(single: Sequence[Settling]) -> Settling | None:
     """Return the figures of several stops; None of none."""
     if not single:
         return None
     columns = _columns(single)
-    middle = columns["settling"].sort().values[(len(single) - 1) // 2]
-    changed = {"stops": len(single), "settling": float(middle), "distance": _root_mean_square(columns["distance"])}
-    return replace(single[0], **_means(columns) | changed | {"furthest": float(columns["distance"].max())})
+    distances = columns["static_distance"]
+    changed = {
+        "stops": len(single),
+        "settling_time": float(columns["settling_time"].sort().values[(len(single) - 1) // 2]),
+        "static_distance": _root_mean_square(distances),
+        "max_static_distance": float(distances.max()),
+    }
+    return replace(single[0], **_means(columns) | changed)
 
 
-def joined_hung(single: Sequence[Hung]) -> Hung | None:
+def joined_minimum_errors(single: Sequence[MinimumErrors]) -> MinimumErrors | None:
     """Return the figures of several stops; None of none."""
     if not single:
         return None
     columns = _columns(single)
-    changed = {"stops": len(single), "distance": _root_mean_square(columns["distance"])}
-    return replace(single[0], **_means(columns) | changed | {"imbalance": float(columns["imbalance"].max())})
+    changed = {
+        "stops": len(single),
+        "minimum_distance": _root_mean_square(columns["minimum_distance"]),
+        "max_residual": float(columns["max_residual"].max()),
+    }
+    return replace(single[0], **_means(columns) | changed)
 
 
-def _columns(figures: Sequence[Holds] | Sequence[Hung] | Sequence[Loops]) -> dict[str, Tensor]:
+def _columns(figures: Sequence[Settling] | Sequence[MinimumErrors] | Sequence[LoopDrift]) -> dict[str, Tensor]:
     """Return each figure of several ones, shape (N,)."""
     names = vars(figures[0])
     return {name: torch.tensor([vars(one)[name] for one in figures], dtype=torch.float64) for name in names}
@@ -104,7 +113,7 @@ def _root_mean_square(values: Tensor) -> float:
     return float(values.square().mean()) ** 0.5
 
 
-def looped(takes: Sequence[Take], fps: float, frames: int) -> tuple[list[Take], list[int]]:
+def looped_takes(takes: Sequence[Take], fps: float, frames: int) -> tuple[list[Take], list[int]]:
     """Return takes whose first seconds loop for at least so many frames and three loops, and the loops' lengths."""
     least = max(frames, LOOPS * round(2 * (RUN_UP + EASE) * fps))
     pairs = [back_and_forth(take.motion.clip(0, round(RUN_UP * fps)), fps, least) for take in takes]
@@ -112,42 +121,45 @@ def looped(takes: Sequence[Take], fps: float, frames: int) -> tuple[list[Take], 
 
 
 @torch.no_grad()
-def drifted(dressed: EvaluationScene, reel: TakeSet, method: Method, lengths: Sequence[int]) -> list[Loops]:
+def loop_drift(
+    dressed: EvaluationScene, take_set: TakeSet, method: Method, lengths: Sequence[int]
+) -> list[LoopDrift]:
     """Return how the last loop of each take differs from its second."""
-    return [_drifted(dressed, reel, method, take, length) for take, length in enumerate(lengths)]
+    return [_loop_drift(dressed, take_set, method, take, length) for take, length in enumerate(lengths)]
 
 
-def _drifted(dressed: EvaluationScene, reel: TakeSet, method: Method, take: int, length: int) -> Loops:
-    count = reel.takes[take].frame_count
+def _loop_drift(dressed: EvaluationScene, take_set: TakeSet, method: Method, take: int, length: int) -> LoopDrift:
+    count = take_set.takes[take].frame_count
     second, last = range(length, 2 * length), range(count - length, count)
     paths = [method.vertices(take, range(loop.start - 2, loop.stop)) for loop in (second, last)]
-    totals = [_total(dressed, reel, take, loop, path) for loop, path in zip((second, last), paths)]
-    drift, apart = totals[1] - totals[0], mean_square(paths[1] - paths[0], dressed.energy.mass)
-    return Loops(
+    totals = [_total(dressed, take_set, take, loop, path) for loop, path in zip((second, last), paths)]
+    drift, distance = totals[1] - totals[0], mean_square(paths[1] - paths[0], dressed.energy.mass)
+    return LoopDrift(
         clips=1,
         frames=count,
-        second=totals[0],
-        last=totals[1],
-        drift=drift,
-        most=drift,
-        apart=float(apart.mean()) ** 0.5,
+        second_loop_total=totals[0],
+        last_loop_total=totals[1],
+        total_drift=drift,
+        max_total_drift=drift,
+        loop_distance=float(distance.mean()) ** 0.5,
     )
 
 
-def _total(dressed: EvaluationScene, reel: TakeSet, take: int, frames: range, path: Tensor) -> float:
-    terms = frame_energies(dressed, reel, take, frames, path)
+def _total(dressed: EvaluationScene, take_set: TakeSet, take: int, frames: range, path: Tensor) -> float:
+    terms = frame_energies(dressed, take_set, take, frames, path)
     return sum(float(values.mean()) for name, values in terms.items() if name != "collisions")
 
 
-def joined_loops(single: Sequence[Loops]) -> Loops | None:
+def joined_loop_drift(single: Sequence[LoopDrift]) -> LoopDrift | None:
     """Return the figures of several clips; None of none."""
     if not single:
         return None
     columns = _columns(single)
-    drifts = columns["drift"]
+    drifts = columns["total_drift"]
     changed = {
         "clips": len(single),
         "frames": int(columns["frames"].min()),
-        "apart": _root_mean_square(columns["apart"]),
+        "max_total_drift": float(drifts[drifts.abs().argmax()]),
+        "loop_distance": _root_mean_square(columns["loop_distance"]),
     }
-    return replace(single[0], **_means(columns) | changed | {"most": float(drifts[drifts.abs().argmax()])})
+    return replace(single[0], **_means(columns) | changed)

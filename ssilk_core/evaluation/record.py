@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is measured of every frame of a take, in blocks, so that takes may be of any length."""
+"""Measures every frame of a take, in blocks, so that takes may be of any length."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .methods import EvaluationScene, Method, TakeSet
 from .metrics import BINS, derivative, kinetic_energy, mean_square, principal_stretches, stretch_histogram
 
 PAST = 3  # frames that a third difference looks back on
-TRUTH = ("position", "velocity", "acceleration")  # differences from another method, by order of the derivative
+ERRORS = ("position error", "velocity error", "acceleration error")  # by order of the derivative
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,9 +21,9 @@ class TakeRecord:
     """One method over one take.
 
     Attributes:
-        values: for each frame, float64 on the CPU, shape (N,): the frame_energies of `energy.frames.energy_terms`,
-            "kinetic" energy [J], "jerk" squared, "largest stretch", "motion" squared [m2] away from the method's own
-            quasi-static state, and squared errors of `TRUTH`. NaN where the take has no past to tell it from.
+        values: for each frame, float64 on the CPU, shape (N,): the terms of `energy.frames.energy_terms` [J],
+            "kinetic energy" [J], "largest stretch", and mean squares of "jerk", of "static distance", that to the
+            method's own static state, and of `ERRORS`. NaN where a take has too short a past.
         stretches: histogram of the larger principal stretch of all triangles.
     """
 
@@ -33,12 +33,12 @@ class TakeRecord:
 
 @torch.no_grad()
 def recorded(
-    dressed: EvaluationScene, reel: TakeSet, method: Method, take: int, truth: Method | None = None
+    dressed: EvaluationScene, take_set: TakeSet, method: Method, take: int, reference: Method | None = None
 ) -> TakeRecord:
-    """Measure a method over a take, beside `truth` where there is one."""
+    """Measure a method over a take, and its errors where there is a `reference`."""
     parts, stretches = [], torch.zeros(BINS, dtype=torch.float64)
-    ours, theirs = _Past(method, take), _Past(truth, take) if truth else None
-    count = reel.takes[take].frame_count
+    ours, theirs = _Past(method, take), _Past(reference, take) if reference else None
+    count = take_set.takes[take].frame_count
     for start in range(0, count, FRAMES_PER_CHUNK):
         frames = range(start, min(start + FRAMES_PER_CHUNK, count))
         path, still = ours.joined(frames), method.still(take, frames)
@@ -46,10 +46,10 @@ def recorded(
         stretch = principal_stretches(dressed.columns(x))[0]
         stretches += stretch_histogram(stretch)
         values = {
-            **frame_energies(dressed, reel, take, frames, path),
+            **frame_energies(dressed, take_set, take, frames, path),
             **_moving(dressed, path, len(frames)),
             "largest stretch": stretch.amax(0),
-            **({} if still is None else {"motion": mean_square(x - still, dressed.energy.mass)}),
+            **({} if still is None else {"static distance": mean_square(x - still, dressed.energy.mass)}),
             **({} if theirs is None else _errors(dressed, path - theirs.joined(frames), len(frames))),
         }
         parts.append({name: value.double().cpu() for name, value in values.items()})
@@ -57,10 +57,10 @@ def recorded(
 
 
 def frame_energies(
-    dressed: EvaluationScene, reel: TakeSet, take: int, frames: range, path: Tensor
+    dressed: EvaluationScene, take_set: TakeSet, take: int, frames: range, path: Tensor
 ) -> dict[str, Tensor]:
     """Return `energy.frames.energy_terms` of the last frames of a path (V, 3, past + N), shape (N,)."""
-    x, character = path[..., -len(frames) :], reel.character(take, frames)
+    x, character = path[..., -len(frames) :], take_set.character(take, frames)
     body, joined = dressed.body.pose(character, exact=dressed.exact), path[..., -len(frames) - 2 :]
     down = x.new_tensor([0.0, -1.0, 0.0])
     return energy_terms(dressed.energy, x, dressed.lbs(character), dressed.contacts, body, joined, dressed.fps, down)
@@ -82,14 +82,14 @@ class _Past:
 def _moving(dressed: EvaluationScene, path: Tensor, count: int) -> dict[str, Tensor]:
     mass, fps = dressed.energy.mass, dressed.fps
     return {
-        "kinetic": _last(kinetic_energy(path, mass, fps), count),
+        "kinetic energy": _last(kinetic_energy(path, mass, fps), count),
         "jerk": _last(mean_square(derivative(path, 3, fps), mass), count),
     }
 
 
 def _errors(dressed: EvaluationScene, away: Tensor, count: int) -> dict[str, Tensor]:
     mass, fps = dressed.energy.mass, dressed.fps
-    orders = {name: derivative(away, order, fps) for order, name in enumerate(TRUTH)}
+    orders = {name: derivative(away, order, fps) for order, name in enumerate(ERRORS)}
     return {name: _last(mean_square(vectors, mass), count) for name, vectors in orders.items()}
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,24 +15,43 @@ from torch import Tensor
 from ..assets import Motion
 from ..errors import fail
 from ..events import Progress, Reporter, silent
-from ..motion_bank import LatentModel, MotionBank, build_bank
-from .figures import Figures, Holds, Hung, Loops
-from .methods import CachedPoints, EvaluationScene, Method, Network, Plain, Reader, Simulated, TakeSet, reel_of
+from ..motion_bank import MotionBank, build_bank
+from .figures import Figures, LoopDrift, MinimumErrors, Settling
+from .methods import (
+    CachedPoints,
+    EvaluatedMethod,
+    EvaluationScene,
+    LinearBlendSkinning,
+    Method,
+    Reader,
+    Simulated,
+    TakeSet,
+    build_take_set,
+)
 from .metrics import pose_distance
-from .minimum import hung, minima
-from .probes import drifted, held, joined_holds, joined_hung, joined_loops, last_frames, looped, stops
+from .minimum import minima, minimum_errors
+from .probes import (
+    joined_loop_drift,
+    joined_minimum_errors,
+    joined_settling,
+    last_frames,
+    loop_drift,
+    looped_takes,
+    settling,
+    stopped_takes,
+)
 from .record import recorded
 from .takes import takes_of
-from .tally import Tally, against, figures, poses, takes_in
+from .tally import Tally, figures, pose_novelty, reference_errors, takes_in
 
 SIMULATOR = "simulator"
-Stop = tuple[str, Holds, Hung | None]
-"""The clip of a stop, with what happened after it."""
+Stop = tuple[str, Settling, MinimumErrors | None]
+"""The clip of a stop, and what was measured after it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationOptions:
-    """What is measured beside the energies.
+    """What is measured besides the energies.
 
     Attributes:
         sequence: frames after which a clip starts anew, as in the paper (512); None for whole clips.
@@ -61,23 +81,15 @@ class EvaluationOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class EvaluatedModel:
-    """A network under a name, and the character's joints that it has in view."""
-
-    name: str
-    model: LatentModel
-    joints: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
 class EvaluationClips:
     """What is played.
 
     Attributes:
         clips: motions by name.
         splits: names of clips by split; a clip may be in several.
-        simulated: clips that the reference simulator has played, with `read` to get its points at the models' rate.
-        seen: motions that networks were trained on; none where that is not known.
+        simulated: clips that there are shots of the reference simulator of; `read` returns its points at the
+            methods' rate.
+        seen: training motions; none where they are not known.
     """
 
     clips: Mapping[str, Motion]
@@ -99,31 +111,30 @@ class ResultRow:
 
 def evaluate(
     dressed: EvaluationScene,
-    subjects: Sequence[EvaluatedModel],
+    methods: Sequence[EvaluatedMethod],
     playlist: EvaluationClips,
     options: EvaluationOptions | None = None,
     report: Reporter = silent,
 ) -> Iterator[ResultRow]:
-    """Yield the figures of linear blend skinning, of the simulator where it has played, and of each network, by
-    split.
+    """Yield the figures of linear blend skinning, of the simulator where it has played, and of each method, by split.
 
     Raises:
         SsilkError: no clip has four frames, or a point cache is not of its clip.
     """
-    run = _Run(dressed, subjects, playlist, options or EvaluationOptions(), report)
+    run = _Run(dressed, methods, playlist, options or EvaluationOptions(), report)
     yield from run.rows(run.lbs, "LBS")
-    yield from run.truth_rows()
-    for subject in subjects:
-        yield from run.network_rows(subject)
+    yield from run.simulator_rows()
+    for method in methods:
+        yield from run.method_rows(method)
 
 
 class _Run:
-    """Takes of all clips, with the records of linear blend skinning and of the simulator on them."""
+    """Takes of all clips, with the records of linear blend skinning and of the simulator."""
 
     def __init__(
         self,
         dressed: EvaluationScene,
-        subjects: Sequence[EvaluatedModel],
+        methods: Sequence[EvaluatedMethod],
         playlist: EvaluationClips,
         options: EvaluationOptions,
         report: Reporter,
@@ -133,20 +144,20 @@ class _Run:
         self.takes = [take for takes in cut for take in takes]
         self.clips = {number: take.clip for number, take in enumerate(self.takes)}
         self.simulated = takes_in(self.clips, playlist.simulated)
-        self.done, self.total = 0, len(self.takes) * (len(subjects) + 1) + len(self.simulated)
-        self.joints = subjects[0].joints
-        reel = reel_of(self.takes, dressed, self.joints)
+        self.done, self.total = 0, len(self.takes) * (len(methods) + 1) + len(self.simulated)
+        self.joints = methods[0].joints
+        take_set = build_take_set(self.takes, dressed, self.joints)
         read = playlist.read
-        self.cache = CachedPoints(SIMULATOR, read, dressed, reel) if read else None
-        self.truth = self._tally(reel, self.cache, self.simulated) if self.cache else Tally({}, self.clips)
-        self.lbs = self._tally(reel, Plain(dressed, reel), list(self.clips))
+        self.cache = CachedPoints(read, dressed, take_set) if read else None
+        self.simulator = self._tally(take_set, self.cache, self.simulated) if self.cache else Tally({}, self.clips)
+        self.lbs = self._tally(take_set, LinearBlendSkinning(dressed, take_set), list(self.clips))
 
-    def _tally(self, reel: TakeSet, method: Method, takes: Sequence[int]) -> Tally:
-        """Measure a method over takes, beside the simulator where that has played."""
+    def _tally(self, take_set: TakeSet, method: Method, takes: Sequence[int]) -> Tally:
+        """Measure a method over takes, with its errors where the simulator has played."""
         records = {}
         for take in takes:
-            truth = self.cache if take in self.simulated and method is not self.cache else None
-            records[take] = recorded(self.dressed, reel, method, take, truth)
+            reference = self.cache if take in self.simulated and method is not self.cache else None
+            records[take] = recorded(self.dressed, take_set, method, take, reference)
             self.done += 1
             self.report(Progress(self.done, self.total))
         return Tally(records, self.clips)
@@ -161,69 +172,69 @@ class _Run:
     def _figures(self, tally: Tally) -> Figures:
         takes, weight = list(tally.records), self.dressed.weight
         found = figures(tally, self.lbs.only(takes), weight)
-        return replace(found, truth=against(tally, self.truth.only(takes), weight))
+        return replace(found, reference=reference_errors(tally, self.simulator.only(takes), weight))
 
-    def truth_rows(self) -> Iterator[ResultRow]:
+    def simulator_rows(self) -> Iterator[ResultRow]:
         """Yield the figures of the simulator."""
-        wanted = self.options.simulate and self.options.stops and self.truth.records
-        stopped = self._stopped(self.joints, lambda reel: Simulated(SIMULATOR, self.dressed, reel)) if wanted else []
-        for row in self.rows(self.truth, SIMULATOR):
+        wanted = self.options.simulate and self.options.stops and self.simulator.records
+        stopped = self._stopped(self.joints, partial(Simulated, self.dressed)) if wanted else []
+        for row in self.rows(self.simulator, SIMULATOR):
             yield replace(row, figures=replace(row.figures, **self._rested(stopped, row.split)))
 
-    def network_rows(self, subject: EvaluatedModel) -> Iterator[ResultRow]:
-        """Yield the figures of a network."""
-        reel = reel_of(self.takes, self.dressed, subject.joints)
-        tally = self._tally(reel, Network(subject.name, subject.model, reel), list(self.clips))
-        far, loops = self._distances(reel, subject), self._loops(subject)
-        stopped = self._stopped(subject.joints, lambda reel: Network(subject.name, subject.model, reel))
-        for row in self.rows(tally, subject.name):
+    def method_rows(self, method: EvaluatedMethod) -> Iterator[ResultRow]:
+        """Yield the figures of a method."""
+        take_set = build_take_set(self.takes, self.dressed, method.joints)
+        tally = self._tally(take_set, method.on(take_set), list(self.clips))
+        distances, loops = self._distances(take_set, method.joints), self._loops(method)
+        stopped = self._stopped(method.joints, method.on)
+        for row in self.rows(tally, method.name):
             names = self.playlist.splits[row.split]
             found = replace(
                 row.figures,
                 **self._rested(stopped, row.split),
-                poses=poses(tally.only(takes_in(self.clips, names)), far) if far else None,
-                loops=joined_loops([loop for clip, loop in loops if clip in names]),
+                pose_novelty=pose_novelty(tally.only(takes_in(self.clips, names)), distances) if distances else None,
+                loop_drift=joined_loop_drift([loop for clip, loop in loops if clip in names]),
             )
             yield replace(row, figures=found)
 
-    def _distances(self, reel: TakeSet, subject: EvaluatedModel) -> dict[int, Tensor]:
-        """Return how far the poses of each take are from those seen in training [rad], (N,); empty if not known."""
+    def _distances(self, take_set: TakeSet, joints: np.ndarray) -> dict[int, Tensor]:
+        """Return the distances of each take's poses from the training's [rad], (N,); empty if those are not known."""
         if not self.playlist.seen:
             return {}
         skeleton, device = self.dressed.scene.character.skeleton, self.dressed.device
-        seen = build_bank(self.playlist.seen, skeleton, subject.joints, self.dressed.fps, device)
-        far = pose_distance(_upright(reel.bank), _upright(seen), len(subject.joints))
-        return dict(enumerate(far.split((reel.bank.stops - reel.bank.starts).tolist())))
+        seen = build_bank(self.playlist.seen, skeleton, joints, self.dressed.fps, device)
+        far = pose_distance(_upright(take_set.bank), _upright(seen), len(joints))
+        return dict(enumerate(far.split((take_set.bank.stops - take_set.bank.starts).tolist())))
 
     def _stopped(self, joints: np.ndarray, method_on: Callable[[TakeSet], Method]) -> list[Stop]:
-        """Return what happens after stops, and where that is beside the minimum, with the clip of each."""
+        """Return what was measured after each stop."""
         options, dressed = self.options, self.dressed
-        takes, first = stops(self.takes, dressed.fps, options.stops, options.hold)
+        takes, first = stopped_takes(self.takes, dressed.fps, options.stops, options.hold)
         if not takes:
             return []
-        reel = reel_of(takes, dressed, joints)
-        method = method_on(reel)
-        holds = held(dressed, reel, method, first)
-        rested: Sequence[Hung | None] = [None] * len(takes)
+        take_set = build_take_set(takes, dressed, joints)
+        method = method_on(take_set)
+        settled = settling(dressed, take_set, method, first)
+        rested: Sequence[MinimumErrors | None] = [None] * len(takes)
         if options.minimum:
-            rested = hung(minima(dressed.simulator, takes, last_frames(method, takes)), dressed.weight)
-        return [(take.clip, hold, rest) for take, hold, rest in zip(takes, holds, rested)]
+            rested = minimum_errors(minima(dressed.simulator, takes, last_frames(method, takes)), dressed.weight)
+        return [(take.clip, after, errors) for take, after, errors in zip(takes, settled, rested)]
 
     def _rested(self, stopped: Sequence[Stop], split: str) -> dict[str, Any]:
         """Return the figures of the stops of a split."""
         own = [stop for stop in stopped if stop[0] in self.playlist.splits[split]]
         return {
-            "holds": joined_holds([hold for _, hold, _ in own]),
-            "hung": joined_hung([rest for _, _, rest in own if rest]),
+            "settling": joined_settling([after for _, after, _ in own]),
+            "minimum": joined_minimum_errors([errors for _, _, errors in own if errors]),
         }
 
-    def _loops(self, subject: EvaluatedModel) -> list[tuple[str, Loops]]:
+    def _loops(self, method: EvaluatedMethod) -> list[tuple[str, LoopDrift]]:
         """Return how looped takes drift, with the clip of each."""
         if not self.options.loop:
             return []
-        takes, lengths = looped(self.takes, self.dressed.fps, self.options.loop)
-        reel = reel_of(takes, self.dressed, subject.joints)
-        found = drifted(self.dressed, reel, Network(subject.name, subject.model, reel), lengths)
+        takes, lengths = looped_takes(self.takes, self.dressed.fps, self.options.loop)
+        take_set = build_take_set(takes, self.dressed, method.joints)
+        found = loop_drift(self.dressed, take_set, method.on(take_set), lengths)
         return [(take.clip, loop) for take, loop in zip(takes, found)]
 
 

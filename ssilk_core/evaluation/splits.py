@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which clips belong to which split: an index, a list of {"clip", "split", "tags"}."""
+"""Splits of clips, as an index lists them: {"clip", "split", "tags"}."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The figures of an evaluation as tables for people: aligned, and Markdown at the same time."""
+"""The figures of an evaluation as Markdown tables with aligned columns."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from math import degrees, isfinite
 from typing import Any
 
 from ..energy import TERMS
-from .figures import Against, Figures, Holds, Hung, Loops, PoseNovelty
+from .figures import Figures, LoopDrift, MinimumErrors, PoseNovelty, ReferenceErrors, Settling
 from .run import ResultRow
 
 
 def aligned(header: Sequence[str], rows: Sequence[Sequence[str]], words: int) -> str:
-    """Return a Markdown table with columns of even width, the first ones with words and the others with figures."""
+    """Return a Markdown table with aligned columns; the first `words` ones hold text, the others numbers."""
     widths = [max(map(len, column)) for column in zip(header, *rows)]
 
     def line(cells: Sequence[str]) -> str:
@@ -25,7 +25,7 @@ def aligned(header: Sequence[str], rows: Sequence[Sequence[str]], words: int) ->
 
 
 def tables(rows: Sequence[ResultRow]) -> str:
-    """Return one table for each kind of figures that any row has, the methods of a split together."""
+    """Return a table for each kind of figures that any row has, with the methods of a split side by side."""
     places = {(row.garment, row.split): place for place, row in reversed(list(enumerate(rows)))}
     together = sorted(rows, key=lambda row: places[row.garment, row.split])
     return "\n".join(text for text in (_table(together, *kind) for kind in KINDS) if text)
@@ -43,53 +43,71 @@ def _table(
     return aligned(["garment", "split", "method", *header], lines, 3) if lines else ""
 
 
-ENERGIES = ("frames", "total [J]", *TERMS, "inside the body", "gravity, of m g L", "clips: min / median / max")
-MOVING = ("kinetic [J]", "own motion [mm]", "jitter [m/s3]", "of LBS", "stretch 50 / 95 / 99 / 100 %")
-TRUTH = ("frames", "excess [J]", "simulator [J]", "floats, of m g L", "position [mm]", "velocity [m/s]",
-         "acceleration [m/s2]", "jitter, of its")  # fmt: skip
-HOLDS = ("stops", "kinetic at the stop [J]", "at the end", "settle", "within [s]", "off P, RMS [mm]", "at most",
-         "over P [J]", "floats over P, of m g L")  # fmt: skip
-HUNG = ("stops", "over the minimum [J]", "floats, of m g L", "linear blend skinning floats", "off it, RMS [mm]",
-        "out of balance, at most [g]")  # fmt: skip
-LOOPS = ("clips", "frames", "second loop [J]", "last [J]", "drift [J]", "at most", "apart [mm]")
-POSES = ("from trained poses, mean [deg]", "95 %", "total, nearest half [J]", "furthest tenth [J]")
+ENERGIES = ("frames", "L_tot [J]", *(f"{name} [J]" for name in TERMS), "vertices inside the body [%]",
+            "gravity excess over LBS [% m g L]", "L_tot of a clip, min / median / max [J]")  # fmt: skip
+MOTION = ("kinetic energy [J]", "RMS distance to static state [mm]", "RMS jerk [m/s3]", "RMS jerk / LBS",
+          "larger principal stretch, 50 / 95 / 99 / 100 %")  # fmt: skip
+REFERENCE = ("frames", "L_tot excess over simulator [J]", "simulator L_tot [J]",
+             "gravity excess over simulator [% m g L]", "RMS position error [mm]", "RMS velocity error [m/s]",
+             "RMS acceleration error [m/s2]", "RMS jerk / simulator")  # fmt: skip
+SETTLING = ("stops", "kinetic energy at stop [J]", "kinetic energy at end [J]", "settled stops [%]",
+            "median settling time [s]", "RMS distance to static state [mm]", "its maximum [mm]",
+            "static energy excess over static state [J]", "gravity excess over static state [% m g L]")  # fmt: skip
+MINIMUM = ("stops", "static energy excess over minimum [J]", "gravity excess over minimum [% m g L]",
+           "LBS gravity excess over minimum [% m g L]", "RMS distance to minimum [mm]",
+           "maximum static residual [g]")  # fmt: skip
+LOOP_DRIFT = ("clips", "frames", "L_tot of second loop [J]", "L_tot of last loop [J]", "L_tot drift [J]",
+              "largest L_tot drift [J]", "RMS distance between loops [mm]")  # fmt: skip
+POSE_NOVELTY = ("distance to training poses, mean [deg]", "95th percentile [deg]", "L_tot, nearest half [J]",
+                "L_tot, furthest tenth [J]")  # fmt: skip
 
 
 def _energies(f: Figures) -> list[str]:
     terms = [f"{f.terms[name]:.4g}" for name in TERMS]
     spread = " / ".join(f"{value:.3g}" for value in f.clip_totals)
-    return [str(f.frames), f"{f.total:.4g}", *terms, f"{f.collisions:.2%}", f"{f.lift:+.1%}", spread]
+    return [str(f.frames), f"{f.total:.4g}", *terms, _percent(f.collisions), _signed(f.gravity_excess, 1), spread]
 
 
-def _moving(f: Figures) -> list[str]:
-    motion = "" if f.motion is None else _millimetres(f.motion)
-    stretches = " / ".join(f"{value:.3f}" for value in f.stretches)
-    return [f"{f.kinetic:.3g}", motion, f"{f.jitter:.3g}", f"{f.jitter_of_lbs:.2f}", stretches]
+def _motion(f: Figures) -> list[str]:
+    distance = "" if f.static_distance is None else _millimetres(f.static_distance)
+    stretches = " / ".join(f"{value:.3f}" for value in f.stretch_quantiles)
+    return [f"{f.kinetic_energy:.3g}", distance, f"{f.jerk:.3g}", f"{f.jerk_ratio:.2f}", stretches]
 
 
-def _truth(f: Against) -> list[str]:
-    return [str(f.frames), f"{f.excess:.4g}", f"{f.total:.4g}", f"{f.floats:+.2%}", _millimetres(f.position),
-            f"{f.velocity:.3f}", f"{f.acceleration:.2f}", f"{f.jitter:.2f}"]  # fmt: skip
+def _reference(f: ReferenceErrors) -> list[str]:
+    return [str(f.frames), f"{f.total_excess:.4g}", f"{f.reference_total:.4g}", _signed(f.gravity_excess),
+            _millimetres(f.position_error), f"{f.velocity_error:.3f}", f"{f.acceleration_error:.2f}",
+            f"{f.jerk_ratio:.2f}"]  # fmt: skip
 
 
-def _holds(f: Holds) -> list[str]:
-    settling = f"{f.settling:.2f}" if isfinite(f.settling) else "never"
-    return [str(f.stops), f"{f.begun:.2g}", f"{f.kinetic:.2g}", f"{f.settled:.0%}", settling,
-            _millimetres(f.distance), _millimetres(f.furthest), f"{f.above:.4f}", f"{f.floats:+.2%}"]  # fmt: skip
+def _settling(f: Settling) -> list[str]:
+    time = f"{f.settling_time:.2f}" if isfinite(f.settling_time) else "never"
+    return [str(f.stops), f"{f.initial_kinetic_energy:.2g}", f"{f.final_kinetic_energy:.2g}",
+            _percent(f.settled_share, 0), time, _millimetres(f.static_distance), _millimetres(f.max_static_distance),
+            f"{f.static_energy_excess:.4f}", _signed(f.gravity_excess)]  # fmt: skip
 
 
-def _hung(f: Hung) -> list[str]:
-    return [str(f.stops), f"{f.above:.4f}", f"{f.floats:+.2%}", f"{f.lbs:+.2%}", _millimetres(f.distance),
-            f"{f.imbalance:.1g}"]  # fmt: skip
+def _minimum(f: MinimumErrors) -> list[str]:
+    return [str(f.stops), f"{f.static_energy_excess:.4f}", _signed(f.gravity_excess), _signed(f.lbs_gravity_excess),
+            _millimetres(f.minimum_distance), f"{f.max_residual:.1g}"]  # fmt: skip
 
 
-def _loops(f: Loops) -> list[str]:
-    return [str(f.clips), str(f.frames), f"{f.second:.4g}", f"{f.last:.4g}", f"{f.drift:+.2g}", f"{f.most:+.2g}",
-            _millimetres(f.apart)]  # fmt: skip
+def _loop_drift(f: LoopDrift) -> list[str]:
+    return [str(f.clips), str(f.frames), f"{f.second_loop_total:.4g}", f"{f.last_loop_total:.4g}",
+            f"{f.total_drift:+.2g}", f"{f.max_total_drift:+.2g}", _millimetres(f.loop_distance)]  # fmt: skip
 
 
-def _poses(f: PoseNovelty) -> list[str]:
-    return [f"{degrees(f.mean):.1f}", f"{degrees(f.high):.1f}", f"{f.familiar:.4g}", f"{f.unfamiliar:.4g}"]
+def _pose_novelty(f: PoseNovelty) -> list[str]:
+    angles = [f"{degrees(angle):.1f}" for angle in (f.mean_distance, f.p95_distance)]
+    return [*angles, f"{f.nearest_half_total:.4g}", f"{f.furthest_tenth_total:.4g}"]
+
+
+def _percent(share: float, digits: int = 2) -> str:
+    return f"{100 * share:.{digits}f}"
+
+
+def _signed(share: float, digits: int = 2) -> str:
+    return f"{100 * share:+.{digits}f}"
 
 
 def _millimetres(value: float) -> str:
@@ -98,10 +116,10 @@ def _millimetres(value: float) -> str:
 
 KINDS: tuple[tuple[Callable[[Figures], Any], Sequence[str], Callable[[Any], list[str]]], ...] = (
     (lambda figures: figures, ENERGIES, _energies),
-    (lambda figures: figures.truth, TRUTH, _truth),
-    (lambda figures: figures, MOVING, _moving),
-    (lambda figures: figures.holds, HOLDS, _holds),
-    (lambda figures: figures.hung, HUNG, _hung),
-    (lambda figures: figures.loops, LOOPS, _loops),
-    (lambda figures: figures.poses, POSES, _poses),
+    (lambda figures: figures.reference, REFERENCE, _reference),
+    (lambda figures: figures, MOTION, _motion),
+    (lambda figures: figures.settling, SETTLING, _settling),
+    (lambda figures: figures.minimum, MINIMUM, _minimum),
+    (lambda figures: figures.loop_drift, LOOP_DRIFT, _loop_drift),
+    (lambda figures: figures.pose_novelty, POSE_NOVELTY, _pose_novelty),
 )

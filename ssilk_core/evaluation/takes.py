@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is played: stretches of clips without cuts at a model's rate, and clips that loop or come to a stop."""
+"""Takes: parts of clips without cuts, at a model's rate, and clips that loop or stop."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SHORTEST = 4  # frames; a third difference needs as many
 
 @dataclass(frozen=True, eq=False)
 class Take:
-    """A stretch of a clip without cuts.
+    """A part of a clip without cuts.
 
     Attributes:
         clip: its name.

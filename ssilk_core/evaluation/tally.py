@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From records of takes to the figures of a split."""
+"""Averages records of takes to the figures of a split."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from ..energy import TERMS
-from .figures import Against, Figures, PoseNovelty
+from .figures import Figures, PoseNovelty, ReferenceErrors
 from .metrics import histogram_quantiles, ratio
-from .record import TRUTH, TakeRecord
+from .record import ERRORS, TakeRecord
 
 SHARES = (0.5, 0.95, 0.99)  # of triangles and frames, below which quantiles of stretch lie
-NEAR, FAR = 0.5, 0.9  # quantiles up to which poses count as familiar, and from which as unfamiliar
+NEAREST, FURTHEST = 0.5, 0.9  # quantiles of pose distance below and above which totals are averaged
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,15 +58,15 @@ def takes_in(clips: Mapping[int, str], names: Collection[str]) -> list[int]:
 
 
 def figures(tally: Tally, lbs: Tally, weight: float) -> Figures:
-    """Return what a method comes to.
+    """Return the figures of a method.
 
     Args:
         lbs: linear blend skinning on the same takes.
         weight: m g L of the garment [J].
     """
-    jitter = tally.root("jerk")
+    jerk = tally.root("jerk")
     stretches = sum((record.stretches for record in tally.records.values()), torch.zeros(()))
-    has_still = "motion" in next(iter(tally.records.values())).values
+    has_static_state = "static distance" in next(iter(tally.records.values())).values
     return Figures(
         clips=len({tally.clips[take] for take in tally.records}),
         frames=len(tally.totals()),
@@ -74,43 +74,43 @@ def figures(tally: Tally, lbs: Tally, weight: float) -> Figures:
         terms={name: tally.mean(name) for name in TERMS},
         collisions=tally.mean("collisions"),
         clip_totals=tally.clip_totals(),
-        lift=ratio(tally.mean("gravity"), weight),
-        kinetic=tally.mean("kinetic"),
-        motion=tally.root("motion") if has_still else None,
-        jitter=jitter,
-        jitter_of_lbs=ratio(jitter, lbs.root("jerk")),
-        stretches=(*histogram_quantiles(stretches, SHARES), float(tally.each("largest stretch").max())),
+        gravity_excess=ratio(tally.mean("gravity"), weight),
+        kinetic_energy=tally.mean("kinetic energy"),
+        static_distance=tally.root("static distance") if has_static_state else None,
+        jerk=jerk,
+        jerk_ratio=ratio(jerk, lbs.root("jerk")),
+        stretch_quantiles=(*histogram_quantiles(stretches, SHARES), float(tally.each("largest stretch").max())),
     )
 
 
-def against(tally: Tally, truth: Tally, weight: float) -> Against | None:
-    """Return how a method compares with the simulator, on the takes that it has; None where it has none of them."""
-    ours = tally.only(list(truth.records))
-    if not ours.records or "position" not in next(iter(ours.records.values())).values:
+def reference_errors(tally: Tally, reference: Tally, weight: float) -> ReferenceErrors | None:
+    """Compare a method with the simulator on the takes that both have; None where there are none."""
+    ours = tally.only(list(reference.records))
+    if not ours.records or ERRORS[0] not in next(iter(ours.records.values())).values:
         return None
-    theirs = truth.only(list(ours.records))
+    theirs = reference.only(list(ours.records))
     total = float(theirs.totals().mean())
-    position, velocity, acceleration = (ours.root(name) for name in TRUTH)
-    return Against(
+    position, velocity, acceleration = (ours.root(name) for name in ERRORS)
+    return ReferenceErrors(
         frames=len(ours.totals()),
-        total=total,
-        excess=float(ours.totals().mean()) - total,
-        floats=ratio(ours.mean("gravity") - theirs.mean("gravity"), weight),
-        position=position,
-        velocity=velocity,
-        acceleration=acceleration,
-        jitter=ratio(ours.root("jerk"), theirs.root("jerk")),
+        reference_total=total,
+        total_excess=float(ours.totals().mean()) - total,
+        gravity_excess=ratio(ours.mean("gravity") - theirs.mean("gravity"), weight),
+        position_error=position,
+        velocity_error=velocity,
+        acceleration_error=acceleration,
+        jerk_ratio=ratio(ours.root("jerk"), theirs.root("jerk")),
     )
 
 
-def poses(tally: Tally, distances: Mapping[int, Tensor]) -> PoseNovelty:
-    """Return what the distance of poses from those trained on [rad], by take (N,), does to a method."""
-    far = torch.cat([distances[take] for take in tally.records]).double().cpu()
+def pose_novelty(tally: Tally, distances: Mapping[int, Tensor]) -> PoseNovelty:
+    """Relate a method's totals to the distances of poses from the training's [rad], by take (N,)."""
+    distance = torch.cat([distances[take] for take in tally.records]).double().cpu()
     totals = tally.totals()
-    near, high = (far.quantile(share) for share in (NEAR, FAR))
+    near, far = (distance.quantile(share) for share in (NEAREST, FURTHEST))
     return PoseNovelty(
-        mean=float(far.mean()),
-        high=float(far.quantile(0.95)),
-        familiar=float(totals[far <= near].mean()),
-        unfamiliar=float(totals[far >= high].mean()),
+        mean_distance=float(distance.mean()),
+        p95_distance=float(distance.quantile(0.95)),
+        nearest_half_total=float(totals[distance <= near].mean()),
+        furthest_tenth_total=float(totals[distance >= far].mean()),
     )

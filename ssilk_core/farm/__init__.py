@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bakes in bulk: which garment in which shot, what is done already, and how farms are told of it."""
+"""Bakes in bulk: jobs as files, job bundles of Open Job Description, workers, and Ray clusters."""

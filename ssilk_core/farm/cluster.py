@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tasks of a job on a Python cluster: Ray starts them, and starts those anew whose worker died."""
+"""The tasks of a job on a Ray cluster, which restarts a task when its worker dies."""
 
 from __future__ import annotations
 
@@ -7,45 +7,46 @@ import logging
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
+from ..bake import BakeResult, BakeTask, LayerFolder
 from ..errors import SsilkError, fail
-from .tasks import BakeTask
 
-Bake = Callable[[BakeTask, Path], dict[str, object]]
+BakeFunction = Callable[[BakeTask, Path], BakeResult]
 RETRIES = 10  # of a task whose worker died
 
 
 @dataclass(frozen=True)
 class TaskOutcome:
-    """How a task ended: `detail` as the bake says it, or what was wrong."""
+    """How a task ended: with a result, or with what was wrong."""
 
     task: BakeTask
-    detail: dict[str, object]
+    result: BakeResult | None = None
     error: str = ""
 
 
 def run_on_cluster(
     tasks: Sequence[BakeTask],
     folder: Path,
-    bake: Bake,
+    bake: BakeFunction,
     *,
     address: str | None = None,
     cores: int | None = None,
     gpu: bool = False,
 ) -> Iterator[TaskOutcome]:
-    """Yield the outcome of each task as it ends, on a cluster that is there or on the cores of this machine.
+    """Yield the outcome of each task as it ends, on an existing cluster or on the cores of this machine.
 
     Args:
-        bake: what a worker does, a function of a module that workers can import.
-        address: of the cluster, "auto" for the one that this machine is in; None starts one here.
-        cores: how many of this machine's, where a cluster is started here; None for all.
+        bake: what a worker does (`bake_here`), a function of a module that workers can import.
+        address: of the cluster; "auto" for the one that this machine is in; None starts one on this machine.
+        cores: of this machine, for a cluster that is started here; None for all.
         gpu: each task needs a GPU.
 
     Raises:
         SsilkError: there is no such cluster.
     """
-    os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", ".")  # Ray's own words went to standard output, among events
+    os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", ".")  # or Ray writes to standard output, among events
     import ray
     from ray.exceptions import RayError
 
@@ -63,13 +64,23 @@ def run_on_cluster(
             try:
                 yield ray.get(done)
             except RayError as error:
-                yield TaskOutcome(task, {}, f"its workers died ({str(error).splitlines()[0]})")
+                yield TaskOutcome(task, error=f"its workers died ({str(error).splitlines()[0]})")
     finally:
         ray.shutdown()
 
 
-def _outcome(bake: Bake, task: BakeTask, folder: Path) -> TaskOutcome:
+def _outcome(bake: BakeFunction, task: BakeTask, folder: Path) -> TaskOutcome:
     try:
         return TaskOutcome(task, bake(task, folder))
     except SsilkError as error:
-        return TaskOutcome(task, {}, str(error))
+        return TaskOutcome(task, error=str(error))
+
+
+def bake_here(task: BakeTask, folder: Path) -> BakeResult:
+    """Bake a task in this process, which keeps the garment of its last task."""
+    return _layer_folder(folder).bake(task)
+
+
+@lru_cache(maxsize=1)
+def _layer_folder(folder: Path) -> LayerFolder:
+    return LayerFolder(folder)

@@ -11,10 +11,10 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 from .. import __version__
-from ..errors import fail
+from ..bake import BakeTask
+from ..bake.plain import from_plain
+from ..errors import SsilkError, fail
 from ..files import replacing
-from .record import INPUTS
-from .tasks import BakeTask
 
 NAME = "job.json"
 
@@ -30,7 +30,7 @@ def read_job(path: str | Path, mapping: str | Path | None = None) -> list[BakeTa
     """Return the tasks of a job.
 
     Args:
-        mapping: a file with Open Job Description's rules for where paths of another machine lie on this one.
+        mapping: a file with Open Job Description's rules for where another machine's paths lie on this one.
 
     Raises:
         SsilkError: a file is missing or damaged.
@@ -38,11 +38,9 @@ def read_job(path: str | Path, mapping: str | Path | None = None) -> list[BakeTa
     document = _json(Path(path), "a file written by 'ssilk farm' is needed")
     rules = _json(Path(mapping), "path mapping rules are needed").get("path_mapping_rules", []) if mapping else []
     try:
-        tasks = [BakeTask(**entry) for entry in document["tasks"]]
-        for task in tasks:
-            _check_types(task)
+        tasks = [_checked(from_plain(BakeTask, entry)) for entry in document["tasks"]]
         return [_mapped(task, rules) for task in tasks]
-    except (KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, AttributeError, SsilkError) as error:
         fail(str(path), f"it is no job ({type(error).__name__}: {error})", "a file written by 'ssilk farm' is needed")
 
 
@@ -58,21 +56,16 @@ def _json(path: Path, allowed: str) -> dict[str, Any]:
     return document
 
 
-def _check_types(task: BakeTask) -> None:
-    """Raise `TypeError` unless all values have the types that were written."""
-    like = BakeTask(garment="", shot="", model="", stage="", motion="")
-    for name, value in vars(task).items():
-        allowed = {"fps": (int, float, type(None)), "root": (str, type(None))}.get(name, (type(getattr(like, name)),))
-        if type(value) not in allowed:
-            raise TypeError(f"{name!r} is {str(value)[:40]}")
+def _checked(task: BakeTask) -> BakeTask:
+    """Return a task; raise `TypeError` where its names would lead to files elsewhere."""
     if not re.fullmatch(r"[A-Za-z_]\w*/[\w-]+", f"{task.garment}/{task.shot}", flags=re.ASCII):
         raise TypeError(f"{task.name!r} names no files")
+    return task
 
 
 def _mapped(task: BakeTask, rules: Iterable[dict[str, str]]) -> BakeTask:
     """Return a task with its inputs where they lie on this machine."""
-    model, stage, motion = (_found(getattr(task, name), rules) for name in INPUTS)
-    return replace(task, model=model, stage=stage, motion=motion)
+    return replace(task, request=task.request.relocated(lambda path: _found(path, rules)))
 
 
 def _found(path: str, rules: Iterable[dict[str, str]]) -> str:
@@ -84,17 +77,19 @@ def _found(path: str, rules: Iterable[dict[str, str]]) -> str:
 
 
 def numbers(text: str, count: int) -> list[int]:
-    """Return the numbers of tasks that "0-9,12" names, of `count` that there are.
+    """Return the numbers of tasks that a text such as "0-9,12" names.
+
+    Args:
+        count: how many tasks there are.
 
     Raises:
-        SsilkError: it names none, or some that there are not.
+        SsilkError: it names none, or one that does not exist.
     """
     where, allowed = "--tasks", f"numbers from 0 to {count - 1} are needed, such as 0-9,12"
     found: list[int] = []
     for part in text.split(","):
         first, dash, last = part.partition("-")
-        lbs = first.strip().isdecimal() and (not dash or last.strip().isdecimal())
-        if not lbs:
+        if not (first.strip().isdecimal() and (not dash or last.strip().isdecimal())):
             fail(where, f"'{text}'", allowed)
         span = range(int(first), int(last if dash else first) + 1)
         if not (len(span) and span[-1] < count):

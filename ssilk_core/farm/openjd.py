@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Open Job Description: the bundle that a farm takes, and the lines by which a worker speaks to it."""
+"""Open Job Description: the bundle that a farm takes, and the lines that a worker prints for it."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
+from ..bake import BakeTask
 from ..events import Event, Failed, GarmentEvent, Message, Progress, Result, Started, describe
 from ..files import replacing
 from .job import NAME, write_job
-from .record import INPUTS
-from .tasks import BakeTask
 
 TEMPLATE, VALUES, ASSETS = "template.json", "parameter_values.json", "asset_references.json"
 NOTICE = 30  # seconds that a worker has to stop
@@ -23,15 +22,15 @@ _STOP = {"mode": "NOTIFY_THEN_TERMINATE", "notifyPeriodInSeconds": NOTICE}
 
 @dataclass(frozen=True, kw_only=True)
 class BundleOptions:
-    """How a job is cut and what its hosts need.
+    """How a job is divided and what its hosts need.
 
     Attributes:
         name: of the job.
-        chunk: tasks that a worker takes at once, to begin with.
-        seconds: how long such a chunk should take [s]; farms adapt its size to that, 0 leaves it.
+        chunk: tasks that a worker takes at once, at first.
+        seconds: how long a chunk should take [s]; farms adapt its size to it, 0 keeps the size.
         memory: of a host [MiB].
         gpu: a host needs a GPU.
-        timeout: seconds after which a chunk is given up.
+        timeout: seconds after which a chunk is cancelled.
     """
 
     name: str = "SSILK bake"
@@ -43,7 +42,7 @@ class BundleOptions:
 
 
 def write_bundle(folder: Path, tasks: Sequence[BakeTask], output: Path | None, options: BundleOptions) -> None:
-    """Write a job bundle: template, job, parameter values and the files that it takes and gives.
+    """Write a job bundle: template, job, parameter values and the files that go in and come out.
 
     Raises:
         SsilkError: it cannot be written.
@@ -61,7 +60,7 @@ def _write(path: Path, document: dict[str, Any]) -> None:
 
 
 def _asset_references(tasks: Sequence[BakeTask], output: Path | None) -> dict[str, Any]:
-    files = sorted({getattr(task, name).partition(":/")[0] for task in tasks for name in INPUTS})
+    files = sorted({path.partition(":/")[0] for task in tasks for path in task.request.inputs.values()})
     folders = [] if output is None else [str(output.absolute())]
     return {
         "assetReferences": {"inputs": {"filenames": files, "directories": []}, "outputs": {"directories": folders}}
@@ -87,15 +86,15 @@ def _parameters(options: BundleOptions) -> list[dict[str, Any]]:
         {"name": "Output", "type": "PATH", "objectType": "DIRECTORY", "dataFlow": "OUT", "default": "layers",
          "description": "Where the layers go."},
         {"name": "ChunkSize", "type": "INT", "minValue": 1, "default": options.chunk,
-         "description": "Shots that a worker takes at once, to begin with."},
+         "description": "Shots that a worker takes at once, at first."},
         {"name": "ChunkSeconds", "type": "INT", "minValue": 0, "default": options.seconds,
-         "description": "How long a chunk should take; its size is adapted to that."},
+         "description": "How long a chunk should take; its size is adapted to it."},
         {"name": "Ssilk", "type": "STRING", "default": "ssilk", "description": "The command of SSILK on a worker."},
     ]  # fmt: skip
 
 
 def _environment() -> dict[str, Any]:
-    """Return what a session sets up once: one thread for each worker, and a host without SSILK fails at once."""
+    """Return what a session sets up once: one thread for each worker; a host without SSILK fails here."""
     return {
         "name": "SSILK",
         "variables": {"OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"},
@@ -114,7 +113,7 @@ def _bake_step(count: int, options: BundleOptions) -> dict[str, Any]:
         "name": "Bake",
         "parameterSpace": {"taskParameterDefinitions": [shots]},
         "hostRequirements": _host(options),
-        "script": _script(options, "--tasks", "{{BakeTask.Param.Shots}}"),
+        "script": _script(options, "--tasks", "{{Task.Param.Shots}}"),
     }
 
 

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Integration schemes of the latent state: the paper's Eqs. 3, 11 and 12, and a damped spring."""
+"""How the latent state advances: the integrators of the schemes in `ssilk_core.schemes`."""
 
 from __future__ import annotations
 
+import importlib
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -13,21 +14,22 @@ from torch import Tensor, nn
 from .. import kernels
 from ..config import (
     DISTANCE_SCALE,
-    FORCE_ALLOWANCE,
-    MAX_STEPPER_OUTPUT,
+    MAX_OUTPUT,
+    OUTPUT_SCALE,
     RATE_ALLOWANCE,
-    STEPPER_OUTPUT_SCALE,
+    STATE_ALLOWANCE,
     VELOCITY_SCALE,
     ModelConfig,
 )
+from ..schemes import SCHEMES
 
 NORM_EPSILON = 1e-12  # far below any length that counts; its square's inverse is finite in float32
 
 
 def soft_clamp(values: Tensor, bound: float) -> Tensor:
-    """Clamp values smoothly to a bound b; a bound of zero changes nothing.
+    """Clamp values smoothly to a bound b; a bound of zero changes zero.
 
-    The clamp is the identity up to h = b / 2, so that it does not damp states well within the bound. Beyond, it is
+    It is the identity up to h = b / 2, so that it does not damp states well within the bound. Beyond, it is
     h + h tanh((|v| - h) / h), which never exceeds b.
     """
     if not bound:
@@ -50,24 +52,19 @@ def clip_norm(vectors: Tensor, longest: Tensor) -> Tensor:
 class Integrator(nn.Module, ABC):
     """Advances z from the two states before it.
 
-    `config.latent_bound` clamps each new state, so that it stays in the range that the decoder was trained on,
-    however long the rollout.
+    `config.latent_bound` limits each new state, so that no rollout leaves the range that the decoder was trained on.
 
     Args:
         config: bounds and sizes.
         rates: number of last entries of a dynamic descriptor that are zero while the character holds still.
 
     Attributes:
-        states: latent vectors among the inputs of the stepper S.
-        centred: whether only differences between outputs of S are used; its last layer then needs no bias.
+        scheme: its entry in `schemes.SCHEMES`.
     """
-
-    states = 2
-    centred = False
 
     def __init__(self, config: ModelConfig, rates: int = 0) -> None:
         super().__init__()
-        self.config, self.rates = config, rates
+        self.config, self.rates, self.scheme = config, rates, SCHEMES[config.scheme]
 
     def forward(self, stepper: nn.Module, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor) -> Tensor:
         """Return z_t, shape (batch, latent).
@@ -93,25 +90,8 @@ class Integrator(nn.Module, ABC):
         return soft_clamp(z, self.config.latent_bound)
 
     @abstractmethod
-    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *precomputed: Tensor) -> Tensor: ...
-
-
-class Verlet(Integrator):
-    """z_t = zbar + S([zbar, z_{t-1}, pose]) with zbar = alpha z_{t-1} + beta (z_{t-1} - z_{t-2}) (Eqs. 2, 3).
-
-    `config.max_latent_step` clamps the output of S, a latent acceleration.
-    """
-
-    def __init__(self, config: ModelConfig, rates: int = 0) -> None:
-        super().__init__(config, rates)
-        self.alpha = nn.Parameter(torch.full((config.latent,), 1.0))
-        # 1 would turn noise on the first two states into a steady drift; with 0.9 it decays within a second.
-        self.beta = nn.Parameter(torch.full((config.latent,), 0.9))
-
     def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *precomputed: Tensor) -> Tensor:
-        _, pose = precomputed
-        forward = self.alpha * now + self.beta * (now - before)
-        return forward + soft_clamp(stepper(torch.cat([forward, now, pose], dim=1)), self.config.max_latent_step)
+        """Return z_t before it is clamped, shape (batch, latent)."""
 
 
 class SpringVerlet(Integrator):
@@ -121,26 +101,22 @@ class SpringVerlet(Integrator):
         z_t = zbar + f + u,         u = s (S(z_{t-1}, v, p - zbar, pose) - S(p, 0, 0, pose held still))
 
     Without S every dimension is a damped spring, stable for any k in (0, 1]. S learns what such a spring misses.
-    Spring constants start spread over slow and fast springs and stay below `config.stiffness`.
-    `config.max_latent_step` clamps f + u.
+    The output of S for a garment at rest under a still character is subtracted, so that p is an equilibrium. The
+    loss cannot enforce this: an error of a millimetre a frame is a tenth of gravity, and stretch and collisions
+    hide it. Stiffnesses start spread from slow swings to quick following and stay under `config.stiffness`.
+    `config.max_latent_step` limits spring and S together.
 
-    The output of S for a garment at rest, under a character that holds still, is subtracted, so that the garment
-    rests at p exactly. The training loss could not ensure that: an error of one millimetre a frame is a tenth of
-    gravity, which stretch and collisions outweigh.
-
-    The garment rests nowhere else, whatever S has learned. S may add half of what the spring does, and more only
-    while something moves; motion seldom comes near this limit:
+    p is the only equilibrium, whatever S has learned, because S gives at most half of what the spring gives, and
+    more only while something moves:
 
         |u| <= (|f| + |v|) / 2 + |rates of the pose| / 20
 
-    Eq. 2's alpha is one: a larger one would cancel the spring.
+    Motion seldom reaches this limit. Eq. 2's alpha is one: a larger one would undo the spring.
 
-    The inputs of S are velocities and distances, scaled to order one. The states themselves would make these small
-    differences of large inputs, which a network learns last. s = `STEPPER_OUTPUT_SCALE` scales the output of S.
+    S sees velocities and distances, scaled to order one. Given as states side by side they would be small
+    differences of large inputs, which networks learn last. s is `OUTPUT_SCALE`.
     """
 
-    states = 3
-    centred = True
     slowest = 0.01
 
     def __init__(self, config: ModelConfig, rates: int = 0) -> None:
@@ -152,58 +128,42 @@ class SpringVerlet(Integrator):
         self.share = nn.Parameter(torch.logit(start / config.stiffness))
 
     def precompute(self, stepper: nn.Module, rest: Tensor, pose: Tensor) -> tuple[Tensor, ...]:
-        """Return the quasi-static state, the pose, the output of S at rest in this pose, and |rates| / 20."""
+        """Return the quasi-static state, the pose, the output of S at rest there, and |rates| / 20."""
         static, rates = pose.tensor_split([pose.shape[1] - self.rates], dim=1)
         zero = torch.zeros_like(rest)
-        output_at_rest = self._evaluate(stepper, rest, zero, zero, static, torch.zeros_like(rates))
-        return rest, pose, output_at_rest, RATE_ALLOWANCE * length(rates)
+        at_rest = self._evaluate(stepper, rest, zero, zero, static, torch.zeros_like(rates))
+        return rest, pose, at_rest, RATE_ALLOWANCE * length(rates)
 
     def step(self, stepper: nn.Module, before: Tensor, now: Tensor, precomputed: Sequence[Tensor]) -> Tensor:
         if torch.is_grad_enabled() or torch.compiler.is_compiling() or not kernels.supports(now):
             return super().step(stepper, before, now, precomputed)
         from ..kernels.spring import next_state_kernel, stepper_input_kernel
 
-        rest, pose, output_at_rest, rate_allowance = precomputed
+        rest, pose, at_rest, rate_allowance = precomputed
         scales = VELOCITY_SCALE, DISTANCE_SCALE
         output = stepper(stepper_input_kernel(before, now, rest, pose, self.beta, scales))
         stiffness, max_step, bound = self.config.stiffness, self.config.max_latent_step, self.config.latent_bound
-        limits = stiffness, MAX_STEPPER_OUTPUT, STEPPER_OUTPUT_SCALE, FORCE_ALLOWANCE, max_step, bound
-        outputs, springs = (output, output_at_rest), (self.beta, self.share)
+        limits = stiffness, MAX_OUTPUT, OUTPUT_SCALE, STATE_ALLOWANCE, max_step, bound
+        outputs, springs = (output, at_rest), (self.beta, self.share)
         return next_state_kernel((before, now), rest, outputs, rate_allowance, springs, limits)
 
     def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *precomputed: Tensor) -> Tensor:
-        rest, pose, output_at_rest, rate_allowance = precomputed
+        rest, pose, at_rest, rate_allowance = precomputed
         velocity = now - before
         forward = now + self.beta * velocity
         away = rest - forward
         output = self._evaluate(stepper, now, VELOCITY_SCALE * velocity, DISTANCE_SCALE * away, pose)
         spring = self.config.stiffness * torch.sigmoid(self.share) * away
-        allowance = FORCE_ALLOWANCE * (length(spring) + length(velocity)) + rate_allowance
-        learned = clip_norm(STEPPER_OUTPUT_SCALE * (output - output_at_rest), allowance)
+        allowance = STATE_ALLOWANCE * (length(spring) + length(velocity)) + rate_allowance
+        learned = clip_norm(OUTPUT_SCALE * (output - at_rest), allowance)
         return forward + soft_clamp(spring + learned, self.config.max_latent_step)
 
     def _evaluate(self, stepper: nn.Module, *inputs: Tensor) -> Tensor:
-        return stepper(torch.cat(inputs, dim=1)).clamp(-MAX_STEPPER_OUTPUT, MAX_STEPPER_OUTPUT)
-
-
-class Direct(Integrator):
-    """z_t = S([z_{t-2}, z_{t-1}, pose]) (Eq. 11)."""
-
-    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *precomputed: Tensor) -> Tensor:
-        return stepper(torch.cat([before, now, precomputed[1]], dim=1))
-
-
-class DirectResidual(Integrator):
-    """z_t = z_{t-1} + S([z_{t-2}, z_{t-1}, pose]) (Eq. 12)."""
-
-    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *precomputed: Tensor) -> Tensor:
-        return now + stepper(torch.cat([before, now, precomputed[1]], dim=1))
+        return stepper(torch.cat(inputs, dim=1)).clamp(-MAX_OUTPUT, MAX_OUTPUT)
 
 
 class QuasiStatic(Integrator):
-    """z_t = P(theta_t): no stepper and no earlier states, for garments without loose vertices."""
-
-    states = 0
+    """z_t = P(theta_t), with no stepper and no earlier states, for garments without loose vertices."""
 
     def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *precomputed: Tensor) -> Tensor:
         return precomputed[0]
@@ -212,10 +172,7 @@ class QuasiStatic(Integrator):
         return self.advance(stepper, before, now, *precomputed)  # `rest` is already clamped
 
 
-INTEGRATORS: dict[str, type[Integrator]] = {
-    "spring_verlet": SpringVerlet,
-    "verlet": Verlet,
-    "direct": Direct,
-    "direct_residual": DirectResidual,
-    "quasi_static": QuasiStatic,
-}
+def integrator(config: ModelConfig, rates: int = 0) -> Integrator:
+    """Return the integrator of a network's scheme; `rates` as in `Integrator`."""
+    module, _, name = SCHEMES[config.scheme].integrator.partition(":")
+    return getattr(importlib.import_module(module), name)(config, rates)

@@ -15,7 +15,7 @@ from ..descriptors import descriptor_joints
 from ..kinematics import matrix_from_quaternion, quaternion_from_matrix
 from ..parameters import descriptor_sizes
 from .decoder import Decoder
-from .integrators import INTEGRATORS
+from .integrators import integrator
 
 
 def mlp(
@@ -54,11 +54,11 @@ class GarmentModel(nn.Module):
         static, dynamic = descriptor_sizes(scene, self.joints)
         z = config.latent
         self.initialiser = mlp(static, config.widths, z, generator, 1.0)
-        # Zero: training starts as pure Verlet integration.
-        self.integrator = INTEGRATORS[config.scheme](config, dynamic)
-        seen, bias = self.integrator.states * z + static + dynamic, not self.integrator.centred
-        has_stepper = self.integrator.states > 0
-        self.stepper = mlp(seen, config.widths, z, generator, 0.0, bias) if has_stepper else nn.Sequential()
+        # Zero: training starts as the scheme integrates without S.
+        self.integrator = integrator(config, dynamic)
+        scheme = self.integrator.scheme
+        seen = scheme.states * z + static + dynamic
+        self.stepper = mlp(seen, config.widths, z, generator, 0.0, scheme.bias) if scheme.states else nn.Sequential()
         # Small: training starts as linear blend skinning.
         self.output = mlp(z, config.widths, self.decoder.output_count, generator, 0.01)
 

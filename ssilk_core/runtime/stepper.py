@@ -20,17 +20,17 @@ from numpy.typing import NDArray
 from ..config import (
     DISTANCE_SCALE,
     DIVERGENCE_BOUND,
-    FORCE_ALLOWANCE,
-    MAX_STEPPER_OUTPUT,
+    MAX_OUTPUT,
+    OUTPUT_SCALE,
     RATE_ALLOWANCE,
     RECOVERY_FRAMES,
-    STEPPER_OUTPUT_SCALE,
+    STATE_ALLOWANCE,
     VELOCITY_SCALE,
     ModelConfig,
 )
 from .networks import Layer, Parameters, as_float32, evaluate_tail, layers
 
-MAX_SCALED_OUTPUT = STEPPER_OUTPUT_SCALE * MAX_STEPPER_OUTPUT
+MAX_SCALED_OUTPUT = OUTPUT_SCALE * MAX_OUTPUT
 SAFE_SQUARED_NORM = MAX_SCALED_OUTPUT**2  # a vector with a smaller one has no entry that needs clamping
 
 
@@ -121,7 +121,7 @@ class SpringStepper:
         speed, away = VELOCITY_SCALE * of_speed, DISTANCE_SCALE * of_away
         self.bias, self.of_still = first.bias, np.hstack([of_now, of_static])
         self.first = as_float32(np.hstack([of_now - away, speed - away * beta]).T)
-        self.later = [*hidden, Layer(as_float32(STEPPER_OUTPUT_SCALE * last.rows))]
+        self.later = [*hidden, Layer(as_float32(OUTPUT_SCALE * last.rows))]
         self.beta = beta.astype(np.float32)
         self.stiffness = (config.stiffness / (1 + np.exp(-share))).astype(np.float32)
         self.config = config
@@ -188,7 +188,7 @@ class SpringStepper:
                 np.add(along, away, along)
                 np.multiply(self.stiffness, along, pull)
                 np.subtract(own, at_rest, own)
-                limit = FORCE_ALLOWANCE * (sqrt(pull.dot(pull)) + sqrt(velocity.dot(velocity))) + rate_limit
+                limit = STATE_ALLOWANCE * (sqrt(pull.dot(pull)) + sqrt(velocity.dot(velocity))) + rate_limit
                 size = sqrt(own.dot(own))
                 if size > limit:
                     np.multiply(own, limit / size, own)

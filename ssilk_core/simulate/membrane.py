@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Energy, gradient and positive semi-definite Hessian of the membrane, for either stretch model.
 
-Both models have a first Piola-Kirchhoff stress P = F S with a symmetric 2 x 2 matrix S. Their Hessian is the geometric
-part S (x) I, indefinite under compression, plus a positive semi-definite material part, a sum of outer products of
-the columns w_u, w_v of F:
+Both models have a first Piola-Kirchhoff stress P = F S with a symmetric 2 x 2 matrix S. Their Hessian is the
+geometric part S (x) I, indefinite under compression, plus a positive semi-definite material part, a sum of outer
+products of the columns w_u, w_v of F:
 
     M_uu = a w_u w_u' + b w_v w_v',   M_vv = c w_v w_v' + b w_u w_u',   M_uv = d w_u w_v' + b w_v w_u'
 

@@ -81,8 +81,8 @@ class VariantMeter:
             total=total,
             excess=total - float(self.base),
             collisions=tally.mean("collisions"),
-            position=tally.root("position"),
-            velocity=tally.root("velocity"),
+            position=tally.root("position error"),
+            velocity=tally.root("velocity error"),
         )
 
     @property

@@ -83,7 +83,7 @@ class Objective:
         static = bank.static_descriptor(times, down)
         pose = torch.cat([static, bank.dynamic[times]], dim=1).reshape(length, batch, -1)
         # Beside a stepper, the initialiser is trained on the energy of its own states, not on that of later frames.
-        with torch.set_grad_enabled(not model.integrator.states):
+        with torch.set_grad_enabled(not model.integrator.scheme.states):
             target = model.initial(static).reshape(length, batch, -1)
             start = torch.where(sampler.carried[None, :, None], sampler.latents, target[:2])
         with torch.set_grad_enabled(sampler.config.bptt):

@@ -37,6 +37,15 @@ def learning_rate(config: TrainConfig, iteration: int) -> float:
     return ramp * (final + (peak - final) * 0.5 * (1 + math.cos(math.pi * done / max(1, span))))
 
 
+def averaging_decay(config: TrainConfig, iteration: int) -> float:
+    """Return the decay of the average at an iteration: min(ema_decay, (1 + t) / (10 + t)) at step t of a phase."""
+    # A constant decay d keeps d^n of the initial parameters after n steps: 9.5 % for 0.9995 and 4,706 steps. With
+    # this warm-up they vanish, and in a short phase the average spans about its last ninth.
+    static = config.static_iterations
+    done = iteration if iteration < static else iteration - static
+    return min(config.ema_decay, (1 + done) / (10 + done))
+
+
 GradientAverage = Callable[[list[Tensor]], None]
 
 
@@ -68,7 +77,9 @@ class Stepper:
         self.ema_model = copy.deepcopy(model).requires_grad_(False)
         self.terms: dict[str, Tensor] = {}
         self.skipped = SkippedSteps(self.device)
+        # Tensors: a captured graph reads them anew in each replay.
         self._iteration = torch.zeros((), dtype=torch.int64, device=self.device)
+        self._decay = torch.zeros((), device=self.device)
         self._graph: torch.cuda.CUDAGraph | None = None
         self._phase, self._eager = "", 0
 
@@ -114,19 +125,25 @@ class Stepper:
         # The fused optimiser skips the step where this is one.
         self.optimiser.found_inf = bad.float()  # type: ignore[attr-defined]
         self.optimiser.step()
-        with torch.no_grad():
-            torch._foreach_lerp_(
-                [*self.ema_model.parameters()], [*self.model.parameters()], 1 - self.config.ema_decay
-            )
+        self._average()
         terms = {name: value.detach() for name, value in terms.items()}
         self.skipped.record(bad, self._iteration, terms | (beside or {}), window)
         for name, value in terms.items():
             self.terms.setdefault(name, torch.zeros((), device=self.device)).copy_(value)
 
+    @torch.no_grad()
+    def _average(self) -> None:
+        """Move the average towards the parameters."""
+        averaged: list[Tensor] = [*self.ema_model.parameters()]
+        parameters: list[Tensor] = [*self.model.parameters()]
+        torch._foreach_mul_(averaged, self._decay)
+        torch._foreach_add_(averaged, [*torch._foreach_mul(parameters, 1 - self._decay)])
+
     def run(self, iteration: int) -> None:
         """Do the step of an iteration, in the phase of that iteration."""
         rate = learning_rate(self.config, iteration)
         self._iteration.fill_(iteration)
+        self._decay.fill_(averaging_decay(self.config, iteration))
         for group, factor in zip(self.optimiser.param_groups, self.rate_scales):
             if self.device.type == "cuda":
                 group["lr"].fill_(rate * factor)

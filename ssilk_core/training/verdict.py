@@ -4,12 +4,16 @@
 from __future__ import annotations
 
 from math import isfinite
+from typing import TYPE_CHECKING
 
 from ..events import Message
-from .validation import Score
+
+if TYPE_CHECKING:
+    from .validation import Score
 
 # A rollout closer than this to the quasi-static state of each pose has learned no dynamics.
 NO_DYNAMICS = 2e-3  # [m]
+ADVICE = "nothing dynamic is being learned: train longer, or check that the motions move"
 
 
 def non_finite_terms(score: Score) -> list[str]:
@@ -27,6 +31,5 @@ def validation_message(iteration: int, score: Score, lbs: Score, moves: bool) ->
         f"({terms}), collisions {score.collisions:.2%}, motion of its own {score.dynamics * 1000:.0f} mm"
     )
     if score.dynamics < NO_DYNAMICS and moves:
-        advice = "nothing dynamic is being learned: train longer, or check that the motions move"
-        return Message(f"{text}; {advice}", "warning")
+        return Message(f"{text}; {ADVICE}", "warning")
     return Message(text)

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT / "usd"))  # as the wheel in the zip brings it
 HEIGHTS = (0.8, 1.2, 1.5)  # of the bones [m]
 BONES = ("Hips", "Spine", "Head")
 

@@ -30,11 +30,11 @@ save_model(sys.argv[1], replace(file, parameters=parameters))
 DECODED = """
 import sys
 import numpy as np
-from ssilk_core.cli._baking import BakeRequest, open_bake
-model, stage, motion, seconds, plain, output = sys.argv[1:]
-request = BakeRequest(model=model, stage=stage, motion=motion, pre_roll=float(seconds), plain=plain == "plain")
-bake = open_bake(request)
-np.save(output, [bake.units.points_from_core(points) for points in bake.vertices(lambda event: None)])
+from ssilk_core.bake import BakeRequest, load_rollout
+model, stage, motion, seconds, lbs, output = sys.argv[1:]
+request = BakeRequest(model=model, stage=stage, motion=motion, pre_roll=float(seconds), lbs=lbs == "lbs")
+bake = load_rollout(request)
+np.save(output, [bake.units.points_from_core(points) for points in bake.vertices()])
 """
 
 
@@ -83,10 +83,10 @@ def enliven(python: str, model: Path) -> None:
     subprocess.run([python, "-c", LIVELY, str(model)], check=True)
 
 
-def decoded(python: str, model: Path, folder: Path, *, pre_roll: float = 0.0, plain: bool = False) -> np.ndarray:
+def decoded(python: str, model: Path, folder: Path, *, pre_roll: float = 0.0, lbs: bool = False) -> np.ndarray:
     """Return the decoder's own vertices of the last bake in Blender's world, shape (F, V, 3)."""
     inputs, output = model.parent / "bake", folder / "decoded.npy"
-    words = [model, model.parent / "dressed.usdc", inputs / "motion.usdc", pre_roll, "plain" if plain else "", output]
+    words = [model, model.parent / "dressed.usdc", inputs / "motion.usdc", pre_roll, "lbs" if lbs else "", output]
     subprocess.run([python, "-c", DECODED, *map(str, words)], check=True)
     return np.load(output)
 

@@ -13,7 +13,7 @@ pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-b
 
 from blender_addon.scene.models import model_of
 
-from .conftest import ROOT, activate
+from .conftest import activate
 from .scenes import decoded, shown
 
 EXACT = 1e-5  # [m]
@@ -43,7 +43,7 @@ def strips(thing, garment) -> list:
 def test_blender_shows_what_the_decoder_says_on_every_frame(ready, trained, tmp_path, ssilk_python, pre_roll):
     bake(ready, trained, pre_roll=pre_roll)
     wanted = decoded(ssilk_python, model_of(trained), tmp_path, pre_roll=pre_roll)
-    plain = decoded(ssilk_python, model_of(trained), tmp_path, plain=True)
+    plain = decoded(ssilk_python, model_of(trained), tmp_path, lbs=True)
     assert np.abs(wanted - plain).max() > 0.05
     assert np.abs(shown(ready, trained, FRAMES) - wanted).max() < EXACT
 
@@ -53,7 +53,7 @@ def test_a_level_of_quality_leaves_shapes_out(ready, trained, tmp_path, ssilk_py
     whole = shown(ready, trained, FRAMES)
     bake(ready, trained, quality="crowd")
     away = np.linalg.norm(shown(ready, trained, FRAMES) - whole, axis=-1).max()
-    plain = decoded(ssilk_python, model_of(trained), tmp_path, plain=True)
+    plain = decoded(ssilk_python, model_of(trained), tmp_path, lbs=True)
     assert 1e-4 < away < np.linalg.norm(whole - plain, axis=-1).max()
     assert len([key for key in trained.data.shape_keys.key_blocks if key.name.startswith("SSILK ")]) < 25
 
@@ -87,12 +87,13 @@ def test_a_reduced_model_leaves_its_proxies_at_rest(ready, trained, tmp_path, ss
 
 
 def test_levels_are_those_of_ssilk(bpy):
-    from blender_addon.operators.baking import QUALITIES
-    from blender_addon.training_properties import PRESETS
+    from blender_addon.operators.baking import LEVELS
+    from blender_addon.training_properties import CHOICES
+    from ssilk_core.config import PRESETS
+    from ssilk_core.quality import QUALITIES
 
-    config, quality = ((ROOT / "ssilk_core" / f"{name}.py").read_text() for name in ("config", "quality"))
-    assert [name for name, *_ in PRESETS] == re.findall(r'(?:Preset\(|^ {12})name="(\w+)"', config, re.MULTILINE)
-    assert [name for name, *_ in QUALITIES[1:]] == re.findall(r'Quality\(name="(\w+)"', quality)
+    assert [name for name, *_ in CHOICES] == list(PRESETS)
+    assert [name for name, *_ in LEVELS] == ["WHOLE", *QUALITIES]
 
 
 def test_the_bake_is_one_action_beneath_the_artists_own(ready, trained):
@@ -327,8 +328,8 @@ def test_another_file_than_a_model_fails_in_one_sentence(ready, trained, folder)
 def test_a_garment_deleted_meanwhile_changes_nothing(ready, trained, monkeypatch):
     from blender_addon.operators import baking
 
-    kept = baking.Bake.finish
-    monkeypatch.setattr(baking.Bake, "finish", lambda self, *rest: remove(ready, trained) or kept(self, *rest))
+    kept = baking.BakeGarment.finish
+    monkeypatch.setattr(baking.BakeGarment, "finish", lambda self, *rest: remove(ready, trained) or kept(self, *rest))
     activate(ready, trained)
     with pytest.raises(RuntimeError, match="'Skirt' was deleted meanwhile"):
         ready.ops.ssilk.bake()

@@ -7,11 +7,6 @@ import numpy as np
 import pytest
 
 from blender_addon import classes as palette
-from ssilk_core import assets
-
-
-def test_numbers_are_the_cores():
-    assert (palette.PINNED, palette.TIGHT, palette.LOOSE) == (assets.PINNED, assets.TIGHT, assets.LOOSE)
 
 
 def test_colors_and_classes_are_each_others_inverse():

@@ -28,7 +28,7 @@ def edit(ready, rigged):
 
 
 def edits_of(bpy, thing):
-    from blender_addon.scene.handmade import find_edits
+    from blender_addon.scene.edit_tracking import find_edits
 
     return find_edits(bpy.data.objects["Rig"], thing)
 
@@ -193,7 +193,7 @@ def test_fewer_proxies_leave_an_edited_one_its_own(ready, rigged, edit):
 @pytest.fixture
 def dressed_up(ready, rigged):
     """The skirt with weights of chance put on as trained ones, after its vertex 5 was repainted; both weights."""
-    from blender_addon.scene.worn import put_on
+    from blender_addon.scene.trained_weights import put_trained_weights
 
     armature, names = ready.data.objects["Rig"], [*BONES, *proxies_of(ready)]
     for group in rigged.vertex_groups:
@@ -201,7 +201,7 @@ def dressed_up(ready, rigged):
     rigged.vertex_groups["Hips"].add([5], 1.0, "REPLACE")
     before = named_weights(rigged, names)
     learned = np.random.default_rng(0).dirichlet(np.ones(len(names)), len(rigged.data.vertices)).astype(np.float32)
-    put_on(armature, rigged, learned, names)
+    put_trained_weights(armature, rigged, learned, names)
     return names, before, learned
 
 
@@ -223,32 +223,38 @@ def test_trained_weights_are_no_repainting_and_repainted_vertices_stay_known(rea
 
 def test_trained_weights_come_off_again_but_for_what_was_painted_on_them(ready, rigged, dressed_up):
     from blender_addon.scene.gather import gather
-    from blender_addon.scene.worn import is_worn, put_on, take_off
+    from blender_addon.scene.trained_weights import has_trained_weights, put_trained_weights, restore_own_weights
 
     names, before, learned = dressed_up
     armature = ready.data.objects["Rig"]
-    np.testing.assert_allclose(gather(rigged).garment.weights, before, atol=1e-6)  # what is trained on
+    now = gather(rigged).rig.skin.dense(len(names))  # what is trained on
+    np.testing.assert_allclose(now, before, atol=1e-6)
     ready.data.armatures[armature.data.name].bones[names[-1]].name = "Renamed"
     names[-1] = "Renamed"
     for group in rigged.vertex_groups:
         group.remove([9])
     rigged.vertex_groups["Spine"].add([9], 1.0, "REPLACE")
-    put_on(armature, rigged, learned, names)  # once more, as by a second bake
-    take_off(armature, rigged)
+    put_trained_weights(armature, rigged, learned, names)  # once more, as by a second bake
+    restore_own_weights(armature, rigged)
     wanted = before.copy()
     wanted[9] = [name == "Spine" for name in names]
     np.testing.assert_allclose(named_weights(rigged, names), wanted, atol=1e-6)
-    assert not is_worn(rigged) and np.flatnonzero(edits_of(ready, rigged).repainted).tolist() == [5, 9]
+    assert not has_trained_weights(rigged) and np.flatnonzero(edits_of(ready, rigged).repainted).tolist() == [5, 9]
 
 
 def test_a_garment_without_weights_of_its_own_has_none_again(ready, skirt):
-    from blender_addon.scene.worn import is_worn, own_groups, put_on, take_off
+    from blender_addon.scene.trained_weights import (
+        has_trained_weights,
+        own_groups,
+        put_trained_weights,
+        restore_own_weights,
+    )
 
     armature, weights = ready.data.objects["Rig"], np.full((len(skirt.data.vertices), 3), 1 / 3, dtype=np.float32)
-    put_on(armature, skirt, weights, BONES)
+    put_trained_weights(armature, skirt, weights, BONES)
     assert len(skirt.vertex_groups) == 3 and not own_groups(armature, skirt, BONES).any()
-    take_off(armature, skirt)
-    assert not skirt.vertex_groups and not is_worn(skirt)
+    restore_own_weights(armature, skirt)
+    assert not skirt.vertex_groups and not has_trained_weights(skirt)
 
 
 def test_writing_weights_leaves_shape_keys_and_attributes_alone(ready, skirt):

@@ -1,28 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fabrics: the extension's are ssilk's, and what an artist sets reaches the command line."""
+"""Fabrics: what an artist sets reaches the command line."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
-
 import pytest
 
-from blender_addon import fabrics
-from ssilk_core.fabrics import FABRICS, STRETCH_MODELS
+
+def test_every_fabric_and_model_can_be_chosen(bpy, skirt):
+    from blender_addon.fabric_properties import CHOICES, MODELS, NUMBERS
+    from ssilk_core.fabrics import FABRICS, STRETCH_MODELS
+
+    assert [name for name, *_ in CHOICES] == list(FABRICS)
+    assert {name for name, *_ in MODELS} == set(STRETCH_MODELS)
+    assert all(hasattr(skirt.ssilk.fabric, name) for name in NUMBERS)
 
 
-def test_presets_are_the_cores():
-    assert fabrics.STRETCH_MODELS == STRETCH_MODELS
-    cores = {name: {key: value for key, value in asdict(fabric).items() if isinstance(value, float)}
-             for name, fabric in FABRICS.items()}  # fmt: skip
-    assert cores == fabrics.PRESETS
+def test_only_what_differs_is_said(bpy, skirt):
+    from blender_addon.fabric_properties import fabric_options
 
-
-def test_only_what_differs_is_said():
-    silk = fabrics.PRESETS["silk"]
-    assert fabrics.options("silk", "stvk", silk) == ["--fabric", "silk"]
-    given = fabrics.options("silk", "baraff_witkin", {**silk, "density": 0.2, "bending": 3.0000001e-6})
-    assert given == ["--fabric", "silk", "--material", "stretch_model=baraff_witkin", "--material", "density=0.2"]
+    fabric = skirt.ssilk.fabric
+    fabric.preset, fabric.stretch_model, fabric.density = "silk", "baraff_witkin", 0.2
+    given = ["--fabric", "silk", "--material", "stretch_model=baraff_witkin", "--material", "density=0.2"]
+    assert fabric_options(fabric) == given
 
 
 def test_a_preset_sets_the_values_and_these_may_be_changed(bpy, skirt):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Heat maps against closed forms, worst frames, and plain skinning beside the garment."""
+"""Heat maps against closed forms, worst frames, and linear blend skinning beside the garment."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ def colors(garment) -> np.ndarray:
 
 
 def test_heat_is_shown_follows_frames_and_goes(bpy, dressed):
-    from blender_addon.scene import warming
+    from blender_addon.scene import heat_updates
 
     assert bpy.ops.ssilk.show_heat(kind="PENETRATION", deepest=0.02) == {"FINISHED"}
     expected = heat.colors_of(expected_depths(dressed), 0.02)
@@ -160,7 +160,7 @@ def test_heat_is_shown_follows_frames_and_goes(bpy, dressed):
     assert np.ptp(colors(dressed), axis=0)[:3].min() > 0.2
     dressed.scale = (3, 3, 1)
     bpy.context.scene.frame_set(5)
-    while warming.go_on() is not None:  # what a timer does as soon as the frame stands
+    while heat_updates.go_on() is not None:  # what a timer does as soon as the frame stands
         pass
     np.testing.assert_allclose(colors(dressed)[:, :3], np.tile(heat.GREY, (len(expected), 1)), atol=2e-3)
     assert bpy.ops.ssilk.hide_heat() == {"FINISHED"}
@@ -180,9 +180,9 @@ def test_the_panel_offers_to_hide_what_is_shown(bpy, dressed):
     from blender_addon.panels.quality import QualityPanel
 
     shown = ["ssilk.show_heat", "ssilk.find_worst"] * 2
-    assert drawn(QualityPanel, bpy.context) == [*shown, "ssilk.clear_worst", "ssilk.toggle_plain"]
+    assert drawn(QualityPanel, bpy.context) == [*shown, "ssilk.clear_worst", "ssilk.toggle_lbs"]
     bpy.ops.ssilk.show_heat()
-    assert drawn(QualityPanel, bpy.context) == [*shown, "ssilk.hide_heat", "ssilk.clear_worst", "ssilk.toggle_plain"]
+    assert drawn(QualityPanel, bpy.context) == [*shown, "ssilk.hide_heat", "ssilk.clear_worst", "ssilk.toggle_lbs"]
 
 
 def test_stretch_is_that_of_what_blender_shows(bpy, dressed):
@@ -239,7 +239,7 @@ def test_plain_skinning_stands_beside_and_goes(ready, skirt, ssilk_python, tmp_p
     bpy.context.scene.frame_set(21)
     bpy.ops.ssilk.show_heat(kind="STRETCH")
     before = {kind: len(getattr(bpy.data, kind)) for kind in ("objects", "meshes", "collections", "shape_keys")}
-    assert bpy.ops.ssilk.toggle_plain() == {"FINISHED"}
+    assert bpy.ops.ssilk.toggle_lbs() == {"FINISHED"}
     copy = bpy.data.objects["Skirt plain"]
     assert not copy.ssilk.live and not copy.ssilk.heat and "SSILK Heat" not in copy.data.attributes
     assert not copy.data.color_attributes and "SSILK Classes" in skirt.data.color_attributes
@@ -253,7 +253,7 @@ def test_plain_skinning_stands_beside_and_goes(ready, skirt, ssilk_python, tmp_p
     found -= [1.3 * max(skirt.dimensions[:2]), 0, 0]
     plain = plainly_skinned(bpy, skirt)
     assert np.abs(found - plain).max() < 1e-4
-    assert bpy.ops.ssilk.toggle_plain() == {"FINISHED"}
+    assert bpy.ops.ssilk.toggle_lbs() == {"FINISHED"}
     assert {kind: len(getattr(bpy.data, kind)) for kind in before} == before
 
 
@@ -270,7 +270,7 @@ def plainly_skinned(bpy, skirt) -> np.ndarray:
     scene, armature = load_model(model_of(skirt)).scene, bpy.data.objects["Rig"]
     names = [path.rpartition("/")[2] for path in scene.joint_names]
     points = np.array([(*vertex.co, 1) for vertex in skirt.data.shape_keys.reference_key.data])
-    weights = scene.plain_skin.dense(len(names))
+    weights = scene.lbs_skin.dense(len(names))
     moved = np.zeros((len(points), 3))
     for name, share in zip(names, weights.T):
         bone = armature.pose.bones[name]

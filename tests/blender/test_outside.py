@@ -13,9 +13,10 @@ from pathlib import Path
 import pytest
 
 from blender_addon.outside import python as pythons
-from blender_addon.outside.events import Event, parse
 from blender_addon.outside.work import Work
 from ssilk_core import events
+
+from .conftest import ROOT
 
 
 def work(*programs: str) -> Work:
@@ -30,20 +31,22 @@ def wait(running: Work) -> Work:
     return running
 
 
-def test_what_ssilk_writes_is_read(capsys):
+def test_what_ssilk_says_is_heard(capsys):
     report = events.JsonReporter()
     report(events.Progress(3, 12, terms={"stretch": float("nan")}))
     report(events.Message("half way", "warning"))
     report(events.Failed("cape.usd: no garment."))
-    progress, message, failed = map(parse, capsys.readouterr().out.splitlines())
-    assert (progress.kind, progress.fraction) == ("progress", 0.25)
-    assert (message.kind, message.text) == ("message", "half way")
-    assert (failed.kind, failed.text) == ("failed", "cape.usd: no garment.")
+    said = capsys.readouterr().out
+    heard = wait(work(f"print({said!r}, end=''); raise SystemExit(2)"))
+    assert (heard.fraction, heard.text, heard.error) == (0.25, "cape.usd: no garment.", "cape.usd: no garment.")
+    heard.close()
 
 
 @pytest.mark.parametrize("line", ["Collecting torch", "[1, 2]", '"event"', '{"done": 1}', "12"])
 def test_other_lines_are_messages(line):
-    assert parse(line) == Event("message", {"text": line})
+    heard = wait(work(f"print({line!r})"))
+    assert (heard.text, heard.error, heard.result) == (line, "", {})
+    heard.close()
 
 
 def test_work_hears_events_and_ends_with_a_result():
@@ -127,12 +130,6 @@ def test_a_mismatch_is_one_sentence(changed, sentence):
     assert pythons.Handshake.of("/p", {"versions": {**FULL, **changed}}).mismatch == sentence
 
 
-def test_the_extension_speaks_with_this_ssilk():
-    from ssilk_core import __version__
-
-    assert tuple(map(int, __version__.split(".")[:2])) == pythons.NEEDED
-
-
 def test_probe_tells_versions_and_device(ssilk_python):
     asked = wait(Work("Asking", lambda _: [pythons.probe_command(ssilk_python)]))
     met = pythons.Handshake.of(ssilk_python, asked.result)
@@ -188,15 +185,21 @@ def test_an_environment_is_made_from_a_wheel(tmp_path):
 
 
 def write_wheel(folder: Path) -> Path:
-    """A wheel named ssilk without dependencies, so that nothing is downloaded."""
+    """A wheel of ssilk as it is, but without dependencies, so that nothing is downloaded."""
     info, path = "ssilk-0.1.9.dist-info", folder / "ssilk-0.1.9-py3-none-any.whl"
     files = {
-        f"{info}/METADATA": "Metadata-Version: 2.1\nName: ssilk\nVersion: 0.1.9\n"
-        "Provides-Extra: train\nProvides-Extra: bake\n",
-        f"{info}/WHEEL": "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
+        str(file.relative_to(root)): file.read_bytes()
+        for root, package in ((ROOT, "ssilk_core"), (ROOT / "usd", "ssilk_usd"))
+        for file in sorted((root / package).rglob("*"))
+        if file.is_file() and "__pycache__" not in file.parts and file.suffix != ".safetensors"
+    }
+    files |= {
+        f"{info}/METADATA": b"Metadata-Version: 2.1\nName: ssilk\nVersion: 0.1.9\n"
+        b"Provides-Extra: train\nProvides-Extra: bake\n",
+        f"{info}/WHEEL": b"Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
     }
     record = "".join(f"{name},,\n" for name in (*files, f"{info}/RECORD"))
     with zipfile.ZipFile(path, "w") as wheel:
-        for name, text in (*files.items(), (f"{info}/RECORD", record)):
-            wheel.writestr(name, text)
+        for name, content in (*files.items(), (f"{info}/RECORD", record)):
+            wheel.writestr(name, content)
     return path

@@ -25,8 +25,8 @@ bpy.ops.extensions.package_install_files(filepath=sys.argv[1], repo="user_defaul
 for _ in range(2):
     assert package in bpy.context.preferences.addons
     assert "paint_classes" in dir(bpy.ops.ssilk) and hasattr(bpy.types.Object, "ssilk")
-    runtime = importlib.import_module(package + ".core").core("runtime")
-    assert runtime.Player.__module__.startswith(package + ".vendor")
+    for name in ("ssilk_core.runtime", "ssilk_usd.units"):
+        assert ".local" in importlib.import_module(name).__file__  # where Blender puts wheels
     bpy.ops.preferences.addon_disable(module=package)
     assert not dir(bpy.ops.ssilk) and not hasattr(bpy.types.Object, "ssilk")
     bpy.ops.preferences.addon_enable(module=package)
@@ -56,9 +56,7 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The zip as `make extension` packs it, but with a wheel that has no dependencies: nothing is downloaded."""
     folder = tmp_path_factory.mktemp("package")
     stage = [sys.executable, str(ROOT / "tools" / "stage_extension.py"), str(folder / "staged")]
-    subprocess.run(stage, check=True)
-    (folder / "staged" / "wheel").mkdir()
-    write_wheel(folder / "staged" / "wheel")
+    subprocess.run([*stage, str(write_wheel(folder))], check=True)
     command_line("build", "--source-dir", str(folder / "staged"), "--output-filepath", str(folder / "ssilk.zip"))
     return folder / "ssilk.zip"
 
@@ -68,10 +66,18 @@ def test_the_zip_is_valid_and_holds_what_it_needs(package):
     with zipfile.ZipFile(package) as files:
         names = set(files.namelist())
     sources = {str(path.relative_to(ADDON)) for path in ADDON.rglob("*.py")}
-    carried = {name for name in names if name.startswith("vendor/")}
-    assert names - carried == {*sources, "LICENSE", "blender_manifest.toml", "wheel/ssilk-0.1.9-py3-none-any.whl"}
-    assert {"vendor/LICENSE", "vendor/NOTICE", "vendor/ssilk_core/runtime/player.py"} <= carried
-    assert not {name for name in carried if any(part in name for part in ("model", "training", "energy", "cli"))}
+    assert names == {*sources, "LICENSE", "blender_manifest.toml", "wheels/ssilk-0.1.9-py3-none-any.whl"}
+
+
+def test_the_wheel_for_blender_is_built_without_the_demos_models(tmp_path):
+    sys.path.insert(0, str(ROOT / "tools"))
+    from stage_extension import copy_project
+
+    copy_project(tmp_path)
+    for folder in ("ssilk_core", "usd/ssilk_usd"):
+        own = {path.relative_to(ROOT) for path in (ROOT / folder).rglob("*.py")}
+        assert {path.relative_to(tmp_path) for path in (tmp_path / folder).rglob("*.py")} == own
+    assert not list(tmp_path.rglob("*.safetensors")) and (tmp_path / "NOTICE").is_file()
 
 
 def test_the_manifest_says_what_the_code_says():

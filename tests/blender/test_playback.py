@@ -176,5 +176,5 @@ def test_what_cannot_be_played_is_said(ready, trained, tmp_path):
     ready.data.objects["Rig"].data.edit_bones["Head"].name = "Kopf"
     ready.ops.object.mode_set(mode="OBJECT")
     activate(ready, trained)
-    with pytest.raises(RuntimeError, match="not those that the model was trained with"):
+    with pytest.raises(RuntimeError, match="not those that the garment was trained with"):
         ready.ops.ssilk.play_live()

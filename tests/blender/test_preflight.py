@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from blender_addon.contract.arrays import Dressed, Joints, Shape
-from blender_addon.contract.findings import Clip, polygons_of, read_findings
+from blender_addon.findings import Clip, polygons_of, read_findings
+from ssilk_core.assets import Mesh
 
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
@@ -18,8 +18,12 @@ from .scenes import animate
 from .test_panels import drawn
 
 
-def shape(name: str, counts: list[int], points: int) -> Shape:
-    return Shape(name, np.zeros((points, 3)), np.array(counts), np.zeros(sum(counts), int), False, None, None)
+def mesh(name: str, counts: list[int], points: int) -> Mesh:
+    faces = np.zeros((sum(counts) - 2 * len(counts), 3), int)
+    return Mesh(f"/Character/{name}", np.zeros((points, 3)), faces, np.array(counts), np.zeros(sum(counts), int))
+
+
+SHIRT = {"Shirt": mesh("Shirt", [4], 4)}
 
 
 def test_triangles_are_named_by_their_polygons():
@@ -30,18 +34,15 @@ def test_triangles_are_named_by_their_polygons():
 
 
 def test_findings_on_several_bodies_come_apart():
-    joints = Joints(("Root",), np.array([-1]), np.eye(4)[None])
-    bodies = (shape("Torso", [4], 4), shape("Hand", [3, 3], 5))
-    dressed = Dressed(1.0, joints, bodies, shape("Shirt", [4], 4), None, None)
-    prims = {"Shirt": "/Character/Shirt", "Torso": "/Character/Torso", "Hand": "/Character/Hand"}
+    meshes = {**SHIRT, "Torso": mesh("Torso", [4], 4), "Hand": mesh("Hand", [3, 3], 5)}
     document = {"severity": "warning", "code": "holes", "found": "", "why": "", "fix": "", "fixable": False}
     whole = {**document, "prim": "a.usdc:/Character"}
     rim, faces = (
         {**whole, "elements": "vertices", "indices": [1, 4, 8]}, {**whole, "elements": "faces", "indices": [3]},
     )  # fmt: skip
     own = {**document, "prim": "a.usdc:/Character/Shirt", "elements": "joints", "indices": [0]}
-    said = read_findings([rim, faces, own], dressed, prims)
-    found = [(finding.target, finding.elements, finding.indices) for finding in said]
+    said = read_findings([rim, faces, own], "Shirt", meshes)
+    found = [(finding.prim, finding.elements, finding.indices) for finding in said]
     assert found == [
         ("Torso", "vertices", (1,)),
         ("Hand", "vertices", (0, 4)),
@@ -51,13 +52,12 @@ def test_findings_on_several_bodies_come_apart():
 
 
 def test_findings_on_motions_stand_on_the_timeline():
-    dressed = Dressed(1.0, Joints(("Root",), np.array([-1]), np.eye(4)[None]), (), shape("Shirt", [4], 4), None, None)
     jump = {"severity": "warning", "code": "root-jumps", "found": "", "why": "", "fix": "", "fixable": False,
             "elements": "frames", "indices": [7, 9]}  # fmt: skip
     clips = {"/takes/a:b/Walk.usdc": Clip("Walk", 100), "run.usdc": Clip("run.usdc")}
     documents = [{**jump, "prim": f"{path}:/Motion"} for path in clips]
-    said = read_findings(documents, dressed, {}, clips)
-    assert [(finding.target, finding.elements, finding.indices) for finding in said] == [
+    said = read_findings(documents, "Shirt", SHIRT, clips)
+    assert [(finding.prim, finding.elements, finding.indices) for finding in said] == [
         ("Walk", "frames", (107, 109)),
         ("run.usdc", "", ()),  # its frames are nowhere to go to
     ]
@@ -219,10 +219,11 @@ def test_a_modifier_before_the_armature_is_listed(ready, skirt):
 
 
 def test_joints_are_selected_as_bones(ready, skirt):
-    from blender_addon.contract.findings import Finding
     from blender_addon.preflight_properties import keep_findings
+    from ssilk_core.preflight.finding import Finding
 
-    keep_findings(ready.context, "Skirt", [Finding("info", "still", "", "", elements="joints", indices=(1,))])
+    finding = Finding(severity="info", code="still", prim="", found="", elements="joints", indices=(1,))
+    keep_findings(ready.context, "Skirt", [finding])
     assert ready.ops.ssilk.select_finding() == {"FINISHED"}
     armature = ready.data.objects["Rig"]
     assert ready.context.mode == "POSE"

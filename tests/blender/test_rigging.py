@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
-from .conftest import BONES, activate, add_armature
+from .conftest import BONES, HEIGHTS, activate, add_armature
 from .scenes import proxies_of, weights_of
 
 READ = """
@@ -76,10 +76,12 @@ def evaluated(bpy, thing) -> np.ndarray:
 
 def contract_of(thing, python: str, path: Path) -> dict:
     """What ssilk reads of a garment that Blender hands over."""
-    from blender_addon.contract.write import write_stage
+    from ssilk_usd.write import write_scene
+
     from blender_addon.scene.gather import gather
 
-    write_stage(gather(thing), path)
+    scene = gather(thing)
+    write_scene(path, scene.character, scene.garment, scene.rig, units=scene.units)
     done = subprocess.run([python, "-c", READ, str(path)], capture_output=True, text=True, check=True, env={})
     return json.loads(done.stdout)
 
@@ -195,8 +197,8 @@ def test_another_garments_proxies_are_no_joints_of_the_character(ready, rigged):
     other.data = rigged.data.copy()
     other.name = "Apron"
     ready.context.collection.objects.link(other)
-    dressed = gather(other)
-    assert (dressed.joints.names, dressed.joints.proxy_count) == (BONES, 0)
+    scene = gather(other)
+    assert (scene.joints.names, scene.joints.proxy_count, scene.rig) == (BONES, 0, None)
     assert [thing.name for thing in bodies_of(other, ready.data.objects["Rig"])] == ["Pillar"]
 
 
@@ -289,10 +291,44 @@ def test_a_body_is_taken_as_its_modifiers_shape_it(ready, skirt):
     armature = ready.data.objects["Rig"]
     armature.pose.bones["Hips"].location = (3.0, 0.0, 0.0)
     ready.context.view_layer.update()
-    (body,) = gather(skirt).bodies
-    assert len(body.points) > len(pillar.data.vertices)
-    assert np.abs(body.points[:, 0]).max() < 0.2
+    (body,) = gather(skirt).character.bodies
+    assert body.mesh.vertex_count > len(pillar.data.vertices)
+    assert np.abs(body.mesh.points[:, 0]).max() < 0.2
     assert armature.data.pose_position == "POSE"
+
+
+def test_what_ssilk_has_is_in_metres_with_y_up(bpy, skirt):
+    from blender_addon.scene.gather import gather
+
+    bpy.context.scene.unit_settings.scale_length = 0.01
+    skirt.data.uv_layers.new()
+    scene = gather(skirt)
+    points = np.array([vertex.co for vertex in skirt.data.vertices]) @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    np.testing.assert_allclose(scene.garment.mesh.points, 0.01 * points, atol=1e-8)
+    np.testing.assert_allclose(scene.joints.binds[:, :3, 3], [(0, 0.01 * z, 0) for z in HEIGHTS], atol=1e-8)
+    uvs = [loop.uv[:] for loop in skirt.data.uv_layers.active.data]
+    np.testing.assert_allclose(scene.garment.mesh.uvs, uvs, atol=1e-6)
+    assert {name: mesh.path for name, mesh in scene.meshes.items()} == {
+        "Skirt": "/Character/Skirt", "Pillar": "/Character/Pillar",
+    }  # fmt: skip
+    assert (scene.garment.skin, scene.garment.classes, scene.rig) == (None, None, None)
+
+
+def test_faces_of_a_mirrored_object_are_turned_over(bpy, skirt):
+    from ssilk_usd.read_polygons import triangulate
+
+    from blender_addon.scene.gather import gather
+
+    def outward(mesh, faces) -> bool:
+        a, b, c = np.moveaxis(mesh.points[faces], 1, 0)
+        middles = (a + b + c) * [1, 0, 1]
+        return bool((np.cross(b - a, c - a) * middles).sum(axis=1).min() > 0)
+
+    skirt.scale.x = -1
+    bpy.context.view_layer.update()
+    mesh = gather(skirt).garment.mesh
+    written = triangulate(mesh.points, mesh.polygon_counts, mesh.polygon_indices)
+    assert outward(mesh, mesh.faces) and outward(mesh, written)
 
 
 def test_nothing_runs_before_the_python_was_checked(bpy, skirt):

@@ -8,12 +8,12 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from benchmarks.baselines.descriptors import JointBank, joint_bank
+from benchmarks.baselines.files import load_network, save_baseline
+from benchmarks.baselines.networks import METHODS, Baseline, BaselineConfig, baseline
+from benchmarks.baselines.run import BaselineJob, BaselineRun, train_baseline
+from benchmarks.baselines.training import BaselineObjective, BaselineStepper
 from ssilk_core.assets import PINNED, Motion, Scene
-from ssilk_core.baselines.descriptors import JointBank, joint_bank
-from ssilk_core.baselines.files import load_network, save_baseline
-from ssilk_core.baselines.networks import METHODS, Baseline, BaselineConfig, baseline
-from ssilk_core.baselines.run import BaselineJob, BaselineRun, train_baseline
-from ssilk_core.baselines.training import BaselineObjective, BaselineStepper
 from ssilk_core.checkpoint import load_model, model_file, save_model
 from ssilk_core.collision.body import CollisionBody
 from ssilk_core.collision.distance import signed_distance_to_planes
@@ -324,7 +324,7 @@ def test_a_run_ends_with_its_time(job, monkeypatch):
     """At ten seconds a step, of which a hundred seconds hold ten."""
     clock = iter(range(10**6))
     run = BaselineRun(job(seconds=100.0), silent)
-    monkeypatch.setattr("ssilk_core.baselines.run.time.monotonic", lambda: 30.0 * next(clock))
+    monkeypatch.setattr("benchmarks.baselines.run.time.monotonic", lambda: 30.0 * next(clock))
     run.advance()  # three steps between two looks at the clock
     assert run.iterations == run.stepper.config.iterations == 10 and run.state.seconds == 30
 

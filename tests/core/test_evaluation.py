@@ -7,37 +7,47 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from benchmarks.baselines.evaluation import method_over
+from benchmarks.baselines.networks import METHODS, BaselineConfig, baseline
 from ssilk_core.assets import Motion
-from ssilk_core.baselines.networks import METHODS, BaselineConfig, baseline
 from ssilk_core.collision.distance import signed_distance
 from ssilk_core.constants import GRAVITY
 from ssilk_core.energy import TERMS
 from ssilk_core.errors import SsilkError
-from ssilk_core.evaluation.methods import CachedPoints, EvaluationScene, Network, Plain, Simulated, TakeSet, reel_of
-from ssilk_core.evaluation.minimum import hung, minima
+from ssilk_core.evaluation.methods import (
+    CachedPoints,
+    EvaluatedMethod,
+    EvaluationScene,
+    LinearBlendSkinning,
+    Simulated,
+    TakeSet,
+    build_take_set,
+)
+from ssilk_core.evaluation.minimum import minima, minimum_errors
 from ssilk_core.evaluation.probes import (
-    CALM,
-    drifted,
-    held,
-    joined_holds,
-    joined_hung,
-    joined_loops,
+    REST_SPEED,
+    joined_loop_drift,
+    joined_minimum_errors,
+    joined_settling,
     last_frames,
-    looped,
-    stops,
+    loop_drift,
+    looped_takes,
+    settling,
+    stopped_takes,
 )
 from ssilk_core.evaluation.record import recorded
-from ssilk_core.evaluation.run import SIMULATOR, EvaluatedModel, EvaluationClips, EvaluationOptions, evaluate
+from ssilk_core.evaluation.run import SIMULATOR, EvaluationClips, EvaluationOptions, evaluate
 from ssilk_core.evaluation.splits import chosen, read_index, splits_of
 from ssilk_core.evaluation.tables import aligned, tables
 from ssilk_core.evaluation.takes import Take, back_and_forth, stopped, takes_of
-from ssilk_core.evaluation.tally import Tally, against, figures
+from ssilk_core.evaluation.tally import Tally, figures, reference_errors
 from ssilk_core.fabrics import Fabric
 from ssilk_core.kinematics import motion_transforms, skin_points, skinning_matrices
 from ssilk_core.training.validation import Validator
@@ -56,17 +66,15 @@ def motion(scene, toy_motion) -> Motion:
 
 
 @pytest.fixture
-def reel(dressed, motion) -> TakeSet:
-    return reel_of(takes_of("sway", motion, FPS), dressed, JOINTS)
+def take_set(dressed, motion) -> TakeSet:
+    return build_take_set(takes_of("sway", motion, FPS), dressed, JOINTS)
 
 
 class Still:
     """Cloth that moves by given offsets (N, 3) away from linear blend skinning, whose quasi-static state that is."""
 
-    name = "still"
-
-    def __init__(self, dressed: EvaluationScene, reel: TakeSet, offsets: Tensor) -> None:
-        self.lbs, self.offsets = Plain(dressed, reel), offsets
+    def __init__(self, dressed: EvaluationScene, take_set: TakeSet, offsets: Tensor) -> None:
+        self.lbs, self.offsets = LinearBlendSkinning(dressed, take_set), offsets
 
     def vertices(self, take: int, frames: range) -> Tensor:
         return self.lbs.vertices(take, frames) + self.offsets[frames.start : frames.stop].T
@@ -104,54 +112,62 @@ def test_energies_are_those_of_the_validation(scene, dressed, toy_motion, toy_mo
     """Of models and baselines, also over several blocks."""
     model = toy_model(scene) if kind == "ssilk" else baseline(scene, BaselineConfig(method=kind), JOINTS)
     clip = toy_motion(scene, 23)
-    reel = reel_of(takes_of("clip", clip, FPS), dressed, JOINTS)
-    network = Network(kind, model, reel)
-    validator = Validator(network.reel.bank, dressed.energy, dressed.body, scene, dressed.rest, FPS, clip.frame_count)
+    take_set = build_take_set(takes_of("clip", clip, FPS), dressed, JOINTS)
+    network = method_over(model, take_set)
+    validator = Validator(
+        network.take_set.bank, dressed.energy, dressed.body, scene, dressed.rest, FPS, clip.frame_count
+    )
     expected = validator.frame_terms(range(23), model)
     monkeypatch.setattr("ssilk_core.evaluation.record.FRAMES_PER_CHUNK", 9)
-    found = recorded(dressed, reel, network, 0).values
+    found = recorded(dressed, take_set, network, 0).values
     for name in (*TERMS, "collisions"):
         np.testing.assert_allclose(found[name], expected[name].double(), rtol=1e-4, atol=1e-7)
-    lbs = recorded(dressed, reel, Plain(dressed, reel), 0).values
+    lbs = recorded(dressed, take_set, LinearBlendSkinning(dressed, take_set), 0).values
     np.testing.assert_allclose(lbs["stretch"], validator.frame_terms(range(23), None)["stretch"], rtol=1e-4)
-    assert lbs["gravity"].abs().max() == 0 and "motion" not in lbs
+    assert lbs["gravity"].abs().max() == 0 and "static distance" not in lbs
 
 
-def test_a_record_in_blocks_is_that_of_the_whole(dressed, reel, monkeypatch):
+def test_a_record_in_blocks_is_that_of_the_whole(dressed, take_set, monkeypatch):
     offsets = 0.01 * torch.randn(40, 3, generator=torch.Generator().manual_seed(1))
-    method, truth = Still(dressed, reel, offsets), Plain(dressed, reel)
-    whole = recorded(dressed, reel, method, 0, truth)
+    method, reference = Still(dressed, take_set, offsets), LinearBlendSkinning(dressed, take_set)
+    whole = recorded(dressed, take_set, method, 0, reference)
     monkeypatch.setattr("ssilk_core.evaluation.record.FRAMES_PER_CHUNK", 2)
-    parts = recorded(dressed, reel, method, 0, truth)
+    parts = recorded(dressed, take_set, method, 0, reference)
     assert whole.values.keys() == parts.values.keys() and torch.equal(whole.stretches, parts.stretches)
     for name, values in whole.values.items():
         np.testing.assert_allclose(parts.values[name], values, rtol=1e-3, atol=1e-9, err_msg=name)
     missing = {name: int(values.isnan().sum()) for name, values in whole.values.items()}
     assert {name: count for name, count in missing.items() if count} == {
-        "kinetic": 1, "jerk": 3, "velocity": 1, "acceleration": 2,
+        "kinetic energy": 1, "jerk": 3, "velocity error": 1, "acceleration error": 2,
     }  # fmt: skip
 
 
-def test_errors_against_a_reference_are_those_of_the_offset(dressed, reel):
+def test_errors_against_a_reference_are_those_of_the_offset(dressed, take_set):
     """Cloth that is carried along a wave beside the reference, as a whole."""
     rate, amplitude = 6.0, 0.02
     path = torch.zeros(40, 3)
     path[:, 1] = amplitude * torch.sin(rate * torch.arange(40) / FPS)
-    truth = Tally({0: recorded(dressed, reel, Plain(dressed, reel), 0)}, {0: "sway"})
-    tally = Tally({0: recorded(dressed, reel, Still(dressed, reel, path), 0, Plain(dressed, reel))}, {0: "sway"})
-    found = against(tally, truth, dressed.weight)
+    reference = Tally({0: recorded(dressed, take_set, LinearBlendSkinning(dressed, take_set), 0)}, {0: "sway"})
+    tally = Tally(
+        {0: recorded(dressed, take_set, Still(dressed, take_set, path), 0, LinearBlendSkinning(dressed, take_set))},
+        {0: "sway"},
+    )
+    found = reference_errors(tally, reference, dressed.weight)
     exact = [path, path.diff(dim=0) * FPS, path.diff(n=2, dim=0) * FPS**2]
     expected = [float(values[:, 1].square().mean()) ** 0.5 for values in exact]
-    np.testing.assert_allclose([found.position, found.velocity, found.acceleration], expected, rtol=2e-3)
+    errors = [found.position_error, found.velocity_error, found.acceleration_error]
+    np.testing.assert_allclose(errors, expected, rtol=2e-3)
     mass = float(dressed.energy.mass.sum())
-    assert found.floats == pytest.approx(mass * GRAVITY * float(path[:, 1].mean()) / dressed.weight, rel=1e-3)
-    own = figures(tally, truth, dressed.weight)
-    assert found.excess == pytest.approx(own.total - found.total) and found.frames == 40
-    assert own.motion == pytest.approx(expected[0], rel=1e-3) and own.lift == pytest.approx(found.floats, rel=1e-3)
-    assert own.jitter_of_lbs == pytest.approx(found.jitter)
+    lifted = mass * GRAVITY * float(path[:, 1].mean())
+    assert found.gravity_excess == pytest.approx(lifted / dressed.weight, rel=1e-3)
+    own = figures(tally, reference, dressed.weight)
+    assert found.total_excess == pytest.approx(own.total - found.reference_total) and found.frames == 40
+    assert own.static_distance == pytest.approx(expected[0], rel=1e-3)
+    assert own.gravity_excess == pytest.approx(found.gravity_excess, rel=1e-3)
+    assert own.jerk_ratio == pytest.approx(found.jerk_ratio)
 
 
-def test_collisions_can_be_with_the_whole_body(scene, dressed, reel):
+def test_collisions_can_be_with_the_whole_body(scene, dressed, take_set):
     """A spike of the ball right behind the cloth: its long triangles are near where its only vertex is far."""
     ball = scene.character.bodies[0]
     points = ball.mesh.points.copy()
@@ -159,8 +175,10 @@ def test_collisions_can_be_with_the_whole_body(scene, dressed, reel):
     body = replace(ball, mesh=replace(ball.mesh, points=points))
     spiked = replace(scene, character=replace(scene.character, bodies=(body,)))
     near, whole = (EvaluationScene(spiked, dressed.fabric, FPS, CPU, exact=exact) for exact in (False, True))
-    found = [recorded(one, reel, Plain(one, reel), 0).values["collision"] for one in (near, whole)]
-    character = reel.character(0, range(40))
+    found = [
+        recorded(one, take_set, LinearBlendSkinning(one, take_set), 0).values["collision"] for one in (near, whole)
+    ]
+    character = take_set.character(0, range(40))
     distance = signed_distance(whole.lbs(character), whole.body.pose(character, exact=True))
     np.testing.assert_allclose(found[1], whole.energy.collision_at(distance), rtol=1e-5)
     assert (found[0] - found[1]).abs().max() > 1e-3
@@ -171,71 +189,78 @@ def test_the_weight_is_that_of_the_cloth_at_its_height(dressed):
     assert dressed.weight == pytest.approx(0.2 * 0.55 * 0.15 * 9.81 * 0.55)
 
 
-def test_a_point_cache_is_measured_as_the_cloth_that_was_written(scene, dressed, reel, motion):
+def test_a_point_cache_is_measured_as_the_cloth_that_was_written(scene, dressed, take_set, motion):
     matrices = skinning_matrices(
         motion_transforms(motion, scene.character.skeleton.parents), scene.character.skeleton.bind_transforms
     )
     points = skin_points(scene.garment.mesh.points, scene.lbs_skin, matrices)
-    cache = CachedPoints("cache", lambda clip, frames: points[frames.start : frames.stop], dressed, reel)
-    lbs = Plain(dressed, reel)
-    ours, theirs = (recorded(dressed, reel, method, 0, lbs) for method in (cache, lbs))
-    for name in (*TERMS, "kinetic"):
+    cache = CachedPoints(lambda clip, frames: points[frames.start : frames.stop], dressed, take_set)
+    lbs = LinearBlendSkinning(dressed, take_set)
+    ours, theirs = (recorded(dressed, take_set, method, 0, lbs) for method in (cache, lbs))
+    for name in (*TERMS, "kinetic energy"):
         np.testing.assert_allclose(ours.values[name], theirs.values[name], rtol=1e-3, atol=2e-6, err_msg=name)
-    assert ours.values["position"].max() < 1e-10
-    elsewhere = CachedPoints("cache", lambda clip, frames: points[frames.start : frames.stop] + 0.1, dressed, reel)
+    assert ours.values["position error"].max() < 1e-10
+    elsewhere = CachedPoints(lambda clip, frames: points[frames.start : frames.stop] + 0.1, dressed, take_set)
     with pytest.raises(SsilkError, match=r"sway: in the point cache, pinned vertices are 0.173 m from"):
         elsewhere.vertices(0, range(5))
 
 
 def test_a_swing_that_dies_away_settles(dressed, motion):
     """An offset that decays while the pose is held: energy, settling time and distance from rest follow from it."""
-    takes, first = stops(takes_of("sway", motion, FPS), FPS, 2, 2.0)
+    takes, first = stopped_takes(takes_of("sway", motion, FPS), FPS, 2, 2.0)
     assert [take.clip for take in takes] == ["sway"] * 2 and first[1] > first[0]
-    reel, tau, begun = reel_of(takes, dressed, JOINTS), 0.3, 0.1
+    take_set, tau, begun = build_take_set(takes, dressed, JOINTS), 0.3, 0.1
     count = max(take.frame_count for take in takes)
     offsets = torch.zeros(count, 3)
     offsets[:, 1] = begun * torch.exp(-(torch.arange(count) - first[0]) / FPS / tau)
-    found = held(dressed, reel, Still(dressed, reel, offsets), first)[0]
+    found = settling(dressed, take_set, Still(dressed, take_set, offsets), first)[0]
     decay = 1 - math.exp(-1 / FPS / tau)  # the first two frames at rest are apart by begun * decay
     speed, mass = begun * FPS * decay, float(dressed.energy.mass.sum())
-    assert found.begun == pytest.approx(mass * speed**2 / 2, rel=1e-3)
-    settled = tau * math.log(speed / CALM)
-    assert settled <= found.settling < settled + 1 / FPS
+    assert found.initial_kinetic_energy == pytest.approx(mass * speed**2 / 2, rel=1e-3)
+    settled = tau * math.log(speed / REST_SPEED)
+    assert settled <= found.settling_time < settled + 1 / FPS
     last = begun * math.exp(-(takes[0].frame_count - 1 - first[0]) / FPS / tau)
-    assert found.distance == pytest.approx(last, rel=1e-3)
-    assert found.floats == pytest.approx(mass * GRAVITY * last / dressed.weight, rel=1e-3)
+    assert found.static_distance == pytest.approx(last, rel=1e-3)
+    assert found.gravity_excess == pytest.approx(mass * GRAVITY * last / dressed.weight, rel=1e-3)
 
 
 def test_cloth_that_is_held_up_is_found_out(dressed, motion):
     """Ten centimetres above its quasi-static state for ever: it settles, and floats."""
-    takes, first = stops(takes_of("sway", motion, FPS), FPS, 1, 1.0)
-    reel = reel_of(takes, dressed, JOINTS)
+    takes, first = stopped_takes(takes_of("sway", motion, FPS), FPS, 1, 1.0)
+    take_set = build_take_set(takes, dressed, JOINTS)
     lifted = torch.tensor([0.0, 0.1, 0.0]).expand(takes[0].frame_count, 3)
-    found = joined_holds(held(dressed, reel, Still(dressed, reel, lifted), first))
-    assert (found.stops, found.settled) == (1, 1.0) and found.kinetic < 1e-9
-    assert found.distance == found.furthest == pytest.approx(0.1, rel=1e-4)
-    assert found.floats == pytest.approx(0.1 / 0.55, rel=1e-3)
-    assert joined_holds([]) is None and joined_loops([]) is None
+    found = joined_settling(settling(dressed, take_set, Still(dressed, take_set, lifted), first))
+    assert (found.stops, found.settled_share) == (1, 1.0) and found.final_kinetic_energy < 1e-9
+    assert found.static_distance == found.max_static_distance == pytest.approx(0.1, rel=1e-4)
+    assert found.gravity_excess == pytest.approx(0.1 / 0.55, rel=1e-3)
+    assert joined_settling([]) is None and joined_loop_drift([]) is None
 
 
 def test_minima_are_where_forces_balance(dressed, motion):
     """Of two poses at once, from linear blend skinning: lower, in balance, and a place to measure heights from."""
-    takes, _ = stops(takes_of("sway", motion, FPS), FPS, 2, 0.5)
-    reel = reel_of(takes, dressed, JOINTS)
-    found = minima(dressed.simulator, takes, last_frames(Plain(dressed, reel), takes))
+    takes, _ = stopped_takes(takes_of("sway", motion, FPS), FPS, 2, 0.5)
+    take_set = build_take_set(takes, dressed, JOINTS)
+    found = minima(dressed.simulator, takes, last_frames(LinearBlendSkinning(dressed, take_set), takes))
     np.testing.assert_allclose(found.start, found.poses.lbs, atol=1e-6)
-    assert (found.imbalance < 0.01).all() and (found.over() > 0.01).all() and (found.distance() > 0.01).all()
-    middle = dressed.simulator.setting(found.poses, None).body.points.double().mean(0)
+    assert (found.residual < 0.01).all() and (found.energy_excess() > 0.01).all() and (found.distance() > 0.01).all()
+    middle = dressed.simulator.inputs(found.poses, None).body.points.double().mean(0)
     assert (found.inside(0 * found.x + middle) == 1).all() and (found.inside(found.x + 100) == 0).all()
     lifted = found.x + torch.tensor([0.3, 0.1, -0.2], dtype=torch.float64)[:, None]
     mass = float(dressed.energy.mass.sum())
-    np.testing.assert_allclose(found.floats(lifted), mass * GRAVITY * 0.1, rtol=1e-6)
-    figures_of = hung(found, dressed.weight)
-    joined = joined_hung(figures_of)
-    assert joined.floats == pytest.approx(joined.lbs, rel=1e-4) and joined.stops == 2 and joined_hung([]) is None
-    assert joined.above == pytest.approx(float(found.over().mean())) and joined.imbalance == found.imbalance.max()
+    np.testing.assert_allclose(found.gravity_excess(lifted), mass * GRAVITY * 0.1, rtol=1e-6)
+    figures_of = minimum_errors(found, dressed.weight)
+    joined = joined_minimum_errors(figures_of)
+    assert (
+        joined.gravity_excess == pytest.approx(joined.lbs_gravity_excess, rel=1e-4)
+        and joined.stops == 2
+        and joined_minimum_errors([]) is None
+    )
+    assert (
+        joined.static_energy_excess == pytest.approx(float(found.energy_excess().mean()))
+        and joined.max_residual == found.residual.max()
+    )
     again = minima(dressed.simulator, takes, found.x.float() + found.poses.root - _origins(takes))
-    assert (again.over().abs() < 1e-5).all() and (again.distance() < 1e-3).all()
+    assert (again.energy_excess().abs() < 1e-5).all() and (again.distance() < 1e-3).all()
 
 
 def _origins(takes: Sequence[Take]) -> Tensor:
@@ -245,36 +270,42 @@ def _origins(takes: Sequence[Take]) -> Tensor:
 def test_the_simulator_comes_to_rest_at_its_own_minimum(scene, dressed, motion):
     """Played over a stop in thick air like any other method: calm at the end, where forces balance."""
     dressed = EvaluationScene(scene, replace(dressed.fabric, drag=1.2), FPS, CPU)
-    takes, first = stops(takes_of("sway", motion, FPS), FPS, 1, 1.5)
-    reel = reel_of(takes, dressed, JOINTS)
-    found = held(dressed, reel, Simulated("simulator", dressed, reel), first)[0]
-    assert found.begun > 100 * found.kinetic and 0 < found.settling < 1.5
-    assert found.distance < 0.01 and abs(found.floats) < 0.005
+    takes, first = stopped_takes(takes_of("sway", motion, FPS), FPS, 1, 1.5)
+    take_set = build_take_set(takes, dressed, JOINTS)
+    found = settling(dressed, take_set, Simulated(dressed, take_set), first)[0]
+    assert found.initial_kinetic_energy > 100 * found.final_kinetic_energy and 0 < found.settling_time < 1.5
+    assert found.static_distance < 0.01 and abs(found.gravity_excess) < 0.005
 
 
 def test_holds_come_together(dressed, motion):
-    takes, first = stops(takes_of("sway", motion, FPS), FPS, 3, 1.0)
-    reel = reel_of(takes, dressed, JOINTS)
-    single = held(dressed, reel, Still(dressed, reel, torch.zeros(100, 3)), first)
-    never = replace(single[0], settled=0.0, settling=math.inf, distance=0.3, furthest=0.3)
-    assert joined_holds([never, never, single[1]]).settling == math.inf
-    found = joined_holds([never, single[1], single[2]])
-    assert found.settled == pytest.approx(2 / 3) and found.settling < math.inf and found.stops == 3
-    assert found.distance == pytest.approx(0.3 / 3**0.5, rel=1e-3) and found.furthest == 0.3
+    takes, first = stopped_takes(takes_of("sway", motion, FPS), FPS, 3, 1.0)
+    take_set = build_take_set(takes, dressed, JOINTS)
+    single = settling(dressed, take_set, Still(dressed, take_set, torch.zeros(100, 3)), first)
+    never = replace(
+        single[0], settled_share=0.0, settling_time=math.inf, static_distance=0.3, max_static_distance=0.3
+    )
+    assert joined_settling([never, never, single[1]]).settling_time == math.inf
+    found = joined_settling([never, single[1], single[2]])
+    assert found.settled_share == pytest.approx(2 / 3) and found.settling_time < math.inf and found.stops == 3
+    assert found.static_distance == pytest.approx(0.3 / 3**0.5, rel=1e-3) and found.max_static_distance == 0.3
 
 
 def test_drift_is_what_changes_from_loop_to_loop(dressed, motion):
-    takes, lengths = looped(takes_of("sway", motion, FPS), FPS, 400)
-    reel = reel_of(takes, dressed, JOINTS)
+    takes, lengths = looped_takes(takes_of("sway", motion, FPS), FPS, 400)
+    take_set = build_take_set(takes, dressed, JOINTS)
     frames, length = takes[0].frame_count, lengths[0]
-    same = drifted(dressed, reel, Still(dressed, reel, torch.zeros(frames, 3)), lengths)[0]
-    assert frames >= 400 and abs(same.drift) < 1e-6 and same.apart < 1e-6
+    same = loop_drift(dressed, take_set, Still(dressed, take_set, torch.zeros(frames, 3)), lengths)[0]
+    assert frames >= 400 and abs(same.total_drift) < 1e-6 and same.loop_distance < 1e-6
     rising = torch.zeros(frames, 3)
     rising[:, 1] = 0.05 * torch.arange(frames) / frames
-    found = drifted(dressed, reel, Still(dressed, reel, rising), lengths)[0]
-    assert found.apart == pytest.approx(0.05 * (frames - 2 * length) / frames, rel=1e-3)
-    joined = joined_loops([found, replace(found, drift=-1.0, most=-1.0)])
-    assert joined.most == -1.0 and joined.drift == pytest.approx((found.drift - 1) / 2)
+    found = loop_drift(dressed, take_set, Still(dressed, take_set, rising), lengths)[0]
+    assert found.loop_distance == pytest.approx(0.05 * (frames - 2 * length) / frames, rel=1e-3)
+    joined = joined_loop_drift([found, replace(found, total_drift=-1.0, max_total_drift=-1.0)])
+    assert joined.max_total_drift == -1.0 and joined.total_drift == pytest.approx((found.total_drift - 1) / 2)
+
+
+def evaluated(name: str, model: torch.nn.Module) -> EvaluatedMethod:
+    return EvaluatedMethod(name, JOINTS, partial(method_over, model))
 
 
 def playlist(dressed: EvaluationScene, motion: Motion, slow: Motion, **options: object) -> EvaluationClips:
@@ -286,15 +317,18 @@ def playlist(dressed: EvaluationScene, motion: Motion, slow: Motion, **options: 
 def test_every_method_gets_its_row_in_every_split(scene, dressed, motion, toy_motion, toy_model):
     motion, slow = motion.clip(0, 20), toy_motion(scene, 12, speed=0.3)
     subjects = [
-        EvaluatedModel("ssilk", toy_model(scene), JOINTS),
-        EvaluatedModel("ncs", baseline(scene, BaselineConfig(method="ncs"), JOINTS), JOINTS),
+        evaluated("ssilk", toy_model(scene)),
+        evaluated("ncs", baseline(scene, BaselineConfig(method="ncs"), JOINTS)),
     ]
     cache = {}
 
     def read(clip: str, frames: range) -> np.ndarray:
         if not cache:
-            reel = reel_of(takes_of("slow", slow, FPS), dressed, JOINTS)
-            cache["slow"] = Plain(dressed, reel).vertices(0, range(12)).permute(2, 0, 1) + slow.translations[0, 0]
+            take_set = build_take_set(takes_of("slow", slow, FPS), dressed, JOINTS)
+            cache["slow"] = (
+                LinearBlendSkinning(dressed, take_set).vertices(0, range(12)).permute(2, 0, 1)
+                + slow.translations[0, 0]
+            )
         return cache[clip][frames.start : frames.stop].numpy()
 
     played = playlist(dressed, motion, slow, simulated=frozenset({"slow"}), read=read, seen=[motion])
@@ -306,12 +340,15 @@ def test_every_method_gets_its_row_in_every_split(scene, dressed, motion, toy_mo
     assert names == [(method, split) for method in methods for split in ("valid", "flips")]
     by_name = {name: row.figures for name, row in zip(names, rows)}
     model, simulated = by_name["ssilk", "valid"], by_name[SIMULATOR, "valid"]
-    assert (model.frames, model.truth.frames, simulated.frames, simulated.clips) == (32, 12, 12, 1)
-    assert by_name["LBS", "valid"].truth.position < 1e-6 < model.truth.position  # LBS is what was written
-    assert (model.holds.stops, model.hung.stops, model.loops.clips) == (2, 2, 2) and model.hung.above > 0
-    assert by_name["LBS", "valid"].holds is None and simulated.holds.stops == 2
+    assert (model.frames, model.reference.frames, simulated.frames, simulated.clips) == (32, 12, 12, 1)
+    assert (
+        by_name["LBS", "valid"].reference.position_error < 1e-6 < model.reference.position_error
+    )  # LBS is what was written
+    assert (model.settling.stops, model.minimum.stops, model.loop_drift.clips) == (2, 2, 2)
+    assert model.minimum.static_energy_excess > 0
+    assert by_name["LBS", "valid"].settling is None and simulated.settling.stops == 2
     # The training saw 'sway' and not 'slow', which is why the whole is nearer than the part.
-    assert model.poses.mean < by_name["ssilk", "flips"].poses.mean
+    assert model.pose_novelty.mean_distance < by_name["ssilk", "flips"].pose_novelty.mean_distance
     assert model.clip_totals[0] <= model.total <= model.clip_totals[2]
     text = tables(rows)
     first = [line.split("|")[2].strip() for line in text.split("\n\n")[0].splitlines()[2:]]
@@ -319,27 +356,19 @@ def test_every_method_gets_its_row_in_every_split(scene, dressed, motion, toy_mo
     assert text.count("| garment") == 7 and len({len(line) for line in text.split("\n\n")[0].splitlines()}) == 1
 
 
-def test_a_character_that_never_moves_has_no_jitter_to_compare_with(scene, dressed, motion, toy_model):
+def test_a_character_that_never_moves_has_no_jerk_to_compare_with(scene, dressed, motion, toy_model):
     frozen = replace(motion, rotations=motion.rotations[[5] * 12], translations=motion.translations[[5] * 12])
     played = EvaluationClips(clips={"frozen": frozen}, splits={"all": ["frozen"]})
-    rows = list(
-        evaluate(
-            dressed, [EvaluatedModel("ssilk", toy_model(scene), JOINTS)], played, EvaluationOptions(stops=0, loop=0)
-        )
-    )
-    assert rows[0].figures.jitter == 0 and math.isnan(rows[1].figures.jitter_of_lbs) and "nan" in tables(rows)
+    rows = list(evaluate(dressed, [evaluated("ssilk", toy_model(scene))], played, EvaluationOptions(stops=0, loop=0)))
+    assert rows[0].figures.jerk == 0 and math.isnan(rows[1].figures.jerk_ratio) and "nan" in tables(rows)
 
 
 def test_nothing_is_asked_for_nothing_is_computed(scene, dressed, motion, toy_model):
     played = EvaluationClips(clips={"sway": motion}, splits={"all": ["sway"]})
-    rows = list(
-        evaluate(
-            dressed, [EvaluatedModel("ssilk", toy_model(scene), JOINTS)], played, EvaluationOptions(stops=0, loop=0)
-        )
-    )
+    rows = list(evaluate(dressed, [evaluated("ssilk", toy_model(scene))], played, EvaluationOptions(stops=0, loop=0)))
     assert [row.method for row in rows] == ["LBS", "ssilk"]
     found = rows[1].figures
-    assert (found.truth, found.poses, found.holds, found.loops) == (None, None, None, None)
+    assert (found.reference, found.pose_novelty, found.settling, found.loop_drift) == (None, None, None, None)
 
 
 def test_an_index_says_which_clips_are_in_which_split(tmp_path):
@@ -384,7 +413,7 @@ def test_options_out_of_range_are_refused(options, complaint):
 def test_no_take_is_refused(dressed, motion):
     nothing: Sequence[Take] = takes_of("short", motion.clip(0, 3), FPS)
     with pytest.raises(SsilkError, match="none of four frames"):
-        reel_of(nothing, dressed, JOINTS)
+        build_take_set(nothing, dressed, JOINTS)
 
 
 def test_tables_are_aligned():

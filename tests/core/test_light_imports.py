@@ -18,12 +18,13 @@ CORE, USD = ROOT / "ssilk_core", ROOT / "usd" / "ssilk_usd"
 # From the inside out: a module imports its own layer or those before it.
 LAYERS = (
     {"errors"},
+    {"schemes"},
     {"assets", "config", "devices", "fabrics", "events", "files", "packing", "tensors"},
     {"mesh", "kinematics", "kernels", "descriptors", "parameters", "sampling", "targets"},
     {"model", "energy"},
     {"checkpoint"},
     {"demo", "view", "simulate", "training", "rollout", "preflight", "setup", "wardrobe", "runtime", "farm"},
-    {"baselines", "cost", "reduction", "refine"},
+    {"cost", "reduction", "refine"},
     {"evaluation", "quality", "stress"},
     {"trade", "report"},
     {"cli"},

@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from ssilk_core.assets import GarmentPose, SkinWeights
-from ssilk_core.config import SCHEMES, ModelConfig
+from ssilk_core.config import ModelConfig
 from ssilk_core.model.network import GarmentModel, mlp, model_joints
 from ssilk_core.parameters import descriptor_sizes, parameter_shapes
+from ssilk_core.schemes import SCHEMES
 
 
 def fresh(scene, **options) -> GarmentModel:
@@ -23,13 +24,15 @@ def test_mlp_has_the_layers_asked_for_and_a_quiet_last_one():
     assert network(torch.randn(4, 5)).abs().max() == 0
 
 
-def test_training_starts_from_plain_verlet_and_almost_plain_skinning(scene):
-    model = fresh(scene, scheme="verlet", latent_bound=0.0, max_latent_step=0.0)
-    before, now = torch.randn(2, 6, 8, generator=torch.Generator().manual_seed(0))
-    pose = torch.randn(6, model.stepper[0].in_features - 16, generator=torch.Generator().manual_seed(1))
+def test_training_starts_from_the_spring_alone_and_almost_from_lbs(scene):
+    model = fresh(scene, latent_bound=0.0, max_latent_step=0.0)
+    before, now, rest = torch.randn(3, 6, 8, generator=torch.Generator().manual_seed(0))
+    pose = torch.randn(6, model.stepper[0].in_features - 24, generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
-        stepped = model.step(before, now, now, pose)
-        np.testing.assert_allclose(stepped, now + 0.9 * (now - before), atol=1e-6)
+        stepped, own = model.step(before, now, rest, pose), model.integrator
+        forward = now + own.beta * (now - before)
+        spring = model.config.stiffness * torch.sigmoid(own.share) * (rest - forward)
+        np.testing.assert_allclose(stepped, forward + spring, atol=1e-6)
         activation, rotations = model.pose(now)
     assert activation.abs().max() < 0.1
     np.testing.assert_allclose(rotations, torch.eye(3)[None, ..., None].expand(2, 3, 3, 6), atol=0.1)

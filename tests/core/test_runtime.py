@@ -17,11 +17,12 @@ from ssilk_core.errors import SsilkError
 from ssilk_core.fabrics import FABRICS
 from ssilk_core.kinematics import deform, resample
 from ssilk_core.model.network import GarmentModel
-from ssilk_core.parameters import SCHEMES, parameter_shapes
+from ssilk_core.parameters import parameter_shapes
 from ssilk_core.rollout import decode, garment_poses, roll
 from ssilk_core.runtime import Player
 from ssilk_core.runtime.character import character_matrices
 from ssilk_core.runtime.stepper import SoftClamp
+from ssilk_core.schemes import SCHEMES
 
 FRAMES = 150  # more than two blocks of decoded frames, the last one short
 
@@ -228,11 +229,6 @@ def test_a_motion_of_another_character_is_refused(model, scene, toy_motion):
     player, motion = player_of(model), toy_motion(scene, 5)
     with pytest.raises(SsilkError, match="2 joints; the model's character has 3"):
         player.play(replace(motion, rotations=motion.rotations[:, :2], translations=motion.translations[:, :2]))
-
-
-def test_other_schemes_are_refused(scene, toy_model):
-    with pytest.raises(SsilkError, match="scheme is 'direct'"):
-        player_of(toy_model(scene, scheme="direct"))
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)

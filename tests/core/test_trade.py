@@ -13,7 +13,7 @@ import torch
 from ssilk_core.checkpoint import model_file
 from ssilk_core.cost import ShotBytes, model_bytes
 from ssilk_core.errors import SsilkError
-from ssilk_core.evaluation.methods import EvaluationScene, Network, reel_of
+from ssilk_core.evaluation.methods import EvaluationScene, Network, build_take_set
 from ssilk_core.evaluation.record import recorded
 from ssilk_core.evaluation.takes import takes_of
 from ssilk_core.fabrics import FABRICS
@@ -48,7 +48,7 @@ def bench(scene, model, toy_motion):
         for name, frames in (("long", 50), ("short", 20))
         for take in takes_of(name, toy_motion(scene, frames), FPS)
     ]
-    return Reducer(file, [toy_motion(scene, 60, speed=1.3)]), dressed, reel_of(takes, dressed, file.joints)
+    return Reducer(file, [toy_motion(scene, 60, speed=1.3)]), dressed, build_take_set(takes, dressed, file.joints)
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +92,7 @@ def test_precisions_round_as_they_should():
 
 def test_the_whole_model_is_what_the_network_in_pytorch_is(meter, bench, model, points):
     reducer, dressed, reel = bench
-    network = Network("ssilk", model, reel)
+    network = Network(model, reel)
     records = [recorded(dressed, reel, network, take) for take in range(2)]
     total = sum(
         torch.cat([r.values[name] for r in records])

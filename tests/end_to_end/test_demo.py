@@ -18,9 +18,9 @@ from ssilk_usd.stages import demo_body_path
 from ssilk_usd.write import write_garment, write_motion
 
 from ssilk_core.assets import Garment, Motion, Scene, Skeleton
+from ssilk_core.bake import BakeRequest, load_rollout
 from ssilk_core.checkpoint import ModelFile, load_model, save_model
 from ssilk_core.cli import demo, main, parser
-from ssilk_core.cli._baking import BakeRequest, open_bake
 from ssilk_core.cli.options import load_scene
 from ssilk_core.demo import garments, motions, shipped
 from ssilk_core.energy import GarmentEnergy
@@ -83,8 +83,8 @@ def test_shipped_models_do_what_they_did_when_they_were_packed(garment, tmp_path
     model, shot = shipped.shipped_path(garment), tmp_path / "shot.usdc"
     file, skeleton = load_model(model), read_character(demo_body_path()).skeleton
     write_motion(shot, motions.demo_shot(skeleton), skeleton)
-    bake = open_bake(BakeRequest(model=str(model), stage=str(demo_body_path()), motion=str(shot)))
-    points = torch.tensor(np.stack(list(bake.vertices(silent))), dtype=torch.float32)
+    bake = load_rollout(BakeRequest(model=str(model), stage=str(demo_body_path()), motion=str(shot)))
+    points = torch.tensor(np.stack(list(bake.vertices())), dtype=torch.float32)
     energy = GarmentEnergy(file.scene.garment.mesh, file.fabric, device=torch.device("cpu"))
     found = float(energy.stretch(points.permute(1, 2, 0).contiguous()).mean())
     assert found == pytest.approx(file.provenance["shipped"]["stretch on the demo's shot [J]"], rel=0.01)

@@ -18,10 +18,9 @@ import pytest
 from pxr import Sdf
 from ssilk_usd import layers as layers_of_usd
 
-from ssilk_core.cli import farm as farm_verb
+from ssilk_core.bake import LayerFolder
 from ssilk_core.cli import main
-from ssilk_core.cli._layers import Wardrobe, bake_task
-from ssilk_core.events import silent
+from ssilk_core.farm import cluster
 from ssilk_core.farm.job import read_job
 from ssilk_core.files import sha256
 
@@ -121,11 +120,11 @@ def test_a_chunk_writes_its_asset_once_while_it_stays_as_it_was(farm, monkeypatc
 
     monkeypatch.setattr(layers_of_usd, "write_asset", counted)
     assert task() == 0 and written == ["a"]
-    wardrobe, job = Wardrobe(), read_job(Path("bundle/job.json"))
-    bake_task(job[0], Path("out"), wardrobe, silent, again=True)
+    folder, job = LayerFolder("out"), read_job(Path("bundle/job.json"))
+    folder.bake(job[0], again=True)
     whole = sha256("out/assets/model/geometry.usdc")
     Path("out/assets/model/geometry.usdc").write_bytes(b"")
-    bake_task(job[1], Path("out"), wardrobe, silent, again=True)
+    folder.bake(job[1], again=True)
     assert written == ["a", "a", "b"] and sha256("out/assets/model/geometry.usdc") == whole
 
 
@@ -204,24 +203,24 @@ def test_a_cluster_whose_workers_die_bakes_every_shot_once(farm, monkeypatch, ca
     assert run("task bundle/job.json -o quiet") == 0
 
     def dying(job, folder):
-        from ssilk_core.cli.farm import bake_here
+        from ssilk_core.farm.cluster import bake_here
 
         first = not (tried := folder.with_name(f"tried_{job.shot}")).exists()
         tried.touch()
         if first and job.shot == "a":
             os.kill(os.getpid(), signal.SIGKILL)
-        detail = bake_here(job, folder)
+        result = bake_here(job, folder)
         if first and job.shot == "b":
             (folder / "shots/b/model/bake.json").unlink()
             os.kill(os.getpid(), signal.SIGKILL)
-        if "current" not in detail:
+        if not result.current:
             with folder.with_name("log").open("a") as log:
                 log.write(f"{job.name}\n")
         if first and job.shot == "c":
             os.kill(os.getpid(), signal.SIGKILL)
-        return detail
+        return result
 
-    monkeypatch.setattr(farm_verb, "bake_here", dying)
+    monkeypatch.setattr(cluster, "bake_here", dying)
     Path("d.usda").write_text("no usd")
     capsys.readouterr()
     assert run(f"{WORDS} d.usda -o out --cluster") == 4

@@ -398,7 +398,7 @@ OPTIONS = [
     Case("unknown setting", f"{TRAIN} --set magic=1", ("--set magic=1", "settings are", "iterations", "latent")),
     Case("setting of the wrong type", f"{TRAIN} --set iterations=many", ("'iterations=many'", "int")),
     Case("setting without a value", f"{TRAIN} --set latent", ("'latent'", "int")),
-    Case("unknown scheme", f"{TRAIN} --set scheme=euler", ("'euler'", "verlet")),
+    Case("unknown scheme", f"{TRAIN} --set scheme=euler", ("'euler'", "spring_verlet")),
     Case("no iterations", f"{TRAIN} --set iterations=0", ("'iterations'", "0", "between 1 and")),
     Case("zero-length window", f"{TRAIN} --set window=0", ("window of 0 poses", "at least 3")),
     Case("window longer than the clip", f"{TRAIN} --set window=500", ("500", "--set window=")),

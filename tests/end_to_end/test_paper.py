@@ -80,6 +80,8 @@ def test_every_command_is_understood_and_every_need_is_made(paper, plan):
     for job in found:
         if job.command[:3] == (PYTHON, "-m", "ssilk_core"):
             assert verbs.parse_args(job.command[3:]).verb in ("train", "simulate")
+        else:
+            assert job.command[0] == PYTHON and (Path(__file__).parents[2] / job.command[1]).is_file()
     trained = [job for job in found if job.name.startswith("cape_ssilk") and job.command[3] == "train"]
     assert len(trained) == 3 and len({job.command[-1] for job in trained}) == 1  # seeds differ in nothing else
 
@@ -97,7 +99,7 @@ def test_equal_iterations_are_as_many_as_the_baselines_have(paper, plan):
 
 
 def test_only_models_that_are_there_are_measured(paper, plan, tmp_path):
-    from paper_jobs import without_models
+    from helpers.paper_jobs import without_models
 
     job = next(job for job in paper.jobs(plan) if job.name == "pants_sequences")
     plan.model("pants_ncs").parent.mkdir()

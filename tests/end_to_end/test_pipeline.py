@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shlex
 import shutil
 import signal
@@ -19,8 +20,9 @@ import torch
 from pxr import Gf, Sdf, Usd, UsdSkel, Vt
 from ssilk_usd.provenance import read_provenance
 
+from ssilk_core.bake import BakeRollout, bake_layers
 from ssilk_core.checkpoint import load_model, save_model
-from ssilk_core.cli import _baking, main
+from ssilk_core.cli import main
 
 EVENTS = {"started", "progress", "message", "checkpoint", "result", "failed"}
 SHOT = "bake model.safetensors --stage rigged.usda --motion clip.usda"
@@ -127,10 +129,10 @@ def test_the_same_bake_gives_the_same_bytes(world):
 def test_a_pre_roll_changes_poses_and_no_times(world):
     assert run(f"{SHOT} -o shot.usdc --no-verify") == 0
     assert run(f"{SHOT} -o settled.usdc --pre-roll 0.5") == 0
-    lbs, settled = Usd.Stage.Open("shot.usdc"), Usd.Stage.Open("settled.usdc")
+    direct, settled = Usd.Stage.Open("shot.usdc"), Usd.Stage.Open("settled.usdc")
     for read in (Usd.Stage.GetStartTimeCode, Usd.Stage.GetEndTimeCode):
-        assert read(lbs) == read(settled)
-    first = [np.array(animation(shot).GetRotationsAttr().Get(shot.GetStartTimeCode())) for shot in (lbs, settled)]
+        assert read(direct) == read(settled)
+    first = [np.array(animation(shot).GetRotationsAttr().Get(shot.GetStartTimeCode())) for shot in (direct, settled)]
     np.testing.assert_array_equal(first[0][:3], first[1][:3])
     assert np.abs(first[0][3:] - first[1][3:]).max() > 1e-4
     assert run("verify settled.usdc") == 0
@@ -142,12 +144,12 @@ def test_a_pre_roll_out_of_range_is_refused(world, capsys, seconds):
     assert "0 to 600 are allowed" in capsys.readouterr().err
 
 
-def test_plain_skinning_moves_with_the_body_alone(world):
-    assert run(f"{SHOT} -o plain.usdc --lbs") == 0
-    stage = Usd.Stage.Open("plain.usdc")
+def test_linear_blend_skinning_moves_with_the_body_alone(world):
+    assert run(f"{SHOT} -o lbs.usdc --lbs") == 0
+    stage = Usd.Stage.Open("lbs.usdc")
     assert len(animation(stage).GetJointsAttr().Get()) == 3
     assert not animation(stage).GetBlendShapesAttr().Get()
-    assert run("verify plain.usdc") == 0
+    assert run("verify lbs.usdc") == 0
 
 
 def test_a_tampered_rotation_fails_verification(world, capsys):
@@ -192,8 +194,8 @@ def test_of_several_animations_one_is_named(world, tmp_path):
 
 def test_a_shot_that_fails_its_proof_is_not_kept(world, monkeypatch, capsys):
     """The decoder is moved by 1 cm, so that no written file agrees with it."""
-    honest = _baking.Bake._decoded
-    monkeypatch.setattr(_baking.Bake, "_decoded", lambda bake, pose: honest(bake, pose) + 0.01)
+    honest = BakeRollout.decode
+    monkeypatch.setattr(BakeRollout, "decode", lambda rollout, pose: honest(rollout, pose) + 0.01)
     Path("shots").mkdir()
     Path("shots/shot.usdc").write_text("older")
     capsys.readouterr()
@@ -247,3 +249,45 @@ def test_an_interrupted_training_goes_on_to_the_same_model(world):
     assert main([*train, "-o", "halved.safetensors", "--resume"]) == 0
     assert main([*train, "-o", "whole.safetensors"]) == 0
     assert Path("halved.safetensors").read_bytes() == Path("whole.safetensors").read_bytes()
+
+
+DOCUMENT = Path(__file__).parents[2] / "docs" / "pipeline.md"
+
+
+def test_the_python_example_runs_as_it_is_written(world, capsys):
+    (code,) = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), flags=re.DOTALL)
+    Path("model.safetensors").rename("cape.safetensors")
+    for name, frames in (("walk", 8), ("run", 6)):
+        world.write_clip(Path(f"{name}.usdc"), frames=frames)
+    Sdf.Layer.FindOrOpen("rigged.usda").Export("hero.usdc")
+    capsys.readouterr()
+    names: dict = {}
+    exec(compile(code, str(DOCUMENT), "exec"), names)
+    printed, reported = capsys.readouterr()
+    result, layers = names["result"], names["layers"]
+    assert (result.frames, result.fps, result.size_bytes) == (8, 30, Path("shot.usdc").stat().st_size)
+    assert result.verification.largest_error_m < result.verification.allowed_error_m
+    assert [layer.frames for layer in layers] == [8, 6] and all(layer.path.is_file() for layer in layers)
+    assert Path("layers/shots/run/shot.usda").is_file()
+    assert "8 frames at 30.0 fps" in printed and "shot.usdc" in reported
+    again = bake_layers([names["walk"]], "layers")[0]
+    assert again.current and replace(again, current=False) == layers[0]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"plain": True}, "'plain' is no field"),
+        ({"samples_per_frame": "many"}, "'samples_per_frame' is 'many'"),
+        ({"keep": "1,2"}, "not enough values"),
+    ],
+)
+def test_a_shot_of_other_settings_is_refused_and_not_misread(world, capsys, change, says):
+    layer = Sdf.Layer.FindOrOpen("shot.usda")
+    data = layer.customLayerData
+    data["ssilk"]["request"] = {**data["ssilk"]["request"], **change}
+    layer.customLayerData = data
+    layer.Save()
+    assert run("verify shot.usda") == 2
+    said = capsys.readouterr().err
+    assert "does not say how it was baked" in said and says in said and "bake it again" in said

@@ -6,14 +6,16 @@ from __future__ import annotations
 import json
 import shlex
 import sys
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from ssilk_core.baselines.files import save_baseline
-from ssilk_core.baselines.networks import BaselineConfig, baseline
+from benchmarks.baselines.files import save_baseline
+from benchmarks.baselines.networks import BaselineConfig, baseline
 from ssilk_core.checkpoint import load_model, save_model
+from ssilk_core.schemes import SCHEMES
 
 WORLD = "--stage rigged.usda --motions clips --index index.json"
 
@@ -37,21 +39,22 @@ def world(toy, tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def made(world, monkeypatch):
-    """Makes a table as its command does, into the folder of the world; returns its lines and figures."""
+def made(world, monkeypatch, capsys):
+    """Make a table as its command does; return the lines that it prints and the figures that it writes."""
     monkeypatch.syspath_prepend(Path(__file__).parents[2] / "benchmarks")
-    import reports
-    import sweeps
     import tables
+    from helpers import paper_schemes, reports
 
+    for name, scheme in paper_schemes.PAPER_SCHEMES.items():
+        monkeypatch.setitem(SCHEMES, name, scheme)  # what the command registers goes with the test
     monkeypatch.setattr(reports, "RESULTS", world)
-    monkeypatch.setattr(sweeps, "RESULTS", world)
 
     def make(words: str) -> tuple[list[list[str]], object]:
         monkeypatch.setattr(sys, "argv", ["tables.py", *shlex.split(words)])
+        capsys.readouterr()
         tables.main()
-        name = words.split()[0]
-        lines = (world / f"{name}.md").read_text().splitlines()
+        name, lines = words.split()[0], capsys.readouterr().out.splitlines()
+        (world / "shown.md").write_text("\n".join(lines))
         cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines if line.startswith("|")]
         return [cells[0], *cells[2:]], json.loads((world / f"{name}.json").read_text())["measured"]
 
@@ -60,21 +63,22 @@ def made(world, monkeypatch):
 
 def test_methods_stand_side_by_side_and_seeds_together(made, world):
     (header, *lines), figures = made(f"table1 models ncs.safetensors {WORLD}")
-    assert header[:4] == ["garment", "method", "valid: L_tot [J]", "valid: collisions"] and len(header) == 8
+    assert (
+        header[:4] == ["garment", "method", "valid: L_tot [J]", "valid: vertices inside the body"]
+        and len(header) == 8
+    )
     assert [line[:2] for line in lines] == [["Skirt", "LBS"], ["Skirt", "ssilk"], ["Skirt", "ncs*"]]
     assert "±" in lines[1][2] and "±" not in lines[2][2]  # two models are seeds of one method
-    assert {row["model"] for row in figures} == {
-        None,
-        "models/2.safetensors",
-        "models/4.safetensors",
-        "ncs.safetensors",
-    }
-    assert "- ssilk's total is lower than ncs*'s in" in (world / "table1.md").read_text()
+    found = {(row["method"], row["split"]): row for row in figures["figures"]}
+    assert len(found["ssilk", "flips"]["total"]) == 2 and len(found["ncs*", "flips"]["collisions"]) == 1
+    assert "total_excess" not in found["ssilk", "flips"]  # there is no simulator
+    assert Counter(training["method"] for training in figures["trainings"]) == {"ssilk": 2, "ncs*": 1}
+    assert "- ssilk's total is lower than ncs*'s in" in (world / "shown.md").read_text()
 
 
 def test_tables_of_records_are_those_of_their_models(made, world):
     lines, _ = made(f"table1 models ncs.safetensors {WORLD}")
-    swept, _ = made(f"table5 models {WORLD}")
+    swept, _ = made(f"ablations models {WORLD}")
     sys.argv = ["tables.py", *shlex.split(f"record models ncs.safetensors {WORLD} -o records/all.json")]
     import tables
 
@@ -82,37 +86,38 @@ def test_tables_of_records_are_those_of_their_models(made, world):
     sys.argv = ["tables.py", *shlex.split(f"record models {WORLD} -o skirts.json")]
     tables.main()
     assert made("table1 records")[0] == lines
-    assert made("table5 skirts.json")[0] == swept
-    assert "cpu" in json.loads((world / "table5.json").read_text())["hardware"]
+    assert made("ablations skirts.json")[0] == swept
+    assert "cpu" in json.loads((world / "ablations.json").read_text())["hardware"]
 
 
 def test_totals_are_of_whole_clips_and_the_simulator_of_sequences():
-    from records import with_truth
+    from helpers.records import with_reference
 
-    def row(sequence: int | None, total: float, truth: dict | None, method: str = "ssilk (a)") -> dict:
-        figures = {"total": total, "truth": truth}
+    def row(sequence: int | None, total: float, errors: dict | None, method: str = "ssilk (a)") -> dict:
+        figures = {"total": total, "reference": errors}
         return {"model": "x/a.safetensors", "garment": "Cape", "method": method, "split": "valid",
                 "sequence": sequence, "figures": figures}  # fmt: skip
 
-    found = with_truth([row(None, 1.0, None), row(64, 2.0, {"excess": 0.5}, "ssilk")])
-    assert [item["figures"] for item in found] == [{"total": 1.0, "truth": {"excess": 0.5}}]
-    assert with_truth([row(64, 2.0, {"excess": 0.5})])[0]["figures"]["total"] == 2.0
+    found = with_reference([row(None, 1.0, None), row(64, 2.0, {"total_excess": 0.5}, "ssilk")])
+    assert [item["figures"] for item in found] == [{"total": 1.0, "reference": {"total_excess": 0.5}}]
+    assert with_reference([row(64, 2.0, {"total_excess": 0.5})])[0]["figures"]["total"] == 2.0
 
 
 def test_everything_is_what_evaluate_tells(made, world):
     _, figures = made(f"evaluate models/2.safetensors {WORLD} --loop 1")
-    assert (world / "evaluate.md").read_text().count("| garment |") == 4  # energies, motion, stops, loops
-    assert figures[-1]["figures"]["holds"]["stops"] == 2 and figures[-1]["figures"]["loops"]["clips"] == 1
+    assert (world / "shown.md").read_text().count("| garment |") == 4  # energies, motion, stops, loops
+    assert figures[-1]["figures"]["settling"]["stops"] == 2 and figures[-1]["figures"]["loop_drift"]["clips"] == 1
 
 
 def test_one_setting_at_a_time(made, world):
-    (_, *lines), figures = made(f"table5 models {WORLD}")
-    assert [line[:2] for line in lines] == [["batch", "2"], ["batch", "4"], ["window", "4"], ["latent", "8"]]
-    assert figures["batch"].keys() == {"2", "4"} and (world / "table5.png").is_file()
+    (_, *lines), figures = made(f"ablations models {WORLD}")
+    assert [line[:2] for line in lines] == [["batch", "2"], ["batch", "4"]]  # nothing else has several values
+    assert [row["value"] for row in figures["total"]] == ["2", "4"] and figures["garment"] == "Skirt"
+    assert all(len(row["flips"]) == 1 for row in figures["total"])
 
 
 def test_settings_vary_about_what_most_models_have(made):
-    from sweeps import alone
+    from helpers.sweeps import alone
 
     told = {
         "usual": {"batch": 32, "window": 6}, "again": {"batch": 32, "window": 6},
@@ -133,7 +138,7 @@ def test_single_frames_are_timed(made):
     [
         ("table2 models", "no simulator among the figures"),
         ("record models", "no --output"),
-        ("table5 ncs.safetensors", "ncs is a baseline"),
+        ("ablations ncs.safetensors", "ncs is a baseline"),
         ("table1 clips", "no model and no record"),
         ("table3 nothing.safetensors", "no such model file"),
     ],

@@ -13,38 +13,59 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from openjd.model import create_job, decode_job_template, preprocess_job_parameters
 
+from ssilk_core.bake import BakeRequest, BakeResult, BakeTask, FrameSpan, Verification, plan_layers
+from ssilk_core.bake.record import RECORD, TaskRecord, current_record, read_record, task_key, write_record
 from ssilk_core.errors import SsilkError
 from ssilk_core.events import Failed, GarmentEvent, Message, Progress, Started
 from ssilk_core.farm.job import numbers, read_job, write_job
 from ssilk_core.farm.openjd import BundleOptions, OpenJdReporter, template, write_bundle
-from ssilk_core.farm.record import INPUTS, NAME, TaskRecord, is_current, read_record, task_key, write_record
-from ssilk_core.farm.tasks import BakeTask, plan
 from ssilk_core.files import sha256
+from ssilk_core.reduction import ModelSize
 
-LIKE = BakeTask(garment="", shot="", model="", stage="/s/hero.usd", motion="")
-TASK = replace(LIKE, garment="cape", shot="walk", model="/m/cape.safetensors", motion="/s/walk.usd")
-CONTENTS = dict.fromkeys(INPUTS, "0")
+REQUEST = BakeRequest(model="/m/cape.safetensors", stage="/s/hero.usd", motion="/s/walk.usd")
+TASK = BakeTask(garment="cape", shot="walk", request=REQUEST)
+CONTENTS = dict.fromkeys(REQUEST.inputs, "0")
 SETTINGS = settings(max_examples=200, deadline=None, derandomize=True, database=None,
                     suppress_health_check=[HealthCheck.function_scoped_fixture])  # fmt: skip
+
+
+def requests(models: list[tuple[str, str | None]], motions: list[str]) -> list[BakeRequest]:
+    """Each model over each motion, the motions first, so that planning has to sort."""
+    return [replace(REQUEST, model=model, root=root, motion=motion) for motion in motions for model, root in models]
 
 
 def test_tasks_of_one_model_follow_each_other_and_a_character_has_one_body():
     models = [("/m/cape.safetensors", "/World/Anna"), ("/m/hat.safetensors", "/World/Anna"),
               ("/m/cape.safetensors", "/World/Bert")]  # fmt: skip
-    tasks = plan(models, ["a/01 walk.usd", "b/run.usd:/Clips/Fast"], LIKE)
+    tasks = plan_layers(requests(models, ["a/01 walk.usd", "b/run.usd:/Clips/Fast"]))
     assert [task.name for task in tasks] == [
         f"{shot}/{garment}" for garment in ("Anna_cape", "Anna_hat", "Bert_cape") for shot in ("01_walk", "run_Fast")
     ]
-    assert [task.body for task in tasks] == [True, True, False, False, True, True]
+    assert [task.include_body for task in tasks] == [True, True, False, False, True, True]
 
 
 @pytest.mark.parametrize(("models", "motions", "says"), [
     (["a/x.safetensors", "b/x.safetensors"], ["w.usd"], "2 garments are named 'x'"),
     (["x.safetensors"], ["a/w.usd", "b/w.usda"], "2 shots are named 'w'"),
+    (["x.safetensors", "x.safetensors"], ["w.usd"], "tasks are named 'w/x'"),
 ])  # fmt: skip
 def test_no_two_tasks_write_the_same_file(models, motions, says):
     with pytest.raises(SsilkError, match=says):
-        plan([(model, None) for model in models], motions, LIKE)
+        plan_layers(requests([(model, None) for model in models], motions))
+
+
+@pytest.mark.parametrize(("change", "says"), [
+    ({"target": "arkit"}, "--target arkit: layers; it takes .usdz"),
+    ({"keep": ModelSize(shapes=1, joints=1, influences=1)}, "bake models that 'ssilk reduce' made"),
+])  # fmt: skip
+def test_requests_that_cannot_share_an_asset_are_refused(change, says):
+    with pytest.raises(SsilkError, match=says):
+        plan_layers([replace(REQUEST, **change)])
+
+
+def test_refined_points_are_written_beside_the_joints():
+    assert [task.points for task in plan_layers([replace(REQUEST, refine=2)])] == [True]
+    assert [task.points for task in plan_layers([replace(REQUEST, refine=2, refined_output="joints")])] == [False]
 
 
 @pytest.mark.parametrize(("text", "expected"), [("0-3", [0, 1, 2, 3]), ("4", [4]), ("1,3-4", [1, 3, 4])])
@@ -60,47 +81,76 @@ def test_numbers_that_name_no_task(text):
 
 def test_a_key_is_of_all_that_decides_what_is_written():
     key = task_key(TASK, CONTENTS)
-    others = [task_key(replace(TASK, **{name: value}), CONTENTS) for name, value in (
-        ("fps", 24.0), ("samples", 2), ("target", "game4"), ("lbs", True), ("body", False), ("points", True),
-        ("garment", "hat"), ("shot", "run"), ("refine", 1),
+    others = [task_key(replace(TASK, request=replace(REQUEST, **{name: value})), CONTENTS) for name, value in (
+        ("fps", 24.0), ("samples_per_frame", 2), ("target", "game4"), ("lbs", True), ("refine", 1),
     )]  # fmt: skip
-    others += [task_key(TASK, {**CONTENTS, name: "1"}) for name in INPUTS]
+    others += [task_key(replace(TASK, **{name: value}), CONTENTS) for name, value in (
+        ("include_body", False), ("points", True), ("garment", "hat"), ("shot", "run"),
+    )]  # fmt: skip
+    others += [task_key(TASK, {**CONTENTS, name: "1"}) for name in CONTENTS]
     assert len({key, *others}) == len(others) + 1
-    assert task_key(replace(TASK, model="/elsewhere/cape.safetensors"), CONTENTS) == key
+    moved = replace(TASK, request=replace(REQUEST, model="/elsewhere/cape.safetensors"))
+    assert task_key(moved, CONTENTS) == key
+
+
+def result(path: Path) -> BakeResult:
+    found = Verification(frames=9, largest_error_m=1e-7, allowed_error_m=1e-5)
+    return BakeResult(
+        path=path, frames=9, fps=24, joints=3, proxies=1, blendshapes=2, size_bytes=4, verification=found,
+        recovered=(FrameSpan(2, 5),),
+    )  # fmt: skip
 
 
 def test_a_task_is_current_while_its_files_are_as_written(tmp_path):
-    (tmp_path / "anim.usdc").write_bytes(b"shot")
-    write_record(tmp_path, TaskRecord(key="k", files={"anim.usdc": sha256(tmp_path / "anim.usdc")}))
-    assert is_current(tmp_path, "k") and not is_current(tmp_path, "other")
-    (tmp_path / "anim.usdc").write_bytes(b"shut")
-    assert not is_current(tmp_path, "k")
+    path = tmp_path / "anim.usdc"
+    path.write_bytes(b"shot")
+    write_record(tmp_path, TaskRecord(key="k", files={"anim.usdc": sha256(path)}, result=result(path)))
+    assert current_record(tmp_path, "k") and not current_record(tmp_path, "other")
+    path.write_bytes(b"shut")
+    assert not current_record(tmp_path, "k")
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"key": 1}', '{"key": "k", "files": 3}', "[" * 100_000])
+def test_a_record_tells_the_result_again_wherever_its_folder_goes(tmp_path):
+    path = tmp_path / "here" / "anim.usdc"
+    write_record(path.parent, TaskRecord(key="k", files={}, result=result(path)))
+    path.parent.rename(tmp_path / "there")
+    record = read_record(tmp_path / "there")
+    assert record is not None and record.result == result(tmp_path / "there" / "anim.usdc")
+
+
+@pytest.mark.parametrize("text", [
+    "", "{", "[]", '{"key": 1}', '{"key": "k", "files": 3}', "[" * 100_000,
+    '{"key": "k", "files": {}, "result": {"path": "anim.usdc", "frames": "9"}}',
+])  # fmt: skip
 def test_a_damaged_record_means_that_the_task_is_done_again(tmp_path, text):
-    (tmp_path / NAME).write_text(text)
-    assert read_record(tmp_path) is None and not is_current(tmp_path, "k")
+    (tmp_path / RECORD).write_text(text)
+    assert read_record(tmp_path) is None and not current_record(tmp_path, "k")
 
 
 def test_a_job_reads_as_it_was_written_and_where_its_inputs_lie_now(tmp_path):
-    write_job(tmp_path / "job.json", [TASK, replace(TASK, shot="run", motion="/s/run.usd:/Clip", fps=24.0)])
+    other = replace(REQUEST, motion="/s/run.usd:/Clip", fps=24.0)
+    write_job(tmp_path / "job.json", [TASK, replace(TASK, shot="run", request=other)])
     assert read_job(tmp_path / "job.json")[0] == TASK
     rules = [{"source_path_format": "POSIX", "source_path": "/s", "destination_path": "/farm/7"}]
     (tmp_path / "rules.json").write_text(json.dumps({"version": "pathmapping-1.0", "path_mapping_rules": rules}))
-    mapped = read_job(tmp_path / "job.json", tmp_path / "rules.json")[1]
+    mapped = read_job(tmp_path / "job.json", tmp_path / "rules.json")[1].request
     assert (mapped.model, mapped.stage, mapped.motion) == (
         "/m/cape.safetensors", "/farm/7/hero.usd", "/farm/7/run.usd:/Clip")  # fmt: skip
 
 
 @pytest.mark.parametrize("change", [
-    {"garment": "../../etc"}, {"shot": "a/b"}, {"shot": ".."}, {"garment": ""}, {"model": 3}, {"samples": "2"},
-    {"unknown": 1}, {"fps": "24"}, {"shot": "/tmp"},
+    {"garment": "../../etc"}, {"shot": "a/b"}, {"shot": ".."}, {"garment": ""}, {"shot": "/tmp"}, {"unknown": 1},
+    {"request": {"model": 3}}, {"request": {"samples_per_frame": "2"}}, {"request": {"fps": "24"}},
+    {"request": {"lbs": 1}}, {"request": {"pre_roll": 601}}, {"points": 1}, {"request": 3},
 ])  # fmt: skip
 def test_a_job_cannot_name_files_elsewhere_or_values_of_other_types(tmp_path, change):
     write_job(tmp_path / "job.json", [TASK])
     document = json.loads((tmp_path / "job.json").read_text())
-    document["tasks"][0] |= change
+    nested = change.get("request")
+    if isinstance(nested, dict):
+        document["tasks"][0]["request"] |= nested
+    else:
+        document["tasks"][0] |= change
     (tmp_path / "job.json").write_text(json.dumps(document))
     with pytest.raises(SsilkError, match="it is no job"):
         read_job(tmp_path / "job.json")
@@ -115,7 +165,8 @@ VALUES = st.recursive(
 
 @SETTINGS
 @given(document=VALUES | st.fixed_dictionaries({"tasks": VALUES | st.lists(st.fixed_dictionaries(
-    dict.fromkeys(("garment", "shot", "model", "stage", "motion"), VALUES)), max_size=2)}))  # fmt: skip
+    {"garment": VALUES, "shot": VALUES, "request": VALUES | st.fixed_dictionaries(
+        dict.fromkeys(("model", "stage", "motion", "fps", "keep"), VALUES))}), max_size=2)}))  # fmt: skip
 def test_any_json_is_a_job_or_one_sentence(tmp_path, document):
     path = tmp_path / "job.json"
     path.write_text(json.dumps(document))

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from scipy.spatial.transform import Rotation
+from ssilk_usd.facts import playback_rate
 from ssilk_usd.read_motion import read_motion
-from ssilk_usd.read_scene import read_scene
+from ssilk_usd.read_scene import read_rigged, read_scene
 from ssilk_usd.rig_io import read_proxy_rig, write_rigged_stage
 
 from ssilk_core import kinematics
@@ -67,7 +68,7 @@ CAPE = """
         uniform token[] xformOpOrder = ["xformOp:translate"]
     }
 """
-PLAIN = np.array([[1.0, 0, 0], [0, 1, 0], [0.5, 0.5, 0], [0, 0, 1], [0.2, 0.3, 0.5], [0, 1, 0]])
+LBS_SKIN = np.array([[1.0, 0, 0], [0, 1, 0], [0.5, 0.5, 0], [0, 0, 1], [0.2, 0.3, 0.5], [0, 1, 0]])
 WEIGHTS = np.array(
     [
         [1.0, 0, 0, 0, 0, 0],
@@ -99,7 +100,7 @@ def dress(source: Path, garment: str, names: tuple[str, ...] = PROXIES) -> Scene
     character, read, _ = read_scene(source, garment=garment)
     path, turns = read.mesh.path, Rotation.random(3, random_state=1).as_matrix()
     bind = kinematics.rigid(turns, np.array([[0.1, 1, -0.2], [0.1, 0.7, -0.2], [0.3, 0.7, -0.2]]))
-    skin = SkinWeights.from_dense(path, PLAIN)
+    skin = SkinWeights.from_dense(path, LBS_SKIN)
     rig = ProxyRig(path, names, np.array([1, 3, 3]), bind, SkinWeights.from_dense(path, WEIGHTS))
     return Scene(character, Garment(read.mesh, skin, np.array([0, 2, 2, 1, 2, 2])), rig)
 
@@ -156,10 +157,19 @@ def test_a_written_rig_reads_back(where, meters, up, tmp_path):
     np.testing.assert_array_equal(garment.mesh.polygon_indices, scene.garment.mesh.polygon_indices)
     np.testing.assert_array_equal(garment.mesh.uvs, scene.garment.mesh.uvs)
     np.testing.assert_array_equal(garment.classes, scene.classes)
-    np.testing.assert_allclose(garment.skin.dense(3), PLAIN, atol=1e-7)
+    np.testing.assert_allclose(garment.skin.dense(3), LBS_SKIN, atol=1e-7)
     assert rig.joint_names == PROXIES and rig.parents.tolist() == [1, 3, 3]
     np.testing.assert_allclose(rig.bind_transforms, scene.rig.bind_transforms, atol=1e-9)
     np.testing.assert_allclose(rig.skin.dense(6), WEIGHTS, atol=1e-7)
+
+
+def test_garments_with_proxies_are_found(tmp_path):
+    _, source, out = rigged(tmp_path)
+    ((skeleton, garment, rig),) = read_rigged(out)
+    assert (skeleton.joint_names, rig.joint_names) == (JOINTS, PROXIES)
+    np.testing.assert_allclose(garment.skin.dense(3), LBS_SKIN, atol=1e-7)
+    np.testing.assert_allclose(rig.skin.dense(6), WEIGHTS, atol=1e-7)
+    assert (read_rigged(source), playback_rate(out)) == ([], 30)
 
 
 @pytest.mark.parametrize("where", ["skelroot", "beside", "own file"])
@@ -221,7 +231,7 @@ def test_a_removed_proxy_takes_its_weights_along(tmp_path):
     rig = read_proxy_rig(out, scene.character.skeleton, report=said.append)
     assert rig.joint_names == (PROXIES[0], PROXIES[2]) and rig.parents.tolist() == [1, 3]
     expected = WEIGHTS[:, [0, 1, 2, 3, 5]]
-    expected[5, :3] = PLAIN[5]  # it hung from the removed proxy alone
+    expected[5, :3] = LBS_SKIN[5]  # it hung from the removed proxy alone
     np.testing.assert_allclose(rig.skin.dense(5), expected / expected.sum(axis=1, keepdims=True), atol=1e-7)
     assert ["1 of its proxy joints are gone" in said[0].text, "1 vertices lost" in said[1].text] == [True, True]
 
@@ -254,7 +264,7 @@ def test_a_joint_added_beneath_a_proxy_is_a_proxy_and_takes_painted_weights(tmp_
             primvar.Set(value)
 
     character, garment, rig = read_scene(edited(out, add))
-    np.testing.assert_allclose(garment.skin.dense(3), PLAIN, atol=1e-7)
+    np.testing.assert_allclose(garment.skin.dense(3), LBS_SKIN, atol=1e-7)
     assert character.skeleton.joint_names == JOINTS
     assert rig.joint_names == (*PROXIES, tip) and rig.parents.tolist() == [1, 3, 3, 4]
     np.testing.assert_allclose(rig.skin.dense(7), np.tile([0, 0.25, 0, 0, 0, 0, 0.75], (6, 1)))
@@ -312,7 +322,7 @@ def test_a_rig_without_proxies_is_still_a_rig(tmp_path):
     source, garment = hero(tmp_path, "skelroot")
     scene = dress(source, garment)
     path = scene.rig.path
-    empty = ProxyRig(path, (), np.zeros(0, int), np.zeros((0, 4, 4)), SkinWeights.from_dense(path, PLAIN))
+    empty = ProxyRig(path, (), np.zeros(0, int), np.zeros((0, 4, 4)), SkinWeights.from_dense(path, LBS_SKIN))
     write_rigged_stage(source, replace(scene, rig=empty), tmp_path / "out.usdc")
     rig = read_scene(tmp_path / "out.usdc")[2]
     assert rig is not None and rig.proxy_count == 0

@@ -17,8 +17,12 @@ from ssilk_usd.read_character import read_character
 from ssilk_usd.read_garment import read_garment
 from ssilk_usd.read_motion import read_motion
 from ssilk_usd.read_polygons import triangulate
+from ssilk_usd.read_scene import read_scene
+from ssilk_usd.read_shot import read_baked
 from ssilk_usd.shot import write_shot
+from ssilk_usd.skinned import SkinnedGarment
 from ssilk_usd.units import StageUnits
+from ssilk_usd.write import write_scene
 
 from ssilk_core.assets import (
     Body,
@@ -296,6 +300,83 @@ def test_readers_take_a_shot_as_a_stage(tmp_path):
     back = read_motion(path, character.skeleton)
     ours, theirs = (motion_transforms(each, character.skeleton.parents) for each in (motion, back))
     np.testing.assert_allclose(theirs, ours, atol=2e-6)
+
+
+@pytest.mark.parametrize("units", [METRES_Y, CENTIMETRES_Z], ids=["metres_y", "centimetres_z"])
+@pytest.mark.parametrize("proxies, shapes", [(2, 3), (0, 3), (2, 0)])
+def test_a_baked_garment_is_read_as_it_was_written(tmp_path, units, proxies, shapes):
+    rng = np.random.default_rng(3)
+    deformer, motion = make_deformer(rng, proxies=proxies, shapes=shapes), make_motion(rng)
+    poses = make_poses(rng, deformer)
+    write_shot(tmp_path / "shot.usdc", deformer, motion, poses, units=units, start=1001)
+    found, wanted = read_baked(tmp_path / "shot.usdc"), SkinnedGarment.of(deformer)
+    own = found.garment
+    assert (own.joint_names, own.shape_names, found.start) == (wanted.joint_names, wanted.shape_names, 1001)
+    np.testing.assert_allclose(own.bind_transforms, wanted.bind_transforms, atol=1e-9)
+    np.testing.assert_allclose(own.points, wanted.points, atol=1e-6)
+    np.testing.assert_allclose(own.shapes, wanted.shapes, atol=1e-6)
+    np.testing.assert_allclose(own.skin.dense(3 + proxies), wanted.skin.dense(3 + proxies), atol=1e-6)
+    weights, rotations = (
+        np.concatenate([getattr(pose, name) for pose in poses]) for name in ("weights", "rotations")
+    )
+    np.testing.assert_allclose(found.pose.weights, weights, atol=1e-7)
+    cosines = np.abs((found.pose.rotations * rotations).sum(axis=-1))
+    np.testing.assert_allclose(cosines, 1, atol=1e-6)
+
+
+def unskin(stage: Usd.Stage) -> None:
+    for name in ("jointIndices", "jointWeights"):
+        stage.GetPrimAtPath("/Hero/cape").RemoveProperty(f"primvars:skel:{name}")
+
+
+def still(stage: Usd.Stage) -> None:
+    stage.GetPrimAtPath("/Hero/Animation").GetAttribute("blendShapes").Set(["shape_000"])
+
+
+@pytest.mark.parametrize(
+    "change, sentence",
+    [(unskin, "the garment has proxies but no weights"), (still, "it does not animate 'shape_001'")],
+)
+def test_a_garment_that_was_not_baked_to_joints_is_refused(tmp_path, change, sentence):
+    write(tmp_path / "shot.usda")
+    stage = Usd.Stage.Open(str(tmp_path / "shot.usda"))
+    change(stage)
+    stage.Save()
+    with pytest.raises(SsilkError, match=sentence):
+        read_baked(tmp_path / "shot.usda")
+
+
+@pytest.mark.parametrize("units", [METRES_Y, CENTIMETRES_Z], ids=["metres_y", "centimetres_z"])
+@pytest.mark.parametrize("proxies", [2, 0])
+def test_a_written_scene_reads_back(tmp_path, units, proxies):
+    scene = make_scene(np.random.default_rng(5), proxies)
+    write_scene(tmp_path / "scene.usdc", scene.character, scene.garment, scene.rig, units=units)
+    assert StageUnits.of(Usd.Stage.Open(str(tmp_path / "scene.usdc"))) == units
+    character, garment, rig = read_scene(tmp_path / "scene.usdc")
+    skeleton, mesh = character.skeleton, scene.garment.mesh
+    assert (skeleton.joint_names, rig.joint_names) == (scene.character.skeleton.joint_names, scene.rig.joint_names)
+    assert garment.mesh.path == f"{tmp_path / 'scene.usdc'}:/Hero/cape"
+    np.testing.assert_allclose(skeleton.bind_transforms, scene.character.skeleton.bind_transforms, atol=1e-9)
+    np.testing.assert_allclose(skeleton.rest_transforms, scene.character.skeleton.rest_transforms, atol=1e-9)
+    np.testing.assert_allclose(rig.bind_transforms, scene.rig.bind_transforms, atol=1e-9)
+    assert rig.parents.tolist() == scene.rig.parents.tolist()
+    np.testing.assert_allclose(garment.mesh.points, mesh.points, atol=1e-6)
+    np.testing.assert_array_equal(garment.mesh.polygon_indices, mesh.polygon_indices)
+    np.testing.assert_allclose(garment.mesh.uvs, mesh.uvs, atol=1e-6)
+    np.testing.assert_array_equal(garment.classes, scene.classes)
+    for own, wanted in ((garment.skin, scene.lbs_skin), (rig.skin, scene.rig.skin)):
+        np.testing.assert_allclose(own.dense(3 + proxies), wanted.dense(3 + proxies), atol=1e-6)
+    for own, wanted in zip(character.bodies, scene.character.bodies, strict=True):
+        np.testing.assert_allclose(own.mesh.points, wanted.mesh.points, atol=1e-6)
+        np.testing.assert_allclose(own.skin.dense(3), wanted.skin.dense(3), atol=1e-6)
+
+
+def test_what_a_garment_lacks_is_left_out(tmp_path):
+    scene = make_scene(np.random.default_rng(5), 0)
+    mesh = replace(scene.garment.mesh, uvs=None)
+    write_scene(tmp_path / "scene.usdc", scene.character, Garment(mesh), units=METRES_Y)
+    _, garment, rig = read_scene(tmp_path / "scene.usdc")
+    assert (garment.skin, garment.classes, garment.mesh.uvs, rig) == (None, None, None, None)
 
 
 def with_weights(poses, value):

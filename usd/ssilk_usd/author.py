@@ -11,18 +11,18 @@ from itertools import count
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
-from ssilk_core.assets import Body, Deformer, Floats, Ints, Mesh, Scene, SkinWeights
-from ssilk_core.errors import need
+from ssilk_core.assets import Body, Deformer, Floats, Ints, Mesh, ProxyRig, Skeleton, SkinWeights
+from ssilk_core.errors import fail
 from ssilk_core.kinematics import local_transforms, world_transforms
 
 from .garment_api import GarmentRecord, apply_garment_api
-from .read_mesh import CLASS, PROXIES
+from .names import CLASS, LBS_SKIN, PROXIES, shape_name
 from .units import StageUnits
 
 
 @dataclass(frozen=True)
 class Asset:
-    """Where the moving parts of an authored asset stand.
+    """Paths of the prims of an authored asset that a shot animates.
 
     Attributes:
         root: the SkelRoot.
@@ -62,13 +62,13 @@ def define_asset(
     names = prim_names(["Skeleton", "Animation", *meshes])
     root = UsdSkel.Root.Define(stage, "/" + (name or prim_names([scene.character.path])[0]))
     paths = [root.GetPath().AppendChild(name) for name in names]
-    skeleton = _define_skeleton(stage, paths[0], scene, units)
+    skeleton = define_skeleton(stage, paths[0], scene.character.skeleton, scene.rig, units)
     shapes = np.flatnonzero(deformer.shapes.any(axis=(1, 2)))
-    shape_names = [f"shape_{index:03d}" for index in shapes]
+    shape_names = [shape_name(index) for index in shapes]
     _define_animation(stage, paths[1], scene.joint_names, shape_names)
     _bind_root(root, skeleton, paths[1])
     garment = define_mesh(stage, paths[2], scene.garment.mesh, units)
-    _mark_garment(garment, scene)
+    mark_garment(garment.GetPrim(), scene.classes, scene.rig.joint_names or None)
     apply_garment_api(garment.GetPrim(), record)
     bind_skin(garment, deformer.skin, skeleton)
     _define_blendshapes(garment, shape_names, deformer.shapes[shapes], units)
@@ -110,32 +110,39 @@ def _bind_root(root: UsdSkel.Root, skeleton: UsdSkel.Skeleton, animation: Sdf.Pa
     binding.CreateAnimationSourceRel().SetTargets([animation])
 
 
-def _define_skeleton(stage: Usd.Stage, path: Sdf.Path, scene: Scene, units: StageUnits) -> UsdSkel.Skeleton:
-    """Define the character's joints followed by the proxies, at their bind and rest transforms."""
-    names = Vt.TokenArray(scene.joint_names)
-    spelled = np.array(UsdSkel.Topology(names).GetParentIndices())
-    wrong = np.flatnonzero(spelled != scene.parents)
-    need(
-        wrong.size == 0,
-        scene.rig.path,
-        f"the path of joint '{scene.joint_names[wrong[0]] if wrong.size else ''}' does not spell its parent",
-        "UsdSkel reads the hierarchy from the joint paths",
-        "name each joint '<path of its parent>/<name>'",
-    )
-    skeleton = UsdSkel.Skeleton.Define(stage, path)
-    skeleton.CreateJointsAttr(names)
-    skeleton.CreateBindTransformsAttr(matrix_array(units.transforms_from_core(scene.bind_transforms)))
-    skeleton.CreateRestTransformsAttr(matrix_array(_rest_transforms(scene, units)))
-    UsdSkel.BindingAPI.Apply(skeleton.GetPrim())
-    return skeleton
+def define_skeleton(
+    stage: Usd.Stage, path: Sdf.Path, skeleton: Skeleton, rig: ProxyRig | None, units: StageUnits
+) -> UsdSkel.Skeleton:
+    """Define the character's joints followed by the proxies, at their bind and rest transforms.
+
+    Raises:
+        SsilkError: the joint paths spell another hierarchy than the parents.
+    """
+    joints, parents, binds = skeleton.joint_names, skeleton.parents, skeleton.bind_transforms
+    if rig is not None:
+        joints, parents = (*joints, *rig.joint_names), np.concatenate([parents, rig.parents])
+        binds = np.concatenate([binds, rig.bind_transforms])
+    wrong = np.flatnonzero(np.array(UsdSkel.Topology(joints).GetParentIndices()) != parents)
+    if wrong.size:
+        fail(
+            skeleton.path if rig is None else rig.path,
+            f"the path of joint '{joints[wrong[0]]}' does not spell its parent",
+            "UsdSkel reads the hierarchy from the joint paths",
+            "name each joint '<path of its parent>/<name>'",
+        )
+    prim = UsdSkel.Skeleton.Define(stage, path)
+    prim.CreateJointsAttr(Vt.TokenArray(joints))
+    prim.CreateBindTransformsAttr(matrix_array(units.transforms_from_core(binds)))
+    prim.CreateRestTransformsAttr(matrix_array(_rest_transforms(skeleton, binds, parents, units)))
+    UsdSkel.BindingAPI.Apply(prim.GetPrim())
+    return prim
 
 
-def _rest_transforms(scene: Scene, units: StageUnits) -> Floats:
+def _rest_transforms(skeleton: Skeleton, binds: Floats, parents: Ints, units: StageUnits) -> Floats:
     """Joint to parent at rest in the stage's units: as authored for the character, as bound for the proxies."""
-    skeleton = scene.character.skeleton
-    proxies = local_transforms(scene.bind_transforms, scene.parents)[skeleton.joint_count :]
-    world = world_transforms(np.concatenate([skeleton.rest_transforms, proxies]), scene.parents)
-    return local_transforms(units.transforms_from_core(world), scene.parents)
+    proxies = local_transforms(binds, parents)[skeleton.joint_count :]
+    world = world_transforms(np.concatenate([skeleton.rest_transforms, proxies]), parents)
+    return local_transforms(units.transforms_from_core(world), parents)
 
 
 def matrix_array(transforms: Floats) -> Vt.Matrix4dArray:
@@ -164,14 +171,36 @@ def extent_array(low: Floats, high: Floats) -> Vt.Vec3fArray:
     return Vt.Vec3fArray.FromNumpy(np.stack([low, high]).astype(np.float32))
 
 
-def _mark_garment(mesh: UsdGeom.Mesh, scene: Scene) -> None:
-    """Author the vertex classes and the names of the proxy joints on the garment's mesh."""
-    prim, types = mesh.GetPrim(), Sdf.ValueTypeNames
-    classes = UsdGeom.Primvar(prim.CreateAttribute(CLASS, types.IntArray, custom=False))
-    classes.SetInterpolation(UsdGeom.Tokens.vertex)
-    classes.Set(Vt.IntArray.FromNumpy(scene.classes.astype(np.int32)))
-    if scene.rig.proxy_count:
-        prim.CreateAttribute(PROXIES, types.TokenArray).Set(Vt.TokenArray(scene.rig.joint_names))
+def mark_garment(prim: Usd.Prim, classes: Ints | None, proxies: Sequence[str] | None) -> None:
+    """Author a garment's vertex classes and the joint paths of its proxies; neither where it is None."""
+    if classes is not None:
+        _author_rows(prim, CLASS, classes[:, None].astype(np.int32))
+    if proxies is not None:
+        _author_names(prim, PROXIES, proxies)
+
+
+def keep_lbs_skin(prim: Usd.Prim, skin: SkinWeights, joints: Sequence[str]) -> None:
+    """Author a garment's weights over the character's joints alone, in addition to those of its rig."""
+    _author_names(prim, LBS_SKIN[2], joints)
+    for name, rows in zip(LBS_SKIN[:2], sorted_influences(skin)):
+        _author_rows(prim, name, rows)
+
+
+def _author_names(prim: Usd.Prim, name: str, names: Sequence[str]) -> None:
+    """Author a list of names that does not vary over time."""
+    attribute = prim.CreateAttribute(name, Sdf.ValueTypeNames.TokenArray, False, Sdf.VariabilityUniform)
+    attribute.Set(Vt.TokenArray(list(names)))
+
+
+def _author_rows(prim: Usd.Prim, name: str, rows: np.ndarray) -> None:
+    """Author a vertex primvar of whole numbers or floats, shape (V, elementSize)."""
+    whole = np.issubdtype(rows.dtype, np.integer)
+    kind = Sdf.ValueTypeNames.IntArray if whole else Sdf.ValueTypeNames.FloatArray
+    array = (Vt.IntArray if whole else Vt.FloatArray).FromNumpy(np.ascontiguousarray(rows).reshape(-1))
+    primvar = UsdGeom.PrimvarsAPI(prim).CreatePrimvar(name.removeprefix("primvars:"), kind, UsdGeom.Tokens.vertex)
+    if rows.shape[1] > 1:
+        primvar.SetElementSize(rows.shape[1])
+    primvar.Set(array)
 
 
 def bind_skin(mesh: UsdGeom.Mesh, skin: SkinWeights, skeleton: UsdSkel.Skeleton) -> None:
@@ -203,7 +232,7 @@ def _define_blendshapes(mesh: UsdGeom.Mesh, names: Sequence[str], offsets: Float
     stage = mesh.GetPrim().GetStage()
     for name, shape in zip(names, offsets):
         rows = np.flatnonzero(shape.any(axis=1))
-        moved = np.asarray(units.vectors_from_core(shape[rows]), dtype=np.float32)
+        moved = np.asarray(units.points_from_core(shape[rows]), dtype=np.float32)
         prim = UsdSkel.BlendShape.Define(stage, path.AppendChild(name))
         prim.CreateOffsetsAttr(Vt.Vec3fArray.FromNumpy(moved))
         prim.CreatePointIndicesAttr(Vt.IntArray.FromNumpy(rows.astype(np.int32)))

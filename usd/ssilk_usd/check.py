@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check a written shot: USD's validators, our own rules, and the points that UsdSkel makes of it."""
+"""Check a written shot: USD's validators, our own rules, and the points that UsdSkel computes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ssilk_core.errors import VerificationError
 
 from .check_mesh import check_blendshapes, check_mesh, check_skin
 from .check_skel import check_animation, check_skeleton
-from .finding import Finding, error_unless
+from .finding import ShotFinding, error_unless
 from .play import Shot, frame_times
 from .read_stage import PRIMS, apply, open_stage, world_matrix
 
@@ -28,7 +28,7 @@ _SEVERITIES = {
 }
 
 
-def check_shot(path: str | Path) -> list[Finding]:
+def check_shot(path: str | Path) -> list[ShotFinding]:
     """Return what is wrong with a shot: UsdValidation's findings, then our own; empty when nothing is.
 
     Extents are compared with the skinned points only where nothing else is wrong.
@@ -43,16 +43,16 @@ def check_shot(path: str | Path) -> list[Finding]:
     return findings
 
 
-def _validate(stage: Usd.Stage) -> Iterator[Finding]:
+def _validate(stage: Usd.Stage) -> Iterator[ShotFinding]:
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     for error in UsdValidation.ValidationContext(validators).Validate(stage):
         prims = [str(site.GetPrim().GetPath()) for site in error.GetSites() if site.IsPrim()]
         severity = _SEVERITIES.get(error.GetType())
         if severity:
-            yield Finding(severity, ", ".join(prims), error.GetMessage())
+            yield ShotFinding(severity, ", ".join(prims), error.GetMessage())
 
 
-def _check_stage(stage: Usd.Stage) -> Iterator[Finding]:
+def _check_stage(stage: Usd.Stage) -> Iterator[ShotFinding]:
     """Check default prim, kind, rates, units and frame range, and that there is one SkelRoot."""
     top, root = stage.GetPseudoRoot(), stage.GetDefaultPrim()
     yield from error_unless(root, top, "there is no default prim")
@@ -66,7 +66,7 @@ def _check_stage(stage: Usd.Stage) -> Iterator[Finding]:
     yield from error_unless(len(roots) == 1, top, f"there are {len(roots)} SkelRoots, where one is needed")
 
 
-def _check_prims(stage: Usd.Stage) -> Iterator[Finding]:
+def _check_prims(stage: Usd.Stage) -> Iterator[ShotFinding]:
     frames = frame_times(stage)
     for prim in Usd.PrimRange(stage.GetPseudoRoot(), PRIMS):
         if prim.IsPseudoRoot():
@@ -81,14 +81,14 @@ def _check_prims(stage: Usd.Stage) -> Iterator[Finding]:
             yield from _check_binding(prim)
 
 
-def _check_source(prim: Usd.Prim, frames: tuple[float, ...]) -> Iterator[Finding]:
+def _check_source(prim: Usd.Prim, frames: tuple[float, ...]) -> Iterator[ShotFinding]:
     source = UsdSkel.BindingAPI(prim).GetInheritedAnimationSource()
     yield from error_unless(source, prim, "no animation is bound to it")
     if source:
         yield from check_animation(source, UsdSkel.Skeleton(prim).GetJointsAttr().Get() or [], frames)
 
 
-def _check_binding(prim: Usd.Prim) -> Iterator[Finding]:
+def _check_binding(prim: Usd.Prim) -> Iterator[ShotFinding]:
     """Check influences and blendshapes of a mesh that is bound to a skeleton."""
     skeleton = UsdSkel.BindingAPI(prim).GetInheritedSkeleton()
     if not prim.HasAPI(UsdSkel.BindingAPI):
@@ -101,7 +101,7 @@ def _check_binding(prim: Usd.Prim) -> Iterator[Finding]:
         yield from check_blendshapes(prim, animated or [])
 
 
-def _check_extents(shot: Shot) -> Iterator[Finding]:
+def _check_extents(shot: Shot) -> Iterator[ShotFinding]:
     """Check that the SkelRoot's extent holds everything skinned, at each frame."""
     root = next(prim for prim in Usd.PrimRange(shot.stage.GetPseudoRoot(), PRIMS) if prim.IsA(UsdSkel.Root))
     within = [mesh.path.startswith(f"{root.GetPath()}/") for mesh in shot.meshes]
@@ -109,14 +109,16 @@ def _check_extents(shot: Shot) -> Iterator[Finding]:
     missing = np.setdiff1d(shot.frame_times, extent.GetTimeSamples())
     if len(missing):
         text = f"extent has no sample at {len(missing)} of {len(shot.frame_times)} frames"
-        yield Finding("error", str(root.GetPath()), text)
+        yield ShotFinding("error", str(root.GetPath()), text)
         return
     for time in shot.frame_times:
         points = np.concatenate([each for each, inside in zip(shot.points(time), within) if inside])
         low, high = _world_box(shot, root, np.array(extent.Get(time), dtype=np.float64), time)
         slack = allowed_error(points)
         if (points < low - slack).any() or (points > high + slack).any():
-            yield Finding("error", str(root.GetPath()), f"extent does not hold the skinned points at time {time:g}")
+            yield ShotFinding(
+                "error", str(root.GetPath()), f"extent does not hold the skinned points at time {time:g}"
+            )
             return
 
 
@@ -129,7 +131,7 @@ def _world_box(shot: Shot, root: Usd.Prim, extent: Floats, time: float) -> tuple
 
 @dataclass(frozen=True)
 class Comparison:
-    """How far a shot is from what was computed, where it is nearest to its bound or furthest past it.
+    """Distance of a shot from the computed points, at the vertex that is nearest to its bound or furthest past it.
 
     Attributes:
         worst: distance [m]; bound: what is allowed there [m].

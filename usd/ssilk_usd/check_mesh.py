@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rules for skinned meshes that USD's own validators leave unchecked: arrays, influences, blendshapes."""
+"""Rules for skinned meshes that USD's own validators do not check: arrays, influences, blendshapes."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from pxr import Usd, UsdGeom, UsdSkel
 
-from .finding import Finding, error_unless
+from .finding import ShotFinding, error_unless
 
 SUM_TOLERANCE = 1e-5  # of a vertex's weights
 
 
-def check_mesh(prim: Usd.Prim) -> Iterator[Finding]:
+def check_mesh(prim: Usd.Prim) -> Iterator[ShotFinding]:
     """Check the polygons of a mesh and the lengths of its primvars."""
     mesh = UsdGeom.Mesh(prim)
     points = np.array(mesh.GetPointsAttr().Get(Usd.TimeCode.EarliestTime()) or []).reshape(-1, 3)
@@ -33,7 +33,7 @@ def check_mesh(prim: Usd.Prim) -> Iterator[Finding]:
             yield from error_unless(size == expected * width, prim, text)
 
 
-def check_skin(prim: Usd.Prim, joints: Sequence[str]) -> Iterator[Finding]:
+def check_skin(prim: Usd.Prim, joints: Sequence[str]) -> Iterator[ShotFinding]:
     """Check a mesh's influences against the joints of its skeleton."""
     binding = UsdSkel.BindingAPI(prim)
     own = binding.GetJointsAttr().Get() or joints
@@ -59,7 +59,7 @@ def check_skin(prim: Usd.Prim, joints: Sequence[str]) -> Iterator[Finding]:
         yield from _check_weights(prim, indices.reshape(-1, width), weights.reshape(-1, width))
 
 
-def _check_weights(prim: Usd.Prim, indices: np.ndarray, weights: np.ndarray) -> Iterator[Finding]:
+def _check_weights(prim: Usd.Prim, indices: np.ndarray, weights: np.ndarray) -> Iterator[ShotFinding]:
     negative = np.count_nonzero(~(weights >= 0))
     yield from error_unless(not negative, prim, f"{negative} jointWeights are negative or not finite")
     off = np.count_nonzero(~(np.abs(weights.sum(axis=1) - 1) <= SUM_TOLERANCE))
@@ -73,7 +73,7 @@ def _check_weights(prim: Usd.Prim, indices: np.ndarray, weights: np.ndarray) -> 
     )
 
 
-def check_blendshapes(prim: Usd.Prim, animated: Sequence[str]) -> Iterator[Finding]:
+def check_blendshapes(prim: Usd.Prim, animated: Sequence[str]) -> Iterator[ShotFinding]:
     """Check a mesh's blendshapes against its targets, its points and the names that the animation knows."""
     binding = UsdSkel.BindingAPI(prim)
     names = list(binding.GetBlendShapesAttr().Get() or [])
@@ -93,7 +93,7 @@ def check_blendshapes(prim: Usd.Prim, animated: Sequence[str]) -> Iterator[Findi
             yield from _check_blendshape(shape, point_count)
 
 
-def _check_blendshape(prim: Usd.Prim, point_count: int) -> Iterator[Finding]:
+def _check_blendshape(prim: Usd.Prim, point_count: int) -> Iterator[ShotFinding]:
     shape = UsdSkel.BlendShape(prim)
     offsets = np.array(shape.GetOffsetsAttr().Get() or []).reshape(-1, 3)
     sparse = shape.GetPointIndicesAttr().HasAuthoredValue()

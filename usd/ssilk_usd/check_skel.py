@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rules of UsdSkel that USD's own validators leave unchecked: skeletons and their animation."""
+"""Rules of UsdSkel that USD's own validators do not check: skeletons and their animation."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from pxr import Usd, UsdSkel
 
-from .finding import Finding, error_unless
+from .finding import ShotFinding, error_unless
 
 UNIT_TOLERANCE = 1e-3  # of quaternions
 
 
-def check_skeleton(prim: Usd.Prim) -> Iterator[Finding]:
+def check_skeleton(prim: Usd.Prim) -> Iterator[ShotFinding]:
     """Check joints, bind and rest transforms of a Skeleton."""
     skeleton = UsdSkel.Skeleton(prim)
     joints = list(skeleton.GetJointsAttr().Get() or [])
@@ -29,7 +29,7 @@ def check_skeleton(prim: Usd.Prim) -> Iterator[Finding]:
         yield from error_unless(regular, prim, f"{attribute.GetName()} are not finite or cannot be inverted")
 
 
-def check_animation(prim: Usd.Prim, joints: Sequence[str], frames: Sequence[float]) -> Iterator[Finding]:
+def check_animation(prim: Usd.Prim, joints: Sequence[str], frames: Sequence[float]) -> Iterator[ShotFinding]:
     """Check a SkelAnimation against the joints of the skeleton that it moves and the stage's frames."""
     animation = UsdSkel.Animation(prim)
     names = list(animation.GetJointsAttr().Get() or [])
@@ -46,7 +46,7 @@ def check_animation(prim: Usd.Prim, joints: Sequence[str], frames: Sequence[floa
         yield from _check_weights(animation.GetBlendShapeWeightsAttr())
 
 
-def check_samples(attribute: Usd.Attribute, length: int, frames: Sequence[float]) -> Iterator[Finding]:
+def check_samples(attribute: Usd.Attribute, length: int, frames: Sequence[float]) -> Iterator[ShotFinding]:
     """Check that an array has a value at each frame, or one for all time, and one length at all samples."""
     prim, name, times = attribute.GetPrim(), attribute.GetName(), attribute.GetTimeSamples()
     yield from error_unless(attribute.HasAuthoredValue(), prim, f"{name} has no value")
@@ -66,19 +66,19 @@ def _samples(attribute: Usd.Attribute) -> Iterator[tuple[float | str, Sequence]]
         yield "default", attribute.Get()
 
 
-def _check_rotations(attribute: Usd.Attribute) -> Iterator[Finding]:
+def _check_rotations(attribute: Usd.Attribute) -> Iterator[ShotFinding]:
     for time, value in _samples(attribute):
         off = np.abs(np.linalg.norm(np.array(value).reshape(-1, 4), axis=1) - 1)
         if not (off < UNIT_TOLERANCE).all():
             text = f"rotations are no unit quaternions at time {time}"
-            yield Finding("error", str(attribute.GetPrimPath()), text)
+            yield ShotFinding("error", str(attribute.GetPrimPath()), text)
             return
 
 
-def _check_weights(attribute: Usd.Attribute) -> Iterator[Finding]:
+def _check_weights(attribute: Usd.Attribute) -> Iterator[ShotFinding]:
     for time, value in _samples(attribute):
         weights = np.array(value)
         if not ((weights >= 0) & (weights <= 1)).all():
             text = f"blendShapeWeights leave [0, 1] at time {time}, where importers clamp them"
-            yield Finding("error", str(attribute.GetPrimPath()), text)
+            yield ShotFinding("error", str(attribute.GetPrimPath()), text)
             return

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing a layer as a file, whole or not at all."""
+"""Write a layer as a file, completely or not at all."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from pathlib import Path
 
 from pxr import Sdf, Tf, Usd, UsdGeom
 
-from ssilk_core.errors import fail, need
+from ssilk_core.errors import fail
 from ssilk_core.files import replacing
 
-from .read_stage import LAYER_SUFFIXES, usd_reason
+from .names import LAYER_SUFFIXES
+from .read_stage import usd_reason
 from .specs import free_when_closed
 from .units import StageUnits
 
@@ -27,7 +28,8 @@ ZIP_HEADER, EXTRA_HEADER, EXTRA_FIELD, ALIGNMENT = 30, 4, 0x1986, 64  # bytes, a
 def need_layer_suffix(out: str | Path) -> None:
     """Raise `SsilkError` unless a name ends as a USD layer's does."""
     suffix, allowed = Path(out).suffix, ", ".join(LAYER_SUFFIXES)
-    need(suffix in LAYER_SUFFIXES, str(out), f"the suffix is '{suffix}'", f"it is one of {allowed}")
+    if suffix not in LAYER_SUFFIXES:
+        fail(str(out), f"the suffix is '{suffix}'", f"it is one of {allowed}")
 
 
 def new_stage(path: Path, units: StageUnits) -> Usd.Stage:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What files say beside the assets that are read from them: authored units, sampled times, animated joints."""
+"""Facts of files that assets do not hold: authored units, frame rate, sampled times, animated joints."""
 
 from __future__ import annotations
 
@@ -38,6 +38,16 @@ def stage_facts(source: StageLike) -> StageFacts:
         UsdGeom.StageHasAuthoredMetersPerUnit(stage),
         stage.HasAuthoredMetadata(UsdGeom.Tokens.upAxis),
     )
+
+
+def playback_rate(source: StageLike) -> float | None:
+    """Return the frames per second of a stage that has a time range [1/s]; None for one that has none.
+
+    Raises:
+        SsilkError: not a readable stage.
+    """
+    stage = open_stage(source)
+    return float(stage.GetFramesPerSecond()) if stage.HasAuthoredTimeCodeRange() else None
 
 
 def animated(motion: Motion, skeleton: Skeleton) -> tuple[Ints, Floats]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a check of a shot has to say."""
+"""The findings of `check_shot`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pxr import Usd
 
 
 @dataclass(frozen=True)
-class Finding:
+class ShotFinding:
     """`severity` is "error" (some reader will show something else) or "warning"; `prim` is a path, or empty."""
 
     severity: str
@@ -21,7 +21,7 @@ class Finding:
         return f"{self.severity}: {self.prim or 'stage'}: {self.text}"
 
 
-def error_unless(condition: object, prim: Usd.Prim, text: str) -> Iterator[Finding]:
+def error_unless(condition: object, prim: Usd.Prim, text: str) -> Iterator[ShotFinding]:
     """Yield an error about `prim` unless `condition` holds."""
     if not condition:
-        yield Finding("error", str(prim.GetPath()), text)
+        yield ShotFinding("error", str(prim.GetPath()), text)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`SsilkGarmentAPI`: how a garment came to be, on its mesh, as a codeless schema that readers need not have.
+"""`SsilkGarmentAPI`: a garment's origin, authored on its mesh, as a codeless schema that readers do not need.
 
 `usd/ssilk_usd/schema` holds it; programs that set PXR_PLUGINPATH_NAME to that folder know it too.
 """

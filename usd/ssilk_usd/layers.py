@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bake as layers: an asset that stays, and for each shot one small layer that a new bake replaces.
+"""A bake as layers: a lasting asset, and for each shot one small layer that a new bake replaces.
 
     FOLDER/assets/cape/asset.usda        component; payload and variants
     FOLDER/assets/cape/geometry.usdc     the payload: meshes, skeleton, blendshapes
@@ -69,7 +69,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class WrittenAsset:
-    """An asset on disk: where its prims stand, and what layers above may have relied on and is no longer so."""
+    """An asset on disk: the paths of its prims, and changes that may break layers above."""
 
     asset: Asset
     changes: tuple[str, ...]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What layers above an asset may rely on: its joints, and the topology and blendshapes of its meshes."""
+"""Facts of an asset on which layers above may rely: joints, topology and blendshapes."""
 
 from __future__ import annotations
 

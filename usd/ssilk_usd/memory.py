@@ -9,30 +9,33 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from ssilk_core.errors import need
+from ssilk_core.errors import fail
 
 VARIABLE, USUAL = "SSILK_READ_GIB", 1.0  # GiB; a character of a million vertices takes 0.6
+HOST = "bpy"  # Blender's own module
 STACK = 8 << 20  # bytes of each thread that USD may start meanwhile
 
 
 def allowed_gib() -> float:
-    """Return how many GiB reading may take, as the environment says it, or the usual amount."""
+    """Return how many GiB reading may take: from the environment, else the default."""
     text = os.environ.get(VARIABLE, str(USUAL))
     try:
         allowed = float(text)
     except ValueError:
         allowed = 0.0
-    need(0 < allowed < 1e6, VARIABLE, f"'{text}'", "a number of GiB is needed", "correct it in the environment")
+    if not 0 < allowed < 1e6:
+        fail(VARIABLE, f"'{text}'", "a number of GiB is needed", "correct it in the environment")
     return allowed
 
 
 @contextmanager
 def bounded_memory(gib: float | None = None) -> Iterator[None]:
-    """Let this process take so much more than it has, or `allowed_gib`; USD and numpy then refuse what does not fit.
+    """Limit how much more memory this process may take; USD and numpy then refuse what does not fit.
 
-    Where the system knows no such bound (all but Linux), and within a smaller one, nothing changes.
+    Nothing changes where the system has no such bound (all but Linux), within a smaller bound, and inside Blender,
+    whose other threads would meet the bound too.
     """
-    if not sys.platform.startswith("linux"):
+    if not sys.platform.startswith("linux") or HOST in sys.modules:
         yield
         return
     import resource

@@ -9,7 +9,7 @@ import numpy as np
 from pxr import Usd, UsdGeom, UsdSkel
 
 from ssilk_core.assets import Floats, Ints
-from ssilk_core.errors import need
+from ssilk_core.errors import fail
 
 from .read_mesh import is_drawn, is_garment, read_mesh
 from .read_stage import PRIMS, StageLike, apply, column_matrix, open_stage, stage_name
@@ -56,7 +56,8 @@ class Shot:
         skinned = _skinning_of(self.stage)
         everything = Usd.PrimRange(self.stage.GetPseudoRoot(), PRIMS)
         prims = [prim for prim in everything if prim.IsA(UsdGeom.Mesh) and is_drawn(prim)]
-        need(prims, self.name, "no visible mesh", "a shot holds at least one", "check that this is the right file")
+        if not prims:
+            fail(self.name, "no visible mesh", "a shot holds at least one", "check that this is the right file")
         self._players = [
             _SkinnedMesh(prim, *skinned[prim]) if prim in skinned else _PlainMesh(prim) for prim in prims
         ]
@@ -86,7 +87,8 @@ class Shot:
 
     def _garment(self) -> _SkinnedMesh | _PlainMesh:
         garments = [player for player, mesh in zip(self._players, self.meshes) if mesh.is_garment]
-        need(len(garments) == 1, self.name, f"{len(garments)} meshes are marked as garments", "one is needed")
+        if len(garments) != 1:
+            fail(self.name, f"{len(garments)} meshes are marked as garments", "one is needed")
         return garments[0]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from ssilk_core.assets import Floats, Motion, Scene
-from ssilk_core.errors import need
+from ssilk_core.errors import fail
 from ssilk_core.files import replacing
 from ssilk_core.kinematics import lbs_deformer, lbs_poses
 
@@ -27,7 +27,7 @@ FRAMES_PER_SAVE = 128  # 5 MB of points in memory for a garment of 3,000 vertice
 
 
 class PointCache:
-    """A file under way, whose frames may come in any order.
+    """A point cache that is being written; frames may come in any order.
 
     Attributes:
         shot: what the file holds.
@@ -50,10 +50,12 @@ class PointCache:
             SsilkError: no such frame, points of another garment, or points that are not finite.
         """
         where = f"{self.path}: frame {frame}"
-        need(0 <= frame < self.frame_count, where, "no such frame", f"frames run from 0 to {self.frame_count - 1}")
-        need(points.shape == (self.vertex_count, 3), where, f"points of shape {points.shape}",
-             f"({self.vertex_count}, 3) is needed")  # fmt: skip
-        need(np.isfinite(points).all(), where, "NaN or infinity among the points", "all must be finite")
+        if not 0 <= frame < self.frame_count:
+            fail(where, "no such frame", f"frames run from 0 to {self.frame_count - 1}")
+        if points.shape != (self.vertex_count, 3):
+            fail(where, f"points of shape {points.shape}", f"({self.vertex_count}, 3) is needed")
+        if not np.isfinite(points).all():
+            fail(where, "NaN or infinity among the points", "all must be finite")
         placed = np.ascontiguousarray(self.units.points_from_core(points), dtype=np.float32)
         low, high = placed.min(axis=0), placed.max(axis=0)
         time = self.shot.start + self.step * frame
@@ -121,7 +123,8 @@ def point_cache(
         cache = PointCache(temporary, shot, scene.garment.mesh.vertex_count, units, samples_per_frame)
         yield cache
         missing = int((~cache.written).sum())
-        need(missing == 0, str(path), f"{missing} of {motion.frame_count} frames have no points", "each needs some")
+        if missing:
+            fail(str(path), f"{missing} of {motion.frame_count} frames have no points", "each needs some")
         cache.save()
         del cache  # the file is closed before it is renamed
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a shot came from, as it says itself."""
+"""Provenance that a shot holds."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from .read_stage import StageLike, open_stage
 
 
 def read_provenance(source: StageLike) -> dict[str, Any]:
-    """Return what `write_shot` was given as provenance; empty for files of other origin.
+    """Return the provenance that `write_shot` stored; empty for other files.
 
     Raises:
         SsilkError: not a readable stage.

@@ -8,12 +8,13 @@ from collections.abc import Sequence
 from pxr import Usd, UsdGeom, UsdSkel
 
 from ssilk_core.assets import Body, Character, Floats
-from ssilk_core.errors import need
+from ssilk_core.errors import fail
 from ssilk_core.events import Message, Reporter, silent
 
+from .names import SKEL
 from .read_mesh import is_drawn, is_garment, read_mesh
 from .read_skeleton import bound_skeleton, character_skeleton, find_skeleton
-from .read_skin import SKEL, read_skin
+from .read_skin import read_skin
 from .read_spaces import SkelSource
 from .read_stage import (
     PRIMS,
@@ -84,13 +85,13 @@ def _body_prims(skel: SkelSource, bodies: Sequence[str], garment: str | None) ->
     if not bodies:
         return [prim for prim in meshes if is_drawn(prim) and not is_garment(prim) and prim not in garments]
     unknown = next((name for name in bodies if not named(meshes, name)), None)
-    need(
-        unknown is None,
-        location(skel.root),
-        f"no mesh '{unknown}' is bound to the skeleton",
-        f"there are {listed(meshes)}",
-        "name one of these with --body",
-    )
+    if unknown is not None:
+        fail(
+            location(skel.root),
+            f"no mesh '{unknown}' is bound to the skeleton",
+            f"there are {listed(meshes)}",
+            "name one of these with --body",
+        )
     return [prim for name in bodies for prim in named(meshes, name)]
 
 

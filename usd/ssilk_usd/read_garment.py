@@ -7,12 +7,13 @@ import numpy as np
 from pxr import Usd, UsdGeom
 
 from ssilk_core.assets import Floats, Garment, Ints, Skeleton, SkinWeights
-from ssilk_core.errors import need
+from ssilk_core.errors import fail
 
+from .names import CLASS, LBS_SKIN, PROXIES
 from .read_character import geom_to_core, is_skinned
-from .read_mesh import CLASS, PROXIES, is_drawn, is_garment, read_mesh
+from .read_mesh import is_drawn, is_garment, read_mesh
 from .read_skeleton import bound_skeleton, find_skeleton, skeletons
-from .read_skin import PLAIN, read_influences, read_skin
+from .read_skin import read_influences, read_skin
 from .read_spaces import SkelSource
 from .read_stage import (
     EARLIEST,
@@ -67,21 +68,19 @@ def find_garment(stage: Usd.Stage, garment: str | None = None) -> Usd.Prim:
     marked = [prim for prim in meshes if is_garment(prim)]
     if garment is not None:
         found = named(meshes, garment)
-        need(
-            found, where, f"no mesh is named '{garment}'", f"there are {listed(meshes)}", "choose one with --garment"
-        )
+        if not found:
+            fail(where, f"no mesh is named '{garment}'", f"there are {listed(meshes)}", "choose one with --garment")
     else:
         found = marked if marked or skeletons(stage) else [prim for prim in meshes if is_drawn(prim)]
-        need(
-            found,
-            where,
-            f"no mesh is marked as a garment; the meshes are {listed(meshes)}",
-            "a garment has primvars:ssilk:class or ssilk:garment = true",
-            "name it with --garment",
-        )
-    need(
-        len(found) == 1, where, f"there are several garments: {listed(found)}", "one is used", "choose with --garment"
-    )
+        if not found:
+            fail(
+                where,
+                f"no mesh is marked as a garment; the meshes are {listed(meshes)}",
+                "a garment has primvars:ssilk:class or ssilk:garment = true",
+                "name it with --garment",
+            )
+    if len(found) != 1:
+        fail(where, f"there are several garments: {listed(found)}", "one is used", "choose with --garment")
     return found[0]
 
 
@@ -107,8 +106,8 @@ def garment_to_core(prim: Usd.Prim, skel: SkelSource | None) -> Floats:
 
 def lbs_skin(prim: Usd.Prim, joints: tuple[str, ...], skeleton: Skeleton) -> SkinWeights | None:
     """Return a garment's weights onto the character's joints alone, or None; those kept beside a rig go first."""
-    if has_value(prim, PLAIN[0]):
-        influences = read_influences(prim, joints, PLAIN)
+    if has_value(prim, LBS_SKIN[0]):
+        influences = read_influences(prim, joints, LBS_SKIN)
         assert influences is not None
         return SkinWeights(influences.path, *influences.onto(skeleton.joint_names))
     return None if has_value(prim, PROXIES) else read_skin(prim, joints, skeleton.joint_names)
@@ -120,16 +119,15 @@ def _classes(prim: Usd.Prim) -> Ints | None:
     if not primvar or not primvar.HasAuthoredValue():
         return None
     where, interpolation = location(prim), primvar.GetInterpolation()
-    need(
-        interpolation in (UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying),
-        where,
-        f"{CLASS} has {interpolation} interpolation",
-        "classes are one value for each point (vertex interpolation)",
-        "paint them on points",
-    )
+    if interpolation not in (UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying):
+        fail(
+            where,
+            f"{CLASS} has {interpolation} interpolation",
+            "classes are one value for each point (vertex interpolation)",
+            "paint them on points",
+        )
     classes = np.array(primvar.ComputeFlattened(EARLIEST), dtype=np.float64).reshape(-1)
     broken = int(np.count_nonzero(classes != np.round(classes)))
-    need(
-        broken == 0, where, f"{broken} vertex classes are no whole numbers", "they are 0, 1 or 2", "paint them again"
-    )
+    if broken:
+        fail(where, f"{broken} vertex classes are no whole numbers", "they are 0, 1 or 2", "paint them again")
     return classes.astype(np.int64)

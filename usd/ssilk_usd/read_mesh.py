@@ -7,14 +7,11 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
 from ssilk_core.assets import Floats, Ints, Mesh
-from ssilk_core.errors import need
+from ssilk_core.errors import fail
 
+from .names import CLASS, GARMENT, PROXIES
 from .read_polygons import triangulate
 from .read_stage import EARLIEST, apply, has_value, location, value
-
-CLASS = "primvars:ssilk:class"
-GARMENT = "ssilk:garment"
-PROXIES = "ssilk:proxyJoints"
 
 
 def is_garment(prim: Usd.Prim) -> bool:
@@ -59,22 +56,23 @@ def _polygons(prim: Usd.Prim, point_count: int, where: str) -> tuple[Ints, Ints]
     counts = np.array(value(prim, "faceVertexCounts") or [], dtype=np.int64)
     indices = np.array(value(prim, "faceVertexIndices") or [], dtype=np.int64)
     few = int(np.count_nonzero(counts < 3))
-    need(few == 0, where, f"{few} faces have fewer than three corners", "a face has three or more", "remove them")
-    need(
-        counts.sum() == len(indices),
-        where,
-        f"faceVertexCounts add up to {counts.sum()} but there are {len(indices)} faceVertexIndices",
-        "both must match",
-        "export the mesh again",
-    )
+    if few:
+        fail(where, f"{few} faces have fewer than three corners", "a face has three or more", "remove them")
+    if counts.sum() != len(indices):
+        fail(
+            where,
+            f"faceVertexCounts add up to {counts.sum()} but there are {len(indices)} faceVertexIndices",
+            "both must match",
+            "export the mesh again",
+        )
     bad = int(np.count_nonzero((indices < 0) | (indices >= point_count)))
-    need(
-        bad == 0,
-        where,
-        f"{bad} face indices lie outside 0 to {point_count - 1}",
-        "an index names a point of the mesh",
-        "export the mesh again",
-    )
+    if bad:
+        fail(
+            where,
+            f"{bad} face indices lie outside 0 to {point_count - 1}",
+            "an index names a point of the mesh",
+            "export the mesh again",
+        )
     return counts, indices
 
 
@@ -104,14 +102,14 @@ def _texture_coordinates(prim: Usd.Prim, indices: Ints) -> Floats | None:
         expected, corners = len(value(prim, "points")), indices.astype(np.int64)
     else:
         return None  # one value for a whole face maps no cloth
-    need(
-        len(uvs) == expected,
-        location(prim),
-        f"{chosen.GetName()} holds {len(uvs)} texture coordinates for {expected} "
-        f"({chosen.GetInterpolation()} interpolation)",
-        "one for each is needed",
-        "unwrap the mesh again, or remove them",
-    )
+    if len(uvs) != expected:
+        fail(
+            location(prim),
+            f"{chosen.GetName()} holds {len(uvs)} texture coordinates for {expected} "
+            f"({chosen.GetInterpolation()} interpolation)",
+            "one for each is needed",
+            "unwrap the mesh again, or remove them",
+        )
     return uvs[corners]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from pxr import Usd, UsdGeom, UsdSkel
 
 from ssilk_core.assets import Floats, Ints, Motion, Skeleton
-from ssilk_core.errors import fail, need
+from ssilk_core.errors import fail
 from ssilk_core.kinematics import matrix_from_quaternion, quaternion_from_matrix, rigid
 
 from .read_skeleton import skeletons
@@ -54,7 +54,8 @@ def _listed_folders(paths: Iterable[str | Path]) -> list[Path]:
     files: list[Path] = []
     for path in map(Path, paths):
         within = sorted(file for file in path.iterdir() if file.suffix in USD_SUFFIXES) if path.is_dir() else [path]
-        need(within, str(path), "the folder holds no USD files", f"motions are {', '.join(USD_SUFFIXES)} files")
+        if not within:
+            fail(str(path), "the folder holds no USD files", f"motions are {', '.join(USD_SUFFIXES)} files")
         files += within
     return files
 
@@ -85,7 +86,7 @@ def read_motion(source: StageLike, skeleton: Skeleton, *, prim: str | None = Non
     joints = tuple(str(name) for name in UsdSkel.Animation(animation).GetJointsAttr().Get() or ())
     match = _matched(joints, skeleton, where)
     codes, fps = _time_codes(stage, animation, placed)
-    rotations, translations = _samples(animation, codes, len(joints), where)
+    rotations, translations = read_samples(animation, codes, len(joints), where)
     placements = np.stack([world_matrix(placed, code) for code in codes]) if placed else np.eye(4)[None]
     if placed:
         need_similarity(placed, placements)
@@ -114,20 +115,20 @@ def find_animation(stage: Usd.Stage, prim: str | None, root: str | None) -> tupl
     bound = own or bound
     every = [other for other in Usd.PrimRange.Stage(stage, PRIMS) if other.IsA(UsdSkel.Animation)]
     found = named(every, prim) if prim else list(bound) or every
-    need(
-        found,
-        where,
-        f"no SkelAnimation{f' is named {prim!r}' if prim else ''}",
-        f"a motion is a SkelAnimation; there are {listed(every)}",
-        "export the animation, or name another prim",
-    )
-    need(
-        len(found) == 1,
-        where,
-        f"there are several animations: {listed(found)}",
-        "one is read",
-        f"name one, such as {where}:{found[0].GetPath()}",
-    )
+    if not found:
+        fail(
+            where,
+            f"no SkelAnimation{f' is named {prim!r}' if prim else ''}",
+            f"a motion is a SkelAnimation; there are {listed(every)}",
+            "export the animation, or name another prim",
+        )
+    if len(found) != 1:
+        fail(
+            where,
+            f"there are several animations: {listed(found)}",
+            "one is read",
+            f"name one, such as {where}:{found[0].GetPath()}",
+        )
     return found[0], bound.get(found[0])
 
 
@@ -136,14 +137,14 @@ def _matched(joints: tuple[str, ...], skeleton: Skeleton, where: str) -> Ints:
     match = np.array(match_joints(skeleton.joint_names, joints))
     found, smaller = int(np.count_nonzero(match >= 0)), min(len(joints), skeleton.joint_count)
     missing = [name for name, index in zip(skeleton.joint_names, match) if index < 0]
-    need(
-        found > 0 and 2 * found >= smaller,
-        where,
-        f"this is a motion of another skeleton: {found} of {skeleton.joint_count} joints match its {len(joints)} "
-        f"(it lacks {', '.join(missing[:3])})",
-        f"at least half of the joints of {skeleton.path} must be in it, by path or by leaf name",
-        "retarget the motion or rename its joints",
-    )
+    if not found or 2 * found < smaller:
+        fail(
+            where,
+            f"this is a motion of another skeleton: {found} of {skeleton.joint_count} joints match its {len(joints)} "
+            f"(it lacks {', '.join(missing[:3])})",
+            f"at least half of the joints of {skeleton.path} must be in it, by path or by leaf name",
+            "retarget the motion or rename its joints",
+        )
     return match
 
 
@@ -151,7 +152,8 @@ def _time_codes(stage: Usd.Stage, animation: Usd.Prim, placed: Usd.Prim | None) 
     """Return the time codes of the frames and their rate [1/s]."""
     second = stage.GetTimeCodesPerSecond()
     fps = stage.GetFramesPerSecond() if stage.HasAuthoredMetadata("framesPerSecond") else second
-    need(fps > 0 and second > 0, stage.GetRootLayer().identifier, f"a rate of {fps} frames", "it must be positive")
+    if not (fps > 0 and second > 0):
+        fail(stage.GetRootLayer().identifier, f"a rate of {fps} frames", "it must be positive")
     samples = [
         time for name in ("rotations", "translations") for time in animation.GetAttribute(name).GetTimeSamples()
     ]
@@ -163,30 +165,28 @@ def _time_codes(stage: Usd.Stage, animation: Usd.Prim, placed: Usd.Prim | None) 
         return np.zeros(1), fps
     step = second / fps
     first, last = min(samples), max(samples)
-    need(
-        last - first < step * _MOST_FRAMES,
-        location(animation),
-        f"samples run from time code {first:g} to {last:g}",
-        f"a motion has at most {_MOST_FRAMES} frames",
-        "remove stray samples",
-    )
+    if last - first >= step * _MOST_FRAMES:
+        fail(
+            location(animation),
+            f"samples run from time code {first:g} to {last:g}",
+            f"a motion has at most {_MOST_FRAMES} frames",
+            "remove stray samples",
+        )
     return first + step * np.arange(int((last - first) / step + 1e-6) + 1), fps
 
 
-def _samples(animation: Usd.Prim, codes: Floats, count: int, where: str) -> tuple[Floats, Floats]:
+def read_samples(animation: Usd.Prim, codes: Floats, count: int, where: str) -> tuple[Floats, Floats]:
     """Return rotations (F, N, 4) as (w, x, y, z) and translations (F, N, 3) in stage units."""
     rotations = _sampled(animation, "rotations", codes, (count, 4), where)
     translations = _sampled(animation, "translations", codes, (count, 3), where)
     if animation.GetAttribute("scales").HasAuthoredValue():
         scales = _sampled(animation, "scales", codes, (count, 3), where)
         scaled = int(np.count_nonzero((np.abs(scales - 1) > _SCALE_TOLERANCE).any(axis=(0, 2))))
-        need(
-            scaled == 0, where, f"{scaled} joints are scaled", "joints may turn and move only", "bake the scale away"
-        )
+        if scaled:
+            fail(where, f"{scaled} joints are scaled", "joints may turn and move only", "bake the scale away")
     norms = np.linalg.norm(rotations, axis=-1, keepdims=True)
-    need(
-        norms.min() > 1e-6, where, "a rotation is the zero quaternion", "rotations are unit quaternions", "repair it"
-    )
+    if norms.min() <= 1e-6:
+        fail(where, "a rotation is the zero quaternion", "rotations are unit quaternions", "repair it")
     return np.roll(rotations / norms, 1, axis=-1), translations
 
 
@@ -212,10 +212,10 @@ def _check_lengths(local: Floats, rest: Floats, parents: Ints, where: str) -> No
     if not kept.any():
         return
     ratio = float(np.median(np.linalg.norm(local[0, kept, :3, 3], axis=-1) / bones[kept]))
-    need(
-        0.5 < ratio < 2,
-        where,
-        f"bones are {ratio:.3g} times as long as the skeleton's",
-        "both must agree in metres",
-        "set metersPerUnit of the motion's file to its units",
-    )
+    if not 0.5 < ratio < 2:
+        fail(
+            where,
+            f"bones are {ratio:.3g} times as long as the skeleton's",
+            "both must agree in metres",
+            "set metersPerUnit of the motion's file to its units",
+        )

@@ -8,12 +8,23 @@ from pathlib import Path
 
 from pxr import Usd, UsdGeom
 
-from ssilk_core.assets import Character, Garment, ProxyRig
+from ssilk_core.assets import Character, Garment, ProxyRig, Skeleton
 from ssilk_core.events import Message, Reporter, silent
 
+from .names import PROXIES
 from .read_character import read_character
-from .read_garment import read_garment
-from .read_stage import USD_SUFFIXES, StageLike, needs_whole_files, open_stage, split_location, stage_name
+from .read_garment import fitted_skeleton, read_garment
+from .read_skeleton import character_skeleton, find_skeleton
+from .read_stage import (
+    PRIMS,
+    USD_SUFFIXES,
+    StageLike,
+    needs_whole_files,
+    open_stage,
+    split_location,
+    stage_name,
+    value,
+)
 from .rig_io import read_proxy_rig
 
 
@@ -51,6 +62,24 @@ def read_scene(
     skeleton = character.skeleton
     rig = read_proxy_rig(wardrobe, skeleton, **where, report=report)
     return character, read_garment(wardrobe, skeleton, **where), rig
+
+
+@needs_whole_files
+def read_rigged(source: StageLike) -> list[tuple[Skeleton, Garment, ProxyRig]]:
+    """Read each garment of a stage that has proxies, with its rig and the skeleton that the proxies hang from.
+
+    Raises:
+        SsilkError: as `read_garment` and `read_proxy_rig` do.
+    """
+    stage = open_stage(source)
+    prims = [prim for prim in Usd.PrimRange.Stage(stage, PRIMS) if prim.IsA(UsdGeom.Mesh) and value(prim, PROXIES)]
+    found = []
+    for prim in prims:
+        skeleton, name = character_skeleton(fitted_skeleton(prim) or find_skeleton(stage)), str(prim.GetPath())
+        rig = read_proxy_rig(stage, skeleton, garment=name)
+        assert rig is not None  # it lists proxies
+        found.append((skeleton, read_garment(stage, skeleton, garment=name), rig))
+    return found
 
 
 def _announce_units(stage: Usd.Stage, report: Reporter) -> None:

@@ -1,19 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The meshes of a shot at rest, and what its garments say of themselves."""
+"""The meshes of a shot at rest, and a baked garment as bones and blendshapes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from pxr import Usd, UsdGeom
+from pxr import Usd, UsdGeom, UsdSkel
 
-from ssilk_core.assets import Mesh
+from ssilk_core.assets import Floats, GarmentPose, Mesh
+from ssilk_core.errors import fail
 
 from .garment_api import GarmentRecord, read_garment_record
-from .play import Shot
+from .play import Shot, frame_times
+from .read_garment import find_garment, fitted_skeleton, garment_to_core, read_garment
 from .read_mesh import read_mesh
-from .read_stage import apply
+from .read_motion import find_animation, read_samples
+from .read_skeleton import character_skeleton
+from .read_skin import match_joints
+from .read_stage import StageLike, apply, location, needs_whole_files, open_stage
+from .rig_io import read_proxy_rig
+from .skinned import BakedGarment, SkinnedGarment
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,3 +42,59 @@ def _part(shot: Shot, prim: Usd.Prim) -> ShotPart:
     if len(timeless) == mesh.vertex_count:
         mesh = replace(mesh, points=apply(shot.units.matrix, timeless))
     return ShotPart(mesh, read_garment_record(prim))
+
+
+@needs_whole_files
+def read_baked(source: StageLike) -> BakedGarment:
+    """Read the garment of a shot that `write_shot` wrote.
+
+    Raises:
+        SsilkError: no garment or several, one that is bound to no joints, or malformed data.
+    """
+    stage = open_stage(source)
+    prim = find_garment(stage)
+    skel = fitted_skeleton(prim)
+    if skel is None:
+        fail(location(prim), "its stage has no skeleton", "joints move a baked garment", "choose a shot with joints")
+    skeleton = character_skeleton(skel)
+    garment, rig = read_garment(stage, skeleton), read_proxy_rig(stage, skeleton)
+    joints, binds, skin = skeleton.joint_names, skeleton.bind_transforms, garment.skin
+    if rig is not None:
+        joints, binds, skin = (*joints, *rig.joint_names), np.concatenate([binds, rig.bind_transforms]), rig.skin
+    if skin is None:
+        fail(location(prim), "no joint moves it", "a baked garment has weights", "bake to joints, not to points")
+    names, shapes = _read_blendshapes(prim, garment_to_core(prim, skel)[:3, :3], garment.mesh.vertex_count)
+    times = frame_times(stage)
+    pose = _read_pose(find_animation(stage, None, None)[0], joints[skeleton.joint_count :], names, times)
+    return BakedGarment(SkinnedGarment(joints, binds, garment.mesh.points, skin, names, shapes), pose, times[0])
+
+
+def _read_blendshapes(prim: Usd.Prim, to_core: Floats, point_count: int) -> tuple[tuple[str, ...], Floats]:
+    """Return names and offsets [m] of a mesh's blendshapes, shape (K, V, 3)."""
+    binding = UsdSkel.BindingAPI(prim)
+    names = tuple(str(name) for name in binding.GetBlendShapesAttr().Get() or ())
+    offsets = np.zeros((len(names), point_count, 3))
+    for row, path in zip(offsets, binding.GetBlendShapeTargetsRel().GetTargets()):
+        shape = UsdSkel.BlendShape(prim.GetStage().GetPrimAtPath(path))
+        moved = shape.GetPointIndicesAttr().Get()
+        row[np.array(moved) if moved else slice(None)] = np.array(shape.GetOffsetsAttr().Get()) @ to_core.T
+    return names, offsets
+
+
+def _read_pose(
+    prim: Usd.Prim, proxies: tuple[str, ...], shapes: tuple[str, ...], times: tuple[float, ...]
+) -> GarmentPose:
+    """Return rotations of the proxies and weights of the blendshapes at time codes."""
+    animation, where = UsdSkel.Animation(prim), location(prim)
+    joints = tuple(str(name) for name in animation.GetJointsAttr().Get() or ())
+    found = match_joints(proxies, joints)
+    lost = [name for name, index in zip(proxies, found) if index < 0]
+    names = [str(name) for name in animation.GetBlendShapesAttr().Get() or ()]
+    lost += [name for name in shapes if name not in names]
+    if lost:
+        fail(where, f"it does not animate '{lost[0]}'", "proxies and blendshapes are animated", "bake the shot again")
+    rotations, _ = read_samples(prim, np.array(times), len(joints), where)
+    weights = animation.GetBlendShapeWeightsAttr()
+    columns = [names.index(name) for name in shapes]
+    rows = [np.array(weights.Get(time))[columns] for time in times] if shapes else np.zeros((len(times), 0))
+    return GarmentPose(0, rotations[:, found], np.array(rows))

@@ -7,9 +7,9 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdSkel
 
 from ssilk_core.assets import Floats, Ints, Skeleton
-from ssilk_core.errors import fail, need
+from ssilk_core.errors import fail
 
-from .read_mesh import PROXIES
+from .names import PROXIES
 from .read_skin import match_joints
 from .read_spaces import SkelSource, joints_to_core, need_similarity
 from .read_stage import (
@@ -33,23 +33,24 @@ def find_skeleton(stage: Usd.Stage, *, root: str | None = None) -> SkelSource:
         SsilkError: there is none, there are several and `root` names none, or the skeleton is malformed.
     """
     where, found = stage_name(stage), skeletons(stage)
-    need(
-        found,
-        where,
-        "there is no SkelRoot with a Skeleton",
-        "a character is a SkelRoot with a Skeleton and meshes bound to it",
-        "export the character with its armature",
-    )
+    if not found:
+        fail(
+            where,
+            "there is no SkelRoot with a Skeleton",
+            "a character is a SkelRoot with a Skeleton and meshes bound to it",
+            "export the character with its armature",
+        )
     chosen = found if root is None else _pairs_named(found, root)
     there_are = "there are " + ", ".join(f"{top.GetPath()} ({skeleton.GetName()})" for top, skeleton in found)
-    need(chosen, where, f"no SkelRoot or Skeleton is named '{root}'", there_are, "choose one with --root")
-    need(
-        len(chosen) == 1,
-        where,
-        f"{len(chosen)} skeletons could be the character's",
-        there_are,
-        "choose one with --root, by the path of its Skeleton if need be",
-    )
+    if not chosen:
+        fail(where, f"no SkelRoot or Skeleton is named '{root}'", there_are, "choose one with --root")
+    if len(chosen) != 1:
+        fail(
+            where,
+            f"{len(chosen)} skeletons could be the character's",
+            there_are,
+            "choose one with --root, by the path of its Skeleton if need be",
+        )
     return _source(*chosen[0])
 
 
@@ -95,7 +96,8 @@ def character_skeleton(source: SkelSource) -> Skeleton:
 
 def _source(root: Usd.Prim, prim: Usd.Prim) -> SkelSource:
     where, joints = location(prim), tuple(str(name) for name in value(prim, "joints") or ())
-    need(joints, where, "the skeleton has no joints", "at least one is needed", "export the armature again")
+    if not joints:
+        fail(where, "the skeleton has no joints", "at least one is needed", "export the armature again")
     parents = _parents(joints, where)
     bind = _matrices(prim, "bindTransforms", len(joints))
     if bind is None:
@@ -119,18 +121,20 @@ def _source(root: Usd.Prim, prim: Usd.Prim) -> SkelSource:
 def _parents(joints: tuple[str, ...], where: str) -> Ints:
     """Return parent indices as UsdSkel reads them from joint paths: the nearest ancestor that is a joint."""
     repeated = next((name for name in joints if joints.count(name) > 1), None)
-    need(repeated is None, where, f"joint '{repeated}' stands twice", "each joint needs its own path", "rename one")
+    if repeated is not None:
+        fail(where, f"joint '{repeated}' stands twice", "each joint needs its own path", "rename one")
     broken = next((name for name in joints if not Sdf.Path.IsValidPathString(name)), None)
-    need(broken is None, where, f"joint '{broken}' is no path", "joints are paths like 'Hips/Spine'", "rename it")
+    if broken is not None:
+        fail(where, f"joint '{broken}' is no path", "joints are paths like 'Hips/Spine'", "rename it")
     topology = UsdSkel.Topology(joints)
     valid, reason = topology.Validate()
-    need(
-        valid,
-        where,
-        f"the joints are out of order ({reason.partition('.')[0]})",
-        "parents come before their children and a joint is never its own ancestor",
-        "reorder the joints",
-    )
+    if not valid:
+        fail(
+            where,
+            f"the joints are out of order ({reason.partition('.')[0]})",
+            "parents come before their children and a joint is never its own ancestor",
+            "reorder the joints",
+        )
     return np.array(topology.GetParentIndices(), dtype=np.int64)
 
 
@@ -139,17 +143,19 @@ def _matrices(prim: Usd.Prim, name: str, count: int) -> Floats | None:
     matrices = value(prim, name)
     if matrices is None or not len(matrices):
         return None
-    need(
-        len(matrices) == count,
-        location(prim),
-        f"{len(matrices)} {name} for {count} joints",
-        "one for each joint is needed",
-        "export the armature again",
-    )
+    if len(matrices) != count:
+        fail(
+            location(prim),
+            f"{len(matrices)} {name} for {count} joints",
+            "one for each joint is needed",
+            "export the armature again",
+        )
     result = column_matrix(matrices)
-    need(np.isfinite(result).all(), location(prim), f"{name} hold NaN or infinity", "all must be finite", "repair it")
+    if not np.isfinite(result).all():
+        fail(location(prim), f"{name} hold NaN or infinity", "all must be finite", "repair it")
     singular = int(np.count_nonzero(np.abs(np.linalg.det(result)) < 1e-30))
-    need(singular == 0, location(prim), f"{singular} {name} cannot be inverted", "joints may not have no size")
+    if singular:
+        fail(location(prim), f"{singular} {name} cannot be inverted", "joints may not have no size")
     return result
 
 

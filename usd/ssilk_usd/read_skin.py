@@ -10,18 +10,14 @@ import numpy as np
 from pxr import Usd, UsdGeom
 
 from ssilk_core.assets import Floats, Ints, SkinWeights
-from ssilk_core.errors import need
+from ssilk_core.errors import fail
 
+from .names import JOINTS, SKEL
 from .read_stage import EARLIEST, inherited, location
-
-JOINTS = "skel:joints"
-# Indices, weights and, where the mesh names its joints, their order.
-SKEL = ("primvars:skel:jointIndices", "primvars:skel:jointWeights", JOINTS)
-PLAIN = ("primvars:ssilk:plainJointIndices", "primvars:ssilk:plainJointWeights", "ssilk:plainJoints")
 
 
 @dataclass(frozen=True, eq=False)
-class Influences:
+class AuthoredInfluences:
     """Influences as authored: `indices` (V, I) into the names `joints`, and `weights` (V, I)."""
 
     path: str
@@ -76,44 +72,44 @@ def read_skin(prim: Usd.Prim, joints: tuple[str, ...], names: tuple[str, ...]) -
         return None
     used = influences.used_joints()
     absent = [name for name, index in zip(used, match_joints(tuple(used), names)) if index < 0]
-    need(
-        not absent,
-        influences.path,
-        f"it is weighted to joint '{absent[0] if absent else ''}', which the character's skeleton does not have",
-        "weights belong to the character's joints",
-        "bind the mesh to this skeleton again",
-    )
+    if absent:
+        fail(
+            influences.path,
+            f"it is weighted to joint '{absent[0]}', which the character's skeleton does not have",
+            "weights belong to the character's joints",
+            "bind the mesh to this skeleton again",
+        )
     return SkinWeights(influences.path, *influences.onto(names))
 
 
 def read_influences(
     prim: Usd.Prim, joints: tuple[str, ...], properties: tuple[str, str, str] = SKEL
-) -> Influences | None:
+) -> AuthoredInfluences | None:
     """Read the influences of a mesh under the names `properties`, over its own joint order or else `joints`."""
     where = location(prim)
     indices, weights = (inherited(prim, name) for name in properties[:2])
     if indices is None and weights is None:
         return None
-    need(
-        indices is not None and weights is not None,
-        where,
-        f"only one of {properties[0]} and {properties[1]} is authored",
-        "both are needed",
-        "bind the mesh again",
-    )
+    if indices is None or weights is None:
+        fail(
+            where,
+            f"only one of {properties[0]} and {properties[1]} is authored",
+            "both are needed",
+            "bind the mesh again",
+        )
     count = len(UsdGeom.Mesh(prim).GetPointsAttr().Get(EARLIEST) or [])
     rows_of_indices = _rows(indices, count, where).astype(np.int64)
     rows_of_weights = _rows(weights, count, where).astype(np.float64)
-    need(
-        rows_of_indices.shape == rows_of_weights.shape,
-        where,
-        f"{rows_of_indices.shape[1]} joint indices but {rows_of_weights.shape[1]} weights for each point",
-        "both need the same elementSize",
-        "bind the mesh again",
-    )
+    if rows_of_indices.shape != rows_of_weights.shape:
+        fail(
+            where,
+            f"{rows_of_indices.shape[1]} joint indices but {rows_of_weights.shape[1]} weights for each point",
+            "both need the same elementSize",
+            "bind the mesh again",
+        )
     own = inherited(prim, properties[2]) or inherited(prim, JOINTS)
     names = joints if own is None else tuple(own.Get(EARLIEST) or ())
-    return Influences(where, names, _checked(rows_of_indices, rows_of_weights, names, where), rows_of_weights)
+    return AuthoredInfluences(where, names, _checked(rows_of_indices, rows_of_weights, names, where), rows_of_weights)
 
 
 def _rows(attribute: Usd.Attribute, point_count: int, where: str) -> Floats:
@@ -122,13 +118,13 @@ def _rows(attribute: Usd.Attribute, point_count: int, where: str) -> Floats:
     values, size = np.array(primvar.ComputeFlattened(EARLIEST) or []), primvar.GetElementSize()
     constant = primvar.GetInterpolation() == UsdGeom.Tokens.constant
     rows = 1 if constant else point_count
-    need(
-        len(values) == rows * size,
-        where,
-        f"{attribute.GetName()} holds {len(values)} values for {rows} x {size}",
-        f"elementSize values {'in all' if constant else 'for each point'} are needed",
-        "bind the mesh again",
-    )
+    if len(values) != rows * size:
+        fail(
+            where,
+            f"{attribute.GetName()} holds {len(values)} values for {rows} x {size}",
+            f"elementSize values {'in all' if constant else 'for each point'} are needed",
+            "bind the mesh again",
+        )
     return np.broadcast_to(values.reshape(rows, size), (point_count, size))
 
 
@@ -136,11 +132,11 @@ def _checked(indices: Ints, weights: Floats, names: tuple[str, ...], where: str)
     """Return indices with -1 where there is no weight; the others must name a joint."""
     used = weights != 0
     bad = int(np.count_nonzero(used & ((indices < 0) | (indices >= len(names)))))
-    need(
-        bad == 0,
-        where,
-        f"{bad} joint indices lie outside 0 to {len(names) - 1}",
-        "an index names a joint of the mesh's joint order",
-        "bind the mesh again",
-    )
+    if bad:
+        fail(
+            where,
+            f"{bad} joint indices lie outside 0 to {len(names) - 1}",
+            "an index names a joint of the mesh's joint order",
+            "bind the mesh again",
+        )
     return np.where(used, indices, -1)

@@ -14,7 +14,7 @@ import numpy as np
 from pxr import Usd
 
 from ssilk_core.assets import Floats, Ints
-from ssilk_core.errors import need
+from ssilk_core.errors import fail
 from ssilk_core.kinematics import world_transforms
 
 from .read_stage import location
@@ -144,11 +144,11 @@ def need_similarity(prim: Usd.Prim, matrices: Floats) -> Floats:
     """
     linear, scale = matrices[..., :3, :3], similarity_scale(matrices)
     uniform = np.abs(np.swapaxes(linear, -1, -2) @ linear - np.eye(3) * scale**2) < _RIGID_TOLERANCE * scale**2
-    need(
-        scale > 0 and uniform.all(),
-        location(prim),
-        "the xforms above the skeleton mirror, shear, animate scale or scale unequally",
-        "they may move, turn and scale uniformly by one factor",
-        "apply the scale and export again",
-    )
+    if not (scale > 0 and uniform.all()):
+        fail(
+            location(prim),
+            "the xforms above the skeleton mirror, shear, animate scale or scale unequally",
+            "they may move, turn and scale uniformly by one factor",
+            "apply the scale and export again",
+        )
     return matrices

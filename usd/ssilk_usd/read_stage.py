@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Opening stages, naming what is in them, and asking prims for values: what every reader shares."""
+"""Functions that all readers share: opening stages, naming prims, and reading values."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ import numpy as np
 from pxr import Pcp, Tf, Usd, UsdGeom, UsdUtils
 
 from ssilk_core.assets import Floats
-from ssilk_core.errors import fail, need
+from ssilk_core.errors import fail
 from ssilk_core.files import sha256
 
 from .garment_api import register_schema
 from .memory import VARIABLE, allowed_gib, bounded_memory
+from .names import LAYER_SUFFIXES
 from .specs import free_when_closed
 
 Reader = TypeVar("Reader", bound=Callable[..., Any])
 StageLike: TypeAlias = str | Path | Usd.Stage
-LAYER_SUFFIXES = (".usdc", ".usd", ".usda")
 USD_SUFFIXES = (*LAYER_SUFFIXES, ".usdz")
 EARLIEST = Usd.TimeCode.EarliestTime()
 # Instance proxies are read too: a referenced character may be instanceable.
@@ -33,7 +33,7 @@ _MISSING = (Pcp.ErrorInvalidAssetPath, Pcp.ErrorInvalidSublayerPath, Pcp.ErrorUn
 
 
 def needs_whole_files(read: Reader) -> Reader:
-    """Make a reader, whose first argument is its source, say in one sentence that USD finds a file damaged."""
+    """Decorate a reader, whose first argument is its source: a damaged file raises one `SsilkError`."""
 
     @wraps(read)
     def reader(source: StageLike, *args: Any, **options: Any) -> Any:
@@ -65,19 +65,32 @@ def open_stage(source: StageLike) -> Usd.Stage:
     """
     if isinstance(source, Usd.Stage):
         return source
-    need(Path(source).is_file(), str(source), "there is no such file", "a USD file is needed", "check the path")
+    if not Path(source).is_file():
+        fail(str(source), "there is no such file", "a USD file is needed", "check the path")
     quiet = UsdUtils.CoalescingDiagnosticDelegate()  # what USD would print, the errors below say
     stage = Usd.Stage.Open(str(source), Usd.Stage.LoadAll)
     stage.Reload()
     del quiet
     missing = [
         " ".join(str(error).split()).rstrip(".")
-        for error in stage.GetCompositionErrors()
+        for error in _composition_errors(stage)
         if isinstance(error, _MISSING)
     ]
     free_when_closed(stage.GetUsedLayers())
-    need(not missing, str(source), " and ".join(missing[:2]), "every layer must be found", "restore it or its path")
+    if missing:
+        fail(str(source), " and ".join(missing[:2]), "every layer must be found", "restore it or its path")
     return stage
+
+
+def _composition_errors(stage: Usd.Stage) -> list[Any]:
+    """Return what stays unresolved on a stage. Blender 4.2 has USD 24.5, which lists that by prim and layer stack."""
+    if hasattr(stage, "GetCompositionErrors"):
+        return list(stage.GetCompositionErrors())
+    root = stage.GetPseudoRoot()
+    found = list(root.GetPrimIndex().rootNode.layerStack.localErrors)
+    for prim in Usd.PrimRange(root, Usd.PrimAllPrimsPredicate):
+        found += prim.GetPrimIndex().localErrors
+    return found
 
 
 def content_hash(source: str | Path) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A repaired copy of the file that a garment stands in: its mesh with all data on it, its units stated."""
+"""Write a repaired copy of a garment's file: its mesh with all data on it, and authored units."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _LOCKS = {
 
 
 def repair_lock(source: str | Path, garment: str | None = None) -> str:
-    """Return what forbids to remove vertices and faces of a garment, in words; empty if nothing does."""
+    """Return why vertices and faces of a garment cannot be removed; empty if they can."""
     stage = open_stage(source)  # prims live only as long as their stage
     prim = find_garment(stage, garment)
     held = [words for name, words in _LOCKS.items() if _has(prim, name)]

@@ -11,7 +11,7 @@ import numpy as np
 from pxr import Usd, UsdGeom
 
 from ssilk_core.assets import Floats, Ints
-from ssilk_core.errors import need
+from ssilk_core.errors import fail
 
 from .read_stage import EARLIEST, location, value
 
@@ -43,7 +43,7 @@ def rewrite_mesh(mesh: UsdGeom.Mesh, repair: MeshRepair, offsets: Floats) -> Non
 
 
 def _reshape(mesh: UsdGeom.Mesh, repair: MeshRepair) -> None:
-    """Take points and faces away, turn faces over, and let everything that is on them follow."""
+    """Remove points and faces, flip faces, and update all data on them."""
     corners = _authored_corners(mesh, repair)
     old = np.array(value(mesh.GetPrim(), "faceVertexIndices"), dtype=np.int64)
     for primvar in UsdGeom.PrimvarsAPI(mesh.GetPrim()).GetPrimvarsWithAuthoredValues():
@@ -71,7 +71,7 @@ def _backwards(counts: Ints) -> Ints:
 
 
 def _rewrite_primvar(primvar: UsdGeom.Primvar, repair: MeshRepair, old: Ints, corners: Ints) -> None:
-    """Let a primvar follow: the indices of an indexed one, else its values."""
+    """Update a primvar: the indices of an indexed one, else its values."""
     indexed, interpolation = primvar.IsIndexed(), primvar.GetInterpolation()
     attribute = primvar.GetIndicesAttr() if indexed else primvar.GetAttr()
     size = 1 if indexed else primvar.GetElementSize()
@@ -86,7 +86,7 @@ def _rewrite_primvar(primvar: UsdGeom.Primvar, repair: MeshRepair, old: Ints, co
 
 
 def _rewrite_normals(mesh: UsdGeom.Mesh, repair: MeshRepair, old: Ints, corners: Ints) -> None:
-    """Let authored normals follow, and turn those of faces that are turned over."""
+    """Update authored normals, and negate those of flipped faces."""
     attribute, interpolation = mesh.GetNormalsAttr(), mesh.GetNormalsInterpolation()
     if not attribute.HasAuthoredValue():
         return
@@ -129,13 +129,13 @@ def _check_length(attribute: Usd.Attribute, size: int, interpolation: str, repai
     expected = rows.get(interpolation, len(repair.new_index))
     for time in _times(attribute):
         found = len(attribute.Get(time))
-        need(
-            found == expected * size,
-            location(attribute.GetPrim()),
-            f"{attribute.GetName()} holds {found} values for {expected} x {size} ({interpolation} interpolation)",
-            "one for each is needed",
-            "author it again, or remove it",
-        )
+        if found != expected * size:
+            fail(
+                location(attribute.GetPrim()),
+                f"{attribute.GetName()} holds {found} values for {expected} x {size} ({interpolation} interpolation)",
+                "one for each is needed",
+                "author it again, or remove it",
+            )
 
 
 def _torn(attribute: Usd.Attribute, size: int, repair: MeshRepair) -> bool:
@@ -147,7 +147,7 @@ def _torn(attribute: Usd.Attribute, size: int, repair: MeshRepair) -> bool:
 
 
 def _rewrite_subsets(prim: Usd.Prim, repair: MeshRepair) -> None:
-    """Let sets of faces and points on the mesh follow."""
+    """Update subsets of faces and points."""
     faces = np.full(len(value(prim, "faceVertexCounts")), -1)
     faces[repair.polygons] = np.arange(len(repair.polygons))
     for child in prim.GetChildren():

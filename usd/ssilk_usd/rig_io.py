@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Proxy rigs in stages: joints appended to the skeleton, listed in the garment's `ssilk:proxyJoints`.
 
-A rig may be edited by hand. What the skeleton holds is what counts: a joint listed is a proxy wherever it moved
+A rig may be edited by hand. The skeleton decides: a joint listed is a proxy wherever it moved
 in the hierarchy (it is found by a leaf name that is unique), a joint removed is gone with its weights, and a joint
 that descends from a proxy is a proxy.
 """
@@ -15,16 +15,24 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from ssilk_core.assets import Floats, Garment, Ints, ProxyRig, Scene, Skeleton, SkinWeights
-from ssilk_core.errors import fail, need
+from ssilk_core.errors import fail
 from ssilk_core.events import Message, Reporter, silent
 
-from .author import bind_skin, define_mesh, matrix_array, prim_names, sorted_influences
+from .author import (
+    bind_skin,
+    define_mesh,
+    keep_lbs_skin,
+    mark_garment,
+    matrix_array,
+    prim_names,
+)
 from .export import export, need_layer_suffix
 from .garment_api import apply_garment_api
+from .names import CLASS, LBS_SKIN, PROXIES, SKEL
 from .read_garment import find_garment, fitted_skeleton, garment_to_core, lbs_skin
-from .read_mesh import CLASS, PROXIES, is_garment
+from .read_mesh import is_garment
 from .read_skeleton import find_skeleton
-from .read_skin import PLAIN, SKEL, leaf, match_joints, read_influences
+from .read_skin import leaf, match_joints, read_influences
 from .read_spaces import SkelSource
 from .read_stage import (
     PRIMS,
@@ -56,10 +64,10 @@ def read_proxy_rig(
         source: the stage with the garment and the skeleton that its proxies hang from.
         skeleton: the character's; combined joint indices run over its joints, then over the proxies.
         garment, root: as in `read_garment`.
-        report: hears of proxies that are gone, and of vertices that fall back to plain skinning for that.
+        report: hears of proxies that are gone, and of vertices that fall back to LBS because of that.
 
     Raises:
-        SsilkError: a proxy hangs from another garment's, or vertices have no weights left and no plain ones.
+        SsilkError: a proxy hangs from another garment's, or vertices have no weights left and no LBS weights.
     """
     stage = open_stage(source)
     prim = find_garment(stage, garment)
@@ -87,7 +95,7 @@ def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path) -> Non
 
     The copy keeps the stage's units and axes. Proxies are appended to the skeleton's joints, in place of older ones
     of the same garment. The garment's mesh stands under the SkelRoot with its classes, the rig's weights, and the
-    plain-skinning weights beside them (`primvars:ssilk:plainJointIndices` and `...Weights`).
+    LBS weights over the character beside them (`primvars:ssilk:plainJointIndices` and `...Weights`).
 
     Args:
         source: the stage that `scene.character` was read from.
@@ -117,23 +125,18 @@ def _proxy_parents(skel: SkelSource, mine: Ints, skeleton: Skeleton, where: str)
     parents = []
     for index in mine:
         above = int(skel.parents[index])
-        need(
-            above >= 0,
-            where,
-            f"proxy '{skel.joints[index]}' has no parent",
-            "proxies hang from joints",
-            "reparent it",
-        )
+        if above < 0:
+            fail(where, f"proxy '{skel.joints[index]}' has no parent", "proxies hang from joints", "reparent it")
         combined = own.get(above, -1)
         if combined < 0 and not skel.owners[above]:
             combined = match_joints((skel.joints[above],), skeleton.joint_names)[0]
-        need(
-            combined >= 0,
-            where,
-            f"proxy '{skel.joints[index]}' hangs from '{skel.joints[above]}'",
-            "a proxy hangs from a joint of the character or from a proxy of the same garment",
-            "reparent it",
-        )
+        if combined < 0:
+            fail(
+                where,
+                f"proxy '{skel.joints[index]}' hangs from '{skel.joints[above]}'",
+                "a proxy hangs from a joint of the character or from a proxy of the same garment",
+                "reparent it",
+            )
         parents.append(combined)
     return np.array(parents, dtype=np.int64)
 
@@ -141,7 +144,7 @@ def _proxy_parents(skel: SkelSource, mine: Ints, skeleton: Skeleton, where: str)
 def _rig_skin(
     prim: Usd.Prim, skel: SkelSource, skeleton: Skeleton, names: tuple[str, ...], report: Reporter
 ) -> SkinWeights:
-    """Return the garment's weights over the combined joints; rows whose joints are all gone take plain ones."""
+    """Return the garment's weights over the combined joints; rows whose joints are all gone take LBS weights."""
     influences = read_influences(prim, skel.joints)
     if influences is None:
         fail(
@@ -151,20 +154,19 @@ def _rig_skin(
     lost = (weights.sum(axis=1) <= 0) & (influences.weights.sum(axis=1) > 0)
     if not lost.any():
         return SkinWeights(influences.path, indices, weights)
-    plain = lbs_skin(prim, skel.joints, skeleton)
-    need(
-        plain,
-        influences.path,
-        f"{np.count_nonzero(lost)} vertices are weighted to joints that are gone, and to no others",
-        "each vertex needs a weight",
-        "paint them, or rig the garment again",
-    )
-    assert plain is not None
+    lbs = lbs_skin(prim, skel.joints, skeleton)
+    if lbs is None:
+        fail(
+            influences.path,
+            f"{np.count_nonzero(lost)} vertices are weighted to joints that are gone, and to no others",
+            "each vertex needs a weight",
+            "paint them, or rig the garment again",
+        )
     report(Message(f"{influences.path}: {np.count_nonzero(lost)} vertices lost all proxies and follow the body"))
-    width = max(indices.shape[1], plain.indices.shape[1])
+    width = max(indices.shape[1], lbs.indices.shape[1])
     mixed = [
         np.where(lost[:, None], _padded(body, width), _padded(own, width))
-        for body, own in ((plain.indices, indices), (plain.weights, weights))
+        for body, own in ((lbs.indices, indices), (lbs.weights, weights))
     ]
     return SkinWeights(influences.path, *mixed)
 
@@ -286,32 +288,14 @@ def _bind_garment(
 
     Its own joint order holds the names, so that its weights survive joints that are removed or reordered by hand.
     """
-    prim, plain_joints = mesh.GetPrim(), scene.character.skeleton.joint_names
-    for name in (CLASS, *SKEL, *PLAIN):
+    prim, character_joints = mesh.GetPrim(), scene.character.skeleton.joint_names
+    for name in (CLASS, *SKEL, *LBS_SKIN):
         prim.RemoveProperty(name)
         prim.RemoveProperty(f"{name}:indices")  # of an indexed primvar
     apply_garment_api(prim)
     bind_skin(mesh, scene.rig.skin, UsdSkel.Skeleton(skel.prim))
     binding = UsdSkel.BindingAPI(prim)
     binding.CreateGeomBindTransformAttr(Gf.Matrix4d(to_bind.T.tolist()))
-    binding.CreateJointsAttr(Vt.TokenArray((*plain_joints, *proxies)))
-    _author_names(prim, PROXIES, proxies)
-    _author_names(prim, PLAIN[2], plain_joints)
-    _author_rows(prim, CLASS, scene.classes[:, None].astype(np.int32))
-    for name, rows in zip(PLAIN[:2], sorted_influences(scene.lbs_skin)):
-        _author_rows(prim, name, rows)
-
-
-def _author_names(prim: Usd.Prim, name: str, names: tuple[str, ...]) -> None:
-    attribute = prim.CreateAttribute(name, Sdf.ValueTypeNames.TokenArray, False, Sdf.VariabilityUniform)
-    attribute.Set(Vt.TokenArray(names))
-
-
-def _author_rows(prim: Usd.Prim, name: str, rows: np.ndarray) -> None:
-    """Author a vertex primvar of whole numbers or floats, shape (V, elementSize)."""
-    whole = np.issubdtype(rows.dtype, np.integer)
-    kind = Sdf.ValueTypeNames.IntArray if whole else Sdf.ValueTypeNames.FloatArray
-    array = (Vt.IntArray if whole else Vt.FloatArray).FromNumpy(np.ascontiguousarray(rows).reshape(-1))
-    primvar = UsdGeom.PrimvarsAPI(prim).CreatePrimvar(name.removeprefix("primvars:"), kind, UsdGeom.Tokens.vertex)
-    primvar.SetElementSize(rows.shape[1])
-    primvar.Set(array)
+    binding.CreateJointsAttr(Vt.TokenArray((*character_joints, *proxies)))
+    mark_garment(prim, scene.classes, proxies)
+    keep_lbs_skin(prim, scene.lbs_skin, character_joints)

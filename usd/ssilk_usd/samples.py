@@ -10,7 +10,7 @@ import numpy as np
 from pxr import Gf, Sdf, UsdSkel, Vt
 
 from ssilk_core.assets import Deformer, Floats, GarmentPose, Ints, Motion, SkinWeights
-from ssilk_core.errors import need
+from ssilk_core.errors import fail
 from ssilk_core.kinematics import (
     combined_transforms,
     local_transforms,
@@ -28,7 +28,7 @@ AT_REST = 1e-7  # by which entries of a joint's transform may differ and still c
 
 
 class Samples:
-    """The samples of a shot under way.
+    """The time samples of a shot that is being written.
 
     Args:
         layer: where they go; it holds specs of the SkelRoot and the SkelAnimation.
@@ -141,12 +141,12 @@ def kept_joints(deformer: Deformer, motion: Motion, lean: bool) -> Ints:
         SsilkError: the motion is of another skeleton.
     """
     skeleton, scene = deformer.scene.character.skeleton, deformer.scene
-    need(
-        motion.rotations.shape[1] == skeleton.joint_count,
-        motion.path,
-        f"{motion.rotations.shape[1]} animated joints, where {skeleton.path} has {skeleton.joint_count}",
-        "the motion must be one of this skeleton",
-    )
+    if motion.rotations.shape[1] != skeleton.joint_count:
+        fail(
+            motion.path,
+            f"{motion.rotations.shape[1]} animated joints, where {skeleton.path} has {skeleton.joint_count}",
+            "the motion must be one of this skeleton",
+        )
     turned = np.abs(matrix_from_quaternion(motion.rotations) - skeleton.rest_transforms[:, :3, :3])
     moved = np.abs(motion.translations - skeleton.rest_transforms[:, :3, 3])
     away = np.maximum(turned.max(axis=(0, 2, 3)), moved.max(axis=(0, 2)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write a baked garment as one self-contained UsdSkel shot, whatever its length in little memory."""
+"""Write a baked garment as one self-contained UsdSkel shot of any length, in little memory."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom, Vt
 
 from ssilk_core.assets import Deformer, GarmentPose, Motion
-from ssilk_core.errors import fail, need
+from ssilk_core.errors import fail
 from ssilk_core.files import replacing
 
 from .author import define_asset
@@ -94,8 +94,10 @@ def write_samples(
     path: str | Path,
     provenance: Mapping[str, object] | None = None,
 ) -> None:
-    """Write the frames of a shot, checked, saving now and then, and last, what may have grown meanwhile, where it
-    came from; `path` is what messages call the file."""
+    """Check and write the frames of a shot, saving at intervals, then its provenance, which may have grown meanwhile.
+
+    Messages call the file `path`.
+    """
     for pose in _checked(poses, samples.deformer, samples.motion):
         samples.append(pose)
         if samples.unsaved_count >= FRAMES_PER_SAVE:
@@ -167,7 +169,8 @@ def _checked(poses: Iterable[GarmentPose], deformer: Deformer, motion: Motion) -
     """Yield the chunks; raise unless they are of this garment and cover the motion in order."""
     where, count = deformer.scene.garment.mesh.path, 0
     for pose in poses:
-        need(pose.start == count, where, f"a chunk that starts at frame {pose.start}", f"frame {count} comes next")
+        if pose.start != count:
+            fail(where, f"a chunk that starts at frame {pose.start}", f"frame {count} comes next")
         _check_pose(pose, deformer)
         count += pose.frame_count
         _need_frames(count <= motion.frame_count, count, deformer, motion)
@@ -176,30 +179,30 @@ def _checked(poses: Iterable[GarmentPose], deformer: Deformer, motion: Motion) -
 
 
 def _need_frames(enough: bool, count: int, deformer: Deformer, motion: Motion) -> None:
-    need(
-        enough,
-        deformer.scene.garment.mesh.path,
-        f"{count} garment frames for the {motion.frame_count} of {motion.path}",
-        "each frame of the motion needs one",
-    )
+    if not enough:
+        fail(
+            deformer.scene.garment.mesh.path,
+            f"{count} garment frames for the {motion.frame_count} of {motion.path}",
+            "each frame of the motion needs one",
+        )
 
 
 def _check_pose(pose: GarmentPose, deformer: Deformer) -> None:
     where = deformer.scene.garment.mesh.path
     frames, proxies, shapes = pose.frame_count, deformer.scene.rig.proxy_count, deformer.shape_count
-    need(
-        pose.rotations.shape == (frames, proxies, 4) and pose.weights.shape == (frames, shapes),
-        where,
-        f"proxy rotations of shape {pose.rotations.shape} and blendshape weights of shape {pose.weights.shape}",
-        f"({frames}, {proxies}, 4) and ({frames}, {shapes}) are needed",
-    )
-    need(
-        np.isfinite(pose.rotations).all(),
-        where,
-        f"NaN or infinity among the proxy rotations from frame {pose.start}",
-        "rotations are unit quaternions",
-        "train the model again, or for longer",
-    )
+    if pose.rotations.shape != (frames, proxies, 4) or pose.weights.shape != (frames, shapes):
+        fail(
+            where,
+            f"proxy rotations of shape {pose.rotations.shape} and blendshape weights of shape {pose.weights.shape}",
+            f"({frames}, {proxies}, 4) and ({frames}, {shapes}) are needed",
+        )
+    if not np.isfinite(pose.rotations).all():
+        fail(
+            where,
+            f"NaN or infinity among the proxy rotations from frame {pose.start}",
+            "rotations are unit quaternions",
+            "train the model again, or for longer",
+        )
     wrong = np.argwhere(~((pose.weights >= 0) & (pose.weights <= 1)))
     if wrong.size:
         frame, shape = wrong[0]

@@ -8,12 +8,15 @@ roots' transforms, and of all other joints the length of their translations alon
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from pxr import Usd, UsdGeom
 
 from ssilk_core.assets import Floats
-from ssilk_core.errors import need
+from ssilk_core.errors import fail
+
+if TYPE_CHECKING:
+    from pxr import Usd
 
 _TO_Y_UP = {
     "Y": np.eye(3),
@@ -35,10 +38,14 @@ class StageUnits:
         Raises:
             SsilkError: metersPerUnit is not positive, or the up axis is neither Y nor Z.
         """
+        from pxr import UsdGeom
+
         where, meters = stage.GetRootLayer().identifier, UsdGeom.GetStageMetersPerUnit(stage)
-        need(0 < meters < np.inf, where, f"metersPerUnit is {meters}", "it must be positive", "set it in the file")
+        if not 0 < meters < np.inf:
+            fail(where, f"metersPerUnit is {meters}", "it must be positive", "set it in the file")
         axis = str(UsdGeom.GetStageUpAxis(stage))
-        need(axis in _TO_Y_UP, where, f"upAxis is '{axis}'", "it is Y or Z", "set it in the file")
+        if axis not in _TO_Y_UP:
+            fail(where, f"upAxis is '{axis}'", "it is Y or Z", "set it in the file")
         return cls(meters, axis)
 
     @property
@@ -53,13 +60,17 @@ class StageUnits:
         matrix[:3, :3] = self.rotation * self.meters_per_unit
         return matrix
 
-    def points_from_core(self, points: Floats) -> Floats:
-        """Return points [m], y up, shape (..., 3), in the stage's units and axes."""
-        return np.asarray(points) @ self.rotation / self.meters_per_unit
+    def points_to_core(self, points: Floats) -> Floats:
+        """Return points in the stage's units and axes, shape (..., 3), in metres, y up."""
+        return np.asarray(points) @ self.rotation.T * self.meters_per_unit
 
-    def vectors_from_core(self, vectors: Floats) -> Floats:
-        """Return offsets [m], y up, shape (..., 3), in the stage's units and axes."""
-        return self.points_from_core(vectors)
+    def transforms_to_core(self, transforms: Floats) -> Floats:
+        """Return rigid joint-to-world transforms of the stage, shape (..., 4, 4), in metres, y up."""
+        return self.matrix @ transforms @ scaling(1 / self.meters_per_unit)
+
+    def points_from_core(self, points: Floats) -> Floats:
+        """Return points or offsets [m], y up, shape (..., 3), in the stage's units and axes."""
+        return np.asarray(points) @ self.rotation / self.meters_per_unit
 
     def transforms_from_core(self, transforms: Floats) -> Floats:
         """Return rigid joint-to-world transforms [m], y up, shape (..., 4, 4), in the stage's units and axes."""

@@ -1,21 +1,59 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plain files of a garment mesh and of a motion, as artists and motion libraries hand them over."""
+"""Write characters with garments, garments and motions as files of their own."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
-from pxr import Gf, Kind, Usd, UsdGeom, UsdSkel, Vt
+from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
-from ssilk_core.assets import Mesh, Motion, Skeleton
+from ssilk_core.assets import Character, Garment, Mesh, Motion, ProxyRig, Skeleton
 from ssilk_core.files import replacing
 
-from .author import define_mesh, prim_names
+from .author import bind_skin, define_mesh, define_skeleton, keep_lbs_skin, mark_garment, prim_names
 from .export import new_stage, save
+from .names import GARMENT
 from .units import StageUnits
 
 CORE_UNITS = StageUnits(1.0, UsdGeom.Tokens.y)
+
+
+def write_scene(
+    path: str | Path, character: Character, garment: Garment, rig: ProxyRig | None = None, *, units: StageUnits
+) -> None:
+    """Write a character with a garment at its bind pose, as `read_scene` reads them.
+
+    SkelRoot, Skeleton and meshes are named after the last parts of their paths. Weights, classes and proxies are
+    left out where there are none; the garment's weights over the character's joints stand beside those of its rig.
+
+    Args:
+        path: the file to write: .usdc, .usd or .usda.
+        units: units and up axis of the stage.
+
+    Raises:
+        SsilkError: the joint paths spell another hierarchy than the parents, or the file cannot be written.
+    """
+    skeleton, bodies = character.skeleton, character.bodies
+    with replacing(path) as temporary:
+        stage = new_stage(temporary, units)
+        root = UsdSkel.Root.Define(stage, _root_path(character.path))
+        stage.SetDefaultPrim(root.GetPrim())
+        names = prim_names([skeleton.path, garment.mesh.path, *(body.mesh.path for body in bodies)])
+        paths = [root.GetPath().AppendChild(name) for name in names]
+        joints = define_skeleton(stage, paths[0], skeleton, rig, units)
+        UsdSkel.BindingAPI.Apply(root.GetPrim()).CreateSkeletonRel().SetTargets([joints.GetPath()])
+        mesh = define_mesh(stage, paths[1], garment.mesh, units)
+        skin = garment.skin if rig is None else rig.skin
+        if skin is not None:
+            bind_skin(mesh, skin, joints)
+        mesh.GetPrim().CreateAttribute(GARMENT, Sdf.ValueTypeNames.Bool).Set(True)
+        mark_garment(mesh.GetPrim(), garment.classes, None if rig is None else rig.joint_names)
+        if rig is not None and garment.skin is not None:
+            keep_lbs_skin(mesh.GetPrim(), garment.skin, skeleton.joint_names)
+        for place, body in zip(paths[2:], bodies):
+            bind_skin(define_mesh(stage, place, body.mesh, units), body.skin, joints)
+        save(stage.GetRootLayer(), path)
 
 
 def write_garment(path: str | Path, mesh: Mesh) -> None:
@@ -40,13 +78,17 @@ def write_motion(path: str | Path, motion: Motion, skeleton: Skeleton) -> None:
         stage.SetEndTimeCode(motion.start + motion.frame_count - 1)
         animation.CreateJointsAttr(Vt.TokenArray(skeleton.joint_names))
         animation.CreateScalesAttr(Vt.Vec3hArray(skeleton.joint_count, Gf.Vec3h(1)))
-        rotations, translations = animation.CreateRotationsAttr(), animation.CreateTranslationsAttr()
-        for frame in range(motion.frame_count):
-            time = motion.start + frame
-            imaginary_first = np.roll(motion.rotations[frame], -1, axis=1).astype(np.float32)
-            rotations.Set(Vt.QuatfArray.FromNumpy(imaginary_first), time)
-            translations.Set(Vt.Vec3fArray.FromNumpy(motion.translations[frame].astype(np.float32)), time)
-        save(stage.GetRootLayer(), path)
+        rotations, translations = (
+            attribute.GetPath() for attribute in (animation.CreateRotationsAttr(), animation.CreateTranslationsAttr())
+        )
+        layer = stage.GetRootLayer()
+        del stage, animation  # nobody has to hear of each sample
+        imaginary_first = np.roll(motion.rotations, -1, axis=-1).astype(np.float32)
+        places = motion.translations.astype(np.float32)
+        for frame, (turns, moves) in enumerate(zip(imaginary_first, places)):
+            layer.SetTimeSample(rotations, motion.start + frame, Vt.QuatfArray.FromNumpy(turns))
+            layer.SetTimeSample(translations, motion.start + frame, Vt.Vec3fArray.FromNumpy(moves))
+        save(layer, path)
 
 
 def _root_path(name: str) -> str:

@@ -7,5 +7,5 @@ from pathlib import Path
 
 
 def demo_body_path() -> Path:
-    """Return the path of the stage of the demo's body; licence and making are told in LICENSE.md beside it."""
+    """Return the path of the stage of the demo's body; LICENSE.md beside it states its licence and origin."""
     return Path(__file__).with_name("demo_body.usdc")

@@ -1,0 +1,17 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Run 'ssilk train' with the paper's integration schemes.
+
+python benchmarks/train_scheme.py STAGE --motions FOLDER --valid FOLDER -o verlet.safetensors --set scheme=verlet
+"""
+
+from __future__ import annotations
+
+import sys
+
+from helpers import paper_schemes
+
+from ssilk_core.cli import main
+
+if __name__ == "__main__":
+    paper_schemes.register()
+    raise SystemExit(main(["train", *sys.argv[1:]]))

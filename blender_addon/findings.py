@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What `ssilk inspect` found, said of objects and motions.
+
+A finding's `prim` is then the name of an object or of a motion, empty for the character as a whole. Faces become the
+"polygons" of the object's mesh.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from ssilk_core.assets import Mesh
+from ssilk_core.preflight.finding import Finding
+
+
+@dataclass(frozen=True)
+class Clip:
+    """What people call a motion, and its first frame; None where its frames are not those of the timeline."""
+
+    name: str
+    start: int | None = None
+
+
+def read_findings(
+    documents: Sequence[Mapping[str, Any]],
+    garment: str,
+    meshes: Mapping[str, Mesh],
+    clips: Mapping[str, Clip] = MappingProxyType({}),
+) -> list[Finding]:
+    """Return findings by object; those on several bodies as one come apart.
+
+    Args:
+        documents: the findings as `ssilk inspect --json` wrote them.
+        garment: name of its object.
+        meshes: by the names of objects the meshes that were inspected; their paths are those of their prims.
+        clips: the motions that were inspected, by the paths of their files.
+    """
+    found: list[Finding] = []
+    names = {mesh.path: name for name, mesh in meshes.items()}
+    bodies = {name: mesh for name, mesh in meshes.items() if name != garment}
+    for document in documents:
+        finding = Finding(**{**document, "indices": tuple(document["indices"])})
+        file, _, prim = finding.prim.rpartition(":")
+        finding = replace(finding, prim=names.get(prim, ""))
+        if file in clips:
+            found.append(_on_timeline(finding, clips[file]))
+        elif finding.prim:
+            found.append(_on_polygons(finding, meshes[finding.prim]))
+        elif finding.elements in {"vertices", "faces"}:
+            found += _by_body(finding, bodies)
+        else:
+            found.append(finding)
+    return found
+
+
+def polygons_of(counts: np.ndarray, triangles: Sequence[int]) -> tuple[int, ...]:
+    """Return the polygons, of which these are the counts of corners (P,), that have all of their triangles named."""
+    owner = np.repeat(np.arange(len(counts)), counts - 2)
+    named = np.bincount(owner[list(triangles)], minlength=len(counts))
+    return tuple(np.flatnonzero(named == counts - 2).tolist())
+
+
+def _on_timeline(finding: Finding, clip: Clip) -> Finding:
+    """Return a finding on a motion, with its frames as the timeline counts them."""
+    if finding.elements == "frames" and clip.start is not None:
+        finding = replace(finding, indices=tuple(clip.start + index for index in finding.indices))
+    elif finding.elements == "frames":
+        finding = replace(finding, elements="", indices=())
+    return replace(finding, prim=clip.name)
+
+
+def _on_polygons(finding: Finding, mesh: Mesh) -> Finding:
+    """Return a finding on triangles as one on polygons; on all of them where it names none."""
+    if finding.elements != "faces":
+        return finding
+    polygons = polygons_of(np.asarray(mesh.polygon_counts), finding.indices or range(len(mesh.faces)))
+    return replace(finding, elements="polygons", indices=polygons)
+
+
+def _by_body(finding: Finding, bodies: Mapping[str, Mesh]) -> Iterator[Finding]:
+    """Yield a finding on all bodies as one for each body that it is about."""
+    start = 0
+    for name, mesh in bodies.items():
+        size = mesh.vertex_count if finding.elements == "vertices" else len(mesh.faces)
+        own = tuple(index - start for index in finding.indices if start <= index < start + size)
+        start += size
+        if own or not finding.indices:
+            yield _on_polygons(replace(finding, prim=name, indices=own), mesh)

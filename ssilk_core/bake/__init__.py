@@ -1,0 +1,27 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bake trained garments over motions as UsdSkel, and verify what was written.
+
+    request = BakeRequest(model="cape.safetensors", stage="hero.usdc", motion="walk.usdc")
+    result = bake(request, "shot.usdc")
+
+`bake` writes one file, `bake_layers` a folder of layers, `verify` compares a written shot with the network again.
+Work speaks through `ssilk_core.events`; bad input raises `SsilkError`, a file that is not what was computed
+`VerificationError`. This package and the command line are the only ones that join the core and USD.
+"""
+
+from .character import on_character
+from .layers import LayerFolder, bake_layers
+from .load import LoadedGarment, load_garment, load_rollout, with_model
+from .request import BakeRequest
+from .result import BakeResult, FrameSpan, RefinementSummary, Verification
+from .rollout import BakeRollout
+from .sizing import shot_bytes
+from .task import BakeTask, plan_layers
+from .verification import verify
+from .write import bake
+
+__all__ = [
+    "BakeRequest", "BakeResult", "BakeRollout", "BakeTask", "FrameSpan", "LayerFolder", "LoadedGarment",
+    "RefinementSummary", "Verification", "bake", "bake_layers", "load_garment", "load_rollout", "on_character",
+    "plan_layers", "shot_bytes", "verify", "with_model",
+]  # fmt: skip

@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Loading what a request names: the garment on its character, then the motion."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING
+
+from ..assets import Deformer, Motion
+from ..checkpoint import ModelFile, load_model
+from ..devices import chosen_device
+from ..errors import fail
+from ..files import sha256
+from ..kinematics import lbs_deformer, resample
+from ..quality import SizeReduction
+from ..reduction import Reducer
+from ..targets import Target, capped
+from .character import on_character
+from .request import BakeRequest
+from .rollout import BakeRollout
+
+if TYPE_CHECKING:
+    from pxr import Usd
+    from ssilk_usd.garment_api import GarmentRecord
+    from ssilk_usd.units import StageUnits
+
+    from ..model.network import GarmentModel
+
+MAX_FPS = 10_000
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedGarment:
+    """A garment on its character, ready for any motion.
+
+    Attributes:
+        model: the network; None under linear blend skinning.
+        deformer: the garment as its target takes it.
+        units: units and up axis of what is written.
+        provenance: where the model comes from, as a shot stores it.
+        record: how the model was made, as its mesh stores it.
+    """
+
+    request: BakeRequest
+    file: ModelFile
+    model: GarmentModel | None
+    deformer: Deformer
+    units: StageUnits
+    provenance: dict[str, object]
+    record: GarmentRecord
+
+    def over(self, motion: str) -> BakeRollout:
+        """Return the garment over a motion, "file[:/Prim/Path]".
+
+        Raises:
+            SsilkError: the file is missing or does not fit.
+        """
+        from ssilk_usd.read_motion import read_motion
+        from ssilk_usd.read_stage import split_location
+        from ssilk_usd.read_visibility import read_hidden
+
+        request = replace(self.request, motion=motion)
+        source = read_motion(motion, self.file.scene.character.skeleton, root=request.root)
+        at_fps = source if request.fps is None else _at_fps(source, request.fps)
+        samples = request.samples_per_frame
+        sampled = at_fps if samples == 1 else _at_fps(source, at_fps.fps * samples)
+        kept, reduction = self._cut(source) if request.keep else (self, None)
+        provenance = {
+            **self.provenance,
+            **({"reduced": reduction.to_metadata()} if reduction else {}),
+            "request": request.to_metadata(),
+            "motion_sha256": sha256(split_location(motion)[0]),
+        }
+        return BakeRollout(
+            request=request,
+            model=kept.model,
+            deformer=kept.deformer,
+            motion=sampled,
+            source=source,
+            hidden=read_hidden(motion, sampled, root=request.root),
+            units=self.units,
+            provenance=provenance,
+            record=self.record,
+            fabric=self.file.fabric,
+            reduction=reduction,
+        )
+
+    def _cut(self, motion: Motion) -> tuple[LoadedGarment, SizeReduction]:
+        """Return the garment cut to the size that the request keeps, so as to be best for this motion."""
+        assert self.model is not None and self.request.keep is not None
+        reducer = Reducer(self.file, [motion])
+        found = reducer.reduced(self.request.keep)
+        model, deformer = _network_like(self.model, found.file, self.request)
+        return replace(self, model=model, deformer=deformer), SizeReduction.of(reducer.whole, found)
+
+
+def load_garment(request: BakeRequest) -> LoadedGarment:
+    """Load what a request names, except its motion.
+
+    Raises:
+        SsilkError: a file is missing or does not fit the others.
+    """
+    from ssilk_usd.read_stage import open_stage
+
+    from ..checkpoint import network
+
+    device = chosen_device(request.device)
+    file = load_model(request.model)
+    stage = open_stage(request.stage)
+    scene = on_character(file, stage, request.root)
+    model = None if request.lbs else network(file, scene).to(device)
+    deformer = lbs_deformer(scene) if model is None else model.deformer()
+    model_hash = sha256(request.model)
+    return LoadedGarment(
+        request=request,
+        file=file,
+        model=model,
+        deformer=capped(deformer, request.receiver),
+        units=_units(stage, request.receiver),
+        provenance={"model_sha256": model_hash, "training": file.provenance.get("ssilk", "")},
+        record=_record(file, model_hash),
+    )
+
+
+def load_rollout(request: BakeRequest) -> BakeRollout:
+    """Load everything that a request names.
+
+    Raises:
+        SsilkError: a file is missing or does not fit the others.
+    """
+    return load_garment(request).over(request.motion)
+
+
+def with_model(rollout: BakeRollout, file: ModelFile) -> BakeRollout:
+    """Return a rollout of another model of the same garment."""
+    assert rollout.model is not None
+    model, deformer = _network_like(rollout.model, file, rollout.request)
+    return replace(rollout, model=model, deformer=deformer)
+
+
+def _network_like(like: GarmentModel, file: ModelFile, request: BakeRequest) -> tuple[GarmentModel, Deformer]:
+    """Return a model's network on the character of another network, and the garment as its target takes it."""
+    from ..checkpoint import network
+
+    model = network(file, replace(file.scene, character=like.scene.character))
+    model.to(chosen_device(request.device))
+    return model, capped(model.deformer(), request.receiver)
+
+
+def _at_fps(motion: Motion, fps: float) -> Motion:
+    if not 0 < fps <= MAX_FPS:
+        fail("--fps", f"{fps:g} frames per second", f"a positive rate of at most {MAX_FPS} is needed")
+    return replace(resample(motion, fps), start=motion.start * fps / motion.fps)
+
+
+def _units(stage: Usd.Stage, target: Target) -> StageUnits:
+    """Return a target's units and axis, or those of the character's stage where it takes any."""
+    from ssilk_usd.units import StageUnits
+
+    own = StageUnits.of(stage)
+    return StageUnits(target.meters_per_unit or own.meters_per_unit, target.up_axis or own.up_axis)
+
+
+def _record(file: ModelFile, model_hash: str) -> GarmentRecord:
+    from ssilk_usd.garment_api import GarmentRecord
+
+    numbers = {name: float(value) for name, value in asdict(file.fabric).items() if isinstance(value, int | float)}
+    return GarmentRecord(
+        model_hash=model_hash,
+        version=str(file.provenance.get("ssilk", "")),
+        seed=int(file.provenance.get("seed", 0)),
+        fabric=file.fabric.name,
+        parameters=numbers,
+    )

@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frozen dataclasses from the plain values of JSON and of USD's metadata, with their types checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from types import UnionType
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+
+T = TypeVar("T")
+
+
+def from_plain(kind: type[T], document: object) -> T:
+    """Return a dataclass of the values that `dataclasses.asdict` made of one.
+
+    Raises:
+        TypeError: a field is missing, unknown, or of another type.
+        SsilkError: the dataclass refuses a value.
+    """
+    if not isinstance(document, Mapping):
+        raise TypeError(f"{str(document)[:40]!r} has no fields")
+    types = get_type_hints(kind)
+    known = {item.name for item in fields(kind)}  # type: ignore[arg-type]
+    unknown = sorted(str(name) for name in document.keys() - known)
+    if unknown:
+        raise TypeError(f"{unknown[0]!r} is no field")
+    return kind(**{name: _value(types[name], name, value) for name, value in document.items()})
+
+
+def _value(kind: Any, name: str, value: object) -> Any:
+    """Return a plain value as `kind`: a dataclass, a tuple of one type, a union, or a plain type itself."""
+    if get_origin(kind) is UnionType:
+        if value is None and type(None) in get_args(kind):
+            return None
+        (kind,) = (each for each in get_args(kind) if each is not type(None))
+    if get_origin(kind) is tuple and isinstance(value, list | tuple):
+        return tuple(_value(get_args(kind)[0], name, item) for item in value)
+    if is_dataclass(kind):
+        return from_plain(kind, value)  # type: ignore[arg-type]
+    if isinstance(value, kind if kind is not float else (int, float)) and isinstance(value, bool) == (kind is bool):
+        return value
+    raise TypeError(f"{name!r} is {str(value)[:40]!r}")

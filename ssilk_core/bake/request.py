@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is baked."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+from ..errors import fail
+from ..reduction import ModelSize
+from ..targets import TARGETS, Target
+from .plain import from_plain
+
+INPUTS = ("model", "stage", "motion")  # the files that a shot is baked from
+REFINED_OUTPUTS = ("points", "joints")
+MAX_SAMPLES_PER_FRAME = 64
+MAX_PRE_ROLL = 600.0  # [s]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BakeRequest:
+    """One garment over one motion: all that decides how the garment moves.
+
+    Fields are named as the options of 'ssilk bake'. A shot stores its request, so that it can be verified later.
+
+    Attributes:
+        model: file written by 'ssilk train'.
+        stage: USD file with the character.
+        motion: USD file with the motion; "file:/Prim/Path" names a SkelAnimation where there are several.
+        root: SkelRoot of the character, where the stage has several.
+        fps: frames per second of the shot [1/s]; None for the motion's.
+        samples_per_frame: samples in each frame, for motion blur.
+        pre_roll: run-up to the first pose and after each cut [s].
+        target: who receives the shot, a name in `ssilk_core.targets.TARGETS`.
+        lbs: bake linear blend skinning instead of the network.
+        refine: iterations of the simulator's solver in each frame, from the network's state; 0 for none.
+        feedback: refined frames look back on refined frames instead of the network's.
+        refined_output: "points" writes refined frames as points, "joints" fits joints and blendshapes to them.
+        keep: what is kept of the model, cut to be best for this motion; None for all.
+        device: where the network runs.
+
+    Raises:
+        SsilkError: an unknown target or refined output, or a number out of range.
+    """
+
+    model: str
+    stage: str
+    motion: str
+    root: str | None = None
+    fps: float | None = None
+    samples_per_frame: int = 1
+    pre_roll: float = 0.0
+    target: str = "usd"
+    lbs: bool = False
+    refine: int = 0
+    feedback: bool = False
+    refined_output: str = "points"
+    keep: ModelSize | None = None
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        for name in INPUTS:  # a pathlib.Path is as good, but USD's metadata stores text
+            object.__setattr__(self, name, os.fspath(getattr(self, name)))
+        if self.target not in TARGETS:
+            fail("--target", f"'{self.target}'", f"it is one of {', '.join(TARGETS)}")
+        if not 1 <= self.samples_per_frame <= MAX_SAMPLES_PER_FRAME:
+            found = f"{self.samples_per_frame} samples in each frame"
+            fail("--samples-per-frame", found, f"1 to {MAX_SAMPLES_PER_FRAME} are allowed")
+        if not 0 <= self.pre_roll <= MAX_PRE_ROLL:
+            fail("--pre-roll", f"{self.pre_roll:g} seconds", f"0 to {MAX_PRE_ROLL:g} are allowed")
+        if self.refined_output not in REFINED_OUTPUTS:
+            fail("--refined-output", f"'{self.refined_output}'", f"it is one of {', '.join(REFINED_OUTPUTS)}")
+        if self.lbs and self.keep:
+            fail("--lbs", "linear blend skinning with a size to keep", "only the network has one", "leave keep out")
+        if self.lbs and self.refine and not self.writes_points:
+            fail(
+                "--lbs",
+                "linear blend skinning has no proxies and no blendshapes to fit to refined vertices",
+                "they can be written as points",
+                "use --refined-output points",
+            )
+
+    @property
+    def inputs(self) -> dict[str, str]:
+        """The files that it is baked from, by their fields."""
+        return {name: getattr(self, name) for name in INPUTS}
+
+    @property
+    def writes_points(self) -> bool:
+        """Whether the garment is refined and written as points instead of joints."""
+        return self.refine != 0 and self.refined_output == "points"
+
+    @property
+    def receiver(self) -> Target:
+        """Who receives the shot."""
+        return TARGETS[self.target]
+
+    def relocated(self, locate: Callable[[str], str]) -> BakeRequest:
+        """Return the request with its input files elsewhere: `locate` gives the new path of each."""
+        model, stage, motion = (locate(getattr(self, name)) for name in INPUTS)
+        return replace(self, model=model, stage=stage, motion=motion)
+
+    def to_metadata(self) -> dict[str, object]:
+        """Return what differs from the defaults, as a shot stores it."""
+        changed = {name: value for name, value in vars(self).items() if value != getattr(BakeRequest, name, None)}
+        return {**changed, "keep": str(self.keep)} if self.keep else changed
+
+    @classmethod
+    def from_metadata(cls, document: object) -> BakeRequest:
+        """Return the request that `to_metadata` stored.
+
+        Raises:
+            TypeError, ValueError: it is none, or of a version with other fields.
+            SsilkError: a value out of range.
+        """
+        if isinstance(document, Mapping) and isinstance(document.get("keep"), str):
+            document = {**document, "keep": vars(ModelSize.of(document["keep"]))}
+        return from_plain(cls, document)

@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A garment over a motion: its poses as a shot stores them, and its points as the decoder has them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from ..assets import Deformer, Floats, GarmentPose, Motion
+from ..events import Message, Progress, Reporter, silent
+from ..fabrics import Fabric
+from ..kinematics import deform, lbs_poses
+from ..quality import SizeReduction
+from .request import BakeRequest
+from .result import FrameSpan, RefinementSummary
+
+if TYPE_CHECKING:
+    from ssilk_usd.garment_api import GarmentRecord
+    from ssilk_usd.units import StageUnits
+
+    from ..model.network import GarmentModel
+
+CHUNK = 256  # frames in memory at once
+
+
+@dataclass(frozen=True, eq=False)
+class Refinement:
+    """The refined frames of a rollout, all in memory: 65 MB for 1,000 frames of 2,700 vertices.
+
+    Attributes:
+        points: garment vertices of each frame in the world [m], shape (V, 3).
+        poses: poses fitted to them, where joints are written.
+        summary: what the solver changed.
+    """
+
+    points: tuple[Floats, ...]
+    poses: tuple[GarmentPose, ...]
+    summary: RefinementSummary
+
+
+@dataclass(frozen=True, eq=False)
+class BakeRollout:
+    """A garment over a motion at the rate of the shot's samples.
+
+    Attributes:
+        model: the network; None under linear blend skinning.
+        deformer: the garment as its target takes it.
+        motion: the character's motion at the shot's samples; `source` is the motion as it was read.
+        hidden: at which frames of the motion the garment becomes hidden (True) or visible (False).
+        units: units and up axis of the shot.
+        provenance: where all of this comes from, as a shot stores it.
+        record: how the garment's model was made.
+        reduction: what was kept of the model, where less than all.
+        refinement: the refined frames, once `refined` has computed them.
+        recovered: frames at which the rollout was lost and the garment was put to rest; filled while `network_poses`
+            yields.
+    """
+
+    request: BakeRequest
+    model: GarmentModel | None
+    deformer: Deformer
+    motion: Motion
+    source: Motion
+    hidden: list[tuple[int, bool]]
+    units: StageUnits
+    provenance: dict[str, object]
+    record: GarmentRecord
+    fabric: Fabric
+    reduction: SizeReduction | None = None
+    refinement: Refinement | None = None
+    recovered: list[FrameSpan] = field(default_factory=list)
+
+    @property
+    def start(self) -> float:
+        """Time code of the first frame."""
+        return self.motion.start / self.request.samples_per_frame
+
+    @property
+    def influences(self) -> int:
+        """How many joints move a vertex of the trained garment, at most; 0 under linear blend skinning."""
+        return 0 if self.model is None else self.model.scene.rig.skin.indices.shape[1]
+
+    def poses(self) -> Iterator[GarmentPose]:
+        """Yield the shot's poses, some frames at a time: the network's, or those fitted to refined vertices."""
+        if self.refinement is None or self.request.writes_points:
+            yield from self.network_poses()
+        else:
+            yield from self.refinement.poses
+
+    def network_poses(self) -> Iterator[GarmentPose]:
+        """Yield the network's poses, some frames at a time."""
+        if self.model is None:
+            yield from lbs_poses(self.motion.frame_count)
+            return
+        from ..rollout import garment_poses
+
+        self.recovered.clear()
+        rate, pre_roll = self.motion.fps, self.request.pre_roll
+        yield from garment_poses(self.model, self.source, rate, CHUNK, self._note, pre_roll=pre_roll)
+
+    def _note(self, frames: range) -> None:
+        self.recovered.append(FrameSpan(frames[0], frames[-1]))
+
+    def vertices(self, report: Reporter = silent) -> Iterator[Floats]:
+        """Yield the decoder's garment vertices in the world [m], shape (V, 3), of each of the shot's poses."""
+        yield from self._decoded(self.poses(), report)
+
+    def network_vertices(self) -> Iterator[Floats]:
+        """Yield the decoder's garment vertices in the world [m], shape (V, 3), of each of the network's poses."""
+        yield from self._decoded(self.network_poses(), silent)
+
+    def points(self, report: Reporter = silent) -> Iterator[Floats]:
+        """Yield the points [m], shape (V, 3), that a point cache holds at each sample: refined, or the decoder's."""
+        if self.refinement is not None and self.request.writes_points:
+            yield from self.refinement.points
+        else:
+            yield from self.vertices(report)
+
+    def _decoded(self, poses: Iterator[GarmentPose], report: Reporter) -> Iterator[Floats]:
+        for pose in poses:
+            yield from self.decode(pose)
+            report(Progress(pose.start + pose.frame_count, self.motion.frame_count))
+
+    def decode(self, pose: GarmentPose) -> Floats:
+        """Return the decoder's vertices in the world [m], shape (F, V, 3), of consecutive poses."""
+        if self.model is None:
+            return deform(self.deformer, self.motion, pose)
+        from ..rollout import decode
+
+        return decode(self.model, self.motion, pose)
+
+    def warn(self, report: Reporter) -> None:
+        """Report at which frames the rollout was lost."""
+        for span in self.recovered:
+            report(Message(f"frames {span}: the rollout was lost, and the garment is put to rest", "warning"))

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How much of a garment is baked: a level of quality, a budget, or what the target takes."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from ..assets import GarmentPose
+from ..checkpoint import ModelFile, load_model
+from ..cost import POINT, ShotBytes
+from ..errors import fail
+from ..events import Reporter
+from ..quality import quality_named, size_at, spend
+from ..reduction import Reducer
+from .load import load_rollout, with_model
+from .request import BakeRequest
+from .rollout import BakeRollout
+
+EXCERPT = 64  # frames that are written to estimate the bytes of a whole shot
+
+
+def load_sized(
+    request: BakeRequest,
+    *,
+    quality: str | None,
+    budget: str | None,
+    suffix: str,
+    include_body: bool,
+    report: Reporter,
+) -> BakeRollout:
+    """Load a rollout with as much of its garment, and as many frames, as a level, a budget and the target allow.
+
+    What is kept is fitted to the shot's own motion.
+
+    Args:
+        suffix, include_body: of the file that a budget in bytes is for.
+
+    Raises:
+        SsilkError: an unknown level, a budget that nothing fits, or either for linear blend skinning or points.
+    """
+    request = _at_quality(request, quality, budget)
+    rollout = load_rollout(request)
+    most = request.receiver.influences or rollout.influences
+    if not (quality or budget or rollout.influences > most):
+        return rollout
+    if quality and request.fps is None:
+        request = replace(request, fps=quality_named(quality).rate(rollout.source.fps))
+    reducer = Reducer(load_model(request.model), [rollout.source])
+    size = size_at(quality, reducer.whole)
+    size = replace(size, influences=min(size.influences, most))
+    if budget:
+        at_fps = load_rollout(request)
+
+        def size_bytes(file: ModelFile) -> float:
+            found = shot_bytes(with_model(at_fps, file), suffix, include_body=include_body)
+            return found.of(at_fps.motion.frame_count)
+
+        size = spend(budget, reducer, size, rollout.source, size_bytes, report).size
+    return load_rollout(replace(request, keep=None if size == reducer.whole else size))
+
+
+def _at_quality(request: BakeRequest, quality: str | None, budget: str | None) -> BakeRequest:
+    """Return a request refined as its level says, where it does not say so itself; check that they go together."""
+    if request.lbs and (quality or budget):
+        fail(
+            "--lbs",
+            "linear blend skinning has no level of quality",
+            "--quality and --budget are about the network",
+            "leave one of them out",
+        )
+    if quality:
+        request = replace(request, refine=request.refine or quality_named(quality).refine)
+    if budget and request.writes_points:
+        fail(
+            "--budget",
+            "a budget for points",
+            "every vertex is stored at every frame, whatever is kept of the model",
+            "use --refined-output joints, or leave the budget out",
+        )
+    return request
+
+
+def shot_bytes(rollout: BakeRollout, suffix: str, *, include_body: bool) -> ShotBytes:
+    """Estimate the bytes of a shot from two excerpts, one of more frames than the other."""
+    many = min(EXCERPT * rollout.request.samples_per_frame, rollout.motion.frame_count)
+    few = max(many // 4, 1)
+    first, second = (_excerpt_bytes(rollout, count, suffix, include_body) for count in (few, many))
+    frame = (second - first) / max(many - few, 1)
+    points = POINT * rollout.deformer.scene.garment.mesh.vertex_count if rollout.request.writes_points else 0
+    return ShotBytes(second - frame * many, frame + points)
+
+
+def _excerpt_bytes(rollout: BakeRollout, frames: int, suffix: str, include_body: bool) -> int:
+    from ssilk_usd.shot import write_shot
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"shot{'.usda' if suffix == '.usda' else '.usdc'}"
+        write_shot(
+            path,
+            rollout.deformer,
+            rollout.motion.clip(0, frames),
+            _first(rollout.network_poses(), frames),
+            units=rollout.units,
+            samples_per_frame=rollout.request.samples_per_frame,
+            include_body=include_body,
+        )
+        return path.stat().st_size
+
+
+def _first(poses: Iterator[GarmentPose], frames: int) -> Iterator[GarmentPose]:
+    """Yield the first frames of consecutive poses."""
+    for pose in poses:
+        count = min(pose.frame_count, frames - pose.start)
+        yield GarmentPose(pose.start, pose.rotations[:count], pose.weights[:count])
+        if pose.start + count == frames:
+            return

@@ -1,5 +1,0 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Pose-driven garment networks of other papers, trained on the same energies and motions, to be measured against.
-
-`ncs` is Neural Cloth Simulation (Bertiche et al. 2022), `snug` is SNUG (Santesteban et al. 2022).
-"""

@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Names that USD allows, and bones found again among the joints of a model, without Blender."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from blender_addon.errors import SetupError
+from blender_addon.joints import Joints, joint_order
+from blender_addon.names import identifiers, joint_paths
+
+
+def test_names_become_unique_identifiers():
+    assert identifiers(["Arm.L", "Arm_L", "Ärmel", "", "2nd", "Skeleton"], ["Skeleton"]) == [
+        "Arm_L", "Arm_L_2", "_rmel", "_", "_2nd", "Skeleton_2",
+    ]  # fmt: skip
+
+
+def test_joint_paths_spell_parents():
+    assert joint_paths(["a:Hips", "Leg.L", "Leg_L"], [-1, 0, 1]) == ("a_Hips", "a_Hips/Leg_L", "a_Hips/Leg_L/Leg_L_2")
+
+
+@pytest.fixture
+def joints() -> Joints:
+    """Two bones and two proxies, a metre apart."""
+    binds = np.tile(np.eye(4), (4, 1, 1))
+    binds[:, 1, 3] = range(4)
+    return Joints(("Hips", "Über-Spine", "hem.1", "hem.2"), np.array([-1, 0, 1, 2]), binds, proxy_count=2)
+
+
+def test_a_character_has_no_proxies(joints):
+    skeleton = joints.skeleton("/Character/Skeleton")
+    assert (joints.proxies, joints.character.names) == (("hem.1", "hem.2"), ("Hips", "Über-Spine"))
+    assert skeleton.joint_names == ("Hips", "Hips/_ber_Spine")
+    np.testing.assert_array_equal(skeleton.rest_transforms[1, :3, 3], (0, 1, 0))
+
+
+def test_joints_are_found_again_in_another_order(joints):
+    first, second, third, fourth = joints.paths
+    assert joint_order(joints, [first, second, fourth, third]).tolist() == [0, 1, 3, 2]
+
+
+def test_proxies_alone_may_be_missing_and_only_where_that_is_allowed(joints):
+    first, second, third, fourth = joints.paths
+    assert joint_order(joints, [first, second, fourth], fewer_proxies=True).tolist() == [0, 1, -1, 2]
+    for names, fewer, odd in (
+        ([first, second, third], False, "hem_2"),
+        ([first, third, fourth], True, "_ber_Spine"),
+        ([*joints.paths, "Hips/Tail"], True, "Tail"),
+    ):
+        with pytest.raises(SetupError, match=f"'{odd}' was added, removed, renamed or has another parent"):
+            joint_order(joints, names, fewer_proxies=fewer)
