@@ -21,7 +21,7 @@ from helpers.reports import table, write_results
 
 from ssilk_core.config import ModelConfig
 from ssilk_core.devices import chosen_device
-from ssilk_core.model.batch import BatchPlayer, Driven, driven
+from ssilk_core.model.batch import BatchPlayer, MotionInputs, motion_inputs
 from ssilk_core.model.network import GarmentModel
 
 SHOTS = (1, 8, 64, 512, 2048)
@@ -29,17 +29,17 @@ FRAMES = 128
 SIZE = synthetic.Size(vertices=2500, body=600, proxies=20, shapes=64, batch=1, window=3, static_batch=0)
 
 
-def build(device: torch.device) -> tuple[GarmentModel, Driven]:
+def build(device: torch.device) -> tuple[GarmentModel, MotionInputs]:
     """Return an untrained network, and one shot."""
     scene, config = synthetic.scene(SIZE), ModelConfig(shapes=SIZE.shapes)
     model = GarmentModel(scene, config, np.arange(synthetic.JOINTS)).to(device).eval()
     motion = synthetic.motion(scene.character.skeleton, config.fps, 0).clip(0, FRAMES)
-    return model, driven(model, [motion])
+    return model, motion_inputs(model, [motion])
 
 
-def repeated(shot: Driven, shots: int) -> Driven:
+def repeated(shot: MotionInputs, shots: int) -> MotionInputs:
     """Return the same shot many times; rows of matrices share memory until they are copied."""
-    return Driven(
+    return MotionInputs(
         shot.rest.expand(-1, shots, -1),
         shot.pose.expand(-1, shots, -1),
         shot.character.expand(-1, -1, -1, -1, shots),
@@ -53,7 +53,7 @@ def wait(device: torch.device) -> None:
         torch.cuda.synchronize()
 
 
-def latencies(player: BatchPlayer, shots: Driven, device: torch.device) -> list[float]:
+def latencies(player: BatchPlayer, shots: MotionInputs, device: torch.device) -> list[float]:
     """Return the time of each call by itself [s]."""
     taken = []
     for frame in range(FRAMES):
@@ -65,7 +65,7 @@ def latencies(player: BatchPlayer, shots: Driven, device: torch.device) -> list[
     return taken
 
 
-def throughput(player: BatchPlayer, shots: Driven, device: torch.device) -> float:
+def throughput(player: BatchPlayer, shots: MotionInputs, device: torch.device) -> float:
     """Return frames of all shots per second, over a clip."""
     wait(device)
     start = time.perf_counter()
@@ -75,7 +75,7 @@ def throughput(player: BatchPlayer, shots: Driven, device: torch.device) -> floa
     return FRAMES * shots.rest.shape[1] / (time.perf_counter() - start)
 
 
-def measured(model: GarmentModel, shot: Driven, shots: int, vertices: bool, repeats: int) -> dict[str, float]:
+def measured(model: GarmentModel, shot: MotionInputs, shots: int, vertices: bool, repeats: int) -> dict[str, float]:
     """Return median and 95th percentile of a call [us], and the best throughput [1/s]."""
     device, many = shot.rest.device, repeated(shot, shots)
     torch.compiler.reset()  # or else the ninth size would no longer be compiled

@@ -69,7 +69,7 @@ class Count:
 
     def add(self, x: Tensor, character: Tensor) -> None:
         """Count positions (V, 3, N) under skinning matrices (J, 3, 4, N)."""
-        posed = self.subject.body.posed(character)
+        posed = self.subject.body.pose(character)
         distance = signed_distance(x, posed).double().numpy()
         for frame in range(x.shape[-1]):
             at, body = x[..., frame].double().numpy(), posed.points[..., frame].double().numpy()
@@ -109,7 +109,7 @@ def rest_distances(subject: Subject) -> Floats:
     """Return the signed distance of each vertex to the body in the bind pose [m], shape (V,)."""
     bind = torch.eye(3, 4).expand(subject.scene.character.skeleton.joint_count, 3, 4)[..., None]
     rest = subject.model.decoder.rest[..., None]
-    return signed_distance(rest, subject.body.posed(bind))[:, 0].double().numpy()
+    return signed_distance(rest, subject.body.pose(bind))[:, 0].double().numpy()
 
 
 def row(garment: str, how: str, found: dict[str, Any]) -> list[str]:

@@ -27,7 +27,7 @@ from torch import Tensor
 from ssilk_core.assets import Motion
 from ssilk_core.checkpoint import ModelFile, network, save_model
 from ssilk_core.energy import TERMS
-from ssilk_core.energy.frames import DECODED_AT_ONCE
+from ssilk_core.energy.frames import FRAMES_PER_CHUNK
 from ssilk_core.errors import fail
 from ssilk_core.evaluation.splits import chosen, read_index
 from ssilk_core.evaluation.takes import back_and_forth
@@ -96,7 +96,7 @@ def positions(subject: Subject, motion: Motion) -> Tensor:
         states = roll_states(model, validator.bank, [clip], validator.down)[0]
         found += [
             model.vertices(z, validator.bank.character(at))
-            for z, at in zip(states.split(DECODED_AT_ONCE), frames.split(DECODED_AT_ONCE))
+            for z, at in zip(states.split(FRAMES_PER_CHUNK), frames.split(FRAMES_PER_CHUNK))
         ]
     return torch.cat(found, dim=-1)
 

@@ -32,8 +32,8 @@ from ssilk_core.cli import parser as ssilk_parser
 from ssilk_core.cli.train import training_job
 from ssilk_core.devices import chosen_device, device_name
 from ssilk_core.events import silent
-from ssilk_core.training.divergence import EVERY
-from ssilk_core.training.parallel import ProcessGroup, joined
+from ssilk_core.training.divergence import CHECK_INTERVAL
+from ssilk_core.training.parallel import ProcessGroup, join_process_group
 from ssilk_core.training.run import TrainingRun
 
 SETTLE = 8  # steps before any is timed: eager ones, the capture, and some more
@@ -51,7 +51,7 @@ def measure(options: argparse.Namespace, batch: str, group: ProcessGroup, device
     with tempfile.TemporaryDirectory() as folder:
         words = ["train", *options.training, "--set", f"batch={whole}", "-o", f"{folder}/model.safetensors"]
         job = training_job(ssilk_parser().parse_args(words), device, silent)
-        run = TrainingRun(replace(job, train=ProcessGroup(0, int(parts or 1)).part(job.train)), silent, group)
+        run = TrainingRun(replace(job, train=ProcessGroup(0, int(parts or 1)).local_config(job.train)), silent, group)
     phases = {"warm start": 0, "windows": run.config.static_iterations}
     times = {name: blocks(run, iteration, group, options) for name, iteration in phases.items()}
     parameters = b"".join(value.detach().cpu().numpy().tobytes() for value in run.stepper.model.parameters())
@@ -67,7 +67,7 @@ def blocks(run: TrainingRun, iteration: int, group: ProcessGroup, options: argpa
     def steps() -> None:
         for number in range(options.steps):
             run.stepper.run(iteration)
-            if number % EVERY == 0:
+            if number % CHECK_INTERVAL == 0:
                 group.any(False)  # as training does
 
     return [timed(steps, run, group) / options.steps for _ in range(options.blocks)]
@@ -103,9 +103,9 @@ def settle(device: torch.device) -> None:
 
 def work_in_team(options: argparse.Namespace) -> None:
     """Measure the batches that this process was started for; the first of the group writes what was found."""
-    with joined(options.device) as (group, device):
+    with join_process_group(options.device) as (group, device):
         found = {batch: measure(options, batch, group, device) for batch in options.only}
-        if group.first:
+        if group.is_first:
             options.into.write_text(json.dumps(found))
 
 

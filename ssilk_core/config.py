@@ -10,14 +10,14 @@ from .errors import fail
 from .schemes import need_scheme
 
 CLOSEST_POINTS = ("triangles", "vertices")
-MOST = 1e9  # of anything that has no other bound
+NO_BOUND = 1e9  # of anything that has no other bound
 
 # Constants of `model.integrators.SpringVerlet`, which explains them, shared with the numpy runtime.
 VELOCITY_SCALE, DISTANCE_SCALE, OUTPUT_SCALE = 10.0, 3.0, 0.1
 MAX_OUTPUT = 100.0  # of each output of S: finite, and far above what `max_latent_step` lets through
 STATE_ALLOWANCE, RATE_ALLOWANCE = 0.5, 0.05
-LOST = 1e3  # of a latent: trained ones stay below ten, and no decoder knows what this means
-RECOVERY = 15  # frames at rest after a lost state, half a second of the usual rate
+DIVERGENCE_BOUND = 1e3  # of a latent: trained ones stay below ten, and no decoder knows what this means
+RECOVERY_FRAMES = 15  # frames at rest after a lost state, half a second of the usual rate
 
 
 def _need_between(config: object, low: float, high: float, *names: str) -> None:
@@ -60,12 +60,12 @@ class ModelConfig:
         need_scheme(self.scheme)
         if not min(self.widths) > 0:
             fail("model", f"widths = {self.widths}", "each is at least 1")
-        _need_between(self, 1, MOST, "latent", "fps")
-        _need_between(self, 0, MOST, "shapes", "activations", "latent_bound", "max_latent_step")
+        _need_between(self, 1, NO_BOUND, "latent", "fps")
+        _need_between(self, 0, NO_BOUND, "shapes", "activations", "latent_bound", "max_latent_step")
         _need_between(self, 1e-6, 1, "stiffness")
 
     @property
-    def given(self) -> int:
+    def activation_count(self) -> int:
         """How many activations D gives."""
         return self.activations or self.shapes
 
@@ -140,14 +140,14 @@ class TrainConfig:
             fail("training", f"closest_point '{self.closest_point}'", f"it is one of {', '.join(CLOSEST_POINTS)}")
         if not self.window >= 3:
             fail("training", f"a window of {self.window} poses", "inertia needs at least 3")
-        _need_between(self, 1, MOST, "iterations", "batch", "pretraining_batch", "static_batch", "validate_every")
-        _need_between(self, 3, MOST, "valid_frames")
+        _need_between(self, 1, NO_BOUND, "iterations", "batch", "pretraining_batch", "static_batch", "validate_every")
+        _need_between(self, 3, NO_BOUND, "valid_frames")
         _need_between(self, 0, 1, "state_reuse", "rotated_fraction", "noise_correlation", "noise_probability")
         _need_between(self, 0, 0.99999, "static_fraction", "ema_decay")
         _need_between(
             self,
             0,
-            MOST,
+            NO_BOUND,
             "noise",
             "static_learning_rate",
             "learning_rate",
@@ -156,8 +156,8 @@ class TrainConfig:
             "skin_learning_rate_scale",
             "shape_learning_rate_scale",
         )
-        _need_between(self, 0, MOST, "latent_regularization")
-        _need_between(self, 1e-9, MOST, "latent_regularization_scale")
+        _need_between(self, 0, NO_BOUND, "latent_regularization")
+        _need_between(self, 1e-9, NO_BOUND, "latent_regularization_scale")
         _need_between(self, 0, 1000, "recombinations")
         _need_between(self, 0, 2**63 - 1, "seed")
 

@@ -39,7 +39,7 @@ class PoseFeatures:
     down: Floats
 
 
-def joints_in_view(skeleton: Skeleton, used: Floats) -> np.ndarray:
+def descriptor_joints(skeleton: Skeleton, used: Floats) -> np.ndarray:
     """Return the sorted joints that can matter: those flagged in `used` (J,) and all their ancestors."""
     keep = np.array(used, dtype=bool)
     for joint in range(skeleton.joint_count - 1, -1, -1):

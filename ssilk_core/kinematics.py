@@ -164,16 +164,16 @@ CUT_SPEED = 25.0  # [m/s]; a root that is so much faster than before and after h
 AROUND = 5  # frames to either side that say how fast a root moves anyway, be it in a car
 
 
-def split_at_cuts(motion: Motion, *, most_turn: float = np.inf) -> list[Motion]:
+def split_at_cuts(motion: Motion, *, max_joint_speed: float = np.inf) -> list[Motion]:
     """Return the spans of a motion between jumps of its root (a teleport, an edit), in order; mostly just one.
 
-    A jump is a step that the median of the steps around it does not explain. With `most_turn` [rad/s] it is also cut
-    where any joint turns faster than that, as captured joints do that flip.
+    A jump is a step that the median of the steps around it does not explain. With `max_joint_speed` [rad/s] it is
+    also cut where any joint turns faster than that, as captured joints do that flip.
     """
     step = _unexplained(np.diff(motion.translations[:, 0], axis=0)) * motion.fps
     cosine = np.abs((motion.rotations[1:] * motion.rotations[:-1]).sum(-1)).clip(max=1.0)
     turn = 2 * np.arccos(cosine).max(axis=1) * motion.fps
-    ends = [*(np.flatnonzero((step > CUT_SPEED) | (turn > most_turn)) + 1), motion.frame_count]
+    ends = [*(np.flatnonzero((step > CUT_SPEED) | (turn > max_joint_speed)) + 1), motion.frame_count]
     return [motion.clip(start, stop) for start, stop in zip([0, *ends[:-1]], ends)]
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much memory a training step needs, before it is asked for."""
+"""Prediction of the memory that a training step needs."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from .assets import Scene
 from .config import ModelConfig, TrainConfig
 from .errors import fail
 
-SHARE = 0.8  # of the free memory that a training may plan for
-UNKNOWN = 8 << 30  # bytes that are planned for where the system cannot be asked portably
+PLANNED_SHARE = 0.8  # of the free memory that a training may plan for
+DEFAULT_FREE_MEMORY = 8 << 30  # bytes that are planned for where the system cannot be asked portably
 MEMINFO = Path("/proc/meminfo")
 CONTAINER = Path("/sys/fs/cgroup")
 # Limit, usage, statistics and the name of reclaimable cache in them, for versions 2 and 1 of control groups.
@@ -29,7 +29,7 @@ def free_memory(device: torch.device) -> int:
     if device.type == "cuda":
         return int(torch.cuda.mem_get_info(device)[0])
     if device.type != "cpu" or not MEMINFO.is_file():
-        return UNKNOWN
+        return DEFAULT_FREE_MEMORY
     machine = int(_numbers(MEMINFO)["MemAvailable:"]) * 1024
     left = (_left_in_container(*names) for names in CONTROL_GROUPS if (CONTAINER / names[0]).is_file())
     return int(min([machine, *left]))
@@ -77,13 +77,13 @@ def fitting_batch(
 ) -> tuple[int, int]:
     """Return the largest batch and warm batch, up to the configured ones, whose steps fit into `available` bytes."""
     per_frame = step_memory(scene, model, 1, body_vertices) - step_memory(scene, model, 0, body_vertices)
-    frames = int(max(1, (SHARE * available - step_memory(scene, model, 0, body_vertices)) // per_frame))
+    frames = int(max(1, (PLANNED_SHARE * available - step_memory(scene, model, 0, body_vertices)) // per_frame))
     return max(1, min(config.batch, int(frames / _frames_of_a_window(config)))), max(
         1, min(config.pretraining_batch, frames)
     )
 
 
-def need_one_window(
+def check_one_window_fits(
     scene: Scene, model: ModelConfig, config: TrainConfig, body_vertices: int, available: int
 ) -> None:
     """Raise `SsilkError` unless a step on a single window fits into `available` bytes."""
@@ -97,7 +97,7 @@ def need_one_window(
         )
 
 
-def suffices(work: Callable[[], None]) -> bool:
+def fits_in_memory(work: Callable[[], None]) -> bool:
     """Do `work`; return whether the device had the memory for it. Nothing that `work` made is held on failure."""
     try:
         work()

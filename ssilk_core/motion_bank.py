@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All motions of a training run as tensors on one device, and windows drawn from them."""
+"""The motions of a training run or evaluation as tensors on one device."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .kinematics import motion_transforms, resample, skinning_matrices, split_at
 from .model.descriptors import gravity_features
 
 # Captured joints that flip turn faster than this [rad/s], people do not; the garment would learn from the blow.
-MOST_TURN = 40.0
+MAX_JOINT_SPEED = 40.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +69,7 @@ def build_bank(
     fps: float,
     device: torch.device,
     *,
-    most_turn: float = np.inf,
+    max_joint_speed: float = np.inf,
 ) -> MotionBank:
     """Resample motions to `fps` and place them on a device, cut where `usable_spans` says.
 
@@ -78,7 +78,7 @@ def build_bank(
     """
     if not motions:
         fail("motions", "none given", "at least one is needed", "name motion files with --motions")
-    clips = [resample(span, fps) for span in usable_spans(motions, fps, most_turn)]
+    clips = [resample(span, fps) for span in usable_spans(motions, fps, max_joint_speed)]
     if not clips:
         fail(motions[0].path, "every motion is shorter than four frames", "longer ones are needed")
     features = [pose_features(clip, skeleton, joints) for clip in clips]
@@ -100,12 +100,12 @@ def build_bank(
     )
 
 
-def usable_spans(motions: Sequence[Motion], fps: float, most_turn: float = np.inf) -> list[Motion]:
+def usable_spans(motions: Sequence[Motion], fps: float, max_joint_speed: float = np.inf) -> list[Motion]:
     """Return what becomes the clips of a bank, in order: spans between cuts that hold four frames at `fps`.
 
-    Motions are cut where the root jumps, and where a joint turns faster than `most_turn` [rad/s].
+    Motions are cut where the root jumps, and where a joint turns faster than `max_joint_speed` [rad/s].
     """
-    spans = [span for motion in motions for span in split_at_cuts(motion, most_turn=most_turn)]
+    spans = [span for motion in motions for span in split_at_cuts(motion, max_joint_speed=max_joint_speed)]
     return [span for span in spans if span.frame_count > span.fps / fps * 3]
 
 

@@ -17,7 +17,7 @@ def parameter_shapes(scene: Scene, config: ModelConfig, joints: Ints) -> Shapes:
     free, proxies = int((scene.classes != PINNED).sum()), scene.rig.proxy_count
     static, dynamic = descriptor_sizes(scene, joints)
     scheme, z, widths = SCHEMES[config.scheme], config.latent, config.widths
-    reduced: Shapes = {"decoder.readout": (config.shapes, config.given), "decoder.offset": (free, 3)}
+    reduced: Shapes = {"decoder.readout": (config.shapes, config.activation_count), "decoder.offset": (free, 3)}
     return {
         "decoder.skin_offset": (free, scene.rig.skin.indices.shape[1]),
         "decoder.shapes": (free, 3, config.shapes),
@@ -29,7 +29,7 @@ def parameter_shapes(scene: Scene, config: ModelConfig, joints: Ints) -> Shapes:
             if scheme.states
             else {}
         ),
-        **_layers("output", (z, *widths, config.given + 6 * proxies)),
+        **_layers("output", (z, *widths, config.activation_count + 6 * proxies)),
     }
 
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from .assets import Floats, GarmentPose, Motion
-from .config import LOST, RECOVERY
+from .config import DIVERGENCE_BOUND, RECOVERY_FRAMES
 from .descriptors import pose_features
 from .errors import fail
 from .kinematics import frames_at, motion_transforms, resample, run_up, skinning_matrices, split_at_cuts
@@ -65,7 +65,7 @@ def roll_blocks(model: GarmentModel, blocks: Iterable[Motion]) -> Iterator[Step]
 
     A motion of any length takes the memory of one block, and one in which a calm garment's character holds still
     the work of one frame. A state that is not finite, or that leaves all bounds, is
-    replaced by the quasi-static one for `RECOVERY` frames, from which the rollout goes on.
+    replaced by the quasi-static one for `RECOVERY_FRAMES` frames, from which the rollout goes on.
 
     Raises:
         SsilkError: a block is not at the model's rate.
@@ -125,7 +125,7 @@ def _advance(
 
 def _kept(states: Tensor) -> tuple[Tensor, Tensor]:
     """Return states (N, latent) with zeros for those that are lost, and which ones are."""
-    lost = ~(states.abs().amax(dim=1) < LOST)  # NaN is not less than anything
+    lost = ~(states.abs().amax(dim=1) < DIVERGENCE_BOUND)  # NaN is not less than anything
     return torch.where(lost[:, None], torch.zeros_like(states), states), lost
 
 
@@ -138,7 +138,7 @@ def _rolled(
         rolled = model.roll(states, rest[done:], pose[done:])[len(states) :]
         bad = _kept(torch.cat(rolled))[1].nonzero()
         good = int(bad[0]) if len(bad) else len(rolled)
-        first, done = done + good, min(done + good + RECOVERY, len(rest))
+        first, done = done + good, min(done + good + RECOVERY_FRAMES, len(rest))
         states = [*states, *rolled[:good], *rest[first:done]]
         lost[len(lost) - len(rest) + first : len(lost) - len(rest) + done] = True
     return states, lost

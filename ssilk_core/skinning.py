@@ -13,30 +13,30 @@ from torch import Tensor, nn
 from . import kernels
 from .assets import Ints, SkinWeights
 
-PARTS = 16  # programs that share the gradient of a joint's matrix, so that few joints fill a GPU too
+PARTS = 16  # programs that share the gradient of a joint's matrix, so that few joints use a whole GPU
 
 
-def blended(weights: Tensor, matrices: Tensor) -> Tensor:
+def blend_matrices(weights: Tensor, matrices: Tensor) -> Tensor:
     """Blend skinning matrices (J, 3, 4, N) by dense weights (V, J) to one for each vertex, (V, 3, 4, N)."""
     return (weights @ matrices.flatten(1)).reshape(-1, *matrices.shape[1:])
 
 
-def transformed(affine: Tensor, points: Tensor) -> Tensor:
+def transform_points(affine: Tensor, points: Tensor) -> Tensor:
     """Apply an affine transform (V, 3, 4, N) to each point (V, 3, N or 1); returns (V, 3, N)."""
-    return turned(affine, points) + affine[:, :, 3]
+    return transform_directions(affine, points) + affine[:, :, 3]
 
 
-def turned(affine: Tensor, directions: Tensor) -> Tensor:
+def transform_directions(affine: Tensor, directions: Tensor) -> Tensor:
     """Apply the linear part of an affine transform (V, 3, 4, N) to each direction (V, 3, N or 1)."""
     return (affine[:, :, :3] * directions[:, None]).sum(2)
 
 
 class Skinning(nn.Module):
-    """The influences of a mesh, in the orders in which skinning and its gradients go through them.
+    """Linear blend skinning of one mesh.
 
     Args:
-        skin: joints of each vertex; weights of zero stand for no influence.
-        trainable: consecutive joints whose matrices may carry a gradient. Others count as constant.
+        skin: joints and weights of each vertex; zero weights mean no influence.
+        trainable: consecutive joints whose matrices may have a gradient; all others are constant.
 
     Attributes:
         weights: those of `skin`, shape (V, I).
@@ -62,7 +62,7 @@ class Skinning(nn.Module):
             "used": used.astype(np.int64),
             "columns": np.searchsorted(used, skin.indices).clip(max=len(used) - 1),
             "joints": skin.indices.copy(),
-            # Influences after a vertex's last one are skipped; others of zero weight add nothing.
+            # Influences after a vertex's last one are skipped; other zero weights add nothing.
             "counts": (support.shape[1] - support[:, ::-1].argmax(axis=1)).astype(np.int32),
             "entries": entries,
             "starts": starts,
@@ -87,7 +87,7 @@ class Skinning(nn.Module):
             movers = (self.first_trainable, self.entries, self.starts)
             return skin_kernel(rest, offsets, weights, matrices, (self.joints, self.counts), movers)
         points = rest[:, :, None] if offsets is None else rest[:, :, None] + offsets
-        return transformed(blended(self.dense(weights), matrices[self.used]), points)
+        return transform_points(blend_matrices(self.dense(weights), matrices[self.used]), points)
 
     def surface(self, points: Tensor, normals: Tensor, matrices: Tensor) -> tuple[Tensor, Tensor]:
         """Return skinned points and unit normals (V, 3, N) of points and normals (V, 3); without gradients."""
@@ -95,21 +95,21 @@ class Skinning(nn.Module):
             from .kernels.skinning import skin_surface_kernel
 
             return skin_surface_kernel(points, normals, self.weights, matrices, (self.joints, self.counts))
-        affine = blended(self.dense(self.weights), matrices[self.used])
-        direction = turned(affine, normals[:, :, None])
-        return transformed(affine, points[:, :, None]), direction / direction.norm(dim=1, keepdim=True).clamp_min(
-            1e-8
-        )
+        affine = blend_matrices(self.dense(self.weights), matrices[self.used])
+        direction = transform_directions(affine, normals[:, :, None])
+        return transform_points(affine, points[:, :, None]), direction / direction.norm(
+            dim=1, keepdim=True
+        ).clamp_min(1e-8)
 
 
 def by_joint(indices: Ints, support: np.ndarray, trainable: range) -> tuple[Ints, Ints]:
-    """Sort influences by joint and split each joint's evenly.
+    """Sort influences by joint and split those of each joint evenly.
 
     Args:
-        indices: joints (V, I); support: which of them count (V, I); trainable: consecutive joints, T of them.
+        indices: joints (V, I); support: which of them count (V, I); trainable: T consecutive joints.
 
     Returns:
-        Flat influences of these joints (E,), and where their parts begin and the last one ends (T, PARTS + 1); int32.
+        Flat indices of these joints' influences (E,), and the boundaries of their parts (T, PARTS + 1); int32.
     """
     chosen = np.flatnonzero(support & np.isin(indices, trainable))
     joint = indices.reshape(-1)[chosen]

@@ -14,13 +14,13 @@ import torch
 from ssilk_core.devices import chosen_device
 from ssilk_core.errors import fail
 from ssilk_core.events import Checkpoint, Message, Progress, Reporter, Started
-from ssilk_core.training.curve import CurvePoint, with_point
+from ssilk_core.training.curve import CurvePoint, append_point
 from ssilk_core.training.job import TrainJob
 from ssilk_core.training.parts import build_parts
 from ssilk_core.training.run_files import RunFiles
 from ssilk_core.training.state import Best, RunState, load_state, restore
 from ssilk_core.training.validation import Score
-from ssilk_core.training.verdict import not_finite, verdict
+from ssilk_core.training.verdict import non_finite_terms, validation_message
 
 from .descriptors import joint_bank
 from .files import save_baseline
@@ -66,7 +66,7 @@ class BaselineRun:
         self.job, self.report, base = job, report, job.base
         device = chosen_device(base.device)
         self.files = RunFiles(base, device)
-        self.files.tidy()
+        self.files.remove_unfinished()
         parts = build_parts(base, device)
         joints = parts.model.joints
         inner = torch.as_tensor(base.scene.character.skeleton.parents[joints] >= 0, device=device)
@@ -94,7 +94,7 @@ class BaselineRun:
     def _resume(self) -> None:
         self.state, tensors = load_state(self.files.state, self.state.asked)
         restore(self.files.state, self.stepper, tensors)
-        self.stepper.faults.count.fill_(self.state.undone)
+        self.stepper.skipped.count.fill_(self.state.skipped)
         self._plan(self.state.seconds / self.state.iteration)
 
     def _plan(self, each: float) -> None:
@@ -126,8 +126,8 @@ class BaselineRun:
             SsilkError: the score is not finite.
         """
         state, base = self.state, self.job.base
-        score = self.validator.score(self.stepper.averaged)
-        broken = " and ".join(not_finite(score))
+        score = self.validator.score(self.stepper.ema_model)
+        broken = " and ".join(non_finite_terms(score))
         if broken:
             fail(
                 str(base.output),
@@ -135,13 +135,13 @@ class BaselineRun:
                 "the best model before it is kept",
                 "train again with smaller steps (--set learning_rate=...)",
             )
-        self.report(verdict(state.iteration, score, self.lbs, base.scene.rig.proxy_count > 0))
+        self.report(validation_message(state.iteration, score, self.lbs, base.scene.rig.proxy_count > 0))
         finite = {name: value for name, value in self.batch.items() if math.isfinite(value)}
-        state.curve = with_point(state.curve, CurvePoint(state.iteration, state.seconds, finite, score))
-        state.undone = int(self.stepper.faults.count)
+        state.curve = append_point(state.curve, CurvePoint(state.iteration, state.seconds, finite, score))
+        state.skipped = int(self.stepper.skipped.count)
         if state.best is None or score.total < state.best.score.total:
             state.best = Best(state.iteration, score)
-            save_baseline(base.output, self.stepper.averaged, base.fabric, self.files.provenance(state, score))
+            save_baseline(base.output, self.stepper.ema_model, base.fabric, self.files.provenance(state, score))
             self.report(Checkpoint(str(base.output), state.iteration, True))
         self.files.save_state(self.stepper, state)
         self.files.save_curve(state, self.lbs)
@@ -157,6 +157,6 @@ def train_baseline(job: BaselineJob, report: Reporter) -> RunState:
     while run.state.iteration < run.iterations:
         run.advance()
         run.validate()
-    if run.state.undone:
-        report(Message(f"{run.state.undone} steps in all were undone.", "warning"))
+    if run.state.skipped:
+        report(Message(f"{run.state.skipped} steps in total were skipped.", "warning"))
     return run.state

@@ -74,10 +74,10 @@ class BaselineObjective(Objective):
             past = self.model.vertices(states[before], self.bank.character(times[before]))
         character = self.bank.character(times[now])
         x = self.model.vertices(states[now], character)
-        terms = self.potential(x, down[now], character)
+        terms = self.quasi_static_terms(x, down[now], character)
         path = torch.cat([past, x[..., : len(times[now]) - batch].detach()], dim=-1)
         root = self.bank.root[times].T[:, -(self.judged + 1) * batch :]
-        terms["inertia"], terms["drag"] = self.energy.kinetic(
+        terms["inertia"], terms["drag"] = self.energy.inertia_and_drag(
             x, path[..., batch:], path[..., :-batch], root[:, batch:] - root[:, :-batch], self.dt
         )
         return terms
@@ -87,7 +87,7 @@ class BaselineStepper(Stepper):
     """Trains a baseline as `Stepper` trains a model."""
 
     objective: BaselineObjective
-    averaged: Baseline  # type: ignore[assignment]
+    ema_model: Baseline  # type: ignore[assignment]
 
     def __init__(self, objective: BaselineObjective, config: TrainConfig, generator: torch.Generator) -> None:
         if not config.window >= objective.judged + 2:
@@ -98,11 +98,11 @@ class BaselineStepper(Stepper):
             )
         sampler = WindowSampler(objective.bank, config, 0, generator)  # no state goes from window to window
         super().__init__(objective.model, objective, sampler, config)  # type: ignore[arg-type]
-        for module in self.averaged.modules():
+        for module in self.ema_model.modules():
             if isinstance(module, nn.GRU):
                 module.flatten_parameters()  # a copy's are scattered
 
-    def windows(self) -> None:
+    def dynamic_step(self) -> None:
         """Train everything on one window of every slot."""
         terms = self.objective.rolled(self.sampler)
         means = {name: value.mean() for name, value in terms.items()}

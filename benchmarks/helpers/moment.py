@@ -98,7 +98,7 @@ class Moment:
 
     def posed(self) -> PosedBody:
         assert self.objective.body is not None
-        return self.objective.body.posed(self.character)
+        return self.objective.body.pose(self.character)
 
     def surface(self) -> Tensors:
         body = self.posed()

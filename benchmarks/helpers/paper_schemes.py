@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ssilk_core.config import ModelConfig
-from ssilk_core.model.integrators import Integrator, limited
+from ssilk_core.model.integrators import Integrator, soft_clamp
 from ssilk_core.schemes import SCHEMES, Scheme
 
 
@@ -29,7 +29,7 @@ class Verlet(Integrator):
     def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *precomputed: Tensor) -> Tensor:
         _, pose = precomputed
         forward = self.alpha * now + self.beta * (now - before)
-        return forward + limited(stepper(torch.cat([forward, now, pose], dim=1)), self.config.max_latent_step)
+        return forward + soft_clamp(stepper(torch.cat([forward, now, pose], dim=1)), self.config.max_latent_step)
 
 
 class Direct(Integrator):

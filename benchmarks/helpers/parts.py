@@ -125,10 +125,12 @@ def energy_parts(at: Moment) -> list[Part]:
     return [
         Part(name="stretch and bending", run=lambda: energy.elastic(x), reads=(x,), leaves=(x,), energy=True,
              operations=elastic),
-        Part(name="gravity and collision", run=lambda: energy.potential(x, root, gravity, at.normal, at.offset),
+        Part(name="gravity and collision",
+             run=lambda: energy.gravity_and_collision(x, root, gravity, at.normal, at.offset),
              reads=(x, at.normal, at.offset), leaves=(x,), energy=True, operations=2 * POINTWISE * moved),
         Part(name="positions before", run=at.path, reads=(at.first, at.last), phases=(WINDOWS,)),
-        Part(name="inertia and drag", run=lambda: energy.kinetic(x, at.last, at.before, shift, at.objective.dt),
+        Part(name="inertia and drag",
+             run=lambda: energy.inertia_and_drag(x, at.last, at.before, shift, at.objective.dt),
              reads=(at.x[..., :moving], at.last, at.before), leaves=(x,), energy=True,
              operations=2 * POINTWISE * x.shape[0] * moving, phases=(WINDOWS,)),
     ]  # fmt: skip
@@ -146,7 +148,7 @@ def single_energy_parts(at: Moment) -> list[Part]:
         term("stretch", lambda: energy.stretch(x), STRETCH * len(energy.area), x),
         term("bending", lambda: energy.bending(x), BENDING * len(energy.rest_angle), x),
         term("gravity", lambda: energy.gravity(x, gravity), cloth, x),
-        term("collision", lambda: energy.collision_of((at.normal * x).sum(1) - at.offset), cloth, x, at.normal,
+        term("collision", lambda: energy.collision_at((at.normal * x).sum(1) - at.offset), cloth, x, at.normal,
              at.offset),
         term("inertia", lambda: energy.inertia(moving, predicted, dt), cloth, moving, predicted),
         term("drag", lambda: energy.drag(moving, at.last, dt), cloth, moving, at.last),

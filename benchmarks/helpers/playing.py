@@ -15,14 +15,14 @@ from torch import Tensor
 
 from ssilk_core.assets import Motion
 from ssilk_core.checkpoint import ModelFile, network
-from ssilk_core.model.batch import DOWN, driven
+from ssilk_core.model.batch import DOWN, motion_inputs
 from ssilk_core.model.network import GarmentModel
 from ssilk_core.motion_bank import build_bank
-from ssilk_core.runtime.drive import drive
-from ssilk_core.runtime.playback import BLOCK, POSED
+from ssilk_core.runtime.character import character_frames
+from ssilk_core.runtime.playback import BLOCK, VERTEX_BLOCK
 from ssilk_core.runtime.player import Player
-from ssilk_core.runtime.skinning import posed
-from ssilk_core.skinning import Skinning, blended, transformed
+from ssilk_core.runtime.skinning import skin_garment
+from ssilk_core.skinning import Skinning, blend_matrices, transform_points
 
 DESCRIPTORS, REST, LATENTS, DECODER, KINEMATICS, SKINNING = PARTS = (
     "descriptors and character", "networks of the poses alone", "latents", "decoder", "proxy kinematics",
@@ -61,20 +61,22 @@ def with_numpy(player: Player, motion: Motion) -> Laps:
     monitor, before = Stopwatch(), None
     assert player.stepper is not None
     for frames in spans(motion.frame_count, BLOCK):
-        seen = min(frames.start, 2)
-        given = drive(motion.clip(frames.start - seen, frames.stop), player.skeleton, player.file.joints, seen)
+        lookback = min(frames.start, 2)
+        given = character_frames(
+            motion.clip(frames.start - lookback, frames.stop), player.skeleton, player.file.joints, lookback
+        )
         monitor.lap(DESCRIPTORS)
-        course = player.stepper.prepared(player.at_rest(given.static), given.static, given.rates, before)
+        course = player.stepper.prepare(player.quasi_static(given.static), given.static, given.rates, before)
         monitor.lap(REST)
-        states = player.stepper.rolled(course)
+        states = player.stepper.roll(course)
         before = states[-2:]
         monitor.lap(LATENTS)
-        activations, rotations = player.decoder.decoded(states)
+        activations, rotations = player.decoder.decode(states)
         monitor.lap(DECODER)
         matrices = player.kinematics.matrices(rotations, given.matrices)
         monitor.lap(KINEMATICS)
-        for part in spans(len(states), POSED):
-            posed(player.tiles, activations[:, part], matrices[..., part], given.origins[part])
+        for part in spans(len(states), VERTEX_BLOCK):
+            skin_garment(player.tiles, activations[:, part], matrices[..., part], given.origins[part])
         monitor.lap(SKINNING)
     return monitor.laps
 
@@ -94,7 +96,7 @@ class Skinner:
     def __call__(self, activations: Tensor, matrices: Tensor) -> Tensor:
         """Return points (V, 3, N) of activations (K, N) and matrices of all joints (J, 3, 4, N)."""
         offsets = (self.shapes @ activations).unflatten(0, self.rest.shape)
-        return transformed(blended(self.weights, matrices[self.used]), self.rest[:, :, None] + offsets)
+        return transform_points(blend_matrices(self.weights, matrices[self.used]), self.rest[:, :, None] + offsets)
 
 
 @torch.no_grad()
@@ -104,7 +106,7 @@ def with_torch(model: GarmentModel, skinner: Skinner, motion: Motion, chunk: int
     Latents advance frame by frame in any case. The stepper sees each pose moved and held still in one call.
     """
     monitor = Stopwatch()
-    given = driven(model, [motion])
+    given = motion_inputs(model, [motion])
     monitor.lap(DESCRIPTORS)  # with the quasi-static latents, which PyTorch computes at once
     states: list[Tensor] = []
     for frames in spans(motion.frame_count, chunk):
@@ -117,7 +119,7 @@ def with_torch(model: GarmentModel, skinner: Skinner, motion: Motion, chunk: int
         character = given.character[frames, ..., 0].permute(1, 2, 3, 0)
         matrices = model.decoder.proxy_matrices(rotations, character)
         monitor.lap(KINEMATICS)
-        for part in spans(len(rest), POSED):
+        for part in spans(len(rest), VERTEX_BLOCK):
             skinner(activations[:, part], matrices[..., part])
         monitor.lap(SKINNING)
     return monitor.laps
@@ -129,10 +131,10 @@ def with_baseline(model: Baseline, skinner: Skinner, motion: Motion, chunk: int)
     monitor, skeleton = Stopwatch(), model.scene.character.skeleton
     bank = build_bank([motion], skeleton, model.joints, model.config.fps, torch.device("cpu"))
     inner = torch.as_tensor(skeleton.parents[model.joints] >= 0)
-    seen = joint_bank(bank, inner, model.config.fps)
+    lookback = joint_bank(bank, inner, model.config.fps)
     down = torch.tensor(DOWN).expand(bank.frame_count, 3)
     every = torch.arange(bank.frame_count)
-    static, pose = seen.static_descriptor(every, down), seen.dynamic_descriptor(every, down)[:, None]
+    static, pose = lookback.static_descriptor(every, down), lookback.dynamic_descriptor(every, down)[:, None]
     monitor.lap(DESCRIPTORS)
     states = [model.initial(static[:1])]
     monitor.lap(REST)

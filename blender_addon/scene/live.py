@@ -150,7 +150,7 @@ class Live:
         if np.allclose(placed, self.placed[index], rtol=MOVED, atol=MOVED):
             return
         self.placed[index] = placed
-        self.playback, self.stale = self.playback.changed(self._motion(self.placed), index), True
+        self.playback, self.stale = self.playback.with_motion(self._motion(self.placed), index), True
 
     def _motion(self, placed: np.ndarray) -> Motion:
         """Return joints of the armature to the world, shape (F, J, 4, 4), as a motion of the model's skeleton."""

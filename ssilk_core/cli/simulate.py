@@ -74,7 +74,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         batch=options.batch,
         sequence=options.sequence,
         solver=SolverOptions(tolerance=options.tolerance, iterations=options.iterations),
-        rest=SolverOptions(tolerance=options.tolerance, iterations=150),
+        quasi_static_solver=SolverOptions(tolerance=options.tolerance, iterations=150),
     )
     motions = [read_motion(str(path), scene.character.skeleton) for path in options.motion]
     shots = [

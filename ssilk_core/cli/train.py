@@ -60,17 +60,17 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Train; return 0 when finished, 130 when interrupted."""
-    from ..training.parallel import joined
+    from ..training.parallel import join_process_group
     from ..training.run import train
-    from ..training.signals import interruptible
+    from ..training.signals import stop_on_signals
 
     if options.output.suffix != ".safetensors":
         fail(str(options.output), "not a name for a model", "it ends in .safetensors")
     shared.check_output(options.output)
     if not (options.minutes is None or 0 < options.minutes < inf):
         fail("--minutes", f"{options.minutes}", "a positive number is needed")
-    with joined(options.device) as (group, device), interruptible() as stop:
-        report = report if group.first else silent
+    with join_process_group(options.device) as (group, device), stop_on_signals() as stop:
+        report = report if group.is_first else silent
         trained = train(training_job(options, device, report), report, stop, group)
     share = 1 - trained.score.total / trained.lbs.total
     report(

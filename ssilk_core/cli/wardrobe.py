@@ -73,7 +73,7 @@ def _train(
     trainings: Sequence[GarmentTraining], source: Path, device: str, slots: Sequence[Slot], show: Reporter
 ) -> None:
     """Train all garments that wait; paths of the list are relative to `source`."""
-    from ..training.signals import interruptible
+    from ..training.signals import stop_on_signals
 
     named = {training.entry.name: training for training in trainings}
 
@@ -90,7 +90,7 @@ def _train(
     for name, training in named.items():
         if training.plan:
             tell(name, Message(training.plan))
-    with interruptible() as stop:
+    with stop_on_signals() as stop:
         tasks = (training.begin(source, device) for training in trainings if training.state == "waiting")
         Queue(slots, tell, ended).run(lambda: next(tasks, None), stop)
 

@@ -10,14 +10,14 @@ from torch import Tensor
 from ..assets import Body, Ints, Mesh, SkinWeights
 from ..mesh import topology
 from ..skinning import Skinning
-from .closest_point import patches_of
+from .closest_point import triangle_patches
 from .distance import PosedBody
-from .nearest_vertex import GROUP, compact_blocks
+from .nearest_vertex import BODY_GROUP, compact_blocks
 from .one_ring import triangle_rings
 
 
 def faces_among(mesh: Mesh, chosen: Ints) -> Ints:
-    """Return the faces that have all corners among `chosen` vertices, in their numbering, shape (F, 3)."""
+    """Return the faces whose corners are all among `chosen` vertices, indexed within these, shape (F, 3)."""
     place = np.full(mesh.vertex_count, -1)
     place[chosen] = np.arange(len(chosen))
     faces = place[mesh.faces]
@@ -25,10 +25,10 @@ def faces_among(mesh: Mesh, chosen: Ints) -> Ints:
 
 
 class CollisionBody:
-    """Body vertices and normals under skinning matrices, for the vertices listed (all by default).
+    """Body vertices and normals under skinning matrices, for the vertices candidates (all by default).
 
     Attributes:
-        vertices: indices of those vertices in the body.
+        vertices: indices of its vertices in the whole body.
     """
 
     def __init__(self, body: Body, joint_count: int, *, vertices: Ints | None = None, device: torch.device) -> None:
@@ -43,19 +43,22 @@ class CollisionBody:
         faces = faces_among(body.mesh, chosen)
         rings = triangle_rings(faces, len(chosen))
         self.faces = torch.as_tensor(faces, device=device)
-        self.patches = torch.as_tensor(patches_of(body.mesh.points[chosen], faces), device=device)
+        self.patches = torch.as_tensor(triangle_patches(body.mesh.points[chosen], faces), device=device)
         self.rings = torch.as_tensor(rings, device=device)
-        self.groups = torch.as_tensor(compact_blocks(body.mesh.points[chosen], GROUP), device=device)
+        self.groups = torch.as_tensor(compact_blocks(body.mesh.points[chosen], BODY_GROUP), device=device)
         skin = SkinWeights(body.skin.path, body.skin.indices[chosen], body.skin.weights[chosen])
         self.skin = Skinning(skin).to(device)
         self.points = tensor(body.mesh.points[chosen])[:, :, None]
         self.normals = tensor(normals)[:, :, None]
 
     @torch.no_grad()
-    def posed(self, character: Tensor, *, surface: bool = True, exact: bool = False) -> PosedBody:
-        """Pose by skinning matrices (J, 3, 4, N); normals turn with the blended matrices.
+    def pose(self, character: Tensor, *, surface: bool = True, exact: bool = False) -> PosedBody:
+        """Pose the body with skinning matrices (J, 3, 4, N); normals rotate with the blended matrices.
 
-        Without `surface` only vertices are collided with; `exact` finds the nearest point of the whole surface.
+        Args:
+            surface: whether the nearest body point lies on the triangles around the nearest vertex, or is that
+                vertex.
+            exact: whether it is the exact nearest point of the whole surface.
         """
         points, normals = self.skin.surface(self.points[:, :, 0], self.normals[:, :, 0], character)
         rings, exactly = self.rings if surface else None, (self.faces, self.patches) if exact else (None, None)

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nearest point of a body's whole surface, exactly.
+"""The exact nearest point of a body's whole surface.
 
-The nearest point may lie on a triangle that does not touch the nearest vertex. Training overlooks that, as `nearest`
-and `surface_point` do: where it happens the distance they find is larger, by millimetres on a coarse body, and jumps.
-A solver that moves vertices over such seams does not settle; here every triangle counts that can hold the nearest
-point, and the Euclidean distance is continuous, and smooth wherever the nearest point is unique.
+The nearest point may lie on a triangle that does not touch the nearest vertex. Training ignores that
+(`nearest_vertex`, `one_ring`): there the distance is too large, by millimetres on a coarse body, and discontinuous.
+A solver does not converge across such discontinuities. This module therefore checks every triangle that can hold the
+nearest point. The result is the Euclidean distance, which is continuous, and smooth where the nearest point is
+unique.
 """
 
 from __future__ import annotations
@@ -17,58 +18,58 @@ from ..assets import Floats, Ints
 from .nearest_vertex import compact_blocks
 from .one_ring import closest_in_triangle
 
-SCORES = 1 << 25  # pairs of a vertex and a triangle looked at together, on a processor
-ON_GPU = 8  # times as many: 2 GB of scores, in few launches
-PATCH = 8  # triangles that the kernel takes together
+MAX_PAIRS = 1 << 25  # pairs of a vertex and a triangle in memory at once, on a CPU
+GPU_FACTOR = 8  # times as many pairs on a GPU: 2 GB, in few launches
+PATCH_SIZE = 8  # triangles that the kernel processes together
 
 
-def patches_of(points: Floats, faces: Ints) -> Ints:
-    """Return the corners of triangles in compact patches, int32 (ceil(F / PATCH), 4 PATCH).
+def triangle_patches(points: Floats, faces: Ints) -> Ints:
+    """Return the corners of triangles in compact patches, int32 (ceil(F / PATCH_SIZE), 4 PATCH_SIZE).
 
-    A patch has the first corners of its triangles, then the second, then the third; the last quarter fills it up.
+    A patch holds the first corners of its triangles, then the second, then the third; the last quarter is padding.
     """
-    triangles = faces[compact_blocks(points[faces].mean(axis=1), PATCH)]
+    triangles = faces[compact_blocks(points[faces].mean(axis=1), PATCH_SIZE)]
     corners = np.concatenate([triangles, triangles[..., :1]], axis=-1)
     return corners.transpose(0, 2, 1).reshape(len(triangles), -1).astype(np.int32)
 
 
 def closest_on_faces(
-    x: Tensor, reach: Tensor, points: Tensor, faces: Tensor, listed: Tensor | None = None
+    x: Tensor, search_radius: Tensor, points: Tensor, faces: Tensor, candidates: Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the nearest points of triangles to all queries that have one within reach, Q of them.
+    """Return the nearest points on triangles for the Q queries that have one within their search radius.
 
     Args:
         x: queries, shape (V, 3, N).
-        reach: distance that each nearest point is known to be within [m], shape (V, N); negative: not asked.
+        search_radius: upper bound of each distance [m], shape (V, N); negative values skip a query.
         points: corners of the triangles, shape (B, 3, N).
         faces: triangles, shape (F, 3).
-        listed: the triangles that each row of queries may find, filled up by -1, shape (V, L); any by default.
+        candidates: triangles that each row of queries may find, padded with -1, shape (V, L); all by default.
 
     Returns:
-        Row and frame of each query (Q,), body vertices at the corners of its triangle and barycentric coordinates,
-        both (3, Q).
+        Row and frame of each query (Q,); the body vertices at the corners of its triangle and barycentric
+        coordinates, both (3, Q).
     """
-    frames = frames_at_once(x, faces, listed)
+    frames = frames_at_once(x, faces, candidates)
     parts = [
-        _closest(x, reach, points, faces, listed, at, min(at + frames, x.shape[2]))
+        _closest(x, search_radius, points, faces, candidates, at, min(at + frames, x.shape[2]))
         for at in range(0, x.shape[2], frames)
     ]
     row, frame, corners, weights = (torch.cat(part, dim=-1) for part in zip(*parts))
     return row, frame, corners, weights
 
 
-def frames_at_once(x: Tensor, faces: Tensor, listed: Tensor | None) -> int:
-    """Return how many frames of such queries are looked at together."""
-    scores = SCORES * (ON_GPU if x.is_cuda else 1)
-    return max(1, scores // (len(x) * (len(faces) if listed is None else listed.shape[1])))
+def frames_at_once(x: Tensor, faces: Tensor, candidates: Tensor | None) -> int:
+    """Return how many frames of queries are processed at once."""
+    scores = MAX_PAIRS * (GPU_FACTOR if x.is_cuda else 1)
+    return max(1, scores // (len(x) * (len(faces) if candidates is None else candidates.shape[1])))
 
 
 def _closest(
-    x: Tensor, reach: Tensor, points: Tensor, faces: Tensor, listed: Tensor | None, start: int, stop: int
+    x: Tensor, search_radius: Tensor, points: Tensor, faces: Tensor, candidates: Tensor | None, start: int, stop: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return what `closest_on_faces` does, in frames `start` to `stop`."""
-    part = x[..., start:stop], reach[:, start:stop], points[..., start:stop]
-    row, frame, face = pairs_within_reach(*part, faces, listed)
+    """Return the result of `closest_on_faces` for frames `start` to `stop`."""
+    part = x[..., start:stop], search_radius[:, start:stop], points[..., start:stop]
+    row, frame, face = candidate_pairs(*part, faces, candidates)
     frame = frame + start
     corners = faces[face].T
     origin, second, third = (points[corner, :, frame].T for corner in corners)
@@ -76,18 +77,18 @@ def _closest(
     s, t, value = closest_in_triangle(p, second - origin, third - origin)
     squares = (p * p).sum(0) + value
     query = row * x.shape[2] + frame
-    _, first = least_of_each(query, squares, x[:, 0].numel())
+    _, first = segment_min(query, squares, x[:, 0].numel())
     winner = first[first < len(query)]
     return row[winner], frame[winner], corners[:, winner], torch.stack([1 - s - t, s, t])[:, winner]
 
 
-def least_of_each(query: Tensor, values: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Return the least value of each query and where it stands, both (count,); infinity and Q where there is none.
+def segment_min(query: Tensor, values: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Return the minimum of each query's values and its index, both (count,); infinity and Q where there is none.
 
-    Of several that are equal it is the first: results are the same in every run.
+    Of equal values the first counts, so that results are deterministic.
 
     Args:
-        query: which query each value is of, shape (Q,); values: shape (Q,).
+        query: the query that each value belongs to, shape (Q,); values: shape (Q,).
     """
     least = values.new_full((count,), torch.inf).scatter_reduce(0, query, values, "amin")
     place = torch.arange(len(query), device=query.device)
@@ -95,28 +96,29 @@ def least_of_each(query: Tensor, values: Tensor, count: int) -> tuple[Tensor, Te
     return least, place.new_full((count,), len(place)).scatter_reduce(0, query, chosen, "amin")
 
 
-def pairs_within_reach(
-    x: Tensor, reach: Tensor, points: Tensor, faces: Tensor, listed: Tensor | None
+def candidate_pairs(
+    x: Tensor, search_radius: Tensor, points: Tensor, faces: Tensor, candidates: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return row, frame and face of all pairs of a query and a triangle whose sphere is within reach, (M,) each.
+    """Return row, frame and face of all pairs of a query and a triangle whose bounding sphere is within reach, (M,)
+    each.
 
-    Arguments are those of `closest_on_faces`. All frames are looked at together.
+    Arguments are those of `closest_on_faces`. All frames are processed at once.
     """
-    if listed is None:
-        return _within_reach(x, reach, points, faces)
-    return _listed_within_reach(x, reach, points, faces, listed)
+    if candidates is None:
+        return _all_pairs(x, search_radius, points, faces)
+    return _listed_pairs(x, search_radius, points, faces, candidates)
 
 
-def _listed_within_reach(
-    x: Tensor, reach: Tensor, points: Tensor, faces: Tensor, listed: Tensor
+def _listed_pairs(
+    x: Tensor, search_radius: Tensor, points: Tensor, faces: Tensor, candidates: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return what `_within_reach` does, of the faces listed for each query, shape (V, L)."""
+    """Return the result of `_all_pairs` among the candidates of each query, shape (V, L)."""
     centre, radius = bounding_spheres(points, faces)
-    apart = sum((x[:, None, axis] - centre[:, axis][listed]).square() for axis in range(3))  # (V, L, N)
-    within = apart <= ((radius[:, 0][listed] + reach[:, None]) * (1 + 1e-6)).square()
-    asked = (reach >= 0)[:, None] & (listed >= 0)[..., None]
+    apart = sum((x[:, None, axis] - centre[:, axis][candidates]).square() for axis in range(3))  # (V, L, N)
+    within = apart <= ((radius[:, 0][candidates] + search_radius[:, None]) * (1 + 1e-6)).square()
+    asked = (search_radius >= 0)[:, None] & (candidates >= 0)[..., None]
     row, place, frame = (within & asked).nonzero(as_tuple=True)
-    return row, frame, listed[row, place]
+    return row, frame, candidates[row, place]
 
 
 def bounding_spheres(points: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
@@ -126,16 +128,21 @@ def bounding_spheres(points: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
     return centre, (corners - centre[:, None]).norm(dim=2).amax(1)[:, None]
 
 
-def _within_reach(x: Tensor, reach: Tensor, points: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return row, frame and face of all pairs whose triangle's bounding sphere comes within reach, (M,) each.
+def _all_pairs(x: Tensor, search_radius: Tensor, points: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return row, frame and face of all pairs whose triangle's bounding sphere is within reach, (M,) each.
 
-    |x - c| <= r + u, squared and spread out, is one product of matrices: [-2 x, -2 u, |x|^2 - u^2, 1] with
+    The condition |x - c| <= r + u, squared and expanded, is one matrix product: [-2 x, -2 u, |x|^2 - u^2, 1] times
     [c, r, 1, |c|^2 - r^2].
     """
     centre, radius = bounding_spheres(points, faces)
-    asked, reach = (reach >= 0)[:, None], reach[:, None]
+    asked, search_radius = (search_radius >= 0)[:, None], search_radius[:, None]
     squares, about = (x * x).sum(1, keepdim=True), (centre * centre).sum(1, keepdim=True)
-    left = [-2 * x, -2 * reach, (squares - reach**2).where(asked, torch.inf), torch.ones_like(reach)]
+    left = [
+        -2 * x,
+        -2 * search_radius,
+        (squares - search_radius**2).where(asked, torch.inf),
+        torch.ones_like(search_radius),
+    ]
     right = [centre, radius, torch.ones_like(radius), about - radius**2]
     scores = torch.cat(left, dim=1).permute(2, 0, 1) @ torch.cat(right, dim=1).permute(2, 1, 0)
     rounding = 16 * torch.finfo(x.dtype).eps * about.amax()

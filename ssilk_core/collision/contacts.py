@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which part of the body each garment vertex can meet.
+"""The part of the body that each garment vertex can touch.
 
-The nearest body point does not know which side cloth came from: a sleeve that one bad step takes through the arm is
-pushed out on the other side, and stays there. What is loose may meet any part of the body. What is tight lies over
-one patch of it, as in the bind pose, and meets no other, so that it is always pushed back to its own side; nor is it
-caught between two parts of a body that passes through itself, as in an armpit.
+The nearest body point does not tell which side the cloth came from. A sleeve that one bad step takes through the arm
+would be pushed out on the far side and stay there. Loose vertices can touch any part of the body. A tight vertex can
+touch only the patch of the body that lies beneath it in the bind pose: it is always pushed back to its own side, and
+is not caught where a body intersects itself, as in an armpit.
 """
 
 from __future__ import annotations
@@ -21,20 +21,27 @@ from ..assets import PINNED, TIGHT, Floats, Ints, Mesh, Scene
 from ..mesh import topology
 from ..mesh.geodesic import edge_graph
 from .body import faces_among
-from .distance import FAR, Patches, PosedBody, nearest_planes, signed, smoothed_planes
-from .nearest_vertex import BLOCK, compact_blocks
+from .distance import (
+    MAX_QUERY_DISTANCE,
+    Patches,
+    PosedBody,
+    nearest_planes,
+    signed_distance_to_planes,
+    smoothed_planes,
+)
+from .nearest_vertex import GARMENT_BLOCK, compact_blocks
 from .smoothed_distance import SmoothedDistance
 
-EXTENT = 1 / 12  # radius of a patch along the body, as a share of the body's diagonal: half the girth of an upper arm
-MOST = 256  # vertices of a patch; of a finer body the patch is smaller
-SOURCES = 512  # vertices that distances along the body are found from at once
-SAME_PLACE = 1e-6  # [m] that vertices at the same place are apart at most
-NOWHERE = 1e6  # [m] from a plane that is met by nothing
+PATCH_RADIUS = 1 / 12  # geodesic, relative to the diagonal of the body's bounding box: half the girth of an upper arm
+MAX_PATCH_VERTICES = 256  # on a finer body the patch is smaller than its radius
+SOURCES_PER_BATCH = 512  # of geodesic distances
+COINCIDENT_DISTANCE = 1e-6  # [m]
+NO_CONTACT_DISTANCE = 1e6  # [m]
 
 
 @dataclass(frozen=True, eq=False)
 class _Group:
-    """Garment vertices `rows` that find the body in one way, with their blocks and what they may find."""
+    """Garment vertices that query the body in the same way: their indices, compact blocks and body patches."""
 
     rows: Tensor
     blocks: Tensor
@@ -42,11 +49,11 @@ class _Group:
 
 
 class Contacts:
-    """Finds the plane of the body that each vertex of a garment meets.
+    """Finds the tangent plane of the body that each garment vertex can touch.
 
     Args:
         vertices: the body vertices that are posed, all by default.
-        pinned: whether pinned vertices meet the body too. Nothing that is learned moves them.
+        pinned: whether pinned vertices collide too. Training, which cannot move them, leaves them out.
     """
 
     def __init__(
@@ -64,7 +71,7 @@ class Contacts:
             return torch.as_tensor(values, device=device)
 
         def group(rows: Ints, found: Patches | None = None) -> _Group:
-            return _Group(tensor(rows), tensor(compact_blocks(garment.points[rows], BLOCK)), found)
+            return _Group(tensor(rows), tensor(compact_blocks(garment.points[rows], GARMENT_BLOCK)), found)
 
         self._groups = [group(np.flatnonzero(elsewhere))] if elsewhere.any() else []
         if covered.any():
@@ -73,35 +80,39 @@ class Contacts:
             self._groups.append(group(tight[covered], Patches(tensor(vertices.astype(np.int32)), tensor(faces))))
 
     def planes(self, x: Tensor, body: PosedBody) -> tuple[Tensor, Tensor]:
-        """Return unit normals (V, 3, N) and offsets (V, N) of the planes that x (V, 3, N) meets, without gradients.
+        """Return unit normals (V, 3, N) and offsets (V, N) of the planes that x (V, 3, N) can touch, without
+        gradients.
 
-        Planes of vertices that meet nothing are far below them.
+        Vertices that can touch nothing get planes far below them.
         """
-        normal, offset = self._of_groups(x, body, nearest_planes, no_planes)
+        normal, offset = self._query_groups(x, body, nearest_planes, no_planes)
         return normal, offset
 
     def smoothed(self, x: Tensor, body: PosedBody) -> SmoothedDistance:
-        """Return smoothed distances of x (V, 3, N) to what it meets, as `planes` does, in the precision of x."""
+        """Return smoothed distances of x (V, 3, N) to the body, in the precision of x."""
 
         def find(*asked: Any) -> Sequence[Tensor]:
             return smoothed_planes(*asked).tensors()
 
-        def nothing(x: Tensor) -> Sequence[Tensor]:
+        def no_contact(x: Tensor) -> Sequence[Tensor]:
             return *no_planes(x), x.new_zeros(len(x), 3, *x.shape[1:], dtype=torch.float32)
 
-        return SmoothedDistance(*self._of_groups(x, body, find, nothing))
+        return SmoothedDistance(*self._query_groups(x, body, find, no_contact))
 
-    def _of_groups(
+    def _query_groups(
         self,
         x: Tensor,
         body: PosedBody,
         find: Callable[..., Sequence[Tensor]],
-        nothing: Callable[[Tensor], Sequence[Tensor]],
+        no_contact: Callable[[Tensor], Sequence[Tensor]],
     ) -> Sequence[Tensor]:
-        """Return what each group finds, with `nothing` for vertices that are in none; vertices first in all of it."""
+        """Return the results of `find` for all groups, and of `no_contact` for other vertices.
+
+        Vertices come first.
+        """
         if len(self._groups) == 1 and len(self._groups[0].rows) == len(x):
             return find(x, body, self._groups[0].blocks, self._groups[0].patches)
-        gathered = nothing(x)
+        gathered = no_contact(x)
         for group in self._groups:
             found = find(x.index_select(0, group.rows), body, group.blocks, group.patches)
             for whole, part in zip(gathered, found, strict=True):
@@ -110,29 +121,32 @@ class Contacts:
 
     def distances(self, x: Tensor, body: PosedBody) -> tuple[Tensor, Tensor]:
         """Return signed distances of x (V, 3, N) [m] to these planes and to the whole body, both (V, N)."""
-        met = signed(x, *self.planes(x, body))
+        met = signed_distance_to_planes(x, *self.planes(x, body))
         nearest = met.clone()
         for group in self._groups:
             if group.patches is not None:
                 part = x.index_select(0, group.rows)
-                nearest.index_copy_(0, group.rows, signed(part, *nearest_planes(part, body, group.blocks)))
+                nearest.index_copy_(
+                    0, group.rows, signed_distance_to_planes(part, *nearest_planes(part, body, group.blocks))
+                )
         return met, nearest
 
 
 def no_planes(x: Tensor) -> tuple[Tensor, Tensor]:
-    """Return planes that no vertex of x (V, 3, N) meets."""
-    return x.new_zeros(x.shape), x.new_full((len(x), x.shape[2]), -NOWHERE)
+    """Return planes that no vertex of x (V, 3, N) touches."""
+    return x.new_zeros(x.shape), x.new_full((len(x), x.shape[2]), -NO_CONTACT_DISTANCE)
 
 
 def patches_beneath(points: Floats, body: Mesh, chosen: Ints) -> Ints:
-    """Return the patch of a body that each of some points (T, 3) lies over, in the bind pose.
+    """Return the patch of the body beneath each point (T, 3) in the bind pose.
 
-    A patch is what lies within `EXTENT` along the body's edges of the vertex nearest to the point, and faces the
-    same half of space. Vertices at the same place count as joined: bodies are split at seams, or come in parts.
+    A patch holds the vertices within `PATCH_RADIUS`, along the body's edges, of the vertex nearest to the point whose
+    normals point into the same half-space. Coincident vertices count as connected, because bodies are split at seams
+    or come in parts.
 
     Returns:
-        How many vertices follow, then these as indices into `chosen`, the nearest first, filled up with it,
-        shape (T, 1 + C); no vertices for a point that lies over nothing.
+        The number of vertices, then their indices into `chosen`, nearest first, padded with the nearest one, shape
+        (T, 1 + C); no vertices for a point far from the body.
     """
     from scipy.spatial import cKDTree
 
@@ -141,27 +155,27 @@ def patches_beneath(points: Floats, body: Mesh, chosen: Ints) -> Ints:
     distance, nearest = cKDTree(body.points[chosen]).query(points)
     anchors, which = np.unique(nearest, return_inverse=True)
     patches = _patches(body, chosen, anchors)[which]
-    patches[distance > FAR, 0] = 0
+    patches[distance > MAX_QUERY_DISTANCE, 0] = 0
     return patches
 
 
 def _patches(body: Mesh, chosen: Ints, anchors: Ints) -> Ints:
-    """Return the patch around each of the vertices `chosen[anchors]`, as `patches_beneath` does, (A, 1 + C)."""
+    """Return the patch around each vertex `chosen[anchors]`, (A, 1 + C), in the format of `patches_beneath`."""
     from scipy.sparse.csgraph import dijkstra
     from scipy.spatial import cKDTree
 
-    joined = cKDTree(body.points).query_pairs(SAME_PLACE, output_type="ndarray")
+    joined = cKDTree(body.points).query_pairs(COINCIDENT_DISTANCE, output_type="ndarray")
     pairs = np.unique(np.concatenate([topology.edges(body.faces), joined]), axis=0)
     graph = edge_graph(body.points, pairs)
     normals = topology.vertex_normals(body.points, body.faces)[chosen]
-    extent = EXTENT * float(np.linalg.norm(np.ptp(body.points, axis=0)))
+    extent = PATCH_RADIUS * float(np.linalg.norm(np.ptp(body.points, axis=0)))
     patches = []
-    for start in range(0, len(anchors), SOURCES):
-        part = anchors[start : start + SOURCES]
+    for start in range(0, len(anchors), SOURCES_PER_BATCH):
+        part = anchors[start : start + SOURCES_PER_BATCH]
         along = dijkstra(graph, directed=False, indices=chosen[part], limit=extent)[:, chosen]
         along[normals[part] @ normals.T <= 0] = np.inf
         along[np.arange(len(part)), part] = 0
-        order = np.argsort(along, axis=1, kind="stable")[:, :MOST]
+        order = np.argsort(along, axis=1, kind="stable")[:, :MAX_PATCH_VERTICES]
         within = np.isfinite(np.take_along_axis(along, order, axis=1))
         patches.append(np.column_stack([within.sum(axis=1), np.where(within, order, order[:, :1])]))
     found = np.concatenate(patches)
@@ -169,7 +183,7 @@ def _patches(body: Mesh, chosen: Ints, anchors: Ints) -> Ints:
 
 
 def faces_around(patches: Ints, faces: Ints, count: int) -> Ints:
-    """Return the faces with a corner in each patch (T, 1 + C) of `count` vertices, filled up by -1, shape (T, L)."""
+    """Return the faces with a corner in each patch (T, 1 + C) of `count` vertices, padded with -1, shape (T, L)."""
     owner = np.repeat(np.arange(len(faces)), 3)[np.argsort(faces.reshape(-1), kind="stable")]
     ends = np.cumsum(np.bincount(faces.reshape(-1), minlength=count))
     around = np.split(owner, ends[:-1])

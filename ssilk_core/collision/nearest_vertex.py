@@ -9,14 +9,14 @@ from torch import Tensor
 
 from ..assets import Floats, Ints
 
-SCORES = 1 << 27  # held at once where products serve
-BLOCK, GROUP = 32, 8  # vertices of the garment and of the body that the kernel takes together
+MAX_SCORES = 1 << 27  # in memory at once, in batched matrix products
+GARMENT_BLOCK, BODY_GROUP = 32, 8  # vertices of the garment and of the body that the kernel processes together
 
 
 def compact_blocks(points: Floats, size: int) -> Ints:
-    """Return indices of points (P, 3) in compact blocks, int32 (ceil(P / size), size), by halving their widest side.
+    """Return indices of points (P, 3) in compact blocks, int32 (ceil(P / size), size), by bisecting the widest side.
 
-    The last block is filled up with its last index.
+    The last block is padded with its last index.
     """
     blocks, parts = [], [np.arange(len(points))]
     while parts:
@@ -32,7 +32,7 @@ def compact_blocks(points: Floats, size: int) -> Ints:
 
 
 def consecutive_blocks(count: int, size: int, device: torch.device) -> Tensor:
-    """Return indices 0 to count - 1 in blocks as they come, int32; the last is filled up with its last index."""
+    """Return indices 0 to count - 1 in consecutive blocks, int32; the last block is padded with its last index."""
     return (
         torch.arange(-(-count // size) * size, dtype=torch.int32, device=device).clamp_max(count - 1).view(-1, size)
     )
@@ -41,13 +41,14 @@ def consecutive_blocks(count: int, size: int, device: torch.device) -> Tensor:
 def nearest_vertex(x: Tensor, body: Tensor, allowed: Tensor | None = None) -> Tensor:
     """Return the index of the nearest body vertex by brute force; equal distances go to the lower index.
 
-    All paths minimise |x - b|^2 / 2 - |x|^2 / 2 = [x, 1] . [-b, |b|^2 / 2], with coordinates centred on the body so
-    that the cancellation stays far under the length of a body edge.
+    All implementations minimise |x - b|^2 / 2 - |x|^2 / 2 = [x, 1] . [-b, |b|^2 / 2], with coordinates centred on the
+    body so that cancellation errors stay far below the length of a body edge.
 
     Args:
         x: garment positions, shape (V, 3, N).
         body: body positions, shape (B, 3, N).
-        allowed: how many body vertices each garment vertex may find, then these, shape (V, 1 + C); all by default.
+        allowed: the number of body vertices that each garment vertex can find, then their indices, shape (V, 1 + C);
+            all by default.
 
     Returns:
         int64, shape (V, N).
@@ -62,7 +63,7 @@ def nearest_vertex(x: Tensor, body: Tensor, allowed: Tensor | None = None) -> Te
 
 
 def _barred(allowed: Tensor | None, count: int, dtype: torch.dtype) -> Tensor | None:
-    """Return what is added to the scores of garment vertices (V, B): infinity for body vertices not allowed."""
+    """Return the term added to scores (V, B): infinity for body vertices that are not allowed, else zero."""
     if allowed is None:
         return None
     barred = torch.full((len(allowed), count), torch.inf, dtype=dtype, device=allowed.device)
@@ -70,7 +71,7 @@ def _barred(allowed: Tensor | None, count: int, dtype: torch.dtype) -> Tensor | 
 
 
 def _by_rows(left: Tensor, right: Tensor, barred: Tensor | None) -> Tensor:
-    # One buffer serves all frames, and numpy's argmin uses the processor's vector units.
+    # One buffer serves all frames; numpy's argmin is vectorised.
     score = left.new_empty(left.shape[2], right.shape[2])
     found = []
     for a, b in zip(left, right):
@@ -80,7 +81,7 @@ def _by_rows(left: Tensor, right: Tensor, barred: Tensor | None) -> Tensor:
 
 
 def _by_products(left: Tensor, right: Tensor, barred: Tensor | None) -> Tensor:
-    step = max(1, SCORES // (left.shape[2] * right.shape[2]))
+    step = max(1, MAX_SCORES // (left.shape[2] * right.shape[2]))
     found = []
     for i in range(0, len(left), step):
         factors = left[i : i + step].transpose(1, 2), right[i : i + step]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nearest point of a body's surface, from its nearest vertex and the triangles around that."""
+"""The nearest point of a body's surface on the triangles around its nearest vertex."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from ..assets import Ints
 
 
 def triangle_rings(faces: Ints, vertex_count: int) -> Ints:
-    """Return for each vertex how many numbers follow, then its neighbours in turn, shape (B, 1 + D).
+    """Return for each vertex the number of entries, then its neighbours in order around it, shape (B, 1 + D).
 
-    A neighbour and the next span a triangle with the vertex. Where a triangle does not join the one before, the
-    vertex itself stands between them, and it fills up shorter rows: what it spans is an edge or a point.
+    Each two consecutive neighbours form a triangle with the vertex. The vertex itself separates triangles that are
+    not adjacent, and pads shorter rows: the triangles that it forms degenerate to an edge or a point.
     """
     following: list[dict[int, list[int]]] = [{} for _ in range(vertex_count)]
     for a, b, c in faces.tolist():
@@ -28,7 +28,7 @@ def triangle_rings(faces: Ints, vertex_count: int) -> Ints:
 
 
 def _walk(vertex: int, after: dict[int, list[int]]) -> list[int]:
-    """Use up all steps from one neighbour of a vertex to the next, in as few walks as the triangles allow."""
+    """Consume all steps from one neighbour of a vertex to the next, in as few walks as possible."""
     entered = {neighbour for followers in after.values() for neighbour in followers}
     walk: list[int] = []
     for start in sorted(after, key=lambda neighbour: neighbour in entered):  # walks of an open fan begin at its edge
@@ -42,7 +42,7 @@ def _walk(vertex: int, after: dict[int, list[int]]) -> list[int]:
 def nearest_on_rings(
     x: Tensor, vertex: Tensor, frame: Tensor, points: Tensor, rings: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the nearest point on the triangles around each query's nearest vertex.
+    """Find the nearest point on the triangles around each query's nearest vertex.
 
     Args:
         x: queries, shape (3, M).
@@ -51,7 +51,7 @@ def nearest_on_rings(
         rings: neighbours around each body vertex (`triangle_rings`), shape (B, 1 + D).
 
     Returns:
-        Body vertices at the corners of the winning triangle, shape (3, M), and barycentric coordinates, (3, M).
+        Body vertices at the corners of the nearest triangle, shape (3, M), and barycentric coordinates, (3, M).
     """
     origin = points[:, vertex, frame]
     p = x - origin
@@ -71,9 +71,9 @@ def nearest_on_rings(
 
 
 def closest_in_triangle(p: Tensor, e1: Tensor, e2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Minimise |p - s e1 - t e2|^2 over s, t >= 0, s + t <= 1; return s, t and the minimum less |p|^2.
+    """Minimise |p - s e1 - t e2|^2 over s, t >= 0, s + t <= 1; return s, t and the minimum minus |p|^2.
 
-    The least of the inside, where the plane's foot lies there, and of the three edges.
+    The minimum is taken over the projection onto the plane, if it lies inside, and the three edges.
     """
     d1, d2 = (e1 * p).sum(0), (e2 * p).sum(0)
     a, b, c = (e1 * e1).sum(0), (e1 * e2).sum(0), (e2 * e2).sum(0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which part of the body a garment can ever touch, so that nothing else is posed or searched."""
+"""The part of the body that a garment can touch; nothing else is posed or searched."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from ..kinematics import motion_transforms, skin_points, skinning_matrices
 from ..mesh import topology
 from ..mesh.geodesic import edge_graph
 
-SLACK = 0.08  # [m] play that blendshapes and stretch add to the geometric reach
-POSES = 200  # poses that the reach is measured on
+REACH_MARGIN = 0.08  # [m]; allowance for blendshapes and stretch
+SAMPLED_POSES = 200
 
 
 @dataclass(frozen=True, eq=False)
-class Reach:
-    """The part of the body that can be touched: its vertices, and flags of the joints that move them."""
+class ReachableBody:
+    """The part of the body that a garment can touch: its vertices, and flags of the joints that move them."""
 
     vertices: Ints
     joints: Floats
 
 
-def reachable_body(scene: Scene, motions: Sequence[Motion]) -> Reach:
-    """Find the body vertices that come within reach of the garment in any of a spread of poses.
+def reachable_body(scene: Scene, motions: Sequence[Motion]) -> ReachableBody:
+    """Find the body vertices that come within reach of the garment in any of `SAMPLED_POSES` poses.
 
-    A loose vertex hangs from its anchor, the nearest pinned or tight vertex along the cloth, and stays within
-    the length of cloth between them; tight vertices stay within `SLACK` of linear blend skinning. Where pinned ones
-    are cannot be helped, so that they touch nothing.
+    A loose vertex hangs from its anchor, the nearest pinned or tight vertex along the cloth, and stays within the
+    length of cloth between them. Tight vertices stay within `REACH_MARGIN` of linear blend skinning. Pinned vertices
+    do not count, because nothing moves them.
     """
     from scipy.spatial import cKDTree
     from scipy.spatial.distance import cdist
@@ -44,18 +44,18 @@ def reachable_body(scene: Scene, motions: Sequence[Motion]) -> Reach:
         posed = skin_points(body.mesh.points, body.skin, matrices)[0]
         lbs = skin_points(garment.points, scene.lbs_skin, matrices)[0]
         if len(tight):
-            reached |= cKDTree(lbs[tight]).query(posed)[0] < SLACK
-        reached |= (cdist(lbs[anchors], posed) < lengths[:, None] + SLACK).any(axis=0)
+            reached |= cKDTree(lbs[tight]).query(posed)[0] < REACH_MARGIN
+        reached |= (cdist(lbs[anchors], posed) < lengths[:, None] + REACH_MARGIN).any(axis=0)
     vertices = np.flatnonzero(reached)
     joints = np.zeros(skeleton.joint_count, dtype=bool)
     joints[body.skin.indices[vertices][body.skin.weights[vertices] > 0.05]] = True
-    return Reach(vertices, joints)
+    return ReachableBody(vertices, joints)
 
 
 def _tethers(scene: Scene) -> tuple[Ints, Floats]:
-    """Return anchors (A,) and, for each, the longest run of cloth to a loose vertex that hangs from it [m].
+    """Return anchors (A,) and for each the longest distance along the cloth to a loose vertex that hangs from it [m].
 
-    Edge paths are used, which are never shorter than the geodesic: the reach errs on the safe side.
+    Paths follow edges and are never shorter than the geodesic, so that no reachable vertex is missed.
     """
     from scipy.sparse.csgraph import dijkstra
 
@@ -73,9 +73,9 @@ def _tethers(scene: Scene) -> tuple[Ints, Floats]:
 
 
 def _spread_frames(motions: Sequence[Motion]) -> list[Motion]:
-    """Return about `POSES` single frames, spread evenly over all motions."""
+    """Return about `SAMPLED_POSES` single frames, spread evenly over all motions."""
     ends = np.cumsum([motion.frame_count for motion in motions])
-    picks = np.unique(np.linspace(0, ends[-1] - 1, POSES).astype(int))
+    picks = np.unique(np.linspace(0, ends[-1] - 1, SAMPLED_POSES).astype(int))
     clip = np.searchsorted(ends, picks, side="right")
     starts = ends - [motion.frame_count for motion in motions]
     return [motions[c].clip(p - starts[c], p - starts[c] + 1) for c, p in zip(clip, picks)]

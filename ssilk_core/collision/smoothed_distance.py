@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The distance to a body's whole surface, smoothed where several of its triangles are about equally near.
+"""The distance to a body's whole surface, smoothed where several triangles are about equally near.
 
-The Euclidean distance has a crease wherever two points of the surface are equally near. Taut cloth lies on such
-creases, in the concave folds of a body: there it is in balance, and no gradient tells so. With the distances r_f to
-the triangles and p = `SHARPNESS`,
+The gradient of the Euclidean distance jumps wherever two points of the surface are equally near. Taut cloth lies on
+such creases, in the concave folds of a body, and no gradient vanishes at its equilibrium there. With the distances
+r_f to the triangles and p = `SMOOTHING_EXPONENT`, the smoothed distance
 
     d = sign (sum_f r_f^-p)^(-1/p),   grad d = sign sum_f (d / r_f)^(p+1) u_f,   u_f the direction away from f
 
-has none outside of the body. It is less than the Euclidean distance, by at most ln(k)/p of it where k triangles are
-equally near: at a corner of six by 1.8 %, 0.07 mm at a margin of 4 mm. Every edge and corner thus has a dimple, on
-flat parts too: there the gradient is tilted by 0.01 on average and 0.07 at most.
+has no creases outside of the body. It is smaller than the Euclidean distance, by at most ln(k)/p of it where k
+triangles are equally near: by 1.8 % at a corner of six triangles, which is 0.07 mm at a margin of 4 mm. On flat parts
+too the distance dips at every edge and corner; the gradient is tilted there by 0.01 on average and 0.07 at most.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .closest_point import least_of_each, pairs_within_reach
+from .closest_point import candidate_pairs, segment_min
 from .one_ring import closest_in_triangle
 
-SHARPNESS = 100.0
-SLACK = 12.0 / SHARPNESS  # further away by this share than the nearest, a triangle counts e^-12 of it
-ON_EDGE = 1e-6  # barycentric coordinate up to which a point counts as on the edge opposite
+SMOOTHING_EXPONENT = 100.0
+SEARCH_MARGIN = 12.0 / SMOOTHING_EXPONENT  # a triangle further than the nearest by this ratio has e^-12 of its weight
+EDGE_EPSILON = 1e-6  # barycentric coordinate up to which a point counts as on the edge opposite
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,11 +32,11 @@ class SmoothedDistance:
     """Smoothed distances to first and second order, for each vertex and frame.
 
     Attributes:
-        normal: their gradients, shorter than 1 on creases, shape (V, 3, N).
+        normal: gradients, shorter than 1 on creases, shape (V, 3, N).
         offset: normal . x - d [m], shape (V, N).
-        curvature: roughly the negative of their second derivatives where that is positive [1/m]: how the planes of a
-            crease close in outside of the body, and how the nearest edge or corner pushes back inside of it, float32
-            of shape (V, 3, 3, N).
+        curvature: approximate negative second derivatives, positive semi-definite [1/m]: of the smoothed crease
+            outside of the body, and of the distance to the nearest edge or corner inside, float32 of shape (V, 3, 3,
+            N).
     """
 
     normal: Tensor
@@ -48,9 +48,9 @@ class SmoothedDistance:
         return (self.normal * x).sum(1) - self.offset
 
     def expected(self, x: Tensor, moved: Tensor) -> Tensor:
-        """Return those to second order after vertices have moved by `moved` (V, 3, N) to x.
+        """Return signed distances to second order after vertices have moved by `moved` (V, 3, N) to x [m].
 
-        No distance falls by more than its vertex has moved: the curvature of a crease ends soon beside it.
+        No distance decreases by more than its vertex has moved, since the curvature of a crease is local.
         """
         distance = self.distance(x)
         least = distance - (self.normal * moved).sum(1) - moved.norm(dim=1)
@@ -58,51 +58,51 @@ class SmoothedDistance:
         return torch.maximum(distance - bent, least)
 
     def tensors(self) -> list[Tensor]:
-        """Return all that it holds, frames last."""
+        """Return all tensors, frames last."""
         return [self.normal, self.offset, self.curvature]
 
     def select(self, frames: Tensor) -> SmoothedDistance:
-        """Return those of the frames with indices (M,)."""
+        """Return the distances in the frames with indices (M,)."""
         return SmoothedDistance(*(values[..., frames] for values in self.tensors()))
 
     def to(self, dtype: torch.dtype) -> SmoothedDistance:
-        """Return the planes in a precision; the curvature stays float32."""
+        """Convert the planes to a precision; the curvature stays float32."""
         return SmoothedDistance(self.normal.to(dtype), self.offset.to(dtype), self.curvature)
 
 
 def smoothed_distance(
     x: Tensor,
-    reach: Tensor,
+    search_radius: Tensor,
     points: Tensor,
     normals: Tensor,
     faces: Tensor,
-    touching: float,
-    listed: Tensor | None = None,
+    surface_epsilon: float,
+    candidates: Tensor | None = None,
 ) -> tuple[Tensor, SmoothedDistance]:
-    """Return which of the queries have a triangle within reach, (V, N), and their distances, zero for the others.
+    """Return which queries have a triangle within reach (V, N), and their distances, zero for the others.
 
     Args:
         x: queries, shape (V, 3, N).
-        reach: distance that each nearest point is known to be within [m], shape (V, N); negative: not asked.
+        search_radius: upper bound of each distance [m], shape (V, N); negative values skip a query.
         points, normals: of the body, shape (B, 3, N).
         faces: triangles, shape (F, 3).
-        touching: nearer than this [m], the interpolated normal is the gradient.
-        listed: the triangles that each row of queries may find, filled up by -1, shape (V, L); any by default.
+        surface_epsilon: nearer than this [m], the interpolated normal is the gradient.
+        candidates: triangles that each row of queries may find, padded with -1, shape (V, L); all by default.
     """
-    rows, frames = reach.shape
-    row, frame, face = pairs_within_reach(x.float(), reach * (1 + SLACK), points, faces, listed)
+    rows, frames = search_radius.shape
+    row, frame, face = candidate_pairs(x.float(), search_radius * (1 + SEARCH_MARGIN), points, faces, candidates)
     query, corners = row * frames + frame, faces[face].T
     positions = torch.stack([points[corner, :, frame].T.to(x.dtype) for corner in corners])
     r, away, weights = _nearest_points(x[row, :, frame].T, positions)
-    nearest, best = least_of_each(query, r, rows * frames)
+    nearest, best = segment_min(query, r, rows * frames)
     found = best < len(query)
     best, nearest = best[found], nearest[found]
-    place = torch.cumsum(found, 0)[query] - 1  # of each pair's query among those found
+    place = torch.cumsum(found, 0)[query] - 1  # index of each pair's query among those found
     distance, gradient, closing = _norm(r, away, place, nearest)
 
     normal = (normals[corners[:, best], :, frame[best]].permute(2, 0, 1) * weights[:, best]).sum(1)
     normal = normal / normal.norm(dim=0).clamp_min(1e-8)
-    inside, touches = (away[:, best] * normal).sum(0) < 0, nearest <= touching
+    inside, touches = (away[:, best] * normal).sum(0) < 0, nearest <= surface_epsilon
     sign = torch.where(inside, -1.0, 1.0)
     distance = sign * torch.where(touches, nearest, distance)
     gradient = torch.where(touches, normal, sign * gradient)
@@ -114,7 +114,7 @@ def smoothed_distance(
 
 
 def _nearest_points(x: Tensor, positions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return distances (Q,) of queries (3, Q) to triangles (3, 3, Q: corner, axis), directions away, barycentrics."""
+    """Return distances (Q,), directions and barycentric coordinates of queries (3, Q) on triangles (3, 3, Q)."""
     origin, e1, e2 = positions[0], positions[1] - positions[0], positions[2] - positions[0]
     s, t, _ = closest_in_triangle(x - origin, e1, e2)
     away = x - origin - s * e1 - t * e2
@@ -123,27 +123,27 @@ def _nearest_points(x: Tensor, positions: Tensor) -> tuple[Tensor, Tensor, Tenso
 
 
 def _norm(r: Tensor, away: Tensor, place: Tensor, nearest: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the norm (M,) of the distances r (Q,) of each query, its gradient (3, M), and how its planes close in.
+    """Return each query's norm of its distances r (Q,), shape (M,), the gradient (3, M) and the curvature (3, 3, M).
 
     Args:
         away: directions, shape (3, Q).
-        place: the query of each pair, shape (Q,); nearest: their least distances, shape (M,).
+        place: the query of each pair, shape (Q,); nearest: the minimum distances of queries, shape (M,).
     """
 
     def total(values: Tensor) -> Tensor:
         flat = values.reshape(values.shape[:-1].numel(), len(r))
         return flat.new_zeros(len(flat), len(nearest)).index_add_(1, place, flat).reshape(*values.shape[:-1], -1)
 
-    weight = (nearest[place] / r) ** SHARPNESS
+    weight = (nearest[place] / r) ** SMOOTHING_EXPONENT
     sums = total(weight)
-    distance = nearest * sums ** (-1 / SHARPNESS)
+    distance = nearest * sums ** (-1 / SMOOTHING_EXPONENT)
     mean, square = total(weight * away) / sums, total(weight * away[:, None] * away) / sums
-    closing = (square - mean[:, None] * mean) * ((SHARPNESS + 1) / distance)
+    closing = (square - mean[:, None] * mean) * ((SMOOTHING_EXPONENT + 1) / distance)
     return distance, total(weight / r * away) * (distance / sums), closing
 
 
 def _spread(values: Tensor, found: Tensor) -> Tensor:
-    """Return values (..., M) of the queries found (V, N), and zero for the others, shape (V, ..., N)."""
+    """Scatter values (..., M) to the queries found (V, N), with zero for the others, shape (V, ..., N)."""
     full = values.new_zeros(*values.shape[:-1], *found.shape)
     full[..., found] = values
     return full.movedim(-2, 0)
@@ -152,15 +152,15 @@ def _spread(values: Tensor, found: Tensor) -> Tensor:
 def edge_curvature(away: Tensor, r: Tensor, weights: Tensor, positions: Tensor) -> Tensor:
     """Return the second derivative of the distance to an edge or a corner, zero within a face [1/m], (3, 3, M).
 
-    Across the direction away from it, and for an edge not along that: (1 - u u' - e e') / r.
+    It is (1 - u u' - e e') / r, with u the direction away and e that of the edge, zero at a corner.
 
     Args:
         away, r: directions from the nearest points, and distances, (3, M) and (M,).
         weights: barycentric coordinates of the nearest points, (3, M).
         positions: of the triangles' corners, (3, 3, M): corner, axis.
     """
-    none = weights <= ON_EDGE
-    opposite = positions.roll(-1, 0) - positions.roll(-2, 0)  # the edge on which a corner has no share
+    none = weights <= EDGE_EPSILON
+    opposite = positions.roll(-1, 0) - positions.roll(-2, 0)  # the edge opposite of each corner
     edge = (opposite * (none & (none.sum(0) == 1))[:, None]).sum(0)
     edge = edge / edge.norm(dim=0).clamp_min(torch.finfo(r.dtype).tiny)
     across = torch.eye(3, dtype=r.dtype, device=r.device)[:, :, None] - away[:, None] * away - edge[:, None] * edge

@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 def cross(a: Tensor, b: Tensor) -> Tensor:
-    """Cross product over dimension 1; on (H, 3, N) several times faster than the library's on the CPU."""
+    """Cross product over dimension 1; on (H, 3, N) several times faster than `torch.linalg.cross` on the CPU."""
     (ax, ay, az), (bx, by, bz) = a.unbind(1), b.unbind(1)
     return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], dim=1)
 
@@ -29,12 +29,12 @@ def dihedral_angles(edge: Tensor, left: Tensor, right: Tensor) -> Tensor:
         Shape (H, N).
     """
     normal_left, normal_right = cross(edge, left), cross(right, edge)
-    # With lengths left in, atan2(|e| n_r . left', n_l . n_r) needs no normalisation but that of the edge.
+    # With unnormalised normals, atan2(|e| n_r . left', n_l . n_r) needs only the length of the edge.
     square = (edge * edge).sum(1)
     sine = -(normal_right * left).sum(1) * square.clamp_min(1e-18).sqrt()
     cosine = (normal_left * normal_right).sum(1)
-    # Where a face collapses both vanish but for rounding: such a hinge counts as flat and pulls nowhere. Both are
-    # squared in the gradient of atan2, and the square of less than 1e-18 underflows in single precision.
+    # At a degenerate face both are rounding errors: the hinge counts as flat and has no gradient. The gradient of
+    # atan2 squares both, and squares of values below 1e-18 underflow in single precision.
     collapsed = sine.abs() + cosine.abs() < (1e-6 * square**2).clamp_min(1e-18)
     return torch.atan2(torch.where(collapsed, 0.0, sine), torch.where(collapsed, 1.0, cosine))
 
@@ -44,13 +44,13 @@ def bending_energy(angle: Tensor, rest_angle: Tensor, stiffness: Tensor) -> Tens
 
     `stiffness` is k_b l^2 / (8 (A_1 + A_2)) of the rest shape, shape (H, 1), as `rest_angle`.
     """
-    return stiffness * bent(angle, rest_angle) ** 2
+    return stiffness * wrapped_difference(angle, rest_angle) ** 2
 
 
-def bent(angle: Tensor, rest_angle: Tensor) -> Tensor:
-    """Return how far a hinge is turned from its rest, the shorter way round, in [-pi, pi].
+def wrapped_difference(angle: Tensor, rest_angle: Tensor) -> Tensor:
+    """Return angle - rest_angle, wrapped to [-pi, pi].
 
-    An angle jumps from pi to -pi where a hinge that is folded flat goes on: the energy must not.
+    The dihedral angle jumps from pi to -pi when a hinge folds past flat; the energy must stay continuous.
     """
     change = angle - rest_angle
     return change - 2 * pi * torch.round(change.detach() / (2 * pi))

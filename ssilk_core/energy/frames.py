@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All energies of frames in a row, as validation and evaluation tell them."""
+"""All energies of consecutive frames, for validation and evaluation."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ..collision.distance import PosedBody
 from ..constants import GRAVITY
 from .garment import GarmentEnergy
 
-DECODED_AT_ONCE = 256  # frames in memory
+FRAMES_PER_CHUNK = 256  # frames in memory at once
 
 
 def energy_terms(
@@ -26,20 +26,20 @@ def energy_terms(
 ) -> dict[str, Tensor]:
     """Return each of `TERMS` [J], and the share of vertices inside the body as "collisions", shape (N,).
 
-    The share counts what lies inside any part of the body, whichever part the vertex meets in the energy.
+    The share counts vertices inside any part of the body, also where the energy lets them touch only one part.
 
     Args:
-        x, lbs: positions (V, 3, N); gravity is that of `x` less that of `lbs`.
-        joined: `x` after up to two frames before it. Where two are lacking there is no inertia.
+        x, lbs: positions (V, 3, N); gravity is that of `x` minus that of `lbs`.
+        joined: up to two earlier frames, then `x`. Inertia is zero where two earlier frames are missing.
         down: direction of gravity, shape (3,).
     """
-    met, nearest = contacts.distances(x, body)
+    contact_distance, body_distance = contacts.distances(x, body)
     inertia = energy.inertia(joined[..., 2:], 2 * joined[..., 1:-1] - joined[..., :-2], 1 / fps)
     return {
         "stretch": energy.stretch(x),
         "bending": energy.bending(x),
         "gravity": energy.gravity(x - lbs, GRAVITY * down[:, None]),
         "inertia": torch.cat([inertia.new_zeros(x.shape[-1] - len(inertia)), inertia]),
-        "collision": energy.collision_of(met),
-        "collisions": (nearest < 0).double().mean(0),
+        "collision": energy.collision_at(contact_distance),
+        "collisions": (body_distance < 0).double().mean(0),
     }

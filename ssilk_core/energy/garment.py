@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All energies of one garment, with its rest shape prepared once."""
+"""All energies of one garment."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from .. import kernels
 from ..assets import Floats, Ints, Mesh
-from ..collision.distance import PosedBody, signed, signed_distance
+from ..collision.distance import PosedBody, signed_distance, signed_distance_to_planes
 from ..fabrics import Fabric
 from ..kernels.corners import elastic_tables
 from ..mesh import topology
@@ -20,7 +20,7 @@ from .operators import difference_operator
 from .stretch import column_weights, deformation_gradient_operator, stretch_density, stretched_areas
 
 TERMS = ("stretch", "bending", "gravity", "inertia", "collision")
-"""The paper's terms; drag is trained with, but not counted, so that totals compare with its."""
+"""The paper's terms. Drag is part of training but not of totals, so that these compare with the paper's."""
 
 
 class GarmentEnergy:
@@ -66,69 +66,71 @@ class GarmentEnergy:
         return -(self.mass @ (x * gravity).sum(1))
 
     def inertia(self, x: Tensor, predicted: Tensor, dt: float) -> Tensor:
-        """Return sum m/(2 dt^2) |x - predicted|^2; predicted = 2 x_{t-1} - x_{t-2} carries no gradient."""
+        """Return sum m/(2 dt^2) |x - predicted|^2; predicted = 2 x_{t-1} - x_{t-2} has no gradient."""
         return self.mass @ ((x - predicted.detach()) ** 2).sum(1) / (2 * dt * dt)
 
-    def drag(self, x: Tensor, carried: Tensor, dt: float) -> Tensor:
-        """Return sum c a/(2 dt) |x - carried|^2, whose force is -c a v with v = (x - carried) / dt.
+    def drag(self, x: Tensor, advected: Tensor, dt: float) -> Tensor:
+        """Return sum c a/(2 dt) |x - advected|^2, whose force is -c a v with v = (x - advected) / dt.
 
-        `carried` is where the air took the last positions (V, 3, N); it carries no gradient.
+        `advected` (V, 3, N) are the last positions moved with the air; they have no gradient.
         """
         weight = self.fabric.drag / self.fabric.density * self.mass
-        return weight @ ((x - carried.detach()) ** 2).sum(1) / (2 * dt)
+        return weight @ ((x - advected.detach()) ** 2).sum(1) / (2 * dt)
 
     def collision(self, x: Tensor, body: PosedBody) -> Tensor:
-        return self.collision_of(signed_distance(x, body))
+        return self.collision_at(signed_distance(x, body))
 
-    def collision_of(self, distance: Tensor) -> Tensor:
+    def collision_at(self, distance: Tensor) -> Tensor:
         """Return the penalty of given signed distances (V, N)."""
         return collision_energy(distance, self.fabric.collision, self.fabric.margin).sum(0)
 
     def elastic(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Return stretch and bending; this and the next two use fused kernels where there are any."""
-        if not kernels.serve(x):
+        """Return stretch and bending; this and the next two methods use fused kernels where available."""
+        if not kernels.supports(x):
             return self.stretch(x), self.bending(x)
         from ..kernels.elastic import elastic_kernel
 
         return elastic_kernel(x, self._tables, self.fabric)
 
-    def potential(
+    def gravity_and_collision(
         self, x: Tensor, root: Tensor, gravity: Tensor, normal: Tensor, offset: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return gravity, of heights over `root` (3, N), and the collision with one plane for each vertex.
+        """Return gravity, with heights relative to `root` (3, N), and the collision with one plane for each vertex.
 
-        Neither the planes, unit normals (V, 3, N) and offsets (V, N), nor `root` carry a gradient.
+        The planes, with unit normals (V, 3, N) and offsets (V, N), and `root` have no gradient.
         """
         normal, offset, root = normal.detach(), offset.detach(), root.detach()
-        if not kernels.serve(x):
-            return self.gravity(x - root, gravity), self.collision_of(signed(x, normal, offset))
-        from ..kernels.pointwise import potential_kernel
+        if not kernels.supports(x):
+            return self.gravity(x - root, gravity), self.collision_at(signed_distance_to_planes(x, normal, offset))
+        from ..kernels.pointwise import gravity_and_collision_kernel
 
-        return potential_kernel(
+        return gravity_and_collision_kernel(
             x, self.mass, root, gravity, (normal, offset), self.fabric.collision, self.fabric.margin
         )
 
-    def kinetic(self, x: Tensor, last: Tensor, before: Tensor, shift: Tensor, dt: float) -> tuple[Tensor, Tensor]:
-        """Return inertia and drag of the first M frames of x (V, 3, N); neither the past nor the air has a gradient.
+    def inertia_and_drag(
+        self, x: Tensor, last: Tensor, before: Tensor, shift: Tensor, dt: float
+    ) -> tuple[Tensor, Tensor]:
+        """Return inertia and drag of the first M frames of x (V, 3, N); only x has a gradient.
 
         Args:
             last, before: positions one and two frames ago (V, 3, M).
-            shift: how far the air went since (3, M), with the character's root.
+            shift: displacement of the air, which moves with the character's root, since the last frame (3, M).
         """
-        if not kernels.serve(x):
+        if not kernels.supports(x):
             moving = x[..., : last.shape[-1]]
             return self.inertia(moving, 2 * last - before, dt), self.drag(moving, last + shift, dt)
-        from ..kernels.pointwise import kinetic_kernel
+        from ..kernels.pointwise import inertia_and_drag_kernel
 
         weights = 1 / (dt * dt), self.fabric.drag / self.fabric.density / dt
-        return kinetic_kernel(x, self.mass, last, before, shift, *weights)
+        return inertia_and_drag_kernel(x, self.mass, last, before, shift, *weights)
 
 
 def _hinge_shapes(mesh: Mesh, hinges: Ints) -> Floats:
-    """Return l^2 / (8 (A_1 + A_2)) of each hinge at rest, with its edge's length and the areas beside it, (H,).
+    """Return l^2 / (8 (A_1 + A_2)) of each hinge at rest, from the length of its edge and the adjacent areas, (H,).
 
-    Faces count as high as a `SLIVER`th of the edge at least. The angle turns with the inverse of a face's height:
-    hinges of lower ones are so much softer that no vertex is held more stiffly than by the slimmest clean triangle.
+    The derivative of the angle grows with the inverse of a face's height. Heights below edge / `SLIVER` count as
+    that, and such hinges are softened, so that no sliver is stiffer than the thinnest regular triangle.
     """
     x0, x1, left, right = (mesh.points[hinges[:, i]] for i in range(4))
     squared = np.sum((x1 - x0) ** 2, axis=1)

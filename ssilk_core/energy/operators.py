@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sparse linear operators on vertex positions, with a deterministic gradient.
 
-Positions are laid out (vertices, 3, frames): a row is contiguous over all frames, so that gathering a vertex
-copies one long run of memory, and the transposed operator (a sum over the incident elements of each vertex)
-needs no atomics.
+Positions are laid out (vertices, 3, frames): frames of a vertex are contiguous, so that gathering a vertex is one
+block copy. The transposed operator, a sum over the incident elements of each vertex, needs no atomics.
 """
 
 from __future__ import annotations

@@ -15,10 +15,10 @@ from .operators import SparseOperator
 
 
 def rest_frames(mesh: Mesh) -> tuple[Floats, Floats]:
-    """Return the inverse rest shape matrices (F, 2, 2) [1/m] and true areas (F,) [m2] of the triangles.
+    """Return the inverse rest shape matrices (F, 2, 2) [1/m] and areas (F,) [m2] of the triangles.
 
-    Warp, the second in-plane axis, runs up the triangle, and along x where the triangle lies flat. StVK is the
-    same in any orthonormal frame; Baraff-Witkin is not, so the axes may not follow from the order of the corners.
+    The second in-plane axis (warp) points up, or along x in horizontal triangles. StVK is isotropic; Baraff-Witkin is
+    not, so the axes must not depend on the order of the corners.
 
     Raises:
         SsilkError: a triangle has no area.
@@ -51,11 +51,11 @@ def rest_frames(mesh: Mesh) -> tuple[Floats, Floats]:
 
 
 def stretched_areas(mesh: Mesh) -> Floats:
-    """Return the area that the stretch of each triangle counts for [m2], shape (F,): its own, less for slivers.
+    """Return the area that weights the stretch of each triangle [m2], shape (F,): its own, less for slivers.
 
-    A point that is moved by d stretches a triangle of height h by d / h and StVK takes the fourth power, so that
-    a few slivers, modelled by accident, would outweigh a whole garment. Below a height of a `SLIVER`th of its
-    longest edge a triangle counts as (height / that)^3: for the same d no more than it would count for there.
+    A vertex displaced by d stretches a triangle of height h by d / h, and StVK takes the fourth power of that: a few
+    accidental slivers would outweigh a whole garment. Where h < h_0 = longest edge / `SLIVER`, the area is scaled by
+    (h / h_0)^3, so that for equal d the energy is at most that of a triangle of height h_0.
     """
     _, areas = rest_frames(mesh)
     return areas * np.minimum(1.0, SLIVER * 2 * areas / _longest_squared(mesh)) ** 3
@@ -110,7 +110,7 @@ def stvk_density(gradient: Tensor, mu: float, lame_lambda: float) -> Tensor:
 def baraff_witkin_density(gradient: Tensor, stretch: float, shear: float) -> Tensor:
     """Energy per rest area [J/m2], k_s ((|w_u|-1)^2 + (|w_v|-1)^2) + k_sh (w_u . w_v)^2; arguments as above."""
     w_u, w_v = gradient.chunk(2)
-    # The length has no gradient at zero; a floor far under any real stretch keeps it finite there.
+    # The length has no gradient at zero; a floor far below any real length keeps it finite.
     length_u = (w_u * w_u).sum(1).clamp_min(1e-12).sqrt()
     length_v = (w_v * w_v).sum(1).clamp_min(1e-12).sqrt()
     return stretch * ((length_u - 1) ** 2 + (length_v - 1) ** 2) + shear * (w_u * w_v).sum(1) ** 2

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..simulate import Simulator
-from ..simulate.actors import PosedCharacters
+from ..simulate.characters import PosedCharacters
 from .figures import MinimumErrors
 from .metrics import mean_square
 from .takes import Take
@@ -65,10 +65,10 @@ def minima(simulator: Simulator, takes: Sequence[Take], x: Tensor) -> Minima:
     rotations, translations = (
         np.stack([getattr(motion, name)[-1] for motion in motions]) for name in ("rotations", "translations")
     )
-    poses = simulator.actors.posed(rotations, translations)
+    poses = simulator.poser.pose(rotations, translations)
     origins = torch.as_tensor(np.stack([m.translations[0, 0] for m in motions], axis=1), device=x.device)
-    start = simulator.pinned(x.double() + origins - poses.root, poses)
-    found = simulator.rest(poses, start)
+    start = simulator.apply_pins(x.double() + origins - poses.root, poses)
+    found = simulator.quasi_static(poses, start)
     return Minima(simulator, poses, start, found.x, found.residual)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..energy.frames import DECODED_AT_ONCE, energy_terms
+from ..energy.frames import FRAMES_PER_CHUNK, energy_terms
 from .methods import EvaluationScene, Method, TakeSet
 from .metrics import BINS, derivative, kinetic_energy, mean_square, principal_stretches, stretch_histogram
 
@@ -39,8 +39,8 @@ def recorded(
     parts, stretches = [], torch.zeros(BINS, dtype=torch.float64)
     ours, theirs = _Past(method, take), _Past(reference, take) if reference else None
     count = take_set.takes[take].frame_count
-    for start in range(0, count, DECODED_AT_ONCE):
-        frames = range(start, min(start + DECODED_AT_ONCE, count))
+    for start in range(0, count, FRAMES_PER_CHUNK):
+        frames = range(start, min(start + FRAMES_PER_CHUNK, count))
         path, still = ours.joined(frames), method.still(take, frames)
         x = path[..., -len(frames) :]
         stretch = principal_stretches(dressed.columns(x))[0]
@@ -61,7 +61,7 @@ def frame_energies(
 ) -> dict[str, Tensor]:
     """Return `energy.frames.energy_terms` of the last frames of a path (V, 3, past + N), shape (N,)."""
     x, character = path[..., -len(frames) :], take_set.character(take, frames)
-    body, joined = dressed.body.posed(character, exact=dressed.exact), path[..., -len(frames) - 2 :]
+    body, joined = dressed.body.pose(character, exact=dressed.exact), path[..., -len(frames) - 2 :]
     down = x.new_tensor([0.0, -1.0, 0.0])
     return energy_terms(dressed.energy, x, dressed.lbs(character), dressed.contacts, body, joined, dressed.fps, down)
 

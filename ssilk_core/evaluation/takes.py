@@ -9,7 +9,7 @@ import numpy as np
 
 from ..assets import Floats, Motion
 from ..kinematics import sample_motion
-from ..simulate.actors import spans_of
+from ..simulate.characters import split_into_spans
 
 EASE = 0.25  # [s] to start or to stop
 SHORTEST = 4  # frames; a third difference needs as many
@@ -39,7 +39,7 @@ def takes_of(clip: str, motion: Motion, fps: float, longest: int | None = None) 
 
     Frames are those of `ssilk simulate` at the same rate, so that a point cache of the clip lines up.
     """
-    spans = spans_of(motion, 0, fps, 1, longest)
+    spans = split_into_spans(motion, 0, fps, 1, longest)
     return [Take(clip, span.first, span.motion) for span in spans if span.motion.frame_count >= SHORTEST]
 
 

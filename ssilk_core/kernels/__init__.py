@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Triton kernels for CUDA. Each has a reference implementation in PyTorch beside its caller, used everywhere else.
+"""Triton kernels for CUDA. Each has a reference implementation in PyTorch, which runs on all other devices.
 
-Modules with kernels import Triton, and are themselves imported only where `available` said yes.
+The modules with kernels import Triton, so they are imported only where `available` returns true.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from torch import Tensor
 
 
 def available(device: torch.device) -> bool:
-    """Return whether the kernels serve a device: CUDA with Triton installed. The one place that chooses."""
+    """Return whether a device runs the kernels: CUDA with Triton installed."""
     return device.type == "cuda" and importlib.util.find_spec("triton") is not None
 
 
-def serve(x: Tensor) -> bool:
-    """Return whether the kernels serve a tensor: single precision on such a device."""
+def supports(x: Tensor) -> bool:
+    """Return whether the kernels support a tensor: float32 on such a device."""
     return x.dtype == torch.float32 and available(x.device)

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nearest of the body vertices listed for each garment vertex; `collision.nearest_vertex` holds the reference
-implementation.
+"""The nearest of each garment vertex's candidate body vertices; reference: `collision.nearest_vertex`.
 
 A program owns one garment vertex in a block of frames: the list is the same for all of its threads.
 """
@@ -17,12 +16,12 @@ from .vectors import dot, load3
 FRAMES, WARPS = 128, 2  # of one program
 
 
-def listed_kernel(x: Tensor, points: Tensor, lists: Tensor) -> Tensor:
-    """Return the index of the nearest listed body vertex, int32 of shape (V, N); of equals the first in the list.
+def nearest_candidate_kernel(x: Tensor, points: Tensor, lists: Tensor) -> Tensor:
+    """Return the index of the nearest candidate, int32 of shape (V, N); of equally near ones the first in its list.
 
     Args:
         x, points: garment (V, 3, N) and body (B, 3, N), float32.
-        lists: how many body vertices each garment vertex may find, then these, int32 (V, 1 + C).
+        lists: for each garment vertex the number of candidates, then their indices, int32 (V, 1 + C).
     """
     x, points, lists = x.contiguous(), points.contiguous(), lists.contiguous()
     vertices, _, frames = x.shape

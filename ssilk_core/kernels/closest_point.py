@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The plane of the nearest point of a body's whole surface; `collision.closest_point` holds the reference
-implementation.
+"""The tangent plane at the nearest point of a body's whole surface; reference: `collision.closest_point`.
 
-As in `nearest`, vertices of the garment come in compact blocks with bounding boxes, a program owns one frame and a
-few blocks, and groups of the body whose boxes are out of reach are left out. A group here is a patch of triangles,
-and what is known to be within reach is the nearest body vertex.
+As in `nearest_vertex`, vertices of the garment come in compact blocks with bounding boxes, a program owns one frame
+and a few blocks, and body groups whose boxes are out of reach are skipped. A group is a patch of triangles here, and
+the distance to the nearest body vertex bounds the search.
 """
 
 from __future__ import annotations
@@ -17,19 +16,19 @@ from .nearest_vertex import CHUNK, RUN, SAFE, _gaps, _three, by_frame
 from .one_ring import _closest_alone
 from .vectors import dot
 
-LANES = tl.constexpr(8)  # triangles of a patch; their corners are four rows of a table, of which the last fills up
+LANES = tl.constexpr(8)  # triangles of a patch; their corners are four rows of a table, the last of them padding
 WARPS = 2
 
 
-def closest_kernel(
+def closest_point_kernel(
     x: Tensor,
     index: Tensor,
     points: Tensor,
     normals: Tensor,
     blocks: Tensor,
     patches: Tensor,
-    far: float,
-    touching: float,
+    max_distance: float,
+    surface_epsilon: float,
 ) -> tuple[Tensor, Tensor]:
     """Return unit normals (V, 3, N) and offsets n . b (V, N) of the nearest body points b, as `nearest_planes` does.
 
@@ -37,9 +36,9 @@ def closest_kernel(
         x: queries (V, 3, N); index: their nearest body vertices (V, N), int32.
         points, normals: of the body (B, 3, N).
         blocks: the queries in compact blocks (`collision.nearest_vertex.compact_blocks`), int32.
-        patches: corners of triangles in compact patches (`collision.closest_point.patches_of`), int32.
-        far: further than this from its nearest vertex [m], a query keeps that as its nearest point.
-        touching: nearer than this to its nearest point [m], a query keeps the normal there.
+        patches: corners of triangles in compact patches (`collision.closest_point.triangle_patches`), int32.
+        max_distance: queries further than this from their nearest vertex [m] use it as the nearest point.
+        surface_epsilon: queries nearer than this to their nearest point [m] use the interpolated normal.
     """
     vertices, _, frames = x.shape
     points, normals = points.contiguous(), normals.contiguous()
@@ -47,13 +46,14 @@ def closest_kernel(
     garment, body = by_frame(x, blocks), by_frame(points, patches)
     grid = (frames, triton.cdiv(len(blocks), RUN))
     _search[grid](*garment, *body, blocks, patches, index, points, normals, normal, offset, frames, len(blocks),
-                  len(patches), far * far, touching, blocks.shape[1], CHUNK, RUN, num_warps=WARPS)  # fmt: skip
+                  len(patches), max_distance * max_distance, surface_epsilon, blocks.shape[1], CHUNK, RUN,
+                  num_warps=WARPS)  # fmt: skip
     return normal, offset
 
 
 @triton.jit
 def _search(garment, garment_boxes, body, body_boxes, blocks, patches, index, points, normals, normal, offset,
-            frames, block_count, patch_count, far, touching, block_v: tl.constexpr, chunk: tl.constexpr,
+            frames, block_count, patch_count, max_square, surface_epsilon, block_v: tl.constexpr, chunk: tl.constexpr,
             run: tl.constexpr):  # fmt: skip
     frame = tl.program_id(0).to(tl.int64)
     garment += frame * 3 * block_count * block_v
@@ -67,7 +67,7 @@ def _search(garment, garment_boxes, body, body_boxes, blocks, patches, index, po
         first = tl.load(index + vertex * frames + frame).to(tl.int64)
         ox, oy, oz = _three(points + first * 3 * frames + frame, frames)
         square = dot(x - ox, y - oy, z - oz, x - ox, y - oy, z - oz)
-        near = square < far
+        near = square < max_square
         bound = tl.max(tl.where(near, square, 0.0), axis=0)
         winner, s, t = _nearest(x, y, z, garment_boxes + block, block_count, body, body_boxes, patch_count, bound,
                                 block_v, chunk)  # fmt: skip
@@ -82,15 +82,15 @@ def _search(garment, garment_boxes, body, body_boxes, blocks, patches, index, po
         nx, ny, nz = nx / length, ny / length, nz / length
         ax, ay, az = x - bx, y - by, z - bz
         away = tl.sqrt(dot(ax, ay, az, ax, ay, az))
-        side = tl.where(dot(ax, ay, az, nx, ny, nz) < 0, -1.0, 1.0) / tl.maximum(away, touching)
-        outward = near & (away > touching)
+        side = tl.where(dot(ax, ay, az, nx, ny, nz) < 0, -1.0, 1.0) / tl.maximum(away, surface_epsilon)
+        outward = near & (away > surface_epsilon)
         nx, ny, nz = (
             tl.where(outward, side * ax, nx),
             tl.where(outward, side * ay, ny),
             tl.where(outward, side * az, nz),
         )
         target = normal + vertex * 3 * frames + frame
-        tl.store(target, nx)  # a vertex that fills up its block writes the same again
+        tl.store(target, nx)  # padding of a block writes the same value again
         tl.store(target + frames, ny)
         tl.store(target + 2 * frames, nz)
         tl.store(offset + vertex * frames + frame, dot(nx, ny, nz, bx, by, bz))
@@ -99,7 +99,7 @@ def _search(garment, garment_boxes, body, body_boxes, blocks, patches, index, po
 @triton.jit
 def _nearest(x, y, z, box, block_count, body, body_boxes, patch_count, bound, block_v: tl.constexpr,
              chunk: tl.constexpr):  # fmt: skip
-    """For each vertex of a block the nearest triangle that is within reach, and where on it the nearest point is."""
+    """For each vertex of a block: the nearest triangle within reach, and the nearest point on it."""
     lx, ly, lz = _three(box, block_count)
     hx, hy, hz = _three(box + 3 * block_count, block_count)
     lane = tl.arange(0, LANES)[None, :]
@@ -127,7 +127,7 @@ def _nearest(x, y, z, box, block_count, body, body_boxes, patch_count, bound, bl
 
 @triton.jit
 def _on_patch(x, y, z, corner, stride):
-    """The nearest points of the triangles of a patch to a block of vertices: s, t and squared distances."""
+    """Nearest points on the triangles of a patch to a block of vertices: s, t and squared distances."""
     ax, ay, az = _three(corner, stride)
     ux, uy, uz = _three(corner + LANES, stride)
     wx, wy, wz = _three(corner + 2 * LANES, stride)

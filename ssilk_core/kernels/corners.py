@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of a mesh at rest for elastic kernels: a row for each corner of each triangle, and for each hinge."""
+"""Tables of the rest shape for the elastic kernels: one row for each corner of each triangle, and for each hinge."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..mesh import topology
 
 @dataclass(frozen=True, eq=False)
 class ElasticTables:
-    """A mesh at rest as kernels read it; indices are int32, numbers float32.
+    """The rest shape in the layout of the kernels; indices are int32, numbers float32.
 
     The row of a corner turns its triangle (a, b, c) so that the corner comes first. Its indices (6,) are a, b, c and
     the hinges on ab, bc, ca; its numbers (8,) the weights of b in both columns of F, those of c, the rest area, and
@@ -42,11 +42,11 @@ class ElasticTables:
 def elastic_tables(
     vertex_count: int, faces: Ints, weights: Floats, areas: Floats, hinges: Ints, hinge_numbers: Tensor
 ) -> ElasticTables:
-    """Lay out the tables of a mesh, on the device of `hinge_numbers`.
+    """Build the tables of a mesh on the device of `hinge_numbers`.
 
     Args:
         faces: (F, 3); weights: of their corners in both columns of F (F, 3, 2); areas: at rest (F,).
-        hinges: those that resist bending (H, 4), with their `hinge_numbers` (H, 2).
+        hinges: hinges that resist bending (H, 4), with their `hinge_numbers` (H, 2).
     """
     edge_hinges, signs = _hinges_of_edges(faces, hinges)
     rows, numbers = [], []
@@ -82,7 +82,7 @@ def _hinges_of_edges(faces: Ints, hinges: Ints) -> tuple[Ints, Floats]:
     hinge[edge[len(half) :]] = np.arange(len(hinges))
     edge = edge[: len(half)]
     hinge, first = hinge[edge], first[edge]
-    # The first triangle on an edge has the hinge's own normal; the other one too if it runs along the edge backwards.
+    # The first triangle on an edge has the hinge's normal; so has the other one if it traverses the edge backwards.
     agrees = (first == np.arange(len(half))) | (half[:, 0] != half[first, 0])
     sign = np.where(hinge >= 0, np.where(agrees, 1.0, -1.0), 0.0)
     return np.maximum(hinge, 0).reshape(-1, 3), sign.reshape(-1, 3)

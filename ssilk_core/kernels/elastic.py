@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stretch and bending; `GarmentEnergy.stretch` and `.bending` are the reference implementations.
+"""Stretch and bending energies; reference: `GarmentEnergy.stretch` and `.bending`.
 
-Every program owns a block of frames. For values it goes through a few triangles or hinges and writes their share of
-the sum; for gradients it owns a vertex and gathers from the triangles around. Nothing is written twice: results do
-not depend on the order.
+Every program owns a block of frames. For values it sums over a few triangles or hinges and writes this partial sum;
+for gradients it owns a vertex and gathers from the triangles around it. There are no atomics: results are
+deterministic.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from .corners import ElasticTables
 from .vectors import cross, dot, load3, store3
 
 FRAMES, WARPS = 128, 2  # frames and warps of one program
-ELEMENTS = 8  # triangles or hinges that the program of a value sums over
+ELEMENTS = 8  # triangles or hinges that one program sums over
 
 
 def elastic_kernel(x: Tensor, tables: ElasticTables, fabric: Fabric) -> tuple[Tensor, Tensor]:
@@ -74,7 +74,7 @@ class _Elastic(Function):
 
 @triton.jit
 def _point(x, index, frames, n, inside):
-    """The position of the vertex that stands at `index`."""
+    """Load the position of the vertex whose index is stored at `index`."""
     return load3(x + tl.load(index).to(tl.int64) * 3 * frames, frames, n, inside)
 
 
@@ -149,9 +149,9 @@ def _stretch(
 
 @triton.jit
 def _atan2(y, x):
-    """Angle of (x, y) != 0 to float32 rounding; the interpreter lacks the library's."""
+    """Angle of (x, y) != 0 to float32 rounding; Triton's interpreter lacks atan2."""
     low, high = tl.minimum(tl.abs(x), tl.abs(y)), tl.maximum(tl.abs(x), tl.abs(y))
-    steep = low > 0.41421357 * high  # over pi/8: turned by pi/4
+    steep = low > 0.41421357 * high  # above pi/8: rotated by pi/4
     t = tl.where(steep, low - high, low) / tl.where(steep, low + high, high)
     s = t * t
     # Minimax fit of (atan(t)/t - 1)/t^2; the relative error of the angle is 2e-8.
@@ -182,7 +182,7 @@ def _bending(x, hinges, numbers, slope, shares, count, frames, chunk: tl.constex
         square = dot(ex, ey, ez, ex, ey, ez)
         sine = -dot(rx, ry, rz, lx, ly, lz) * tl.sqrt(tl.maximum(square, 1e-18))
         cosine = dot(mx, my, mz, rx, ry, rz)
-        # As in the reference implementation, a collapsed hinge counts as flat and pulls nowhere.
+        # As in the reference implementation, a degenerate hinge counts as flat and has no gradient.
         collapsed = tl.abs(sine) + tl.abs(cosine) < tl.maximum(1e-6 * square * square, 1e-18)
         angle = tl.where(collapsed, 0.0, _atan2(sine, tl.where(collapsed, 1.0, cosine)))
         stiffness = tl.load(numbers + hinge * 2)
@@ -195,17 +195,17 @@ def _bending(x, hinges, numbers, slope, shares, count, frames, chunk: tl.constex
 
 @triton.jit
 def _turn(slope, index, number, frames, n, inside):
-    """What the hinge at `index` gains when its normal on this side turns; its sign is at `number`."""
+    """Derivative of a hinge's energy with respect to its angle, with the sign stored at `number`."""
     row = slope + tl.load(index).to(tl.int64) * frames
     return tl.load(number) * tl.load(row + n, mask=inside, other=0.0)
 
 
 @triton.jit
 def _pull(px, py, pz, qx, qy, qz, ab, bc, ca):
-    """Gradient in a of the three hinges of a triangle, which gain ab, bc and ca with their angles.
+    """Gradient at a of the three hinges of a triangle, whose energies have derivatives ab, bc and ca in their angles.
 
-    The angle at bc grows by -|bc| n/|n|^2 with a, where n is the normal p x q. At an edge that a is an end of, it
-    takes up the other tip's reaction: the part of it that the foot of that tip on the edge gives.
+    The angle at bc has the gradient -|bc| n/|n|^2 at a, where n is the normal p x q. At an edge that ends in a, its
+    share of the opposite tip's reaction follows from where the tip projects onto the edge.
     """
     nx, ny, nz = cross(px, py, pz, qx, qy, qz)
     dx, dy, dz = qx - px, qy - py, qz - pz

@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The exact nearest body vertex, with far groups of body vertices left out; `collision.nearest_vertex` holds the
-reference implementation.
+"""The exact nearest body vertex; reference: `collision.nearest_vertex`.
 
-Vertices of the garment come in blocks and those of the body in groups, both compact, each with its bounding box in
-every frame. A program owns one frame and a few blocks. For one block it looks at the group nearest to its middle:
-no vertex can be further from the body than from that. It then compares with the groups whose boxes are no further
-from the block's box than this bound, and with no other. Nothing is written twice with different values, and equal
-distances go to the vertex that stands first in the table of groups: results are the same in every run.
+Vertices of the garment come in compact blocks and those of the body in compact groups, each with its bounding box in
+every frame. A program owns one frame and a few blocks. For one block it first visits the group nearest to its centre,
+which bounds the distances. It then visits only the groups whose boxes are no further from the block's box than this
+bound. Of equally near vertices the first in the table of groups counts, so that results are deterministic.
 """
 
 from __future__ import annotations
@@ -16,14 +14,14 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-FRAMES = 32  # frames that a program of `_pack` turns from last to first
+FRAMES = 32  # frames that a program of `_pack` transposes
 CHUNK = 64  # groups whose boxes are compared with a block's at once
-RUN = 4  # blocks that a program of `_search` takes in turn, so that boxes stay in its cache
-# A gap is rounded no further than this share of itself, so no group is left out by rounding.
+RUN = 4  # blocks that a program of `_search` processes in turn, so that boxes stay in its cache
+# Bounds the relative rounding error of a gap, so that rounding skips no group.
 SAFE = tl.constexpr(1 - 1e-5)
 
 
-def nearest_kernel(x: Tensor, points: Tensor, blocks: Tensor, groups: Tensor) -> Tensor:
+def nearest_vertex_kernel(x: Tensor, points: Tensor, blocks: Tensor, groups: Tensor) -> Tensor:
     """Return the index of the nearest body vertex, int32 of shape (V, N).
 
     Args:
@@ -87,7 +85,7 @@ def _search(garment, garment_boxes, body, body_boxes, blocks, groups, found, fra
         for start in range(0, group_count, chunk):
             group = start + tl.arange(0, chunk)
             gap = _gaps(body_boxes, group, group_count, lx, ly, lz, hx, hy, hz)
-            # Written so that what is not a number rules nothing out.
+            # Written so that NaN skips no group.
             near = ~(gap * SAFE > bound)
             g = tl.min(tl.where(near, group, group_count), axis=0)
             while g < group_count:
@@ -100,7 +98,7 @@ def _search(garment, garment_boxes, body, body_boxes, blocks, groups, found, fra
         least = tl.min(best, axis=1)
         winner = tl.min(tl.where(best == least[:, None], place, 2147483647), axis=1)
         target = found + tl.load(blocks + v).to(tl.int64) * frames + frame
-        tl.store(target, tl.load(groups + winner))  # a vertex that fills up its block writes the same again
+        tl.store(target, tl.load(groups + winner))  # padding of a block writes the same value again
 
 
 @triton.jit

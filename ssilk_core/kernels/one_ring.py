@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The plane of the nearest body point, on the triangles around the nearest vertex; `collision.distance` holds the
-reference implementation.
+"""The nearest point on the triangles around the nearest body vertex; reference: `collision.distance`.
 
-A program owns one garment vertex in a block of frames: mostly its threads look at the same few triangles, and
-neighbouring frames are neighbours in memory.
+A program owns one garment vertex in a block of frames: its threads mostly visit the same few triangles, and
+consecutive frames are contiguous in memory.
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ BLOCK = 32  # frames of one program
 TINY = tl.constexpr(1e-30)
 
 
-def surface_kernel(
-    x: Tensor, index: Tensor, points: Tensor, normals: Tensor, rings: Tensor, far: float
+def one_ring_kernel(
+    x: Tensor, index: Tensor, points: Tensor, normals: Tensor, rings: Tensor, max_distance: float
 ) -> tuple[Tensor, Tensor]:
     """Return unit normals (V, 3, N) and offsets n . b (V, N) of the nearest body points b.
 
@@ -28,20 +27,21 @@ def surface_kernel(
         x: queries (V, 3, N); index: their nearest body vertices (V, N), int32.
         points, normals: of the body (B, 3, N).
         rings: neighbours around each vertex (`collision.one_ring.triangle_rings`), int32.
-        far: further than this from its nearest vertex [m], a query keeps that as its nearest point.
+        max_distance: queries further than this from their nearest vertex [m] use it as the nearest point.
     """
     x, points, normals = x.contiguous(), points.contiguous(), normals.contiguous()
     vertices, _, frames = x.shape
     assert points.numel() < 1 << 31  # body vertices are addressed by 32 bits
     normal, offset = torch.empty_like(x), x.new_empty(vertices, frames)
     grid = (vertices, triton.cdiv(frames, BLOCK))
-    _surface[grid](x, index, points, normals, rings, normal, offset, frames, rings.shape[1], far * far, BLOCK,
+    _surface[grid](x, index, points, normals, rings, normal, offset, frames, rings.shape[1],
+                   max_distance * max_distance, BLOCK,
                    num_warps=1)  # fmt: skip
     return normal, offset
 
 
 @triton.jit
-def _surface(x, index, points, normals, rings, normal, offset, frames, width, far, block: tl.constexpr):
+def _surface(x, index, points, normals, rings, normal, offset, frames, width, max_square, block: tl.constexpr):
     v = tl.program_id(0).to(tl.int64)
     n = tl.program_id(1) * block + tl.arange(0, block)
     inside = n < frames
@@ -49,7 +49,7 @@ def _surface(x, index, points, normals, rings, normal, offset, frames, width, fa
     ox, oy, oz = load3(points + first * 3 * frames, frames, n, inside)
     px, py, pz = load3(x + v * 3 * frames, frames, n, inside)
     px, py, pz = px - ox, py - oy, pz - oz
-    near = inside & (dot(px, py, pz, px, py, pz) < far)
+    near = inside & (dot(px, py, pz, px, py, pz) < max_square)
     ring = rings + first * width
     zero = tl.zeros_like(px)
     best, s_best, t_best, j_best, k_best = zero, zero, zero, first, first
@@ -73,9 +73,9 @@ def _surface(x, index, points, normals, rings, normal, offset, frames, width, fa
 
 @triton.jit
 def _closest(px, py, pz, ux, uy, uz, wx, wy, wz):
-    """Minimise |p - s u - t w|^2 over s, t >= 0, s + t <= 1; give s, t and the minimum less |p|^2.
+    """Minimise |p - s u - t w|^2 over s, t >= 0, s + t <= 1; return s, t and the minimum minus |p|^2.
 
-    The edge along u is left out: it was the edge along w one step before.
+    The edge along u is skipped, since it was the edge along w of the previous triangle.
     """
     d1, d2 = dot(ux, uy, uz, px, py, pz), dot(wx, wy, wz, px, py, pz)
     a, b, c = dot(ux, uy, uz, ux, uy, uz), dot(ux, uy, uz, wx, wy, wz), dot(wx, wy, wz, wx, wy, wz)
@@ -95,7 +95,7 @@ def _closest(px, py, pz, ux, uy, uz, wx, wy, wz):
 
 @triton.jit
 def _closest_alone(px, py, pz, ux, uy, uz, wx, wy, wz):
-    """As `_closest`, for a triangle that comes after no other: the edge along u counts too."""
+    """`_closest` for a single triangle, which includes the edge along u."""
     s, t, e = _closest(px, py, pz, ux, uy, uz, wx, wy, wz)
     along, length = dot(ux, uy, uz, px, py, pz), dot(ux, uy, uz, ux, uy, uz)
     alone = _clamped(along, length)
@@ -110,7 +110,7 @@ def _clamped(part, whole):
 
 @triton.jit
 def _mixed(values, frames, i, j, k, s, t, n, inside, near):
-    """(1 - s - t) of vertex i, s of j and t of k; the latter count only where `near`."""
+    """Interpolate (1 - s - t) of vertex i, s of j and t of k; j and k are loaded only where `near`."""
     ix, iy, iz = load3(values + i * 3 * frames, frames, n, inside)
     jx, jy, jz = load3(values + j * 3 * frames, frames, n, near)
     kx, ky, kz = load3(values + k * 3 * frames, frames, n, near)

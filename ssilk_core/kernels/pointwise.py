@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Energies of single vertices; `GarmentEnergy.gravity`, `.collision_of`, `.inertia` and `.drag` are the reference
-implementations.
+"""Energies of single vertices; reference: `GarmentEnergy.gravity`, `.collision_at`, `.inertia`, `.drag`.
 
-A program owns a block of frames and, for values, a few vertices, whose share of the sum it writes; for gradients one
-vertex. Nothing is written twice: results do not depend on the order.
+A program owns a block of frames. For values it sums over a few vertices and writes this partial sum; for gradients it
+owns one vertex. There are no atomics: results are deterministic.
 """
 
 from __future__ import annotations
@@ -17,10 +16,10 @@ from torch.autograd.function import once_differentiable
 from .vectors import dot, load3, store3
 
 FRAMES, WARPS = 128, 2  # frames and warps of one program
-VERTICES = 16  # that the program of a value sums over
+VERTICES = 16  # vertices that one program sums over
 
 
-def potential_kernel(
+def gravity_and_collision_kernel(
     x: Tensor,
     mass: Tensor,
     root: Tensor,
@@ -33,30 +32,30 @@ def potential_kernel(
 
     Args:
         x: positions (V, 3, N), the only argument with a gradient; mass: (V,).
-        root: where heights are taken from (3, N); gravity: acceleration (3, N) or (3, 1).
-        planes: that each vertex collides with: unit normals (V, 3, N) and offsets (V, N).
+        root: origin of heights (3, N); gravity: acceleration (3, N) or (3, 1).
+        planes: unit normals (V, 3, N) and offsets (V, N) of the plane that each vertex collides with.
     """
     rows = [values.detach().expand(3, x.shape[-1]).contiguous() for values in (root, gravity)]
     normal, offset = (values.detach().contiguous() for values in planes)
-    return _Potential.apply(x.contiguous(), mass, *rows, normal, offset, stiffness, margin)
+    return _GravityAndCollision.apply(x.contiguous(), mass, *rows, normal, offset, stiffness, margin)
 
 
-def kinetic_kernel(
+def inertia_and_drag_kernel(
     x: Tensor, mass: Tensor, last: Tensor, before: Tensor, shift: Tensor, inertia: float, drag: float
 ) -> tuple[Tensor, Tensor]:
     """Return inertia/2 sum m |x - 2 last + before|^2 and drag/2 sum m |x - last - shift|^2 [J], both (M,).
 
     Args:
         x: positions (V, 3, N), the only argument with a gradient; mass: (V,).
-        last, before: positions one and two frames ago (V, 3, M) of the first M frames of x; the others count nothing.
-        shift: where the air went since the last frame (3, M).
+        last, before: positions one and two frames ago (V, 3, M), for the first M frames of x only.
+        shift: displacement of the air since the last frame (3, M).
     """
     past = [_sliced(values.detach()) for values in (last, before)]
-    return _Kinetic.apply(x.contiguous(), mass, *past, shift.detach().contiguous(), inertia, drag)
+    return _InertiaAndDrag.apply(x.contiguous(), mass, *past, shift.detach().contiguous(), inertia, drag)
 
 
 def _sliced(values: Tensor) -> Tensor:
-    """Return (V, 3, M) as some frames of contiguous values; a copy only of what is not."""
+    """Return (V, 3, M) as a slice of frames of a contiguous tensor, copied only where it is not one."""
     _, width, step = values.stride()
     return values if step == 1 and values.stride(0) == 3 * width else values.contiguous()
 
@@ -65,14 +64,14 @@ def _blocks(frames: int) -> int:
     return triton.cdiv(frames, FRAMES)
 
 
-class _Potential(Function):
+class _GravityAndCollision(Function):
     @staticmethod
     def forward(ctx, x, mass, root, gravity, normal, offset, stiffness, margin):
         vertices, _, frames = x.shape
         ctx.save_for_backward(x, mass, gravity, normal, offset)
         ctx.penalty = stiffness, margin
         shares = x.new_empty(2, triton.cdiv(vertices, VERTICES), frames)
-        _potential[shares.shape[1], _blocks(frames)](
+        _gravity_and_collision[shares.shape[1], _blocks(frames)](
             *(x, mass, root, gravity, normal, offset, shares),
             *(stiffness, margin, vertices, frames, VERTICES, FRAMES),
             num_warps=WARPS,
@@ -85,7 +84,7 @@ class _Potential(Function):
         x = ctx.saved_tensors[0]
         vertices, _, frames = x.shape
         grad = x.new_empty(x.shape)
-        _potential_gradient[vertices, _blocks(frames)](
+        _gravity_and_collision_gradient[vertices, _blocks(frames)](
             *ctx.saved_tensors,
             *(values.contiguous() for values in upstream),
             *(grad, *ctx.penalty, frames, FRAMES),
@@ -94,7 +93,7 @@ class _Potential(Function):
         return grad, *[None] * 7
 
 
-class _Kinetic(Function):
+class _InertiaAndDrag(Function):
     @staticmethod
     def forward(ctx, x, mass, last, before, shift, inertia, drag):
         vertices, _, moving = last.shape
@@ -102,7 +101,7 @@ class _Kinetic(Function):
         ctx.weights = inertia, drag
         ctx.sizes = x.stride(1), last.stride(1), before.stride(1), moving
         shares = x.new_empty(2, triton.cdiv(vertices, VERTICES), moving)
-        _kinetic[shares.shape[1], _blocks(moving)](
+        _inertia_and_drag[shares.shape[1], _blocks(moving)](
             *(x, mass, last, before, shift, shares, inertia, drag),
             *(*ctx.sizes, vertices, VERTICES, FRAMES),
             num_warps=WARPS,
@@ -115,7 +114,7 @@ class _Kinetic(Function):
         x = ctx.saved_tensors[0]
         vertices, _, frames = x.shape
         grad = x.new_empty(x.shape)
-        _kinetic_gradient[vertices, _blocks(frames)](
+        _inertia_and_drag_gradient[vertices, _blocks(frames)](
             *ctx.saved_tensors,
             *(values.contiguous() for values in upstream),
             *(grad, *ctx.weights, *ctx.sizes, FRAMES),
@@ -126,13 +125,13 @@ class _Kinetic(Function):
 
 @triton.jit
 def _depth(px, py, pz, nx, ny, nz, offset, margin):
-    """How far a point lies within the margin: negative, else zero."""
+    """Penetration of a point into the margin: negative, else zero."""
     depth = dot(nx, ny, nz, px, py, pz) - offset - margin
-    return tl.where(depth > 0, 0.0, depth)  # unlike a minimum this passes NaN on
+    return tl.where(depth > 0, 0.0, depth)  # unlike a minimum this propagates NaN
 
 
 @triton.jit
-def _potential(
+def _gravity_and_collision(
     x,
     mass,
     root,
@@ -166,7 +165,7 @@ def _potential(
 
 
 @triton.jit
-def _potential_gradient(
+def _gravity_and_collision_gradient(
     x, mass, gravity, normal, offset, to_gravity, to_collision, grad, stiffness, margin, frames, block: tl.constexpr
 ):
     v = tl.program_id(0).to(tl.int64)
@@ -184,7 +183,7 @@ def _potential_gradient(
 
 @triton.jit
 def _moved(x, last, before, width, last_width, before_width, v, n, inside):
-    """What vertex v moved since the last frame, and by how much more than in the frame before that."""
+    """First and second backward differences of the position of vertex v."""
     px, py, pz = load3(x + v * 3 * width, width, n, inside)
     lx, ly, lz = load3(last + v * 3 * last_width, last_width, n, inside)
     bx, by, bz = load3(before + v * 3 * before_width, before_width, n, inside)
@@ -193,7 +192,7 @@ def _moved(x, last, before, width, last_width, before_width, v, n, inside):
 
 
 @triton.jit
-def _kinetic(
+def _inertia_and_drag(
     x,
     mass,
     last,
@@ -228,7 +227,7 @@ def _kinetic(
 
 
 @triton.jit
-def _kinetic_gradient(
+def _inertia_and_drag_gradient(
     x,
     mass,
     last,
@@ -251,7 +250,7 @@ def _kinetic_gradient(
     sx, sy, sz = load3(shift, moving, n, inside)
     dx, dy, dz, ax, ay, az = _moved(x, last, before, width, last_width, before_width, v, n, inside)
     weight = tl.load(mass + v)
-    # Both are zero for frames without a past.
+    # Both are zero for frames without previous positions.
     thrown = inertia * weight * tl.load(to_inertia + n, mask=inside, other=0.0)
     blown = drag * weight * tl.load(to_drag + n, mask=inside, other=0.0)
     gx, gy, gz = thrown * ax + blown * (dx - sx), thrown * ay + blown * (dy - sy), thrown * az + blown * (dz - sz)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Forward kinematics of proxies from 6D rotations, and its gradient; `model.decoder` holds the reference
-implementation.
+"""Forward kinematics of proxies from 6D rotations, and its gradient; reference: `model.decoder`.
 
-A program is one warp that owns a block of frames and walks over the proxies, parents first; backwards for the
-gradient, which it passes on from each proxy to its parent. No frame is another program's: there are no races.
+A program is one warp that owns a block of frames and iterates over the proxies, parents first. For the gradient it
+iterates backwards and accumulates each proxy's gradient into its parent's. Programs share no frames: there are no
+races.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from torch.autograd.function import once_differentiable
 
 from .vectors import cross, dot, load3, store3
 
-BLOCK = 32  # frames of one program: few, since the walk is what takes time
-SHORTEST = tl.constexpr(1e-8)  # length that a vector is divided by at least
+BLOCK = 32  # frames of one program: few, since the loop over proxies is sequential
+MIN_LENGTH = tl.constexpr(1e-8)  # floor for the length that a vector is divided by
 
 
 def proxies_kernel(six_d: Tensor, pivots: Tensor, parents: Tensor, character: Tensor) -> Tensor:
@@ -60,15 +60,15 @@ class _Proxies(Function):
 
 @triton.jit
 def _unit(x, y, z):
-    """A vector's direction, the inverse of its length, and whether the length is enough for one."""
+    """A vector's direction, the inverse of its length, and whether the length is above `MIN_LENGTH`."""
     length = tl.sqrt(dot(x, y, z, x, y, z))
-    scale = 1 / tl.maximum(length, SHORTEST)
-    return scale * x, scale * y, scale * z, scale, length >= SHORTEST
+    scale = 1 / tl.maximum(length, MIN_LENGTH)
+    return scale * x, scale * y, scale * z, scale, length >= MIN_LENGTH
 
 
 @triton.jit
 def _unit_gradient(x, y, z, scale, enough, gx, gy, gz):
-    """The gradient of a vector whose direction (x, y, z) has the gradient (gx, gy, gz)."""
+    """Gradient of a vector from the gradient (gx, gy, gz) of its direction (x, y, z)."""
     along = tl.where(enough, dot(x, y, z, gx, gy, gz), 0.0)
     return scale * (gx - along * x), scale * (gy - along * y), scale * (gz - along * z)
 
@@ -87,7 +87,7 @@ def _axes(six_d, frames, n, inside):
 
 @triton.jit
 def _axes_gradient(six_d, frames, n, inside, gax, gay, gaz, gbx, gby, gbz, gcx, gcy, gcz):
-    """The gradient of a 6D rotation from those of its three axes."""
+    """Gradient of a 6D rotation from those of its three axes."""
     ax, ay, az = load3(six_d, frames, n, inside)
     vx, vy, vz = load3(six_d + 3 * frames, frames, n, inside)
     ax, ay, az, scale_a, enough_a = _unit(ax, ay, az)
@@ -97,7 +97,7 @@ def _axes_gradient(six_d, frames, n, inside, gax, gay, gaz, gbx, gby, gbz, gcx, 
     tx, ty, tz = cross(gcx, gcy, gcz, ax, ay, az)
     gvx, gvy, gvz = _unit_gradient(bx, by, bz, scale_b, enough_b, gbx + tx, gby + ty, gbz + tz)
     tx, ty, tz = cross(bx, by, bz, gcx, gcy, gcz)
-    # The second is v - (a.v) a before it gets its length.
+    # The second is v - (a.v) a before normalisation.
     part = dot(ax, ay, az, gvx, gvy, gvz)
     gax, gay, gaz = gax + tx - along * gvx, gay + ty - along * gvy, gaz + tz - along * gvz
     gax, gay, gaz = gax - part * vx, gay - part * vy, gaz - part * vz
@@ -127,7 +127,7 @@ def _compose(six_d, pivots, parents, matrices, joints, proxies, frames, block: t
             a, b, c = dot(sx, sy, sz, ax, ay, az), dot(sx, sy, sz, bx, by, bz), dot(sx, sy, sz, cx, cy, cz)
             store3(made + row * 4 * frames, frames, n, inside, a, b, c)
             tl.store(made + (row * 4 + 3) * frames + n, dot(sx, sy, sz, ox, oy, oz) + shift, mask=inside)
-        tl.debug_barrier()  # what was written is read again by the children
+        tl.debug_barrier()  # children read what was written
 
 
 @triton.jit
@@ -168,4 +168,4 @@ def _compose_gradient(six_d, pivots, parents, matrices, total, grad, joints, pro
         )
         store3(grad + p * 6 * frames, frames, n, inside, gax, gay, gaz)
         store3(grad + (p * 6 + 3) * frames, frames, n, inside, gbx, gby, gbz)
-        tl.debug_barrier()  # what was added to a parent is read again when its turn comes
+        tl.debug_barrier()  # a parent reads what its children added

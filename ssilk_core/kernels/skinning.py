@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Linear blend skinning over sparse influences, and its gradients; `skinning` holds the reference implementations.
+"""Linear blend skinning over sparse influences, and its gradients; reference: `skinning`.
 
-A program is one warp: it owns a block of frames and takes a few vertices in turn, so that joints and weights are
+A program is one warp: it owns a block of frames and processes a few vertices in turn, so that joints and weights are
 scalars and matrices stay in the cache. Homogeneous coordinates run along the first axis of its tensors, which lies
-in registers. The gradient of a matrix is gathered over its joint's own vertices, in parts that are summed afterwards.
-Nothing is written twice: results do not depend on the order.
+in registers. The gradient of a matrix is gathered over its joint's vertices, in parts that are summed afterwards.
+There are no atomics: results are deterministic.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torch.autograd.function import once_differentiable
 from .vectors import dot, load3, store3
 
 BLOCK = 128  # frames of one program
-VERTICES = 1  # that one program takes in turn
+VERTICES = 1  # vertices that one program processes in turn
 
 
 def skin_kernel(
@@ -108,7 +108,7 @@ def _matrix_gradient(rest, offsets, weights, upstream, entries, starts, found):
 
 @triton.jit
 def _columns(frames, block: tl.constexpr):
-    """The frames of a block (1, block); where its four columns lie in a matrix row (4, block); masks of both."""
+    """Frames of a block (1, block), offsets of its four columns in a matrix row (4, block), and both masks."""
     n = tl.program_id(1) * block + tl.arange(0, block)[None, :]
     r = tl.arange(0, 4)[:, None]
     return n, r * frames + n, n < frames, (r < 3) & (n < frames)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The smoothed distance to a body's surface; `collision.smoothed_distance` holds the reference implementation.
+"""The smoothed distance to a body's surface; reference: `collision.smoothed_distance`.
 
-A program owns one garment vertex in a block of frames and looks at its triangles one after another, closely at those
-whose bounding sphere is within reach in any of the frames. Sums over them are kept relative to the nearest so far, so
-that one pass is enough.
+A program owns one garment vertex in a block of frames. It iterates over the vertex's triangles and evaluates those
+whose bounding sphere is within reach in any of the frames. Sums are kept relative to the nearest triangle so far, so
+that one pass suffices.
 """
 
 from __future__ import annotations
@@ -27,43 +27,44 @@ def smoothed_distance_kernel(
     normals: Tensor,
     faces: Tensor,
     spheres: Tensor,
-    listed: Tensor | None,
+    candidates: Tensor | None,
     *,
-    far: float,
-    touching: float,
-    sharpness: float,
-    slack: float,
-    on_edge: float,
+    max_distance: float,
+    surface_epsilon: float,
+    exponent: float,
+    search_margin: float,
+    edge_epsilon: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return gradients (V, 3, N), smoothed distances (V, N) and their curvature (V, 3, 3, N).
 
-    They are those of `collision.smoothed_distance.smoothed_distance`, which has the constants, and of the nearest
-    vertex's plane for vertices `far` from it.
+    The values are those of `collision.smoothed_distance.smoothed_distance`; for queries further than `max_distance`
+    from the nearest vertex, those of its tangent plane.
 
     Args:
         x: queries (V, 3, N); index: their nearest body vertices (V, N), int32.
         points, normals: of the body (B, 3, N).
         faces: triangles (F, 3), and `spheres` around them: centre and radius, (F, 4, N).
-        listed: those that each query may find, filled up by -1, shape (V, L); any by default.
+        candidates: triangles that each query can find, padded with -1, shape (V, L); None for all.
     """
     x, points, normals = x.contiguous(), points.contiguous(), normals.contiguous()
     vertices, _, frames = x.shape
     assert points.numel() < 1 << 31  # body vertices are addressed by 32 bits
     faces, spheres = faces.int().contiguous(), spheres.contiguous()
-    table = faces.new_zeros(1) if listed is None else listed.int().contiguous()
-    width = len(faces) if listed is None else listed.shape[1]
+    table = faces.new_zeros(1) if candidates is None else candidates.int().contiguous()
+    width = len(faces) if candidates is None else candidates.shape[1]
     normal, distance = torch.empty_like(x), x.new_empty(vertices, frames)
     curvature = x.new_empty(vertices, 3, 3, frames)
     grid = (vertices, triton.cdiv(frames, BLOCK))
-    _rounded[grid](x, index, points, normals, faces, spheres, table, normal, distance, curvature, frames, width,
-                   far * far, touching, sharpness, on_edge, 1 + slack, listed is not None, BLOCK,
-                   num_warps=1)  # fmt: skip
+    _smoothed[grid](x, index, points, normals, faces, spheres, table, normal, distance, curvature, frames, width,
+                    max_distance * max_distance, surface_epsilon, exponent, edge_epsilon, 1 + search_margin,
+                    candidates is not None, BLOCK, num_warps=1)  # fmt: skip
     return normal, distance, curvature
 
 
 @triton.jit
-def _rounded(x, index, points, normals, faces, spheres, table, normal, distances, curvature, frames, width, far,
-             touching, sharpness, on_edge, slack, listed: tl.constexpr, block: tl.constexpr):  # fmt: skip
+def _smoothed(x, index, points, normals, faces, spheres, table, normal, distances, curvature, frames, width,
+              max_square, surface_epsilon, exponent, edge_epsilon, search_margin, candidates: tl.constexpr,
+              block: tl.constexpr):  # fmt: skip
     v = tl.program_id(0).to(tl.int64)
     n = tl.program_id(1) * block + tl.arange(0, block)
     inside = n < frames
@@ -72,23 +73,23 @@ def _rounded(x, index, points, normals, faces, spheres, table, normal, distances
     ox, oy, oz = load3(points + first * 3 * frames, frames, n, inside)
     mx, my, mz = load3(normals + first * 3 * frames, frames, n, inside)
     square = dot(qx - ox, qy - oy, qz - oz, qx - ox, qy - oy, qz - oz)
-    near = inside & (square < far)
-    reach = tl.sqrt(square) * slack * 1.000001  # the nearest vertex is not nearer than the nearest point
+    near = inside & (square < max_square)
+    radius = tl.sqrt(square) * search_margin * 1.000001  # the nearest vertex is not nearer than the nearest point
     zero = tl.zeros_like(qx)
     best = zero + 1e30
     i_best, j_best, k_best, s_best, t_best = first, first, first, zero, zero
-    wx, wy, wz = zero, zero, zero  # away from the nearest
+    wx, wy, wz = zero, zero, zero  # direction away from the nearest
     total, gx, gy, gz, hx, hy, hz = zero, zero, zero, zero, zero, zero, zero
     xx, xy, xz, yy, yz, zz = zero, zero, zero, zero, zero, zero
     for place in range(tl.where(tl.max(near.to(tl.int32), axis=0) > 0, width, 0)):
         face = place
-        if listed:
+        if candidates:
             face = tl.load(table + v * width + place)
         there = near & (zero + face >= 0)
         face = tl.maximum(face, 0)
         ball = spheres + face.to(tl.int64) * 4 * frames
         ax, ay, az = load3(ball, frames, n, there)
-        apart = reach + tl.load(ball + 3 * frames + n, mask=there, other=0.0)
+        apart = radius + tl.load(ball + 3 * frames + n, mask=there, other=0.0)
         there = there & (dot(qx - ax, qy - ay, qz - az, qx - ax, qy - ay, qz - az) <= apart * apart)
         if tl.max(there.to(tl.int32), axis=0) > 0:
             i, j, k = tl.load(faces + 3 * face), tl.load(faces + 3 * face + 1), tl.load(faces + 3 * face + 2)
@@ -102,8 +103,8 @@ def _rounded(x, index, points, normals, faces, spheres, table, normal, distances
             r = tl.maximum(tl.sqrt(dot(px, py, pz, px, py, pz)), TINY)
             px, py, pz = px / r, py / r, pz / r
             closer = there & (r < best)
-            shrink = tl.exp2(sharpness * tl.log2(tl.where(closer, r / best, 1.0)))
-            weight = tl.exp2(sharpness * tl.log2(tl.where(closer, 1.0, best / r)))
+            shrink = tl.exp2(exponent * tl.log2(tl.where(closer, r / best, 1.0)))
+            weight = tl.exp2(exponent * tl.log2(tl.where(closer, 1.0, best / r)))
             weight = tl.where(there, weight, 0.0)
             best = tl.where(closer, r, best)
             i_best, j_best = tl.where(closer, i, i_best), tl.where(closer, j, j_best)
@@ -119,9 +120,9 @@ def _rounded(x, index, points, normals, faces, spheres, table, normal, distances
             gx, gy, gz = gx * shrink + weight * px, gy * shrink + weight * py, gz * shrink + weight * pz
     found = near & (best < 1e29)
     total = tl.where(found, total, 1.0)
-    distance = best * tl.exp2(-tl.log2(total) / sharpness)
+    distance = best * tl.exp2(-tl.log2(total) / exponent)
     hx, hy, hz = hx / total, hy / total, hz / total
-    scale = (sharpness + 1) / tl.maximum(distance, TINY)
+    scale = (exponent + 1) / tl.maximum(distance, TINY)
     xx, xy, xz = (xx / total - hx * hx) * scale, (xy / total - hx * hy) * scale, (xz / total - hx * hz) * scale
     yy, yz, zz = (yy / total - hy * hy) * scale, (yz / total - hy * hz) * scale, (zz / total - hz * hz) * scale
     scale = distance / total
@@ -132,7 +133,7 @@ def _rounded(x, index, points, normals, faces, spheres, table, normal, distances
     nx, ny, nz = nx / length, ny / length, nz / length
     within = found & (dot(wx, wy, wz, nx, ny, nz) < 0)
     sign = tl.where(within, -1.0, 1.0)
-    touches = found & (best <= touching)
+    touches = found & (best <= surface_epsilon)
     gx, gy, gz = tl.where(touches, nx, sign * gx), tl.where(touches, ny, sign * gy), tl.where(touches, nz, sign * gz)
     distance = sign * tl.where(touches, best, distance)
     gx, gy, gz = tl.where(found, gx, mx), tl.where(found, gy, my), tl.where(found, gz, mz)
@@ -141,7 +142,7 @@ def _rounded(x, index, points, normals, faces, spheres, table, normal, distances
     tl.store(distances + v * frames + n, tl.where(found, distance, far_off), mask=inside)
 
     # Inside, the nearest edge or corner: (1 - u u' - e e') / r.
-    ex, ey, ez, bends = _edge(points, frames, i_best, j_best, k_best, s_best, t_best, on_edge, n, inside)
+    ex, ey, ez, bends = _edge(points, frames, i_best, j_best, k_best, s_best, t_best, edge_epsilon, n, inside)
     scale = tl.where(bends, 1.0, 0.0) / best
     use, out = found & ~touches, curvature + v * 9 * frames
     xx = tl.where(use, tl.where(within, (1 - wx * wx - ex * ex) * scale, xx), 0.0)
@@ -156,9 +157,9 @@ def _rounded(x, index, points, normals, faces, spheres, table, normal, distances
 
 
 @triton.jit
-def _edge(points, frames, i, j, k, s, t, on_edge, n, inside):
-    """The direction of the edge that a point is on, zero on a corner or within, and whether it is on either."""
-    none_i, none_j, none_k = 1 - s - t <= on_edge, s <= on_edge, t <= on_edge
+def _edge(points, frames, i, j, k, s, t, edge_epsilon, n, inside):
+    """Direction of the edge that a point lies on, else zero, and whether it lies on an edge or corner."""
+    none_i, none_j, none_k = 1 - s - t <= edge_epsilon, s <= edge_epsilon, t <= edge_epsilon
     many = none_i.to(tl.int32) + none_j.to(tl.int32) + none_k.to(tl.int32)
     start = tl.where(none_i, j, tl.where(none_j, k, i))
     stop = tl.where(none_i, k, tl.where(none_j, i, j))

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A step of the spring in two launches beside those of S; `model.integrators.SpringVerlet.advance` is the reference
-implementation.
+"""A step of the damped spring in two launches; reference: `model.integrators.SpringVerlet.advance`.
 
-A program owns a row. Steps wait for one another, and so small that starting a kernel takes longer than running it.
+A program owns a row. Steps are sequential and so small that launching a kernel takes longer than running it.
 """
 
 from __future__ import annotations
@@ -13,10 +12,10 @@ import triton.language as tl
 from torch import Tensor
 
 
-def seen_kernel(
+def stepper_input_kernel(
     before: Tensor, now: Tensor, rest: Tensor, pose: Tensor, beta: Tensor, scales: tuple[float, float]
 ) -> Tensor:
-    """Return what S sees, [now, a v, b (rest - now - beta v), pose] with v = now - before, (rows, 3 latent + D).
+    """Return the input of S, [now, a v, b (rest - now - beta v), pose] with v = now - before, (rows, 3 latent + D).
 
     Args:
         before, now, rest: states (rows, latent), float32; pose: (rows, D); beta: (latent,).
@@ -24,39 +23,39 @@ def seen_kernel(
     """
     rows, latent = now.shape
     before, now, rest, pose = (values.contiguous() for values in (before, now, rest, pose))
-    seen = now.new_empty(rows, 3 * latent + pose.shape[1])
-    _seen[rows,](before, now, rest, pose, beta, seen, *scales, latent, pose.shape[1],
+    inputs = now.new_empty(rows, 3 * latent + pose.shape[1])
+    _stepper_input[rows,](before, now, rest, pose, beta, inputs, *scales, latent, pose.shape[1],
                  triton.next_power_of_2(latent), triton.next_power_of_2(pose.shape[1]), num_warps=1)  # fmt: skip
-    return seen
+    return inputs
 
 
-def next_kernel(
+def next_state_kernel(
     past: tuple[Tensor, Tensor],
     rest: Tensor,
-    given: tuple[Tensor, Tensor],
-    roused: Tensor,
+    outputs: tuple[Tensor, Tensor],
+    rate_allowance: Tensor,
     springs: tuple[Tensor, Tensor],
     limits: tuple[float, ...],
 ) -> Tensor:
-    """Return the next state within its bound, shape (rows, latent).
+    """Return the next state, clamped to its bound, shape (rows, latent).
 
     Args:
-        past: the two states before; rest: the quasi-static one, all (rows, latent), float32.
-        given: what S gives of the frame, and at rest.
-        roused: what the motion of the pose allows, (rows, 1).
-        springs: beta and the shares s (latent,) of k = stiffness / (1 + exp(-s)).
-        limits: stiffness, the most that S gives, reach, own share, push and bound.
+        past: z_{t-2} and z_{t-1}; rest: the quasi-static state; all (rows, latent), float32.
+        outputs: the output of S for this frame, and at rest.
+        rate_allowance: what the rates of the pose allow S to add, (rows, 1).
+        springs: beta, and s (latent,) in k = stiffness / (1 + exp(-s)).
+        limits: stiffness, max_output, output_scale, state_allowance, max_step and bound.
     """
     rows, latent = rest.shape
-    tensors = (values.contiguous() for values in (*past, rest, *given, roused, *springs))
+    tensors = (values.contiguous() for values in (*past, rest, *outputs, rate_allowance, *springs))
     state = torch.empty_like(rest, memory_format=torch.contiguous_format)
-    _next[rows,](*tensors, state, *limits, latent, triton.next_power_of_2(latent), num_warps=1)
+    _next_state[rows,](*tensors, state, *limits, latent, triton.next_power_of_2(latent), num_warps=1)
     return state
 
 
 @triton.jit
-def _seen(before, now, rest, pose, beta, seen, of_velocity, of_distance, latent, sizes, block: tl.constexpr,
-          block_pose: tl.constexpr):  # fmt: skip
+def _stepper_input(before, now, rest, pose, beta, inputs, of_velocity, of_distance, latent, sizes,
+                   block: tl.constexpr, block_pose: tl.constexpr):  # fmt: skip
     row = tl.program_id(0).to(tl.int64)
     at = tl.arange(0, block)
     here = at < latent
@@ -64,7 +63,7 @@ def _seen(before, now, rest, pose, beta, seen, of_velocity, of_distance, latent,
     velocity = z - last
     forward = z + tl.load(beta + at, mask=here, other=0.0) * velocity
     away = _rows(rest, row, latent, at, here) - forward
-    target = seen + row * (3 * latent + sizes)
+    target = inputs + row * (3 * latent + sizes)
     tl.store(target + at, z, mask=here)
     tl.store(target + latent + at, of_velocity * velocity, mask=here)
     tl.store(target + 2 * latent + at, of_distance * away, mask=here)
@@ -74,8 +73,8 @@ def _seen(before, now, rest, pose, beta, seen, of_velocity, of_distance, latent,
 
 
 @triton.jit
-def _next(before, now, rest, moved, held, roused, beta, share, state, stiffness, most, reach, own_share, push, bound,
-          latent, block: tl.constexpr):  # fmt: skip
+def _next_state(before, now, rest, output, output_at_rest, rate_allowance, beta, share, state, stiffness, max_output,
+                output_scale, state_allowance, max_step, bound, latent, block: tl.constexpr):  # fmt: skip
     row = tl.program_id(0).to(tl.int64)
     at = tl.arange(0, block)
     here = at < latent
@@ -84,12 +83,15 @@ def _next(before, now, rest, moved, held, roused, beta, share, state, stiffness,
     forward = z + tl.load(beta + at, mask=here, other=0.0) * velocity
     constant = stiffness * tl.sigmoid(tl.load(share + at, mask=here, other=0.0))
     spring = constant * (_rows(rest, row, latent, at, here) - forward)
-    added = reach * (_clamped(_rows(moved, row, latent, at, here), most) - _rows(held, row, latent, at, here))
-    allowed = own_share * (_length(spring) + _length(velocity)) + tl.load(roused + row)
+    clamped = _clamped(_rows(output, row, latent, at, here), max_output)
+    added = output_scale * (clamped - _rows(output_at_rest, row, latent, at, here))
+    allowed = state_allowance * (_length(spring) + _length(velocity)) + tl.load(rate_allowance + row)
     size = _length(added)
     longest = allowed / tl.where(size < 1e-12, 1e-12, size)
-    added *= tl.where(longest > 1, 1.0, longest)  # unlike a maximum and a minimum these pass NaN on
-    tl.store(state + row * latent + at, _limited(forward + _limited(spring + added, push), bound), mask=here)
+    added *= tl.where(longest > 1, 1.0, longest)  # unlike a maximum and a minimum these propagate NaN
+    tl.store(
+        state + row * latent + at, _soft_clamp(forward + _soft_clamp(spring + added, max_step), bound), mask=here
+    )
 
 
 @triton.jit
@@ -103,16 +105,16 @@ def _length(values):
 
 
 @triton.jit
-def _clamped(values, most):
-    """Values within a bound; what is not a number stays so."""
-    values = tl.where(values > most, most, values)
-    return tl.where(values < -most, -most, values)
+def _clamped(values, bound):
+    """Clamp values to a bound; NaN stays NaN."""
+    values = tl.where(values > bound, bound, values)
+    return tl.where(values < -bound, -bound, values)
 
 
 @triton.jit
-def _limited(values, bound):
-    """`model.integrators.limited`; tanh x = 2 / (1 + exp(-2 x)) - 1."""
+def _soft_clamp(values, bound):
+    """`model.integrators.soft_clamp`; tanh x = 2 / (1 + exp(-2 x)) - 1."""
     half = bound / 2
     inner = _clamped(values, half)
-    bent = inner + half * (2 * tl.sigmoid(2 * (values - inner) / tl.maximum(half, 1e-30)) - 1)
-    return tl.where(bound > 0, bent, values)
+    clamped = inner + half * (2 * tl.sigmoid(2 * (values - inner) / tl.maximum(half, 1e-30)) - 1)
+    return tl.where(bound > 0, clamped, values)

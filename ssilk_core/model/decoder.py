@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From blendshape weights and proxy rotations to vertices, differentiably (paper, Sections 3.3 and 3.4).
+"""Differentiable decoder: from blendshape weights and proxy rotations to vertices (paper, Sections 3.3 and 3.4).
 
 Layouts keep frames last: transforms (joints, 3, 4, N), positions (V, 3, N).
 
-A skinning matrix S_j takes the bind pose to the posed world. A proxy turns about its own bind position p inside
-its parent's frame, so S_p = S_parent [R', p - R' p], with R' the network's rotation in the axes of the bind pose.
-The local rotation that a file stores is P^T R' B, with B and P the bind rotations of the proxy and its parent.
+A skinning matrix S_j maps the bind pose to the posed world. A proxy rotates about its bind position p in its parent's
+frame: S_p = S_parent [R', p - R' p], with R' the network's rotation in the axes of the bind pose. A file stores the
+local rotation P^T R' B, with B and P the bind rotations of the proxy and its parent.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def rotation_from_six_d(values: Tensor) -> Tensor:
 
 
 def compose(left: Tensor, right: Tensor) -> Tensor:
-    """Multiply affine transforms (..., 3, 4, N), left after right."""
+    """Multiply affine transforms (..., 3, 4, N): first `right`, then `left`."""
     linear, moved = left[..., :3, :], left[..., 3:, :]
     product = torch.einsum("...abn,...bcn->...acn", linear, right)
     return torch.cat([product[..., :3, :], product[..., 3:, :] + moved], dim=-2)
@@ -42,9 +42,9 @@ class Decoder(nn.Module):
         scene: garment, rig and character.
         shapes: blendshapes K.
         generator: source of the initial blendshapes.
-        activations: what the network gives for them, where it is more than K. Fixed linear combinations of these,
-            `readout` (K, activations) with rows whose absolute values sum to one, then activate the blendshapes
-            about the mean displacement `offset` (V', 3) [m] of the vertices that are not pinned.
+        activations: number of activations that the network outputs, where it is more than K. Fixed linear
+            combinations of these, `readout` (K, activations) with rows whose absolute values sum to one, then weight
+            the blendshapes, relative to the mean displacement `offset` (V', 3) [m] of vertices that are not pinned.
     """
 
     rest: Tensor
@@ -59,26 +59,26 @@ class Decoder(nn.Module):
     def __init__(self, scene: Scene, shapes: int, generator: torch.Generator, activations: int = 0) -> None:
         super().__init__()
         rig = scene.rig
-        self.proxy_count, self.shape_count, self.given = rig.proxy_count, shapes, activations or shapes
+        self.proxy_count, self.shape_count, self.activation_count = rig.proxy_count, shapes, activations or shapes
         self.is_reduced = activations > 0
-        self.above = tuple(rig.parents.tolist())  # as numbers too, which need not be fetched from a GPU
+        self.parent_indices = tuple(rig.parents.tolist())  # as Python numbers, without a copy from the GPU
         self.skin = Skinning(rig.skin, range(scene.character.skeleton.joint_count, len(scene.joint_names)))
         free = np.flatnonzero(scene.classes != PINNED)
         self._constant("rest", scene.garment.mesh.points)
         self._constant("pivots", rig.bind_transforms[:, :3, 3])
         self._constant("parents", rig.parents)
         self._constant("free", free)
-        # Minus infinity stays what it is: training gives no vertex another joint.
+        # Minus infinity never changes: training adds no joints to a vertex.
         weights = rig.skin.weights
         self._constant("logits", np.log(weights, out=np.full_like(weights, -np.inf), where=weights > 0))
         self._constant("identity", np.array([1.0, 0, 0, 0, 1, 0]))
         self.skin_offset = nn.Parameter(torch.zeros(len(free), weights.shape[1]))
         self.shapes = nn.Parameter(1e-3 * torch.randn(len(free), 3, shapes, generator=generator))
-        self.register_buffer("readout", torch.eye(shapes, self.given), persistent=self.is_reduced)
+        self.register_buffer("readout", torch.eye(shapes, self.activation_count), persistent=self.is_reduced)
         self.register_buffer("offset", torch.zeros(len(free), 3), persistent=self.is_reduced)
 
     def _constant(self, name: str, values: np.ndarray) -> None:
-        """Register a constant that is rebuilt from the scene, hence not saved; floats become float32."""
+        """Register a constant that is rebuilt from the scene and so not saved; floats become float32."""
         tensor = torch.as_tensor(np.array(values))
         self.register_buffer(name, tensor.float() if tensor.is_floating_point() else tensor, persistent=False)
 
@@ -89,13 +89,13 @@ class Decoder(nn.Module):
 
     @property
     def output_count(self) -> int:
-        """Numbers the network must give for each frame: blendshape activations and 6 P for the proxies."""
-        return self.given + 6 * self.proxy_count
+        """Outputs of the network for each frame: blendshape activations, and 6 for each of P proxies."""
+        return self.activation_count + 6 * self.proxy_count
 
     @property
     def has_constant(self) -> bool:
-        """Whether a file needs one more shape, of constant weight."""
-        return self.given > 0
+        """Whether a file needs one more shape with a constant weight."""
+        return self.activation_count > 0
 
     def activations(self, output: Tensor) -> tuple[Tensor, Tensor]:
         """Split network output (N, K + 6 P) into activations (K, N) in [-1, 1] and rotations (P, 3, 3, N)."""
@@ -103,8 +103,8 @@ class Decoder(nn.Module):
         return activation, rotation_from_six_d(six_d)
 
     def _split(self, output: Tensor) -> tuple[Tensor, Tensor]:
-        delta = output[:, self.given :].T.reshape(self.proxy_count, 6, output.shape[0])
-        activation = torch.tanh(output[:, : self.given].T)
+        delta = output[:, self.activation_count :].T.reshape(self.proxy_count, 6, output.shape[0])
+        activation = torch.tanh(output[:, : self.activation_count].T)
         return self.readout @ activation if self.is_reduced else activation, self.identity[:, None] + delta
 
     def _influence_weights(self) -> Tensor:
@@ -125,7 +125,7 @@ class Decoder(nn.Module):
         offset = self.pivots[:, :, None] - torch.einsum("pabn,pb->pan", rotations, self.pivots)
         own = torch.cat([rotations, offset[:, :, None]], dim=2)
         matrices = [*character]
-        for parent, turn in zip(self.above, own):
+        for parent, turn in zip(self.parent_indices, own):
             matrices.append(compose(matrices[parent], turn))
         return torch.stack(matrices)
 
@@ -138,10 +138,10 @@ class Decoder(nn.Module):
         return self.proxy_matrices(rotation_from_six_d(six_d), character)
 
     def _offsets(self, activation: Tensor) -> Tensor | None:
-        """Return how far blendshapes move the rest shape (V, 3, N); pinned vertices stay."""
+        """Return the displacements by blendshapes (V, 3, N), zero for pinned vertices."""
         if not self.shape_count:
             return None
-        # Rows of zeros for pinned vertices cost less than putting the others in their places in every frame.
+        # Zero rows for pinned vertices cost less than scattering the others in every frame.
         shapes = self.shapes.new_zeros(len(self.rest), 3, self.shape_count).index_copy(0, self.free, self.shapes)
         return (shapes.flatten(0, 1) @ activation).reshape(len(self.rest), 3, activation.shape[1])
 

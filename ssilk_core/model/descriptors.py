@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The descriptors of `ssilk_core.descriptors`, with gravity, which depends on the augmentation, as tensors."""
+"""Gravity as part of the descriptors, as tensors, because training rotates it."""
 
 from __future__ import annotations
 

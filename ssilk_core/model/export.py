@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The network as one ONNX graph, for engines: a frame in, what bones and blendshapes do out."""
+"""The network as an ONNX graph for game engines: one frame in, joint rotations and weights out."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ OUTPUTS = ("state", "weights", "rotations")
 
 
 class FrameNetwork(nn.Module):
-    """One frame of a garment in N characters; what deforms the mesh is outside, for engines skin by themselves."""
+    """The network for one frame of N characters, without skinning, which engines do themselves."""
 
-    above: Tensor
-    own: Tensor
+    parent_rotations: Tensor
+    bind_rotations: Tensor
 
     def __init__(self, model: GarmentModel) -> None:
         super().__init__()
         self.model = model
         joints, bind = model.scene.character.skeleton.joint_count, model.scene.bind_transforms[:, :3, :3]
-        self.register_buffer("above", torch.tensor(bind[model.scene.rig.parents]).float())
-        self.register_buffer("own", torch.tensor(bind[joints:]).float())
+        self.register_buffer("parent_rotations", torch.tensor(bind[model.scene.rig.parents]).float())
+        self.register_buffer("bind_rotations", torch.tensor(bind[joints:]).float())
 
     def forward(
         self, before: Tensor, now: Tensor, static: Tensor, rates: Tensor, begins: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the new latents (N, latent), and weights (N, K + 1) and local proxy rotations (N, P, 3, 3) of files.
+        """Return the new latents (N, latent), shape weights (N, K + 1) and local proxy rotations (N, P, 3, 3).
 
         Args:
             before, now: the two latents before this frame, (N, latent).
             static: static descriptors, gravity in each joint's frame included (N, S); rates: dynamic ones (N, R).
-            begins: whether the garment is at rest in this frame, as in the first two of a shot (N, 1), bool.
+            begins: whether the garment is at rest in this frame, as in the first two frames of a shot (N, 1), bool.
         """
         model = self.model
         rest = model.initial(static)
@@ -51,14 +51,14 @@ class FrameNetwork(nn.Module):
         weights = (activation.T + 1) / 2
         if model.decoder.has_constant:
             weights = torch.cat([weights, torch.ones_like(z[:, :1])], dim=1)
-        # Rotations of no proxies come of nothing: engines refuse to load what reshapes them.
-        turned = rotations.permute(3, 0, 1, 2) if len(self.own) else z.new_zeros(z.shape[0], 0, 3, 3)
-        local = self.above.mT @ turned @ self.own
+        # Without proxies, engines refuse to load the reshaping of empty tensors.
+        by_frame = rotations.permute(3, 0, 1, 2) if len(self.bind_rotations) else z.new_zeros(z.shape[0], 0, 3, 3)
+        local = self.parent_rotations.mT @ by_frame @ self.bind_rotations
         return z, weights.clamp(0, 1), local
 
 
 def export_onnx(model: GarmentModel, path: str | Path) -> None:
-    """Write the network as ONNX, whole or not at all; batches of any size are its first dimension."""
+    """Write the network as ONNX, atomically; the first dimension is a batch of any size."""
     network, config = FrameNetwork(model).eval(), model.config
     static, rates = descriptor_sizes(model.scene, model.joints)
     sizes = (config.latent, config.latent, static, rates)
@@ -70,13 +70,13 @@ def export_onnx(model: GarmentModel, path: str | Path) -> None:
             network, frame, dynamo=True, input_names=INPUTS, output_names=OUTPUTS, dynamic_shapes=shapes,
             opset_version=OPSET, verbose=False,
         )  # fmt: skip
-        assert program is not None  # only the older exporter gives nothing
+        assert program is not None  # only the older exporter returns None
         program.save(temporary, external_data=False)
 
 
 @contextmanager
 def _quietly() -> Iterator[None]:
-    """Keep back what the exporter says of its own insides."""
+    """Suppress the exporter's messages about its internals."""
     log = logging.getLogger("torch.onnx")
     level = log.level
     log.setLevel(logging.ERROR)

@@ -23,14 +23,14 @@ from ..config import (
 )
 from ..schemes import SCHEMES
 
-SMALLEST = 1e-12  # far below any length that counts; its square's inverse is finite in float32
+NORM_EPSILON = 1e-12  # far below any length that counts; its square's inverse is finite in float32
 
 
-def limited(values: Tensor, bound: float) -> Tensor:
-    """Return values kept within a bound b; unlimited for a bound of zero.
+def soft_clamp(values: Tensor, bound: float) -> Tensor:
+    """Clamp values smoothly to a bound b; a bound of zero changes zero.
 
-    The identity up to h = b / 2, so that steps do not draw a state well within its bound towards zero. Beyond, it is
-    h + h tanh((|v| - h) / h), which is smooth and never passes b.
+    It is the identity up to h = b / 2, so that it does not damp states well within the bound. Beyond, it is
+    h + h tanh((|v| - h) / h), which never exceeds b.
     """
     if not bound:
         return values
@@ -44,19 +44,19 @@ def length(vectors: Tensor) -> Tensor:
     return torch.linalg.vector_norm(vectors, dim=1, keepdim=True)
 
 
-def shortened(vectors: Tensor, longest: Tensor) -> Tensor:
-    """Return rows (batch, n) no longer than (batch, 1), with their directions."""
-    return vectors * (longest / length(vectors).clamp_min(SMALLEST)).clamp(max=1)
+def clip_norm(vectors: Tensor, longest: Tensor) -> Tensor:
+    """Clip the norm of each row (batch, n) to `longest` (batch, 1); directions stay."""
+    return vectors * (longest / length(vectors).clamp_min(NORM_EPSILON)).clamp(max=1)
 
 
 class Integrator(nn.Module, ABC):
-    """Advances z from two past states.
+    """Advances z from the two states before it.
 
     `config.latent_bound` limits each new state, so that no rollout leaves the range that the decoder was trained on.
 
     Args:
         config: bounds and sizes.
-        rates: how many of the last entries of a dynamic descriptor are zero while the character holds still.
+        rates: number of last entries of a dynamic descriptor that are zero while the character holds still.
 
     Attributes:
         scheme: its entry in `schemes.SCHEMES`.
@@ -75,23 +75,23 @@ class Integrator(nn.Module, ABC):
             rest: the quasi-static state P(theta_t) of the pose at t.
             pose: dynamic descriptor at t.
         """
-        return self.follow(stepper, before, now, self.precomputed(stepper, rest, pose))
+        return self.step(stepper, before, now, self.precompute(stepper, rest, pose))
 
-    def precomputed(self, stepper: nn.Module, rest: Tensor, pose: Tensor) -> tuple[Tensor, ...]:
-        """Return what steps need and no past state decides, rows of any number of frames at once."""
+    def precompute(self, stepper: nn.Module, rest: Tensor, pose: Tensor) -> tuple[Tensor, ...]:
+        """Return the inputs of `step` that depend on no state, for any number of frames at once."""
         return rest, pose
 
-    def follow(self, stepper: nn.Module, before: Tensor, now: Tensor, precomputed: Sequence[Tensor]) -> Tensor:
-        """Return z_t, shape (batch, latent), from the two states before and a frame's rows of `precomputed`."""
-        return self.bounded(self.advance(stepper, before, now, *precomputed))
+    def step(self, stepper: nn.Module, before: Tensor, now: Tensor, precomputed: Sequence[Tensor]) -> Tensor:
+        """Return z_t, shape (batch, latent), from the two states before it and the `precompute`d values."""
+        return self.bound(self.advance(stepper, before, now, *precomputed))
 
-    def bounded(self, z: Tensor) -> Tensor:
-        """Return states within their bound."""
-        return limited(z, self.config.latent_bound)
+    def bound(self, z: Tensor) -> Tensor:
+        """Clamp states to `config.latent_bound`."""
+        return soft_clamp(z, self.config.latent_bound)
 
     @abstractmethod
     def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *precomputed: Tensor) -> Tensor:
-        """Return z_t before it is limited, shape (batch, latent)."""
+        """Return z_t before it is clamped, shape (batch, latent)."""
 
 
 class SpringVerlet(Integrator):
@@ -106,7 +106,7 @@ class SpringVerlet(Integrator):
     hide it. Stiffnesses start spread from slow swings to quick following and stay under `config.stiffness`.
     `config.max_latent_step` limits spring and S together.
 
-    p is the only equilibrium, whatever S has learnt, because S gives at most half of what the spring gives, and
+    p is the only equilibrium, whatever S has learned, because S gives at most half of what the spring gives, and
     more only while something moves:
 
         |u| <= (|f| + |v|) / 2 + |rates of the pose| / 20
@@ -114,63 +114,62 @@ class SpringVerlet(Integrator):
     Motion seldom reaches this limit. Eq. 2's alpha is one: a larger one would undo the spring.
 
     S sees velocities and distances, scaled to order one. Given as states side by side they would be small
-    differences of large inputs, which networks learn last. `output_scale` is s.
+    differences of large inputs, which networks learn last. s is `OUTPUT_SCALE`.
     """
 
     slowest = 0.01
-    velocity_scale, distance_scale, output_scale = VELOCITY_SCALE, DISTANCE_SCALE, OUTPUT_SCALE
-    max_output, state_allowance, rate_allowance = MAX_OUTPUT, STATE_ALLOWANCE, RATE_ALLOWANCE
 
     def __init__(self, config: ModelConfig, rates: int = 0) -> None:
         super().__init__(config, rates)
         slowest = min(self.slowest, 0.05 * config.stiffness)
         start = torch.logspace(math.log10(slowest), math.log10(0.9 * config.stiffness), config.latent)
-        # S learns what this damps too much; what it damps too little would excite itself.
+        # S can learn to make up for too much damping; too little would let oscillations grow.
         self.beta = nn.Parameter(torch.full((config.latent,), 0.7))
         self.share = nn.Parameter(torch.logit(start / config.stiffness))
 
-    def precomputed(self, stepper: nn.Module, rest: Tensor, pose: Tensor) -> tuple[Tensor, ...]:
+    def precompute(self, stepper: nn.Module, rest: Tensor, pose: Tensor) -> tuple[Tensor, ...]:
         """Return the quasi-static state, the pose, the output of S at rest there, and |rates| / 20."""
         static, rates = pose.tensor_split([pose.shape[1] - self.rates], dim=1)
-        nothing = torch.zeros_like(rest)
-        at_rest = self._of(stepper, rest, nothing, nothing, static, torch.zeros_like(rates))
-        return rest, pose, at_rest, self.rate_allowance * length(rates)
+        zero = torch.zeros_like(rest)
+        at_rest = self._evaluate(stepper, rest, zero, zero, static, torch.zeros_like(rates))
+        return rest, pose, at_rest, RATE_ALLOWANCE * length(rates)
 
-    def follow(self, stepper: nn.Module, before: Tensor, now: Tensor, precomputed: Sequence[Tensor]) -> Tensor:
-        if torch.is_grad_enabled() or torch.compiler.is_compiling() or not kernels.serve(now):
-            return super().follow(stepper, before, now, precomputed)
-        from ..kernels.spring import next_kernel, seen_kernel
+    def step(self, stepper: nn.Module, before: Tensor, now: Tensor, precomputed: Sequence[Tensor]) -> Tensor:
+        if torch.is_grad_enabled() or torch.compiler.is_compiling() or not kernels.supports(now):
+            return super().step(stepper, before, now, precomputed)
+        from ..kernels.spring import next_state_kernel, stepper_input_kernel
 
         rest, pose, at_rest, rate_allowance = precomputed
-        moved = stepper(seen_kernel(before, now, rest, pose, self.beta, (self.velocity_scale, self.distance_scale)))
+        scales = VELOCITY_SCALE, DISTANCE_SCALE
+        output = stepper(stepper_input_kernel(before, now, rest, pose, self.beta, scales))
         stiffness, max_step, bound = self.config.stiffness, self.config.max_latent_step, self.config.latent_bound
-        limits = stiffness, self.max_output, self.output_scale, self.state_allowance, max_step, bound
-        return next_kernel((before, now), rest, (moved, at_rest), rate_allowance, (self.beta, self.share), limits)
+        limits = stiffness, MAX_OUTPUT, OUTPUT_SCALE, STATE_ALLOWANCE, max_step, bound
+        outputs, springs = (output, at_rest), (self.beta, self.share)
+        return next_state_kernel((before, now), rest, outputs, rate_allowance, springs, limits)
 
     def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *precomputed: Tensor) -> Tensor:
         rest, pose, at_rest, rate_allowance = precomputed
         velocity = now - before
         forward = now + self.beta * velocity
         away = rest - forward
-        moved = self._of(stepper, now, self.velocity_scale * velocity, self.distance_scale * away, pose)
+        output = self._evaluate(stepper, now, VELOCITY_SCALE * velocity, DISTANCE_SCALE * away, pose)
         spring = self.config.stiffness * torch.sigmoid(self.share) * away
-        allowed = self.state_allowance * (length(spring) + length(velocity)) + rate_allowance
-        return forward + limited(
-            spring + shortened(self.output_scale * (moved - at_rest), allowed), self.config.max_latent_step
-        )
+        allowance = STATE_ALLOWANCE * (length(spring) + length(velocity)) + rate_allowance
+        learned = clip_norm(OUTPUT_SCALE * (output - at_rest), allowance)
+        return forward + soft_clamp(spring + learned, self.config.max_latent_step)
 
-    def _of(self, stepper: nn.Module, *seen: Tensor) -> Tensor:
-        return stepper(torch.cat(seen, dim=1)).clamp(-self.max_output, self.max_output)
+    def _evaluate(self, stepper: nn.Module, *inputs: Tensor) -> Tensor:
+        return stepper(torch.cat(inputs, dim=1)).clamp(-MAX_OUTPUT, MAX_OUTPUT)
 
 
 class QuasiStatic(Integrator):
-    """z_t = P(theta_t), with no stepper and no past, for garments without loose parts."""
+    """z_t = P(theta_t), with no stepper and no earlier states, for garments without loose vertices."""
 
     def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *precomputed: Tensor) -> Tensor:
         return precomputed[0]
 
-    def follow(self, stepper: nn.Module, before: Tensor, now: Tensor, precomputed: Sequence[Tensor]) -> Tensor:
-        return self.advance(stepper, before, now, *precomputed)  # within its bound already
+    def step(self, stepper: nn.Module, before: Tensor, now: Tensor, precomputed: Sequence[Tensor]) -> Tensor:
+        return self.advance(stepper, before, now, *precomputed)  # `rest` is already clamped
 
 
 def integrator(config: ModelConfig, rates: int = 0) -> Integrator:

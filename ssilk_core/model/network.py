@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from ..assets import Deformer, Floats, GarmentPose, Scene, SkinWeights
 from ..config import ModelConfig
-from ..descriptors import joints_in_view
+from ..descriptors import descriptor_joints
 from ..kinematics import matrix_from_quaternion, quaternion_from_matrix
 from ..parameters import descriptor_sizes
 from .decoder import Decoder
@@ -21,7 +21,7 @@ from .integrators import integrator
 def mlp(
     inputs: int, widths: tuple[int, ...], outputs: int, generator: torch.Generator, last: float, bias: bool = True
 ) -> nn.Sequential:
-    """Return a smooth multilayer perceptron; the last layer starts `last` times its usual size."""
+    """Return a multilayer perceptron with SiLU; `last` scales the initial weights of the last layer."""
     sizes = [inputs, *widths, outputs]
     layers: list[nn.Module] = []
     for index, (fan_in, fan_out) in enumerate(pairwise(sizes)):
@@ -40,9 +40,9 @@ class GarmentModel(nn.Module):
     """A garment on a character, as a latent simulator.
 
     Args:
-        scene: what is simulated.
+        scene: character, garment and rig.
         config: sizes of the network.
-        joints: character joints in the descriptors, as `descriptors.joints_in_view` gives them.
+        joints: character joints in the descriptors (`descriptors.descriptor_joints`).
         seed: of the initial parameters.
     """
 
@@ -64,7 +64,7 @@ class GarmentModel(nn.Module):
 
     def initial(self, static: Tensor) -> Tensor:
         """Return quasi-static latents (N, latent) from static descriptors (Eq. 1)."""
-        return self.integrator.bounded(self.initialiser(static))
+        return self.integrator.bound(self.initialiser(static))
 
     def step(self, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor) -> Tensor:
         """Return z_t from the two latents before it, the quasi-static one of frame t, and its dynamic descriptor."""
@@ -79,9 +79,9 @@ class GarmentModel(nn.Module):
             pose: their dynamic descriptors, shape (F, batch, D).
         """
         states = list(states)
-        precomputed = self.integrator.precomputed(self.stepper, rest.flatten(0, 1), pose.flatten(0, 1))
+        precomputed = self.integrator.precompute(self.stepper, rest.flatten(0, 1), pose.flatten(0, 1))
         for frame in zip(*(values.unflatten(0, rest.shape[:2]) for values in precomputed)):
-            states.append(self.integrator.follow(self.stepper, states[-2], states[-1], frame))
+            states.append(self.integrator.step(self.stepper, states[-2], states[-1], frame))
         return states
 
     def pose(self, z: Tensor) -> tuple[Tensor, Tensor]:
@@ -96,8 +96,9 @@ class GarmentModel(nn.Module):
     def deformer(self) -> Deformer:
         """Return the trained garment for files: shapes for weights in [0, 1], with W^g and W^p made sparse.
 
-        An activation a in [-1, 1] is the weight w = (a + 1) / 2 of the shape 2 B_k. The last shape, -sum_k B_k at a
-        constant weight of one, puts the middle of the range back to the rest shape, or where a reduced model's is.
+        An activation a in [-1, 1] is the weight w = (a + 1) / 2 of the shape 2 B_k. The last shape, -sum_k B_k, has a
+        constant weight of one: it moves the middle of the range back to the rest shape, or to that of a reduced
+            model.
         """
         scene, decoder = self.scene, self.decoder
         dense = np.zeros((scene.garment.mesh.vertex_count, len(scene.joint_names)))
@@ -114,7 +115,7 @@ class GarmentModel(nn.Module):
 
     @torch.no_grad()
     def file_pose(self, activation: Tensor, rotations: Tensor) -> tuple[Floats, Floats]:
-        """Return what a file stores: local proxy quaternions (N, P, 4) and shape weights (N, K + 1) in [0, 1]."""
+        """Return the values that a file stores: local proxy quaternions (N, P, 4), weights (N, K + 1) in [0, 1]."""
         scene = self.scene
         bind = scene.bind_transforms[:, :3, :3]
         joints = scene.character.skeleton.joint_count
@@ -141,7 +142,7 @@ class GarmentModel(nn.Module):
 
 
 def model_joints(scene: Scene, colliding: Floats) -> np.ndarray:
-    """Return the joints a garment must see: those it is skinned to and those of the body faces it can reach.
+    """Return the joints for a garment's descriptors: those that it is skinned to, or that move body parts in reach.
 
     Args:
         scene: character, garment and rig.
@@ -155,4 +156,4 @@ def model_joints(scene: Scene, colliding: Floats) -> np.ndarray:
     for parent in scene.rig.parents:
         if parent < skeleton.joint_count:
             used[parent] = True
-    return joints_in_view(skeleton, used)
+    return descriptor_joints(skeleton, used)

@@ -42,7 +42,7 @@ def memory(scene: Scene, preset: Preset, body_vertices: int) -> Findings:
     batch, pretraining_batch = fitting_batch(scene, model, train, body_vertices, free)
     lowered = (batch, pretraining_batch) != (train.batch, train.pretraining_batch)
     note = (
-        f"; the batch goes from {train.batch} to {batch} windows "
+        f"; the batch is reduced from {train.batch} to {batch} windows "
         f"and from {train.pretraining_batch} to {pretraining_batch} poses"
     )
     yield Finding(

@@ -14,7 +14,7 @@ from .shapes import Basis
 
 def with_basis(file: ModelFile, basis: Basis) -> ModelFile:
     """Return a model with other blendshapes, activated by linear combinations of what its network gives."""
-    config = replace(file.config, shapes=basis.shapes.shape[2], activations=file.config.given)
+    config = replace(file.config, shapes=basis.shapes.shape[2], activations=file.config.activation_count)
     changed = {"shapes": basis.shapes, "offset": basis.offset, "readout": basis.readout}
     single = {f"decoder.{name}": value.astype(np.float32) for name, value in changed.items()}
     return replace(file, config=config, parameters={**file.parameters, **single})
@@ -50,7 +50,7 @@ def _rig(scene: Scene, proxies: np.ndarray, skin: SkinWeights) -> ProxyRig:
 
 def _last_layer(file: ModelFile, proxies: np.ndarray) -> dict[str, np.ndarray]:
     """Return the decoder's last layer with the rows of activations and of these proxies."""
-    given = file.config.given
+    given = file.config.activation_count
     rows = np.concatenate([np.arange(given), (given + 6 * proxies[:, None] + np.arange(6)).reshape(-1)]).astype(int)
     last = 2 * len(file.config.widths)
     return {name: file.parameters[name][rows] for name in (f"output.{last}.weight", f"output.{last}.bias")}

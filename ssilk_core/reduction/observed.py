@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from ..assets import Floats, Motion, Skeleton
 from ..errors import fail
 from ..runtime import Player
-from ..runtime.drive import character_matrices
-from ..runtime.skinning import posed
+from ..runtime.character import character_matrices
+from ..runtime.skinning import skin_garment
 
 POSED = 16  # frames whose vertices are in memory at once
 
@@ -32,7 +32,7 @@ class Observed:
 
     def decoded(self, player: Player) -> tuple[NDArray, NDArray]:
         """Return a model's activations (K, F) and skinning matrices of all its joints (J + P, 3, 4, F)."""
-        activations, rotations = player.decoder.decoded(self.states)
+        activations, rotations = player.decoder.decode(self.states)
         return activations, player.kinematics.matrices(rotations, self.character)
 
     def vertices(self, player: Player) -> Iterator[Floats]:
@@ -41,7 +41,7 @@ class Observed:
         for start in range(0, len(self.states), POSED):
             chosen = slice(start, start + POSED)
             count = len(self.states[chosen])
-            yield posed(player.tiles, activations[:, chosen], matrices[..., chosen], np.zeros((count, 3)))
+            yield skin_garment(player.tiles, activations[:, chosen], matrices[..., chosen], np.zeros((count, 3)))
 
 
 def observe(player: Player, motions: Sequence[Motion], frames: int) -> Observed:
@@ -52,11 +52,11 @@ def observe(player: Player, motions: Sequence[Motion], frames: int) -> Observed:
     """
     if not motions:
         fail("motions", "none given", "at least one is needed", "name motion files with --motions")
-    takes = [take for motion in motions for take in player.play(motion).takes]
-    every = max(1, sum(take.motion.frame_count for take in takes) // frames)
+    spans = [span for motion in motions for span in player.play(motion).rolled_spans]
+    every = max(1, sum(span.motion.frame_count for span in spans) // frames)
     return Observed(
-        np.concatenate([take.states(take.motion.frame_count)[::every] for take in takes]),
-        np.concatenate([_character(take.motion, every, player.skeleton) for take in takes], axis=-1),
+        np.concatenate([span.states(span.motion.frame_count)[::every] for span in spans]),
+        np.concatenate([_character(span.motion, every, player.skeleton) for span in spans], axis=-1),
     )
 
 

@@ -84,9 +84,9 @@ class Reducer:
         if skin != (self.whole.joints, self.whole.influences):
             weights = dense(self.influences.joints, self._skinned(*skin), len(self.scene.joint_names))
             file = with_weights(file, weights, self._gone(kept.joints))
-        if kept != self.whole and file.config.given:
+        if kept != self.whole and file.config.activation_count:
             found = self._followed(*skin)
-            readout = file.parameters.get("decoder.readout", np.eye(file.config.given))
+            readout = file.parameters.get("decoder.readout", np.eye(file.config.activation_count))
             file = with_basis(file, basis(found, kept.shapes, readout))
         return Reduced(file, kept, *self._difference(file))
 
@@ -97,7 +97,7 @@ class Reducer:
             return 0.0
         skin = (kept.joints, kept.influences)
         lost = self.mass * self.influences.lost(self._skinned(*skin))
-        if not self.file.config.given:
+        if not self.file.config.activation_count:
             return float(np.sqrt(lost.sum()))
         pinned = np.delete(lost, self.free).sum()  # shapes can make up for what the others lose
         return float(np.hypot(self._followed(*skin).lost(kept.shapes), np.sqrt(pinned)))

@@ -29,10 +29,10 @@ from ..errors import fail
 from ..fabrics import Fabric
 from ..kinematics import split_at_cuts
 from ..simulate import SimulationOptions, Simulator
-from ..simulate.actors import PosedCharacters
+from ..simulate.characters import PosedCharacters
 from ..simulate.incremental_potential import StepInputs
 from ..simulate.newton import SolverOptions, State, minimise_from
-from ..simulate.simulator import Past
+from ..simulate.simulator import StepHistory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,9 +150,9 @@ class Refiner:
         tail: _Tail | None = None
         for start, stop in _blocks(span.frame_count, 1 if self.options.feedback else self.options.batch):
             world = self._taken(network, stop - start)
-            poses = self.simulator.actors.posed(span.rotations[start:stop], span.translations[start:stop])
+            poses = self.simulator.poser.pose(span.rotations[start:stop], span.translations[start:stop])
             inputs = self.simulator.inputs(poses, self._past(tail, world, poses))
-            before = State.at(self.potential, self.simulator.pinned(world - poses.root, poses), inputs)
+            before = State.at(self.potential, self.simulator.apply_pins(world - poses.root, poses), inputs)
             if given is None:
                 refined = self._refined(before, tail, world, poses, inputs) + poses.root
             else:
@@ -171,18 +171,18 @@ class Refiner:
         """Return refined positions relative to the roots (V, 3, N)."""
         start = before.x
         if tail and self.options.feedback:
-            corrected = self.simulator.pinned(world + tail.correction - poses.root, poses)
-            start = self.simulator.best([start, corrected], inputs)
+            corrected = self.simulator.apply_pins(world + tail.correction - poses.root, poses)
+            start = self.simulator.best_start([start, corrected], inputs)
         return minimise_from(self.potential, start, inputs, self.options.solver).x.double()
 
-    def _past(self, tail: _Tail | None, world: Tensor, poses: PosedCharacters) -> Past | None:
+    def _past(self, tail: _Tail | None, world: Tensor, poses: PosedCharacters) -> StepHistory | None:
         """Return what each of some consecutive frames looks back on."""
         if tail is None:
-            return None if self.options.feedback else Past(world, None, poses.root, poses.lbs)
+            return None if self.options.feedback else StepHistory(world, None, poses.root, poses.lbs)
         seen, count = torch.cat([tail.world, world[..., :-1]], dim=-1), world.shape[-1]
         before = seen[..., -count - 1 : -1] if seen.shape[-1] > count else None
         root = torch.cat([tail.root, poses.root[:, :-1]], dim=1)
-        return Past(seen[..., -count:], before, root, torch.cat([tail.lbs, poses.lbs[..., :-1]], dim=-1))
+        return StepHistory(seen[..., -count:], before, root, torch.cat([tail.lbs, poses.lbs[..., :-1]], dim=-1))
 
     def _tail(self, tail: _Tail | None, world: Tensor, refined: Tensor, poses: PosedCharacters) -> _Tail:
         """Return what the frames after these look back on."""

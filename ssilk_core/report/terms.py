@@ -90,7 +90,7 @@ class TermsMeter:
         at, towards = (torch.as_tensor(values, dtype=torch.float32)[:, :, None] for values in (body, normals))
         distance = signed_distance(x, PosedBody(at, towards, self.rings))
         inside = 100 * float((distance < 0).double().mean())
-        return {"collision": float(self.energy.collision_of(distance)), SHARE: inside}
+        return {"collision": float(self.energy.collision_at(distance)), SHARE: inside}
 
 
 def worst_frames(values: Floats, count: int, apart: int) -> list[int]:

@@ -5,8 +5,8 @@
     playback = Player.load("cape.safetensors").play(motion)
     playback.vertices(12)   # (V, 3) [m], any frame in any order
 
-What depends on the character's poses alone is computed for a whole motion at once, the latents frame by frame, and
-what is decoded from them in blocks of frames.
+Values that depend on the character's poses alone are computed for many frames at once, latents frame by frame, and
+decoded values in blocks of frames.
 """
 
 from .playback import Playback

@@ -24,10 +24,10 @@ def _unit(vectors: NDArray) -> NDArray:
 
 
 class ProxyKinematics:
-    """Forward kinematics of a rig's proxies, one generation after another, all proxies of one at once.
+    """Forward kinematics of a rig's proxies, one level of the hierarchy after another.
 
     Args:
-        rig: the proxies; joints: how many the character has.
+        rig: the proxies; joints: number of the character's joints.
     """
 
     def __init__(self, rig: ProxyRig, joints: int) -> None:

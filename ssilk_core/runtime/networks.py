@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Perceptrons in float32, folded so that an activation takes three calls.
 
-SiLU is x / (1 + exp(-x)). With n = -x it is -n / (1 + exp(n)): hidden layers sum to n, their activation loses its
-sign, and the next layer's weights take it back, so that nothing is left to negate.
+SiLU is x / (1 + exp(-x)). With n = -x it is -n / (1 + exp(n)). The weights of hidden layers are negated, so that they
+sum to n; the sign of the activation is folded into the next layer's weights. No negation is left at run time.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Parameters = Mapping[str, NDArray]
 class Layer:
     """One layer, float32, signs folded in: weights transposed, then biases, shape (inputs + 1, outputs).
 
-    One vector or many meet the same memory: what has to come from it is what takes time.
+    Products with one vector and with many share this memory, because reading it takes most of the time.
     """
 
     rows: NDArray
@@ -37,30 +37,30 @@ class Layer:
 
 
 def layers(parameters: Parameters, name: str) -> list[Layer]:
-    """Return the layers of perceptron `name`, at least two; all but the last sum to minus what the network's do."""
+    """Return the layers of perceptron `name`, at least two; sums of all but the last are negated."""
     last = sum(key.startswith(f"{name}.") and key.endswith(".weight") for key in parameters) - 1
     folded = []
     for index in range(last + 1):
         weights = parameters[f"{name}.{2 * index}.weight"]
         bias = parameters.get(f"{name}.{2 * index}.bias", np.zeros(len(weights)))
-        seen, given = (1 if index == 0 else -1), (1 if index == last else -1)
-        folded.append(Layer(single(np.vstack([seen * given * weights.T, given * bias]))))
+        input_sign, output_sign = (1 if index == 0 else -1), (1 if index == last else -1)
+        folded.append(Layer(as_float32(np.vstack([input_sign * output_sign * weights.T, output_sign * bias]))))
     return folded
 
 
-def single(values: NDArray) -> NDArray:
-    """Return values in one piece of memory, float32."""
+def as_float32(values: NDArray) -> NDArray:
+    """Return values as a contiguous float32 array."""
     return np.ascontiguousarray(values, dtype=np.float32)
 
 
-def evaluated(network: list[Layer], seen: NDArray) -> NDArray:
-    """Return what a perceptron gives, shape (outputs, N), for inputs (inputs, N)."""
+def evaluate(network: list[Layer], inputs: NDArray) -> NDArray:
+    """Return a perceptron's outputs (outputs, N) for inputs (inputs, N)."""
     first = network[0]
-    return continued(network[1:], first.weights @ seen + first.bias)
+    return evaluate_tail(network[1:], first.weights @ inputs + first.bias)
 
 
-def continued(network: list[Layer], sums: NDArray) -> NDArray:
-    """Return what the layers after the first give, shape (outputs, N), from the sums of that one, (hidden, N)."""
+def evaluate_tail(network: list[Layer], sums: NDArray) -> NDArray:
+    """Return the outputs (outputs, N) of the layers after the first, from the first layer's sums (hidden, N)."""
     for layer in network:
         with np.errstate(over="ignore"):  # an activation of minus infinity is zero
             active = sums / (np.exp(sums) + np.float32(1))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A trained garment, ready to play."""
+"""A trained garment, ready to play motions."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from ..parameters import descriptor_sizes
 from .decoder import NumpyDecoder
 from .deformer import deformer
 from .kinematics import ProxyKinematics
-from .networks import evaluated, layers
+from .networks import evaluate, layers
 from .playback import BLOCK, Playback
 from .skinning import tiles
-from .stepper import Limit, SpringStepper, lost
+from .stepper import SoftClamp, SpringStepper, diverged
 
 
 class Player:
     """A trained garment, ready to play motions.
 
     Raises:
-        SsilkError: the model's integration scheme is none that is played here.
+        SsilkError: the runtime does not support the model's integration scheme.
     """
 
     def __init__(self, file: ModelFile) -> None:
@@ -52,15 +52,16 @@ class Player:
         return cls(load_model(path))
 
     def play(self, motion: Motion, *, pre_roll: float = 0.0, block: int = BLOCK) -> Playback:
-        """Return the garment over a motion of any rate, with cuts or without, rolled when somebody looks.
+        """Return the garment over a motion of any rate, with or without cuts; frames are computed on request.
 
         Args:
             motion: of the model's skeleton, at the shot's rate.
-            pre_roll: how long the garment settles before the first frame and after each cut [s].
-            block: frames that are computed together; fewer take longer each, and the first one comes sooner.
+            pre_roll: time for which the garment settles before the first frame and after each cut [s].
+            block: frames computed together; smaller blocks take more time per frame, but deliver the first one
+                sooner.
 
         Raises:
-            SsilkError: the motion is of another skeleton.
+            SsilkError: the motion belongs to another skeleton.
         """
         joints = self.skeleton.joint_count
         if motion.rotations.shape[1] != joints:
@@ -70,12 +71,12 @@ class Player:
         return Playback(self, motion, block, pre_roll)
 
     def deformer(self) -> Deformer:
-        """Return the trained garment as files and hosts hold it."""
+        """Return the trained garment's skin and shapes, as files and host applications hold them."""
         return deformer(self.file)
 
-    def at_rest(self, static: NDArray) -> NDArray:
+    def quasi_static(self, static: NDArray) -> NDArray:
         """Return the quasi-static latents (F, latent) of static descriptors (F, S) (Eq. 1)."""
-        rest = np.ascontiguousarray(evaluated(self.initialiser, static.T).T)
-        Limit(self.file.config.latent_bound, rest.shape)(rest)
-        rest[lost(rest)] = 0
+        rest = np.ascontiguousarray(evaluate(self.initialiser, static.T).T)
+        SoftClamp(self.file.config.latent_bound, rest.shape)(rest)
+        rest[diverged(rest)] = 0
         return rest

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A reference simulator of garments on the very energy that networks are trained with."""
+"""A reference simulator of garments that minimises the same energy as training."""
 
-from .simulator import SimulatedFrame, SimulationOptions, Simulator, minimise, shots_of, simulate
+from .simulator import SimulatedFrame, SimulationOptions, Simulator, quasi_static_states, shots_of, simulate
 
-__all__ = ["SimulatedFrame", "SimulationOptions", "Simulator", "minimise", "shots_of", "simulate"]
+__all__ = ["SimulatedFrame", "SimulationOptions", "Simulator", "quasi_static_states", "shots_of", "simulate"]

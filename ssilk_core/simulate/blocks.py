@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Symmetric matrices of 3 x 3 blocks over the free vertices of a garment, one for each frame.
 
-The sparsity is found once. Element blocks are summed into vertex blocks by constant sparse operators. Systems are
-solved by kernels on the blocks themselves where there are any; elsewhere the blocks of all frames make one
-block-diagonal matrix in compressed rows.
+The sparsity pattern is found once. Constant sparse operators sum element blocks into vertex blocks. Kernels solve
+systems on the blocks where available; elsewhere the blocks of all frames form one block-diagonal CSR matrix.
 """
 
 from __future__ import annotations
@@ -20,10 +19,10 @@ from torch import Tensor
 from .. import kernels
 from ..assets import Ints
 from ..energy.operators import SparseOperator
-from .conjugate import CHECK_EVERY, inverse_blocks, solve
+from .conjugate_gradient import CHECK_EVERY, inverse_blocks, solve
 
 if TYPE_CHECKING:
-    from ..kernels.conjugate import BlockTable
+    from ..kernels.conjugate_gradient import BlockTable
 
 
 def adjoint(operator: SparseOperator, y: Tensor) -> Tensor:
@@ -36,7 +35,7 @@ class BlockMatrix:
     """A symmetric matrix for each of N frames.
 
     Attributes:
-        blocks: as stored, those on the diagonal first and symmetric, shape (stored, 3, 3, N).
+        blocks: stored blocks, first those on the diagonal, shape (stored, 3, 3, N).
     """
 
     pattern: BlockPattern
@@ -44,7 +43,7 @@ class BlockMatrix:
 
     @cached_property
     def rows(self) -> Tensor:
-        """Return all of them, block-diagonal, in compressed rows, (3 U N, 3 U N) for U free vertices."""
+        """The matrices of all frames as one block-diagonal CSR matrix, (3 U N, 3 U N) for U free vertices."""
         return self.pattern.rows(self.blocks)
 
     def __matmul__(self, vectors: Tensor) -> Tensor:
@@ -52,11 +51,14 @@ class BlockMatrix:
         return torch.mv(self.rows, vectors.reshape(-1)).reshape(vectors.shape)
 
     def solve(self, right: Tensor, reduction: float, iterations: int) -> tuple[Tensor, int]:
-        """Solve approximately for right sides (U, 3, N); arguments and result are those of `conjugate.solve`."""
+        """Solve approximately for right sides (U, 3, N).
+
+        Arguments and result are those of `conjugate_gradient.solve`.
+        """
         diagonal = self.blocks[: self.pattern.count].permute(3, 0, 1, 2)
         inverse = inverse_blocks(diagonal.contiguous())
         if kernels.available(right.device):
-            from ..kernels.conjugate import solve_kernel
+            from ..kernels.conjugate_gradient import solve_kernel
 
             inverse, table = inverse.permute(1, 2, 3, 0), self.pattern.table
             return solve_kernel(self.blocks, table, inverse, right, reduction, iterations, CHECK_EVERY)
@@ -71,11 +73,11 @@ class BlockMatrix:
 
 
 class BlockPattern:
-    """Where the blocks of a matrix stand: on the diagonal, and at `pairs` of vertices, each in both orders.
+    """The sparsity pattern of a symmetric block matrix: the diagonal, and pairs of vertices.
 
     Args:
-        pairs: every two vertices that may share an element, in any order and number, shape (M, 2).
-        free: the vertices that the matrix is about; pairs with others are left out, shape (U,).
+        pairs: vertices that share an element, in any order, repetitions allowed, shape (M, 2).
+        free: vertices of the matrix, shape (U,); pairs with other vertices are ignored.
     """
 
     def __init__(self, pairs: Ints, free: Ints, vertex_count: int, device: torch.device) -> None:
@@ -84,11 +86,11 @@ class BlockPattern:
         self.place[free] = np.arange(len(free))
         low, high = self._ordered(pairs)
         self.keys = np.unique((low * self.count + high)[(low >= 0) & (low < high)])
-        self._tiled: tuple[int, Tensor, Tensor] | None = None  # of one number of frames, which is used for long
+        self._tiled: tuple[int, Tensor, Tensor] | None = None  # cached for one number of frames
 
     @property
     def block_count(self) -> int:
-        """How many blocks are stored: the diagonal, then those above it."""
+        """Number of stored blocks: the diagonal and those above it."""
         return self.count + len(self.keys)
 
     def _ordered(self, pairs: Ints) -> tuple[Ints, Ints]:
@@ -96,7 +98,7 @@ class BlockPattern:
         return low, high
 
     def slots(self, pairs: Ints) -> Ints:
-        """Return where the block of each pair (M, 2) is stored, -1 where a vertex is not free, shape (M,)."""
+        """Return the index of the stored block of each pair (M, 2), -1 where a vertex is not free, shape (M,)."""
         low, high = self._ordered(pairs)
         above = self.count + np.searchsorted(self.keys, low * self.count + high)
         return np.where(low < 0, -1, np.where(low == high, low, above))
@@ -108,7 +110,7 @@ class BlockPattern:
         return SparseOperator(slots[kept], sources[kept], weights[kept], shape, self.device, torch.float32)
 
     def _blocks(self) -> tuple[Ints, Ints, Ints, np.ndarray]:
-        """Return row and column of all blocks in order, where each is stored, and whether as its transpose, (E,)."""
+        """Return row, column, stored block and whether it is transposed, for all blocks in order, (E,)."""
         low, high = self.keys // self.count, self.keys % self.count
         above = self.count + np.arange(len(self.keys))
         own, none = np.arange(self.count), np.zeros(self.count + len(low), dtype=bool)
@@ -120,7 +122,7 @@ class BlockPattern:
     @cached_property
     def table(self) -> BlockTable:
         """Return the blocks of each row, for kernels."""
-        from ..kernels.conjugate import BlockTable
+        from ..kernels.conjugate_gradient import BlockTable
 
         row, column, stored, below = self._blocks()
         counts = np.bincount(row, minlength=self.count)
@@ -134,11 +136,11 @@ class BlockPattern:
 
     @cached_property
     def _row_entries(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the stored entry behind each of one frame's compressed rows, its column, and where rows end."""
+        """Return the stored entry and the column of each CSR entry of one frame, and the ends of its rows."""
         row, column, stored, below = (part[:, None, None] for part in self._blocks())
         a, b = np.mgrid[:3, :3]
         entries = 9 * stored + np.where(below, 3 * b + a, 3 * a + b)
-        # Rows of numbers, not of blocks: for each vertex and axis all its blocks in turn.
+        # Scalar rows: for each vertex and axis, the entries of all its blocks.
         axes = 3 * row + a + 0 * b
         by_row = np.argsort(axes.reshape(-1), kind="stable")
 
@@ -149,7 +151,7 @@ class BlockPattern:
         return tensor(entries.reshape(-1)[by_row]), tensor(columns), tensor(ends)
 
     def _tile(self, frames: int) -> tuple[Tensor, Tensor]:
-        """Return row starts and columns of the block-diagonal matrix of so many frames."""
+        """Return row starts and columns of the block-diagonal matrix for a number of frames."""
         if self._tiled is None or self._tiled[0] != frames:
             _, columns, ends = self._row_entries
             frame = torch.arange(frames, device=self.device)[:, None]
@@ -159,7 +161,7 @@ class BlockPattern:
         return self._tiled[1:]
 
     def rows(self, blocks: Tensor) -> Tensor:
-        """Return the matrices of stored blocks (stored, 3, 3, N), block-diagonal, in compressed rows."""
+        """Return the matrices of stored blocks (stored, 3, 3, N) as one block-diagonal CSR matrix."""
         frames = blocks.shape[-1]
         values = blocks.reshape(-1, frames)[self._row_entries[0]].T.reshape(-1)
         with warnings.catch_warnings():

@@ -15,7 +15,7 @@ from .blocks import BlockMatrix, BlockPattern
 from .hinges import Hinges
 from .membrane import Membrane, outer
 
-HELD = 1e6  # times as stiff
+FIXED_STIFFNESS_FACTOR = 1e6
 
 
 class Hessian:
@@ -30,7 +30,7 @@ class Hessian:
     ) -> None:
         device = membrane.area.device
         self.membrane, self.hinges, self.free_count = membrane, hinges, len(free)
-        # A row of the membrane's operator holds a face's corners in ascending order of the vertices.
+        # A row of the membrane's operator has a face's corners in ascending order of vertex indices.
         matrix = membrane.operator.matrix
         faces = matrix.col_indices().cpu().numpy().reshape(2, -1, 3)[0]
         weights = matrix.values().cpu().numpy().reshape(2, -1, 3)
@@ -73,10 +73,10 @@ class Hessian:
         """Return the Hessian at x.
 
         Args:
-            weight: stiffness of each free vertex alike in all directions [N/m], shape (U, 1).
-            contact: added at each free vertex, shape (U, 3, 3, N), or None.
-            fixed: free vertices that are made so stiff that a solution leaves them alone, shape (U, N), or None.
-            exact_hessian: of `Membrane.stiffness`.
+            weight: isotropic stiffness of each free vertex [N/m], shape (U, 1).
+            contact: block added at each free vertex, shape (U, 3, 3, N), or None.
+            fixed: free vertices that are stiffened so that a solution hardly moves them, shape (U, N), or None.
+            exact_hessian: see `Membrane.stiffness`.
         """
         blocks = self.sum_faces(self.membrane.stiffness(x, exact_hessian))
         if self.hinges:
@@ -88,7 +88,9 @@ class Hessian:
             diagonal += contact.float()
         if fixed is not None:
             stiff = (
-                HELD * diagonal.square().sum((1, 2)).sqrt()[:, None, None] * torch.eye(3, device=x.device)[..., None]
+                FIXED_STIFFNESS_FACTOR
+                * diagonal.square().sum((1, 2)).sqrt()[:, None, None]
+                * torch.eye(3, device=x.device)[..., None]
             )
             diagonal.copy_(torch.where(fixed[:, None, None], stiff, diagonal))
         return BlockMatrix(self.pattern, blocks)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Energy, gradient and Gauss-Newton Hessian of bending.
 
-The Hessian leaves out the curvature of the angle itself, (theta - rest) times its second derivative: what remains,
-2 k grad(theta) grad(theta)', is never negative.
+The Gauss-Newton Hessian omits the second derivative of the angle: 2 k grad(theta) grad(theta)' is positive
+semi-definite.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..assets import Ints
 from ..energy import GarmentEnergy
-from ..energy.bending import bending_energy, bent, cross, dihedral_angles
+from ..energy.bending import bending_energy, cross, dihedral_angles, wrapped_difference
 from ..energy.operators import difference_operator
 from .blocks import adjoint
 
@@ -20,7 +20,7 @@ TINY = 1e-18
 
 
 class Hinges:
-    """The bending energy over the interior edges `hinges` (H, 4), as `mesh.topology.hinges` gives them."""
+    """The bending energy of hinges (H, 4) from `mesh.topology.hinges`."""
 
     def __init__(self, hinges: Ints, energy: GarmentEnergy, vertex_count: int) -> None:
         self.stiffness, self.rest = energy.bending_stiffness, energy.rest_angle
@@ -34,7 +34,7 @@ class Hinges:
     def gradient(self, x: Tensor) -> Tensor:
         """Return the gradient [N], shape (V, 3, N)."""
         arms = self.operator(x).chunk(3)
-        moment = 2 * self.stiffness * bent(dihedral_angles(*arms), self.rest)
+        moment = 2 * self.stiffness * wrapped_difference(dihedral_angles(*arms), self.rest)
         return adjoint(self.operator, torch.cat([moment[:, None] * slope for slope in angle_gradients(*arms)]))
 
     def slopes(self, x: Tensor) -> Tensor:
@@ -45,16 +45,16 @@ class Hinges:
 
 
 def angle_gradients(edge: Tensor, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the gradients of the dihedral angle in the edge's end and the two tips, each (H, 3, N).
+    """Return the gradients of the dihedral angle at the edge's end and at the two tips, each (H, 3, N).
 
-    Arguments are those of `dihedral_angles`. A tip turns about the edge at its height over it; the edge's ends move
-    against the tips in the shares that the foot of each height divides the edge in.
+    Arguments are those of `dihedral_angles`. The gradient at a tip is perpendicular to its face, over its height. The
+    reaction at the edge's ends divides in the ratio in which the foot of the height divides the edge.
     """
     normal_left, normal_right = cross(edge, left), cross(right, edge)
     squared = (edge * edge).sum(1, keepdim=True).clamp_min(TINY)
     length = squared.sqrt()
     square_left, square_right = ((normal**2).sum(1, keepdim=True) for normal in (normal_left, normal_right))
-    # A hinge with a collapsed face pulls nowhere, as in `dihedral_angles`.
+    # A hinge with a degenerate face has no gradient, as in `dihedral_angles`.
     stands = square_left * square_right >= (1e-6 * squared**2).clamp_min(TINY) ** 2
     tip_left = -length * normal_left / torch.where(stands, square_left, torch.inf)
     tip_right = -length * normal_right / torch.where(stands, square_right, torch.inf)

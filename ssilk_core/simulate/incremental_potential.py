@@ -5,9 +5,9 @@ Implicit Euler with time step dt is the minimum of
 
     stretch + bending + gravity + collision + m/(2 dt^2) |x - (2 x' - x'')|^2 + drag a/(2 dt) |x - advected|^2
 
-(`energy.GarmentEnergy`); a quasi-static state leaves the last two out. The distance to the body is that to the whole
-surface that a vertex may meet. Training takes the triangles around the nearest vertex alone. The distance is smoothed
-on its creases (`collision.smoothed_distance`), so that the gradient vanishes at minima there.
+(`energy.GarmentEnergy`); a quasi-static state has none of the last two terms. The distance to the body is that to the
+whole surface that a vertex can touch. Training uses only the triangles around the nearest vertex. The distance is
+smoothed on its creases (`collision.smoothed_distance`), so that the gradient vanishes at minima there.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from .membrane import Membrane, outer
 
 @dataclass(frozen=True, eq=False)
 class StepInputs:
-    """What the energy of N frames depends on besides the garment.
+    """Inputs of the energy of N frames, besides the positions.
 
     Attributes:
         body: in the coordinates of the positions, float32.
         gravity: acceleration [m/s2], shape (3, N).
         predicted: 2 x' - x'' [m], shape (V, 3, N), or None for a quasi-static state.
-        advected: where the air took x' [m], shape (V, 3, N), or None likewise.
-        dt: time step [s]. In a quasi-static state it damps the steps of the solver alone.
+        advected: x' moved with the air [m], shape (V, 3, N), or None likewise.
+        dt: time step [s]. For a quasi-static state it only damps the solver's steps.
     """
 
     body: PosedBody | None
@@ -62,8 +62,8 @@ class IncrementalPotential:
     """The incremental potential of one garment; positions are (V, 3, N).
 
     Attributes:
-        free: indices of the vertices that move: all with mass that are not pinned, shape (U,).
-        size: diagonal of the garment's box at rest [m].
+        free: indices of the free vertices: not pinned, with mass, shape (U,).
+        size: diagonal of the garment's bounding box at rest [m].
 
     Args:
         dtype: of positions, energies and gradients; Hessians are float32.
@@ -99,15 +99,15 @@ class IncrementalPotential:
         return total + self.collision(x, body_distance).sum(0)
 
     def collision(self, x: Tensor, body_distance: SmoothedDistance | None) -> Tensor:
-        """Return the energy of each vertex that meets the body [J], shape (V, N)."""
+        """Return the collision energy of each vertex [J], shape (V, N)."""
         return torch.zeros_like(x[:, 0]) if body_distance is None else self.collision_at(body_distance.distance(x))
 
     def collision_at(self, distance: Tensor) -> Tensor:
-        """Return the energy of vertices so far from the body [J], shape (V, N)."""
+        """Return the collision energy of vertices at given distances [J], shape (V, N)."""
         return collision_energy(distance, self.fabric.collision, self.fabric.margin)
 
     def gradient(self, x: Tensor, inputs: StepInputs, body_distance: SmoothedDistance | None) -> Tensor:
-        """Return the gradient [N] in all vertices, shape (V, 3, N)."""
+        """Return the gradient [N] at all vertices, shape (V, 3, N)."""
         total = self.membrane.gradient(x) - self.mass[:, None] * inputs.gravity
         if self.hinges:
             total += self.hinges.gradient(x)
@@ -125,12 +125,12 @@ class IncrementalPotential:
         fixed: Tensor | None = None,
         exact_hessian: Tensor | None = None,
     ) -> BlockMatrix:
-        """Return the Hessian over the free vertices, in float32, its parts made positive semi-definite.
+        """Return the Hessian over the free vertices, in float32, with each part projected to be semi-definite.
 
         Args:
             fixed: vertices that must not move, shape (V, N); none by default.
-            exact_hessian: frames whose membrane keeps its exact Hessian, which compression may make indefinite,
-                shape (N,); none by default.
+            exact_hessian: frames that use the membrane's exact Hessian, which compression may make indefinite, shape
+                (N,); none by default.
         """
         still = [] if inputs.predicted is not None else [(self.mass / inputs.dt**2, None)]
         weight = sum((weight for weight, _ in [*self._anchors(inputs), *still]), torch.zeros_like(self.mass))
@@ -151,7 +151,7 @@ class IncrementalPotential:
         return ((force * force).sum(1) / mass).sum(0).div(mass.sum()).sqrt() / GRAVITY
 
     def _anchors(self, inputs: StepInputs) -> list[tuple[Tensor, Tensor]]:
-        """Return stiffness [N/m] (V, 1) and target (V, 3, N) of inertia and drag, where they act."""
+        """Return stiffness [N/m] (V, 1) and target (V, 3, N) of inertia and drag, where present."""
         found = []
         if inputs.predicted is not None:
             found.append((self.mass / inputs.dt**2, inputs.predicted))

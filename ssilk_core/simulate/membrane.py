@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Energy, gradient and positive semi-definite Hessian of the membrane, for either stretch model.
 
-Both models have a first Piola-Kirchhoff stress P = F S with S symmetric, 2 x 2, and the columns w_u, w_v of F. Their
-Hessian is then the geometric part S (x) I, indefinite under compression, and a material part that is a sum of outer
-products of the columns and never negative:
+Both models have a first Piola-Kirchhoff stress P = F S with a symmetric 2 x 2 matrix S. Their Hessian is the
+geometric part S (x) I, indefinite under compression, plus a positive semi-definite material part, a sum of outer
+products of the columns w_u, w_v of F:
 
     M_uu = a w_u w_u' + b w_v w_v',   M_vv = c w_v w_v' + b w_u w_u',   M_uv = d w_u w_v' + b w_v w_u'
 
@@ -21,7 +21,7 @@ from ..fabrics import Fabric
 from .blocks import adjoint
 
 Symmetric = tuple[Tensor, Tensor, Tensor]  # entries uu, uv, vv of 2 x 2 matrices, each (F, N)
-FLOOR = 1e-12  # squared length of a collapsed thread, as in the density
+MIN_SQUARED_LENGTH = 1e-12  # floor for squared column lengths, as in the density
 
 
 class Membrane:
@@ -46,10 +46,10 @@ class Membrane:
     def stiffness(self, x: Tensor, exact_hessian: Tensor | None = None) -> Tensor:
         """Return the positive semi-definite Hessian in the columns of F [J], float32.
 
-        Its blocks uu, uv, vu, vv follow each other: (4 F, 3, 3, N).
+        The blocks uu, uv, vu, vv follow each other: (4 F, 3, 3, N).
 
         Args:
-            exact_hessian: frames that keep the exact Hessian, which compression may make indefinite, shape (N,).
+            exact_hessian: frames that use the exact Hessian, which compression may make indefinite, shape (N,).
         """
         w_u, w_v = self.operator(x).float().chunk(2)
         stresses = second_piola_kirchhoff(w_u, w_v, self.fabric)
@@ -79,22 +79,24 @@ def outer(a: Tensor, b: Tensor) -> Tensor:
 def second_piola_kirchhoff(w_u: Tensor, w_v: Tensor, fabric: Fabric) -> Symmetric:
     """Return the second Piola-Kirchhoff stress S of P = F S for each triangle [N/m].
 
-    W_u, w_v are the columns of F, shape (F, 3, N).
+    The columns of F are w_u and w_v, shape (F, 3, N).
     """
     uu, uv, vv = (w_u * w_u).sum(1), (w_u * w_v).sum(1), (w_v * w_v).sum(1)
     if fabric.stretch_model == "stvk":
         trace = 0.5 * fabric.lame_lambda * (uu + vv - 2)
         return fabric.lame_mu * (uu - 1) + trace, fabric.lame_mu * uv, fabric.lame_mu * (vv - 1) + trace
-    length_u, length_v = uu.clamp_min(FLOOR).sqrt(), vv.clamp_min(FLOOR).sqrt()
+    length_u, length_v = uu.clamp_min(MIN_SQUARED_LENGTH).sqrt(), vv.clamp_min(MIN_SQUARED_LENGTH).sqrt()
     return 2 * fabric.stretch * (1 - 1 / length_u), 2 * fabric.shear * uv, 2 * fabric.stretch * (1 - 1 / length_v)
 
 
 def material(w_u: Tensor, w_v: Tensor, fabric: Fabric) -> tuple[Tensor | float, float, Tensor | float, float]:
-    """Return a, b, c and d of the material part (see the module), numbers or shapes that broadcast to blocks."""
+    """Return a, b, c and d of the material part (see the module), numbers or tensors that broadcast to blocks."""
     if fabric.stretch_model == "stvk":
         along = 2 * fabric.lame_mu + fabric.lame_lambda
         return along, fabric.lame_mu, along, fabric.lame_lambda
-    a, c = (2 * fabric.stretch * (w * w).sum(1).clamp_min(FLOOR)[:, None, None] ** -1.5 for w in (w_u, w_v))
+    a, c = (
+        2 * fabric.stretch * (w * w).sum(1).clamp_min(MIN_SQUARED_LENGTH)[:, None, None] ** -1.5 for w in (w_u, w_v)
+    )
     return a, 2 * fabric.shear, c, 0.0
 
 

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Newton's method with conjugate gradients, for many frames at once.
 
-Each iteration solves with the Hessian to a tenth of the residual. A backtracking line search with Armijo's condition
-follows. Distances to the body are found anew for every state, those of the line search included. The energy of a
-frame therefore never rises, and more iterations never end higher.
+Each iteration solves the linear system to a tenth of the residual; a backtracking line search with Armijo's condition
+follows. Distances to the body are recomputed for every state, also in the line search. The energy of a frame
+therefore never rises.
 
 Far from the minimum the Hessian is projected to be positive semi-definite. Near it the exact Hessian of the membrane
-is tried, because cloth that is about to buckle converges much faster under it. A frame that it misleads goes without
-it for some iterations.
+is tried, because cloth that is about to buckle converges much faster with it. If it leads to a short step, the frame
+uses the projected Hessian for some iterations.
 
-Where parts of a body pass through each other, the nearest surface changes sides and the energy jumps. No gradient
-tells of that, and one vertex at such a jump would stop its whole garment. When only a small part of a step lowers the
-energy, the vertices that cost more than expected are fixed and the others move on. Once these have converged, all
-fixed vertices are released and tried once more.
+Where a body intersects itself, the nearest surface changes sides and the energy jumps. The gradient does not show
+that, and one vertex at such a jump would stop its whole garment. When only a short step lowers the energy, the
+vertices whose energy rises more than predicted are fixed and the others move on. Once these have converged, all fixed
+vertices are released, once.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from ..collision.smoothed_distance import SmoothedDistance
 from ..errors import fail
 from .incremental_potential import IncrementalPotential, StepInputs
 
-ARMIJO = 1e-4  # share of the slope that a step has to gain
+ARMIJO = 1e-4  # required decrease relative to the slope
 MAX_BACKTRACKS = 12
 REDUCTION = 0.1  # of the residual by each linear solve
 MAX_DISPLACEMENT = (
-    0.1  # of the garment's size, by which a step moves a vertex at most: stiff systems are solved badly
+    0.1  # of a vertex in one step, relative to the garment's size: stiff systems are solved inaccurately
 )
-SHORT_STEP = 0.25  # of a step: where not even this is possible, obstructing vertices are fixed
-OBSTRUCTING = 0.1  # share of the expected decrease that a vertex takes away, from which on it is obstructing
+SHORT_STEP = 0.25  # step length from which on obstructing vertices are fixed
+OBSTRUCTING = 0.1  # share of the predicted decrease that an obstructing vertex consumes
 EXACT_HESSIAN_BELOW = 2.0  # [g] of residual
-MISLED_BELOW = 0.25  # of a step: where less of one is possible, the exact Hessian has misled
-COOLDOWN = 4  # iterations without the exact Hessian from then on
+MISLED_BELOW = 0.25  # a shorter step means that the exact Hessian misled the frame
+COOLDOWN = 4  # iterations without the exact Hessian after that
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,12 +44,12 @@ class SolverOptions:
     """When a frame counts as converged.
 
     Attributes:
-        tolerance: of the residual, the RMS acceleration that the gradient would give the free mass, in units of g.
-            As inertia alone makes the Hessian at least m/dt^2, it bounds the distance to the minimum by tolerance g
-            dt^2: 0.1 mm for the default at 30 frames per second, and the energy above it by m (tolerance g dt)^2 / 2:
-            1e-6 J.
-        iterations: Newton iterations at most.
-        cg_iterations: iterations of conjugate gradients in each, at most.
+        tolerance: bound of the residual, the RMS acceleration that the gradient would give the free mass, in units of
+            g. Inertia makes the Hessian at least m/dt^2, so the distance to the minimum is at most tolerance g dt^2,
+            0.1 mm for the default at 30 frames per second, and the energy above the minimum at most
+            m (tolerance g dt)^2 / 2, 1e-6 J.
+        iterations: maximum number of Newton iterations.
+        cg_iterations: maximum number of conjugate gradient iterations in each.
     """
 
     tolerance: float = 1e-2
@@ -71,10 +71,10 @@ class Solution:
     Attributes:
         x: positions [m], shape (V, 3, N).
         energy: at x [J], shape (N,).
-        residual: what `SolverOptions.tolerance` bounds, of vertices that are not fixed, shape (N,).
+        residual: as in `SolverOptions.tolerance`, over vertices that are not fixed, shape (N,).
         iterations: Newton iterations, shape (N,).
         fixed: number of fixed vertices, shape (N,).
-        cg_iterations: iterations of conjugate gradients, each for all active frames.
+        cg_iterations: conjugate gradient iterations, each for all active frames.
     """
 
     x: Tensor
@@ -87,7 +87,7 @@ class Solution:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Where N frames are.
+    """Positions of N frames with their distances and energies.
 
     Attributes:
         x: positions [m], shape (V, 3, N).
@@ -115,8 +115,8 @@ class State:
             self.x[..., frames], self.body_distance and self.body_distance.select(frames), self.energy[frames]
         )
 
-    def replaced(self, frames: Tensor, other: State) -> State:
-        """Return the state with the frames of indices (M,) taken from another."""
+    def replace_frames(self, frames: Tensor, other: State) -> State:
+        """Return the state with frames (M,) replaced by those of another state."""
         x, energy, *body_distance = (
             own.index_copy(-1, frames, new) for own, new in zip(self.tensors(), other.tensors(), strict=True)
         )
@@ -130,7 +130,7 @@ def minimise_from(
     """Minimise the energy of each frame over the free vertices; no frame ends higher than it starts.
 
     Args:
-        start: first positions, pinned vertices where they stay, shape (V, 3, N).
+        start: initial positions, with pinned vertices in place, shape (V, 3, N).
 
     Raises:
         SsilkError: the energy of the start is not finite.
@@ -147,8 +147,8 @@ class _Search:
     """The search of `minimise_from`: the active frames, and the best state of every frame.
 
     Attributes:
-        fixed: vertices that stay where they are, shape (V, N).
-        cooldown: iterations that remain without the exact Hessian, shape (N,).
+        fixed: fixed vertices, shape (V, N).
+        cooldown: remaining iterations without the exact Hessian, shape (N,).
         released: frames whose fixed vertices have been released, shape (N,).
     """
 
@@ -179,7 +179,7 @@ class _Search:
         self.solution = Solution(*found, iterations, iterations.clone(), 0)
 
     def drop_finished(self) -> bool:
-        """Drop frames that have converged or that no step improves; return whether any is left."""
+        """Drop frames that have converged or that no step improves; return whether any remains."""
         self._release_fixed()
         kept = (self.moving & (self.residual > self.options.tolerance)).nonzero()[:, 0]
         if 0 < len(kept) < len(self.active):
@@ -208,7 +208,7 @@ class _Search:
         self.solution = replace(found, cg_iterations=found.cg_iterations + count)
 
     def _release_fixed(self) -> None:
-        """Release the fixed vertices of frames that have converged otherwise, once."""
+        """Release the fixed vertices of frames whose other vertices have converged, once."""
         again = (self.residual <= self.options.tolerance) & ~self.released & self.fixed.any(0)
         if bool(again.any()):
             self.fixed &= ~again
@@ -238,9 +238,9 @@ def newton_step(
     fixed: Tensor | None = None,
     exact_hessian: Tensor | None = None,
 ) -> tuple[Tensor, int]:
-    """Return a direction (V, 3, N), zero in pinned and `fixed` (V, N) vertices, and the iterations it took.
+    """Return a direction (V, 3, N), zero at pinned and `fixed` (V, N) vertices, and the iterations of the solve.
 
-    It is a descent direction, except perhaps in frames whose `exact_hessian` (N,) is used.
+    It is a descent direction, except possibly in frames that use the `exact_hessian` (N,).
     """
     right = -gradient[potential.free].float()
     z, count = potential.hessian(state.x, inputs, state.body_distance, fixed, exact_hessian).solve(
@@ -259,11 +259,9 @@ def line_search(
 ) -> tuple[State, Tensor, Tensor]:
     """Backtrack from a full step until the energy of each frame meets Armijo's condition.
 
-    A frame whose energy no trial lowers enough stays.
-
     Returns:
-        The states, the accepted share of the step (N,), 0 for frames that stay, and the vertices that obstruct longer
-        steps where that share is small (V, N).
+        The states, the accepted step lengths (N,), 0 for frames that stay, and the vertices that obstruct longer
+        steps where the length is small (V, N).
     """
     slope = (gradient * step).sum((0, 1))
     found, left, length = state, (slope < 0).nonzero()[:, 0], 1.0
@@ -275,7 +273,7 @@ def line_search(
         fallen = trial.energy <= (state.energy + ARMIJO * length * slope)[left]
         rows = fallen.nonzero()[:, 0]
         if len(rows):
-            found = found.replaced(left[rows], trial.select(rows))
+            found = found.replace_frames(left[rows], trial.select(rows))
             lengths[left[rows]] = length
         if length <= SHORT_STEP:
             cost = excess_collision(potential, state.select(left), trial, length * step[..., left])
@@ -285,7 +283,7 @@ def line_search(
 
 
 def excess_collision(potential: IncrementalPotential, state: State, trial: State, moved: Tensor) -> Tensor:
-    """Return the collision energy of each vertex in a trial beyond its second-order prediction [J], (V, N)."""
+    """Return the collision energy of each vertex in a trial minus its second-order prediction [J], (V, N)."""
     if state.body_distance is None:
         return torch.zeros_like(moved[:, 0])
     expected = potential.collision_at(state.body_distance.expected(trial.x, moved))

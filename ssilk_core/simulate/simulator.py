@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The reference simulator: implicit Euler on the training energy, several shots at once.
 
-A shot starts with the quasi-static state of its first pose, and with the velocity that linear blend skinning has
-then: a character that walks at once does not walk out of its garment. Each step works about the character's root of
-that step, where single precision of the body is finest; between steps positions are kept in the world, in float64.
+A shot starts with the quasi-static state of its first pose and the velocity of linear blend skinning, so that a
+character that starts walking does not leave its garment behind. Each step is solved relative to the character's root,
+where single precision is finest; between steps positions are kept in world space, in float64.
 """
 
 from __future__ import annotations
@@ -20,28 +20,28 @@ from ..constants import GRAVITY
 from ..errors import fail
 from ..events import Progress, Reporter, silent
 from ..fabrics import Fabric
-from .actors import Actors, MotionSpan, PosedCharacters, played, spans_of
+from .characters import CharacterPoser, MotionSpan, PosedCharacters, join_spans, split_into_spans
 from .incremental_potential import IncrementalPotential, StepInputs
 from .newton import Solution, SolverOptions, minimise_from
 
 PRECISIONS = {"float64": torch.float64, "float32": torch.float32}
-MOST_SUBSTEPS = 1000
+MAX_SUBSTEPS = 1000
 
 
 @dataclass(frozen=True, kw_only=True)
 class SimulationOptions:
-    """How a simulation advances.
+    """Settings of a simulation.
 
     Attributes:
-        fps: frames per second; the default is what garments are trained at.
+        fps: frames per second; the default is the rate of training.
         substeps: steps in each frame.
-        batch: shots that advance together.
-        sequence: frames after which a shot starts anew, as evaluations may; sequences then advance side by side, as
-            shots do. None for whole shots.
-        precision: "float64" or "float32", of positions, energies and forces; linear systems are float32 in either.
+        batch: number of shots simulated in parallel.
+        sequence: number of frames after which a shot restarts, for evaluation; sequences are simulated in parallel.
+            None for whole shots.
+        precision: "float64" or "float32", of positions, energies and forces; linear systems are always float32.
         gravity: acceleration [m/s2].
-        solver: of every step.
-        rest: of quasi-static states, which inertia does not help to converge.
+        solver: settings for every step.
+        quasi_static_solver: settings for quasi-static states, which converge more slowly without inertia.
     """
 
     fps: float = 30.0
@@ -51,13 +51,13 @@ class SimulationOptions:
     precision: str = "float64"
     gravity: tuple[float, float, float] = (0.0, -GRAVITY, 0.0)
     solver: SolverOptions = field(default_factory=SolverOptions)
-    rest: SolverOptions = field(default_factory=lambda: SolverOptions(iterations=150))
+    quasi_static_solver: SolverOptions = field(default_factory=lambda: SolverOptions(iterations=150))
 
     def __post_init__(self) -> None:
         if not 0 < self.fps <= 10_000:
             fail("simulation", f"{self.fps:g} frames per second", "a positive rate is needed")
-        if not 0 < self.substeps <= MOST_SUBSTEPS:
-            fail("simulation", f"substeps = {self.substeps}", f"1 to {MOST_SUBSTEPS} are allowed")
+        if not 0 < self.substeps <= MAX_SUBSTEPS:
+            fail("simulation", f"substeps = {self.substeps}", f"1 to {MAX_SUBSTEPS} are allowed")
         if not self.batch > 0:
             fail("simulation", f"batch = {self.batch}", "at least 1 is needed")
         if not (self.sequence is None or self.sequence >= 1):
@@ -73,10 +73,10 @@ class SimulatedFrame:
     """One frame of one shot.
 
     Attributes:
-        shot, number: which shot, and which of its frames.
-        points: garment vertices in the world [m], float64, shape (V, 3).
-        energy: what was minimised [J], heights counted from the character's root.
-        residual, iterations, fixed: of `newton.Solution`, in the last step of the frame.
+        shot, number: index of the shot, and of the frame in it.
+        points: garment vertices in world space [m], float64, shape (V, 3).
+        energy: the incremental potential [J], with heights relative to the character's root.
+        residual, iterations, fixed: see `newton.Solution`, for the last step of the frame.
     """
 
     shot: int
@@ -89,12 +89,12 @@ class SimulatedFrame:
 
 
 @dataclass(frozen=True, eq=False)
-class Past:
-    """What a step looks back on, in N shots.
+class StepHistory:
+    """The previous states of N shots.
 
     Attributes:
-        last, before: positions one and two steps ago in the world [m], float64, shape (V, 3, N); None for `before` in
-            the step after the first.
+        last, before: positions one and two steps ago in world space [m], float64, shape (V, 3, N); `before` is None
+            in the second step.
         root: the character's root one step ago [m], float64, shape (3, N).
         lbs: the garment under linear blend skinning one step ago, relative to that root, shape (V, 3, N).
     """
@@ -104,27 +104,23 @@ class Past:
     root: Tensor
     lbs: Tensor
 
-    def first(self, count: int) -> Past:
-        """Return the past of the first `count` shots."""
+    def first(self, count: int) -> StepHistory:
+        """Return the history of the first `count` shots."""
         before = None if self.before is None else self.before[..., :count]
-        return Past(self.last[..., :count], before, self.root[:, :count], self.lbs[..., :count])
+        return StepHistory(self.last[..., :count], before, self.root[:, :count], self.lbs[..., :count])
 
     @property
     def local(self) -> Tensor:
-        """Return the last positions relative to the root then, shape (V, 3, N)."""
+        """The last positions relative to the root at that time, shape (V, 3, N)."""
         return (self.last - self.root).to(self.lbs.dtype)
 
-    def carried_on(self, poses: PosedCharacters) -> Tensor:
-        """Return positions as far from linear blend skinning as one step ago, relative to the roots of `poses`."""
+    def follow_lbs(self, poses: PosedCharacters) -> Tensor:
+        """Return the last positions moved along with linear blend skinning, relative to the roots of `poses`."""
         return self.local - self.lbs + poses.lbs
 
 
 class Simulator:
-    """Advances one garment on any motions of its character.
-
-    Args:
-        device: where everything runs.
-    """
+    """Simulates one garment for any motions of its character."""
 
     def __init__(
         self,
@@ -137,63 +133,63 @@ class Simulator:
         self.options, device = options or SimulationOptions(), torch.device(device)
         dtype = PRECISIONS[self.options.precision]
         self.potential = IncrementalPotential(scene, fabric, device=device, dtype=dtype)
-        self.actors = Actors(scene, device, dtype)
+        self.poser = CharacterPoser(scene, device, dtype)
         self.gravity = torch.tensor(self.options.gravity, dtype=dtype, device=device)[:, None]
         self.dt = 1 / (self.options.fps * self.options.substeps)
 
     def frames(self, motions: Sequence[Motion]) -> Iterator[SimulatedFrame]:
-        """Yield all frames of all shots: in order within a shot, batches of shots side by side."""
+        """Yield all frames of all shots, in order within a shot; a batch of shots advances in parallel."""
         options = self.options
         cut = (options.fps, options.substeps, options.sequence)
-        spans = [span for shot, motion in enumerate(motions) for span in spans_of(motion, shot, *cut)]
+        spans = [span for shot, motion in enumerate(motions) for span in split_into_spans(motion, shot, *cut)]
         spans.sort(key=lambda span: -span.motion.frame_count)
         for start in range(0, len(spans), options.batch):
-            yield from self._advanced(spans[start : start + options.batch])
+            yield from self._simulate_spans(spans[start : start + options.batch])
 
-    def _advanced(self, spans: Sequence[MotionSpan]) -> Iterator[SimulatedFrame]:
-        """Yield the frames of spans, the longest first."""
-        past: Past | None = None
+    def _simulate_spans(self, spans: Sequence[MotionSpan]) -> Iterator[SimulatedFrame]:
+        """Yield the frames of spans, which are sorted by decreasing length."""
+        past: StepHistory | None = None
         for step in range(spans[0].motion.frame_count):
             running = [span for span in spans if span.motion.frame_count > step]
-            poses = self.actors.poses(running, step)
+            poses = self.poser.poses_at(running, step)
             past = past and past.first(len(running))
-            solution = self._stepped(poses, past) if past else self.rest(poses, poses.lbs)
+            solution = self._step(poses, past) if past else self.quasi_static(poses, poses.lbs)
             world = solution.x.double() + poses.root
-            past = Past(world, past.last if past else None, poses.root, poses.lbs)
+            past = StepHistory(world, past.last if past else None, poses.root, poses.lbs)
             if step % self.options.substeps == 0:
                 yield from _frames(running, step // self.options.substeps, world, solution)
 
-    def rest(self, poses: PosedCharacters, start: Tensor) -> Solution:
-        """Return the quasi-static states of poses nearest to `start` (V, 3, N), relative to the roots."""
-        return minimise_from(self.potential, start, self.inputs(poses, None), self.options.rest)
+    def quasi_static(self, poses: PosedCharacters, start: Tensor) -> Solution:
+        """Return the quasi-static states of poses, minimised from `start` (V, 3, N), relative to the roots."""
+        return minimise_from(self.potential, start, self.inputs(poses, None), self.options.quasi_static_solver)
 
-    def inputs(self, poses: PosedCharacters, past: Past | None) -> StepInputs:
-        """Return what positions relative to the roots are solved for: a step after `past`, else a state at rest."""
+    def inputs(self, poses: PosedCharacters, past: StepHistory | None) -> StepInputs:
+        """Return the inputs of a step after `past`, or of a quasi-static state without it, relative to the roots."""
         gravity = self.gravity.expand(3, poses.root.shape[-1])
         if past is None:
             return StepInputs(poses.body, gravity)
         shift = poses.root - past.root
-        predicted = past.carried_on(poses) if past.before is None else past.local + (past.last - past.before - shift)
+        predicted = past.follow_lbs(poses) if past.before is None else past.local + (past.last - past.before - shift)
         return StepInputs(poses.body, gravity, predicted.to(past.lbs.dtype), past.local, self.dt)
 
-    def _stepped(self, poses: PosedCharacters, past: Past) -> Solution:
+    def _step(self, poses: PosedCharacters, past: StepHistory) -> Solution:
         """Return the states one step later."""
         inputs = self.inputs(poses, past)
         assert inputs.predicted is not None
-        starts = [inputs.predicted, past.local, past.carried_on(poses)]
-        return self.solve(self.best([self.pinned(x, poses) for x in starts], inputs), inputs)
+        starts = [inputs.predicted, past.local, past.follow_lbs(poses)]
+        return self.solve(self.best_start([self.apply_pins(x, poses) for x in starts], inputs), inputs)
 
     def solve(self, start: Tensor, inputs: StepInputs) -> Solution:
-        """Return the minima of one step (V, 3, N), sought from `start`."""
+        """Return the minima of one step, from `start` (V, 3, N)."""
         return minimise_from(self.potential, start, inputs, self.options.solver)
 
-    def pinned(self, x: Tensor, poses: PosedCharacters) -> Tensor:
-        """Return positions (V, 3, N) with the vertices that do not move freely under linear blend skinning."""
+    def apply_pins(self, x: Tensor, poses: PosedCharacters) -> Tensor:
+        """Return positions (V, 3, N) with all vertices but the free ones set to linear blend skinning."""
         free = self.potential.free
         return poses.lbs.index_copy(0, free, x[free].to(poses.lbs.dtype))
 
-    def best(self, starts: Sequence[Tensor], inputs: StepInputs) -> Tensor:
-        """Return for each frame the start of least energy."""
+    def best_start(self, starts: Sequence[Tensor], inputs: StepInputs) -> Tensor:
+        """Return for each frame the start with the least energy."""
         potential = self.potential
         energies = [potential.energy(x, inputs, potential.body_distance(x, inputs)) for x in starts]
         chosen = torch.stack(energies).nan_to_num(nan=torch.inf).argmin(0)
@@ -221,7 +217,7 @@ def simulate(
     device: torch.device | str = "cpu",
     report: Reporter = silent,
 ) -> list[Floats]:
-    """Return the garment's vertices over each motion, at `options.fps`, in the world [m], each (frames, V, 3).
+    """Return the garment's vertices over each motion, at `options.fps`, in world space [m], each (frames, V, 3).
 
     Raises:
         SsilkError: no motion, no body, or a state whose energy is not finite.
@@ -238,12 +234,12 @@ def simulate(
 
 
 def shots_of(motions: Sequence[Motion], options: SimulationOptions) -> list[Motion]:
-    """Return each character's motion at the frames of its simulated shot."""
-    spans = [spans_of(motion, 0, options.fps, options.substeps) for motion in motions]
-    return [played(motion, parts) for motion, parts in zip(motions, spans)]
+    """Return the motions sampled at the frames of their simulated shots."""
+    spans = [split_into_spans(motion, 0, options.fps, options.substeps) for motion in motions]
+    return [join_spans(motion, parts) for motion, parts in zip(motions, spans)]
 
 
-def minimise(
+def quasi_static_states(
     scene: Scene,
     fabric: Fabric,
     motion: Motion,
@@ -251,8 +247,8 @@ def minimise(
     *,
     device: torch.device | str = "cpu",
 ) -> Floats:
-    """Return the quasi-static garment in each pose of a motion by itself, in the world [m], shape (F, V, 3)."""
+    """Return the quasi-static garment of each pose of a motion, in world space [m], shape (F, V, 3)."""
     simulator = Simulator(scene, fabric, options, device=device)
-    poses = simulator.actors.posed(motion.rotations, motion.translations)
-    solution = simulator.rest(poses, poses.lbs)
+    poses = simulator.poser.pose(motion.rotations, motion.translations)
+    solution = simulator.quasi_static(poses, poses.lbs)
     return (solution.x.double() + poses.root).permute(2, 0, 1).cpu().numpy()

@@ -64,8 +64,8 @@ def trained(scene: Scene, fabric: Fabric, drive: ProceduralMotion, steps: int, *
     stepper = parts.stepper(config, 0)
     for step in range(steps):
         stepper.run(step)
-    model: GarmentModel = stepper.averaged
-    return Trial(extent(model, fabric, drive), int(stepper.faults.count), steps, error)
+    model: GarmentModel = stepper.ema_model
+    return Trial(extent(model, fabric, drive), int(stepper.skipped.count), steps, error)
 
 
 def simulated(scene: Scene, fabric: Fabric, motion: Motion, gravity: float = GRAVITY) -> tuple[Extent, float]:

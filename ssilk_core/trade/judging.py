@@ -51,8 +51,8 @@ def judged(dressed: EvaluationScene, reel: TakeSet, method: Method) -> list[Judg
         body = CollisionBody(whole, joints, vertices=chosen, device=dressed.device)
         contacts = Contacts(dressed.scene, vertices=chosen, device=dressed.device)
         begun = time.perf_counter()
-        met, nearest = contacts.distances(x, body.posed(character, surface=surface))
-        inside, energy = float((nearest < 0).double().mean()), float(dressed.energy.collision_of(met).mean())
+        met, nearest = contacts.distances(x, body.pose(character, surface=surface))
+        inside, energy = float((nearest < 0).double().mean()), float(dressed.energy.collision_at(met).mean())
         each = 1000 * (time.perf_counter() - begun) / len(frames)
         found.append(Judged(name, len(chosen), each, energy, inside))
     return found

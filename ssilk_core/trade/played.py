@@ -16,8 +16,8 @@ from ..evaluation.methods import EvaluationScene, TakeSet
 from ..kinematics import resample, sample_motion
 from ..refine import RefineOptions, Refiner
 from ..runtime import Player
-from ..runtime.drive import character_matrices
-from ..runtime.skinning import posed
+from ..runtime.character import character_matrices
+from ..runtime.skinning import skin_garment
 from ..sampling import sample_pose
 
 POSED = 64  # frames whose vertices are computed together
@@ -77,10 +77,12 @@ class Played:
 
     def _between(self, shot: Motion, stored: GarmentPose, at: Floats) -> Floats:
         """Return the vertices at fractional frames (N,) of a shot."""
-        activations, rotations = self.player.decoder.taken(sample_pose(stored, at))
+        activations, rotations = self.player.decoder.network_pose(sample_pose(stored, at))
         moved = Motion(shot.path, shot.fps, *sample_motion(shot, at))
         character, origins = character_matrices(moved, self.player.skeleton)
-        return posed(self.player.tiles, activations, self.player.kinematics.matrices(rotations, character), origins)
+        return skin_garment(
+            self.player.tiles, activations, self.player.kinematics.matrices(rotations, character), origins
+        )
 
 
 def _joined(poses: Iterable[GarmentPose]) -> GarmentPose:

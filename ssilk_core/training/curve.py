@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The learning curve of a run: what each validation found, and when."""
+"""The learning curve of a run: the validations and when they took place."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 from ..files import replacing
 from .validation import Score
 
-MOST_POINTS = 400
+MAX_POINTS = 400
 
 
 @dataclass(frozen=True)
@@ -19,10 +19,10 @@ class CurvePoint:
     """One validation.
 
     Attributes:
-        iteration: steps done until then.
-        seconds: time that the steps took, over all resumed parts of the run, validations and writing left out [s].
+        iteration: steps done so far.
+        seconds: time spent in steps, over all resumed parts of the run, without validation and writing [s].
         batch: energies of the last training batch [J].
-        score: what the validation found.
+        score: result of the validation.
     """
 
     iteration: int
@@ -32,14 +32,14 @@ class CurvePoint:
 
 
 def curve_path(model: str | Path) -> Path:
-    """Return where the learning curve of the run that writes `model` lies."""
+    """Return the path of the learning curve for the run that writes `model`."""
     return Path(model).with_suffix(".curve.json")
 
 
-def with_point(curve: list[CurvePoint], point: CurvePoint) -> list[CurvePoint]:
-    """Return a curve with one point more; every second one is dropped when there are too many."""
+def append_point(curve: list[CurvePoint], point: CurvePoint) -> list[CurvePoint]:
+    """Return a curve with one more point; with more than `MAX_POINTS`, every second point is dropped."""
     curve = [*curve, point]
-    return curve if len(curve) <= MOST_POINTS else curve[::2]
+    return curve if len(curve) <= MAX_POINTS else curve[::2]
 
 
 def write_curve(path: Path, curve: list[CurvePoint], lbs: Score) -> None:
@@ -53,5 +53,5 @@ def write_curve(path: Path, curve: list[CurvePoint], lbs: Score) -> None:
 
 
 def summary(score: Score) -> dict[str, Any]:
-    """Return a score as plain numbers by name: each term and the total [J], collisions, dynamics [m]."""
+    """Return a score as numbers by name: each term and the total [J], collisions, dynamics [m]."""
     return {**score.terms, "total": score.total, "collisions": score.collisions, "dynamics": score.dynamics}

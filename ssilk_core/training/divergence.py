@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Looking after the steps that are undone because something was not finite: telling, judging, keeping for study."""
+"""Detection of diverging training: report skipped steps, judge them, save the last one for study."""
 
 from __future__ import annotations
 
@@ -14,88 +14,93 @@ from torch import Tensor
 
 from ..assets import Motion
 from ..files import replacing
-from ..motion_bank import MOST_TURN, MotionBank, usable_spans
-from .faults import Faults
-from .state import learned
+from ..motion_bank import MAX_JOINT_SPEED, MotionBank, usable_spans
+from .skipped_steps import SkippedSteps
+from .state import learned_tensors
 from .step import Stepper
 
-EVERY = 20  # steps between two looks
-SPAN = 100  # steps that are judged together
-POSES = ("frames", "directions")  # what a step of the warm start is computed from
-LIMIT = 0.5  # of the steps in a span; with more of them undone, training is not going anywhere
+CHECK_INTERVAL = 20  # steps between two checks
+DIVERGENCE_WINDOW = 100  # steps
+STATIC_INPUTS = ("frames", "directions")  # inputs of a static step
+MAX_SKIPPED_SHARE = 0.5  # of the steps in the window; with more, training has diverged
 
 
 class DivergenceMonitor:
-    """Looks now and then at the steps that a stepper has undone.
+    """Checks periodically how many steps were skipped.
 
     Attributes:
-        count: steps undone, as of the last look.
+        count: skipped steps, as of the last check.
     """
 
-    def __init__(self, faults: Faults) -> None:
-        self.faults, self.count = faults, int(faults.count)
+    def __init__(self, skipped: SkippedSteps) -> None:
+        self.skipped, self.count = skipped, int(skipped.count)
         self._initial_count = self.count
-        self._counts = deque([self.count], maxlen=SPAN // EVERY + 1)
-        self._told, self._blamed = self.count, {name: int(value) for name, value in faults.terms.items()}
+        self._counts = deque([self.count], maxlen=DIVERGENCE_WINDOW // CHECK_INTERVAL + 1)
+        self._reported, self._reported_terms = self.count, {name: int(value) for name, value in skipped.terms.items()}
 
-    def look(self) -> str:
-        """Return one sentence when steps were undone; of many, ever fewer are told of. It waits for the device."""
-        self.count = int(self.faults.count)
+    def check(self) -> str:
+        """Return a sentence about newly skipped steps, or ""; repeated ones are reported ever less often.
+
+        It waits for the device.
+        """
+        self.count = int(self.skipped.count)
         self._counts.append(self.count)
-        if self.count == self._told or self.count - self._initial_count < 1.5 * (self._told - self._initial_count):
+        if self.count == self._reported or self.count - self._initial_count < 1.5 * (
+            self._reported - self._initial_count
+        ):
             return ""
-        blamed = {name: int(value) for name, value in self.faults.terms.items()}
-        names = [name for name, value in blamed.items() if value > self._blamed.get(name, 0)]
-        new, self._told, self._blamed = self.count - self._told, self.count, blamed
+        terms = {name: int(value) for name, value in self.skipped.terms.items()}
+        names = [name for name, value in terms.items() if value > self._reported_terms.get(name, 0)]
+        new, self._reported, self._reported_terms = self.count - self._reported, self.count, terms
         return (
             f"{new} step{'s' if new > 1 else ''} up to iteration {self.iteration} "
-            f"{'were' if new > 1 else 'was'} undone: {' and '.join(names)} not finite."
+            f"{'were' if new > 1 else 'was'} skipped: {' and '.join(names)} not finite."
         )
 
     @property
     def iteration(self) -> int:
-        """The iteration that the last undone step led to."""
-        return int(self.faults.iteration) + 1
+        """The iteration after the last skipped step."""
+        return int(self.skipped.iteration) + 1
 
     @property
     def is_diverging(self) -> bool:
-        """Whether too many of the last steps were undone."""
-        return self._counts[-1] - self._counts[0] > LIMIT * SPAN
+        """Whether too many of the last steps were skipped."""
+        return self._counts[-1] - self._counts[0] > MAX_SKIPPED_SHARE * DIVERGENCE_WINDOW
 
     @property
     def non_finite_terms(self) -> list[str]:
-        """Names of what was not finite, the most frequent first."""
-        counts = {name: int(value) for name, value in self.faults.terms.items()}
+        """Names of the terms that were not finite, the most frequent first."""
+        counts = {name: int(value) for name, value in self.skipped.terms.items()}
         return sorted((name for name in counts if counts[name]), key=lambda name: -counts[name])
 
 
 def fault_path(model: str | Path) -> Path:
-    """Return where the run that writes `model` keeps what was not finite."""
+    """Return the path at which the run that writes `model` saves its last skipped step."""
     return Path(model).with_suffix(".fault.safetensors")
 
 
 def save_fault(path: Path, stepper: Stepper, motions: Sequence[Motion], found: str) -> None:
-    """Write the window of the last step that was undone, beside what was learned until then.
+    """Write the inputs of the last skipped step, with the parameters and optimiser state.
 
-    Tensors "window.*" are what the step was computed from; the header says under "ssilk_fault" what was found, the
-    iteration that the step led to, and the motion and frame that each slot of the window begins at.
+    Tensors "window.*" are the inputs of the step. The header holds under "ssilk_fault" what was found, the iteration
+    after the step, and the motion and frame at which each slot of the window begins.
     """
     from safetensors.torch import save
 
-    faults, bank = stepper.faults, stepper.objective.bank
-    still = int(faults.iteration) < stepper.config.static_iterations
-    window = {name: value.cpu() for name, value in faults.window.items() if (name in POSES) == still}
+    skipped, bank = stepper.skipped, stepper.objective.bank
+    still = int(skipped.iteration) < stepper.config.static_iterations
+    window = {name: value.cpu() for name, value in skipped.window.items() if (name in STATIC_INPUTS) == still}
     frames = window.get("frames" if still else "first")
-    places = [] if frames is None else places_of(frames, bank, motions, stepper.model.config.fps)
-    document = {"found": found, "iteration": int(faults.iteration) + 1, "places": places}
-    tensors = learned(stepper) | {f"window.{name}": value.contiguous() for name, value in window.items()}
+    places = [] if frames is None else locate_frames(frames, bank, motions, stepper.model.config.fps)
+    document = {"found": found, "iteration": int(skipped.iteration) + 1, "places": places}
+    tensors = learned_tensors(stepper) | {f"window.{name}": value.contiguous() for name, value in window.items()}
     with replacing(path) as temporary:
         temporary.write_bytes(save(tensors, {"ssilk_fault": json.dumps(document)}))
 
 
-def places_of(frames: Tensor, bank: MotionBank, motions: Sequence[Motion], fps: float) -> list[dict[str, Any]]:
-    """Return for frames (N,) of a bank of `motions` at `fps` which motion they are in, and its own frame there."""
-    spans, starts = usable_spans(motions, fps, MOST_TURN), bank.starts.tolist()
+def locate_frames(frames: Tensor, bank: MotionBank, motions: Sequence[Motion], fps: float) -> list[dict[str, Any]]:
+    """Return motion path and frame for each frame index (N,) of a bank of `motions` at `fps`."""
+    spans, starts = usable_spans(motions, fps, MAX_JOINT_SPEED), bank.starts.tolist()
     index = frames.tolist()
     clips = np.searchsorted(bank.stops.cpu().numpy(), index, side="right").tolist()
     return [

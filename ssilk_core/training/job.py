@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a training run is asked to do."""
+"""The inputs of a training run."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from ..assets import LOOSE, PINNED, Motion, Scene
 from ..config import ModelConfig, TrainConfig
 from ..errors import fail
 from ..fabrics import Fabric
-from .recombine import recombined
-from .state import canonical, scene_digest
+from .recombine import recombine_motions
+from .state import json_round_trip, scene_digest
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainJob:
-    """Everything a training needs, cut down to what its scene requires.
+    """All inputs of a training run, reduced to what the scene needs.
 
-    Garments with nothing loose are quasi-static: a stepper learns nothing there that the initialiser does not know.
+    Garments without loose vertices are quasi-static: a stepper would add nothing to the initialiser.
 
     Attributes:
         scene: character with its body, garment, rig.
-        motions, held_out: what is trained on, and what is validated on.
-        output: the model file to write; the run's other files lie beside it.
+        motions, held_out: motions for training, and for validation.
+        output: the model file to write; the run's other files go to the same folder.
         inputs: hashes of the input files by name, for the provenance.
         minutes: wall time to fill instead of the schedule's iterations; None for these. A resumed run may have more.
     """
@@ -45,31 +45,31 @@ class TrainJob:
     def __post_init__(self) -> None:
         if not self.has_loose:
             object.__setattr__(self, "model", replace(self.model, scheme="quasi_static"))
-        if self.model.scheme == "quasi_static":  # nothing has a past to vary
+        if self.model.scheme == "quasi_static":  # there are no previous states to vary
             object.__setattr__(self, "train", replace(self.train, state_reuse=0, noise=0))
-        if not self.learns:
+        if not self.is_trainable:
             object.__setattr__(self, "model", replace(self.model, latent=1, widths=(1,), shapes=1))
             least = replace(self.train, iterations=1, batch=1, pretraining_batch=1, static_batch=1, recombinations=0)
             object.__setattr__(self, "train", least)
 
     @property
     def has_loose(self) -> bool:
-        """Whether anything of the garment is loose."""
+        """Whether the garment has loose vertices."""
         return bool((self.scene.classes == LOOSE).any())
 
     @property
-    def learns(self) -> bool:
-        """Whether there is anything to learn; a garment that is pinned all over gets the least of networks."""
+    def is_trainable(self) -> bool:
+        """Whether there is anything to learn; a garment that is pinned everywhere gets the smallest network."""
         return bool((self.scene.classes != PINNED).any())
 
-    def trained_motions(self) -> list[Motion]:
-        """Return the motions and what is recombined from them."""
+    def training_motions(self) -> list[Motion]:
+        """Return the motions and those recombined from them."""
         skeleton = self.scene.character.skeleton
-        return [*self.motions, *recombined(self.motions, skeleton, self.train.recombinations, self.train.seed)]
+        return [*self.motions, *recombine_motions(self.motions, skeleton, self.train.recombinations, self.train.seed)]
 
     def identity(self) -> dict[str, Any]:
-        """Return what makes a run the run it is, as it comes back from JSON; a resumed run must be asked the same."""
-        return canonical(
+        """Return the inputs that a resumed run must share, as JSON stores them."""
+        return json_round_trip(
             {
                 "model": asdict(self.model),
                 "train": asdict(self.train),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far distances between garments are from distances between their latents (paper, Eq. 13)."""
+"""Regularisation of distances between latents by distances between garments (paper, Eq. 13)."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from torch import Tensor
 
 from ..model.network import GarmentModel
 
-SMALLEST = 1e-6  # distance of latents, and of garments [m], whose logarithm is finite
+MIN_DISTANCE = 1e-6  # floor for distances of latents, and of garments [m], before the logarithm
 
 
-def latent_irregularity(model: GarmentModel, mass: Tensor, z: Tensor, scale: float) -> Tensor:
+def latent_distortion(model: GarmentModel, mass: Tensor, z: Tensor, scale: float) -> Tensor:
     """Return (log(|x - x'| / (scale |z - z'|)))^2 of each latent z (N, latent) and the next one, shape (N,).
 
-    x are garments in the bind pose, where nothing but their latents tells them apart; their distance is RMS over the
-    mass of each vertex (V,) [m], and `scale` is in metres.
+    x are the garments of these latents in the bind pose; their distance is RMS, weighted by the mass of each vertex
+    (V,) [m], and `scale` is in metres.
     """
     joints = model.scene.character.skeleton.joint_count
     still = torch.eye(3, 4, device=z.device)[None, :, :, None].expand(joints, 3, 4, len(z)).contiguous()
@@ -25,5 +25,5 @@ def latent_irregularity(model: GarmentModel, mass: Tensor, z: Tensor, scale: flo
     apart = ((x - x.roll(1, dims=-1)) ** 2).sum(1)
     squared = torch.einsum("v,vn->n", mass / mass.sum(), apart)
     latent = (z - z.roll(1, dims=0)).square().sum(1)
-    ratio = squared.clamp_min(SMALLEST**2) / latent.clamp_min(SMALLEST**2)
+    ratio = squared.clamp_min(MIN_DISTANCE**2) / latent.clamp_min(MIN_DISTANCE**2)
     return (0.5 * ratio.log() - log(scale)) ** 2

@@ -12,7 +12,7 @@ from ..constants import GRAVITY
 from ..energy import GarmentEnergy
 from ..model.network import GarmentModel
 from ..motion_bank import MotionBank
-from .latent_regularization import latent_irregularity
+from .latent_regularization import latent_distortion
 from .windows import WindowSampler
 
 Terms = dict[str, Tensor]
@@ -22,8 +22,8 @@ class Objective:
     """Computes energies of a model's decoded states; each term is [J] per frame, unreduced.
 
     Args:
-        body: what the garment can touch, None for nothing. Pinned vertices, which nothing that is learned moves,
-            meet no body.
+        body: the part of the body that the garment can touch, None for nothing. Pinned vertices do not collide,
+            because training cannot move them.
     """
 
     def __init__(
@@ -41,24 +41,26 @@ class Objective:
             self.contacts = Contacts(model.scene, vertices=body.vertices, pinned=False, device=device)
         self.dt = 1 / model.config.fps
 
-    def potential(self, x: Tensor, direction: Tensor, character: Tensor) -> Terms:
-        """Return every term but inertia of positions x (V, 3, N) under gravity directions (N, 3)."""
+    def quasi_static_terms(self, x: Tensor, direction: Tensor, character: Tensor) -> Terms:
+        """Return all terms but inertia and drag of positions x (V, 3, N) under gravity directions (N, 3)."""
         energy, root = self.energy, character[0, :, 3]  # heights over the root keep the value of gravity small
         stretch, bending = energy.elastic(x)
-        gravity, collision = energy.potential(x, root, GRAVITY * direction.T, *self._planes(x.detach(), character))
+        gravity, collision = energy.gravity_and_collision(
+            x, root, GRAVITY * direction.T, *self._planes(x.detach(), character)
+        )
         return {"stretch": stretch, "bending": bending, "gravity": gravity, "collision": collision}
 
     def _planes(self, x: Tensor, character: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the plane that each vertex of x (V, 3, N) may meet: normals (V, 3, N) and offsets (V, N)."""
+        """Return the plane that each vertex of x (V, 3, N) can touch: normals (V, 3, N) and offsets (V, N)."""
         if self.body is None:
             return no_planes(x)
-        return self.contacts.planes(x, self.body.posed(character, surface=self.surface))
+        return self.contacts.planes(x, self.body.pose(character, surface=self.surface))
 
     def static(self, frames: Tensor, direction: Tensor) -> Terms:
         """Return the terms of the initialiser's quasi-static states on single poses (Section 3.1)."""
         z = self.model.initial(self.bank.static_descriptor(frames, direction))
         character = self.bank.character(frames)
-        return self.potential(self.model.vertices(z, character), direction, character)
+        return self.quasi_static_terms(self.model.vertices(z, character), direction, character)
 
     def window(
         self, sampler: WindowSampler, noise: Tensor, frames: Tensor, direction: Tensor
@@ -66,13 +68,13 @@ class Objective:
         """Roll one window of every slot.
 
         Args:
-            sampler: where the windows stand.
-            noise: added to the two first latents, shape (2, batch, latent).
-            frames, direction: single poses for the initialiser (M,), and gravity's directions there (M, 3).
+            sampler: frames and states of the windows.
+            noise: added to the first two latents, shape (2, batch, latent).
+            frames, direction: single poses for the initialiser (M,), and their gravity directions (M, 3).
 
         Returns:
-            Terms of the frames from the third on, terms of the initialiser's states of the single
-            poses, and the last two latents (2, batch, latent) for the next window.
+            Terms of the frames from the third on, terms of the quasi-static states of the single poses, and the last
+            two latents (2, batch, latent) for the next window.
         """
         model, bank, length = self.model, self.bank, sampler.config.window
         batch = len(sampler.first)
@@ -80,7 +82,7 @@ class Objective:
         down = sampler.direction.repeat(length, 1)
         static = bank.static_descriptor(times, down)
         pose = torch.cat([static, bank.dynamic[times]], dim=1).reshape(length, batch, -1)
-        # An initialiser with a stepper learns rest states from their own energy, not what helps later frames.
+        # Beside a stepper, the initialiser is trained on the energy of its own states, not on that of later frames.
         with torch.set_grad_enabled(not model.integrator.scheme.states):
             target = model.initial(static).reshape(length, batch, -1)
             start = torch.where(sampler.carried[None, :, None], sampler.latents, target[:2])
@@ -88,7 +90,7 @@ class Objective:
             z = model.roll([*(start + noise)], target[2:], pose[2:])
         rolled = torch.cat(z[2:])
         if not sampler.config.bptt:
-            # The same steps once more, all at once, from states that carry no gradient.
+            # Repeat all steps at once, from states without gradients.
             states = torch.cat(z)
             rolled = model.step(
                 states[: -2 * batch], states[batch:-batch], *(v[2:].flatten(0, 1) for v in (target, pose))
@@ -96,21 +98,21 @@ class Objective:
         quiet = model.initial(bank.static_descriptor(frames, direction))
         with torch.no_grad():
             past = model.vertices(torch.cat(z[:2]), bank.character(times[: 2 * batch]))
-        # The windows from the third frame on and the initialiser's own states share one decoding.
+        # One decoder call for the windows from the third frame on and the single poses.
         character = bank.character(torch.cat([times[2 * batch :], frames]))
         x = model.vertices(torch.cat([rolled, quiet]), character)
-        terms = self.potential(x, torch.cat([down[2 * batch :], direction]), character)
+        terms = self.quasi_static_terms(x, torch.cat([down[2 * batch :], direction]), character)
         count = (length - 2) * batch
         dynamic = {name: value[:count] for name, value in terms.items()}
         static_batch = {name: value[count:] for name, value in terms.items()}
         path = torch.cat([past, x[..., : count - batch].detach()], dim=-1)
         root = bank.root[times].T
-        dynamic["inertia"], dynamic["drag"] = self.energy.kinetic(
+        dynamic["inertia"], dynamic["drag"] = self.energy.inertia_and_drag(
             x, path[..., batch:], path[..., :-batch], root[:, 2 * batch :] - root[:, batch:-batch], self.dt
         )
         if weight := sampler.config.latent_regularization:
             drawn, scale = torch.cat([rolled[-batch:], quiet]), sampler.config.latent_regularization_scale
-            dynamic["latent regularization"] = weight * latent_irregularity(model, self.energy.mass, drawn, scale)
+            dynamic["latent regularization"] = weight * latent_distortion(model, self.energy.mass, drawn, scale)
         return dynamic, static_batch, torch.stack(z[-2:]).detach()
 
 

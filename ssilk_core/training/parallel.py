@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several processes that train one garment together, each on its part of the batch (data parallel)."""
+"""Data-parallel training: several processes train one garment, each on its part of the batch."""
 
 from __future__ import annotations
 
@@ -19,43 +19,41 @@ from ..config import TrainConfig
 from ..devices import chosen_device
 from ..errors import SsilkError, fail
 
-SHARED = (
-    "batch",
-    "pretraining_batch",
-    "static_batch",
-)  # settings that count what one step looks at, in all processes together
-LAUNCHED = ("RANK", "LOCAL_RANK", "WORLD_SIZE")  # what torchrun tells each process
+BATCH_SETTINGS = ("batch", "pretraining_batch", "static_batch")  # totals over all processes
+TORCHRUN_VARIABLES = ("RANK", "LOCAL_RANK", "WORLD_SIZE")
 
 Value = TypeVar("Value")
 
 
 @dataclass(frozen=True)
 class ProcessGroup:
-    """The processes that train one garment, and this one's place among them; one alone exchanges nothing.
+    """The processes that train one garment, and this process's rank; a single process communicates nothing.
 
     All hold the same parameters, bit for bit: they start from one seed, and each step uses one averaged gradient.
-    What they decide (to keep a model, to stop) they decide from values that all of them have.
+    Decisions, such as to keep a model or to stop, depend only on values that all processes share.
     """
 
     rank: int = 0
     size: int = 1
 
     @property
-    def first(self) -> bool:
+    def is_first(self) -> bool:
         """Whether this is the process that reports and writes files."""
         return self.rank == 0
 
     def seed(self, seed: int) -> int:
-        """Return a seed for this process's own random draws; the first process draws as one alone would."""
-        return seed if self.first else int(np.random.SeedSequence((seed, self.rank)).generate_state(1, np.uint64)[0])
+        """Return a seed for this process's random numbers; the first process uses the seed of a single process."""
+        return (
+            seed if self.is_first else int(np.random.SeedSequence((seed, self.rank)).generate_state(1, np.uint64)[0])
+        )
 
-    def part(self, config: TrainConfig) -> TrainConfig:
-        """Return the settings of one process, each with an equal part of every batch.
+    def local_config(self, config: TrainConfig) -> TrainConfig:
+        """Return the settings of one process, with its equal part of every batch.
 
         Raises:
             SsilkError: a batch does not divide.
         """
-        for name in SHARED:
+        for name in BATCH_SETTINGS:
             value = getattr(config, name)
             if value % self.size != 0:
                 fail(
@@ -64,10 +62,10 @@ class ProcessGroup:
                     "each takes an equal part",
                     f"use a multiple of {self.size}",
                 )
-        return replace(config, **{name: getattr(config, name) // self.size for name in SHARED})
+        return replace(config, **{name: getattr(config, name) // self.size for name in BATCH_SETTINGS})
 
     def average(self, tensors: list[Tensor]) -> None:
-        """Replace tensors by their means over all processes, in one exchange that a CUDA graph can hold.
+        """Replace tensors by their means over all processes, with one all-reduce that a CUDA graph can capture.
 
         Raises:
             SsilkError: another process has ended.
@@ -102,8 +100,9 @@ class ProcessGroup:
         except RuntimeError as error:
             reason = str(error).partition("\n")[0].partition(". ")[0]
             raise SsilkError(
-                f"process {self.rank + 1} of {self.size}: the others cannot be reached ({reason}); see whether one "
-                "has said why it ended, then train again with --resume."
+                f"process {self.rank + 1} of {self.size}: the others cannot be reached ({reason}); read their "
+                "messages "
+                "for the cause, then train again with --resume."
             ) from error
 
 
@@ -111,24 +110,25 @@ SINGLE_PROCESS = ProcessGroup()
 
 
 @contextmanager
-def joined(device: str) -> Iterator[tuple[ProcessGroup, str]]:
-    """Join the processes that torchrun has started; yield this one's place among them, and its device.
+def join_process_group(device: str) -> Iterator[tuple[ProcessGroup, str]]:
+    """Join the processes that torchrun has started; yield the group and this process's device.
 
-    Without torchrun, a process is alone on the device that was asked for. Host values travel through gloo, so that
-    no exchange of theirs waits for a GPU; gradients on GPUs travel through NCCL.
+    Without torchrun, the group is a single process on the requested device. Host values use gloo, so that their
+    exchange does not wait for a GPU; gradients on GPUs use NCCL.
 
     Raises:
-        SsilkError: a device is asked for by number, or there are fewer GPUs than processes.
+        SsilkError: the device has a number, or there are fewer GPUs than processes.
     """
-    if any(name not in os.environ for name in LAUNCHED) or os.environ["WORLD_SIZE"] == "1":
+    if any(name not in os.environ for name in TORCHRUN_VARIABLES) or os.environ["WORLD_SIZE"] == "1":
         yield SINGLE_PROCESS, device
         return
     own = _own_device(device, int(os.environ["LOCAL_RANK"]))
     dist.init_process_group("cpu:gloo,cuda:nccl" if own.type == "cuda" else "gloo")
     group = ProcessGroup(dist.get_rank(), dist.get_world_size())
     yield group, str(own)
-    # After an error the others may never come here, and nothing waits for them. Otherwise all leave together, since
-    # torchrun ends those that are left, and captured graphs go before the communicator in them, which waits for that.
+    # Not reached after an error, when the others may never arrive. Otherwise all leave together, because torchrun
+    # ends
+    # those that remain. Captured graphs must be freed before the communicator that they hold.
     group.gather(None)
     gc.collect()
     dist.destroy_process_group()

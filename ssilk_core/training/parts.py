@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run is built from: tensors of the scene and the motions on one device, and the network."""
+"""Everything that a run needs on one device: tensors of the scene and the motions, and the network."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..collision.reach import reachable_body
 from ..config import TrainConfig
 from ..energy import GarmentEnergy
 from ..model.network import GarmentModel, model_joints
-from ..motion_bank import MOST_TURN, MotionBank, build_bank
+from ..motion_bank import MAX_JOINT_SPEED, MotionBank, build_bank
 from .job import TrainJob
 from .objective import Objective
 from .parallel import SINGLE_PROCESS, ProcessGroup
@@ -22,12 +22,12 @@ from .windows import WindowSampler
 
 
 @dataclass(frozen=True, eq=False)
-class Parts:
-    """What stays as it is when a run begins anew with another batch.
+class TrainingParts:
+    """What a run keeps when it restarts with another batch.
 
     Attributes:
         bank: the motions to train on.
-        body: the part of the body that the garment can touch, of `reached` vertices; None for nothing.
+        body: the part of the body that the garment can touch, with `reached` vertices; None for nothing.
     """
 
     model: GarmentModel
@@ -40,7 +40,7 @@ class Parts:
     group: ProcessGroup = SINGLE_PROCESS
 
     def detail(self) -> dict[str, object]:
-        """Return what is trained, for people."""
+        """Return figures about the run, for messages."""
         scene = self.model.scene
         return {
             "garment": scene.garment.mesh.path,
@@ -55,32 +55,32 @@ class Parts:
         }
 
     def stepper(self, config: TrainConfig, seed: int) -> Stepper:
-        """Return a stepper at its beginning, whose draws have a seed of their own; a group shares the batch."""
-        group, own = self.group, self.group.part(config)
+        """Return a new stepper with its own seed; a group of processes shares the batch."""
+        group, own = self.group, self.group.local_config(config)
         generator = torch.Generator(self.device).manual_seed(group.seed(seed))
         sampler = WindowSampler(self.bank, own, self.model.config.latent, generator)
         objective = Objective(self.model, self.energy, self.body, self.bank, config.closest_point == "triangles")
         return Stepper(self.model, objective, sampler, own, group.average if group.size > 1 else None)
 
 
-def build_parts(job: TrainJob, device: torch.device, group: ProcessGroup = SINGLE_PROCESS) -> Parts:
+def build_parts(job: TrainJob, device: torch.device, group: ProcessGroup = SINGLE_PROCESS) -> TrainingParts:
     """Build what a run needs.
 
     Raises:
         SsilkError: the motions are too short.
     """
     scene, skeleton, fps = job.scene, job.scene.character.skeleton, job.model.fps
-    motions = job.trained_motions()
+    motions = job.training_motions()
     reach = reachable_body(scene, [*motions, *job.held_out])
     joints = model_joints(scene, reach.joints)
     model = GarmentModel(scene, job.model, joints, job.train.seed).to(device)
-    bank = build_bank(motions, skeleton, joints, fps, device, most_turn=MOST_TURN)
+    bank = build_bank(motions, skeleton, joints, fps, device, max_joint_speed=MAX_JOINT_SPEED)
     held = build_bank(job.held_out, skeleton, joints, fps, device)
     energy = GarmentEnergy(scene.garment.mesh, job.fabric, device=device)
     body, count = scene.character.merged_body(), skeleton.joint_count
     touched = CollisionBody(body, count, vertices=reach.vertices, device=device) if len(reach.vertices) else None
-    # Validation looks at the whole body: what training leaves out must not go unnoticed.
+    # Validation uses the whole body, to detect collisions with parts that training leaves out.
     whole = CollisionBody(body, count, device=device)
     rest, frames = model.decoder.rest, job.train.valid_frames
     validator = Validator(held, energy, whole, scene, rest, fps, frames, group)
-    return Parts(model, bank, energy, touched, validator, len(reach.vertices), device, group)
+    return TrainingParts(model, bank, energy, touched, validator, len(reach.vertices), device, group)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """More motions from those at hand: limbs of one clip on the body of another.
 
-A few minutes of capture hold few combinations of what arms, legs and spine do, and a garment trained on them meets
-others in every shot. Each limb still moves as it was captured, and so does the root.
+A few minutes of motion capture hold few combinations of arm, leg and spine motions, and every shot has others. In a
+recombined motion each limb, and the root, still moves as captured.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ import numpy as np
 from ..assets import Floats, Ints, Motion, Skeleton
 from ..kinematics import resample
 
-SHARE = 0.4  # of the limbs of a clip that another one moves
+LIMB_PROBABILITY = 0.4  # that a limb moves as in another clip
 
 
-def recombined(motions: Sequence[Motion], skeleton: Skeleton, copies: int, seed: int) -> list[Motion]:
-    """Return up to `copies` more of each motion, in each of which some limbs move as in another motion."""
+def recombine_motions(motions: Sequence[Motion], skeleton: Skeleton, copies: int, seed: int) -> list[Motion]:
+    """Return up to `copies` variants of each motion, in which some limbs move as in another motion."""
     limbs, generator, more = limb_joints(skeleton), np.random.default_rng(seed), []
     for base in [*motions] * copies:
-        chosen = [limb for limb in limbs if generator.random() < SHARE]
+        chosen = [limb for limb in limbs if generator.random() < LIMB_PROBABILITY]
         donor = motions[generator.integers(len(motions))]
         start = int(generator.integers(donor.frame_count))
         if chosen and donor is not base:
-            more.append(with_limbs(base, donor, np.unique(np.concatenate(chosen)), start))
+            more.append(replace_limbs(base, donor, np.unique(np.concatenate(chosen)), start))
     return more
 
 
 def limb_joints(skeleton: Skeleton) -> list[Ints]:
-    """Return the joints of every limb: those below each joint that has siblings."""
+    """Return the joints of every limb: each joint that has siblings, with its descendants."""
     parents = np.asarray(skeleton.parents)
     children = np.bincount(parents[parents >= 0], minlength=len(parents))
     heads = [joint for joint, parent in enumerate(parents) if parent >= 0 and children[parent] > 1]
@@ -39,15 +39,15 @@ def limb_joints(skeleton: Skeleton) -> list[Ints]:
 
 
 def _below(parents: Ints, head: int) -> Floats:
-    """Flag a joint and all under it, shape (J,)."""
+    """Flag a joint and its descendants, shape (J,)."""
     flags = np.zeros(len(parents), dtype=bool)
     for joint, parent in enumerate(parents):  # parents come first
         flags[joint] = joint == head or (parent >= 0 and flags[parent])
     return flags
 
 
-def with_limbs(base: Motion, donor: Motion, joints: Ints, start: int) -> Motion:
-    """Return `base` with these joints turning as in `donor` from its frame `start` on, to and fro at its ends."""
+def replace_limbs(base: Motion, donor: Motion, joints: Ints, start: int) -> Motion:
+    """Return `base` with rotations of some joints from frame `start` of `donor` on, mirrored at its ends."""
     turns = resample(donor, base.fps).rotations
     last = len(turns) - 1
     frames = (start + np.arange(base.frame_count)) % max(1, 2 * last)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run leaves on disk: the best model, the state to resume from, the learning curve, and what went wrong."""
+"""The files of a training run: best model, state to resume from, learning curve, non-finite step."""
 
 from __future__ import annotations
 
@@ -18,50 +18,50 @@ from .curve import curve_path, summary, write_curve
 from .divergence import fault_path, save_fault
 from .job import TrainJob
 from .parallel import SINGLE_PROCESS, ProcessGroup
-from .state import RunState, canonical, copied, save_state, state_path
+from .state import RunState, copy_to_cpu, json_round_trip, save_state, state_path
 from .step import Stepper
 from .validation import Score
 
 
 class RunFiles:
-    """Writes the files of one run, all beside its model; of a group of processes, only the first writes."""
+    """Writes the files of one run, in its model's folder; in a group, only the first process writes."""
 
     def __init__(self, job: TrainJob, device: torch.device, group: ProcessGroup = SINGLE_PROCESS) -> None:
         self.job, self.device, self.group = job, device, group
         self.model, self.state = job.output, state_path(job.output)
         self.curve, self.fault = curve_path(job.output), fault_path(job.output)
 
-    def tidy(self) -> None:
-        """Remove what a run that was killed while it wrote has left behind."""
-        if self.group.first:
+    def remove_unfinished(self) -> None:
+        """Remove partial files of a run that was killed while it wrote."""
+        if self.group.is_first:
             for path in (self.model, self.state, self.curve, self.fault):
                 remove_unfinished(path)
 
     def save_state(self, stepper: Stepper, state: RunState) -> None:
-        """Write the state, for which all of a group are needed."""
-        samplers = self.group.gather(copied(stepper.sampler.state()))
-        if self.group.first:
+        """Write the state; all processes of a group must call this."""
+        samplers = self.group.gather(copy_to_cpu(stepper.sampler.state()))
+        if self.group.is_first:
             save_state(self.state, stepper, samplers, state)
-        self.group.gather(None)  # none goes on before it is there to be read
+        self.group.gather(None)  # no process continues before the file exists
 
     def save_curve(self, state: RunState, lbs: Score) -> None:
-        """Write the learning curve that is in the state, for whoever wants to look at it."""
-        if self.group.first:
+        """Write the learning curve of the state."""
+        if self.group.is_first:
             write_curve(self.curve, state.curve, lbs)
 
     def save_model(self, model: GarmentModel, state: RunState, score: Score) -> None:
         """Write a model with its provenance."""
-        if self.group.first:
+        if self.group.is_first:
             save_model(self.model, model_file(model, self.job.fabric, self.provenance(state, score)))
 
     def save_fault(self, stepper: Stepper, found: str) -> None:
-        """Write what a step that was not finite was computed from."""
-        if self.group.first:
-            save_fault(self.fault, stepper, self.job.trained_motions(), found)
+        """Write the inputs of the last skipped step."""
+        if self.group.is_first:
+            save_fault(self.fault, stepper, self.job.training_motions(), found)
 
     def provenance(self, state: RunState, score: Score) -> dict[str, Any]:
-        """Return how the model came to be."""
-        return canonical(
+        """Return the provenance of a model: inputs, settings, versions and validation."""
+        return json_round_trip(
             {
                 **state.asked,
                 "iteration": state.iteration,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The state of a training run on disk, so that it goes on exactly where it stopped."""
+"""The saved state of a training run, from which it resumes exactly."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ from .validation import Score
 
 Tensors = dict[str, Tensor]
 
-SAMPLER = "sampler."  # begins the names of tensors that say where the windows stand; the others are what was learned
+SAMPLER_PREFIX = "sampler."  # of the sampler's tensors; all others are parameters or optimiser state
 
 
 @dataclass(frozen=True)
 class Best:
-    """The model that was kept: the iteration it was taken at, and its score."""
+    """The best model so far: its iteration and score."""
 
     iteration: int
     score: Score
 
 
 @dataclass(frozen=True)
-class Lowered:
-    """What a run does with from an iteration on, because more did not work.
+class ReducedSettings:
+    """Settings that a run has reduced, for lack of memory or after divergence.
 
     Attributes:
-        iteration: steps done until then.
-        batch, pretraining_batch: what fits into memory; single poses beside the windows are lowered with them.
-        pace: factor on every step size, below one after steps that were not finite.
+        iteration: iteration from which they apply.
+        batch, pretraining_batch: sizes that fit into memory; `static_batch` is reduced in proportion.
+        pace: factor on every learning rate, below one after divergence.
     """
 
     iteration: int
@@ -51,8 +51,8 @@ class Lowered:
     pretraining_batch: int
     pace: float = 1.0
 
-    def applied(self, config: TrainConfig) -> TrainConfig:
-        """Return the schedule with this instead of what was asked for."""
+    def apply_to(self, config: TrainConfig) -> TrainConfig:
+        """Return a schedule with these settings."""
         rates = {
             name: getattr(config, name) * self.pace
             for name in ("static_learning_rate", "learning_rate", "final_learning_rate")
@@ -65,16 +65,16 @@ class Lowered:
 
 @dataclass
 class RunState:
-    """What changes while a run goes on, tensors aside.
+    """Progress of a run, without tensors.
 
     Attributes:
-        asked: what the run was asked to do; a resumed run must be asked the same.
+        asked: inputs of the run (`TrainJob.identity`), which a resumed run must share.
         iteration: steps done.
-        best: the best model so far. A state is written before the model that it tells of: where a run was killed in
-            between, the model is in the state.
-        lowered: what had to be lowered, in order; the last holds.
-        undone: steps undone because something was not finite.
-        seconds: as in `curve.Point`.
+        best: the best model so far. The state is written before its model file, so that a run that was killed in
+            between can still write the model.
+        lowered: reduced settings, in order; the last apply.
+        skipped: number of skipped steps; "undone" in the file.
+        seconds: as in `CurvePoint`.
         planned: iterations that fit into the job's minutes; zero for those of its schedule.
         curve: the validations.
     """
@@ -82,34 +82,34 @@ class RunState:
     asked: dict[str, Any]
     iteration: int = 0
     best: Best | None = None
-    lowered: list[Lowered] = field(default_factory=list)
-    undone: int = 0
+    lowered: list[ReducedSettings] = field(default_factory=list)
+    skipped: int = 0
     seconds: float = 0.0
     planned: int = 0
     curve: list[CurvePoint] = field(default_factory=list)
 
 
 def state_path(model: str | Path) -> Path:
-    """Return where the state of the run that writes `model` lies."""
+    """Return the path of the state for the run that writes `model`."""
     return Path(model).with_suffix(".resume.safetensors")
 
 
 def save_state(path: Path, stepper: Stepper, samplers: Sequence[Tensors], state: RunState) -> None:
-    """Write everything that the next iteration depends on; `samplers` is where the windows stand in each process."""
+    """Write all that the next iteration depends on; `samplers` has the sampler's state of each process."""
     from safetensors.torch import save
 
-    tensors = learned(stepper)
+    tensors = learned_tensors(stepper)
     for rank, sampler in enumerate(samplers):
-        tensors |= {f"{SAMPLER}{rank}.{name}": value for name, value in sampler.items()}
+        tensors |= {f"{SAMPLER_PREFIX}{rank}.{name}": value for name, value in sampler.items()}
     with replacing(path) as temporary:
-        temporary.write_bytes(save(tensors, {"ssilk_state": json.dumps(asdict(state))}))
+        temporary.write_bytes(save(tensors, {"ssilk_state": json.dumps(_document(state))}))
 
 
 def load_state(path: Path, asked: dict[str, Any]) -> tuple[RunState, Tensors]:
     """Return a state and its tensors.
 
     Raises:
-        SsilkError: there is no state, it is damaged, or it belongs to a run that was asked something else.
+        SsilkError: there is no state, it is damaged, or it belongs to a run with other inputs.
     """
     from safetensors import safe_open
 
@@ -117,10 +117,10 @@ def load_state(path: Path, asked: dict[str, Any]) -> tuple[RunState, Tensors]:
         fail(
             str(path),
             "there is no training to resume",
-            "the file is written beside the model",
+            "the file is written to the model's folder",
             "train without --resume",
         )
-    with _damage_named(path):
+    with _name_damage(path):
         with safe_open(path, "pt") as stream:
             state = _state_of(json.loads((stream.metadata() or {})["ssilk_state"]))
             tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
@@ -129,29 +129,29 @@ def load_state(path: Path, asked: dict[str, Any]) -> tuple[RunState, Tensors]:
 
 
 def restore(path: Path, stepper: Stepper, tensors: Tensors, rank: int = 0) -> None:
-    """Put what `load_state` returned into a freshly built `stepper`, that of the process `rank`.
+    """Load the tensors of `load_state` into a newly built `stepper` of the process `rank`.
 
     Raises:
         SsilkError: the tensors do not fit.
     """
-    with _damage_named(path):
-        stepper.sampler.restore(_group(tensors, f"{SAMPLER}{rank}."))
+    with _name_damage(path):
+        stepper.sampler.restore(_group(tensors, f"{SAMPLER_PREFIX}{rank}."))
         restore_learned(stepper, tensors)
 
 
-def learned(stepper: Stepper) -> Tensors:
-    """Return copies on the CPU of all that training changes: parameters, their average, what the optimiser keeps."""
+def learned_tensors(stepper: Stepper) -> Tensors:
+    """Return copies on the CPU of all that training changes: parameters, their average and the optimiser state."""
     tensors = {f"model.{name}": value for name, value in stepper.model.state_dict().items()}
-    tensors |= {f"averaged.{name}": value for name, value in stepper.averaged.state_dict().items()}
+    tensors |= {f"averaged.{name}": value for name, value in stepper.ema_model.state_dict().items()}
     for index, moments in stepper.optimiser.state_dict()["state"].items():
         tensors |= {f"adam.{index}.{name}": torch.as_tensor(value) for name, value in moments.items()}
-    return copied(tensors)
+    return copy_to_cpu(tensors)
 
 
 def restore_learned(stepper: Stepper, tensors: Tensors) -> None:
-    """Put what `learned` returned into a freshly built `stepper`, which may have another batch."""
+    """Load the result of `learned_tensors` into a newly built `stepper`, which may have another batch."""
     stepper.model.load_state_dict(_group(tensors, "model."))
-    stepper.averaged.load_state_dict(_group(tensors, "averaged."))
+    stepper.ema_model.load_state_dict(_group(tensors, "averaged."))
     moments: dict[int, Tensors] = {}
     for name, value in _group(tensors, "adam.").items():
         index, _, key = name.partition(".")
@@ -160,8 +160,8 @@ def restore_learned(stepper: Stepper, tensors: Tensors) -> None:
     stepper.optimiser.load_state_dict({"state": moments, "param_groups": document["param_groups"]})
 
 
-def copied(tensors: Tensors) -> Tensors:
-    """Return copies on the CPU."""
+def copy_to_cpu(tensors: Tensors) -> Tensors:
+    """Return contiguous copies on the CPU."""
     return {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
 
 
@@ -169,19 +169,26 @@ def _group(tensors: Tensors, prefix: str) -> Tensors:
     return {name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)}
 
 
+def _document(state: RunState) -> dict[str, Any]:
+    document = asdict(state)
+    document["undone"] = document.pop("skipped")
+    return document
+
+
 def _state_of(document: dict[str, Any]) -> RunState:
     best, lowered, curve = document.pop("best"), document.pop("lowered"), document.pop("curve")
     return RunState(
+        skipped=document.pop("undone"),
         best=None if best is None else Best(best["iteration"], Score(**best["score"])),
-        lowered=[Lowered(**item) for item in lowered],
+        lowered=[ReducedSettings(**item) for item in lowered],
         curve=[CurvePoint(**{**item, "score": Score(**item["score"])}) for item in curve],
         **document,
     )
 
 
 @contextmanager
-def _damage_named(path: Path) -> Iterator[None]:
-    """Turn whatever a damaged file gives rise to into one sentence."""
+def _name_damage(path: Path) -> Iterator[None]:
+    """Turn the errors that a damaged file causes into one sentence."""
     from safetensors import SafetensorError
 
     try:
@@ -211,7 +218,7 @@ def _need_same(path: Path, asked: dict[str, Any], before: dict[str, Any]) -> Non
 
 
 def scene_digest(scene: Scene) -> str:
-    """Return a hash of all that a scene holds, however it was prepared: meshes, weights, classes, rig, bind pose."""
+    """Return a hash of a scene's contents: meshes, weights, classes, rig and bind pose."""
     digest = hashlib.sha256(json.dumps(scene.joint_names).encode())
     bodies = scene.character.bodies
     body = [array for b in bodies for array in (b.mesh.points, b.mesh.faces, b.skin.indices, b.skin.weights)]
@@ -223,6 +230,6 @@ def scene_digest(scene: Scene) -> str:
     return digest.hexdigest()
 
 
-def canonical(value: Any) -> Any:
-    """Return a value as it comes back from JSON, so that it can be compared with one that did."""
+def json_round_trip(value: Any) -> Any:
+    """Return a value as it is after writing and reading it as JSON."""
     return json.loads(json.dumps(value, default=lambda other: np.asarray(other).tolist()))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One optimiser step of each phase, eager or replayed as a CUDA graph."""
+"""One optimiser step of either phase, eager or replayed as a CUDA graph."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from torch import Tensor, nn
 
 from ..config import TrainConfig
 from ..model.network import GarmentModel
-from .faults import Faults
 from .objective import Objective, total
+from .skipped_steps import SkippedSteps
 from .windows import WindowSampler
 
-SMALLEST = 1e-30  # norm of a gradient that is not zero
+MIN_GRADIENT_NORM = 1e-30  # floor for the norm that gradients are divided by
 EAGER_STEPS = 3  # before a CUDA graph is captured: allocators, handles and kernels settle
 
 
 def learning_rate(config: TrainConfig, iteration: int) -> float:
-    """Step size at an iteration: linear warm-up, then a cosine to the final rate, in each phase anew."""
-    warm = config.static_iterations
-    if iteration < warm:
-        # At a constant rate the warm start's energy climbs again.
-        done, span, peak, final = iteration, warm, config.static_learning_rate, 0.1 * config.static_learning_rate
+    """Return the learning rate of an iteration: in each phase a linear warm-up, then cosine decay."""
+    static = config.static_iterations
+    if iteration < static:
+        # At a constant rate the energy rises again in static training.
+        done, span, peak, final = iteration, static, config.static_learning_rate, 0.1 * config.static_learning_rate
     else:
         done, span, peak, final = (
-            iteration - warm,
-            config.iterations - warm,
+            iteration - static,
+            config.iterations - static,
             config.learning_rate,
             config.final_learning_rate,
         )
@@ -46,19 +46,19 @@ def averaging_decay(config: TrainConfig, iteration: int) -> float:
     return min(config.ema_decay, (1 + done) / (10 + done))
 
 
-Share = Callable[[list[Tensor]], None]
+GradientAverage = Callable[[list[Tensor]], None]
 
 
 class Stepper:
-    """Draws a batch, computes the objective and moves the parameters.
+    """Draws a batch, computes the objective and updates the parameters.
 
     Args:
-        share: given the gradients before they are used, to average them over processes; nothing by default.
+        average_gradients: called with the gradients before they are used, to average them over processes.
 
     Attributes:
         terms: energies of the last step [J], updated in place so that reading them needs no new launch.
-        averaged: exponential moving average of the model's parameters.
-        faults: steps that were undone because something was not finite.
+        ema_model: exponential moving average of the model's parameters.
+        skipped: a record of skipped steps.
     """
 
     def __init__(
@@ -67,35 +67,35 @@ class Stepper:
         objective: Objective,
         sampler: WindowSampler,
         config: TrainConfig,
-        share: Share | None = None,
+        average_gradients: GradientAverage | None = None,
     ) -> None:
         self.model, self.objective, self.sampler, self.config = model, objective, sampler, config
-        self.share = share
+        self.average_gradients = average_gradients
         self.device = sampler.first.device
         self.optimiser = _optimiser(model, self.device)
-        self.factors = [1.0, config.skin_learning_rate_scale, config.shape_learning_rate_scale]
-        self.averaged = copy.deepcopy(model).requires_grad_(False)
+        self.rate_scales = [1.0, config.skin_learning_rate_scale, config.shape_learning_rate_scale]
+        self.ema_model = copy.deepcopy(model).requires_grad_(False)
         self.terms: dict[str, Tensor] = {}
-        self.faults = Faults(self.device)
+        self.skipped = SkippedSteps(self.device)
         # Tensors: a captured graph reads them anew in each replay.
         self._iteration = torch.zeros((), dtype=torch.int64, device=self.device)
         self._decay = torch.zeros((), device=self.device)
         self._graph: torch.cuda.CUDAGraph | None = None
         self._phase, self._eager = "", 0
 
-    def warm(self) -> None:
-        """Train P and D on single random poses under static energies."""
+    def static_step(self) -> None:
+        """Do a step of static training: P and D on single random poses."""
         frames, direction = self.sampler.poses(self.config.pretraining_batch)
         terms = self.objective.static(frames, direction)
         means = {name: value.mean() for name, value in terms.items()}
         self._descend(sum(means.values()), means, {"frames": frames, "directions": direction})  # type: ignore[arg-type]
 
-    def windows(self) -> None:
-        """Train everything on one window of every slot, and P on single poses beside them."""
+    def dynamic_step(self) -> None:
+        """Do a step of dynamic training: all networks on one window of every slot, and P on single poses."""
         noise, poses = self.sampler.noise(), self.sampler.poses(self.config.static_batch)
         dynamic, static_batch, latents = self.objective.window(self.sampler, noise, *poses)
         moving, still = (next(iter(terms.values())).shape[0] for terms in (dynamic, static_batch))
-        # Every frame weighs the same, those that the initialiser answers for included.
+        # All frames have the same weight, those of the single poses included.
         loss = (total(dynamic) * moving + total(static_batch) * still) / (moving + still)
         means = {name: value.mean() for name, value in dynamic.items()}
         beside = {f"static_batch {name}": value.mean() for name, value in static_batch.items()}
@@ -110,54 +110,54 @@ class Stepper:
         window: dict[str, Tensor],
         beside: dict[str, Tensor] | None = None,
     ) -> None:
-        """Move the parameters down the gradient of a loss; `terms` and what is `beside` are what it is made of."""
+        """Do an optimiser step on a loss, which consists of `terms` and those in `beside`."""
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         gradients = [value.grad for value in self.model.parameters() if value.grad is not None]
         judged = loss.detach().clone()
-        if self.share is not None:
-            self.share([*gradients, judged])  # the loss too: all processes must undo the same steps
+        if self.average_gradients is not None:
+            self.average_gradients([*gradients, judged])  # the loss too: all processes must skip the same steps
         norm = nn.utils.get_total_norm(gradients, foreach=True)
         bad = ~(norm.isfinite() & judged.isfinite())
-        # Only directions count. Adam divides by what gradients were lately: one a hundred times as large, of one
-        # torn garment, would move every parameter by as much as all the others of the last iterations do.
-        torch._foreach_div_(gradients, norm.clamp_min(SMALLEST))
-        # The fused optimiser leaves parameters, moments and step counts as they are where this is one.
+        # Normalise the gradient: one a hundred times larger than usual, from a single torn garment, would otherwise
+        # dominate Adam's update of all parameters.
+        torch._foreach_div_(gradients, norm.clamp_min(MIN_GRADIENT_NORM))
+        # The fused optimiser skips the step where this is one.
         self.optimiser.found_inf = bad.float()  # type: ignore[attr-defined]
         self.optimiser.step()
         self._average()
         terms = {name: value.detach() for name, value in terms.items()}
-        self.faults.record(bad, self._iteration, terms | (beside or {}), window)
+        self.skipped.record(bad, self._iteration, terms | (beside or {}), window)
         for name, value in terms.items():
             self.terms.setdefault(name, torch.zeros((), device=self.device)).copy_(value)
 
     @torch.no_grad()
     def _average(self) -> None:
         """Move the average towards the parameters."""
-        averaged: list[Tensor] = [*self.averaged.parameters()]
+        averaged: list[Tensor] = [*self.ema_model.parameters()]
         parameters: list[Tensor] = [*self.model.parameters()]
         torch._foreach_mul_(averaged, self._decay)
         torch._foreach_add_(averaged, [*torch._foreach_mul(parameters, 1 - self._decay)])
 
     def run(self, iteration: int) -> None:
-        """Do the step of an iteration, in the phase that it belongs to."""
+        """Do the step of an iteration, in the phase of that iteration."""
         rate = learning_rate(self.config, iteration)
         self._iteration.fill_(iteration)
         self._decay.fill_(averaging_decay(self.config, iteration))
-        for group, factor in zip(self.optimiser.param_groups, self.factors):
+        for group, factor in zip(self.optimiser.param_groups, self.rate_scales):
             if self.device.type == "cuda":
                 group["lr"].fill_(rate * factor)
             else:
                 group["lr"] = rate * factor
-        name = "warm" if iteration < self.config.static_iterations else "windows"
-        body = self.warm if name == "warm" else self.windows
+        name = "static" if iteration < self.config.static_iterations else "dynamic"
+        body = self.static_step if name == "static" else self.dynamic_step
         if self.device.type == "cuda":
             self._replay(name, body)
         else:
             body()
 
     def _replay(self, phase: str, body: Callable[[], None]) -> None:
-        """Replay a step as one CUDA graph, captured in each phase after a few eager steps; every call is one step."""
+        """Do a step as a CUDA graph, captured in each phase after a few eager steps."""
         if phase != self._phase:
             torch.cuda.synchronize(self.device)
             self._graph, self._phase, self._eager = None, phase, EAGER_STEPS  # the old graph's memory is freed
@@ -178,12 +178,12 @@ class Stepper:
 
 
 def _optimiser(model: GarmentModel, device: torch.device) -> torch.optim.Adam:
-    """Return Adam over networks, then over integration and skinning, then over blendshapes: each at its own pace."""
+    """Return Adam with parameter groups for networks, for integrator and skinning, and for blendshapes."""
     groups: list[list[nn.Parameter]] = [[], [], []]
     for name, value in model.named_parameters():
         slow = name.startswith("integrator.") or "skin_offset" in name
         groups[1 if slow else 2 if name == "decoder.shapes" else 0].append(value)
     on_gpu = device.type == "cuda"
-    # A captured graph reads the step size from a tensor; elsewhere a number is faster.
+    # A captured graph reads the learning rate from a tensor; elsewhere a number is faster.
     rated = [{"params": group, "lr": torch.tensor(0.0, device=device) if on_gpu else 0.0} for group in groups]
     return torch.optim.Adam(rated, capturable=on_gpu, fused=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good a model is on whole clips: each term by itself, beside linear blend skinning."""
+"""Energies of a model on whole clips, and those of linear blend skinning."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..assets import Scene
 from ..collision.body import CollisionBody
 from ..collision.contacts import Contacts
 from ..energy import TERMS, GarmentEnergy
-from ..energy.frames import DECODED_AT_ONCE, energy_terms
+from ..energy.frames import FRAMES_PER_CHUNK, energy_terms
 from ..motion_bank import LatentModel, MotionBank, roll_states
 from ..skinning import Skinning
 from .parallel import SINGLE_PROCESS, ProcessGroup
@@ -26,7 +26,7 @@ class Score:
     Attributes:
         terms: each energy [J]; gravity is relative to linear blend skinning.
         collisions: share of garment vertices inside the body.
-        dynamics: RMS distance between the rollout and the quasi-static state of the same pose [m].
+        dynamics: RMS distance between the rollout and the quasi-static states of the same poses [m].
     """
 
     terms: dict[str, float]
@@ -75,7 +75,7 @@ class Validator:
         return self._mean(None)
 
     def _mean(self, model: LatentModel | None) -> Score:
-        """Return the mean over all clips, dealt out to the processes of the group; all get the same score."""
+        """Return the mean over all clips, distributed over the processes of the group; all get the same score."""
         clips = self.clips[self.group.rank :: self.group.size]
         states = self._states(clips, model)
         own = [self._clip_terms(clip, model, latents) for clip, latents in zip(clips, states)]
@@ -85,23 +85,22 @@ class Validator:
         return Score({name: joined[name] for name in TERMS}, joined["collisions"], joined["dynamics"] ** 0.5)
 
     def frame_terms(self, clip: range, model: LatentModel | None) -> dict[str, Tensor]:
-        """Return what `Score` averages for each frame of a range of the bank, shape (N,).
+        """Return the values that `Score` averages for each frame of a range of the bank, shape (N,).
 
-        Without a model it is linear blend skinning that is scored. Distances to the quasi-static state come squared
-        [m2].
+        Without a model, linear blend skinning is scored. "dynamics" is a squared distance [m2].
         """
         return self._clip_terms(clip, model, self._states([clip], model)[0])
 
     def _states(self, clips: Sequence[range], model: LatentModel | None) -> Sequence[Tensor | None]:
-        """Return the states of each clip; of a group, one may have none to roll."""
+        """Return the states of each clip; a process of a group may have no clips."""
         return roll_states(model, self.bank, clips, self.down) if model and clips else [None] * len(clips)
 
     @torch.no_grad()
     def _clip_terms(self, clip: range, model: LatentModel | None, states: Tensor | None) -> dict[str, Tensor]:
         frames = torch.arange(clip.start, clip.stop, device=self.rest.device)
         parts, tail = [], None
-        for start in range(0, len(frames), DECODED_AT_ONCE):
-            window = slice(start, start + DECODED_AT_ONCE)
+        for start in range(0, len(frames), FRAMES_PER_CHUNK):
+            window = slice(start, start + FRAMES_PER_CHUNK)
             character = self.bank.character(frames[window])
             lbs = self.lbs_vertices(character)
             x, still = lbs, lbs
@@ -111,7 +110,7 @@ class Validator:
                 quiet = model.initial(self.bank.static_descriptor(frames[window], direction))
                 still = model.vertices(quiet, character)
             joined = x if tail is None else torch.cat([tail, x], dim=-1)
-            posed = self.body.posed(character)
+            posed = self.body.pose(character)
             terms = energy_terms(self.energy, x, lbs, self.contacts, posed, joined, self.fps, self.down)
             parts.append({**terms, "dynamics": ((x - still) ** 2).sum(1).mean(0)})
             tail = joined[..., -2:]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a validation means, in words."""
+"""The result of a validation as a message."""
 
 from __future__ import annotations
 
@@ -11,21 +11,18 @@ from ..events import Message
 if TYPE_CHECKING:
     from .validation import Score
 
-# A rollout closer than this to the quasi-static state of each pose has learned no dynamics worth the name.
+# A rollout closer than this to the quasi-static state of each pose has learned no dynamics.
 NO_DYNAMICS = 2e-3  # [m]
 ADVICE = "nothing dynamic is being learned: train longer, or check that the motions move"
 
 
-def not_finite(score: Score) -> list[str]:
+def non_finite_terms(score: Score) -> list[str]:
     """Return the names of the terms that are not finite."""
     return [name for name, value in score.terms.items() if not isfinite(value)]
 
 
-def verdict(iteration: int, score: Score, lbs: Score, moves: bool) -> Message:
-    """Return how a score compares with linear blend skinning's.
-
-    A warning when a garment that `moves` has learned not to.
-    """
+def validation_message(iteration: int, score: Score, lbs: Score, moves: bool) -> Message:
+    """Compare a score with that of linear blend skinning; warn if a garment that `moves` has learned no dynamics."""
     share = 1 - score.total / lbs.total
     terms = ", ".join(f"{name} {value:.4g}" for name, value in score.terms.items())
     text = (

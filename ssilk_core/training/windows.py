@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which frames each slot of a batch trains on, and the states carried from window to window."""
+"""The windows that each slot of a batch trains on, and the states carried from window to window."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from ..motion_bank import MotionBank
 def random_directions(count: int, rotated: float, generator: torch.Generator, device: torch.device) -> Tensor:
     """Return unit gravity directions (count, 3): uniform on the sphere for a share `rotated`, else straight down.
 
-    Turning the character by R under a fixed gravity g is turning gravity by R^T under a fixed character: every
-    other energy is unchanged by rotations. A turn about g itself changes nothing, so the sphere covers SO(3).
+    Rotating the character by R under gravity g is equivalent to rotating gravity by R^T, because all other energies
+    are invariant under rotations. Rotations about g change nothing, so the sphere covers SO(3).
     """
     draw = torch.randn(count, 3, generator=generator, device=device)
     anywhere = draw / draw.norm(dim=1, keepdim=True).clamp_min(1e-6)
     turned = torch.rand(count, 1, generator=generator, device=device) < rotated
-    down = -torch.eye(3, device=device)[1]  # made on the device: a captured graph may not copy from the host
+    down = -torch.eye(3, device=device)[1]  # created on the device: a captured graph must not copy from the host
     return torch.where(turned, anywhere, down)
 
 
 class WindowSampler:
-    """Draws windows; a share of the slots goes on in the clip, and under the gravity, where it stopped.
+    """Draws windows; a share of the slots continues its clip and gravity direction from the last window.
 
     Attributes:
         first: first frame of each slot's window, shape (batch,).
         direction: gravity direction of each slot, shape (batch, 3).
-        latents: the two states that a continued window starts from, shape (2, batch, latent).
+        latents: the two states from which a continued window starts, shape (2, batch, latent).
         carried: which slots continue, shape (batch,).
     """
 
@@ -68,8 +68,9 @@ class WindowSampler:
     def noise(self) -> Tensor:
         """Return noise for the first two latents of each window, shape (2, batch, latent).
 
-        Mostly alike on both: the garment is put elsewhere, not thrown. Independent noise of this size is a velocity
-        ten times that of everyday motion. Windows that begin anew always get it, those that go on now and then.
+        The noise on both is strongly correlated: it displaces the garment rather than accelerates it. Independent
+        noise of this size would be a velocity ten times that of everyday motion. New windows always get noise,
+        continued ones with `noise_probability` in each frame.
         """
         config, device = self.config, self.latents.device
         first, second = torch.randn(self.latents.shape, generator=self.generator, device=device)
@@ -79,14 +80,14 @@ class WindowSampler:
         return config.noise * torch.stack([first, second]) * (kicked | ~self.carried[:, None])
 
     def advance(self, latents: Tensor) -> None:
-        """Move on: keep the last two `latents` (2, batch, latent) of the window, then choose the next windows."""
+        """Keep the last two `latents` (2, batch, latent) of the windows, then choose the next windows."""
         config, device = self.config, self.first.device
         following = self.first + config.window - 2
         fits = following + config.window <= self.stop_of[self.first]
         wish = torch.rand(config.batch, generator=self.generator, device=device) < config.state_reuse
         fresh = random_directions(config.batch, config.rotated_fraction, self.generator, device)
         chosen = self._fresh()
-        # A state that is not finite ends here, or it would spoil every window after it.
+        # States that are not finite must not be reused.
         go_on = fits & wish & latents.isfinite().all(dim=2).all(dim=0)
         self.first.copy_(torch.where(go_on, following, chosen))
         self.direction.copy_(torch.where(go_on[:, None], self.direction, fresh))
@@ -94,15 +95,15 @@ class WindowSampler:
         self.carried.copy_(go_on)
 
     def window(self) -> dict[str, Tensor]:
-        """Return where the windows stand, by name."""
+        """Return the current windows as tensors by name."""
         return {name: getattr(self, name) for name in ("first", "direction", "latents", "carried")}
 
     def state(self) -> dict[str, Tensor]:
-        """Return what a resumed run needs to go on exactly, the random state included."""
+        """Return all that a resumed run needs to continue exactly, random state included."""
         return {**self.window(), "generator": self.generator.get_state()}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Take back what `state` returned."""
+        """Restore the result of `state`."""
         for name, value in self.window().items():
             value.copy_(state[name])
         self.generator.set_state(state["generator"].cpu().to(torch.uint8))

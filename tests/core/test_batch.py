@@ -11,7 +11,7 @@ import torch
 
 from ssilk_core.errors import SsilkError
 from ssilk_core.kinematics import split_at_cuts
-from ssilk_core.model.batch import BatchPlayer, driven
+from ssilk_core.model.batch import BatchPlayer, motion_inputs
 from ssilk_core.rollout import decode, garment_poses, roll
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
@@ -32,7 +32,7 @@ def motions(scene, toy_motion):
 
 
 def test_vertices_are_those_of_each_shot_alone(model, motions):
-    shots = driven(model, motions)
+    shots = motion_inputs(model, motions)
     player = BatchPlayer(model, shots)
     for _ in range(2):  # the second time from where the first one ended
         frames = torch.stack([each.clone() for each in player.play(shots)]).double() + shots.origins[:, None]
@@ -43,7 +43,7 @@ def test_vertices_are_those_of_each_shot_alone(model, motions):
 
 
 def test_the_network_alone_gives_what_the_decoder_takes(model, motions):
-    shots = driven(model, motions)
+    shots = motion_inputs(model, motions)
     player = BatchPlayer(model, shots, vertices=False)
     outputs = torch.stack([each.clone() for each in player.play(shots)], dim=1)
     for mine, motion in zip(outputs, motions):
@@ -54,4 +54,4 @@ def test_the_network_alone_gives_what_the_decoder_takes(model, motions):
 
 def test_a_motion_of_another_rate_is_refused(model, motions):
     with pytest.raises(SsilkError, match="24 frames per second; the model steps at 30"):
-        driven(model, [motions[0], replace(motions[1], fps=24.0)])
+        motion_inputs(model, [motions[0], replace(motions[1], fps=24.0)])

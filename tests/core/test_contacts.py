@@ -13,7 +13,7 @@ from ssilk_core.assets import LOOSE, PINNED, TIGHT, Body, Character, Mesh, Scene
 from ssilk_core.collision import distance, nearest_vertex
 from ssilk_core.collision.body import CollisionBody
 from ssilk_core.collision.contacts import Contacts, faces_around, patches_beneath
-from ssilk_core.collision.distance import Patches, PosedBody, nearest_planes, signed
+from ssilk_core.collision.distance import Patches, PosedBody, nearest_planes, signed_distance_to_planes
 from ssilk_core.collision.one_ring import triangle_rings
 
 CPU = torch.device("cpu")
@@ -45,7 +45,7 @@ def on_limb(scene: Scene, at: np.ndarray, kind: int) -> tuple[Scene, CollisionBo
 
 
 def still(body: CollisionBody, **options: bool) -> PosedBody:
-    return body.posed(torch.eye(3, 4).expand(3, 3, 4)[..., None].contiguous(), **options)
+    return body.pose(torch.eye(3, 4).expand(3, 3, 4)[..., None].contiguous(), **options)
 
 
 @pytest.mark.parametrize("options", [{}, {"exact": True}, {"surface": False}])
@@ -61,11 +61,13 @@ def test_tight_cloth_that_went_through_a_limb_is_sent_back(scene, kind, options)
     assert (side * normal[:, 0] > 0.5).all()
     # The limb has 16 sides, so that its surface is up to 1 mm nearer to the axis than its radius.
     expected = -(RADIUS + 0.02) if kind == TIGHT else -(RADIUS - 0.02)
-    distance = signed(pulled, normal, offset)
+    distance = signed_distance_to_planes(pulled, normal, offset)
     assert ((distance - expected).abs() < 0.03 if options.get("surface") is False else (distance < 0)).all()
     met, whole = contacts.distances(pulled, still(body, **options))
     assert torch.equal(met, distance)
-    np.testing.assert_allclose(whole, signed(pulled, *nearest_planes(pulled, still(body, **options))), atol=1e-6)
+    np.testing.assert_allclose(
+        whole, signed_distance_to_planes(pulled, *nearest_planes(pulled, still(body, **options))), atol=1e-6
+    )
 
 
 def test_where_cloth_is_near_its_own_side_nothing_changes(scene):
@@ -91,7 +93,10 @@ def test_rounded_distances_are_those_of_the_planes_that_tight_and_loose_cloth_me
     x = torch.tensor(dressed.garment.mesh.points, dtype=dtype)[..., None]
     pulled = x - torch.tensor([RADIUS + 0.025, 0, 0])[:, None].to(dtype)
     contacts, posed = Contacts(dressed, device=CPU), still(body, exact=True)
-    found, met = contacts.smoothed(pulled, posed), signed(pulled.float(), *contacts.planes(pulled.float(), posed))
+    found, met = (
+        contacts.smoothed(pulled, posed),
+        signed_distance_to_planes(pulled.float(), *contacts.planes(pulled.float(), posed)),
+    )
     assert found.normal.dtype == found.offset.dtype == dtype and found.curvature.dtype == torch.float32
     torch.testing.assert_close(found.distance(pulled).float(), met, rtol=0.03, atol=1e-6)
     assert (met[1::2] < -RADIUS).all() and (met[::2] > -RADIUS).all()
@@ -104,7 +109,7 @@ def test_pinned_cloth_meets_nothing_unless_it_is_measured(scene):
     dressed, body = on_limb(scene, np.array([0.0, 0, 0]), PINNED)
     x = torch.tensor(dressed.garment.mesh.points, dtype=torch.float32)[..., None]
     free, measured = (Contacts(dressed, pinned=pinned, device=CPU) for pinned in (False, True))
-    assert (signed(x, *free.planes(x, still(body))) > 1e5).all()
+    assert (signed_distance_to_planes(x, *free.planes(x, still(body))) > 1e5).all()
     assert (measured.distances(x, still(body))[0] < 0).all()
 
 
@@ -193,19 +198,19 @@ def test_the_nearest_of_a_list_is_found_on_both_plain_paths(scores, monkeypatch)
     table = lists(rng, 33, 20)
     expected = chosen_by_hand(x, body, table.numpy())
     np.testing.assert_array_equal(nearest_vertex.nearest_vertex(torch.tensor(x), torch.tensor(body), table), expected)
-    monkeypatch.setattr(nearest_vertex, "SCORES", scores)
+    monkeypatch.setattr(nearest_vertex, "MAX_SCORES", scores)
     monkeypatch.setattr(nearest_vertex, "_by_rows", nearest_vertex._by_products)
     np.testing.assert_array_equal(nearest_vertex.nearest_vertex(torch.tensor(x), torch.tensor(body), table), expected)
 
 
 @KERNELS
 def test_the_kernel_finds_the_nearest_of_a_list():
-    from ssilk_core.kernels.candidates import listed_kernel
+    from ssilk_core.kernels.candidates import nearest_candidate_kernel
 
     rng = np.random.default_rng(4)
     x, body = rng.normal(size=(33, 3, 150)).astype(np.float32), rng.normal(size=(20, 3, 150)).astype(np.float32)
     table = lists(rng, 33, 20)
-    found = listed_kernel(*(v.to(DEVICE) for v in (torch.tensor(x), torch.tensor(body), table)))
+    found = nearest_candidate_kernel(*(v.to(DEVICE) for v in (torch.tensor(x), torch.tensor(body), table)))
     np.testing.assert_array_equal(found.cpu(), chosen_by_hand(x, body, table.numpy()))
 
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ssilk_core.assets import Motion
 from ssilk_core.constants import GRAVITY
-from ssilk_core.descriptors import RATE_TIME, SATURATION, joints_in_view, pose_features, six_d
+from ssilk_core.descriptors import RATE_TIME, SATURATION, descriptor_joints, pose_features, six_d
 from ssilk_core.kinematics import matrix_from_quaternion, motion_transforms, quaternion_from_matrix
 from ssilk_core.model.descriptors import gravity_features
 
@@ -136,7 +136,7 @@ def test_first_frames_are_defined_and_agree_with_longer_histories(scene, motion,
 
 def test_joints_in_view_keep_their_ancestors(scene):
     skeleton = scene.character.skeleton
-    assert joints_in_view(skeleton, [False, False, True]).tolist() == [0, 1, 2]
-    assert joints_in_view(skeleton, [False, True, False]).tolist() == [0, 1]
-    assert joints_in_view(skeleton, [True, False, False]).tolist() == [0]
-    assert joints_in_view(skeleton, [False, False, False]).tolist() == []
+    assert descriptor_joints(skeleton, [False, False, True]).tolist() == [0, 1, 2]
+    assert descriptor_joints(skeleton, [False, True, False]).tolist() == [0, 1]
+    assert descriptor_joints(skeleton, [True, False, False]).tolist() == [0]
+    assert descriptor_joints(skeleton, [False, False, False]).tolist() == []

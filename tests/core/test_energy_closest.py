@@ -12,7 +12,7 @@ import torch
 import trimesh
 
 from ssilk_core.collision import closest_point, distance
-from ssilk_core.collision.closest_point import closest_on_faces, patches_of
+from ssilk_core.collision.closest_point import closest_on_faces, triangle_patches
 from ssilk_core.collision.distance import PosedBody, nearest_planes
 from ssilk_core.collision.one_ring import triangle_rings
 
@@ -41,7 +41,7 @@ def scattered(count: int, frames: int) -> torch.Tensor:
 
 @pytest.mark.parametrize("scores", [1 << 25, 1])  # all frames at once, and one after another
 def test_the_nearest_point_is_that_of_the_whole_surface(monkeypatch, scores) -> None:
-    monkeypatch.setattr(closest_point, "SCORES", scores)
+    monkeypatch.setattr(closest_point, "MAX_PAIRS", scores)
     meshes, x = (slab(), slab(1.1), slab(0.9)), scattered(150, 3)
     body = body_of(*meshes)
     reach = torch.full_like(x[:, 0], 2.0)
@@ -93,7 +93,7 @@ def test_planes_held_still_are_the_true_gradient_of_the_distance() -> None:
 def test_the_kernel_finds_what_its_reference_does() -> None:
     meshes = [slab(), slab(1.1)]
     body, x = body_of(*meshes), scattered(90, 2).to(DEVICE)
-    patches = torch.as_tensor(patches_of(meshes[0].vertices, np.array(meshes[0].faces)), device=DEVICE)
+    patches = torch.as_tensor(triangle_patches(meshes[0].vertices, np.array(meshes[0].faces)), device=DEVICE)
     on_device = replace(body, patches=patches)
     (normal, offset), expected = distance._by_kernels(x, on_device, None), nearest_planes(x, body)
     torch.testing.assert_close((normal * x).sum(1) - offset, distances(x, body), rtol=0, atol=1e-6)

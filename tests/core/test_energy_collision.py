@@ -84,7 +84,7 @@ def test_nearest_vertex_matches_brute_force_on_both_paths(vertices, body_vertice
     found = nearest_vertex.nearest_vertex(torch.tensor(x), torch.tensor(body))
     assert found.dtype == torch.int64
     np.testing.assert_array_equal(found, expected)
-    monkeypatch.setattr(nearest_vertex, "SCORES", scores)
+    monkeypatch.setattr(nearest_vertex, "MAX_SCORES", scores)
     monkeypatch.setattr(nearest_vertex, "_by_rows", nearest_vertex._by_products)
     np.testing.assert_array_equal(nearest_vertex.nearest_vertex(torch.tensor(x), torch.tensor(body)), expected)
 
@@ -122,15 +122,15 @@ def test_blocks_hold_every_point_once_and_are_compact(count):
 
 def by_kernel(x: np.ndarray, body: np.ndarray, ordered: bool = True) -> np.ndarray:
     """The kernel's answer, with blocks and groups that are compact in the first frame, or as vertices come."""
-    from ssilk_core.kernels.nearest_vertex import nearest_kernel
+    from ssilk_core.kernels.nearest_vertex import nearest_vertex_kernel
 
     tables = [
         torch.as_tensor(compact_blocks(np.nan_to_num(points[..., 0]), size))
         if ordered
         else nearest_vertex.consecutive_blocks(len(points), size, torch.device("cpu"))
-        for points, size in ((x, nearest_vertex.BLOCK), (body, nearest_vertex.GROUP))
+        for points, size in ((x, nearest_vertex.GARMENT_BLOCK), (body, nearest_vertex.BODY_GROUP))
     ]
-    return nearest_kernel(*(torch.as_tensor(v).to(DEVICE) for v in (x, body, *tables))).cpu().numpy()
+    return nearest_vertex_kernel(*(torch.as_tensor(v).to(DEVICE) for v in (x, body, *tables))).cpu().numpy()
 
 
 def excess(x: np.ndarray, body: np.ndarray, found: np.ndarray) -> float:
@@ -189,7 +189,7 @@ def test_of_equally_near_vertices_the_kernel_takes_the_first_in_its_table():
     body, x = twice_a_cube()
     expected = brute_force(x, body)
     np.testing.assert_array_equal(by_kernel(x, body, ordered=False), expected)
-    order = compact_blocks(body[..., 0], nearest_vertex.GROUP).reshape(-1)
+    order = compact_blocks(body[..., 0], nearest_vertex.BODY_GROUP).reshape(-1)
     np.testing.assert_array_equal(by_kernel(x, body), order[brute_force(x, body[order])])
 
 
@@ -214,7 +214,7 @@ def test_the_kernel_finds_the_nearest_vertex_of_a_posed_body(scene, toy_motion):
     merged, skeleton, garment = scene.character.merged_body(), scene.character.skeleton, scene.garment.mesh
     matrices, _ = centred_matrices(toy_motion(scene, 3), skeleton)
     character = torch.tensor(matrices[:, :, :3].transpose(1, 2, 3, 0), dtype=torch.float32)
-    body = CollisionBody(merged, skeleton.joint_count, device=torch.device("cpu")).posed(character)
+    body = CollisionBody(merged, skeleton.joint_count, device=torch.device("cpu")).pose(character)
     x = skin_points(garment.points, scene.lbs_skin, matrices).transpose(1, 2, 0).astype(np.float32)
     np.testing.assert_array_equal(np.unique(body.groups), np.arange(len(merged.mesh.points)))
     np.testing.assert_array_equal(by_kernel(x, body.points.numpy()), brute_force(x, body.points.numpy()))
@@ -227,7 +227,7 @@ def test_body_is_posed_as_skinning_says_and_normals_turn_along(scene, toy_motion
     matrices, _ = centred_matrices(toy_motion(scene, 5), skeleton)
     character = torch.tensor(matrices[:, :, :3].transpose(1, 2, 3, 0), dtype=torch.float32)
     chosen = np.arange(0, body.mesh.vertex_count, 3)
-    posed = CollisionBody(body, 3, vertices=chosen, device=torch.device("cpu")).posed(character)
+    posed = CollisionBody(body, 3, vertices=chosen, device=torch.device("cpu")).pose(character)
     expected = skin_points(body.mesh.points, body.skin, matrices)
     np.testing.assert_allclose(posed.points.permute(2, 0, 1), expected[:, chosen], atol=1e-5)
     normals = posed.normals.permute(2, 0, 1).numpy()
@@ -242,7 +242,7 @@ def test_a_rigidly_turned_body_has_exactly_turned_normals():
     body = Body(Mesh("/ball", ball.vertices, ball.faces), SkinWeights("/ball", np.zeros((42, 1)), np.ones((42, 1))))
     collider = CollisionBody(body, 1, device=torch.device("cpu"))
     turn = torch.tensor(Rotation.random(random_state=5).as_matrix(), dtype=torch.float32)
-    posed = collider.posed(torch.cat([turn, torch.ones(3, 1)], dim=1)[None, ..., None])
+    posed = collider.pose(torch.cat([turn, torch.ones(3, 1)], dim=1)[None, ..., None])
     np.testing.assert_allclose(posed.normals[..., 0], collider.normals[..., 0] @ turn.T, atol=1e-6)
 
 

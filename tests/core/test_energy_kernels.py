@@ -82,8 +82,8 @@ def evaluate(terms: str, mesh: Mesh, fabric: Fabric, positions: np.ndarray, dtyp
     x = tensor(positions, dtype).requires_grad_()
     call = {
         "elastic": lambda: energy.elastic(x),
-        "potential": lambda: energy.potential(x, root, gravity, normal, offset),
-        "kinetic": lambda: energy.kinetic(x, path[..., 1:-1], path[..., :-2], shift, 1 / 30),
+        "potential": lambda: energy.gravity_and_collision(x, root, gravity, normal, offset),
+        "kinetic": lambda: energy.inertia_and_drag(x, path[..., 1:-1], path[..., :-2], shift, 1 / 30),
     }
     found = []
     for value in call[terms]():

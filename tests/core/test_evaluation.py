@@ -118,7 +118,7 @@ def test_energies_are_those_of_the_validation(scene, dressed, toy_motion, toy_mo
         network.take_set.bank, dressed.energy, dressed.body, scene, dressed.rest, FPS, clip.frame_count
     )
     expected = validator.frame_terms(range(23), model)
-    monkeypatch.setattr("ssilk_core.evaluation.record.DECODED_AT_ONCE", 9)
+    monkeypatch.setattr("ssilk_core.evaluation.record.FRAMES_PER_CHUNK", 9)
     found = recorded(dressed, take_set, network, 0).values
     for name in (*TERMS, "collisions"):
         np.testing.assert_allclose(found[name], expected[name].double(), rtol=1e-4, atol=1e-7)
@@ -131,7 +131,7 @@ def test_a_record_in_blocks_is_that_of_the_whole(dressed, take_set, monkeypatch)
     offsets = 0.01 * torch.randn(40, 3, generator=torch.Generator().manual_seed(1))
     method, reference = Still(dressed, take_set, offsets), LinearBlendSkinning(dressed, take_set)
     whole = recorded(dressed, take_set, method, 0, reference)
-    monkeypatch.setattr("ssilk_core.evaluation.record.DECODED_AT_ONCE", 2)
+    monkeypatch.setattr("ssilk_core.evaluation.record.FRAMES_PER_CHUNK", 2)
     parts = recorded(dressed, take_set, method, 0, reference)
     assert whole.values.keys() == parts.values.keys() and torch.equal(whole.stretches, parts.stretches)
     for name, values in whole.values.items():
@@ -179,8 +179,8 @@ def test_collisions_can_be_with_the_whole_body(scene, dressed, take_set):
         recorded(one, take_set, LinearBlendSkinning(one, take_set), 0).values["collision"] for one in (near, whole)
     ]
     character = take_set.character(0, range(40))
-    distance = signed_distance(whole.lbs(character), whole.body.posed(character, exact=True))
-    np.testing.assert_allclose(found[1], whole.energy.collision_of(distance), rtol=1e-5)
+    distance = signed_distance(whole.lbs(character), whole.body.pose(character, exact=True))
+    np.testing.assert_allclose(found[1], whole.energy.collision_at(distance), rtol=1e-5)
     assert (found[0] - found[1]).abs().max() > 1e-3
 
 

@@ -18,7 +18,7 @@ from ssilk_core.cli import main
 from ssilk_core.config import ModelConfig
 from ssilk_core.fabrics import FABRICS
 from ssilk_core.kinematics import matrix_from_quaternion
-from ssilk_core.model.batch import driven
+from ssilk_core.model.batch import motion_inputs
 from ssilk_core.model.export import export_onnx
 from ssilk_core.model.network import GarmentModel
 from ssilk_core.parameters import descriptor_sizes
@@ -70,7 +70,7 @@ def played(session, model, shots) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("count", [1, 3])
 def test_every_frame_is_what_a_shot_stores(exported, model, scene, toy_motion, count):
     motions = [toy_motion(scene, 2 * FRAMES).clip(4 * shot, 4 * shot + FRAMES) for shot in range(count)]
-    weights, rotations = played(exported[0], model, driven(model, motions))
+    weights, rotations = played(exported[0], model, motion_inputs(model, motions))
     for shot, motion in enumerate(motions):
         (expected,) = garment_poses(model, motion, motion.fps)
         np.testing.assert_allclose(weights[:, shot], expected.weights, atol=2e-5)
@@ -89,7 +89,7 @@ def test_a_tight_garment_without_proxies_or_stepper_is_exported(scene, toy_motio
     export_onnx(model, tmp_path / "tight.onnx")
     session = onnxruntime.InferenceSession(tmp_path / "tight.onnx", providers=["CPUExecutionProvider"])
     motion = toy_motion(tight, FRAMES)
-    weights, rotations = played(session, model, driven(model, [motion]))
+    weights, rotations = played(session, model, motion_inputs(model, [motion]))
     (expected,) = garment_poses(model, motion, motion.fps)
     np.testing.assert_allclose(weights[:, 0], expected.weights, atol=2e-5)
     assert rotations.shape == (FRAMES, 1, 0, 3, 3) and np.ptp(weights[..., :4], axis=0).max() > 0.01

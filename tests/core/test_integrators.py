@@ -10,7 +10,7 @@ from torch import nn
 
 from ssilk_core.config import ModelConfig
 from ssilk_core.kinematics import motion_transforms, skinning_matrices
-from ssilk_core.model.integrators import integrator, limited
+from ssilk_core.model.integrators import integrator, soft_clamp
 from ssilk_core.schemes import SCHEMES
 
 FREE = {"latent_bound": 0.0, "max_latent_step": 0.0}
@@ -148,10 +148,10 @@ def test_a_spring_alone_settles_at_the_rest_state():
 
 def test_the_limit_is_soft_odd_and_the_identity_near_zero():
     values = torch.linspace(-1e7, 1e7, 1001)
-    assert limited(values, 4.0).abs().max() <= 4
+    assert soft_clamp(values, 4.0).abs().max() <= 4
     small = torch.tensor([-0.01, 0.0, 0.02])
-    np.testing.assert_allclose(limited(small, 4.0), small, rtol=1e-4)
-    assert torch.equal(limited(values, 0.0), values)
+    np.testing.assert_allclose(soft_clamp(small, 4.0), small, rtol=1e-4)
+    assert torch.equal(soft_clamp(values, 0.0), values)
 
 
 @torch.no_grad()
@@ -183,7 +183,7 @@ def test_decoded_cloth_stays_within_reach_of_what_holds_it(scene, toy_motion, to
     skeleton = scene.character.skeleton
     matrices = skinning_matrices(motion_transforms(motion, skeleton.parents), skeleton.bind_transforms)
     character = torch.tensor(matrices[:, :, :3].transpose(1, 2, 3, 0), dtype=torch.float32)
-    x = model.vertices(model.integrator.bounded(1e6 * torch.randn(64, 8)), character).permute(2, 0, 1).numpy()
+    x = model.vertices(model.integrator.bound(1e6 * torch.randn(64, 8)), character).permute(2, 0, 1).numpy()
     points, (upper, lower) = scene.garment.mesh.points, scene.rig.bind_transforms[:, :3, 3]
     free = scene.classes != 0
     play = np.zeros(60)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from ssilk_core.config import TrainConfig
-from ssilk_core.training.latent_regularization import latent_irregularity
+from ssilk_core.training.latent_regularization import latent_distortion
 from ssilk_core.training.windows import WindowSampler
 
 MASS = torch.tensor([0.1, 0.3, 0.2, 0.4])
@@ -30,13 +30,13 @@ def isometric(scale: float) -> SimpleNamespace:
 @pytest.mark.parametrize("scale", [0.5, 1.0, 3.0])
 def test_distances_that_agree_cost_nothing_and_others_their_logarithm_squared(scale):
     z = torch.randn(7, 5, generator=torch.Generator().manual_seed(1))
-    found = latent_irregularity(isometric(0.02 * scale), MASS, z, 0.02)
+    found = latent_distortion(isometric(0.02 * scale), MASS, z, 0.02)
     torch.testing.assert_close(found, torch.full((7,), log(scale) ** 2), atol=1e-5, rtol=1e-4)
 
 
 def test_equal_latents_stay_finite():
     z = torch.zeros(3, 5, requires_grad=True)
-    latent_irregularity(isometric(0.02), MASS, z, 0.02).sum().backward()
+    latent_distortion(isometric(0.02), MASS, z, 0.02).sum().backward()
     assert z.grad is not None and z.grad.isfinite().all()
 
 

@@ -12,13 +12,13 @@ from ssilk_core import memory
 from ssilk_core.config import ModelConfig, TrainConfig
 from ssilk_core.errors import SsilkError
 from ssilk_core.memory import (
-    SHARE,
+    PLANNED_SHARE,
+    check_one_window_fits,
     decoded_frames,
+    fits_in_memory,
     fitting_batch,
     free_memory,
-    need_one_window,
     step_memory,
-    suffices,
 )
 
 MODEL, CONFIG = ModelConfig(), TrainConfig(batch=32, window=16, static_batch=32, pretraining_batch=700)
@@ -52,9 +52,9 @@ def test_a_lowered_batch_fits_and_one_more_would_not(scene, megabytes):
     config = replace(CONFIG, batch=10_000, pretraining_batch=100_000, static_batch=10_000)
     batch, warm = fitting_batch(scene, MODEL, config, 1000, available)
     assert 1 < batch < 10_000 and 1 < warm < 100_000
-    assert step_memory(scene, MODEL, max(batch * 17, warm), 1000) <= SHARE * available
-    assert step_memory(scene, MODEL, (batch + 1) * 17, 1000) > SHARE * available
-    assert step_memory(scene, MODEL, warm + 1, 1000) > SHARE * available
+    assert step_memory(scene, MODEL, max(batch * 17, warm), 1000) <= PLANNED_SHARE * available
+    assert step_memory(scene, MODEL, (batch + 1) * 17, 1000) > PLANNED_SHARE * available
+    assert step_memory(scene, MODEL, warm + 1, 1000) > PLANNED_SHARE * available
 
 
 def test_at_least_one_window_is_trained_on(scene):
@@ -63,14 +63,14 @@ def test_at_least_one_window_is_trained_on(scene):
 
 def test_one_window_must_fit(scene):
     needed = step_memory(scene, MODEL, CONFIG.window + 1, 1000)
-    need_one_window(scene, MODEL, CONFIG, 1000, needed)
+    check_one_window_fits(scene, MODEL, CONFIG, 1000, needed)
     with pytest.raises(SsilkError, match=r"one window of 16 poses needs 0\.043 GiB; 0\.043 GiB are free; .*window="):
-        need_one_window(scene, MODEL, CONFIG, 1000, needed - 1)
+        check_one_window_fits(scene, MODEL, CONFIG, 1000, needed - 1)
 
 
 def test_a_lack_of_memory_is_told_from_other_errors():
     done: list[int] = []
-    assert suffices(lambda: done.append(1)) and done == [1]
+    assert fits_in_memory(lambda: done.append(1)) and done == [1]
 
     def lacking() -> None:
         raise torch.OutOfMemoryError("tried to allocate")
@@ -82,9 +82,9 @@ def test_a_lack_of_memory_is_told_from_other_errors():
         finally:
             raise RuntimeError("operation failed due to a previous error during capture")
 
-    assert not suffices(lacking) and not suffices(captured)
+    assert not fits_in_memory(lacking) and not fits_in_memory(captured)
     with pytest.raises(RuntimeError, match="must match the size"):
-        suffices(lambda: print(torch.ones(2) + torch.ones(3)))
+        fits_in_memory(lambda: print(torch.ones(2) + torch.ones(3)))
 
 
 def test_what_did_not_fit_is_held_no_longer():
@@ -95,7 +95,7 @@ def test_what_did_not_fit_is_held_no_longer():
         held.append(weakref.ref(large))
         raise torch.OutOfMemoryError
 
-    assert not suffices(work) and held[0]() is None
+    assert not fits_in_memory(work) and held[0]() is None
 
 
 def test_free_memory_is_within_the_machine():

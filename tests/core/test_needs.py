@@ -77,7 +77,7 @@ def test_a_pinned_garment_has_nothing_to_learn(scene, toy_motion, tmp_path):
 
 def test_a_garment_with_anything_free_learns_as_asked(scene, toy_motion):
     asked = job_of(scene, toy_motion(scene, 30))
-    assert asked.learns and asked.model.latent == 8 and asked.train.iterations == 40
+    assert asked.is_trainable and asked.model.latent == 8 and asked.train.iterations == 40
 
 
 def test_a_body_out_of_reach_costs_no_collisions_and_no_posing(scene, toy_motion):
@@ -96,12 +96,12 @@ def test_only_what_is_not_pinned_meets_the_body(scene, toy_motion):
     character = parts.bank.character(torch.arange(5))
     x = parts.model.vertices(torch.zeros(5, 8), character).detach()
     normal, offset = objective._planes(x, character)
-    expected = nearest_planes(x, parts.body.posed(character), None)
+    expected = nearest_planes(x, parts.body.pose(character), None)
     free = torch.tensor(classes != PINNED)
     torch.testing.assert_close(normal[free], expected[0][free])
     torch.testing.assert_close(offset[free], expected[1][free])
     distance = (normal * x).sum(1) - offset
-    torch.testing.assert_close(distance[free], signed_distance(x, parts.body.posed(character))[free])
+    torch.testing.assert_close(distance[free], signed_distance(x, parts.body.pose(character))[free])
     assert distance[~free].min() > 1e5
 
 

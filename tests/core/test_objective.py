@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from ssilk_core.collision.distance import signed
+from ssilk_core.collision.distance import signed_distance_to_planes
 from ssilk_core.config import TrainConfig
 from ssilk_core.constants import GRAVITY
 from ssilk_core.schemes import SCHEMES
@@ -42,7 +42,9 @@ def at_frame(objective: Objective, z: torch.Tensor, frame: torch.Tensor, down: t
         "stretch": energy.stretch(x),
         "bending": energy.bending(x),
         "gravity": energy.gravity(x - character[0, :, 3], GRAVITY * down.T),
-        "collision": energy.collision_of(signed(x, *objective.contacts.planes(x, objective.body.posed(character)))),
+        "collision": energy.collision_at(
+            signed_distance_to_planes(x, *objective.contacts.planes(x, objective.body.pose(character)))
+        ),
     }
     return x, terms
 
@@ -162,13 +164,13 @@ def test_a_step_weighs_every_frame_the_same(objective):
     length = torch.cat([value.flatten() for value in expected.values()]).norm()  # only directions count
     stepper = Stepper(objective.model, objective, sampler, sampler.config)
     sampler.poses = lambda count: POSES
-    stepper.windows()
+    stepper.dynamic_step()
     for name, value in objective.model.named_parameters():
         assert value.grad is not None
         direction = expected[name] / length
         np.testing.assert_allclose(value.grad, direction, atol=1e-5 * float(direction.abs().max()) + 1e-12)
     assert stepper.terms["inertia"].item() == pytest.approx(dynamic["inertia"].mean().item(), rel=1e-5)
-    assert all(value.is_leaf and not value.requires_grad for value in stepper.averaged.parameters())  # no history
+    assert all(value.is_leaf and not value.requires_grad for value in stepper.ema_model.parameters())  # no history
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1e6])

@@ -25,7 +25,7 @@ from ssilk_core.errors import SsilkError
 from ssilk_core.events import silent
 from ssilk_core.fabrics import Fabric
 from ssilk_core.training.job import TrainJob
-from ssilk_core.training.parallel import LAUNCHED, ProcessGroup, joined
+from ssilk_core.training.parallel import TORCHRUN_VARIABLES, ProcessGroup, join_process_group
 from ssilk_core.training.run import TrainingRun, train
 from ssilk_core.training.state import state_path
 
@@ -41,8 +41,8 @@ class Recorder:
     """Shares gradients as a run does, and keeps a copy of what it gave back."""
 
     def __init__(self, run: TrainingRun) -> None:
-        self.share, self.given = run.stepper.share, []
-        run.stepper.share = self
+        self.share, self.given = run.stepper.average_gradients, []
+        run.stepper.average_gradients = self
 
     def __call__(self, gradients: list[torch.Tensor]) -> None:
         if self.share is not None:
@@ -72,16 +72,16 @@ def shared_gradient(job: TrainJob, group: ProcessGroup) -> dict[str, object]:
     return {"samplers": before, "parameters": parameters, "gradient": recorder.given[0]}
 
 
-def undone_step(job: TrainJob, group: ProcessGroup) -> dict[str, object]:
+def skipped_step(job: TrainJob, group: ProcessGroup) -> dict[str, object]:
     """The parameters before and after a step in which only the last process found no number."""
     run = TrainingRun(replace(job, train=ONE_STEP), silent, group)
 
     def poisoned(gradients: list[torch.Tensor]) -> None:
-        if not group.first:
+        if not group.is_first:
             gradients[0][0] = float("nan")
         group.average(gradients)
 
-    run.stepper.share = poisoned
+    run.stepper.average_gradients = poisoned
     before = [value.detach().clone() for value in run.stepper.model.parameters()]
     run.stepper.run(0)
     return {"before": before, "after": [value.detach() for value in run.stepper.model.parameters()]}
@@ -101,7 +101,7 @@ class SecondLook(threading.Event):
 
 def resumed(job: TrainJob, group: ProcessGroup) -> list[tuple[bool, int]]:
     """Train, the last process alone being asked to stop, and resume; how both ended."""
-    stop = threading.Event() if group.first else SecondLook()
+    stop = threading.Event() if group.is_first else SecondLook()
     ends = [train(job, silent, stop, group), train(replace(job, resume=True), silent, None, group)]
     return [(trained.finished, trained.iterations) for trained in ends]
 
@@ -109,12 +109,12 @@ def resumed(job: TrainJob, group: ProcessGroup) -> list[tuple[bool, int]]:
 def main(folder: Path) -> None:
     torch.set_num_threads(1)
     job: TrainJob = pickle.loads((folder / "job").read_bytes())
-    with joined("cpu") as (group, device):
+    with join_process_group("cpu") as (group, device):
         job = replace(job, device=device)
         whole = replace(job, output=folder / "whole.safetensors")
         found = {
             "one step": shared_gradient(whole, group),
-            "undone": undone_step(whole, group),
+            "skipped": skipped_step(whole, group),
             "trained": train(whole, silent, None, group),
             "resumed": resumed(replace(job, output=folder / "halves.safetensors"), group),
         }
@@ -179,9 +179,9 @@ def test_parameters_stay_alike_bit_for_bit(together):
     assert all(torch.equal(mine, other) for mine, other in zip(ours, theirs))
 
 
-def test_a_step_that_one_cannot_do_is_undone_by_all(together):
+def test_a_step_that_one_cannot_do_is_skipped_by_all(together):
     for found in together:
-        assert all(torch.equal(a, b) for a, b in zip(found["undone"]["before"], found["undone"]["after"]))
+        assert all(torch.equal(a, b) for a, b in zip(found["skipped"]["before"], found["skipped"]["after"]))
 
 
 def test_all_know_the_same_score(together):
@@ -212,9 +212,9 @@ def test_each_process_draws_its_own(job):
 
 
 def test_batches_are_divided_equally_or_refused():
-    assert ProcessGroup(1, 2).part(SHORT) == replace(SHORT, batch=2, pretraining_batch=4, static_batch=4)
+    assert ProcessGroup(1, 2).local_config(SHORT) == replace(SHORT, batch=2, pretraining_batch=4, static_batch=4)
     with pytest.raises(SsilkError, match=r"setting 'batch': 4 for 3 processes; .*a multiple of 3"):
-        ProcessGroup(0, 3).part(replace(SHORT, pretraining_batch=9))
+        ProcessGroup(0, 3).local_config(replace(SHORT, pretraining_batch=9))
 
 
 def test_that_another_process_has_ended_is_told(monkeypatch):
@@ -224,26 +224,26 @@ def test_that_another_process_has_ended_is_told(monkeypatch):
     for name in ("all_reduce", "all_gather_object"):
         monkeypatch.setattr(torch.distributed, name, broken)
     for exchange in (lambda: ProcessGroup(1, 2).average([torch.zeros(1)]), lambda: ProcessGroup(1, 2).any(True)):
-        with pytest.raises(SsilkError, match=r"^process 2 of 2: .*\(\[pair.cc:1\] Connection closed by peer\); see"):
+        with pytest.raises(SsilkError, match=r"^process 2 of 2: .*\(\[pair.cc:1\] Connection closed by peer\); read"):
             exchange()
 
 
 def test_without_torchrun_a_process_is_alone(monkeypatch):
-    for name in LAUNCHED:
+    for name in TORCHRUN_VARIABLES:
         monkeypatch.delenv(name, raising=False)
-    with joined("cuda:5") as (group, device):
+    with join_process_group("cuda:5") as (group, device):
         assert group == ProcessGroup() and device == "cuda:5"
 
 
 def test_torchrun_gives_out_the_devices(monkeypatch):
-    for name, value in zip(LAUNCHED, "112"):
+    for name, value in zip(TORCHRUN_VARIABLES, "112"):
         monkeypatch.setenv(name, value)
     with pytest.raises(SsilkError, match=r"--device cuda:0: torchrun gives each process a GPU of its own"):
-        joined("cuda:0").__enter__()
+        join_process_group("cuda:0").__enter__()
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     with pytest.raises(SsilkError, match=r"process 2: 1 GPUs are visible; .*--nproc-per-node 1"):
-        joined("auto").__enter__()
+        join_process_group("auto").__enter__()
 
 
 if __name__ == "__main__":

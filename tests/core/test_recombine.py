@@ -6,7 +6,7 @@ import pytest
 
 from ssilk_core.assets import Motion, Skeleton
 from ssilk_core.kinematics import motion_transforms
-from ssilk_core.training.recombine import limb_joints, recombined, with_limbs
+from ssilk_core.training.recombine import limb_joints, recombine_motions, replace_limbs
 
 NAMES = ("Hips", "Hips/Leg", "Hips/Leg/Foot", "Hips/Spine", "Hips/Spine/Arm", "Hips/Spine/Head")
 
@@ -31,7 +31,7 @@ def test_limbs_are_what_hangs_below_joints_that_have_siblings(skeleton):
 
 def test_limbs_turn_as_in_the_donor_to_and_fro_and_all_else_as_before(skeleton):
     base, donor = motion("/a", 9), motion("/b", 4)
-    found = with_limbs(base, donor, np.array([1, 2]), 2)
+    found = replace_limbs(base, donor, np.array([1, 2]), 2)
     np.testing.assert_allclose(found.rotations[:, [1, 2]], donor.rotations[[2, 3, 2, 1, 0, 1, 2, 3, 2]][:, [1, 2]])
     np.testing.assert_array_equal(found.rotations[:, [0, 3, 4, 5]], base.rotations[:, [0, 3, 4, 5]])
     np.testing.assert_array_equal(found.translations, base.translations)
@@ -40,13 +40,13 @@ def test_limbs_turn_as_in_the_donor_to_and_fro_and_all_else_as_before(skeleton):
 
 
 def test_a_donor_at_another_rate_moves_limbs_at_its_own_speed():
-    found = with_limbs(motion("/a", 4), motion("/b", 9, fps=60.0), np.array([4]), 0)
+    found = replace_limbs(motion("/a", 4), motion("/b", 9, fps=60.0), np.array([4]), 0)
     np.testing.assert_allclose(found.rotations[:, 4], motion("/b", 9).rotations[[0, 2, 4, 6]][:, 4], atol=1e-12)
 
 
 def test_every_motion_is_recombined_with_others_alone_and_alike_for_a_seed(skeleton):
     motions = [motion("/a", 9), motion("/b", 5), motion("/c", 7)]
-    found, again = (recombined(motions, skeleton, 20, 3) for _ in range(2))
+    found, again = (recombine_motions(motions, skeleton, 20, 3) for _ in range(2))
     assert 30 < len(found) <= 60
     for one, other in zip(found, again):
         np.testing.assert_array_equal(one.rotations, other.rotations)
@@ -56,4 +56,4 @@ def test_every_motion_is_recombined_with_others_alone_and_alike_for_a_seed(skele
         source = next(m for m in motions if m.path == base)
         assert not np.array_equal(item.rotations, source.rotations)
         np.testing.assert_array_equal(item.rotations[:, 0], source.rotations[:, 0])
-    assert recombined(motions, skeleton, 0, 3) == [] and recombined(motions[:1], skeleton, 5, 3) == []
+    assert recombine_motions(motions, skeleton, 0, 3) == [] and recombine_motions(motions[:1], skeleton, 5, 3) == []

@@ -13,18 +13,18 @@ from ssilk_core.assets import Motion
 from ssilk_core.config import ModelConfig
 from ssilk_core.kinematics import split_at_cuts
 from ssilk_core.model.network import GarmentModel
-from ssilk_core.rollout import RECOVERY, garment_poses, roll, roll_blocks
+from ssilk_core.rollout import RECOVERY_FRAMES, garment_poses, roll, roll_blocks
 
 
 def poison(model: GarmentModel, when: Container[int]) -> None:
     """Let a model lose its state at the steps in `when`, counted from zero."""
-    follow, steps = model.integrator.follow, count()
+    follow, steps = model.integrator.step, count()
 
     def poisoned(*inputs: object) -> torch.Tensor:
         given = follow(*inputs)
         return given * torch.nan if next(steps) in when else given
 
-    model.integrator.follow = poisoned
+    model.integrator.step = poisoned
 
 
 @pytest.fixture
@@ -45,8 +45,8 @@ def test_a_lost_state_rests_and_the_rollout_goes_on(model, scene, toy_motion, ch
     steps = list(roll(model, motion, chunk))
     frames, found = recovered(steps), torch.cat([step.activation for step in steps], dim=1)
     rests = frames[-1] - frames[0] + 1
-    assert frames == list(range(21, 21 + rests)) and rests <= RECOVERY
-    assert rests == RECOVERY or (frames[-1] + 1) % chunk == 0
+    assert frames == list(range(21, 21 + rests)) and rests <= RECOVERY_FRAMES
+    assert rests == RECOVERY_FRAMES or (frames[-1] + 1) % chunk == 0
     assert found.isfinite().all() and (found[:, :21] - calm[:, :21]).abs().max() < 1e-4
     assert (found[:, 22:] - calm[:, 22:]).abs().amax(dim=0).min() > 0 and len(found[0]) == 80
 
@@ -98,7 +98,7 @@ def test_the_frames_that_are_told_are_those_that_differ(model, scene, toy_motion
     (frames,) = told
     first = int(np.flatnonzero(moved)[0])
     assert frames[0] == first == int(np.floor(20 / 30 * target + 1e-6)) + 1
-    assert frames[-1] == int(np.ceil((21 + RECOVERY) / 30 * target - 1e-6)) - 1
+    assert frames[-1] == int(np.ceil((21 + RECOVERY_FRAMES) / 30 * target - 1e-6)) - 1
 
 
 def flight(speeds: np.ndarray) -> Motion:

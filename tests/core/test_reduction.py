@@ -258,7 +258,7 @@ def test_blendshapes_make_up_for_joints_as_far_as_they_can(reducer):
 def test_a_smaller_model_can_be_cut_again(reducer, motion):
     once = reducer.reduced(ModelSize(shapes=4, joints=1, influences=2)).file
     twice = Reducer(once, [motion]).reduced(ModelSize(shapes=2, joints=1, influences=2)).file
-    assert twice.config.shapes == 2 and twice.config.given == 6
+    assert twice.config.shapes == 2 and twice.config.activation_count == 6
     at_once = reducer.reduced(ModelSize(shapes=2, joints=1, influences=2)).file
     np.testing.assert_allclose(vertices(twice, motion), vertices(at_once, motion), atol=2e-3)
 

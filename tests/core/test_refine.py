@@ -14,7 +14,7 @@ from ssilk_core.errors import SsilkError
 from ssilk_core.fabrics import Fabric
 from ssilk_core.refine import RefineOptions, Refiner, Summary
 from ssilk_core.rollout import decode, garment_poses
-from ssilk_core.simulate import SimulationOptions, minimise, simulate
+from ssilk_core.simulate import SimulationOptions, quasi_static_states, simulate
 from ssilk_core.simulate.newton import SolverOptions
 
 CLOTH = Fabric("toy", bending=1e-4, margin=0.01)
@@ -74,10 +74,12 @@ def test_without_feedback_a_stretch_by_itself_comes_out_alike(scene, rollout) ->
 def test_with_feedback_it_becomes_the_simulator(scene, rollout) -> None:
     motion, points = rollout
     solver = SolverOptions(tolerance=1e-5, iterations=300)
-    options = SimulationOptions(solver=solver, rest=replace(solver, tolerance=1e-5))
+    options = SimulationOptions(solver=solver, quasi_static_solver=replace(solver, tolerance=1e-5))
     (expected,) = simulate(scene, CLOTH, [motion], options)
     start = points.copy()
-    start[0] = minimise(scene, CLOTH, motion.clip(0, 1), options)[0]  # the rest state that the simulator begins with
+    start[0] = quasi_static_states(scene, CLOTH, motion.clip(0, 1), options)[
+        0
+    ]  # the rest state that the simulator begins with
     found, changes = refined(scene, motion, start, iterations=300, tolerance=1e-5, feedback=True)
     assert max(change.residual for change in changes) < 1e-5
     np.testing.assert_allclose(found, expected, atol=1e-4)

@@ -13,17 +13,15 @@ import pytest
 import torch
 
 from ssilk_core.checkpoint import model_file, save_model
-from ssilk_core.descriptors import pose_features
 from ssilk_core.errors import SsilkError
 from ssilk_core.fabrics import FABRICS
 from ssilk_core.kinematics import deform, resample
-from ssilk_core.model import descriptors
 from ssilk_core.model.network import GarmentModel
 from ssilk_core.parameters import parameter_shapes
 from ssilk_core.rollout import decode, garment_poses, roll
 from ssilk_core.runtime import Player
-from ssilk_core.runtime.drive import character_matrices
-from ssilk_core.runtime.stepper import Limit
+from ssilk_core.runtime.character import character_matrices
+from ssilk_core.runtime.stepper import SoftClamp
 from ssilk_core.schemes import SCHEMES
 
 FRAMES = 150  # more than two blocks of decoded frames, the last one short
@@ -38,7 +36,7 @@ def expected_vertices(model: GarmentModel, motion) -> np.ndarray:
 
 
 def states_of(model: GarmentModel, motion) -> np.ndarray:
-    return player_of(model).play(motion).takes[0].states(motion.frame_count)
+    return player_of(model).play(motion).rolled_spans[0].states(motion.frame_count)
 
 
 def all_vertices(playback) -> np.ndarray:
@@ -84,12 +82,12 @@ def test_limits_are_reached_and_kept_as_in_the_network(scene, toy_model, motion)
 
 @pytest.mark.parametrize("bound", [0.0, 0.3, 4.0])
 def test_a_limit_is_that_of_the_integrators(bound):
-    from ssilk_core.model.integrators import limited
+    from ssilk_core.model.integrators import soft_clamp
 
     for reach in (0.1, 1.0, 30.0):
         values = np.linspace(-reach, reach, 101, dtype=np.float32)
-        expected = limited(torch.from_numpy(values.copy()), bound)
-        Limit(bound, values.shape)(values)
+        expected = soft_clamp(torch.from_numpy(values.copy()), bound)
+        SoftClamp(bound, values.shape)(values)
         np.testing.assert_allclose(values, expected, rtol=1e-6, atol=1e-7)
 
 
@@ -192,12 +190,12 @@ def test_what_changes_later_leaves_the_frames_before_as_they_are(model, motion, 
     player = player_of(model)
     before = player.play(shot, block=8)
     before.vertices(70)
-    after, anew = before.changed(edited, 50), player.play(edited, block=8)
-    assert 32 <= after.takes[0].rolled <= 64 and anew.takes[0].rolled == 0
+    after, anew = before.with_motion(edited, 50), player.play(edited, block=8)
+    assert 32 <= after.rolled_spans[0].rolled <= 64 and anew.rolled_spans[0].rolled == 0
     for frame in (69, 10, 50, 49):
         np.testing.assert_array_equal(after.vertices(frame), anew.vertices(frame))
     assert not np.array_equal(after.vertices(69), before.vertices(69))
-    assert before.changed(edited, 0).takes[0].rolled == 0
+    assert before.with_motion(edited, 0).rolled_spans[0].rolled == 0
 
 
 @pytest.mark.parametrize("fps", [24.0, 30.0])
@@ -209,8 +207,8 @@ def test_garments_run_up_to_the_first_frame_as_in_a_bake(model, motion, fps):
         np.testing.assert_allclose(playback.pose(frame).weights[0], theirs[frame], atol=5e-5)
     assert np.abs(theirs[0] - player_of(model).play(shot).pose(0).weights[0]).max() > 1e-3
     edited = replace(shot, rotations=np.concatenate([shot.rotations[:40], shot.rotations[40:, ::-1]]))
-    after, anew = playback.changed(edited, 40), player_of(model).play(edited, pre_roll=0.7, block=16)
-    assert after.takes[0].rolled > after.takes[0].before == 21
+    after, anew = playback.with_motion(edited, 40), player_of(model).play(edited, pre_roll=0.7, block=16)
+    assert after.rolled_spans[0].rolled > after.rolled_spans[0].before == 21
     np.testing.assert_array_equal(after.vertices(47), anew.vertices(47))
 
 
@@ -239,14 +237,6 @@ def test_parameter_shapes_are_those_of_the_network(scene, toy_model, scheme, wid
     model = toy_model(scene, scheme=scheme, widths=widths)
     found = parameter_shapes(scene, model.config, model.joints)
     assert found == {name: tuple(value.shape) for name, value in model.state_dict().items()}
-
-
-def test_descriptors_are_those_that_training_sees(scene, motion):
-    joints = np.arange(3)
-    mine = pose_features(motion, scene.character.skeleton, joints)
-    theirs = descriptors.pose_features(motion, scene.character.skeleton, joints)
-    for name in ("static", "dynamic", "down"):
-        np.testing.assert_array_equal(getattr(mine, name), getattr(theirs, name))
 
 
 def test_loading_and_playing_load_no_torch(model, motion, tmp_path: Path):

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from ssilk_core.kernels.conjugate import solve_kernel
+from ssilk_core.kernels.conjugate_gradient import solve_kernel
 from ssilk_core.simulate.blocks import BlockMatrix, BlockPattern
-from ssilk_core.simulate.conjugate import CHECK_EVERY, inverse_blocks
+from ssilk_core.simulate.conjugate_gradient import CHECK_EVERY, inverse_blocks
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")  # the interpreter runs kernels on a CPU
 

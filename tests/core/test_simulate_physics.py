@@ -19,8 +19,8 @@ from ssilk_core.kinematics import (
     skin_points,
     skinning_matrices,
 )
-from ssilk_core.simulate import SimulationOptions, Simulator, minimise, shots_of, simulate
-from ssilk_core.simulate.actors import spans_of
+from ssilk_core.simulate import SimulationOptions, Simulator, quasi_static_states, shots_of, simulate
+from ssilk_core.simulate.characters import split_into_spans
 from ssilk_core.simulate.incremental_potential import IncrementalPotential, StepInputs
 from ssilk_core.simulate.newton import SolverOptions, minimise_from
 
@@ -169,7 +169,9 @@ def test_drag_only_decays_motion(scene, toy_grid) -> None:
 
 # --- whole shots of the toy character ---------------------------------------------------------------------------
 
-SHORT = SimulationOptions(solver=SolverOptions(tolerance=1e-5), rest=SolverOptions(tolerance=1e-4, iterations=200))
+SHORT = SimulationOptions(
+    solver=SolverOptions(tolerance=1e-5), quasi_static_solver=SolverOptions(tolerance=1e-4, iterations=200)
+)
 CLOTH = Fabric("toy", bending=1e-4, margin=0.01)
 
 
@@ -224,7 +226,7 @@ def test_a_shot_begins_anew_after_a_cut(scene, toy_motion) -> None:
     moved = motion.translations.copy()
     moved[5:, 0] += [20.0, 0.0, 0.0]
     cut = replace(motion, translations=moved)
-    first, second = spans_of(cut, 0, 30.0, 1)
+    first, second = split_into_spans(cut, 0, 30.0, 1)
     assert (first.first, first.frame_count, second.first, second.frame_count) == (0, 5, 5, 4)
     (points,) = simulate(scene, CLOTH, [cut], SHORT)
     (alone,) = simulate(scene, CLOTH, [cut.clip(5, 9)], SHORT)
@@ -255,9 +257,9 @@ def test_a_garment_comes_to_rest_with_its_character(scene, toy_motion) -> None:
 
 def test_a_quasi_static_pose_hangs_lower_than_plain_skinning(scene, toy_motion) -> None:
     poses = toy_motion(scene, 3)
-    points = minimise(scene, CLOTH, poses, SHORT)
+    points = quasi_static_states(scene, CLOTH, poses, SHORT)
     simulator = Simulator(scene, CLOTH, SHORT)
-    at = simulator.actors.posed(poses.rotations, poses.translations)
+    at = simulator.poser.pose(poses.rotations, poses.translations)
     inputs = StepInputs(at.body, simulator.gravity.expand(3, 3))
     x = torch.as_tensor(points.transpose(1, 2, 0)) - at.root
     energies = [

@@ -21,7 +21,7 @@ from ssilk_core.energy.stretch import stretch_density
 from ssilk_core.errors import SsilkError
 from ssilk_core.fabrics import Fabric
 from ssilk_core.simulate import newton
-from ssilk_core.simulate.conjugate import CHECK_EVERY, inverse_blocks, solve
+from ssilk_core.simulate.conjugate_gradient import CHECK_EVERY, inverse_blocks, solve
 from ssilk_core.simulate.hinges import Hinges
 from ssilk_core.simulate.incremental_potential import IncrementalPotential, StepInputs
 from ssilk_core.simulate.membrane import Membrane, outer, project_psd
@@ -43,7 +43,7 @@ def crumpled(scene: Scene, frames: int = 2, size: float = 0.004) -> torch.Tensor
 def body_of(scene: Scene, frames: int) -> PosedBody:
     joints = scene.character.skeleton.joint_count
     identity = torch.eye(4)[:3, :, None].expand(joints, 3, 4, frames)
-    return CollisionBody(scene.character.merged_body(), joints, device=CPU).posed(identity.contiguous())
+    return CollisionBody(scene.character.merged_body(), joints, device=CPU).pose(identity.contiguous())
 
 
 def moving(scene: Scene, frames: int = 2) -> tuple[torch.Tensor, StepInputs]:

@@ -11,8 +11,15 @@ import torch
 import trimesh
 
 from ssilk_core.collision import closest_point, distance
-from ssilk_core.collision.distance import TOUCHING, Patches, PosedBody, nearest_planes, signed, smoothed_planes
-from ssilk_core.collision.smoothed_distance import SHARPNESS
+from ssilk_core.collision.distance import (
+    SURFACE_EPSILON,
+    Patches,
+    PosedBody,
+    nearest_planes,
+    signed_distance_to_planes,
+    smoothed_planes,
+)
+from ssilk_core.collision.smoothed_distance import SMOOTHING_EXPONENT
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
@@ -45,7 +52,7 @@ def test_over_one_plane_it_is_the_distance() -> None:
     found = smoothed_planes(x.to(DEVICE), body)
     torch.testing.assert_close(found.distance(x.to(DEVICE))[:, 0].cpu(), height, rtol=1e-5, atol=2e-8)
     expected = torch.tensor([0.0, 1.0, 0.0]).expand(7, 3)
-    beyond = height.abs() > TOUCHING
+    beyond = height.abs() > SURFACE_EPSILON
     torch.testing.assert_close(found.normal[..., 0].cpu()[beyond], expected[beyond], rtol=0, atol=1e-3)
     assert found.curvature.abs().max() < 1e-3
 
@@ -57,10 +64,10 @@ def test_between_two_walls_it_is_the_norm_of_their_distances(angle: float) -> No
     x[:, 0, 0], x[:, 1, 0], x[:, 2, 0] = 1e-3 * torch.linspace(-1, 1, 9), 0.01, 0.012
     wall = x[:, 2, 0] * np.sin(angle / 2) + torch.tensor([[-1.0], [1.0]]) * x[:, 0, 0] * np.cos(angle / 2)
     # Each wall has two triangles, of which the point is over one.
-    expected = (wall.double() ** -SHARPNESS).sum(0) ** (-1 / SHARPNESS)
+    expected = (wall.double() ** -SMOOTHING_EXPONENT).sum(0) ** (-1 / SMOOTHING_EXPONENT)
     torch.testing.assert_close(rounded(x.to(DEVICE), body)[:, 0].cpu(), expected.float(), rtol=1e-5, atol=0)
     middle = smoothed_planes(x.to(DEVICE), body).normal[4, :, 0].cpu()
-    shorter = float(np.sin(angle / 2)) * 2 ** (-1 / SHARPNESS)  # the walls push against each other across the fold
+    shorter = float(np.sin(angle / 2)) * 2 ** (-1 / SMOOTHING_EXPONENT)  # across the fold both walls count
     torch.testing.assert_close(middle, torch.tensor([0.0, 0.0, shorter]), rtol=0, atol=1e-4)
 
 
@@ -74,10 +81,10 @@ def near(mesh: trimesh.Trimesh, reach: float, count: int = 600) -> torch.Tensor:
 def test_it_lies_little_below_the_euclidean_distance() -> None:
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
     body, x = body_of(ball), near(ball, 0.02)[..., None].float().to(DEVICE)
-    exact, found = signed(x, *nearest_planes(x, body)), rounded(x, body)
+    exact, found = signed_distance_to_planes(x, *nearest_planes(x, body)), rounded(x, body)
     apart = (exact.abs() - found.abs()) / exact.abs()
-    assert (exact.abs() > TOUCHING).all() and torch.equal(exact > 0, found > 0)
-    assert apart.min() > -2e-4 and 1e-3 < apart.max() < np.log(6) / SHARPNESS + 1e-4
+    assert (exact.abs() > SURFACE_EPSILON).all() and torch.equal(exact > 0, found > 0)
+    assert apart.min() > -2e-4 and 1e-3 < apart.max() < np.log(6) / SMOOTHING_EXPONENT + 1e-4
 
 
 def in_the_fold(count: int) -> torch.Tensor:
@@ -140,7 +147,7 @@ def test_inside_it_bends_about_the_nearest_edge() -> None:
     x = torch.tensor([[1e-3, 0.02, -5e-3], [-2e-3, -0.03, -8e-3]], dtype=torch.float64)[..., None]
     found = smoothed_planes(x, body)
     radius = x[:, [0, 2], 0].norm(dim=1)
-    torch.testing.assert_close(-found.distance(x)[:, 0], radius * 2 ** (-1 / SHARPNESS), rtol=1e-6, atol=0)
+    torch.testing.assert_close(-found.distance(x)[:, 0], radius * 2 ** (-1 / SMOOTHING_EXPONENT), rtol=1e-6, atol=0)
     for curvature, at, r in zip(found.curvature[..., 0], x[..., 0], radius):
         around = torch.tensor([at[2], 0.0, -at[0]], dtype=torch.float64) / r
         torch.testing.assert_close(curvature.double(), around[:, None] * around / r, rtol=1e-5, atol=1e-4)
@@ -167,7 +174,7 @@ def test_frames_looked_at_in_turn_give_the_same(monkeypatch) -> None:
     ball = trimesh.creation.icosphere(subdivisions=1, radius=0.1)
     body, x = body_of(ball, ball, ball), near(ball, 0.01, 50)[..., None].float().repeat(1, 1, 3).to(DEVICE)
     together = smoothed_planes(x, body)
-    monkeypatch.setattr(closest_point, "SCORES", 1)
+    monkeypatch.setattr(closest_point, "MAX_PAIRS", 1)
     assert torch.equal(smoothed_planes(x, body).curvature, together.curvature)
 
 
@@ -189,7 +196,7 @@ def test_the_kernel_finds_what_its_reference_does(monkeypatch, listed: bool) -> 
         faces[::2, -9:] = -1
         patches = Patches(vertices, faces)
     with monkeypatch.context() as lbs:
-        lbs.setattr(distance.kernels, "serve", lambda x: False)
+        lbs.setattr(distance.kernels, "supports", lambda x: False)
         expected = smoothed_planes(x, body, patches=patches)
         found = distance._smoothed_by_kernel(x, body, None, patches)
     torch.testing.assert_close(found.distance(x.double()), expected.distance(x.double()), rtol=0, atol=3e-7)
@@ -210,7 +217,7 @@ def test_the_kernel_serves_more_frames_than_a_block_some_of_them_far_off(monkeyp
     x = in_the_fold(3).repeat(1, 1, frames).float().to(DEVICE)
     x[:, 2, ::3] += 0.5
     with monkeypatch.context() as lbs:
-        lbs.setattr(distance.kernels, "serve", lambda x: False)
+        lbs.setattr(distance.kernels, "supports", lambda x: False)
         expected = smoothed_planes(x, body)
         found = distance._smoothed_by_kernel(x, body, None, None)
     torch.testing.assert_close(found.distance(x.double()), expected.distance(x.double()), rtol=0, atol=3e-7)

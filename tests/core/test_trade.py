@@ -124,10 +124,10 @@ def test_collisions_are_told_with_any_body(meter, scene):
     fabric = replace(FABRICS["silk"], margin=0.2)  # as wide as the gap between the toy's garment and its body
     dressed = EvaluationScene(scene, fabric, FPS, torch.device("cpu"))
     surface, points, few = judged(dressed, meter.reel, meter.whole)
-    body = dressed.body.posed(meter.reel.character(0, range(50)))
+    body = dressed.body.pose(meter.reel.character(0, range(50)))
     met, nearest = dressed.contacts.distances(meter.whole.vertices(0, range(50)), body)
     assert surface.inside == pytest.approx(float((nearest < 0).double().mean()))
-    assert surface.collision == pytest.approx(float(dressed.energy.collision_of(met).mean()))
+    assert surface.collision == pytest.approx(float(dressed.energy.collision_at(met).mean()))
     assert surface.vertices == points.vertices == scene.character.merged_body().mesh.vertex_count
     assert few.vertices == -(-points.vertices // 4) and few.collision != points.collision
     assert len(judging_table([surface, points, few]).splitlines()) == 5

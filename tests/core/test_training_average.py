@@ -43,13 +43,13 @@ def test_the_average_is_its_closed_form(scene, toy_motion, toy_model, toy_object
     weights = [math.prod(decays), *((1 - d) * math.prod(decays[step + 1 :]) for step, d in enumerate(decays))]
     assert sum(weights) == pytest.approx(1)
     expected = sum(weight * row for weight, row in zip(weights, rows))
-    torch.testing.assert_close(flat(stepper.averaged), expected, rtol=1e-5, atol=1e-6)
-    assert (flat(stepper.averaged) - rows[-1]).abs().max() > 1e-3
+    torch.testing.assert_close(flat(stepper.ema_model), expected, rtol=1e-5, atol=1e-6)
+    assert (flat(stepper.ema_model) - rows[-1]).abs().max() > 1e-3
 
 
 def test_without_a_decay_the_average_is_the_model(scene, toy_motion, toy_model, toy_objective):
     stepper, _ = stepped(scene, toy_motion, toy_model, toy_objective, replace(CONFIG, iterations=12, ema_decay=0.0))
-    for averaged, own in zip(stepper.averaged.parameters(), stepper.model.parameters()):
+    for averaged, own in zip(stepper.ema_model.parameters(), stepper.model.parameters()):
         assert torch.equal(averaged, own)
 
 

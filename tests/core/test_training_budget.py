@@ -14,7 +14,7 @@ from ssilk_core.errors import SsilkError
 from ssilk_core.events import Message, Progress, Started, silent
 from ssilk_core.training import budget
 from ssilk_core.training import run as training
-from ssilk_core.training.budget import fitting_iterations, shaped
+from ssilk_core.training.budget import fitting_iterations, scale_schedule
 from ssilk_core.training.parallel import ProcessGroup
 from ssilk_core.training.run import TrainingRun, train
 from ssilk_core.training.state import load_state, state_path
@@ -27,15 +27,15 @@ PLAN = TrainConfig(iterations=1000, static_fraction=0.3, learning_rate_warmup=50
 
 @pytest.mark.parametrize("iterations", [50, 1000, 8000])
 def test_a_stretched_schedule_has_the_same_shape(iterations):
-    found, factor = shaped(PLAN, iterations), iterations / PLAN.iterations
+    found, factor = scale_schedule(PLAN, iterations), iterations / PLAN.iterations
     assert found.iterations == iterations and found.static_iterations == round(PLAN.static_iterations * factor)
     assert found.iterations // found.validate_every == 10
     for share in (0.1, 0.4, 0.6, 0.9):
         rates = [learning_rate(config, int(share * config.iterations)) for config in (found, PLAN)]
         assert rates[0] == pytest.approx(rates[1], rel=0.02)
-    # What the running average still holds of the first parameters in the end.
+    # The weight of the first parameters in the moving average at the end.
     assert found.ema_decay**iterations == pytest.approx(PLAN.ema_decay**1000, rel=1e-6)
-    assert shaped(replace(PLAN, ema_decay=0.0), iterations).ema_decay == 0
+    assert scale_schedule(replace(PLAN, ema_decay=0.0), iterations).ema_decay == 0
 
 
 class Clocked:
@@ -43,8 +43,8 @@ class Clocked:
 
     device = torch.device("cpu")
 
-    def __init__(self, warm: float, proper: float) -> None:
-        self.times, self.now = (warm, proper), 0.0
+    def __init__(self, static: float, dynamic: float) -> None:
+        self.times, self.now = (static, dynamic), 0.0
 
     def run(self, iteration: int) -> None:
         self.now += self.times[iteration >= PLAN.static_iterations]
@@ -60,14 +60,16 @@ def test_as_many_iterations_are_planned_as_fit(monkeypatch):
     each = 0.3 * 0.1 + 0.7 * 0.4
     assert planned(monkeypatch, 600) == int(0.9 * 600 / each)
     assert planned(monkeypatch, 600, scoring=10) == int((0.9 * 600 - 8 * 10) / each)
-    with pytest.raises(SsilkError, match=r"^cape.safetensors: 14 iterations fit into the minutes .* smaller preset"):
+    with pytest.raises(
+        SsilkError, match=r"^cape.safetensors: 14 iterations fit into the remaining minutes .* smaller preset"
+    ):
         planned(monkeypatch, 5)
 
 
 def test_a_run_with_minutes_is_one_of_as_many_iterations(job, monkeypatch):  # noqa: F811
     """Timing its steps leaves no trace in what is learned."""
     real, said = training.fitting_iterations, []
-    monkeypatch.setattr(budget, "FEWEST", 1)
+    monkeypatch.setattr(budget, "MIN_ITERATIONS", 1)
     monkeypatch.setattr(training, "fitting_iterations", lambda *given: real(*given) * 0 + 11)
     trained = train(job("minutes", minutes=5.0), said.append)
     assert trained.finished and trained.iterations == 11
@@ -75,7 +77,7 @@ def test_a_run_with_minutes_is_one_of_as_many_iterations(job, monkeypatch):  # n
     assert any(
         "11 iterations are planned for 5 minutes" in event.text for event in said if isinstance(event, Message)
     )
-    lbs = job("iterations", shaped(SHORT, 11))
+    lbs = job("iterations", scale_schedule(SHORT, 11))
     train(lbs, silent)
     asked = job("minutes", minutes=5.0)
     _, one = load_state(state_path(asked.output), asked.identity())
@@ -99,7 +101,7 @@ def test_a_run_ends_with_its_time_and_goes_on_with_more(job, monkeypatch):  # no
 
 
 @pytest.mark.parametrize("resume", [False, True])
-def test_a_team_has_no_minutes(job, resume):  # noqa: F811
+def test_a_process_group_has_no_minutes(job, resume):  # noqa: F811
     """Each process would end by a clock of its own, and the others wait for it."""
     with pytest.raises(SsilkError, match="minutes for a group of processes; its clocks differ; set the iterations"):
         TrainingRun(job("group", minutes=1.0, resume=resume), silent, ProcessGroup(0, 2))
@@ -110,7 +112,7 @@ def test_time_is_up_when_no_validation_fits_any_more(job, monkeypatch):  # noqa:
     run = TrainingRun(job("clock", minutes=1.0), silent)
     now = run._began
     monkeypatch.setattr(training.time, "monotonic", lambda: now)
-    run.scoring = 10.0
+    run.validation_seconds = 10.0
     for spent in (49.0, 51.0):
         now = run._began + spent
         assert run.time_left == pytest.approx(50.0 - spent)

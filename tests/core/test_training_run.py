@@ -23,14 +23,14 @@ from ssilk_core.fabrics import Fabric
 from ssilk_core.model.network import GarmentModel
 from ssilk_core.training import run as training
 from ssilk_core.training import validation
-from ssilk_core.training.curve import CurvePoint, curve_path, with_point
+from ssilk_core.training.curve import CurvePoint, append_point, curve_path
 from ssilk_core.training.divergence import fault_path
 from ssilk_core.training.job import TrainJob, split_motions
 from ssilk_core.training.objective import Objective
 from ssilk_core.training.run import train
 from ssilk_core.training.run_files import RunFiles
-from ssilk_core.training.signals import interruptible
-from ssilk_core.training.state import RunState, learned, load_state, state_path
+from ssilk_core.training.signals import stop_on_signals
+from ssilk_core.training.state import RunState, learned_tensors, load_state, state_path
 from ssilk_core.training.step import EAGER_STEPS, Stepper, learning_rate
 from ssilk_core.training.validation import Score
 from ssilk_core.training.windows import WindowSampler
@@ -229,7 +229,7 @@ def test_provenance_tells_how_the_model_came_to_be(uninterrupted):
 
 
 def test_a_diverging_run_says_so_and_keeps_the_best_model(job):
-    """Smaller steps are tried once; these are too large even so."""
+    """Smaller learning rates are tried once; these are too large even so."""
     wild = job(
         "diverging",
         replace(
@@ -247,7 +247,9 @@ def test_a_diverging_run_says_so_and_keeps_the_best_model(job):
         train(wild, events.append)
     assert "resume" not in str(error.value)  # with another step size it would be another run
     (back,) = (
-        e.text for e in events if isinstance(e, Message) and "back to iteration 10 with steps of 25%" in e.text
+        e.text
+        for e in events
+        if isinstance(e, Message) and "back to iteration 10 with 25% of the learning rate" in e.text
     )
     assert str(fault_path(wild.output)) in back
     kept = load_model(wild.output)
@@ -273,7 +275,7 @@ def poison(monkeypatch: pytest.MonkeyPatch, bad: Callable[[Stepper, int], bool],
     monkeypatch.setattr(Objective, "window", spoiled)
 
 
-def test_an_undone_step_is_told_of_by_term_and_iteration_and_counted_across_resumes(job, monkeypatch):
+def test_a_skipped_step_is_reported_by_term_and_iteration_and_counted_across_resumes(job, monkeypatch):
     spoiled = job("spoiled")
     with monkeypatch.context() as patch:
         poison(patch, lambda stepper, iteration: iteration == 7)
@@ -281,15 +283,15 @@ def test_an_undone_step_is_told_of_by_term_and_iteration_and_counted_across_resu
     events: list[Event] = []
     poison(monkeypatch, lambda stepper, iteration: iteration in (11, 12), "static_batch stretch")
     train(replace(spoiled, resume=True), events.append)
-    told = [event.text for event in events if isinstance(event, Message) and "undone" in event.text]
+    told = [event.text for event in events if isinstance(event, Message) and "skipped" in event.text]
     assert told == [
-        "2 steps up to iteration 13 were undone: static_batch stretch not finite.",
-        "3 steps in all were undone.",
+        "2 steps up to iteration 13 were skipped: static_batch stretch not finite.",
+        "3 steps in total were skipped.",
     ]
-    assert load_state(state_path(spoiled.output), spoiled.identity())[0].undone == 3
+    assert load_state(state_path(spoiled.output), spoiled.identity())[0].skipped == 3
 
 
-def test_many_undone_steps_lead_back_to_the_last_state_and_smaller_steps(job, monkeypatch):
+def test_many_skipped_steps_lead_back_to_the_last_state_and_smaller_steps(job, monkeypatch):
     config = replace(SHORT, iterations=120, static_fraction=0.0, validate_every=15)
     poison(
         monkeypatch,
@@ -299,11 +301,11 @@ def test_many_undone_steps_lead_back_to_the_last_state_and_smaller_steps(job, mo
     slowed = job("slowed", config)
     assert train(slowed, events.append).finished
     (back,) = (event.text for event in events if isinstance(event, Message) and "back to" in event.text)
-    assert back.startswith("more than half of the last 100 steps were undone at iteration 80 (bending not finite); ")
-    assert "back to iteration 75 with steps of 25%" in back
+    assert back.startswith("more than half of the last 100 steps were skipped at iteration 80 (bending not finite); ")
+    assert "back to iteration 75 with 25% of the learning rate" in back
     state = load_state(state_path(slowed.output), slowed.identity())[0]
     assert [(item.iteration, item.pace) for item in state.lowered] == [(75, 0.25)]
-    assert state.undone == 61 and [point.iteration for point in state.curve] == [15, 30, 45, 60, 75, 90, 105, 120]
+    assert state.skipped == 61 and [point.iteration for point in state.curve] == [15, 30, 45, 60, 75, 90, 105, 120]
     kept = load_model(slowed.output).provenance["lowered"]
     assert [item["pace"] for item in kept] == ([0.25] if state.best.iteration > 75 else [])
 
@@ -314,7 +316,9 @@ def test_what_stays_broken_stops_with_the_window_to_study(job, monkeypatch, scen
     broken = job(
         "broken", replace(SHORT, iterations=400, static_fraction=0.0, validate_every=1000, rotated_fraction=0.0)
     )
-    with pytest.raises(SsilkError, match=r"undone at iteration 60 \(bending.*no model yet.*broken.fault.safetensors"):
+    with pytest.raises(
+        SsilkError, match=r"skipped at iteration 60 \(bending.*no model yet.*broken.fault.safetensors"
+    ):
         train(broken, silent)
     assert not broken.output.exists()
     with safe_open(fault_path(broken.output), "pt") as stream:
@@ -332,7 +336,7 @@ def test_the_batch_is_lowered_to_fit_and_that_is_said(job, monkeypatch):
     monkeypatch.setattr(training, "free_memory", lambda device: 1 << 30)
     events: list[Event] = []
     monkeypatch.setattr(Stepper, "run", lambda self, iteration: None)
-    run = training.Run(small, events.append)
+    run = training.TrainingRun(small, events.append)
     assert 1 <= run.config.batch < 4000 and 1 <= run.config.pretraining_batch < 90_000
     warning = next(event for event in events if isinstance(event, Message))
     assert warning.level == "warning" and f"from 4000 to {run.config.batch} windows" in warning.text
@@ -350,7 +354,7 @@ def test_a_run_lowered_to_fit_is_resumed_as_it_was(job, monkeypatch):
     runs = []
     for megabytes in (400, 500, 330):
         monkeypatch.setattr(training, "free_memory", lambda device, size=megabytes << 20: size)
-        runs.append(training.Run(replace(big, resume=bool(runs)), silent).config)
+        runs.append(training.TrainingRun(replace(big, resume=bool(runs)), silent).config)
     assert runs[0] == runs[1] == runs[2] and runs[0].batch < 4000
 
 
@@ -384,8 +388,8 @@ def test_a_run_that_is_out_of_memory_goes_on_with_half_the_batch(job, monkeypatc
     assert not train(big, events.append, stop_after(monkeypatch, 9)).finished
     told = [event.text for event in events if isinstance(event, Message) and "memory" in event.text]
     assert told == [
-        "iteration 0: cpu is out of memory: the batch goes from 12 to 6 windows and from 16 to 8 single poses.",
-        "iteration 4: cpu is out of memory: the batch goes from 6 to 3 windows and from 8 to 4 single poses.",
+        "iteration 0: cpu is out of memory: the batch is reduced from 12 to 6 windows and from 16 to 8 single poses.",
+        "iteration 4: cpu is out of memory: the batch is reduced from 6 to 3 windows and from 8 to 4 single poses.",
     ]
     assert not train(replace(big, resume=True), events.append, stop_after(monkeypatch, 1)).finished
     assert train(replace(big, resume=True), events.append).finished
@@ -394,18 +398,18 @@ def test_a_run_that_is_out_of_memory_goes_on_with_half_the_batch(job, monkeypatc
 
 
 def test_nothing_that_was_learned_is_lost_with_half_the_batch(job, monkeypatch):
-    run = training.Run(job("halved", replace(SHORT, batch=8, pretraining_batch=8)), silent)
+    run = training.TrainingRun(job("halved", replace(SHORT, batch=8, pretraining_batch=8)), silent)
     for _ in range(6):
         run.step()
-    before = learned(run.stepper)
+    before = learned_tensors(run.stepper)
     limited(monkeypatch, windows=2, poses=2)
 
     def looked_at(self: Stepper) -> None:
         self.objective.window(self.sampler, self.sampler.noise(), *self.sampler.poses(2))
 
-    monkeypatch.setattr(Stepper, "windows", looked_at)
+    monkeypatch.setattr(Stepper, "dynamic_step", looked_at)
     run.step()
-    after = learned(run.stepper)
+    after = learned_tensors(run.stepper)
     assert run.config.batch == len(run.stepper.sampler.first) == 2 and run.state.iteration == 7
     assert any(name.startswith("adam.") for name in before) and before.keys() == after.keys()
     assert all(torch.equal(value, after[name]) for name, value in before.items())
@@ -475,7 +479,7 @@ def test_a_state_is_saved_by_time_too(job, monkeypatch):
         save(self, stepper, state)
 
     monkeypatch.setattr(RunFiles, "save_state", noted)
-    monkeypatch.setattr(training, "SAVE_EVERY", 0.0)
+    monkeypatch.setattr(training, "SAVE_INTERVAL", 0.0)
     train(job("timed"), silent)
     assert saved == [*range(15)]
 
@@ -538,14 +542,14 @@ def test_the_learning_curve_goes_on_where_a_resumed_run_does(job, uninterrupted,
 def test_a_long_curve_is_thinned_and_ends_at_the_last_validation():
     curve: list[CurvePoint] = []
     for iteration in range(1, 5001):
-        curve = with_point(curve, CurvePoint(iteration, iteration / 100, {}, Score({}, 0.0)))
+        curve = append_point(curve, CurvePoint(iteration, iteration / 100, {}, Score({}, 0.0)))
         assert curve[-1].iteration == iteration and len(curve) <= 400
     assert curve[0].iteration == 1 and len(curve) > 200
 
 
 def test_interrupts_set_the_event_once_and_are_immediate_the_second_time():
     before = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt), interruptible() as stop:
+    with pytest.raises(KeyboardInterrupt), stop_on_signals() as stop:
         assert not stop.is_set()
         os.kill(os.getpid(), signal.SIGINT)
         assert stop.wait(1)
@@ -559,7 +563,7 @@ def test_interrupts_elsewhere_than_in_the_main_thread_are_left_alone():
     found: list[bool] = []
 
     def work() -> None:
-        with interruptible() as stop:
+        with stop_on_signals() as stop:
             found.append(stop.is_set())
 
     thread = threading.Thread(target=work)

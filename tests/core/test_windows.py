@@ -158,9 +158,9 @@ def test_motions_are_cut_where_a_joint_flips(scene, toy_motion):
     rotations = smooth.rotations.copy()
     rotations[25:, 2] = rotations[25:, 2] @ np.diag([1.0, 1, 1, 1])[[1, 0, 3, 2]]  # half a turn between two frames
     flipped = replace(smooth, rotations=rotations)
-    cut = build_bank([flipped], scene.character.skeleton, JOINTS, 30.0, CPU, most_turn=40.0)
+    cut = build_bank([flipped], scene.character.skeleton, JOINTS, 30.0, CPU, max_joint_speed=40.0)
     assert cut.stops.tolist() == [25, 40]
     for motion, turn in ((flipped, np.inf), (smooth, 40.0)):
-        assert build_bank([motion], scene.character.skeleton, JOINTS, 30.0, CPU, most_turn=turn).stops.tolist() == [
-            40
-        ]
+        assert build_bank(
+            [motion], scene.character.skeleton, JOINTS, 30.0, CPU, max_joint_speed=turn
+        ).stops.tolist() == [40]

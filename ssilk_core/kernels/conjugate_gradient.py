@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Conjugate gradients on symmetric matrices of blocks, in three kernels an iteration; `simulate.conjugate` holds the
-reference implementation.
+"""Conjugate gradients on symmetric block matrices; reference: `simulate.conjugate_gradient`.
 
-The frames of a batch share one sparsity: columns are read once for all of them, and of two symmetric blocks only one
-is stored. A program owns some rows and some frames. It leaves its part of an inner product in a row of its own, and
-the next kernel's programs each sum these in the same order: nothing waits for the host, no result depends on timing.
+The frames of a batch share one sparsity pattern: columns are read once for all of them, and of two symmetric blocks
+only one is stored. A program owns some rows and some frames. It writes its part of an inner product to its own row;
+the programs of the next kernel sum these in a fixed order. The host is not involved and results are deterministic.
 """
 
 from __future__ import annotations
@@ -16,18 +15,18 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-ROWS, FRAMES, WARPS = 16, 32, 4  # rows, at most so many frames, and warps of one program
+ROWS, FRAMES, WARPS = 16, 32, 4  # rows, maximum number of frames, and warps of one program
 CHUNK = tl.constexpr(32)  # parts of an inner product summed together
 TINY = tl.constexpr(1.1754943508222875e-38)
 
 
 @dataclass(frozen=True, eq=False)
 class BlockTable:
-    """Which blocks a row holds.
+    """The blocks of each row.
 
     Attributes:
-        columns: their columns, shape (U, W), int32; shorter rows are filled up.
-        places: twice where each is stored, and one more where its transpose is stored, shape (U, W), int32.
+        columns: their columns, shape (U, W), int32; shorter rows are padded.
+        places: 2 i for the stored block i, 2 i + 1 for its transpose, shape (U, W), int32.
         counts: blocks of each row, shape (U,), int32.
     """
 
@@ -45,12 +44,12 @@ def solve_kernel(
     iterations: int,
     check_every: int,
 ) -> tuple[Tensor, int]:
-    """Return what `simulate.conjugate.solve` does, with the inverse of the diagonal blocks for a preconditioner.
+    """Return the result of `simulate.conjugate_gradient.solve`, preconditioned with the inverse diagonal blocks.
 
     Args:
         blocks: as stored, shape (S, 3, 3, N), float32.
         inverse: shape (U, 3, 3, N); right: shape (U, 3, N).
-        check_every: iterations between looks at the residuals, which halt the GPU.
+        check_every: iterations between convergence checks, which synchronise with the GPU.
     """
     rows, _, frames = right.shape
     tile = min(FRAMES, triton.next_power_of_2(frames))
@@ -77,7 +76,7 @@ def solve_kernel(
 
 @triton.jit
 def _tile(rows, frames, block_u: tl.constexpr, block_n: tl.constexpr):
-    """Rows and frames of a program, which of them there are, and where its vectors begin."""
+    """Rows and frames of a program, the mask of valid ones, and the start of its vectors."""
     u, n = tl.program_id(0) * block_u + tl.arange(0, block_u), tl.program_id(1) * block_n + tl.arange(0, block_n)
     inside = (u < rows)[:, None] & (n < frames)[None, :]
     return u, n, inside, u.to(tl.int64)[:, None] * 3 * frames + n[None, :]
@@ -101,7 +100,7 @@ def _store3(base, width, mask, x, y, z):
 
 @triton.jit
 def _summed(parts, count, frames, n, block_n: tl.constexpr):
-    """The sum of the parts of an inner product, for frames n."""
+    """Sum the parts of an inner product, for frames n."""
     total = tl.zeros((block_n,), tl.float32)
     for start in range(0, count, CHUNK):
         part = start + tl.arange(0, CHUNK)
@@ -142,7 +141,7 @@ def _descend(z, residual, y, step, image, inverse, product, enough, along, left,
     u, n, inside, own = _tile(rows, frames, block_u, block_n)
     before = tl.load(product + n, mask=n < frames, other=0.0)
     curvature = _summed(along, parts, frames, n, block_n)
-    # A frame that has converged takes no more steps, nor does one of an indefinite matrix: as in `conjugate.solve`.
+    # Converged frames and frames with an indefinite matrix take no more steps, as in `conjugate_gradient.solve`.
     moves = (before > tl.load(enough + n, mask=n < frames, other=0.0)) & (curvature > 0)
     rate = tl.where(moves, before / tl.maximum(curvature, TINY), 0.0)[None, :]
     zx, zy, zz = _load3(z + own, frames, inside)

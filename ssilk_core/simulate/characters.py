@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Characters in motion: the spans of several motions, and their poses at one step of all of them."""
+"""Posed characters for the simulator, and the spans of their motions between cuts."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from ..kinematics import (
     split_at_cuts,
     world_transforms,
 )
-from ..skinning import blended, transformed
+from ..skinning import blend_matrices, transform_points
 
 
 @dataclass(frozen=True, eq=False)
 class MotionSpan:
-    """A part of a shot without cuts, at the rate of the solver's steps.
+    """A part of a shot without cuts, sampled at the solver's steps.
 
     Attributes:
-        shot: index of the motion that it is of.
-        first: frame of the shot that it begins with.
+        shot: index of its motion.
+        first: its first frame in the shot.
         substeps: steps for each frame of the shot.
         motion: its poses, one for each step.
     """
@@ -43,12 +43,14 @@ class MotionSpan:
 
     @property
     def frame_count(self) -> int:
-        """Frames of the shot that it covers."""
+        """Number of frames of the shot in this span."""
         return (self.motion.frame_count - 1) // self.substeps + 1
 
 
-def spans_of(motion: Motion, shot: int, fps: float, substeps: int, longest: int | None = None) -> list[MotionSpan]:
-    """Return the spans of a motion between its cuts, of `longest` frames at most, those of a shot at `fps`."""
+def split_into_spans(
+    motion: Motion, shot: int, fps: float, substeps: int, longest: int | None = None
+) -> list[MotionSpan]:
+    """Return the spans of a motion between its cuts, each at most `longest` frames of a shot at `fps`."""
     spans, first, source = [], 0, 0
     for part in split_at_cuts(motion):
         stop = frames_at(source + part.frame_count, motion.fps, fps)
@@ -62,8 +64,8 @@ def spans_of(motion: Motion, shot: int, fps: float, substeps: int, longest: int 
     return spans
 
 
-def played(motion: Motion, spans: Sequence[MotionSpan]) -> Motion:
-    """Return the motion as its spans play it: the character of a shot, frame by frame."""
+def join_spans(motion: Motion, spans: Sequence[MotionSpan]) -> Motion:
+    """Return the motion of a shot from its spans, one pose per frame."""
     fps, substeps = spans[0].motion.fps / spans[0].substeps, spans[0].substeps
     parts = [span.motion for span in spans]
     rotations = np.concatenate([part.rotations[::substeps] for part in parts])
@@ -73,7 +75,7 @@ def played(motion: Motion, spans: Sequence[MotionSpan]) -> Motion:
 
 @dataclass(frozen=True, eq=False)
 class PosedCharacters:
-    """Characters at one step, each about its own root.
+    """Posed characters, each relative to its own root.
 
     Attributes:
         root: position of the first joint [m], float64, shape (3, N).
@@ -86,8 +88,8 @@ class PosedCharacters:
     lbs: Tensor
 
 
-class Actors:
-    """Poses the character and the linearly skinned garment of a scene."""
+class CharacterPoser:
+    """Poses the character of a scene, and its garment under linear blend skinning."""
 
     def __init__(self, scene: Scene, device: torch.device, dtype: torch.dtype) -> None:
         self.skeleton, self.dtype = scene.character.skeleton, dtype
@@ -96,21 +98,21 @@ class Actors:
         self.weights = torch.as_tensor(scene.lbs_skin.dense(joints), dtype=dtype, device=device)
         self.rest = torch.as_tensor(np.array(scene.garment.mesh.points), dtype=dtype, device=device)[:, :, None]
 
-    def poses(self, spans: Sequence[MotionSpan], step: int) -> PosedCharacters:
+    def poses_at(self, spans: Sequence[MotionSpan], step: int) -> PosedCharacters:
         """Return the poses of all spans at a step."""
         rotations = np.stack([span.motion.rotations[step] for span in spans])
-        return self.posed(rotations, np.stack([span.motion.translations[step] for span in spans]))
+        return self.pose(rotations, np.stack([span.motion.translations[step] for span in spans]))
 
-    def posed(self, rotations: Floats, translations: Floats) -> PosedCharacters:
-        """Return poses of local joint rotations (N, J, 4) and translations (N, J, 3)."""
+    def pose(self, rotations: Floats, translations: Floats) -> PosedCharacters:
+        """Return characters with local joint rotations (N, J, 4) and translations (N, J, 3)."""
         world = world_transforms(rigid(matrix_from_quaternion(rotations), translations), self.skeleton.parents)
         root = world[:, 0, :3, 3].copy()
         world[:, :, :3, 3] -= root[:, None]
         matrices = skinning_matrices(world, self.skeleton.bind_transforms)[:, :, :3].transpose(1, 2, 3, 0)
         character = torch.as_tensor(matrices.copy(), dtype=self.dtype, device=self.rest.device)
-        lbs = transformed(blended(self.weights, character), self.rest)
+        lbs = transform_points(blend_matrices(self.weights, character), self.rest)
         return PosedCharacters(
             torch.as_tensor(root.T.copy(), device=self.rest.device),
-            self.body.posed(character.float(), exact=True),
+            self.body.pose(character.float(), exact=True),
             lbs,
         )

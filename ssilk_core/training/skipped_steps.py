@@ -1,22 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What went wrong in training steps that were undone, kept on the device so that no step waits for the host."""
+"""A record of skipped training steps, kept on the device so that no step waits for the host."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-GRADIENT = "gradient"  # blamed where every term was finite and the gradient was not
+GRADIENT = "gradient"  # counted where every term was finite and the gradient was not
 
 
-class Faults:
-    """Steps undone because a term or a gradient was not finite.
+class SkippedSteps:
+    """Steps skipped because a term or a gradient was not finite.
 
     Attributes:
-        count: undone steps, int64.
-        iteration: step at which the last one arose, counted from zero, int64; -1 before any.
-        terms: undone steps in which each term was not finite, int64, by name.
-        window: what the last undone step was computed from, by name.
+        count: skipped steps, int64.
+        iteration: index of the last skipped step, int64; -1 for none.
+        terms: for each term, the number of skipped steps in which it was not finite, int64.
+        window: inputs of the last skipped step, by name.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -27,7 +27,7 @@ class Faults:
         self.window: dict[str, Tensor] = {}
 
     def record(self, bad: Tensor, iteration: Tensor, terms: dict[str, Tensor], window: dict[str, Tensor]) -> None:
-        """Take note of one step, without a branch: `bad` (a flag on the device) says whether it was undone."""
+        """Record one step without branching; `bad`, a flag on the device, says whether it was skipped."""
         broken = {name: bad & ~value.isfinite() for name, value in terms.items()}
         broken[GRADIENT] = bad & ~torch.stack([*broken.values()]).any()
         for name, flag in broken.items():

@@ -8,16 +8,16 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-ROUNDING = 4  # units in the last place that sums of element blocks may be off by
-CHECK_EVERY = 8  # iterations between looks at the residuals, which halt a GPU
+ROUNDING = 4  # rounding error of summed element blocks, in units in the last place
+CHECK_EVERY = 8  # iterations between convergence checks, which synchronise with a GPU
 
 
 def inverse_blocks(blocks: Tensor) -> Tensor:
-    """Return the inverses of symmetric blocks (..., 3, 3), positive definite, by cofactors in float64.
+    """Return the inverses of symmetric positive definite blocks (..., 3, 3), by cofactors in float64.
 
-    The determinants of blocks at slivers overflow in single precision. Rounding may have left such blocks indefinite:
-    what it may have taken is added first. To a block that is indefinite by itself its norm is added, which leaves it
-    definite.
+    The determinants of blocks at slivers overflow in single precision. Rounding errors may make such blocks
+    indefinite, so a bound of the error is added to the diagonal first. Blocks that are indefinite even so get their
+    norm added, which makes them definite.
     """
     wide, eye = blocks.double(), torch.eye(3, dtype=torch.float64, device=blocks.device)
     largest = wide.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None]
@@ -55,13 +55,13 @@ def solve(
     """Solve A z = right approximately, from zero.
 
     Args:
-        multiply, precondition: apply A, and roughly its inverse, to (N, U, 3); both positive definite.
-        right: shape (N, U, 3).
-        reduction: how far the residual has to fall, in the preconditioner's norm.
-        iterations: the most that are made.
+        multiply, precondition: apply A, and an approximate inverse, to (N, U, 3); both positive definite.
+        right: right-hand side, shape (N, U, 3).
+        reduction: factor by which the residual must fall, in the preconditioner's norm.
+        iterations: maximum number of iterations.
 
     Returns:
-        z, along which a function with the gradient -right falls, and the number of iterations.
+        z, a descent direction of a function with the gradient -right, and the number of iterations.
     """
     z, residual = torch.zeros_like(right), right
     step = y = precondition(residual)
@@ -70,9 +70,8 @@ def solve(
     tiny = torch.finfo(right.dtype).tiny
     for done in range(1, iterations + 1):
         image = multiply(step)
-        # A frame that has converged takes no more steps: rounding could spoil what it has.
-        # Neither does one whose matrix rounding has left indefinite: it keeps the way down that it has. From then on
-        # their product is zero, so that they end.
+        # Converged frames take no more steps, because rounding could spoil their solution. Neither do frames whose
+        # matrix is indefinite through rounding: they keep their descent direction.
         curvature = dot(step, image)
         moves = (product > enough) & (curvature > 0)
         rate = torch.where(moves, product / curvature.clamp_min(tiny), 0)
