@@ -15,8 +15,9 @@ BLENDER_TOOL = $(wildcard $(BLENDER_VENV)/lib/python3.11/site-packages/bpy/*/scr
 demo: $(STAMP)
 	$(BIN)/ssilk demo --output demo_out
 
+# One process for each core; each of them computes with one thread.
 test: $(STAMP) lint
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
