@@ -20,7 +20,7 @@ from helpers.subjects import Subject, arguments, clip_of, open_subject, parsed
 from torch import Tensor
 
 from ssilk_core.assets import CLASS_NAMES, Floats, Ints, Motion
-from ssilk_core.collision.distance import signed_distance
+from ssilk_core.collision import signed_distance
 from ssilk_core.motion_bank import roll_states
 
 ABOVE = 2e-3  # [m] over the surface, where a free surface is outside the body

@@ -31,7 +31,7 @@ from ssilk_core.assets import (
     Skeleton,
     SkinWeights,
 )
-from ssilk_core.collision.body import CollisionBody
+from ssilk_core.collision import CollisionBody
 from ssilk_core.config import ModelConfig, TrainConfig
 from ssilk_core.energy import GarmentEnergy
 from ssilk_core.fabrics import Fabric

@@ -6,7 +6,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from ssilk_core.collision.body import CollisionBody
+from ssilk_core.collision import CollisionBody
 from ssilk_core.config import TrainConfig
 from ssilk_core.energy import GarmentEnergy
 from ssilk_core.errors import fail

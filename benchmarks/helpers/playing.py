@@ -18,9 +18,9 @@ from ssilk_core.checkpoint import ModelFile, network
 from ssilk_core.model.batch import DOWN, motion_inputs
 from ssilk_core.model.network import GarmentModel
 from ssilk_core.motion_bank import build_bank
+from ssilk_core.runtime import Player
 from ssilk_core.runtime.character import character_frames
 from ssilk_core.runtime.playback import BLOCK, VERTEX_BLOCK
-from ssilk_core.runtime.player import Player
 from ssilk_core.runtime.skinning import skin_garment
 from ssilk_core.skinning import Skinning, blend_matrices, transform_points
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ssilk_core.assets import Motion, Scene
 from ssilk_core.checkpoint import ModelFile, load_model, network
-from ssilk_core.collision.body import CollisionBody
+from ssilk_core.collision import CollisionBody
 from ssilk_core.devices import select_device
 from ssilk_core.energy import GarmentEnergy
 from ssilk_core.errors import fail

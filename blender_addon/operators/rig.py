@@ -110,7 +110,7 @@ class GenerateRig(RigOperator, bpy.types.Operator):
             need_editable(armature)
         if classes is None:
             raise SetupError(f"'{garment.name}' has no classes; classify or paint it first.")
-        options = ("--proxies", str(self.proxies), "--rig", f"roots_per_cluster={self.roots}")
+        options = ("--proxies", str(self.proxies), "--roots", str(self.roots))
         return self.begin(context, f"Rigging '{garment.name}'", classes=True, options=options)
 
     def finish(self, context: bpy.types.Context, work: Work) -> str:

@@ -6,8 +6,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..collision.contacts import Contacts
-from ..collision.distance import PosedBody
+from ..collision import Contacts, PosedBody
 from ..constants import GRAVITY
 from .garment import GarmentEnergy
 

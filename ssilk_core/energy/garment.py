@@ -9,7 +9,7 @@ from torch import Tensor
 
 from .. import kernels
 from ..assets import Floats, Ints, Mesh
-from ..collision.distance import PosedBody, signed_distance, signed_distance_to_planes
+from ..collision import PosedBody, signed_distance, signed_distance_to_planes
 from ..fabrics import Fabric
 from ..kernels.corners import elastic_tables
 from ..mesh import topology

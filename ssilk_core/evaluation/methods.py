@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from ..assets import PINNED, Floats, Scene
-from ..collision.body import CollisionBody
-from ..collision.contacts import Contacts
+from ..collision import CollisionBody, Contacts
 from ..constants import GRAVITY
 from ..energy import GarmentEnergy
 from ..energy.stretch import deformation_gradient_operator

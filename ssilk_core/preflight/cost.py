@@ -24,7 +24,7 @@ def training_cost(scene: Scene, motions: Sequence[Motion], preset: Preset) -> Fi
 
     `motions` may be empty; the reach of the garment is then that of the rest pose.
     """
-    from ..collision.reach import reachable_body
+    from ..collision import reachable_body
 
     reach = reachable_body(scene, motions or [rest_motion(scene)])
     yield from memory(scene, preset, len(reach.vertices))

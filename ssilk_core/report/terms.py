@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..assets import Floats, Mesh
-from ..collision.distance import PosedBody, signed_distance
+from ..collision import PosedBody, signed_distance
 from ..collision.one_ring import triangle_rings
 from ..constants import GRAVITY
 from ..energy import GarmentEnergy

@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from ..assets import Floats, Motion, Scene
-from ..collision.body import CollisionBody
-from ..collision.distance import PosedBody
+from ..collision import CollisionBody, PosedBody
 from ..kinematics import (
     frames_at,
     matrix_from_quaternion,

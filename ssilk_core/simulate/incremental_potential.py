@@ -19,9 +19,7 @@ import torch
 from torch import Tensor
 
 from ..assets import PINNED, Scene
-from ..collision.contacts import Contacts
-from ..collision.distance import PosedBody
-from ..collision.smoothed_distance import SmoothedDistance
+from ..collision import Contacts, PosedBody, SmoothedDistance
 from ..constants import GRAVITY
 from ..energy import GarmentEnergy
 from ..energy.collision import collision_energy

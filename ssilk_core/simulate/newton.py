@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ..collision.smoothed_distance import SmoothedDistance
+from ..collision import SmoothedDistance
 from ..errors import fail
 from .incremental_potential import IncrementalPotential, StepInputs
 

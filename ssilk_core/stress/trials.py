@@ -16,8 +16,7 @@ from ..constants import GRAVITY
 from ..energy import GarmentEnergy
 from ..fabrics import Fabric
 from ..model.network import GarmentModel
-from ..simulate import SimulationOptions
-from ..simulate.simulator import Simulator
+from ..simulate import SimulationOptions, Simulator
 from ..skinning import Skinning
 from ..training.job import TrainJob
 from ..training.parts import build_parts

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from ..collision.body import CollisionBody
-from ..collision.contacts import Contacts
+from ..collision import CollisionBody, Contacts
 from ..evaluation.methods import EvaluationScene, Method, TakeSet
 
 BODIES = (("triangles", True, 1), ("vertices", False, 1), ("every 4th vertex", False, 4))

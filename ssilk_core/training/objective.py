@@ -6,8 +6,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..collision.body import CollisionBody
-from ..collision.contacts import Contacts, no_planes
+from ..collision import CollisionBody, Contacts
+from ..collision.contacts import no_planes
 from ..constants import GRAVITY
 from ..energy import GarmentEnergy
 from ..model.network import GarmentModel

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
-from ..collision.body import CollisionBody
-from ..collision.reach import reachable_body
+from ..collision import CollisionBody, reachable_body
 from ..config import TrainConfig
 from ..energy import GarmentEnergy
 from ..model.network import GarmentModel, model_joints

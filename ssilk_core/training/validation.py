@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from ..assets import Scene
-from ..collision.body import CollisionBody
-from ..collision.contacts import Contacts
+from ..collision import CollisionBody, Contacts
 from ..energy import TERMS, GarmentEnergy
 from ..energy.frames import FRAMES_PER_CHUNK, energy_terms
 from ..motion_bank import LatentModel, MotionBank, roll_states

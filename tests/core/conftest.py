@@ -26,7 +26,7 @@ from ssilk_core.assets import (
     Skeleton,
     SkinWeights,
 )
-from ssilk_core.collision.body import CollisionBody
+from ssilk_core.collision import CollisionBody
 from ssilk_core.config import ModelConfig
 from ssilk_core.energy import GarmentEnergy
 from ssilk_core.fabrics import Fabric

@@ -15,8 +15,7 @@ from benchmarks.baselines.run import BaselineJob, BaselineRun, train_baseline
 from benchmarks.baselines.training import BaselineObjective, BaselineStepper
 from ssilk_core.assets import PINNED, Motion, Scene
 from ssilk_core.checkpoint import load_model, model_file, save_model
-from ssilk_core.collision.body import CollisionBody
-from ssilk_core.collision.distance import signed_distance_to_planes
+from ssilk_core.collision import CollisionBody, signed_distance_to_planes
 from ssilk_core.config import ModelConfig, TrainConfig
 from ssilk_core.constants import GRAVITY
 from ssilk_core.descriptors import RATE_TIME

@@ -10,10 +10,17 @@ import torch
 import trimesh
 
 from ssilk_core.assets import LOOSE, PINNED, TIGHT, Body, Character, Mesh, Scene, SkinWeights
-from ssilk_core.collision import distance, nearest_vertex
-from ssilk_core.collision.body import CollisionBody
-from ssilk_core.collision.contacts import Contacts, faces_around, patches_beneath
-from ssilk_core.collision.distance import Patches, PosedBody, nearest_planes, signed_distance_to_planes
+from ssilk_core.collision import (
+    CollisionBody,
+    Contacts,
+    Patches,
+    PosedBody,
+    distance,
+    nearest_planes,
+    nearest_vertex,
+    signed_distance_to_planes,
+)
+from ssilk_core.collision.contacts import faces_around, patches_beneath
 from ssilk_core.collision.one_ring import triangle_rings
 
 CPU = torch.device("cpu")

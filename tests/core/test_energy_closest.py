@@ -11,9 +11,8 @@ import pytest
 import torch
 import trimesh
 
-from ssilk_core.collision import closest_point, distance
+from ssilk_core.collision import PosedBody, closest_point, distance, nearest_planes
 from ssilk_core.collision.closest_point import closest_on_faces, triangle_patches
-from ssilk_core.collision.distance import PosedBody, nearest_planes
 from ssilk_core.collision.one_ring import triangle_rings
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")

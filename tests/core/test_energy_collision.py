@@ -11,9 +11,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from ssilk_core.assets import Body, Mesh, SkinWeights
-from ssilk_core.collision import distance, nearest_vertex
-from ssilk_core.collision.body import CollisionBody
-from ssilk_core.collision.distance import PosedBody, nearest_planes, signed_distance
+from ssilk_core.collision import CollisionBody, PosedBody, distance, nearest_planes, nearest_vertex, signed_distance
 from ssilk_core.collision.nearest_vertex import compact_blocks
 from ssilk_core.collision.one_ring import nearest_on_rings, triangle_rings
 from ssilk_core.energy import GarmentEnergy

@@ -7,7 +7,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from ssilk_core.assets import Mesh
-from ssilk_core.collision.distance import PosedBody
+from ssilk_core.collision import PosedBody
 from ssilk_core.energy import GarmentEnergy
 from ssilk_core.errors import SsilkError
 from ssilk_core.fabrics import FABRICS, Fabric, fabric_named

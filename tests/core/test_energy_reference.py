@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from ssilk_core.assets import Mesh
-from ssilk_core.collision.distance import PosedBody
+from ssilk_core.collision import PosedBody
 from ssilk_core.energy import GarmentEnergy
 from ssilk_core.fabrics import Fabric
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from benchmarks.baselines.evaluation import method_over
 from benchmarks.baselines.networks import METHODS, BaselineConfig, baseline
 from ssilk_core.assets import Motion
-from ssilk_core.collision.distance import signed_distance
+from ssilk_core.collision import signed_distance
 from ssilk_core.constants import GRAVITY
 from ssilk_core.energy import TERMS
 from ssilk_core.errors import SsilkError

@@ -10,8 +10,7 @@ import torch
 
 from ssilk_core.assets import LOOSE, PINNED, TIGHT, Character, ProxyRig, Scene
 from ssilk_core.checkpoint import load_model, network
-from ssilk_core.collision.distance import nearest_planes, signed_distance
-from ssilk_core.collision.reach import reachable_body
+from ssilk_core.collision import nearest_planes, reachable_body, signed_distance
 from ssilk_core.config import ModelConfig, TrainConfig
 from ssilk_core.events import Event, Message
 from ssilk_core.fabrics import Fabric

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from ssilk_core.collision.distance import signed_distance_to_planes
+from ssilk_core.collision import signed_distance_to_planes
 from ssilk_core.config import TrainConfig
 from ssilk_core.constants import GRAVITY
 from ssilk_core.schemes import SCHEMES

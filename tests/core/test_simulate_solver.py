@@ -12,9 +12,7 @@ import torch
 from scipy.optimize import minimize
 
 from ssilk_core.assets import LOOSE, PINNED, Scene
-from ssilk_core.collision.body import CollisionBody
-from ssilk_core.collision.distance import PosedBody
-from ssilk_core.collision.smoothed_distance import SmoothedDistance
+from ssilk_core.collision import CollisionBody, PosedBody, SmoothedDistance
 from ssilk_core.energy import GarmentEnergy
 from ssilk_core.energy.bending import dihedral_angles
 from ssilk_core.energy.stretch import stretch_density

@@ -10,15 +10,16 @@ import pytest
 import torch
 import trimesh
 
-from ssilk_core.collision import closest_point, distance
-from ssilk_core.collision.distance import (
-    SURFACE_EPSILON,
+from ssilk_core.collision import (
     Patches,
     PosedBody,
+    closest_point,
+    distance,
     nearest_planes,
     signed_distance_to_planes,
     smoothed_planes,
 )
+from ssilk_core.collision.distance import SURFACE_EPSILON
 from ssilk_core.collision.smoothed_distance import SMOOTHING_EXPONENT
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
