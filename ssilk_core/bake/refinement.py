@@ -34,9 +34,9 @@ def refined(rollout: BakeRollout, report: Reporter = silent) -> BakeRollout:
     """
     if not rollout.request.refine or rollout.refinement is not None:
         return rollout
-    from ..refine import RefinementSummary
+    from ..refine import RefinementMeans
 
-    points, summary = [], RefinementSummary()
+    points, summary = [], RefinementMeans()
     for frame in _refiner(rollout).frames(rollout.motion, rollout.network_vertices()):
         points.append(frame.points)
         summary.changes.append(frame.change)

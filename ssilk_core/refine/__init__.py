@@ -2,6 +2,6 @@
 """Refinement of a network's rollout on the training energy, frame by frame."""
 
 from .fit import PoseFit, PoseFitter
-from .refiner import FrameChange, RefinedFrame, RefinementSummary, RefineOptions, Refiner
+from .refiner import FrameChange, RefinedFrame, RefinementMeans, RefineOptions, Refiner
 
-__all__ = ["FrameChange", "PoseFit", "PoseFitter", "RefineOptions", "RefinedFrame", "RefinementSummary", "Refiner"]
+__all__ = ["FrameChange", "PoseFit", "PoseFitter", "RefineOptions", "RefinedFrame", "RefinementMeans", "Refiner"]

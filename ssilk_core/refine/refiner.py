@@ -220,7 +220,7 @@ def _blocks(count: int, size: int) -> Iterator[tuple[int, int]]:
 
 
 @dataclass
-class RefinementSummary:
+class RefinementMeans:
     """Means over the refined frames of a shot."""
 
     changes: list[FrameChange] = field(default_factory=list)
