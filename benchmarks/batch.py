@@ -20,7 +20,7 @@ from helpers import synthetic
 from helpers.reports import table, write_results
 
 from ssilk_core.config import ModelConfig
-from ssilk_core.devices import chosen_device
+from ssilk_core.devices import select_device
 from ssilk_core.model.batch import BatchPlayer, MotionInputs, motion_inputs
 from ssilk_core.model.network import GarmentModel
 
@@ -96,7 +96,7 @@ def main() -> None:
     parser.add_argument("--name", default=Path(__file__).stem, help="of the result files (default: the script's)")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
-    model, shot = build(chosen_device(options.device))
+    model, shot = build(select_device(options.device))
     found = {
         f"{shots} {'with vertices' if vertices else 'network alone'}": measured(
             model, shot, shots, vertices, options.repeats

@@ -30,7 +30,7 @@ from ssilk_core.assets import Floats
 from ssilk_core.bake import BakeRequest, BakeTask, LayerFolder
 from ssilk_core.cli import main
 from ssilk_core.kinematics import deform
-from ssilk_core.targets import TARGETS, capped
+from ssilk_core.targets import TARGETS, cap_influences
 
 SAMPLED = ("blendShapeWeights", "rotations")
 BITS = (16, 12, 10)
@@ -127,7 +127,7 @@ def _share(size: int, cache: int) -> tuple[str, str]:
 def _heaviest(layers: LayerFolder, task: BakeTask, exact: Floats) -> Row:
     """Return what capping influences alone would cost: the heaviest of each vertex, with nothing learned."""
     rollout = layers.garment(task).over(task.request.motion)
-    deformer = capped(rollout.deformer, TARGETS["game4"])
+    deformer = cap_influences(rollout.deformer, TARGETS["game4"])
     points = np.concatenate([deform(deformer, rollout.motion, pose) for pose in rollout.poses()])
     errors = np.linalg.norm(points - exact, axis=-1)
     return Row(name="for comparison: the 4 heaviest influences, nothing learned", size=0, errors=errors)

@@ -32,7 +32,7 @@ from ssilk_core.errors import fail
 from ssilk_core.evaluation.splits import chosen, read_index
 from ssilk_core.evaluation.takes import back_and_forth
 from ssilk_core.motion_bank import roll_states
-from ssilk_core.packing import packed, unpacked
+from ssilk_core.packing import dequantize, quantize
 
 MOST_RMS = 1e-4  # [m] over all vertices, frames and clips
 # [m] any vertex in any frame: amid a cartwheel a rollout makes millimetres of any rounding, for a few frames.
@@ -45,7 +45,7 @@ Rounding = Callable[[np.ndarray], np.ndarray]
 ROUNDINGS: dict[str, Rounding] = {
     "bfloat16": lambda values: torch.from_numpy(values.copy()).bfloat16().float().numpy(),
     "float16": lambda values: values.astype(np.float16).astype(np.float32),
-    "packed": lambda values: unpacked(*packed(values)) if values.ndim > 1 else values,
+    "packed": lambda values: dequantize(*quantize(values)) if values.ndim > 1 else values,
 }
 PARTS: dict[str, Callable[[str, np.ndarray], bool]] = {
     "matrices of P": lambda name, values: name.startswith("initialiser") and values.ndim > 1,

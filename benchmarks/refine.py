@@ -20,7 +20,7 @@ from helpers.subjects import Subject, arguments, clip_of, open_subject, parsed
 
 from ssilk_core.assets import Floats, GarmentPose, Motion
 from ssilk_core.kinematics import deform, resample
-from ssilk_core.refine import RefineOptions, Refiner, Refitter
+from ssilk_core.refine import PoseFitter, RefineOptions, Refiner
 from ssilk_core.rollout import decode, garment_poses
 from ssilk_core.simulate import SimulationOptions, simulate
 
@@ -62,7 +62,7 @@ class Take:
     def put_back(self, points: Floats) -> dict[str, float]:
         """Return what is lost when vertices go back onto joints and blendshapes."""
         deformer, mass = self.subject.model.deformer(), self.subject.energy.mass.cpu().numpy()
-        fits = list(Refitter(deformer, mass).fit(self.motion, self.poses, points))
+        fits = list(PoseFitter(deformer, mass).fit(self.motion, self.poses, points))
         back = np.concatenate([deform(deformer, self.motion, fit.pose) for fit in fits])
         found = self.measured(back)
         return {

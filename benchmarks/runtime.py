@@ -61,7 +61,7 @@ def levels(file: ModelFile, motion: Motion, repeats: int) -> tuple[dict[str, Tim
     """Measure the whole model and its levels of quality with numpy; return times, and a table with what they lose."""
     reducer, found, rows = Reducer(file, [motion]), {}, []
     for level in ("", *QUALITIES):
-        reduced = reducer.reduced(QUALITIES[level].size.within(reducer.whole) if level else reducer.whole)
+        reduced = reducer.reduce(QUALITIES[level].size.within(reducer.whole) if level else reducer.whole)
         way = partial(with_numpy, Player(reduced.file))
         found[level or "whole"] = measured({"numpy": way}, motion, repeats)
         taken = found[level or "whole"]["numpy"]

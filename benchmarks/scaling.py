@@ -30,7 +30,7 @@ from helpers.reports import table, write_results
 
 from ssilk_core.cli import parser as ssilk_parser
 from ssilk_core.cli.train import training_job
-from ssilk_core.devices import chosen_device, device_name
+from ssilk_core.devices import device_name, select_device
 from ssilk_core.events import silent
 from ssilk_core.training.divergence import CHECK_INTERVAL
 from ssilk_core.training.parallel import ProcessGroup, join_process_group
@@ -199,7 +199,7 @@ def main() -> None:
         return
     options.cases = options.cases or default_cases(options.device)
     measured = measure_all(options)
-    device = chosen_device(options.device)
+    device = select_device(options.device)
     count = torch.cuda.device_count() if device.type == "cuda" else 1
     options.hardware = f"{count} x {device_name(device)}, {options.threads} threads for each process"
     write_results(options, table(HEADER, [*rows(measured)]), {"cases": [*map(asdict, measured)]})

@@ -25,7 +25,7 @@ from ssilk_usd.read_scene import read_scene
 from torch import Tensor
 
 from ssilk_core.assets import Motion, Scene
-from ssilk_core.devices import chosen_device
+from ssilk_core.devices import select_device
 from ssilk_core.events import TextReporter
 from ssilk_core.fabrics import Fabric
 from ssilk_core.setup.prepare import prepare_scene
@@ -77,7 +77,7 @@ def newton(scene: Scene, motions: Sequence[Motion], count: int, options: argpars
     settings = SimulationOptions(
         batch=count, precision=options.precision, solver=SolverOptions(tolerance=options.tolerance)
     )
-    simulator = Watched(scene, settings, chosen_device(options.device))
+    simulator = Watched(scene, settings, select_device(options.device))
     for _ in simulator.frames(shots(motions, count, options.frames, settings.fps)):
         pass
     return simulator

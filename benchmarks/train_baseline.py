@@ -20,7 +20,7 @@ from baselines.run import BaselineJob, train_baseline
 
 from ssilk_core.cli import train
 from ssilk_core.config import TrainConfig
-from ssilk_core.devices import chosen_device
+from ssilk_core.devices import select_device
 from ssilk_core.errors import SsilkError
 from ssilk_core.events import Failed, Result, TextReporter
 
@@ -56,7 +56,7 @@ def asked(options: argparse.Namespace, report: TextReporter) -> BaselineJob:
     network, rotated = METHODS[options.method]
     iterations = [] if options.iterations is None else [f"iterations={options.iterations}"]
     options.settings = [*SCHEDULE, f"rotated_fraction={rotated}", *iterations, *options.settings]
-    base = train.training_job(options, str(chosen_device(options.device)), report)
+    base = train.training_job(options, str(select_device(options.device)), report)
     return BaselineJob(
         base=base,
         config=BaselineConfig(method=network, fps=base.model.fps),

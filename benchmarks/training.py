@@ -37,7 +37,7 @@ from helpers.training_tables import tables
 
 from ssilk_core import kernels
 from ssilk_core.config import TrainConfig
-from ssilk_core.devices import chosen_device
+from ssilk_core.devices import select_device
 from ssilk_core.training.step import Stepper
 
 SIZES = {
@@ -124,7 +124,7 @@ def measure_all(options: argparse.Namespace) -> Figures:
 
     Each case has a process of its own, so that nothing of one is left when the next begins.
     """
-    device = chosen_device(options.device)
+    device = select_device(options.device)
     variants = [REFERENCE, KERNELS] if kernels.available(device) else [REFERENCE]
     measured: Figures = {"triton": version("triton") if KERNELS in variants else None, "cases": {}}
     spawned = multiprocessing.get_context("spawn")

@@ -22,7 +22,7 @@ from .config import ModelConfig
 from .errors import SsilkError, fail
 from .fabrics import Fabric
 from .files import replacing
-from .packing import narrowest, packed, unpacked
+from .packing import dequantize, narrowest, quantize
 from .parameters import Shapes, parameter_shapes
 from .tensors import read_tensors
 
@@ -144,7 +144,7 @@ def _packed(tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the tensors of a file with matrices packed; vectors stay as they are: errors in beta add up in time."""
     weights = {name: tensors[name].astype(np.float32) for name in WEIGHTS}
     matrices = {
-        name: packed(value) for name, value in tensors.items() if name.startswith("model.") and value.ndim > 1
+        name: quantize(value) for name, value in tensors.items() if name.startswith("model.") and value.ndim > 1
     }
     steps = {name: pair[0] for name, pair in matrices.items()}
     return {**tensors, **weights, **steps, **{f"scale.{name}": pair[1] for name, pair in matrices.items()}}
@@ -295,7 +295,7 @@ def _parameters(tensors: dict[str, np.ndarray], where: str) -> dict[str, np.ndar
     stored = {name: value for name, value in tensors.items() if name.startswith("model.")}
     for name, value in stored.items():
         if value.dtype.kind == "i":
-            stored[name] = unpacked(value, tensors[f"scale.{name}"])
+            stored[name] = dequantize(value, tensors[f"scale.{name}"])
         finite = np.isfinite(stored[name]).all()
         if not finite:
             fail(where, f"parameter '{name[6:]}' holds NaN or infinity", "all are finite", "train again")

@@ -230,7 +230,7 @@ def _converted(kind: type, text: str) -> Any:
 Config = TypeVar("Config")
 
 
-def overridden(config: Config, assignments: list[str]) -> Config:
+def apply_overrides(config: Config, assignments: list[str]) -> Config:
     """Return `config` with "name=value" assignments applied, each converted to the field's own type.
 
     Raises:

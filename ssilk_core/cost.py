@@ -25,9 +25,9 @@ from .checkpoint import ModelFile, save_model
 from .runtime import Player
 from .runtime.playback import BLOCK
 
-POINT = 12  # bytes of a vertex in a point cache
-TILED = ("decoder.shapes", "decoder.skin_offset")  # parameters that playing holds as `runtime.skinning.tiles` alone
-SECONDS, FEWEST = 0.6, 3  # to measure for at least, and passes over the motion
+POINT_BYTES = 12  # bytes of a vertex in a point cache
+TILE_PARAMETERS = ("decoder.shapes", "decoder.skin_offset")  # the runtime holds these only as tiles
+MIN_SECONDS, MIN_PASSES = 0.6, 3  # to measure for at least, and passes over the motion
 
 
 @dataclass(frozen=True)
@@ -55,11 +55,11 @@ class ShotBytes:
         return self.asset + self.frame * frames
 
 
-def play_time(player: Player, motion: Motion, *, seconds: float = SECONDS) -> Time:
+def play_time(player: Player, motion: Motion, *, seconds: float = MIN_SECONDS) -> Time:
     """Measure what a frame takes to play: character, latents, decoder and all vertices, on a processor."""
     _pass(player, motion)  # warms up
     blocks, passes, end = [], 0, time.perf_counter() + seconds
-    while passes < FEWEST or time.perf_counter() < end:
+    while passes < MIN_PASSES or time.perf_counter() < end:
         blocks += _pass(player, motion)
         passes += 1
     return Time.of(blocks)
@@ -96,7 +96,7 @@ def _weights(file: ModelFile, network: str) -> int:
 
 def memory(player: Player) -> int:
     """Return the bytes that playing keeps in memory: parameters, and the tiles of shapes and weights for skinning."""
-    parameters = (value.size * 4 for name, value in player.file.parameters.items() if name not in TILED)
+    parameters = (value.size * 4 for name, value in player.file.parameters.items() if name not in TILE_PARAMETERS)
     tiles = (tile.shapes.nbytes + tile.weights.nbytes + tile.joints.nbytes for tile in player.tiles)
     return sum(parameters) + sum(tiles)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where networks run: devices by name."""
+"""Devices by name."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     import torch
 
 
-def chosen_device(name: str) -> torch.device:
-    """Return the device that "auto" or a torch device name means.
+def select_device(name: str) -> torch.device:
+    """Return the device for "auto" or a torch device name.
 
     Raises:
         SsilkError: the device does not exist here.
@@ -32,7 +32,7 @@ def chosen_device(name: str) -> torch.device:
 
 
 def device_name(device: torch.device) -> str:
-    """Return what the hardware calls itself."""
+    """Return the name of the hardware."""
     import torch
 
     return torch.cuda.get_device_name(device) if device.type == "cuda" else f"{device.type} ({platform.machine()})"

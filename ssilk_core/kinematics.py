@@ -161,7 +161,7 @@ def run_up(motion: Motion, seconds: float) -> Motion:
 
 
 CUT_SPEED = 25.0  # [m/s]; a root that is so much faster than before and after has been moved, not animated
-AROUND = 5  # frames to either side that say how fast a root moves anyway, be it in a car
+CUT_WINDOW = 5  # frames to either side that say how fast a root moves anyway, be it in a car
 
 
 def split_at_cuts(motion: Motion, *, max_joint_speed: float = np.inf) -> list[Motion]:
@@ -170,19 +170,19 @@ def split_at_cuts(motion: Motion, *, max_joint_speed: float = np.inf) -> list[Mo
     A jump is a step that the median of the steps around it does not explain. With `max_joint_speed` [rad/s] it is
     also cut where any joint turns faster than that, as captured joints do that flip.
     """
-    step = _unexplained(np.diff(motion.translations[:, 0], axis=0)) * motion.fps
+    step = _deviation_from_median(np.diff(motion.translations[:, 0], axis=0)) * motion.fps
     cosine = np.abs((motion.rotations[1:] * motion.rotations[:-1]).sum(-1)).clip(max=1.0)
     turn = 2 * np.arccos(cosine).max(axis=1) * motion.fps
     ends = [*(np.flatnonzero((step > CUT_SPEED) | (turn > max_joint_speed)) + 1), motion.frame_count]
     return [motion.clip(start, stop) for start, stop in zip([0, *ends[:-1]], ends)]
 
 
-def _unexplained(steps: Floats) -> Floats:
+def _deviation_from_median(steps: Floats) -> Floats:
     """Return how far each step (N, 3) is from the median of those around it [m], shape (N,)."""
     if not len(steps):
         return np.zeros(0)
-    padded = np.pad(steps, ((AROUND, AROUND), (0, 0)), mode="reflect")
-    around = np.lib.stride_tricks.sliding_window_view(padded, 2 * AROUND + 1, axis=0)
+    padded = np.pad(steps, ((CUT_WINDOW, CUT_WINDOW), (0, 0)), mode="reflect")
+    around = np.lib.stride_tricks.sliding_window_view(padded, 2 * CUT_WINDOW + 1, axis=0)
     return np.linalg.norm(steps - np.median(around, axis=-1), axis=1)
 
 

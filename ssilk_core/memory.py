@@ -13,8 +13,8 @@ from .assets import Scene
 from .config import ModelConfig, TrainConfig
 from .errors import fail
 
-PLANNED_SHARE = 0.8  # of the free memory that a training may plan for
-DEFAULT_FREE_MEMORY = 8 << 30  # bytes that are planned for where the system cannot be asked portably
+PLANNED_SHARE = 0.8  # of the free memory
+DEFAULT_FREE_MEMORY = 8 << 30  # bytes, where the system offers no portable way to ask
 MEMINFO = Path("/proc/meminfo")
 CONTAINER = Path("/sys/fs/cgroup")
 # Limit, usage, statistics and the name of reclaimable cache in them, for versions 2 and 1 of control groups.
@@ -25,7 +25,7 @@ CONTROL_GROUPS = (
 
 
 def free_memory(device: torch.device) -> int:
-    """Return the bytes that can still be had on a device; on the CPU the container's limit counts."""
+    """Return the free memory of a device [bytes]; on the CPU within the container's limit."""
     if device.type == "cuda":
         return int(torch.cuda.mem_get_info(device)[0])
     if device.type != "cpu" or not MEMINFO.is_file():
@@ -36,7 +36,7 @@ def free_memory(device: torch.device) -> int:
 
 
 def _left_in_container(limit: str, usage: str, statistics: str, cache: str) -> float:
-    """Return the bytes under a control group's limit, counting file cache that the kernel would give up as free."""
+    """Return the free bytes under a control group's limit; reclaimable file cache counts as free."""
     most = (CONTAINER / limit).read_text().strip()
     if most == "max":
         return float("inf")
@@ -68,14 +68,14 @@ def decoded_frames(config: TrainConfig, batch: int) -> int:
 
 
 def _frames_of_a_window(config: TrainConfig) -> float:
-    """Return the frames of a window, with its share of the single poses beside all of them."""
+    """Return the decoded frames per window, with its share of the single poses."""
     return config.window + config.static_batch / config.batch
 
 
 def fitting_batch(
     scene: Scene, model: ModelConfig, config: TrainConfig, body_vertices: int, available: int
 ) -> tuple[int, int]:
-    """Return the largest batch and warm batch, up to the configured ones, whose steps fit into `available` bytes."""
+    """Return the largest batch and pretraining batch, up to the configured ones, that fit into `available` bytes."""
     per_frame = step_memory(scene, model, 1, body_vertices) - step_memory(scene, model, 0, body_vertices)
     frames = int(max(1, (PLANNED_SHARE * available - step_memory(scene, model, 0, body_vertices)) // per_frame))
     return max(1, min(config.batch, int(frames / _frames_of_a_window(config)))), max(
@@ -98,7 +98,10 @@ def check_one_window_fits(
 
 
 def fits_in_memory(work: Callable[[], None]) -> bool:
-    """Do `work`; return whether the device had the memory for it. Nothing that `work` made is held on failure."""
+    """Run `work`.
+
+    Return whether the memory of the device was enough. On failure no tensor of `work` is kept alive.
+    """
     try:
         work()
     except RuntimeError as error:
@@ -109,7 +112,7 @@ def fits_in_memory(work: Callable[[], None]) -> bool:
 
 
 def _of_memory(error: BaseException | None) -> bool:
-    """Return whether an error comes from a lack of memory, which may hide behind one that ends a graph's capture."""
+    """Return whether an error, or its cause, is a lack of memory; failed graph captures hide it in their cause."""
     while error is not None:
         if isinstance(error, torch.OutOfMemoryError) or "out of memory" in str(error):
             return True

@@ -17,19 +17,20 @@ from .errors import fail
 from .kinematics import motion_transforms, resample, skinning_matrices, split_at_cuts
 from .model.descriptors import gravity_features
 
-# Captured joints that flip turn faster than this [rad/s], people do not; the garment would learn from the blow.
+# Flips of captured joints are faster than this [rad/s], human motion is slower; the garment must not learn from
+# flips.
 MAX_JOINT_SPEED = 40.0
 
 
 @dataclass(frozen=True, eq=False)
 class MotionBank:
-    """Motions at the model's rate, one after the other.
+    """Concatenated motions at the model's rate.
 
     Attributes:
-        matrices: skinning matrices of every frame, shape (F, J * 12), moved so that each clip's root starts at
-            the origin (single precision is finest there).
-        root: position of the first joint [m], in the same place, shape (F, 3).
-        static, dynamic, down: the descriptors of `model.descriptors.PoseFeatures`.
+        matrices: skinning matrices of every frame, shape (F, J * 12), translated so that each clip's root starts at
+            the origin, where single precision is finest.
+        root: position of the first joint in the same coordinates [m], shape (F, 3).
+        static, dynamic, down: see `descriptors.PoseFeatures`.
         starts, stops: first frame and end of each clip, shape (clips,).
     """
 
@@ -71,7 +72,7 @@ def build_bank(
     *,
     max_joint_speed: float = np.inf,
 ) -> MotionBank:
-    """Resample motions to `fps` and place them on a device, cut where `usable_spans` says.
+    """Resample the spans of `usable_spans` to `fps` and copy them to a device.
 
     Raises:
         SsilkError: there is no motion.
@@ -101,7 +102,7 @@ def build_bank(
 
 
 def usable_spans(motions: Sequence[Motion], fps: float, max_joint_speed: float = np.inf) -> list[Motion]:
-    """Return what becomes the clips of a bank, in order: spans between cuts that hold four frames at `fps`.
+    """Return the clips of a bank: spans between cuts with at least four frames at `fps`.
 
     Motions are cut where the root jumps, and where a joint turns faster than `max_joint_speed` [rad/s].
     """
@@ -110,7 +111,7 @@ def usable_spans(motions: Sequence[Motion], fps: float, max_joint_speed: float =
 
 
 def centred_matrices(motion: Motion, skeleton: Skeleton) -> tuple[Floats, Floats]:
-    """Return skinning matrices (F, J, 4, 4) moved to have the first root at the origin, and that root (3,) [m]."""
+    """Return skinning matrices (F, J, 4, 4) with the first root at the origin, and that root's position (3,) [m]."""
     world = motion_transforms(motion, skeleton.parents)
     origin = world[0, 0, :3, 3].copy()
     world[..., :3, 3] -= origin
@@ -118,7 +119,7 @@ def centred_matrices(motion: Motion, skeleton: Skeleton) -> tuple[Floats, Floats
 
 
 class LatentModel(Protocol):
-    """What is scored: a `GarmentModel`, or what else has states of its own, shape (N, S), and these methods."""
+    """A model that can be scored: `GarmentModel`, or another with states of shape (N, S) and these methods."""
 
     def initial(self, static: Tensor) -> Tensor: ...
 
@@ -129,14 +130,14 @@ class LatentModel(Protocol):
 
 @torch.no_grad()
 def roll_states(model: LatentModel, bank: MotionBank, clips: Sequence[range], down: Tensor) -> list[Tensor]:
-    """Roll a model over ranges of a bank side by side, each from its quasi-static start.
+    """Roll out a model over ranges of a bank in parallel, each from its quasi-static start.
 
     Returns:
         For each range its states, shape (frames, latent).
     """
     offset = torch.arange(max(map(len, clips)), device=down.device)[:, None]
     first, last = (torch.tensor([clip[end] for clip in clips], device=down.device) for end in (0, -1))
-    frames = torch.minimum(first + offset, last)  # shorter ones wait on their last frame
+    frames = torch.minimum(first + offset, last)  # shorter ranges repeat their last frame
     direction = down.expand(frames.numel(), 3)
     static = bank.static_descriptor(frames.reshape(-1), direction)
     pose = bank.dynamic_descriptor(frames.reshape(-1), direction)

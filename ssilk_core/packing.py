@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arrays in fewer bytes: exactly, in the narrowest type, or in 16 bits with a scale for each row."""
+"""Smaller arrays: exactly, in the narrowest type, or quantized to 16 bits with a scale for each row."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 INTEGERS = (np.uint8, np.int16, np.uint16, np.int32, np.int64)
-STEPS = 32767  # of a 16-bit integer to either side of zero
+MAX_INTEGER = 32767  # of a 16-bit integer to either side of zero
 
 
 def narrowest(array: NDArray) -> NDArray:
@@ -20,17 +20,17 @@ def narrowest(array: NDArray) -> NDArray:
     return single if array.dtype == np.float64 and np.array_equal(single, array) else array
 
 
-def packed(rows: NDArray) -> tuple[NDArray, NDArray]:
+def quantize(rows: NDArray) -> tuple[NDArray, NDArray]:
     """Return rows (N, ...) as 16-bit multiples of a scale for each row, and the scales (N, 1, ...).
 
-    The error is at most half a scale, 1.5e-5 of the row's largest entry; half precision, which takes as many bytes,
-    is out by up to 4.9e-4 of each entry.
+    The error is at most half a scale, 1.5e-5 of the row's largest entry. Half precision, of the same size, has errors
+    of up to 4.9e-4 of each entry.
     """
     largest = np.abs(rows).max(axis=tuple(range(1, rows.ndim)), keepdims=True, initial=0)
-    scales = np.where(largest > 0, largest / STEPS, 1).astype(np.float32)
+    scales = np.where(largest > 0, largest / MAX_INTEGER, 1).astype(np.float32)
     return np.rint(rows / scales).astype(np.int16), scales
 
 
-def unpacked(steps: NDArray, scales: NDArray) -> NDArray:
-    """Invert `packed`, in single precision."""
-    return (steps * scales).astype(np.float32)
+def dequantize(integers: NDArray, scales: NDArray) -> NDArray:
+    """Invert `quantize`, in single precision."""
+    return (integers * scales).astype(np.float32)

@@ -13,10 +13,10 @@ from .checkpoint import ModelFile
 from .cost import play_time
 from .errors import fail
 from .events import Message, Reporter
-from .reduction import ModelSize, Reduced, Reducer
+from .reduction import ModelSize, ReducedModel, Reducer
 from .runtime import Player
 
-ALL = 1_000_000  # more than any garment has
+UNLIMITED = 1_000_000  # more than any garment has
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,9 +31,9 @@ class Quality:
     """
 
     name: str
-    shapes: int = ALL
-    joints: int = ALL
-    influences: int = ALL
+    shapes: int = UNLIMITED
+    joints: int = UNLIMITED
+    influences: int = UNLIMITED
     fps: float | None = None
     refine: int = 0
     about: str
@@ -85,7 +85,7 @@ class SizeReduction:
     max_mm: float
 
     @classmethod
-    def of(cls, whole: ModelSize, found: Reduced) -> SizeReduction:
+    def of(cls, whole: ModelSize, found: ReducedModel) -> SizeReduction:
         """Return what a reduced model keeps of a whole one."""
         return cls(whole=whole, kept=found.size, rms_mm=1000 * found.rms, max_mm=1000 * found.largest)
 
@@ -108,13 +108,13 @@ class Budget:
     unit: str
 
     def __str__(self) -> str:
-        return in_units(self.amount, self.unit)
+        return format_amount(self.amount, self.unit)
 
 
 BYTES = {"kB": 1e3, "MB": 1e6, "GB": 1e9}
 
 
-def in_units(amount: float, unit: str) -> str:
+def format_amount(amount: float, unit: str) -> str:
     """Return an amount as people read it: "0.31 ms", "1.96 MB"."""
     if unit == "ms":
         return f"{amount:.3g} ms"
@@ -122,7 +122,7 @@ def in_units(amount: float, unit: str) -> str:
     return f"{amount / BYTES[name]:.3g} {name}"
 
 
-def budget_of(text: str) -> Budget:
+def parse_budget(text: str) -> Budget:
     """Read a budget: "0.3ms" for each frame, or "2MB" (kB, GB) on disk.
 
     Raises:
@@ -139,10 +139,10 @@ def budget_of(text: str) -> Budget:
 
 
 # Candidate sizes: shares of the model's blendshapes and proxy joints, and numbers of influences.
-SHAPES, JOINTS, INFLUENCES = (1.0, 0.75, 0.5, 0.375, 0.25, 0.125, 0.0), (1.0, 0.5, 0.25, 0.0), (ALL, 4)
+SHAPES, JOINTS, INFLUENCES = (1.0, 0.75, 0.5, 0.375, 0.25, 0.125, 0.0), (1.0, 0.5, 0.25, 0.0), (UNLIMITED, 4)
 
 
-def candidates(whole: ModelSize) -> list[ModelSize]:
+def candidate_sizes(whole: ModelSize) -> list[ModelSize]:
     """Return the sizes that are tried within a budget, from the whole model to none of it."""
     grid = product(JOINTS, INFLUENCES, SHAPES)  # shapes vary fastest: the reducer caches what the others need
     sizes = [
@@ -155,14 +155,16 @@ def candidates(whole: ModelSize) -> list[ModelSize]:
 
 
 @dataclass(frozen=True, eq=False)
-class Choice:
+class BudgetChoice:
     """The best model within a budget, and what it costs in the budget's unit."""
 
-    reduced: Reduced
+    reduced: ReducedModel
     cost: float
 
 
-def best_within(reducer: Reducer, budget: Budget, cost: Callable[[ModelFile], float], most: ModelSize) -> Choice:
+def best_within(
+    reducer: Reducer, budget: Budget, cost: Callable[[ModelFile], float], most: ModelSize
+) -> BudgetChoice:
     """Return the model with the least predicted loss among those whose measured cost is within a budget.
 
     Args:
@@ -173,26 +175,26 @@ def best_within(reducer: Reducer, budget: Budget, cost: Callable[[ModelFile], fl
         SsilkError: not even the smallest model fits.
     """
     tried = []
-    for found in _cheaper(reducer, candidates(most), cost):
+    for found in _cheaper(reducer, candidate_sizes(most), cost):
         tried.append(found.cost)
         if found.cost <= budget.amount:
             return found
     return fail(
         "--budget",
         f"nothing fits {budget}",
-        f"the smallest that this model can be cut to takes {in_units(min(tried), budget.unit)}",
+        f"the smallest that this model can be cut to takes {format_amount(min(tried), budget.unit)}",
         "allow more, or train a smaller network ('ssilk train --set widths=... --set latent=...')",
     )
 
 
-def _cheaper(reducer: Reducer, sizes: list[ModelSize], cost: Callable[[ModelFile], float]) -> Iterator[Choice]:
+def _cheaper(reducer: Reducer, sizes: list[ModelSize], cost: Callable[[ModelFile], float]) -> Iterator[BudgetChoice]:
     """Yield models by what they lose; skip those that keep at least as much as one before."""
     tried: list[ModelSize] = []
-    for size in sorted(sizes, key=lambda size: (reducer.predicted(size), sum(vars(size).values()))):
+    for size in sorted(sizes, key=lambda size: (reducer.predict_error(size), sum(vars(size).values()))):
         if not any(other.within(size) == other for other in tried):
             tried.append(size)
-            reduced = reducer.reduced(size)
-            yield Choice(reduced, cost(reduced.file))
+            reduced = reducer.reduce(size)
+            yield BudgetChoice(reduced, cost(reduced.file))
 
 
 def spend(
@@ -202,11 +204,11 @@ def spend(
     motion: Motion,
     size_bytes: Callable[[ModelFile], float],
     report: Reporter,
-) -> Reduced:
+) -> ReducedModel:
     """Return the best model within a budget, and report what it keeps and costs.
 
     Args:
-        text: the budget, as `budget_of` reads it.
+        text: the budget, as `parse_budget` reads it.
         most: what may be kept.
         motion: models are timed on it.
         size_bytes: gives the bytes on disk that a model takes.
@@ -214,7 +216,7 @@ def spend(
     Raises:
         SsilkError: nothing fits, or the text is no budget.
     """
-    budget = budget_of(text)
+    budget = parse_budget(text)
 
     def cost(file: ModelFile) -> float:
         return size_bytes(file) if budget.unit == "bytes" else play_time(Player(file), motion).median
@@ -222,5 +224,5 @@ def spend(
     choice = best_within(reducer, budget, cost, most)
     kept = choice.reduced.size
     report(Message(f"within {budget}: {kept.shapes} blendshapes, {kept.joints} proxies and {kept.influences} "
-                   f"influences take {in_units(choice.cost, budget.unit)}"))  # fmt: skip
+                   f"influences take {format_amount(choice.cost, budget.unit)}"))  # fmt: skip
     return choice.reduced

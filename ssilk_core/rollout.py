@@ -21,19 +21,19 @@ from .model.network import GarmentModel
 from .sampling import sample_pose
 
 CHUNK = 256  # frames decoded at once
-HISTORY = 2  # frames before a chunk that its descriptors look back on
+HISTORY = 2  # earlier frames that the descriptors of a chunk need
 DOWN = (0.0, -1.0, 0.0)
-STILL = 1e-7  # [rad, m] by which a character may move and count as holding still
-CALM = 3e-5  # by which a latent may still move in a frame and count as at rest
+STILL_THRESHOLD = 1e-7  # [rad, m]; a character that moves less holds still
+REST_THRESHOLD = 3e-5  # change of a latent in one frame below which it is at rest
 
 OnRecovery = Callable[[range], None]
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class RolloutBlock:
     """Consecutive frames of a rollout at the model's rate; tensors as `GarmentModel.pose` returns them.
 
-    `recovered` (N,) flags frames whose state was lost: the garment hangs at rest there, or as its rig skins it.
+    `recovered` (N,) flags frames whose state diverged: there the garment is at rest, or as its rig skins it.
     """
 
     start: int
@@ -42,10 +42,10 @@ class Step:
     recovered: Tensor
 
 
-def roll(model: GarmentModel, span: Motion, chunk: int = CHUNK, *, pre_roll: float = 0.0) -> Iterator[Step]:
-    """Yield the garment's pose over a motion without cuts, at the model's rate, some frames at a time.
+def roll(model: GarmentModel, span: Motion, chunk: int = CHUNK, *, pre_roll: float = 0.0) -> Iterator[RolloutBlock]:
+    """Yield the garment's pose over a motion without cuts, at the model's rate, one chunk at a time.
 
-    The garment starts at rest in the first pose; with `pre_roll` [s] it has come there by `run_up`.
+    The garment starts at rest in the first pose, or `pre_roll` seconds earlier, in the pose of `run_up`.
 
     Raises:
         SsilkError: the motion is not at the model's rate.
@@ -60,12 +60,12 @@ def roll(model: GarmentModel, span: Motion, chunk: int = CHUNK, *, pre_roll: flo
 
 
 @torch.no_grad()
-def roll_blocks(model: GarmentModel, blocks: Iterable[Motion]) -> Iterator[Step]:
+def roll_blocks(model: GarmentModel, blocks: Iterable[Motion]) -> Iterator[RolloutBlock]:
     """Yield the garment's pose over each of consecutive blocks of a motion without cuts, at the model's rate.
 
-    A motion of any length takes the memory of one block, and one in which a calm garment's character holds still
-    the work of one frame. A state that is not finite, or that leaves all bounds, is
-    replaced by the quasi-static one for `RECOVERY_FRAMES` frames, from which the rollout goes on.
+    A motion of any length needs the memory of one block. A block in which the character holds still and the garment
+    is at rest needs the work of one frame. A diverged state is replaced by the quasi-static one for `RECOVERY_FRAMES`
+    frames; the rollout then continues from there.
 
     Raises:
         SsilkError: a block is not at the model's rate.
@@ -76,25 +76,25 @@ def roll_blocks(model: GarmentModel, blocks: Iterable[Motion]) -> Iterator[Step]
     for block in blocks:
         if not abs(block.fps - fps) < 1e-6:
             fail(block.path, f"{block.fps:g} frames per second", f"the model steps at {fps:g}")
-        seen = block if past is None else _following(past, block)
-        if _is_calm(seen, state):
+        seen = block if past is None else _concatenate(past, block)
+        if _is_at_rest(seen, state):
             states = [state[-1]] * HISTORY
-            parts = _decoded(model, state[-1], torch.zeros(1, dtype=torch.bool, device=state[-1].device))
-            yield Step(start, *(part.expand(*part.shape[:-1], block.frame_count) for part in parts))
+            parts = _decode(model, state[-1], torch.zeros(1, dtype=torch.bool, device=state[-1].device))
+            yield RolloutBlock(start, *(part.expand(*part.shape[:-1], block.frame_count) for part in parts))
         else:
-            states, lost = _advance(model, seen, block.frame_count, start, state)
-            yield Step(start, *_decoded(model, torch.cat(states[-block.frame_count :]), lost))
+            states, diverged = _advance(model, seen, block.frame_count, start, state)
+            yield RolloutBlock(start, *_decode(model, torch.cat(states[-block.frame_count :]), diverged))
         past, state = seen.clip(max(0, seen.frame_count - HISTORY), seen.frame_count), states[-HISTORY:]
         start += block.frame_count
 
 
-def _is_calm(seen: Motion, state: list[Tensor]) -> bool:
-    """Return whether a character holds still in all frames of `seen`, and the garment did in the last of `state`."""
-    held = max(np.ptp(seen.rotations, axis=0).max(), np.ptp(seen.translations, axis=0).max()) < STILL
-    return len(state) == HISTORY and held and bool((state[-1] - state[-2]).abs().max() < CALM)
+def _is_at_rest(seen: Motion, state: list[Tensor]) -> bool:
+    """Return whether a character holds still in all frames of `seen`, and the garment in the last of `state`."""
+    held = max(np.ptp(seen.rotations, axis=0).max(), np.ptp(seen.translations, axis=0).max()) < STILL_THRESHOLD
+    return len(state) == HISTORY and held and bool((state[-1] - state[-2]).abs().max() < REST_THRESHOLD)
 
 
-def _following(past: Motion, block: Motion) -> Motion:
+def _concatenate(past: Motion, block: Motion) -> Motion:
     rotations, translations = (
         np.concatenate([getattr(part, name) for part in (past, block)]) for name in ("rotations", "translations")
     )
@@ -104,7 +104,7 @@ def _following(past: Motion, block: Motion) -> Motion:
 def _advance(
     model: GarmentModel, seen: Motion, count: int, start: int, state: list[Tensor]
 ) -> tuple[list[Tensor], Tensor]:
-    """Return the states after those in `state`, each (1, latent), and which of the last `count` were lost.
+    """Return the states after those in `state`, each (1, latent), and which of the last `count` were diverged.
 
     The last `count` frames of `seen` are new, those before them are what descriptors look back on.
     """
@@ -117,46 +117,51 @@ def _advance(
     down = torch.tensor(DOWN, dtype=parameter.dtype, device=parameter.device).expand(count, 3)
     static = torch.cat([tensor(features.static), gravity_features(tensor(features.down), down)], dim=1)
     dynamic = torch.cat([static, tensor(features.dynamic)], dim=1)
-    rest, lost = _kept(model.initial(static))
+    rest, diverged = _replace_diverged(model.initial(static))
     rest, pose = rest.unsqueeze(1), dynamic.unsqueeze(1)
     static_batch = min(max(0, HISTORY - start), count)
-    return _rolled(model, [*state, *rest[:static_batch]], rest[static_batch:], pose[static_batch:], lost)
+    return _roll_and_recover(
+        model, [*state, *rest[:static_batch]], rest[static_batch:], pose[static_batch:], diverged
+    )
 
 
-def _kept(states: Tensor) -> tuple[Tensor, Tensor]:
-    """Return states (N, latent) with zeros for those that are lost, and which ones are."""
-    lost = ~(states.abs().amax(dim=1) < DIVERGENCE_BOUND)  # NaN is not less than anything
-    return torch.where(lost[:, None], torch.zeros_like(states), states), lost
+def _replace_diverged(states: Tensor) -> tuple[Tensor, Tensor]:
+    """Return states (N, latent) with zeros for those that are diverged, and which ones are."""
+    diverged = ~(states.abs().amax(dim=1) < DIVERGENCE_BOUND)  # NaN is not less than anything
+    return torch.where(diverged[:, None], torch.zeros_like(states), states), diverged
 
 
-def _rolled(
-    model: GarmentModel, states: list[Tensor], rest: Tensor, pose: Tensor, lost: Tensor
+def _roll_and_recover(
+    model: GarmentModel, states: list[Tensor], rest: Tensor, pose: Tensor, diverged: Tensor
 ) -> tuple[list[Tensor], Tensor]:
-    """Roll over the frames of `rest` and `pose`; after a lost state the garment rests, then goes on."""
+    """Roll over the frames of `rest` and `pose`; after a diverged state the garment rests, then goes on."""
     done = 0
     while done < len(rest):
         rolled = model.roll(states, rest[done:], pose[done:])[len(states) :]
-        bad = _kept(torch.cat(rolled))[1].nonzero()
+        bad = _replace_diverged(torch.cat(rolled))[1].nonzero()
         good = int(bad[0]) if len(bad) else len(rolled)
         first, done = done + good, min(done + good + RECOVERY_FRAMES, len(rest))
         states = [*states, *rolled[:good], *rest[first:done]]
-        lost[len(lost) - len(rest) + first : len(lost) - len(rest) + done] = True
-    return states, lost
+        diverged[len(diverged) - len(rest) + first : len(diverged) - len(rest) + done] = True
+    return states, diverged
 
 
-def _decoded(model: GarmentModel, z: Tensor, lost: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return activations, rotations and which frames were lost; a pose that is not finite becomes the rig's own."""
+def _decode(model: GarmentModel, z: Tensor, diverged: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return activations, rotations and which frames were diverged.
+
+    A pose that is not finite becomes the rig's own.
+    """
     activation, rotations = model.pose(z)
     bad = ~(activation.isfinite().all(dim=0) & rotations.isfinite().flatten(0, 2).all(dim=0))
     if bad.any():
         unturned = torch.eye(3, dtype=z.dtype, device=z.device)[:, :, None]
         activation = torch.where(bad, torch.zeros_like(activation), activation)
         rotations = torch.where(bad, unturned, rotations)
-    return activation, rotations, lost | bad
+    return activation, rotations, diverged | bad
 
 
-def ignored(frames: range) -> None:
-    """Take frames that were recovered and do nothing."""
+def ignore_recovery(frames: range) -> None:
+    """Ignore the frames that were recovered."""
 
 
 def garment_poses(
@@ -164,7 +169,7 @@ def garment_poses(
     motion: Motion,
     fps: float,
     chunk: int = CHUNK,
-    on_recovery: OnRecovery = ignored,
+    on_recovery: OnRecovery = ignore_recovery,
     *,
     pre_roll: float = 0.0,
 ) -> Iterator[GarmentPose]:
@@ -180,14 +185,19 @@ def garment_poses(
         stop = frames_at(source_frame + span.frame_count, motion.fps, fps)
         shift = (first / fps - source_frame / motion.fps) * model.config.fps
         steps = roll(model, resample(span, model.config.fps, cover=True), chunk, pre_roll=pre_roll)
-        poses = _stored(model, steps, fps / model.config.fps, shift, range(first, stop), on_recovery)
+        poses = _file_poses(model, steps, fps / model.config.fps, shift, range(first, stop), on_recovery)
         for pose in resample_poses(poses, model.config.fps, fps, shift=shift, count=stop - first):
             yield replace(pose, start=first + pose.start)
         first, source_frame = stop, source_frame + span.frame_count
 
 
-def _stored(
-    model: GarmentModel, steps: Iterable[Step], rate: float, shift: float, shot: range, on_recovery: OnRecovery
+def _file_poses(
+    model: GarmentModel,
+    steps: Iterable[RolloutBlock],
+    rate: float,
+    shift: float,
+    shot: range,
+    on_recovery: OnRecovery,
 ) -> Iterator[GarmentPose]:
     """Yield what files store of steps, and tell which of the `shot` frames, at `rate` times theirs, are recovered."""
     for step in steps:
@@ -210,7 +220,7 @@ def resample_poses(
     """
     done, tail = 0, None
     for pose in poses:
-        joined = pose if tail is None else _joined(tail, pose)
+        joined = pose if tail is None else _join_poses(tail, pose)
         last = joined.start + joined.frame_count - 1
         reached = min(int(np.floor((last - shift) * target / source + 1e-6)) + 1, count)
         position = (done + np.arange(max(reached - done, 0))) * source / target + shift
@@ -220,7 +230,7 @@ def resample_poses(
         tail = GarmentPose(last, joined.rotations[-1:], joined.weights[-1:])
 
 
-def _joined(a: GarmentPose, b: GarmentPose) -> GarmentPose:
+def _join_poses(a: GarmentPose, b: GarmentPose) -> GarmentPose:
     return GarmentPose(a.start, np.concatenate([a.rotations, b.rotations]), np.concatenate([a.weights, b.weights]))
 
 

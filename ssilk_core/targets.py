@@ -43,7 +43,7 @@ TARGETS = {
 }
 
 
-def need_influences(found: int, name: str, model: str) -> None:
+def check_influences(found: int, name: str, model: str) -> None:
     """Raise `SsilkError` where `found` joints move a vertex of a model and target `name` takes fewer."""
     most = TARGETS[name].influences
     if not (most is None or found <= most):
@@ -55,11 +55,11 @@ def need_influences(found: int, name: str, model: str) -> None:
         )
 
 
-def capped(deformer: Deformer, target: Target) -> Deformer:
+def cap_influences(deformer: Deformer, target: Target) -> Deformer:
     """Return a garment and its character's bodies with each vertex moved by its heaviest influences alone.
 
     The remaining weights of a vertex are scaled to a sum of one. This is for bodies and linear blend skinning: a
-    trained garment was already fitted to what its target takes, or refused (`need_influences`).
+    trained garment was already fitted to what its target takes, or refused (`check_influences`).
     """
     most = target.influences
     if most is None:

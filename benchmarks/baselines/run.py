@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from ssilk_core.devices import chosen_device
+from ssilk_core.devices import select_device
 from ssilk_core.errors import fail
 from ssilk_core.events import Checkpoint, Message, Progress, Reporter, Started
 from ssilk_core.training.curve import CurvePoint, append_point
@@ -64,7 +64,7 @@ class BaselineRun:
 
     def __init__(self, job: BaselineJob, report: Reporter) -> None:
         self.job, self.report, base = job, report, job.base
-        device = chosen_device(base.device)
+        device = select_device(base.device)
         self.files = RunFiles(base, device)
         self.files.remove_unfinished()
         parts = build_parts(base, device)

@@ -12,7 +12,7 @@ from typing import Any
 from baselines.files import KEY, load_network
 
 from ssilk_core.checkpoint import ModelFile
-from ssilk_core.devices import chosen_device, device_name
+from ssilk_core.devices import device_name, select_device
 from ssilk_core.errors import fail
 from ssilk_core.files import replacing
 from ssilk_core.training.curve import curve_path
@@ -50,7 +50,7 @@ def settings_of(path: Path) -> Settings:
 def write_record(options: argparse.Namespace, rows: Sequence[Row]) -> None:
     """Write rows with the settings of their models, by the models' names."""
     document = {
-        "hardware": device_name(chosen_device(options.device)),
+        "hardware": device_name(select_device(options.device)),
         "sequence": options.sequence,
         "models": {path.stem: settings_of(path) for path in options.models},
         "rows": rows,

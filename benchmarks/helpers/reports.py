@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from ssilk_core import __version__
-from ssilk_core.devices import chosen_device, device_name
+from ssilk_core.devices import device_name, select_device
 from ssilk_core.files import replacing
 
 RESULTS = Path(__file__).parents[1] / "results"
@@ -70,4 +70,4 @@ def indented(value: Any, depth: int = 1) -> str:
 
 
 def _hardware(options: argparse.Namespace) -> str:
-    return f"{device_name(chosen_device(options.device))}, {options.threads} of {os.cpu_count()} cores"
+    return f"{device_name(select_device(options.device))}, {options.threads} of {os.cpu_count()} cores"

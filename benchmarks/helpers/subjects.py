@@ -17,7 +17,7 @@ from torch import Tensor
 from ssilk_core.assets import Motion, Scene
 from ssilk_core.checkpoint import ModelFile, load_model, network
 from ssilk_core.collision import CollisionBody
-from ssilk_core.devices import chosen_device
+from ssilk_core.devices import select_device
 from ssilk_core.energy import GarmentEnergy
 from ssilk_core.errors import fail
 from ssilk_core.evaluation.methods import EvaluationScene
@@ -78,7 +78,7 @@ def dressed_in(file: ModelFile, stage: Path, device: str) -> EvaluationScene:
     if character.skeleton.joint_names != skeleton.joint_names:
         fail(str(stage), "its joints are not the model's", "a model is measured on the character it was trained with")
     scene = replace(file.scene, character=replace(character, skeleton=skeleton))
-    return EvaluationScene(scene, file.fabric, file.config.fps, chosen_device(device))
+    return EvaluationScene(scene, file.fabric, file.config.fps, select_device(device))
 
 
 def arguments(purpose: str) -> argparse.ArgumentParser:

@@ -18,9 +18,9 @@ def version(name):
 def device():
     """Return the name of the device that ssilk would train on, or None without PyTorch."""
     try:
-        from ssilk_core.devices import chosen_device, device_name
+        from ssilk_core.devices import select_device, device_name
 
-        return device_name(chosen_device("auto"))
+        return device_name(select_device("auto"))
     except ImportError:
         return None
 

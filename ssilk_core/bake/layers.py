@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import fail
 from ..events import Message, Reporter, Result, Started, silent
 from ..files import remove_unfinished, replacing, sha256
-from ..targets import need_influences
+from ..targets import check_influences
 from .load import LoadedGarment, load_garment
 from .origin import shot_metadata
 from .record import RECORD, TaskRecord, current_record, read_record, task_key, write_record
@@ -112,7 +112,7 @@ class LayerFolder:
         for path in _own_files(layout):
             remove_unfinished(path)
         rollout = self.garment(task).over(task.request.motion)
-        need_influences(rollout.influences, task.request.target, task.request.model)
+        check_influences(rollout.influences, task.request.target, task.request.model)
         asset = self._asset(task, layout, report)
         result = _write_layer(layout, asset, rollout, task, report)
         files = [layout.animation, layout.asset, layout.geometry, *([layout.points] if task.points else [])]

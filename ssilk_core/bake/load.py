@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 from ..assets import Deformer, Motion
 from ..checkpoint import ModelFile, load_model
-from ..devices import chosen_device
+from ..devices import select_device
 from ..errors import fail
 from ..files import sha256
 from ..kinematics import lbs_deformer, resample
 from ..quality import SizeReduction
 from ..reduction import Reducer
-from ..targets import Target, capped
+from ..targets import Target, cap_influences
 from .character import on_character
 from .request import BakeRequest
 from .rollout import BakeRollout
@@ -89,7 +89,7 @@ class LoadedGarment:
         """Return the garment cut to the size that the request keeps, so as to be best for this motion."""
         assert self.model is not None and self.request.keep is not None
         reducer = Reducer(self.file, [motion])
-        found = reducer.reduced(self.request.keep)
+        found = reducer.reduce(self.request.keep)
         model, deformer = _network_like(self.model, found.file, self.request)
         return replace(self, model=model, deformer=deformer), SizeReduction.of(reducer.whole, found)
 
@@ -104,7 +104,7 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
 
     from ..checkpoint import network
 
-    device = chosen_device(request.device)
+    device = select_device(request.device)
     file = load_model(request.model)
     stage = open_stage(request.stage)
     scene = on_character(file, stage, request.root)
@@ -115,7 +115,7 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
         request=request,
         file=file,
         model=model,
-        deformer=capped(deformer, request.receiver),
+        deformer=cap_influences(deformer, request.receiver),
         units=_units(stage, request.receiver),
         provenance={"model_sha256": model_hash, "training": file.provenance.get("ssilk", "")},
         record=_record(file, model_hash),
@@ -143,8 +143,8 @@ def _network_like(like: GarmentModel, file: ModelFile, request: BakeRequest) -> 
     from ..checkpoint import network
 
     model = network(file, replace(file.scene, character=like.scene.character))
-    model.to(chosen_device(request.device))
-    return model, capped(model.deformer(), request.receiver)
+    model.to(select_device(request.device))
+    return model, cap_influences(model.deformer(), request.receiver)
 
 
 def _at_fps(motion: Motion, fps: float) -> Motion:

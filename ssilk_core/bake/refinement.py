@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..assets import Floats
-from ..devices import chosen_device
+from ..devices import select_device
 from ..errors import VerificationError
 from ..events import Progress, Reporter, silent
 from .result import RefinementSummary, Verification
@@ -34,9 +34,9 @@ def refined(rollout: BakeRollout, report: Reporter = silent) -> BakeRollout:
     """
     if not rollout.request.refine or rollout.refinement is not None:
         return rollout
-    from ..refine import Summary
+    from ..refine import RefinementMeans
 
-    points, summary = [], Summary()
+    points, summary = [], RefinementMeans()
     for frame in _refiner(rollout).frames(rollout.motion, rollout.network_vertices()):
         points.append(frame.points)
         summary.changes.append(frame.change)
@@ -51,18 +51,18 @@ def _refiner(rollout: BakeRollout) -> Refiner:
 
     request = rollout.request
     options = RefineOptions(iterations=request.refine, feedback=request.feedback)
-    device = chosen_device(request.device)
+    device = select_device(request.device)
     return Refiner(rollout.deformer.scene, rollout.fabric, options, fps=rollout.motion.fps, device=device)
 
 
 def _fitted(rollout: BakeRollout, points: Sequence[Floats]) -> Iterator[PoseFit]:
     """Yield joints and blendshape weights fitted to refined vertices by least squares over the mass."""
     from ..energy import GarmentEnergy
-    from ..refine import Refitter
+    from ..refine import PoseFitter
 
     assert rollout.model is not None  # a request refuses joints under linear blend skinning
     mass = GarmentEnergy(rollout.deformer.scene.garment.mesh, rollout.fabric).mass.numpy()
-    refitter = Refitter(rollout.model.deformer(), mass, device=chosen_device(rollout.request.device))
+    refitter = PoseFitter(rollout.model.deformer(), mass, device=select_device(rollout.request.device))
     yield from refitter.fit(rollout.motion, rollout.network_poses(), points)
 
 

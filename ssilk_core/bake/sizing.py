@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ..assets import GarmentPose
 from ..checkpoint import ModelFile, load_model
-from ..cost import POINT, ShotBytes
+from ..cost import POINT_BYTES, ShotBytes
 from ..errors import fail
 from ..events import Reporter
 from ..quality import quality_named, size_at, spend
@@ -89,7 +89,7 @@ def shot_bytes(rollout: BakeRollout, suffix: str, *, include_body: bool) -> Shot
     few = max(many // 4, 1)
     first, second = (_excerpt_bytes(rollout, count, suffix, include_body) for count in (few, many))
     frame = (second - first) / max(many - few, 1)
-    points = POINT * rollout.deformer.scene.garment.mesh.vertex_count if rollout.request.writes_points else 0
+    points = POINT_BYTES * rollout.deformer.scene.garment.mesh.vertex_count if rollout.request.writes_points else 0
     return ShotBytes(second - frame * many, frame + points)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ..checkpoint import load_model
 from ..errors import fail
-from ..targets import need_influences
+from ..targets import check_influences
 from .request import BakeRequest
 
 
@@ -99,7 +99,7 @@ def _need_for_layers(requests: Sequence[BakeRequest]) -> None:
             )
     capped = {(each.model, each.target) for each in requests if each.receiver.influences and not each.lbs}
     for model, target in sorted(capped):
-        need_influences(load_model(model).scene.rig.skin.indices.shape[1], target, model)
+        check_influences(load_model(model).scene.rig.skin.indices.shape[1], target, model)
 
 
 def _garment_name(request: BakeRequest) -> str:

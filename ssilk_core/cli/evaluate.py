@@ -112,10 +112,10 @@ def evaluated(
     options: argparse.Namespace, opener: Opener, report: Reporter
 ) -> tuple[list[ResultRow], list[dict[str, Any]]]:
     """Evaluate the models that options name; return the rows, and the same as files hold them."""
-    from ..devices import chosen_device
+    from ..devices import select_device
     from ..evaluation.run import evaluate
 
-    asked, device = _asked(options), chosen_device(options.device)
+    asked, device = _asked(options), select_device(options.device)
     opened = [opener(path, device) for path in options.models]
     rows: list[ResultRow] = []
     found: list[dict[str, Any]] = []
@@ -225,7 +225,7 @@ def _write(options: argparse.Namespace, rows: list[dict[str, Any]]) -> None:
     import torch
 
     from .. import __version__
-    from ..devices import chosen_device, device_name
+    from ..devices import device_name, select_device
     from ..files import sha256
 
     document = {
@@ -234,7 +234,7 @@ def _write(options: argparse.Namespace, rows: list[dict[str, Any]]) -> None:
         "stage": {str(options.stage): sha256(options.stage)},
         "reference": options.reference and str(options.reference),
         "options": {**asdict(_asked(options)), "clips": options.clips, "exact": options.exact},
-        "hardware": device_name(chosen_device(options.device)),
+        "hardware": device_name(select_device(options.device)),
         "versions": {"ssilk": __version__, "torch": torch.__version__},
         "figures": rows,
     }

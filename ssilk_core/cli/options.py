@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..bake import BakeRequest
-from ..config import overridden
+from ..config import apply_overrides
 from ..errors import fail
 from ..events import Reporter
 from ..fabrics import FABRICS, Fabric, fabric_named
@@ -52,7 +52,7 @@ def add_fabric(verb: argparse.ArgumentParser) -> None:
 
 def fabric(options: argparse.Namespace) -> Fabric:
     """Return the fabric that the options ask for; raise `SsilkError` for an unknown property or a bad value."""
-    return overridden(fabric_named(options.fabric), options.material)
+    return apply_overrides(fabric_named(options.fabric), options.material)
 
 
 def add_bake(verb: argparse.ArgumentParser) -> None:

@@ -25,7 +25,7 @@ NUMBERS = ("shapes", "joints", "influences")
 if TYPE_CHECKING:
     from ..assets import Motion
     from ..checkpoint import ModelFile
-    from ..reduction import Reduced, Reducer
+    from ..reduction import ReducedModel, Reducer
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -79,12 +79,12 @@ def _motions(file: ModelFile, options: argparse.Namespace) -> list[Motion]:
     return read_motions(options.motions or there, file.scene.character.skeleton)
 
 
-def _chosen(options: argparse.Namespace, reducer: Reducer, motions: list[Motion], report: Reporter) -> Reduced:
+def _chosen(options: argparse.Namespace, reducer: Reducer, motions: list[Motion], report: Reporter) -> ReducedModel:
     """Return the model that the options ask for."""
     from ..cost import model_bytes
 
     named = {name: value for name in NUMBERS if (value := getattr(options, name)) is not None}
     size = replace(size_at(options.quality, reducer.whole), **named)
     if not options.budget:
-        return reducer.reduced(size)
+        return reducer.reduce(size)
     return spend(options.budget, reducer, size, motions[0], lambda file: model_bytes(file, pack=True), report)

@@ -59,14 +59,14 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     """Simulate and write."""
     from ssilk_usd.read_motion import motion_files, read_motion
 
-    from ..devices import chosen_device
+    from ..devices import select_device
     from ..simulate import SimulationOptions
     from ..simulate.newton import SolverOptions
 
     outputs = _outputs(options.output, options.motion)
     for output in outputs:
         shared.check_output(output, options.stage, *motion_files(options.motion))
-    device = chosen_device(options.device)
+    device = select_device(options.device)
     scene = shared.load_scene(options, report)
     fabric = shared.fabric(options)
     settings = SimulationOptions(

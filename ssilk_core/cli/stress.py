@@ -91,7 +91,7 @@ def _subject(options: argparse.Namespace) -> StressSubject:
 
 def _write(options: argparse.Namespace, outcomes: list[CaseOutcome]) -> None:
     from .. import __version__
-    from ..devices import chosen_device, device_name
+    from ..devices import device_name, select_device
     from ..events import finite
     from ..files import replacing, sha256
 
@@ -99,7 +99,7 @@ def _write(options: argparse.Namespace, outcomes: list[CaseOutcome]) -> None:
         "ssilk": __version__,
         "model": options.model.name,
         "model_sha256": sha256(options.model),
-        "hardware": device_name(chosen_device("cpu")),
+        "hardware": device_name(select_device("cpu")),
         "quick": options.quick,
         "outcomes": [asdict(outcome) for outcome in outcomes],
     }

@@ -93,10 +93,10 @@ class Bench:
 
     def __init__(self, options: argparse.Namespace) -> None:
         from ..checkpoint import load_model
-        from ..devices import chosen_device
+        from ..devices import select_device
         from ..files import sha256
 
-        self.options, self.device = options, chosen_device(options.device)
+        self.options, self.device = options, select_device(options.device)
         self.files: dict[Path, ModelFile] = {path: load_model(path) for path in options.models}
         first = next(iter(self.files.values()))
         names = [path.stem for path in self.files]

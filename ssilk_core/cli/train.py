@@ -11,7 +11,7 @@ import argparse
 from math import inf
 from pathlib import Path
 
-from ..config import PRESETS, ModelConfig, TrainConfig, overridden, preset_named
+from ..config import PRESETS, ModelConfig, TrainConfig, apply_overrides, preset_named
 from ..errors import EXIT_INTERRUPTED, EXIT_OK, fail
 from ..events import Message, Reporter, Result, silent
 from ..fabrics import Fabric
@@ -143,4 +143,4 @@ def _settings(settings: list[str], model: ModelConfig, train: TrainConfig) -> tu
             fail(where, "no such setting", f"settings are {', '.join(known)}")
     own = [setting for setting in settings if setting.partition("=")[0] in ModelConfig.__dataclass_fields__]
     others = [setting for setting in settings if setting not in own]
-    return overridden(model, own), overridden(train, others)
+    return apply_overrides(model, own), apply_overrides(train, others)

@@ -33,10 +33,10 @@ def training_cost(scene: Scene, motions: Sequence[Motion], preset: Preset) -> Fi
 
 def memory(scene: Scene, preset: Preset, body_vertices: int) -> Findings:
     """Yield how much memory and time a preset takes with a garment that reaches `body_vertices`."""
-    from ..devices import chosen_device
+    from ..devices import select_device
     from ..memory import decoded_frames, fitting_batch, free_memory, step_memory
 
-    model, train, device = preset.model, preset.train, chosen_device("auto")
+    model, train, device = preset.model, preset.train, select_device("auto")
     free = free_memory(device)
     needed = step_memory(scene, model, decoded_frames(train, train.batch), body_vertices)
     batch, pretraining_batch = fitting_batch(scene, model, train, body_vertices, free)

@@ -12,10 +12,10 @@ from ..assets import Floats, Ints, Motion, Skeleton
 from ..kinematics import CUT_SPEED, split_at_cuts
 from .finding import Finding, Findings, amount, joint_leaves, listing
 
-SNAP = 120.0  # [degrees] in one frame; the fastest human joints turn by about 7,000 degrees a second
-STILL = 0.5  # [degrees]
+MAX_FRAME_ROTATION = 120.0  # [degrees] in one frame; the fastest human joints turn by about 7,000 degrees a second
+STILL_ANGLE = 0.5  # [degrees]
 RATES = (15.0, 240.0)  # [1/s]
-GAP = 0.5  # [s] without a sample, in a motion that otherwise has ten times as many
+MAX_SAMPLE_GAP = 0.5  # [s] without a sample, in a motion that otherwise has ten times as many
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ def root_jumps(motion: Motion) -> Findings:
 def joint_snaps(motion: Motion, skeleton: Skeleton) -> Findings:
     """Yield the frames at which a joint flips over within one frame."""
     angles = _angles(motion.rotations[1:], motion.rotations[:-1])
-    frames = np.flatnonzero((angles > SNAP).any(axis=1))
+    frames = np.flatnonzero((angles > MAX_FRAME_ROTATION).any(axis=1))
     if len(frames):
         joint = int(angles.max(axis=0).argmax())
         yield Finding(
@@ -101,13 +101,13 @@ def unusual_rate(motion: Motion) -> Findings:
 def sample_gaps(file: MotionFile) -> Findings:
     """Yield stretches of a densely sampled motion that hold no samples."""
     steps = np.diff(file.times)
-    if len(steps) > 2 and steps.max() > max(GAP, 10 * np.median(steps)):
+    if len(steps) > 2 and steps.max() > max(MAX_SAMPLE_GAP, 10 * np.median(steps)):
         at = int(steps.argmax())
         yield Finding(
             severity="warning",
             code="sample-gaps",
             prim=file.path,
-            count=int(np.count_nonzero(steps > max(GAP, 10 * np.median(steps)))),
+            count=int(np.count_nonzero(steps > max(MAX_SAMPLE_GAP, 10 * np.median(steps)))),
             found=f"it has no samples for {steps.max():.2g} s from {file.times[at]:.3g} s on",
             why="the pose is interpolated straight across the gap",
             fix="export the motion again, or cut it there",
@@ -134,7 +134,7 @@ def still_joints(motions: Sequence[Motion], skeleton: Skeleton) -> Findings:
     """Yield the joints that turn in none of the motions."""
     first = motions[0].rotations[:1]
     turned = np.max([_angles(motion.rotations, first).max(axis=0) for motion in motions], axis=0)
-    still = np.flatnonzero(turned < STILL)
+    still = np.flatnonzero(turned < STILL_ANGLE)
     if len(still):
         yield Finding(
             severity="info",

@@ -10,26 +10,26 @@ from ..kinematics import invert_rigid, skin_points, skinning_matrices, world_tra
 from .finding import Finding, Findings, listing
 from .fit import signed_distance
 
-FAR = 20.0  # [degrees] between bind and rest pose of a joint, from which on cloth for one does not fit the other
-DEEP = 0.01  # [m] inside the body
-SOME = 0.02  # share of vertices so deep that says a garment does not fit a pose
+MAX_ANGLE = 20.0  # [degrees] between bind and rest pose of a joint; cloth for one then does not fit the other
+DEEP_PENETRATION = 0.01  # [m] inside the body
+MAX_DEEP_SHARE = 0.02  # share of deep vertices above which a garment does not fit a pose
 
 
 def rest_pose(character: Character, mesh: Mesh) -> Findings:
     """Yield joints whose rest pose is far from the bind pose: an error if the garment fits the former instead."""
     angles = rest_angles(character.skeleton)
-    far = np.flatnonzero(angles > FAR)
+    far = np.flatnonzero(angles > MAX_ANGLE)
     if not len(far):
         return
     worst = int(angles.argmax())
     fits_bind, fits_rest = (_deep_share(mesh, body) for body in (character.merged_body().mesh, _at_rest(character)))
-    wrong = fits_bind > SOME and fits_rest < 0.5 * fits_bind
+    wrong = fits_bind > MAX_DEEP_SHARE and fits_rest < 0.5 * fits_bind
     yield Finding(
         severity="error" if wrong else "info",
         code="rest-pose",
         prim=mesh.path if wrong else character.skeleton.path,
         count=len(far),
-        found=f"rest and bind pose of {len(far)} joints differ by more than {FAR:.0f} degrees, most at "
+        found=f"rest and bind pose of {len(far)} joints differ by more than {MAX_ANGLE:.0f} degrees, most at "
         f"'{character.skeleton.joint_names[worst]}' ({angles[worst]:.0f})"
         + (f"; {fits_bind:.0%} of the garment is inside the body as bound, {fits_rest:.0%} at rest" if wrong else ""),
         why="the garment is fitted to the bind pose; joints that a motion lacks stay in the rest pose",
@@ -60,4 +60,4 @@ def _at_rest(character: Character) -> Mesh:
 
 
 def _deep_share(mesh: Mesh, body: Mesh) -> float:
-    return float(np.mean(signed_distance(mesh.points, body) < -DEEP))
+    return float(np.mean(signed_distance(mesh.points, body) < -DEEP_PENETRATION))

@@ -10,7 +10,7 @@ from itertools import groupby
 from .finding import SEVERITIES, Finding, amount
 
 WIDTH = 110
-MOST_PLACES = 5  # of one kind of finding that are printed; --json has all
+MAX_PLACES = 5  # of one kind of finding that are printed; --json has all
 
 
 def format_findings(findings: Sequence[Finding]) -> str:
@@ -32,10 +32,10 @@ def summary(findings: Sequence[Finding]) -> str:
 def _block(group: list[Finding]) -> Iterator[str]:
     first = group[0]
     yield f"{first.severity.upper()}  {first.code}{'  (--fix repairs it)' if _all_fixable(group) else ''}"
-    for finding in group[:MOST_PLACES]:
+    for finding in group[:MAX_PLACES]:
         yield from _wrapped(f"{_count(finding)}{finding.prim}: {finding.found}", "  ")
-    if len(group) > MOST_PLACES:
-        yield f"  and in {len(group) - MOST_PLACES} more places; --json lists all"
+    if len(group) > MAX_PLACES:
+        yield f"  and in {len(group) - MAX_PLACES} more places; --json lists all"
     for label, text in (("why", first.why), ("fix", first.fix)):
         if text:
             yield from _wrapped(f"{label}: {text}", "    ")

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fewer influences: the weights with which fewer joints keep each vertex nearest to where all of them have it.
+"""Fewer influences: weights of fewer joints that change each vertex's position least.
 
-A vertex that joint c alone would carry to p_c is at x = sum_c w_c p_c. Other weights v, summing to one too, put it
-sum_c (v_c - w_c) p_c away from there, whose mean square over frames is (v - w)^T H (v - w) with
+With p_c the position of a vertex under joint c alone, it lies at x = sum_c w_c p_c. Other weights v, with sum one,
+displace it by sum_c (v_c - w_c) p_c. The mean square of that over frames is (v - w)^T H (v - w) with
 H_cd = mean (p_c - x) . (p_d - x).
 """
 
@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from ..assets import Floats, Ints
 
-AT_ONCE = 64  # vertices; H of so many takes some 50 MB of positions
-RIDGE = 1e-3  # pull towards the weights that were, relative to H: decides where joints move alike
+VERTICES_PER_BLOCK = 64  # vertices; H of so many takes some 50 MB of positions
+RIDGE = 1e-3  # regularisation towards the original weights, relative to H, for joints that move alike
 
 
 @dataclass(frozen=True, eq=False)
 class InfluenceCandidates:
-    """Weights of each vertex over its candidate joints, and what others would cost.
+    """Weights of each vertex over its candidate joints, and the cost of changing them.
 
     Attributes:
         joints: candidates, shape (V, C), -1 where a vertex has fewer.
@@ -33,45 +33,45 @@ class InfluenceCandidates:
     weights: Floats
     costs: Floats
 
-    def lost(self, weights: Floats) -> Floats:
+    def error(self, weights: Floats) -> Floats:
         """Return the mean squared distances (V,) [m2] by which other weights (V, C) move the vertices."""
         change = weights - self.weights
         return np.einsum("vc,vcd,vd->v", change, self.costs, change).clip(min=0)
 
     def of(self, rows: Ints) -> InfluenceCandidates:
-        """Return those of some vertices."""
+        """Return the candidates of some vertices."""
         return InfluenceCandidates(self.joints[rows], self.weights[rows], self.costs[rows])
 
 
-def measured(joints: Ints, weights: Floats, matrices: NDArray, points: NDArray) -> InfluenceCandidates:
-    """Measure what other weights cost.
+def measure_costs(joints: Ints, weights: Floats, matrices: NDArray, points: NDArray) -> InfluenceCandidates:
+    """Measure the cost of changing weights.
 
     Args:
         joints, weights: as in `InfluenceCandidates`.
         matrices: skinning matrices of all joints (J + P, 3, 4, F); points: unskinned ones (V, 3, F) [m].
     """
     costs = np.empty((*joints.shape, joints.shape[1]))
-    for start in range(0, len(joints), AT_ONCE):
-        rows = slice(start, start + AT_ONCE)
-        carried = carried_by(joints[rows], matrices, points[rows])
+    for start in range(0, len(joints), VERTICES_PER_BLOCK):
+        rows = slice(start, start + VERTICES_PER_BLOCK)
+        carried = transform_by_each(joints[rows], matrices, points[rows])
         carried -= np.einsum("vc,vcaf->vaf", weights[rows], carried)[:, None]
         flat = carried.reshape(*joints[rows].shape, -1)
         costs[rows] = flat @ flat.swapaxes(1, 2) / points.shape[2]
     return InfluenceCandidates(joints, weights, costs)
 
 
-def carried_by(joints: Ints, matrices: NDArray, points: NDArray) -> NDArray:
-    """Return where each joint alone carries each point, shape (V, C, 3, F)."""
+def transform_by_each(joints: Ints, matrices: NDArray, points: NDArray) -> NDArray:
+    """Return the position of each point under each joint alone, shape (V, C, 3, F)."""
     chosen = matrices[joints].astype(np.float64)
     return np.einsum("vcabf,vbf->vcaf", chosen[:, :, :, :3], points) + chosen[:, :, :, 3]
 
 
-def fitted(influences: InfluenceCandidates, allowed: NDArray, most: int) -> Floats:
-    """Return weights (V, C), not negative and summing to one, of at most `most` of the `allowed` candidates (V, C).
+def fit_weights(influences: InfluenceCandidates, allowed: NDArray, most: int) -> Floats:
+    """Return non-negative weights (V, C) that sum to one, of at most `most` of the `allowed` candidates (V, C).
 
-    Each moves its vertex as little as its support allows. Supports shrink by one candidate at a time, first by those
-    whose weight would be negative, then by what is missed least: w_c^2 / [K^-1]_cc, with K the matrix of the
-    constrained least squares.
+    They displace each vertex least for the remaining candidates. Candidates are removed one at a time, first those
+    with a negative weight, then that with the least cost w_c^2 / [K^-1]_cc, with K the matrix of the constrained
+    least squares.
     """
     allowed, weights = allowed.copy(), np.empty(influences.weights.shape)
     rows = np.arange(len(weights))
@@ -86,7 +86,7 @@ def fitted(influences: InfluenceCandidates, allowed: NDArray, most: int) -> Floa
 
 
 def _constrained(influences: InfluenceCandidates, allowed: NDArray) -> tuple[Floats, Floats]:
-    """Return the best weights that sum to one (V, C), of whatever sign, and what dropping each would cost (V, C)."""
+    """Return the best weights of any sign that sum to one (V, C), and the cost of removing each (V, C)."""
     count, size = allowed.shape
     scale = np.einsum("vcc->v", influences.costs)[:, None, None] / size + 1e-30
     both = allowed[:, :, None] & allowed[:, None]

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fewer proxy joints: ends of chains are taken off, those that are missed least first.
+"""Fewer proxy joints: ends of chains are removed, in order of increasing error.
 
-Only ends, so that all that stay move as before: a joint within a chain carries those after it. What a joint moved
-follows the one that carried it, in the same shares, which leaves cloth as smooth as it was. Weights fitted anew for
-each vertex come nearer by themselves, but neighbours part; and what is lost smoothly is what blendshapes can make up
-for: on the cape with 10 of 20 proxies they then leave half as much.
+Only ends of chains are removed, so that the remaining joints move as before. The weights of a removed joint go to its
+parent, which keeps the cloth smooth. Refitting the weights of each vertex has less error at first, but separates
+neighbouring vertices. A smooth error can be compensated by blendshapes: on the cape with 10 of 20 proxies the
+remaining error is then half as large.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from ..assets import Floats, Ints, Scene
 from .influences import InfluenceCandidates
 
 
-def candidates(scene: Scene, weights: Floats) -> Ints:
-    """Return for each vertex the joints that move it and those that carry these, down to the character's.
+def candidate_joints(scene: Scene, weights: Floats) -> Ints:
+    """Return for each vertex the joints that move it and their ancestors, up to the character's joints.
 
     Args:
         weights: of all joints, shape (V, J + P).
 
     Returns:
-        Joints (V, C), rows filled up with -1.
+        Joints (V, C), rows padded with -1.
     """
     character = scene.character.skeleton.joint_count
     wanted = weights > 0
@@ -34,8 +34,8 @@ def candidates(scene: Scene, weights: Floats) -> Ints:
     return np.where(np.take_along_axis(wanted, order, axis=1), order, -1)
 
 
-def least_missed(scene: Scene, influences: InfluenceCandidates, mass: Floats) -> list[int]:
-    """Return all proxies in the order in which to take them off, as combined joint indices.
+def removal_order(scene: Scene, influences: InfluenceCandidates, mass: Floats) -> list[int]:
+    """Return all proxies in order of removal, as combined joint indices.
 
     Args:
         mass: of the vertices, shape (V,).
@@ -52,18 +52,18 @@ def least_missed(scene: Scene, influences: InfluenceCandidates, mass: Floats) ->
 
 
 def _missed(influences: InfluenceCandidates, parents: Ints, mass: Floats, gone: list[int]) -> float:
-    """Return what the vertices that the last of these joints moves lose more by its going [m2, weighted by mass]."""
+    """Return the additional error from removing the last of these joints [m2, weighted by mass]."""
     rows = np.flatnonzero((influences.joints == gone[-1]).any(axis=1))
     own = influences.of(rows)
-    before, after = (own.lost(handed_down(own, parents, gone[:count])) for count in (-1, len(gone)))
+    before, after = (own.error(move_to_parents(own, parents, gone[:count])) for count in (-1, len(gone)))
     return float(mass[rows] @ (after - before))
 
 
-def handed_down(influences: InfluenceCandidates, parents: Ints, gone: list[int]) -> Floats:
-    """Return weights (V, C) with those of some joints given to what carries them.
+def move_to_parents(influences: InfluenceCandidates, parents: Ints, gone: list[int]) -> Floats:
+    """Return weights (V, C) with those of removed joints moved to their parents.
 
     Args:
-        parents: of all joints; gone: ends of chains first.
+        parents: of all joints; gone: removed joints, ends of chains first.
     """
     weights = influences.weights.copy()
     for joint in gone:
@@ -75,7 +75,7 @@ def handed_down(influences: InfluenceCandidates, parents: Ints, gone: list[int])
 
 
 def dense(joints: Ints, weights: Floats, count: int) -> NDArray:
-    """Return weights over candidates (V, C) as those of all joints (V, count)."""
-    matrix = np.zeros((len(joints), count + 1))  # the last column takes the candidates that there are not
+    """Return weights over candidates (V, C) as weights of all joints (V, count)."""
+    matrix = np.zeros((len(joints), count + 1))  # the last column collects the padding
     np.add.at(matrix, (np.arange(len(joints))[:, None], joints), weights)
     return matrix[:, :count]

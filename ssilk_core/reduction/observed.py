@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What motions ask of a trained garment: frames to judge by what a smaller model loses."""
+"""Frames of motions on which the error of a smaller model is measured."""
 
 from __future__ import annotations
 
@@ -15,52 +15,52 @@ from ..runtime import Player
 from ..runtime.character import character_matrices
 from ..runtime.skinning import skin_garment
 
-POSED = 16  # frames whose vertices are in memory at once
+FRAMES_PER_BLOCK = 16  # frames whose vertices are in memory at once
 
 
 @dataclass(frozen=True, eq=False)
-class Observed:
-    """Frames of motions, F of them, as every model that was cut from one whole sees them.
+class ObservedFrames:
+    """F frames of motions, shared by all models reduced from one.
 
     Attributes:
         states: latents, shape (F, latent).
-        character: skinning matrices of the character's joints about the root, shape (J, 3, 4, F).
+        character: skinning matrices of the character's joints relative to the root, shape (J, 3, 4, F).
     """
 
     states: NDArray
     character: NDArray
 
-    def decoded(self, player: Player) -> tuple[NDArray, NDArray]:
+    def decode(self, player: Player) -> tuple[NDArray, NDArray]:
         """Return a model's activations (K, F) and skinning matrices of all its joints (J + P, 3, 4, F)."""
         activations, rotations = player.decoder.decode(self.states)
         return activations, player.kinematics.matrices(rotations, self.character)
 
     def vertices(self, player: Player) -> Iterator[Floats]:
-        """Yield a model's vertices about the root [m], some frames at a time, shape (F', V, 3)."""
-        activations, matrices = self.decoded(player)
-        for start in range(0, len(self.states), POSED):
-            chosen = slice(start, start + POSED)
+        """Yield a model's vertices relative to the root [m], one block of frames at a time, shape (F', V, 3)."""
+        activations, matrices = self.decode(player)
+        for start in range(0, len(self.states), FRAMES_PER_BLOCK):
+            chosen = slice(start, start + FRAMES_PER_BLOCK)
             count = len(self.states[chosen])
             yield skin_garment(player.tiles, activations[:, chosen], matrices[..., chosen], np.zeros((count, 3)))
 
 
-def observe(player: Player, motions: Sequence[Motion], frames: int) -> Observed:
+def observe(player: Player, motions: Sequence[Motion], frames: int) -> ObservedFrames:
     """Play motions and return about `frames` frames of them, evenly spread.
 
     Raises:
-        SsilkError: there is no motion, or it is of another character.
+        SsilkError: there is no motion, or it belongs to another character.
     """
     if not motions:
         fail("motions", "none given", "at least one is needed", "name motion files with --motions")
     spans = [span for motion in motions for span in player.play(motion).rolled_spans]
     every = max(1, sum(span.motion.frame_count for span in spans) // frames)
-    return Observed(
+    return ObservedFrames(
         np.concatenate([span.states(span.motion.frame_count)[::every] for span in spans]),
         np.concatenate([_character(span.motion, every, player.skeleton) for span in spans], axis=-1),
     )
 
 
 def _character(motion: Motion, every: int, skeleton: Skeleton) -> NDArray:
-    """Return the character's skinning matrices about its root (J, 3, 4, F) of every so many frames."""
+    """Return the character's skinning matrices relative to its root (J, 3, 4, F) for every `every`th frame."""
     some = replace(motion, rotations=motion.rotations[::every], translations=motion.translations[::every])
     return character_matrices(some, skeleton)[0]

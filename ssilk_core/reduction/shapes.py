@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fewer blendshapes: the best that any so many can do, by principal components of what follows the activations."""
+"""Fewer blendshapes: principal components of the displacements that activations predict."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from numpy.typing import NDArray
 from ..assets import Floats
 
 RIDGE = 1e-3  # of the mean variance of activations: keeps few frames from being learnt by heart
-LEAST = 1e-14  # of the largest share: modes with less are rounding
+MIN_RELATIVE_SHARE = 1e-14  # of the largest share: modes with less are rounding
 
 
 @dataclass(frozen=True, eq=False)
 class Modes:
-    """What displacements follow of activations a, the most first: mean + sum_i field_i (reading_i (a - middle)).
+    """Displacements predicted from activations a as mean + sum_i field_i (reading_i (a - middle)), largest first.
 
     Attributes:
         mean: shape (V, 3) [m]; middle: mean activations, shape (K,).
-        fields: shape (V, 3, K) [m]; readings: shape (K, K); each field's activation has a variance of one.
-        shares: what each field takes off the mean square of the displacements, weighted by mass, shape (K,) [m2].
-        total: that mean square about the mean [m2].
+        fields: shape (V, 3, K) [m]; readings: shape (K, K); the activation of each field has a variance of one.
+        shares: reduction of the mean squared displacement by each field, weighted by mass, shape (K,) [m2].
+        total: mean squared displacement about the mean [m2].
     """
 
     mean: Floats
@@ -32,16 +32,16 @@ class Modes:
     shares: Floats
     total: float
 
-    def lost(self, count: int) -> float:
+    def error(self, count: int) -> float:
         """Return the RMS displacement that the first `count` fields miss [m]."""
         return float(np.sqrt(max(0.0, self.total - self.shares[:count].sum())))
 
 
 def modes(shapes: NDArray, more: NDArray, activations: NDArray, mass: Floats) -> Modes:
-    """Find what displacements shapes a + more follow of the activations a.
+    """Find modes of the displacements shapes a + more, predicted from the activations a.
 
-    Ridge regression says what `more`, which no shapes give, follows of them; principal components of both together
-    are then the best of their number [Eckart, Young 1936], of the displacements themselves where `more` is zero.
+    Ridge regression predicts `more`, which no shapes produce, from the activations. Principal components of both
+    together are then the best of their number [Eckart, Young 1936]; they are exact where `more` is zero.
 
     Args:
         shapes: (V, 3, K) [m]; more: of the vertices in F frames, shape (V, 3, F) [m].
@@ -72,14 +72,14 @@ def _components(linear: Floats, variance: Floats, weight: Floats) -> tuple[Float
     scaled = linear @ spread
     shares, turn = np.linalg.eigh(scaled.T @ (weight[:, None] * scaled))
     fields, shares = scaled @ turn[:, ::-1], shares[::-1]
-    kept = shares > LEAST * shares.max(initial=0)
+    kept = shares > MIN_RELATIVE_SHARE * shares.max(initial=0)
     inverse = np.divide(1, shares, out=np.zeros_like(shares), where=kept)
     return fields * kept, inverse[:, None] * (fields.T @ (weight[:, None] * linear))
 
 
 @dataclass(frozen=True, eq=False)
 class Basis:
-    """Blendshapes as a model file has them: displacement = offset + shapes (readout a).
+    """Blendshapes in the form of a model file: displacement = offset + shapes (readout a).
 
     Attributes:
         offset: shape (V, 3) [m]; shapes: (V, 3, R) [m].
@@ -95,7 +95,7 @@ def basis(found: Modes, count: int, readout: Floats) -> Basis:
     """Return the first `count` modes as blendshapes.
 
     Args:
-        readout: what the modes' activations are of those that the network gives, shape (K, K').
+        readout: map from the network's activations to those of the modes, shape (K, K').
     """
     fields, readings = found.fields[:, :, :count], found.readings[:count]
     offset = found.mean - fields @ (readings @ found.middle)

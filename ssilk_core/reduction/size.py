@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much of a garment a smaller model keeps."""
+"""The size of a model."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ..errors import fail
 
 @dataclass(frozen=True, kw_only=True)
 class ModelSize:
-    """What is kept of a garment.
+    """The size of a model.
 
     Attributes:
         shapes: blendshapes; joints: proxy joints; influences: joints that move one vertex.
@@ -28,7 +28,7 @@ class ModelSize:
 
     @classmethod
     def of(cls, text: str) -> ModelSize:
-        """Return what `str` wrote."""
+        """Parse the result of `str`."""
         shapes, joints, influences = map(int, text.split(","))
         return cls(shapes=shapes, joints=joints, influences=influences)
 
@@ -36,5 +36,5 @@ class ModelSize:
         return f"{self.shapes},{self.joints},{self.influences}"
 
     def within(self, other: ModelSize) -> ModelSize:
-        """Return what both have."""
+        """Return the smaller of both in each respect."""
         return ModelSize(**{name: min(most, vars(other)[name]) for name, most in vars(self).items()})

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Between a network and the simulator: a rollout refined on the training energy, frame by frame."""
+"""Refinement of a network's rollout on the training energy, frame by frame."""
 
-from .fit import PoseFit, Refitter
-from .refiner import Change, RefinedFrame, RefineOptions, Refiner, Summary
+from .fit import PoseFit, PoseFitter
+from .refiner import FrameChange, RefinedFrame, RefinementMeans, RefineOptions, Refiner
 
-__all__ = ["Change", "PoseFit", "RefineOptions", "RefinedFrame", "Refiner", "Refitter", "Summary"]
+__all__ = ["FrameChange", "PoseFit", "PoseFitter", "RefineOptions", "RefinedFrame", "RefinementMeans", "Refiner"]

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Put garment vertices back onto joints and blendshapes: for each frame least squares over the mass.
+"""Fit blendshape weights and proxy rotations to garment vertices: mass-weighted least squares for each frame.
 
-Gauss-Newton with damping [Marquardt 1963] on what a shot stores, blendshape weights in [0, 1] and proxy rotations,
-several frames at once. Turning a proxy by a small w about its place c moves a vertex by w x (q - W c): W is what the
-proxy and those below it weigh there, and q where they put the vertex, weighted alike. A step counts only where it
-brings the frame nearer, so no frame ends further off than it starts.
+Levenberg-Marquardt [Marquardt 1963] on what a shot stores, blendshape weights in [0, 1] and proxy rotations, several
+frames at once. Rotating a proxy by a small w about its position c moves a vertex by w x (q - W c), where W is the sum
+of the vertex's weights of the proxy and its descendants, and q the sum of its positions under each, weighted alike. A
+step is accepted only where it reduces a frame's error.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from ..assets import PINNED, Deformer, Floats, GarmentPose, Motion
 from ..errors import fail
 from ..kinematics import combined_transforms, matrix_from_quaternion, quaternion_from_matrix, skinning_matrices
 
-STEPS = 15
-ENOUGH = 1e-3  # share of a frame's squared error; a step that gains less is the last
-DAMPING = 1e-4, 1e-9, 1e3  # of the mean diagonal: at first, at least, and where a frame is given up
-AT_ONCE = 16  # frames; the Jacobian of one takes 4 MB for 2,700 vertices, 64 shapes and 20 proxies
+MAX_STEPS = 15
+MIN_GAIN = 1e-3  # relative reduction of a frame's squared error below which its fit stops
+DAMPING = 1e-4, 1e-9, 1e3  # relative to the mean diagonal: initial, minimum, and where the fit of a frame stops
+FRAMES_PER_BLOCK = 16  # frames; the Jacobian of one takes 4 MB for 2,700 vertices, 64 shapes and 20 proxies
 
 
 @dataclass(frozen=True, eq=False)
 class PoseFit:
-    """Poses of consecutive frames and what they lose.
+    """Fitted poses of consecutive frames and their errors.
 
     Attributes:
-        rms: distance to the vertices asked for, over the mass [m], shape (F,).
-        largest: of any vertex [m], shape (F,).
+        rms: RMS distance to the target vertices, weighted by mass [m], shape (F,).
+        largest: largest distance of any vertex [m], shape (F,).
     """
 
     pose: GarmentPose
@@ -40,8 +40,8 @@ class PoseFit:
     largest: Floats
 
 
-class Refitter:
-    """Fits poses of one garment; the last blendshape, which puts the middle of all others back, keeps its weight.
+class PoseFitter:
+    """Fits poses of one garment; the last blendshape, which recentres all others, keeps its constant weight.
 
     Args:
         mass: of the vertices [kg], shape (V,).
@@ -65,43 +65,43 @@ class Refitter:
         return torch.as_tensor(np.array(values), dtype=dtype, device=self.device)
 
     def fit(self, motion: Motion, poses: Iterable[GarmentPose], vertices: Iterable[Floats]) -> Iterator[PoseFit]:
-        """Yield fits, some frames at a time.
+        """Yield fits, one block of frames at a time.
 
         Args:
             motion: of the character over the whole shot.
             poses: consecutive frames to start from.
-            vertices: of each of these frames, in the world [m], shape (V, 3).
+            vertices: target of each of these frames in world space [m], shape (V, 3).
         """
         wanted = iter(vertices)
         for pose in poses:
-            for at in range(0, pose.frame_count, AT_ONCE):
-                part = slice(at, at + AT_ONCE)
+            for at in range(0, pose.frame_count, FRAMES_PER_BLOCK):
+                part = slice(at, at + FRAMES_PER_BLOCK)
                 some = GarmentPose(pose.start + at, pose.rotations[part], pose.weights[part])
-                yield self.fitted(motion, some, np.stack([next(wanted) for _ in range(some.frame_count)]))
+                yield self.fit_block(motion, some, np.stack([next(wanted) for _ in range(some.frame_count)]))
 
-    def fitted(self, motion: Motion, pose: GarmentPose, vertices: Floats) -> PoseFit:
-        """Return the fit of a few frames to vertices in the world [m], shape (F, V, 3)."""
+    def fit_block(self, motion: Motion, pose: GarmentPose, vertices: Floats) -> PoseFit:
+        """Return the fit of a few frames to vertices in world space [m], shape (F, V, 3)."""
         where = f"frames {pose.start} to {pose.start + pose.frame_count - 1}"
         if not np.isfinite(vertices).all():
             fail(where, "NaN or infinity among the vertices", "all must be finite")
         root = motion.translations[pose.start : pose.start + pose.frame_count, :1]
         about = replace(motion, translations=motion.translations - _of_root(motion))
         search = _Search(self, about, pose, self._tensor((vertices - root)[:, self.free]))
-        for _ in range(STEPS):
+        for _ in range(MAX_STEPS):
             if not search.advance():
                 break
         return search.found()
 
 
 def _of_root(motion: Motion) -> Floats:
-    """Return the place of the first joint in its own row and zero in the others, shape (F, J, 3)."""
+    """Return the position of the first joint in its own row and zero in the others, shape (F, J, 3)."""
     places = np.zeros_like(motion.translations)
     places[:, 0] = motion.translations[:, 0]
     return places
 
 
 def _below(parents: np.ndarray, joints: int) -> Floats:
-    """Return which combined joints turn with each proxy, the proxy itself included, shape (J + P, P)."""
+    """Return which combined joints rotate with each proxy: itself and its descendants, shape (J + P, P)."""
     turning = np.zeros((len(parents), len(parents) - joints))
     for joint in range(joints, len(parents)):
         turning[joint, joint - joints] = 1
@@ -112,14 +112,14 @@ def _below(parents: np.ndarray, joints: int) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class _Posed:
-    """Frames as a pose has them.
+    """The garment in a pose, for F frames.
 
     Attributes:
         world: joint to world, all combined joints, shape (F, J + P, 4, 4).
-        blended: skinning matrices' linear parts, blended, shape (F, V, 3, 3).
-        moved: where each influence puts a vertex, weighted, shape (F, V, I, 3).
-        away: the vertices asked for less the posed ones, shape (F, V, 3).
-        error: sum of squared distances over the mass [m2], shape (F,).
+        blended: blended linear parts of the skinning matrices, shape (F, V, 3, 3).
+        moved: weighted position of a vertex under each influence, shape (F, V, I, 3).
+        away: target minus posed vertices, shape (F, V, 3).
+        error: mean squared distance, weighted by mass [m2], shape (F,).
     """
 
     world: Tensor
@@ -130,9 +130,9 @@ class _Posed:
 
 
 class _Search:
-    """The fit of some frames under way."""
+    """The iterative fit of a block of frames."""
 
-    def __init__(self, fitter: Refitter, motion: Motion, pose: GarmentPose, wanted: Tensor) -> None:
+    def __init__(self, fitter: PoseFitter, motion: Motion, pose: GarmentPose, wanted: Tensor) -> None:
         self.fitter, self.motion, self.pose, self.wanted = fitter, motion, pose, wanted
         self.posed = self._at(pose)
         self.damping = torch.full_like(self.posed.error, DAMPING[0])
@@ -149,13 +149,13 @@ class _Search:
         return _Posed(fitter._tensor(world), each[..., :3].sum(2), moved, away, (fitter.share * away**2).sum((1, 2)))
 
     def advance(self) -> bool:
-        """Make one step; return whether any frame may still gain."""
+        """Make one step; return whether any frame can still improve."""
         trial = self._stepped(self._step())
         posed, before = self._at(trial), self.posed
         nearer = (posed.error < before.error) & self.active
         gain = 1 - posed.error / before.error.clamp_min(torch.finfo(before.error.dtype).tiny)
         self.damping = torch.where(nearer, self.damping / 10, self.damping * 10).clamp_min(DAMPING[1])
-        self.active &= torch.where(nearer, gain > ENOUGH, self.damping < DAMPING[2])
+        self.active &= torch.where(nearer, gain > MIN_GAIN, self.damping < DAMPING[2])
         self._accept(nearer, trial, posed)
         return bool(self.active.any())
 
@@ -200,7 +200,7 @@ class _Search:
         return torch.cat([by_weight, by_turn], dim=-1)
 
     def _stuck(self, slope: Tensor) -> Tensor:
-        """Return which unknowns are weights at an end of their range that they would leave, shape (F, K + 3 P)."""
+        """Return which unknowns are weights at an active bound of their range, shape (F, K + 3 P)."""
         weights = self.fitter._tensor(self.pose.weights)[:, :-1]
         ends = ((weights <= 0) & (slope[:, : weights.shape[1]] < 0)) | (
             (weights >= 1) & (slope[:, : weights.shape[1]] > 0)
@@ -219,7 +219,7 @@ class _Search:
         return GarmentPose(pose.start, quaternion_from_matrix(turned), weights)
 
     def found(self) -> PoseFit:
-        """Return the poses as they are now."""
+        """Return the current poses."""
         distance = self.posed.away.norm(dim=2).amax(1)
         return PoseFit(self.pose, self.posed.error.sqrt().cpu().numpy(), distance.cpu().numpy())
 

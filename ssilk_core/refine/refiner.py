@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Refine a rollout: some iterations of the reference solver in each frame, from where the network has the garment.
+"""Refine a rollout: iterations of the reference solver in each frame, starting from the network's state.
 
-Each frame minimises what the simulator does, implicit Euler on the training energy. No step is taken that does not
-lower it: a refined frame never has more energy than the network's, and less with every iteration more, until it is
-solved. What inertia looks back on is a choice:
+Each frame minimises the incremental potential of the simulator, implicit Euler on the training energy. Every
+iteration lowers it, so a refined frame never has more energy than the network's. The previous states for inertia are
 
-- without feedback, the network's two frames before. Frames do not depend on what was refined before them: many are
-  refined at once, any stretch of a shot comes out alike by itself, and nothing can build up.
-- with feedback, the refined frames before, one after the other; each starts from the network's state as it is or
-  carrying the last correction, whichever has less energy. With iterations without end this is the simulator.
+- without feedback, the network's two previous frames. Frames do not depend on earlier refinements: many are refined
+at
+  once, any part of a shot can be refined by itself, and errors do not accumulate.
+- with feedback, the two previous refined frames, one frame after the other. Each starts from the network's state, or
+  from that plus the last correction, whichever has less energy. With enough iterations this is the simulator.
 
-The first frame of a shot, and after a cut, is quasi-static with feedback; without, it looks back on itself at rest:
-it alone would be free of inertia otherwise, and the next frame would jump back.
+The first frame of a shot, and after a cut, is quasi-static with feedback. Without feedback its previous states are
+itself at rest: without any inertia the next frame would jump back.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ class RefineOptions:
     """How much a shot is refined.
 
     Attributes:
-        iterations: of Newton's method in each frame, at most; a frame within the tolerance stops earlier.
-        feedback: look back on refined frames instead of the network's.
-        batch: frames refined at once; with feedback it is one.
+        iterations: maximum number of Newton iterations in each frame.
+        feedback: use refined frames as previous states instead of the network's.
+        batch: frames refined at once; one with feedback.
         tolerance: see `SolverOptions`.
     """
 
@@ -63,14 +63,15 @@ class RefineOptions:
 
 
 @dataclass(frozen=True)
-class Change:
-    """What refining did to one frame.
+class FrameChange:
+    """The change of one frame by refinement.
 
     Attributes:
-        before, after: energy of the network's state and of the refined one, with the same past [J].
-        inside_before, inside_after: share of the vertices inside what they meet of the body (`collision.contacts`).
-        moved: RMS distance over the mass [m].
-        residual: RMS acceleration that forces out of balance would give the free mass [g], held vertices included.
+        before, after: energy of the network's state and of the refined one, with the same previous states [J].
+        inside_before, inside_after: share of the vertices inside the part of the body that they can touch
+            (`collision.contacts`).
+        moved: RMS displacement, weighted by mass [m].
+        residual: RMS acceleration of the free mass by the remaining force [g], fixed vertices included.
     """
 
     before: float
@@ -83,16 +84,21 @@ class Change:
 
 @dataclass(frozen=True, eq=False)
 class RefinedFrame:
-    """One frame of a shot: garment vertices in the world [m], float64, shape (V, 3), and what was changed."""
+    """One frame of a shot: garment vertices in world space [m], float64, shape (V, 3), and its change."""
 
     points: Floats
-    change: Change
+    change: FrameChange
 
 
 @dataclass(frozen=True, eq=False)
 class _Tail:
-    """What the next frames look back on: up to two frames of positions in the world (V, 3, 1 or 2), the last root and
-    linearly skinned garment, and how far refining moved the last frame (V, 3, 1)."""
+    """Previous states for the next frames.
+
+    Attributes:
+        world: positions of one or two frames in world space, shape (V, 3, 1 or 2).
+        root, lbs: root and garment under linear blend skinning in the last frame.
+        correction: displacement of the last frame by refinement, shape (V, 3, 1).
+    """
 
     world: Tensor
     root: Tensor
@@ -121,51 +127,51 @@ class Refiner:
 
         Args:
             motion: the character's, at the shot's frames.
-            network: garment vertices of each frame in the world [m], shape (V, 3).
+            network: garment vertices of each frame in world space [m], shape (V, 3).
 
         Raises:
             SsilkError: the motion is at another rate, or a frame is not finite.
         """
         yield from self._spans(motion, iter(network), None)
 
-    def changes(self, motion: Motion, network: Iterable[Floats], refined: Iterable[Floats]) -> Iterator[Change]:
-        """Yield what was changed in each frame of a shot that is refined already; arguments as for `frames`."""
+    def changes(self, motion: Motion, network: Iterable[Floats], refined: Iterable[Floats]) -> Iterator[FrameChange]:
+        """Yield the changes of a shot that has been refined; arguments as for `frames`."""
         for frame in self._spans(motion, iter(network), iter(refined)):
             yield frame.change
 
     @torch.no_grad()
     def _spans(
-        self, motion: Motion, network: Iterator[Floats], given: Iterator[Floats] | None
+        self, motion: Motion, network: Iterator[Floats], refined_points: Iterator[Floats] | None
     ) -> Iterator[RefinedFrame]:
         fps = self.simulator.options.fps
         if not abs(motion.fps - fps) < 1e-6:
             fail(motion.path, f"{motion.fps:g} frames per second", f"{fps:g} is needed")
         for span in split_at_cuts(motion):
-            yield from self._span(span, network, given)
+            yield from self._span(span, network, refined_points)
 
     def _span(
-        self, span: Motion, network: Iterator[Floats], given: Iterator[Floats] | None
+        self, span: Motion, network: Iterator[Floats], refined_points: Iterator[Floats] | None
     ) -> Iterator[RefinedFrame]:
         """Yield the frames of a motion without cuts."""
         tail: _Tail | None = None
         for start, stop in _blocks(span.frame_count, 1 if self.options.feedback else self.options.batch):
-            world = self._taken(network, stop - start)
+            world = self._next_frames(network, stop - start)
             poses = self.simulator.poser.pose(span.rotations[start:stop], span.translations[start:stop])
-            inputs = self.simulator.inputs(poses, self._past(tail, world, poses))
+            inputs = self.simulator.inputs(poses, self._history(tail, world, poses))
             before = State.at(self.potential, self.simulator.apply_pins(world - poses.root, poses), inputs)
-            if given is None:
-                refined = self._refined(before, tail, world, poses, inputs) + poses.root
+            if refined_points is None:
+                refined = self._refine(before, tail, world, poses, inputs) + poses.root
             else:
-                refined = self._taken(given, stop - start)
-            yield from self._reported(before, inputs, refined, poses.root)
+                refined = self._next_frames(refined_points, stop - start)
+            yield from self._describe(before, inputs, refined, poses.root)
             tail = self._tail(tail, world, refined, poses)
 
-    def _taken(self, vertices: Iterator[Floats], count: int) -> Tensor:
+    def _next_frames(self, vertices: Iterator[Floats], count: int) -> Tensor:
         """Return the next frames' positions (V, 3, N)."""
         points = np.stack(list(islice(vertices, count)), axis=-1)
         return torch.as_tensor(points, dtype=torch.float64, device=self.potential.free.device)
 
-    def _refined(
+    def _refine(
         self, before: State, tail: _Tail | None, world: Tensor, poses: PosedCharacters, inputs: StepInputs
     ) -> Tensor:
         """Return refined positions relative to the roots (V, 3, N)."""
@@ -175,8 +181,8 @@ class Refiner:
             start = self.simulator.best_start([start, corrected], inputs)
         return minimise_from(self.potential, start, inputs, self.options.solver).x.double()
 
-    def _past(self, tail: _Tail | None, world: Tensor, poses: PosedCharacters) -> StepHistory | None:
-        """Return what each of some consecutive frames looks back on."""
+    def _history(self, tail: _Tail | None, world: Tensor, poses: PosedCharacters) -> StepHistory | None:
+        """Return the previous states of consecutive frames."""
         if tail is None:
             return None if self.options.feedback else StepHistory(world, None, poses.root, poses.lbs)
         seen, count = torch.cat([tail.world, world[..., :-1]], dim=-1), world.shape[-1]
@@ -185,13 +191,13 @@ class Refiner:
         return StepHistory(seen[..., -count:], before, root, torch.cat([tail.lbs, poses.lbs[..., :-1]], dim=-1))
 
     def _tail(self, tail: _Tail | None, world: Tensor, refined: Tensor, poses: PosedCharacters) -> _Tail:
-        """Return what the frames after these look back on."""
+        """Return the previous states for the frames after these."""
         kept = refined if self.options.feedback else world
         kept = kept if tail is None else torch.cat([tail.world, kept], dim=-1)
         return _Tail(kept[..., -2:], poses.root[:, -1:], poses.lbs[..., -1:], (refined - world)[..., -1:])
 
-    def _reported(self, before: State, inputs: StepInputs, refined: Tensor, root: Tensor) -> Iterator[RefinedFrame]:
-        """Yield frames with what was changed in them."""
+    def _describe(self, before: State, inputs: StepInputs, refined: Tensor, root: Tensor) -> Iterator[RefinedFrame]:
+        """Yield frames with their changes."""
         mass = self.potential.mass
         after = State.at(self.potential, (refined - root).to(before.x.dtype), inputs)
         inside = [
@@ -204,23 +210,23 @@ class Refiner:
         residual = self.potential.residual(self.potential.gradient(after.x, inputs, after.body_distance))
         figures = torch.stack([before.energy, after.energy, *inside, moved, residual], dim=1).tolist()
         for points, values in zip(refined.permute(2, 0, 1).cpu().numpy(), figures):
-            yield RefinedFrame(points, Change(*values))
+            yield RefinedFrame(points, FrameChange(*values))
 
 
 def _blocks(count: int, size: int) -> Iterator[tuple[int, int]]:
-    """Yield the frames refined together: the first two, which have less of a past, each alone."""
+    """Yield the blocks of frames; the first two, which lack previous states, are refined one by one."""
     yield from ((frame, frame + 1) for frame in range(min(2, count)))
     yield from ((start, min(start + size, count)) for start in range(2, count, size))
 
 
 @dataclass
-class Summary:
-    """Means over the refined frames of a shot, gathered as they come."""
+class RefinementMeans:
+    """Means over the refined frames of a shot."""
 
-    changes: list[Change] = field(default_factory=list)
+    changes: list[FrameChange] = field(default_factory=list)
 
     def figures(self) -> dict[str, float]:
-        """Return figures to state: energies [J], shares, distances [m]."""
+        """Return mean energies [J], shares and distances [m]."""
         mean = {
             name: float(np.mean([getattr(each, name) for each in self.changes])) for name in vars(self.changes[0])
         }

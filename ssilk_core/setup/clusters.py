@@ -72,7 +72,7 @@ def find_pieces(mesh: Mesh, loose: Mask) -> list[Ints]:
     return [kept[label == number] for number in np.argsort(-areas, kind="stable")]
 
 
-def share_out(areas: Floats, sizes: Ints, count: int) -> Ints:
+def distribute_proxies(areas: Floats, sizes: Ints, count: int) -> Ints:
     """Share `count` proxies out among pieces, by area.
 
     The first pieces get one each as far as they go, and none gets more than its `sizes` in vertices, shape (N,).

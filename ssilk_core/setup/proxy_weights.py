@@ -9,7 +9,7 @@ from ..assets import Floats, Mesh
 from ..mesh.geodesic import nearest_sources
 from .clusters import Cluster, Mask, Seam
 
-LEAST_SHARE = 1e-3  # of the body's weights on a loose vertex; less is left out, so that its rows stay short
+MIN_BODY_SHARE = 1e-3  # of the body's weights on a loose vertex; less is left out, so that its rows stay short
 
 
 def proxy_weights(
@@ -68,7 +68,7 @@ def seam_share(cluster: Cluster, seam: Seam) -> Floats:
     """
     radius = 2 * cluster.distances[:, cluster.beside].min(axis=0).mean()
     share = np.exp(-((seam.distance[cluster.vertices] / max(radius, 1e-6)) ** 2))
-    return np.where(share < LEAST_SHARE, 0, share)
+    return np.where(share < MIN_BODY_SHARE, 0, share)
 
 
 def _largest(weights: Floats, count: int) -> Floats:

@@ -16,7 +16,7 @@ from ..assets import LOOSE, Character, Floats, Garment, Ints, Mesh, ProxyRig, Sk
 from ..errors import fail
 from ..kinematics import rigid
 from ..mesh.topology import vertex_areas, vertex_normals
-from .clusters import Cluster, Mask, Seam, build_cluster, find_pieces, find_seam, share_out
+from .clusters import Cluster, Mask, Seam, build_cluster, distribute_proxies, find_pieces, find_seam
 from .proxy_weights import proxy_weights
 
 
@@ -107,7 +107,7 @@ def _clusters(
     """Return the clusters that get proxies of their own, the largest first."""
     pieces, areas = find_pieces(mesh, loose), vertex_areas(mesh.points, mesh.faces)
     count = _affordable(len(pieces), options, mesh.path, report)
-    shares = share_out(
+    shares = distribute_proxies(
         np.array([areas[piece].sum() for piece in pieces]), np.array([len(piece) for piece in pieces]), count
     )
     parents, roots = character.skeleton.parents, options.roots_per_cluster

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..assets import Motion
 from ..checkpoint import ModelFile, network
-from ..cost import POINT, ShotBytes, Time, memory, model_bytes, operations, play_time
+from ..cost import POINT_BYTES, ShotBytes, Time, memory, model_bytes, operations, play_time
 from ..evaluation.methods import EvaluationScene, Method, TakeSet
 from ..evaluation.record import recorded
 from ..evaluation.tally import Tally
@@ -52,7 +52,7 @@ class VariantMeter:
         self.name, self.reducer, self.dressed, self.reel, self.weigh = name, reducer, dressed, reel, weigh
         self.whole = Played(name, reducer.player, dressed, reel, fps=dressed.fps)
         self.base = self._tally(self.whole).totals().mean()
-        self._cut = lru_cache(1)(lambda size: reducer.reduced(size).file)
+        self._cut = lru_cache(1)(lambda size: reducer.reduce(size).file)
         self._torch = lru_cache(1)(self._torch_time)
 
     def point(self, variant: Variant) -> TradePoint:
@@ -113,7 +113,7 @@ class VariantMeter:
         shot = self.weigh(cut, variant.fps)
         if not variant.refine:
             return shot
-        return replace(shot, frame=shot.frame + POINT * self.dressed.scene.garment.mesh.vertex_count)
+        return replace(shot, frame=shot.frame + POINT_BYTES * self.dressed.scene.garment.mesh.vertex_count)
 
 
 def _bytes(file: ModelFile, precision: str) -> int:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..checkpoint import ModelFile
-from ..packing import packed, unpacked
+from ..packing import dequantize, quantize
 from ..quality import QUALITIES
 from ..reduction import ModelSize
 
@@ -20,7 +20,7 @@ INFLUENCES, RATES, REFINED = (6, 4, 3, 2, 1), (1 / 2, 1 / 3), (1, 2)
 Array = np.ndarray
 PRECISIONS: dict[str, Callable[[Array], Array]] = {
     "float32": lambda values: values,
-    "int16": lambda values: unpacked(*packed(values)) if values.ndim > 1 else values,
+    "int16": lambda values: dequantize(*quantize(values)) if values.ndim > 1 else values,
     "float16": lambda values: values.astype(np.float16).astype(np.float32),
     "bfloat16": lambda values: _bfloat16(values),
 }

@@ -16,7 +16,7 @@ import torch.distributed as dist
 from torch import Tensor
 
 from ..config import TrainConfig
-from ..devices import chosen_device
+from ..devices import select_device
 from ..errors import SsilkError, fail
 
 BATCH_SETTINGS = ("batch", "pretraining_batch", "static_batch")  # totals over all processes
@@ -140,7 +140,7 @@ def _own_device(name: str, local_rank: int) -> torch.device:
             f"--device {name}", "torchrun gives each process a GPU of its own", "'auto', 'cuda' and 'cpu' are allowed"
         )
     if name == "cpu" or not torch.cuda.is_available():
-        return chosen_device(name)
+        return select_device(name)
     count = torch.cuda.device_count()
     if not local_rank < count:
         fail(

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ..config import TrainConfig
-from ..devices import chosen_device
+from ..devices import select_device
 from ..errors import fail
 from ..events import Checkpoint, Message, Progress, Reporter, Started
 from ..kinematics import split_at_cuts
@@ -68,7 +68,7 @@ class TrainingRun:
                 "its clocks differ",
                 "set the iterations instead (--set iterations=...)",
             )
-        self.job, self.report, self.device, self.group = job, report, chosen_device(job.device), group
+        self.job, self.report, self.device, self.group = job, report, select_device(job.device), group
         self.files, identity = RunFiles(job, self.device, group), {**job.identity(), "processes": group.size}
         self.state, tensors = load_state(self.files.state, identity) if job.resume else (RunState(identity), None)
         self._began -= self.state.seconds

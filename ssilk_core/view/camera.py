@@ -12,7 +12,7 @@ from ..assets import UP, Floats
 
 MARGIN = 1.08  # room around the action
 SMOOTHING = 0.5  # standard deviation of the camera's path [s]: slower than steps, faster than turns
-STILL = 0.4  # a figure that travels less than this share of its size needs no moving camera
+STATIC_CAMERA_TRAVEL = 0.4  # a figure that travels less than this share of its size needs no moving camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +103,7 @@ def _centres(boxes: Floats) -> Floats:
 def _stays(boxes: Floats) -> bool:
     """Return whether a figure travels less than a small part of its size."""
     size = np.median(boxes[:, 1] - boxes[:, 0], axis=0).max()
-    return bool(np.ptp(boxes.mean(axis=1)[:, ::2], axis=0).max() < STILL * size)
+    return bool(np.ptp(boxes.mean(axis=1)[:, ::2], axis=0).max() < STATIC_CAMERA_TRAVEL * size)
 
 
 def _distances(boxes: Floats, targets: Floats, view: Camera, level: Floats, aspect: float) -> Floats:

@@ -11,14 +11,14 @@ from .light import LAMP_RAYS, Lighting, Lit, sky_directions, sky_radiance
 from .surface import linear
 
 BACKDROP, HAZE, FLOOR = linear([0.70, 0.735, 0.775]), linear([0.90, 0.91, 0.92]), linear([0.855, 0.86, 0.868])
-LINE = 0.86  # brightness of grid lines against the floor
+GRID_LINE_BRIGHTNESS = 0.86  # brightness of grid lines against the floor
 SPACING, LINE_WIDTH = 0.5, 0.008  # of the grid [m]
 NEAR, FAR = 0.4, 3.3  # the floor fades into the backdrop between these distances from the target, in view distances
 KEY_SHADE = 0.42  # darkness of the key lamp's shadow
 SKY_SHADE = 0.75  # darkness where the floor sees no sky
 PENUMBRA = 0.15  # how far the key lamp's shadow may spread past its centre [m]
-REACH = 0.7  # how far around the figure the sky's shade is computed [m]
-CELL = 0.06  # its grid [m]
+SKY_SHADE_RADIUS = 0.7  # how far around the figure the sky's shade is computed [m]
+SKY_SHADE_CELL = 0.06  # its grid [m]
 FLOOR_RAYS = 160  # directions over the sphere, of which the floor sees half
 
 
@@ -39,7 +39,7 @@ def stage(lit: Lit, rig: Lighting, camera: Camera, directions: Floats, height: f
     reach = np.float32(np.linalg.norm(camera.target - camera.position))
     haze = np.where(np.isfinite(distance), np.clip((away / reach - NEAR) / (FAR - NEAR), 0, 1), 1)
     haze = haze * (1.5 - 0.5 * haze)
-    lines = 1 - (1 - LINE) * np.maximum(_line_cover(x), _line_cover(z))
+    lines = 1 - (1 - GRID_LINE_BRIGHTNESS) * np.maximum(_line_cover(x), _line_cover(z))
     shade = lines * _sky_shade(lit, x, z, height) * _key_shade(lit, rig, x, z, height)
     upward = np.clip(directions[..., 1] * 3.0 + 0.05, 0, 1)
     sky = upward * upward * (3 - 2 * upward)
@@ -91,13 +91,15 @@ def _blocked_lamps(lit: Lit, lamps: Floats, points: Floats) -> Floats:
 def _sky_shade(lit: Lit, x: Floats, z: Floats, height: float) -> Floats:
     """Return the floor's brightness (H, W) under the sky, computed on a grid around the figure and interpolated."""
     points = lit.geometry.points[:, ::2]
-    low = np.floor((points.min(axis=0) - REACH) / CELL) * CELL
-    count = np.ceil((points.max(axis=0) + REACH - low) / CELL).astype(int) + 1
-    across, along = (low[k] + CELL * np.arange(count[k]) for k in (0, 1))
+    low = np.floor((points.min(axis=0) - SKY_SHADE_RADIUS) / SKY_SHADE_CELL) * SKY_SHADE_CELL
+    count = np.ceil((points.max(axis=0) + SKY_SHADE_RADIUS - low) / SKY_SHADE_CELL).astype(int) + 1
+    across, along = (low[k] + SKY_SHADE_CELL * np.arange(count[k]) for k in (0, 1))
     grid = np.stack(np.meshgrid(across, [height], along, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
     shade = _softened(_sky_share(lit, grid).reshape(count))
-    fade = [np.clip(np.minimum(c - c[0], c[-1] - c) / REACH, 0, 1) for c in (across, along)]
-    return _bilinear(1 - SKY_SHADE * (1 - shade) * np.outer(*fade), (x - low[0]) / CELL, (z - low[1]) / CELL)
+    fade = [np.clip(np.minimum(c - c[0], c[-1] - c) / SKY_SHADE_RADIUS, 0, 1) for c in (across, along)]
+    return _bilinear(
+        1 - SKY_SHADE * (1 - shade) * np.outer(*fade), (x - low[0]) / SKY_SHADE_CELL, (z - low[1]) / SKY_SHADE_CELL
+    )
 
 
 def _sky_share(lit: Lit, points: Floats) -> Floats:

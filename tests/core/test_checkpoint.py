@@ -17,7 +17,7 @@ from safetensors.numpy import load_file, save_file
 from ssilk_core.checkpoint import load_model, model_file, network, save_model
 from ssilk_core.errors import SsilkError
 from ssilk_core.fabrics import FABRICS
-from ssilk_core.packing import STEPS, narrowest
+from ssilk_core.packing import MAX_INTEGER, narrowest
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +104,7 @@ def test_a_packed_model_is_what_it_was_to_16_bits(path, model, tmp_path):
             np.testing.assert_array_equal(found, mine)
         else:
             largest = np.abs(mine).max(axis=tuple(range(1, mine.ndim)), keepdims=True)
-            assert (np.abs(found - mine) <= 0.501 * largest / STEPS + 1e-30).all(), name
+            assert (np.abs(found - mine) <= 0.501 * largest / MAX_INTEGER + 1e-30).all(), name
     for mine, found in ((model.scene.lbs_skin, read.scene.lbs_skin), (model.scene.rig.skin, read.scene.rig.skin)):
         np.testing.assert_array_equal(found.indices, mine.indices)
         np.testing.assert_allclose(found.weights, mine.weights, rtol=0, atol=1e-7)

@@ -12,7 +12,15 @@ from ssilk_core import cost
 from ssilk_core.checkpoint import model_file
 from ssilk_core.errors import SsilkError
 from ssilk_core.fabrics import FABRICS
-from ssilk_core.quality import QUALITIES, Budget, best_within, budget_of, candidates, in_units, quality_named
+from ssilk_core.quality import (
+    QUALITIES,
+    Budget,
+    best_within,
+    candidate_sizes,
+    format_amount,
+    parse_budget,
+    quality_named,
+)
 from ssilk_core.reduction import ModelSize, Reducer
 from ssilk_core.runtime import Player
 
@@ -32,20 +40,20 @@ def packed_bytes(file) -> int:
     [("0.3ms", 0.3, "ms"), ("2MB", 2e6, "bytes"), (" 1.5 kB ", 1500, "bytes"), ("1e-1GB", 1e8, "bytes")],
 )
 def test_budgets_are_read(text, amount, unit):
-    found = budget_of(text)
+    found = parse_budget(text)
     assert (found.amount, found.unit) == (pytest.approx(amount), unit)
 
 
 @pytest.mark.parametrize("text", ["", "3", "ms", "0ms", "-2MB", "2TB", "nanms", "1e999MB", "1.2.3ms", "3 apples"])
 def test_what_is_no_budget_is_refused(text):
     with pytest.raises(SsilkError, match="not a budget; a time for each frame"):
-        budget_of(text)
+        parse_budget(text)
 
 
 def test_amounts_read_well():
-    assert [in_units(*pair) for pair in ((0.31234, "ms"), (1.96e6, "bytes"), (0.5e3, "bytes"), (7e9, "bytes"))] == [
-        *("0.312 ms", "1.96 MB", "0.5 kB", "7 GB")
-    ]
+    assert [
+        format_amount(*pair) for pair in ((0.31234, "ms"), (1.96e6, "bytes"), (0.5e3, "bytes"), (7e9, "bytes"))
+    ] == [*("0.312 ms", "1.96 MB", "0.5 kB", "7 GB")]
 
 
 def test_levels_keep_more_and_more():
@@ -63,15 +71,15 @@ def test_levels_keep_more_and_more():
 
 @pytest.mark.parametrize("share", [1.0, 0.9, 0.6, 0.2, 0.0])
 def test_the_best_within_a_budget_is_chosen(reducer, share):
-    sizes = candidates(reducer.whole)
-    costs = {size: packed_bytes(reducer.reduced(size).file) for size in sizes}
+    sizes = candidate_sizes(reducer.whole)
+    costs = {size: packed_bytes(reducer.reduce(size).file) for size in sizes}
     low, high = min(costs.values()), max(costs.values())
     budget = Budget(low + share * (high - low), "bytes")
     choice = best_within(reducer, budget, packed_bytes, reducer.whole)
     fitting = [size for size in sizes if costs[size] <= budget.amount]
     assert choice.cost == costs[choice.reduced.size] <= budget.amount
-    least = min(reducer.predicted(size) for size in fitting)
-    assert reducer.predicted(choice.reduced.size) == pytest.approx(least)
+    least = min(reducer.predict_error(size) for size in fitting)
+    assert reducer.predict_error(choice.reduced.size) == pytest.approx(least)
 
 
 def test_nothing_more_is_kept_than_may_be(reducer):
@@ -86,13 +94,13 @@ def test_a_budget_for_nothing_is_refused_in_one_sentence(reducer):
 
 
 def test_what_is_predicted_is_about_what_is_lost(reducer):
-    for size in candidates(reducer.whole)[1:]:
-        found = reducer.reduced(size)
-        assert reducer.predicted(size) == pytest.approx(found.rms, rel=0.3)
+    for size in candidate_sizes(reducer.whole)[1:]:
+        found = reducer.reduce(size)
+        assert reducer.predict_error(size) == pytest.approx(found.rms, rel=0.3)
 
 
 def test_operations_are_those_of_the_matrix_products(reducer):
-    file = reducer.reduced(ModelSize(shapes=3, joints=1, influences=1)).file
+    file = reducer.reduce(ModelSize(shapes=3, joints=1, influences=1)).file
     found, free = cost.operations(file), int((file.scene.classes != 0).sum())
     static = 12 + 9  # two joints' rotations, and gravity in three frames
     assert found["P"] == static * 16 + 16 * 8
@@ -103,7 +111,7 @@ def test_operations_are_those_of_the_matrix_products(reducer):
 
 def test_memory_falls_with_what_is_kept(reducer):
     sizes = [reducer.whole, ModelSize(shapes=4, joints=2, influences=2), ModelSize(shapes=0, joints=0, influences=1)]
-    players = [Player(reducer.reduced(size).file) for size in sizes]
+    players = [Player(reducer.reduce(size).file) for size in sizes]
     found = [cost.memory(player) for player in players]
     assert found == sorted(found, reverse=True)
     vertices = players[0].file.scene.garment.mesh.vertex_count

@@ -15,8 +15,8 @@ from ssilk_core.errors import SsilkError
 from ssilk_core.fabrics import FABRICS
 from ssilk_core.kinematics import deform
 from ssilk_core.reduction import ModelSize, Reducer
-from ssilk_core.reduction.influences import InfluenceCandidates, fitted, measured
-from ssilk_core.reduction.joints import candidates, least_missed
+from ssilk_core.reduction.influences import InfluenceCandidates, fit_weights, measure_costs
+from ssilk_core.reduction.joints import candidate_joints, removal_order
 from ssilk_core.reduction.shapes import basis, modes
 from ssilk_core.rollout import decode, garment_poses
 from ssilk_core.runtime import Player
@@ -63,7 +63,7 @@ def test_shapes_lose_what_eckart_and_young_say_is_least(linear, activations, mas
     singular = np.linalg.svd(centred.reshape(-1, FRAMES) / np.sqrt(FRAMES), compute_uv=False)
     least = np.sqrt((singular[count:] ** 2).sum())
     smaller = basis(found, count, np.eye(GIVEN))
-    assert found.lost(count) == pytest.approx(least, abs=1e-7)
+    assert found.error(count) == pytest.approx(least, abs=1e-7)
     assert weighted_rms(wanted - rebuilt(smaller, activations), mass) == pytest.approx(least, abs=1e-7)
 
 
@@ -82,7 +82,7 @@ def test_no_other_linear_function_of_the_rank_follows_better(linear, activations
         fields = goal @ np.linalg.pinv(reading @ centred)
         reading = np.linalg.pinv(fields) @ goal @ np.linalg.pinv(centred)
     left = np.sqrt(((goal - fields @ reading @ centred) ** 2).sum(0).mean())
-    assert found.lost(2) == pytest.approx(left, rel=1e-6)
+    assert found.error(2) == pytest.approx(left, rel=1e-6)
     smaller = basis(found, 2, np.eye(GIVEN))
     assert weighted_rms(wanted - rebuilt(smaller, activations), mass) == pytest.approx(left, rel=1e-6)
 
@@ -94,7 +94,7 @@ def test_what_is_missed_is_known_however_carefully_it_is_learnt(linear, activati
     found = modes(linear, more, activations, mass)
     for count in range(GIVEN + 1):
         error = linear @ activations + more - rebuilt(basis(found, count, np.eye(GIVEN)), activations)
-        assert found.lost(count) == pytest.approx(weighted_rms(error, mass), rel=1e-6)
+        assert found.error(count) == pytest.approx(weighted_rms(error, mass), rel=1e-6)
 
 
 def test_activations_stay_in_their_range_whatever_the_network_gives(linear, activations, mass):
@@ -107,7 +107,7 @@ def test_activations_that_never_vary_are_no_trouble(linear, activations, mass):
     still = np.repeat(activations[:, :1], FRAMES, axis=1)
     more = np.repeat(dice(7).normal(size=(VERTICES, 3, 1)), FRAMES, axis=2)
     found = modes(linear, more, still, mass)
-    assert found.lost(0) == pytest.approx(0, abs=1e-7)
+    assert found.error(0) == pytest.approx(0, abs=1e-7)
     every = basis(found, GIVEN, np.eye(GIVEN))
     np.testing.assert_allclose(rebuilt(every, still), linear @ still + more, atol=1e-9)
 
@@ -135,11 +135,11 @@ def best_by_search(cost: np.ndarray, most: int) -> float:
 @pytest.mark.parametrize(("most", "worse"), [(5, 1e-6), (4, 1e-5), (3, 0.15), (1, 0.15)])
 def test_weights_are_the_best_of_their_number_or_nearly(most, worse):
     influences = random_influences()
-    weights = fitted(influences, np.ones((40, 5), dtype=bool), most)
+    weights = fit_weights(influences, np.ones((40, 5), dtype=bool), most)
     assert (weights >= 0).all() and ((weights > 0).sum(axis=1) <= most).all()
     np.testing.assert_allclose(weights.sum(axis=1), 1)
     least = np.array([best_by_search(cost, most) for cost in influences.costs])
-    lost = influences.lost(weights)
+    lost = influences.error(weights)
     assert (lost >= least - 1e-8).all()
     assert lost.sum() ** 0.5 <= (1 + worse) * least.sum() ** 0.5 + 1e-3
     if most == 5:
@@ -149,7 +149,7 @@ def test_weights_are_the_best_of_their_number_or_nearly(most, worse):
 def test_what_weights_cost_is_how_far_vertices_move():
     matrices, points = dice(10).normal(size=(4, 3, 4, 9)), dice(11).normal(size=(2, 3, 9))
     joints, weights = np.array([[0, 2, 3], [1, 3, 0]]), dice(12).dirichlet(np.ones(3), 2)
-    influences = measured(joints, weights, matrices, points)
+    influences = measure_costs(joints, weights, matrices, points)
     other = dice(13).dirichlet(np.ones(3), 2)
 
     def skinned(weights: np.ndarray) -> np.ndarray:
@@ -157,22 +157,22 @@ def test_what_weights_cost_is_how_far_vertices_move():
         return np.einsum("vc,vcabf,vbf->vaf", weights, matrices[joints], whole)
 
     expected = ((skinned(other) - skinned(weights)) ** 2).sum(1).mean(1)
-    np.testing.assert_allclose(influences.lost(other), expected)
+    np.testing.assert_allclose(influences.error(other), expected)
 
 
 def test_candidates_are_the_joints_that_move_a_vertex_and_those_below(scene):
     weights = np.zeros((3, 5))
     weights[0, 4] = weights[1, 2] = 1
     weights[2, [0, 3]] = 0.5
-    found = [set(row[row >= 0]) for row in candidates(scene, weights)]
+    found = [set(row[row >= 0]) for row in candidate_joints(scene, weights)]
     assert found == [{1, 3, 4}, {2}, {0, 1, 3}]  # proxy 4 hangs from proxy 3, and that from joint 1
 
 
 def test_only_ends_of_chains_are_taken_off(scene, toy_scene):
     joints = np.tile([1, 3, 4], (2, 1))
     useless_root = InfluenceCandidates(joints, np.tile([0.0, 0, 1], (2, 1)), np.tile(np.diag([9.0, 1, 0]), (2, 1, 1)))
-    assert least_missed(scene, useless_root, np.ones(2)) == [4, 3]
-    assert least_missed(toy_scene(shuffled=True), useless_root, np.ones(2)) == [3, 4]
+    assert removal_order(scene, useless_root, np.ones(2)) == [4, 3]
+    assert removal_order(toy_scene(shuffled=True), useless_root, np.ones(2)) == [3, 4]
 
 
 @pytest.fixture(scope="module")
@@ -206,13 +206,13 @@ SIZES = [
 
 def test_a_model_that_keeps_all_is_the_whole_one(reducer, file):
     assert reducer.whole == WHOLE
-    found = reducer.reduced(ModelSize(shapes=99, joints=99, influences=99))
+    found = reducer.reduce(ModelSize(shapes=99, joints=99, influences=99))
     assert found.file is file and found.size == WHOLE and found.rms == found.largest == 0
 
 
 @pytest.mark.parametrize("size", SIZES, ids=str)
 def test_what_a_model_says_it_loses_is_what_it_loses_in_play(reducer, file, motion, size):
-    found = reducer.reduced(size)
+    found = reducer.reduce(size)
     away = np.linalg.norm(vertices(found.file, motion) - vertices(file, motion), axis=2)
     assert found.rms == pytest.approx(np.sqrt((away**2 @ reducer.mass).mean()), rel=1e-3)
     assert found.largest == pytest.approx(away.max(), rel=1e-3)
@@ -222,7 +222,7 @@ def test_what_a_model_says_it_loses_is_what_it_loses_in_play(reducer, file, moti
 
 @pytest.mark.parametrize("size", SIZES, ids=str)
 def test_files_networks_and_shots_of_it_agree(reducer, motion, size, tmp_path):
-    found = reducer.reduced(size).file
+    found = reducer.reduce(size).file
     save_model(tmp_path / "small.safetensors", found)
     read = load_model(tmp_path / "small.safetensors")
     model, expected = network(read), vertices(found, motion)
@@ -240,26 +240,26 @@ def test_blendshapes_predict_what_they_miss_before_skinning(file, motion):
     free = file.scene.classes != 0
     reducer = Reducer(file, [motion])
     for count in range(6):
-        found = reducer.reduced(replace(WHOLE, shapes=count))
+        found = reducer.reduce(replace(WHOLE, shapes=count))
         small, whole = Player(found.file), reducer.player
-        given = [reducer.seen.decoded(player)[0] for player in (small, whole)]
+        given = [reducer.seen.decode(player)[0] for player in (small, whole)]
         shapes = [player.file.parameters["decoder.shapes"] @ each for player, each in zip((small, whole), given)]
         error = shapes[0] + found.file.parameters["decoder.offset"][:, :, None] - shapes[1]
-        assert reducer.predicted(found.size) == pytest.approx(
+        assert reducer.predict_error(found.size) == pytest.approx(
             weighted_rms(error, reducer.mass[free]), rel=1e-3, abs=1e-6
         )
 
 
 def test_blendshapes_make_up_for_joints_as_far_as_they_can(reducer):
-    lost = [reducer.reduced(ModelSize(shapes=count, joints=1, influences=2)).rms for count in (0, 2, 6)]
+    lost = [reducer.reduce(ModelSize(shapes=count, joints=1, influences=2)).rms for count in (0, 2, 6)]
     assert lost[0] > 1.05 * lost[1] > 1.05**2 * lost[2] > 0
 
 
 def test_a_smaller_model_can_be_cut_again(reducer, motion):
-    once = reducer.reduced(ModelSize(shapes=4, joints=1, influences=2)).file
-    twice = Reducer(once, [motion]).reduced(ModelSize(shapes=2, joints=1, influences=2)).file
+    once = reducer.reduce(ModelSize(shapes=4, joints=1, influences=2)).file
+    twice = Reducer(once, [motion]).reduce(ModelSize(shapes=2, joints=1, influences=2)).file
     assert twice.config.shapes == 2 and twice.config.activation_count == 6
-    at_once = reducer.reduced(ModelSize(shapes=2, joints=1, influences=2)).file
+    at_once = reducer.reduce(ModelSize(shapes=2, joints=1, influences=2)).file
     np.testing.assert_allclose(vertices(twice, motion), vertices(at_once, motion), atol=2e-3)
 
 
@@ -267,7 +267,7 @@ def test_garments_without_shapes_or_proxies_are_cut_too(toy_scene, toy_model, mo
     for options, proxies in (({"shapes": 0}, 2), ({"shapes": 6}, 0)):
         scene = toy_scene(proxies=proxies)
         file = model_file(toy_model(scene, scale=0.1, **options).eval(), FABRICS["silk"], {})
-        found = Reducer(file, [motion]).reduced(ModelSize(shapes=3, joints=1, influences=1))
+        found = Reducer(file, [motion]).reduce(ModelSize(shapes=3, joints=1, influences=1))
         away = np.linalg.norm(vertices(found.file, motion) - vertices(file, motion), axis=2)
         assert 0 < away.max() == pytest.approx(found.largest, rel=1e-3)
 

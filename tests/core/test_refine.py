@@ -12,7 +12,7 @@ import pytest
 from ssilk_core.assets import PINNED
 from ssilk_core.errors import SsilkError
 from ssilk_core.fabrics import Fabric
-from ssilk_core.refine import RefineOptions, Refiner, Summary
+from ssilk_core.refine import RefinementMeans, RefineOptions, Refiner
 from ssilk_core.rollout import decode, garment_poses
 from ssilk_core.simulate import SimulationOptions, quasi_static_states, simulate
 from ssilk_core.simulate.newton import SolverOptions
@@ -47,7 +47,7 @@ def test_no_frame_gains_energy_with_more_iterations(scene, rollout) -> None:
 
 def test_vertices_come_out_of_the_body(scene, rollout) -> None:
     _, changes = refined(scene, *rollout, iterations=8)
-    summary = Summary(changes).figures()
+    summary = RefinementMeans(changes).figures()
     assert summary["inside the body before"] > 0.01 and summary["inside the body"] < 0.002
     assert summary["energy [J]"] < summary["energy before [J]"]
 

@@ -11,7 +11,7 @@ import pytest
 from ssilk_core.assets import GarmentPose
 from ssilk_core.errors import SsilkError
 from ssilk_core.kinematics import deform
-from ssilk_core.refine.fit import Refitter, _Search
+from ssilk_core.refine.fit import PoseFitter, _Search
 from ssilk_core.rollout import garment_poses
 
 FRAMES = 5
@@ -42,7 +42,7 @@ def test_vertices_of_a_pose_are_found_again(played, mass):
     deformer, motion, pose = played
     wanted = deform(deformer, motion, pose)
     start = disturbed(pose, 0.2)
-    (fit,) = Refitter(deformer, mass).fit(motion, [start], wanted)
+    (fit,) = PoseFitter(deformer, mass).fit(motion, [start], wanted)
     found = deform(deformer, motion, fit.pose)
     before = np.linalg.norm(deform(deformer, motion, start) - wanted, axis=-1)
     after = np.linalg.norm(found - wanted, axis=-1)
@@ -53,7 +53,7 @@ def test_vertices_of_a_pose_are_found_again(played, mass):
 
 def test_the_jacobian_is_that_of_differences(played, mass):
     deformer, motion, pose = played
-    fitter = Refitter(deformer, mass)
+    fitter = PoseFitter(deformer, mass)
     wanted = fitter._tensor(deform(deformer, motion, pose)[:, fitter.free])
     search = _Search(fitter, motion, disturbed(pose, 0.05), wanted)
     jacobian, base = search._jacobian().numpy(), search.posed.away.numpy()
@@ -72,12 +72,12 @@ def test_no_frame_ends_further_off_and_weights_stay_in_their_range(played, mass)
     rng = np.random.default_rng(3)
     out_of_reach = deform(deformer, motion, pose) + 0.03 * rng.standard_normal((FRAMES, len(mass), 3))
     out_of_reach[:, deformer.scene.classes == 0] = deform(deformer, motion, pose)[:, deformer.scene.classes == 0]
-    (fit,) = Refitter(deformer, mass).fit(motion, [pose], out_of_reach)
+    (fit,) = PoseFitter(deformer, mass).fit(motion, [pose], out_of_reach)
     away = np.linalg.norm(deform(deformer, motion, pose) - out_of_reach, axis=-1)
     assert (fit.rms < np.sqrt(away**2 @ mass / mass.sum())).all()
     assert fit.pose.weights.min() >= 0 and fit.pose.weights.max() <= 1 and (fit.pose.weights[:, -1] == 1).all()
     # No small change of any rotation or weight brings it nearer.
-    fitter = Refitter(deformer, mass)
+    fitter = PoseFitter(deformer, mass)
     search = _Search(fitter, motion, fit.pose, fitter._tensor(out_of_reach[:, fitter.free]))
     for column in range(search._jacobian().shape[-1]):
         for sign in (-1, 1):
@@ -91,8 +91,8 @@ def test_a_character_far_away_is_fitted_as_well(played, mass):
     moved = motion.translations.copy()
     moved[:, 0] += [3000.0, 0, -2000.0]
     far = replace(motion, translations=moved)
-    (near,) = Refitter(deformer, mass).fit(motion, [disturbed(pose, 0.1)], deform(deformer, motion, pose))
-    (away,) = Refitter(deformer, mass).fit(far, [disturbed(pose, 0.1)], deform(deformer, far, pose))
+    (near,) = PoseFitter(deformer, mass).fit(motion, [disturbed(pose, 0.1)], deform(deformer, motion, pose))
+    (away,) = PoseFitter(deformer, mass).fit(far, [disturbed(pose, 0.1)], deform(deformer, far, pose))
     np.testing.assert_allclose(away.rms, near.rms, atol=1e-6)
 
 
@@ -101,4 +101,4 @@ def test_vertices_that_are_not_finite_are_refused(played, mass):
     wanted = deform(deformer, motion, pose)
     wanted[2, 1] = np.nan
     with pytest.raises(SsilkError, match="frames 0 to 4: NaN or infinity among the vertices"):
-        next(Refitter(deformer, mass).fit(motion, [pose], wanted))
+        next(PoseFitter(deformer, mass).fit(motion, [pose], wanted))

@@ -9,7 +9,7 @@ from ssilk_core import events, kinematics
 from ssilk_core.assets import LOOSE, PINNED, TIGHT, Body, Character, Garment, Mesh, Scene, Skeleton, SkinWeights
 from ssilk_core.errors import SsilkError
 from ssilk_core.mesh.topology import edges
-from ssilk_core.setup.clusters import carrying_joint, share_out
+from ssilk_core.setup.clusters import carrying_joint, distribute_proxies
 from ssilk_core.setup.proxy_weights import falloff
 from ssilk_core.setup.rig import RigOptions, build_rig
 
@@ -243,9 +243,9 @@ def test_carrying_joint_is_the_deepest_with_most_of_the_weight(weights, expected
 
 
 def test_shares_follow_area_but_leave_none_out():
-    assert share_out(np.array([6.0, 3.0, 0.1]), np.array([99, 99, 99]), 10).tolist() == [6, 3, 1]
-    assert share_out(np.array([6.0, 3.0, 0.1]), np.array([2, 2, 2]), 10).tolist() == [2, 2, 2]
-    assert share_out(np.array([6.0, 3.0, 0.1]), np.array([9, 9, 9]), 2).tolist() == [1, 1, 0]
+    assert distribute_proxies(np.array([6.0, 3.0, 0.1]), np.array([99, 99, 99]), 10).tolist() == [6, 3, 1]
+    assert distribute_proxies(np.array([6.0, 3.0, 0.1]), np.array([2, 2, 2]), 10).tolist() == [2, 2, 2]
+    assert distribute_proxies(np.array([6.0, 3.0, 0.1]), np.array([9, 9, 9]), 2).tolist() == [1, 1, 0]
 
 
 def test_falloff_is_continuous_where_the_choice_of_proxies_changes():

@@ -124,7 +124,7 @@ def test_taut_cloth_in_a_fold_comes_to_rest_on_the_crease(scene: Scene) -> None:
     potential, x, inputs = in_the_fold(scene)
     pressed = replace(inputs, predicted=x - torch.tensor([0, 0, 0.005]).double()[:, None])
     found = minimise_from(potential, x, pressed, SolverOptions(tolerance=1e-3))
-    assert (found.residual <= 1e-3).all() and not found.held.any()
+    assert (found.residual <= 1e-3).all() and not found.fixed.any()
 
 
 def test_the_membrane_has_the_hessian_of_autograd_where_it_is_stretched(scene: Scene) -> None:
@@ -235,11 +235,11 @@ def test_under_compression_the_whole_hessian_gives_finite_steps(
     potential: IncrementalPotential, scene: Scene
 ) -> None:
     x, inputs = moving(scene, 3)
-    squeezed, held = 0.3 * x, torch.zeros_like(x[:, 0], dtype=torch.bool)
-    held[potential.free[::5]] = True
+    squeezed, fixed = 0.3 * x, torch.zeros_like(x[:, 0], dtype=torch.bool)
+    fixed[potential.free[::5]] = True
     state = State.at(potential, squeezed, inputs)
     gradient = potential.gradient(squeezed, inputs, state.body_distance)
-    step, _ = newton_step(potential, state, inputs, gradient, 50, held, torch.tensor([True, True, False]))
+    step, _ = newton_step(potential, state, inputs, gradient, 50, fixed, torch.tensor([True, True, False]))
     assert step.isfinite().all() and step[potential.free[::5]].abs().max() == 0
     assert (step[..., 2] * gradient[..., 2]).sum() < 0
 
@@ -376,12 +376,12 @@ def test_a_vertex_on_a_crease_does_not_keep_the_others_from_coming_to_rest(
     options = SolverOptions(tolerance=1e-3)
     found = minimise_from(potential, x, inputs, options)
     assert (found.residual <= 1e-3).all()
-    monkeypatch.setattr(newton, "SPOILING", torch.inf)
+    monkeypatch.setattr(newton, "OBSTRUCTING", torch.inf)
     stuck = minimise_from(potential, x, inputs, options)
     assert (stuck.residual[0] > 1) and found.energy[0] <= stuck.energy[0]
 
 
-def test_held_vertices_are_let_go_once_when_the_rest_is_in_balance(
+def test_fixed_vertices_are_released_once_when_the_others_have_converged(
     potential: IncrementalPotential, scene: Scene
 ) -> None:
     x, inputs = moving(scene, 2)
@@ -389,13 +389,13 @@ def test_held_vertices_are_let_go_once_when_the_rest_is_in_balance(
     vertex = int(potential.free[-1])
     start[vertex, 1] += 2e-3
     search = newton._Search(potential, start, inputs, SolverOptions(tolerance=1e9))
-    search.held[vertex] = torch.tensor([True, False])
-    assert not search.narrowed() and not search.held.any() and search.released.tolist() == [True, False]
-    assert torch.equal(search.solution.residual, search.residual) and not search.solution.held.any()
-    assert (search.residual > 0.1).all()  # what was held counts again
-    search.held[vertex] = True
-    search.narrowed()
-    assert search.held[vertex].tolist() == [True, False]
+    search.fixed[vertex] = torch.tensor([True, False])
+    assert not search.drop_finished() and not search.fixed.any() and search.released.tolist() == [True, False]
+    assert torch.equal(search.solution.residual, search.residual) and not search.solution.fixed.any()
+    assert (search.residual > 0.1).all()  # vertices that were fixed count again
+    search.fixed[vertex] = True
+    search.drop_finished()
+    assert search.fixed[vertex].tolist() == [True, False]
 
 
 def test_a_frame_that_the_whole_hessian_misleads_goes_on_without_it(
@@ -404,10 +404,10 @@ def test_a_frame_that_the_whole_hessian_misleads_goes_on_without_it(
     x, inputs = moving(scene, 2)
     asked = []
 
-    def misleading(potential, state, inputs, gradient, inner, held=None, whole=None):
-        step, count = newton_step(potential, state, inputs, gradient, inner, held)
-        asked.append(whole)
-        return torch.where(whole, 0.0, step), count  # as where the first direction already curves down
+    def misleading(potential, state, inputs, gradient, cg_iterations, fixed=None, exact_hessian=None):
+        step, count = newton_step(potential, state, inputs, gradient, cg_iterations, fixed)
+        asked.append(exact_hessian)
+        return torch.where(exact_hessian, 0.0, step), count  # as where the first direction already curves down
 
     monkeypatch.setattr(newton, "newton_step", misleading)
     found = minimise_from(potential, x, inputs, SolverOptions(tolerance=1e-3))

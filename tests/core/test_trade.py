@@ -107,7 +107,7 @@ def test_the_whole_model_is_what_the_network_in_pytorch_is(meter, bench, model, 
 
 def test_errors_are_distances_and_speeds_from_the_whole_model(meter, bench, points):
     reducer, dressed, reel = bench
-    small = Player(reducer.reduced(ModelSize(shapes=2, joints=2, influences=2)).file)
+    small = Player(reducer.reduce(ModelSize(shapes=2, joints=2, influences=2)).file)
     mass, squares, speeds = dressed.energy.mass.numpy(), [], []
     for take in reel.takes:
         played = [player.play(take.motion) for player in (small, reducer.player)]

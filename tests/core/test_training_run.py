@@ -16,7 +16,7 @@ from safetensors import safe_open
 
 from ssilk_core.checkpoint import load_model
 from ssilk_core.config import ModelConfig, TrainConfig
-from ssilk_core.devices import chosen_device
+from ssilk_core.devices import select_device
 from ssilk_core.errors import SsilkError
 from ssilk_core.events import Checkpoint, Event, Message, Progress, Started, silent
 from ssilk_core.fabrics import Fabric
@@ -585,11 +585,11 @@ def test_motions_are_split_four_to_one(scene, toy_motion):
 
 
 def test_devices_are_chosen_or_refused():
-    assert chosen_device("cpu").type == "cpu"
-    assert chosen_device("auto").type == ("cuda" if torch.cuda.is_available() else "cpu")
+    assert select_device("cpu").type == "cpu"
+    assert select_device("auto").type == ("cuda" if torch.cuda.is_available() else "cpu")
     for name in ("warp", "cuda:99"):
         with pytest.raises(SsilkError, match=rf"--device {name}: no such device here"):
-            chosen_device(name)
+            select_device(name)
 
 
 def test_step_sizes_warm_up_and_decay_in_each_phase():

@@ -12,7 +12,7 @@ import re
 import pytest
 
 from benchmarks.helpers.paper_schemes import PAPER_SCHEMES
-from ssilk_core.config import ModelConfig, TrainConfig, overridden
+from ssilk_core.config import ModelConfig, TrainConfig, apply_overrides
 from ssilk_core.fabrics import Fabric
 from ssilk_core.schemes import SCHEMES
 from tests.documents import measured
@@ -154,4 +154,4 @@ def test_settings_exist_and_take_these_values(document, monkeypatch):
         )
         assert config is not None, f"{document}: no setting '{assignment}'"
         if not isinstance(config, Fabric):
-            overridden(config, [assignment])
+            apply_overrides(config, [assignment])

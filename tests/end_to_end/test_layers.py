@@ -23,7 +23,7 @@ from ssilk_core.checkpoint import load_model
 from ssilk_core.cli import main
 from ssilk_core.files import sha256
 from ssilk_core.kinematics import deform
-from ssilk_core.targets import TARGETS, Target, capped
+from ssilk_core.targets import TARGETS, Target, cap_influences
 
 SHOT_FILES = ("anim.usdc", "points.usdc", "bake.json")
 GARMENT, BAKE = "skirt", "bake skirt.safetensors --stage rigged.usda"
@@ -235,7 +235,7 @@ def test_targets_get_what_they_take_and_their_error_is_measured(copy, capsys, mo
 def test_four_influences_are_learned_and_not_just_the_heaviest(copy, capsys):
     _, *events = said(capsys, "--motion walk.usda --target game4 -o new.usdc")
     whole = load_rollout(BakeRequest(model="skirt.safetensors", stage="rigged.usda", motion="walk.usda"))
-    heaviest = capped(whole.deformer, TARGETS["game4"])
+    heaviest = cap_influences(whole.deformer, TARGETS["game4"])
     (pose,) = whole.poses()
     away = deform(heaviest, whole.motion, pose) - deform(whole.deformer, whole.motion, pose)
     assert events[-1]["detail"]["loses at most [mm]"] < 0.2 * 1000 * np.linalg.norm(away, axis=-1).max()
