@@ -310,10 +310,10 @@ def refinement() -> Text:
     assert frames
     yield f"of {frames[1]} frames of one"
     columns = {"seconds": two_digits, "energy": partial(fixed, places=3), "inside": share_3, "moved": milli_1}
-    past = {"network": "network", "refined": "refined frame"}
+    previous = {"network": "network", "refined": "refined"}
     for key, found in clip.items():
         count, _, name = key.partition(" ")
-        yield row(count, past.get(name, ""), *fields(found, columns))
+        yield row(count, previous.get(name, ""), *fields(found, columns))
 
 
 def inside_the_body() -> Text:

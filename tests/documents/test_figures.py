@@ -8,10 +8,12 @@ of the results must stand in the document, word for word; what is left must be o
 from __future__ import annotations
 
 import re
+import shlex
 
 import pytest
 
 from benchmarks.helpers.paper_schemes import PAPER_SCHEMES
+from ssilk_core.cli import parser
 from ssilk_core.config import ModelConfig, TrainConfig, overridden
 from ssilk_core.fabrics import Fabric
 from ssilk_core.schemes import SCHEMES
@@ -157,3 +159,12 @@ def test_settings_exist_and_take_these_values(document, monkeypatch):
         assert config is not None, f"{document}: no setting '{assignment}'"
         if not isinstance(config, Fabric):
             overridden(config, [assignment])
+
+
+def test_commands_are_those_of_the_command_line():
+    blocks = "".join("".join(re.findall(r"```sh\n(.*?)```", (ROOT / name).read_text(), re.DOTALL)) for name in QUOTED)
+    commands = [shlex.split(line, comments=True) for line in blocks.replace("\\\n", " ").splitlines()]
+    ours = [words for words in commands if words[:1] == ["ssilk"] and "..." not in words]
+    assert ours
+    for words in ours:
+        parser().parse_args(words[1:])
