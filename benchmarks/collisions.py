@@ -125,13 +125,13 @@ def row(garment: str, how: str, found: dict[str, Any]) -> list[str]:
 def measure(subject: Subject, options: Any) -> dict[str, Any]:
     """Return the figures at rest, under the model and under linear blend skinning."""
     rest = rest_distances(subject)
-    counts = {how: Count(subject, rest) for how in ("at rest", "model", "plain")}
+    counts = {how: Count(subject, rest) for how in ("at rest", "model", "LBS")}
     bind = torch.eye(3, 4).expand(subject.scene.character.skeleton.joint_count, 3, 4)[..., None]
     counts["at rest"].add(subject.model.decoder.rest[..., None], bind)
     for clip in options.clips:
         for character, x, lbs in poses(subject, clip_of(options, clip, subject), options.step):
             counts["model"].add(x, character)
-            counts["plain"].add(lbs, character)
+            counts["LBS"].add(lbs, character)
     found = {how: count.figures() for how, count in counts.items()}
     quantiles = [float(np.quantile(rest, q)) for q in (0, 0.05, 0.5)]
     closer = float(np.mean(rest < subject.file.fabric.margin))
@@ -147,7 +147,7 @@ def main() -> None:
     for path in options.models:
         subject = open_subject(path, options.stage, options.device)
         measured[subject.name] = found = measure(subject, options)
-        rows += [row(subject.name, how, found[how]) for how in ("at rest", "model", "plain")]
+        rows += [row(subject.name, how, found[how]) for how in ("at rest", "model", "LBS")]
         least, low, middle = (1000 * value for value in found["clearance"])
         notes += (
             f"\n- {subject.name} at rest: clearance {least:.1f} mm at least, {low:.1f} mm at 5 %, {middle:.1f} mm in "

@@ -20,7 +20,7 @@ from ssilk_core.devices import device_name, select_device
 from ssilk_core.files import replacing
 
 RESULTS = Path(__file__).parents[1] / "results"
-WIDTH = 110  # of a line in a result file
+WIDTH = 110  # of a line in a result file, but for rows and lists of numbers
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
@@ -58,16 +58,26 @@ def rounded(value: Any) -> Any:
 
 
 def indented(value: Any, depth: int = 1) -> str:
-    """Return JSON in which what fits into a line stands on one."""
+    """Return JSON with a line for what fits into one, for each list of numbers, and for each row of a list."""
     flat = json.dumps(value)
-    if len(flat) <= WIDTH or not isinstance(value, (dict, list)):
+    if len(flat) <= WIDTH or (_levels(value) < 2 and not isinstance(value, dict)):
         return flat
-    named = isinstance(value, dict)
-    items = value.items() if isinstance(value, dict) else (("", item) for item in value)
-    lines = [(f"{json.dumps(str(name))}: " if named else "") + indented(item, depth + 1) for name, item in items]
+    if isinstance(value, dict):
+        lines, ends = [f"{json.dumps(str(name))}: {indented(item, depth + 1)}" for name, item in value.items()], "{}"
+    else:
+        lines = [json.dumps(item) if _levels(item) <= 2 else indented(item, depth + 1) for item in value]
+        ends = "[]"
     within = ",\n".join(" " * depth + line for line in lines)
-    return f"{'{' if named else '['}\n{within}\n{' ' * (depth - 1)}{'}' if named else ']'}"
+    return f"{ends[0]}\n{within}\n{' ' * (depth - 1)}{ends[1]}"
+
+
+def _levels(value: Any) -> int:
+    """Return how deep lists and objects are nested; 0 for a number or text."""
+    parts = value.values() if isinstance(value, dict) else value if isinstance(value, list) else None
+    return 0 if parts is None else 1 + max(map(_levels, parts), default=0)
 
 
 def _hardware(options: argparse.Namespace) -> str:
-    return f"{device_name(select_device(options.device))}, {options.threads} of {os.cpu_count()} cores"
+    """Return the device, the cores and how busy they were in the last quarter of an hour."""
+    device, load = device_name(select_device(options.device)), os.getloadavg()[2]
+    return f"{device}, {options.threads} of {os.cpu_count()} cores, load {load:.1f}"

@@ -18,7 +18,7 @@ def version(name):
 def device():
     """Return the name of the device that ssilk would train on, or None without PyTorch."""
     try:
-        from ssilk_core.devices import select_device, device_name
+        from ssilk_core.devices import device_name, select_device
 
         return device_name(select_device("auto"))
     except ImportError:

@@ -88,7 +88,7 @@ def _trained(options: argparse.Namespace) -> list[list[str]]:
 
 def _shots(options: argparse.Namespace) -> dict[str, str]:
     """Return the shots by the captions of their panels, in the order of the film."""
-    files = {"linear blend skinning": "plain", PRESET: f"{options.garment}_{PRESET}"}
+    files = {"linear blend skinning": "lbs", PRESET: f"{options.garment}_{PRESET}"}
     files["shipped"] = f"{options.garment}_shipped"
     return {name: str(options.output / f"{file}.usdc") for name, file in files.items()}
 

@@ -11,13 +11,24 @@ from collections.abc import Callable
 
 from ssilk_usd import memory
 
+from ssilk_core import checkpoint
 from ssilk_core.config import PRESETS
 from ssilk_core.fabrics import Fabric
 from ssilk_core.farm.openjd import BundleOptions
 
-from .measured import default, digits, result, row, series, shipped
+from .measured import default, digits, fixed, micro, milli, percent, result, row, series
 from .quoted_results import results
-from .shared import Text, cache_share, default_step, extremes, frame_time, preset_minutes, two_gpus
+from .shared import (
+    Text,
+    cache_share,
+    compact_row,
+    default_step,
+    extremes,
+    frame_time,
+    preset_minutes,
+    shot_row,
+    two_gpus,
+)
 
 # README.md
 
@@ -25,8 +36,8 @@ from .shared import Text, cache_share, default_step, extremes, frame_time, prese
 def readme() -> Text:
     preview, final = (preset_minutes(PRESETS[name]) for name in ("preview", "final"))
     yield f"about {60 * preview:.0f} seconds on an H200 and `--preset final` about {final:.0f} minutes"
-    yield f"{two_gpus('Windows of 32', 1024):.1f} times as fast with 1,024 windows of 32 poses in a batch"
-    yield f"{two_gpus('Windows of 32', 64):.2f} times as fast with 64 windows"
+    yield f"{two_gpus(32, 1024):.1f} times as fast with 1,024 windows of 32 poses in a batch"
+    yield f"{two_gpus(32, 64):.2f} times as fast with 64 windows"
 
 
 # docs/training.md
@@ -85,26 +96,23 @@ def farm() -> Text:
     )
     chunk = BundleOptions.seconds
     yield f"{python:.1f} s to start and {model:.2f} s to load model and character"
-    yield f"{100 * (python + model) / chunk:.1f} % of a chunk of {chunk} s"
-    cluster = result("farm")["cluster"]
-    rows = {
+    yield f"{percent((python + model) / chunk, 1)} % of a chunk of {chunk} s"
+    cluster = {
         "shots": "shots", "workers killed": "workers killed", "shots lost": "shots lost",
         "shots baked twice": "shots ended twice", "files half written": "half-written files",
         "shots compared with an undisturbed bake": "shots compared",
         "of these, shots that differ": "shots that differ from an undisturbed bake",
     }  # fmt: skip
-    for text, key in rows.items():
-        yield row(text, cluster[key])
-    cores = result("farm_cores")["cores"]
-    for count in (1, 2, 4):
-        yield row(
-            f"shots of 60 frames a second on {count} core{'s' if count > 1 else ''}",
-            f"{cores[f'shots per second, cores: {count}']:.1f}",
-        )
+    for text, key in cluster.items():
+        yield row(text, result("farm")["cluster"][key])
+    for count, cores in {1: "1 core", 2: "2 cores", 4: "4 cores"}.items():
+        rate = result("farm_cores")["cores"][f"shots per second, cores: {count}"]
+        yield row(f"shots of 60 frames a second on {cores}", fixed(rate, 1))
     soak = result("farm_soak")["soak"]
-    memories = [soak[f"memory after {count},000 bakes [MiB]"] for count in (1, 3, 10)]
-    for count, value in zip(("1,000", "3,000", "10,000"), memories, strict=True):
-        yield row(f"memory after {count} bakes in one process [MiB]", f"{value:.0f}")
+    for count in ("1,000", "3,000", "10,000"):
+        yield row(
+            f"memory after {count} bakes in one process [MiB]", fixed(soak[f"memory after {count} bakes [MiB]"])
+        )
     yield f"file handles stay at {soak['file handles, least and most'].partition(',')[0]}"
     yield f"at most {memory.USUAL:g} GiB more"
     yield row(
@@ -117,7 +125,6 @@ def farm() -> Text:
 
 
 def pipeline() -> Text:
-    rows = {line["name"]: line for line in result("compact")["rows"]}
     targets = {
         "usd": ("all", "the stage's", "layers or a file"),
         "blender": ("all", "z up, metres", "layers or a file"),
@@ -126,19 +133,19 @@ def pipeline() -> Text:
         "arkit": ("4", "y up, metres", "one `.usdz`"),
     }
     for name, texts in targets.items():
-        line = rows[f"one file for {name}, garment alone"]
-        yield row(f"`{name}`", *texts, *(digits(1000 * line[key], 2) for key in ("largest", "mean")))
-    heaviest = rows["for comparison: the 4 heaviest influences, nothing learned"]
-    yield f"The 4 heaviest influences alone would be up to {1000 * heaviest['largest']:.0f} mm off"
-    yield f"takes 1/{cache_share():.0f} of the point cache"
-    yield f"{1e6 * rows['anim.usdc, the shot']['largest']:.1f} µm"
+        line = compact_row(f"one file for {name}, garment alone")
+        yield row(f"`{name}`", *texts, *(digits(1000 * line[error], 2) for error in ("largest", "mean")))
+    heaviest = compact_row("for comparison: the 4 heaviest influences, nothing learned")
+    yield f"The 4 heaviest influences alone would be up to {milli(heaviest['largest'])} mm off"
+    yield f"takes {cache_share()} of the point cache"
+    yield f"{micro(shot_row()['largest'], 1)} µm"
 
 
 # CHANGELOG.md
 
 
 def changelog() -> Text:
-    yield f"Model files have format {shipped('cape')['format']}"
+    yield f"Model files have format {checkpoint.FORMAT}; those of format 3 still load"
     yield extremes()
     yield f"{frame_time():.2f} ms a frame"
     yield default_step()

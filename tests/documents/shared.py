@@ -5,12 +5,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from statistics import median
+from typing import Any
 
 from ssilk_core.config import Preset
 
-from .measured import default, document, result
+from .measured import default, document, fixed, result
 
 Text = Iterator[str]
+
+DEFAULT_STEP = "batch 256, window 6, static_batch 256"
+"""The case of `training.py` with the default windows."""
+
+SCALING = {32: "scaling_32", 6: "scaling"}
+"""Results of `scaling.py` by the poses in a window."""
 
 
 def frame_time() -> float:
@@ -18,10 +25,19 @@ def frame_time() -> float:
     return result("runtime")["models"]["cape"]["numpy"]["full, poses included"][0] / 1000
 
 
-def cache_share() -> float:
-    """Return how many times a point cache is larger than the animation of the same shot."""
-    (shot,) = (line for line in result("compact")["rows"] if line["name"] == "anim.usdc, the shot")
-    return result("compact")["cache"] / shot["bytes"]
+def compact_row(name: str) -> dict[str, Any]:
+    """Return size and errors of one way to store a shot."""
+    (found,) = (line for line in result("compact")["rows"] if line["name"] == name)
+    return found
+
+
+def shot_row() -> dict[str, Any]:
+    return compact_row("anim.usdc, the shot")
+
+
+def cache_share() -> str:
+    """Return how large an animation is, relative to a point cache of the same shot."""
+    return f"1/{result('compact')['cache'] / shot_row()['bytes']:.0f}"
 
 
 def preset_minutes(preset: Preset) -> float:
@@ -30,10 +46,17 @@ def preset_minutes(preset: Preset) -> float:
     return preset.train.iterations * cape["seconds"][-1] / cape["iterations"][-1] / 60
 
 
-def two_gpus(case: str, batch: int) -> float:
+def step_time(window: int, processes: int, batch: str) -> float:
+    """Return the time of a training step on windows that processes share [s]."""
+    case = {"step": "windows", "processes": processes, "batch": batch}
+    (times,) = (found["times"] for found in result(SCALING[window])["cases"] if case.items() <= found.items())
+    return median(times)
+
+
+def two_gpus(window: int, batch: int) -> float:
     """Return how many times as fast two GPUs train a batch as one."""
-    one, two = (result("scaling")[case][f"{count} processes, batch {batch}"] for count in (1, 2))
-    return median(one["times"]["windows"]) / median(two["times"]["windows"])
+    one, two = (step_time(window, count, str(batch)) for count in (1, 2))
+    return one / two
 
 
 def extremes() -> str:
@@ -41,14 +64,14 @@ def extremes() -> str:
 
 
 def model_size() -> str:
-    sizes = [shape["model_bytes"] for shape in document("trade_cape")["points"] if shape["precision"] == "int16"]
-    return f"{sizes[0] / 1e6:.1f} MB"
+    sizes = [point["model_bytes"] for point in document("trade_cape")["points"] if point["precision"] == "int16"]
+    return f"{fixed(sizes[0], 1, 1e6)} MB"
 
 
 def default_step() -> str:
     """Return the time of one training step with the default windows."""
-    case = result("training")["cases"]["batch 256, window 6, resting 256"]
+    case = result("training")["cases"][DEFAULT_STEP]
     size = case["size"]
-    assert (size["batch"], size["window"]) == (default("batch"), default("window"))
+    assert all(size[name] == default(name) for name in ("batch", "window", "static_batch"))
     poses = size["batch"] * (size["window"] - 2)
     return f"{case['kernels']['steps [ms]']['windows']:.1f} ms for {poses:,} new poses"

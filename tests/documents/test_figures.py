@@ -8,10 +8,12 @@ of the results must stand in the document, word for word; what is left must be o
 from __future__ import annotations
 
 import re
+import shlex
 
 import pytest
 
 from benchmarks.helpers.paper_schemes import PAPER_SCHEMES
+from ssilk_core.cli import parser
 from ssilk_core.config import ModelConfig, TrainConfig, apply_overrides
 from ssilk_core.fabrics import Fabric
 from ssilk_core.schemes import SCHEMES
@@ -20,7 +22,7 @@ from tests.documents.measured import RESULTS, ROOT
 from tests.documents.quoted import QUOTED
 
 COLUMNS = 118
-LARGEST_FILE, LARGEST_FOLDER = 64_000, 400_000  # bytes of a result, and of all
+LARGEST_DATA, LARGEST_PICTURE, LARGEST_FOLDER = 64_000, 200_000, 600_000  # bytes of a file, and of all
 
 CONSTANTS: dict[str, tuple[str, ...]] = {
     "a number in the paper": (r"\b(Table|Figure|Section|Eqs?\.) \d+( (and|to) \d+)*",),
@@ -28,13 +30,14 @@ CONSTANTS: dict[str, tuple[str, ...]] = {
     "a licence": (r"(Apache|GPL)-\d\.\d(-or-later)?", r"\bCC0\b"),
     "the number of a heading or of a step": (r"^(#+ )?\d+\. ", r"\(step \d\)"),
     "an exit code": (
-        r"^\| (0|2|3|4|130) \|",
+        r"^\| (0|1|2|3|4|130) \|",
         r"exit code 2 \(3 when a",
         r"\b4 when some tasks",
         r"\b130 when\s+interrupted",
     ),
     "part of a definition": (r"\[(0|−1), 1\]", r"gravity \(0, −9\.81, 0\)", r"at most 1 cm/s|under 1 cm/s"),
     "an example of a message": (r"\*12 of 900 vertices",),
+    "the shape of a tensor": (r"the shape \(\w+(, \w+)*\)",),
     "a rate of motion": (r"at 30 frames\s+a second",),
 }
 """Numbers that nothing measures, as patterns, with the reason."""
@@ -116,8 +119,9 @@ def test_results_are_quoted_and_small():
         p.name for p in files if p.name not in documents and not (p.suffix == ".json" and p.stem in measured.read)
     ]
     assert not unused, f"no document quotes {unused}"
-    sizes = {path.name: path.stat().st_size for path in files}
-    assert max(sizes.values()) <= LARGEST_FILE, sizes
+    sizes = {path: path.stat().st_size for path in files}
+    large = [p.name for p, size in sizes.items() if size > (LARGEST_DATA if p.suffix == ".json" else LARGEST_PICTURE)]
+    assert not large, f"{large}: keep what documents quote"
     assert sum(sizes.values()) <= LARGEST_FOLDER, sizes
 
 
@@ -155,3 +159,12 @@ def test_settings_exist_and_take_these_values(document, monkeypatch):
         assert config is not None, f"{document}: no setting '{assignment}'"
         if not isinstance(config, Fabric):
             apply_overrides(config, [assignment])
+
+
+def test_commands_are_those_of_the_command_line():
+    blocks = "".join("".join(re.findall(r"```sh\n(.*?)```", (ROOT / name).read_text(), re.DOTALL)) for name in QUOTED)
+    commands = [shlex.split(line, comments=True) for line in blocks.replace("\\\n", " ").splitlines()]
+    ours = [words for words in commands if words[:1] == ["ssilk"] and "..." not in words]
+    assert ours
+    for words in ours:
+        parser().parse_args(words[1:])

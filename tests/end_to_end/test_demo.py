@@ -113,7 +113,7 @@ def test_the_shipped_model_is_filmed_without_any_training(tmp_path, capsys):
     made = load_model(shipped.shipped_path("cape")).provenance
     assert f"shipped cape: {made['iteration']:,} iterations on {len(made['motions'])} motions, seed" in said
     assert {path.name for path in tmp_path.iterdir()} == {
-        *("wardrobe", "motions", "shot.usdc", "plain.usdc", "cape_shipped.usdc", "shipped.png", "shipped.mp4")
+        *("wardrobe", "motions", "shot.usdc", "lbs.usdc", "cape_shipped.usdc", "shipped.png", "shipped.mp4")
     }
 
 
@@ -122,7 +122,7 @@ def test_the_draft_is_trained_and_filmed_beside_what_ships(tmp_path, capsys):
     assert main(["demo", "-o", str(tmp_path), *SHORT]) == 0
     commands = typed(capsys.readouterr().err)
     assert [command[0] for command in commands[4:]] == ["rig", "train", "bake", "view", "view"]
-    names = ("plain.usdc", "cape_draft.usdc", "cape_shipped.usdc")
+    names = ("lbs.usdc", "cape_draft.usdc", "cape_shipped.usdc")
     assert commands[-1][1:4] == [str(tmp_path / name) for name in names]
     for name in ("cape_draft.safetensors", "shipped.mp4", "draft.mp4", "draft.png"):
         assert (tmp_path / name).stat().st_size > 1000
