@@ -22,7 +22,8 @@ MAX_PRE_ROLL = 600.0  # [s]
 class BakeRequest:
     """One garment over one motion: all that decides how the garment moves.
 
-    Fields are named as the options of 'ssilk bake'. A shot stores its request, so that it can be verified later.
+    Fields are named as the options of 'ssilk bake', which has none for `feedback` and names `root` in MODEL:/ROOT. A
+    shot stores its request, so that it can be verified later.
 
     Attributes:
         model: file written by 'ssilk train'.
