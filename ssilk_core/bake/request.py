@@ -97,6 +97,11 @@ class BakeRequest:
         """Who receives the shot."""
         return TARGETS[self.target]
 
+    @property
+    def needs_gpu(self) -> bool:
+        """Whether it runs on hosts with a GPU alone: its device is one. "auto" runs anywhere."""
+        return self.device.startswith("cuda")
+
     def relocated(self, locate: Callable[[str], str]) -> BakeRequest:
         """Return the request with its input files elsewhere: `locate` gives the new path of each."""
         model, stage, motion = (locate(getattr(self, name)) for name in INPUTS)
