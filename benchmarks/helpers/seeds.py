@@ -13,6 +13,7 @@ from baselines.evaluation import open_network
 from ssilk_core.cli import evaluate as verb
 from ssilk_core.cli import parser
 from ssilk_core.errors import fail
+from ssilk_core.evaluation.run import EvaluationOptions
 from ssilk_core.evaluation.tables import tables
 from ssilk_core.events import silent
 
@@ -38,16 +39,17 @@ def evaluated(options: argparse.Namespace, *, probes: bool = False) -> tuple[lis
     for name in ("stage", "motions"):
         if not getattr(options, name):
             fail(options.table, f"no --{name}", "models are evaluated with it")
-    named = ("stage", "motions", "index", "reference", "sequence", "device")
+    named = ("stage", "motions", "index", "reference", "device")
     given = [(f"--{name}", value) for name in named if (value := getattr(options, name)) is not None]
     words = [word for pair in given for word in pair]
-    words += [
-        f"--{name}" for name in ("exact", "minimum", "simulate-stops") if getattr(options, name.replace("-", "_"))
-    ]
     words += ["--clips", *options.clips] if options.clips else []
-    words += ["--loop", options.loop] if probes else ["--stops", 0, "--loop", 0]
-    asked = parser().parse_args([str(word) for word in ("evaluate", *options.models, *words)])
-    rows, found = verb.evaluated(asked, open_network, silent)
+    command = parser().parse_args([str(word) for word in ("evaluate", *options.models, *words)])
+    asked = EvaluationOptions(sequence=options.sequence, stops=0, loop=0)
+    if probes:
+        asked = EvaluationOptions(
+            sequence=options.sequence, minimum=options.minimum, simulate=options.simulate_stops, loop=options.loop
+        )
+    rows, found = verb.evaluated(command, asked, open_network, silent, exact=options.exact)
     return found, tables(rows)
 
 

@@ -22,7 +22,8 @@ MAX_PRE_ROLL = 600.0  # [s]
 class BakeRequest:
     """One garment over one motion: all that decides how the garment moves.
 
-    Fields are named as the options of 'ssilk bake'. A shot stores its request, so that it can be verified later.
+    Fields are named as the options of 'ssilk bake', which has none for `feedback` and names `root` in MODEL:/ROOT. A
+    shot stores its request, so that it can be verified later.
 
     Attributes:
         model: file written by 'ssilk train'.
@@ -95,6 +96,11 @@ class BakeRequest:
     def receiver(self) -> Target:
         """Who receives the shot."""
         return TARGETS[self.target]
+
+    @property
+    def needs_gpu(self) -> bool:
+        """Whether it runs on hosts with a GPU alone: its device is one. "auto" runs anywhere."""
+        return self.device.startswith("cuda")
 
     def relocated(self, locate: Callable[[str], str]) -> BakeRequest:
         """Return the request with its input files elsewhere: `locate` gives the new path of each."""

@@ -32,7 +32,6 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("-o", "--output", type=Path, required=True,
                       help="shot to write (.usdc, .usd, .usda or .usdz), or a folder of layers")  # fmt: skip
     add_level(verb, "2MB for the shot")
-    verb.add_argument("--again", action="store_true", help="bake what is there and current, too (folders)")
 
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
@@ -46,7 +45,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
                 "their assets are the same for all shots",
                 "bake models that 'ssilk reduce' made",
             )
-        library.bake_layers(requests, options.output, **layer_options(options), again=options.again, report=report)
+        library.bake_layers(requests, options.output, **layer_options(options), report=report)
         return EXIT_OK
     if len(requests) != 1 or options.points:
         found, allowed = "one file", "it holds one garment in one shot and no point cache"

@@ -5,7 +5,7 @@ Models of one garment share their tables with linear blend skinning, on the char
 Gravity is relative to linear blend skinning. --reference compares with the reference simulator. It names a folder of
 shots of the same clips, written by 'ssilk simulate' and named after the clips, or one with such a folder for each
 garment, under its name. Two probes follow. Poses are held after stops: a garment should come to rest at its own
-static state. The first seconds of clips are looped: a garment should repeat itself.
+static state. The first seconds of clips are looped: a garment should repeat itself. --no-probes leaves them out.
 """
 
 from __future__ import annotations
@@ -39,40 +39,28 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--root", metavar="PRIM", help="SkelRoot of the character, where the stage has several")
     verb.add_argument("--motions", type=Path, required=True, metavar="FOLDER", help="folder of motion files")
     verb.add_argument("--index", type=Path, metavar="JSON",
-                      help='list of {"clip", "split", "tags"} (default: all clips in one split)')  # fmt: skip
+                      help='list of {"clip", "split", "tags"}, with "train" as poses that are known (default: '
+                           "all clips in one split)")  # fmt: skip
     verb.add_argument("--clips", nargs="+", default=[], metavar="NAME", help="only these clips")
-    verb.add_argument("--by-clip", action="store_true", help="show each clip by itself too")
     verb.add_argument("--reference", type=Path, metavar="FOLDER", help="shots of 'ssilk simulate' to compare with")
-    verb.add_argument("--trained-on", type=Path, nargs="+", default=[], metavar="PATH",
-                      help="training motions, to tell how new poses are (default: train of --index)")  # fmt: skip
-    verb.add_argument("--sequence", type=int, metavar="FRAMES", help="restart clips after so many (paper: 512)")
-    verb.add_argument(
-        "--stops", type=int, default=2, help="stops in each clip after which poses are held (default 2)"
-    )
-    verb.add_argument("--hold", type=float, default=3.0, metavar="S", help="how long poses are held (default 3)")
-    verb.add_argument("--minimum", action="store_true",
-                      help="compare held poses with a minimum of the static energy (slow on a CPU)")  # fmt: skip
-    verb.add_argument("--simulate-stops", action="store_true",
-                      help="with --reference, simulate the stops too (slow on a CPU)")  # fmt: skip
-    verb.add_argument("--loop", type=int, default=2000, metavar="FRAMES",
-                      help="length of loops, none for 0 (default 2000)")  # fmt: skip
-    verb.add_argument("--exact", action="store_true",
-                      help="collide with the whole body, as the simulator does (slow on a CPU)")  # fmt: skip
+    verb.add_argument("--no-probes", action="store_true", help="measure clips alone, without stops and loops")
     verb.add_argument("-o", "--output", type=Path, help="figures to write (.json), in SI units")
     verb.add_argument("--device", default="cpu", help="where it runs (default cpu)")
 
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Evaluate; return 0."""
+    from ..evaluation.run import EvaluationOptions
     from ..evaluation.tables import tables
 
     if options.output:
         if options.output.suffix != ".json":
             fail(str(options.output), "not a name for figures", "it ends in .json")
         shared.check_output(options.output, *options.models, options.index)
-    rows, found = evaluated(options, open_model, report)
+    asked = EvaluationOptions(stops=0, loop=0) if options.no_probes else EvaluationOptions()
+    rows, found = evaluated(options, asked, open_model, report)
     if options.output:
-        _write(options, found)
+        _write(options, asked, found)
     if not options.json:
         print(tables(rows))
     report(Result("evaluate", {"figures": found} if options.json else {}))
@@ -109,18 +97,22 @@ def open_model(path: Path, device: torch.device) -> OpenedModel:
 
 
 def evaluated(
-    options: argparse.Namespace, opener: Opener, report: Reporter
+    options: argparse.Namespace, asked: EvaluationOptions, opener: Opener, report: Reporter, *, exact: bool = False
 ) -> tuple[list[ResultRow], list[dict[str, Any]]]:
-    """Evaluate the models that options name; return the rows, and the same as files hold them."""
+    """Evaluate the models that options name; return the rows, and the same as files hold them.
+
+    Args:
+        exact: collide with the whole body, as the simulator does (slow on a CPU).
+    """
     from ..devices import select_device
     from ..evaluation.run import evaluate
 
-    asked, device = _asked(options), select_device(options.device)
+    device = select_device(options.device)
     opened = [opener(path, device) for path in options.models]
     rows: list[ResultRow] = []
     found: list[dict[str, Any]] = []
     for models in _by_garment(opened):
-        dressed, methods = _dressed(models[0].file, options, device), _methods(models)
+        dressed, methods = _dressed(models[0].file, options, device, exact), _methods(models)
         playlist = _playlist(options, dressed)
         report(Started("evaluate", len(playlist.clips), {"garment": dressed.name, "clips": list(playlist.clips)}))
         paths = {method.name: str(one.path) for method, one in zip(methods, models)}
@@ -128,19 +120,6 @@ def evaluated(
             rows.append(row)
             found.append({"model": paths.get(row.method), **asdict(row)})
     return rows, found
-
-
-def _asked(options: argparse.Namespace) -> EvaluationOptions:
-    from ..evaluation.run import EvaluationOptions
-
-    return EvaluationOptions(
-        sequence=options.sequence,
-        stops=options.stops,
-        hold=options.hold,
-        minimum=options.minimum,
-        simulate=options.simulate_stops,
-        loop=options.loop,
-    )
 
 
 def _by_garment(opened: Iterable[OpenedModel]) -> list[list[OpenedModel]]:
@@ -160,7 +139,7 @@ def _methods(models: Sequence[OpenedModel]) -> list[EvaluatedMethod]:
     return [EvaluatedMethod(name, one.file.joints, one.on) for name, one in zip(names, models)]
 
 
-def _dressed(file: ModelFile, options: argparse.Namespace, device: torch.device) -> EvaluationScene:
+def _dressed(file: ModelFile, options: argparse.Namespace, device: torch.device, exact: bool) -> EvaluationScene:
     """Put the garment of a model on the character of the stage."""
     from ssilk_usd.read_stage import open_stage
 
@@ -168,7 +147,7 @@ def _dressed(file: ModelFile, options: argparse.Namespace, device: torch.device)
     from ..evaluation.methods import EvaluationScene
 
     scene = on_character(file, open_stage(options.stage), options.root)
-    return EvaluationScene(scene, file.fabric, file.config.fps, device, exact=options.exact)
+    return EvaluationScene(scene, file.fabric, file.config.fps, device, exact=exact)
 
 
 def _playlist(options: argparse.Namespace, dressed: EvaluationScene) -> EvaluationClips:
@@ -215,12 +194,10 @@ def _splits(options: argparse.Namespace) -> tuple[dict[str, list[str]], dict[str
             f"{len(missing)} clips are missing ({', '.join(missing[:3])})",
             f"it holds {', '.join(list(files)[:3])} and so on",
         )
-    single = {name: [name] for names in splits.values() for name in names} if options.by_clip else {}
-    seen = options.trained_on or [files[name] for name in chosen(index, "train") if name in files]
-    return splits | single, files, seen
+    return splits, files, [files[name] for name in chosen(index, "train") if name in files]
 
 
-def _write(options: argparse.Namespace, rows: list[dict[str, Any]]) -> None:
+def _write(options: argparse.Namespace, asked: EvaluationOptions, rows: list[dict[str, Any]]) -> None:
     """Write the figures with their provenance."""
     import torch
 
@@ -233,7 +210,7 @@ def _write(options: argparse.Namespace, rows: list[dict[str, Any]]) -> None:
         "models": {str(path): sha256(path) for path in options.models},
         "stage": {str(options.stage): sha256(options.stage)},
         "reference": options.reference and str(options.reference),
-        "options": {**asdict(_asked(options)), "clips": options.clips, "exact": options.exact},
+        "options": {**asdict(asked), "clips": options.clips},
         "hardware": device_name(select_device(options.device)),
         "versions": {"ssilk": __version__, "torch": torch.__version__},
         "figures": rows,

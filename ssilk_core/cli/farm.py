@@ -2,7 +2,8 @@
 """Bake many shots on a farm: write a job bundle of Open Job Description, or run its tasks on a Ray cluster.
 
 The bundle runs unchanged with 'openjd run' on one machine and with 'deadline bundle submit' on Deadline Cloud. Each
-task is one garment in one shot. Running a job again, anywhere, leaves finished tasks alone.
+task is one garment in one shot. Running a job again, anywhere, leaves finished tasks alone. With --device cuda each
+host needs a GPU. Both commands take the size of chunks as the job's parameters: -p ChunkSize=20 -p ChunkSeconds=600.
 """
 
 from __future__ import annotations
@@ -31,20 +32,13 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     where.add_argument("--bundle", type=Path, metavar="FOLDER", help="folder of the job bundle to write")
     where.add_argument("--cluster", nargs="?", const="", metavar="ADDRESS",
                        help="run now on a Ray cluster (default: all cores of this machine)")  # fmt: skip
-    verb.add_argument("--cores", type=int, help="of this machine, where --cluster names no other (default: all)")
     group = verb.add_argument_group("job bundle")
     defaults = BundleOptions()
-    group.add_argument("--name", default=defaults.name, help="of the job (default '%(default)s')")
-    for name, about in (
-        ("chunk", "tasks that a worker takes at once, at first"),
-        ("seconds", "how long a chunk should take; farms adapt its size to it"),
-        ("memory", "MiB that a host needs"),
-        ("timeout", "seconds after which a chunk is cancelled"),
-    ):
-        group.add_argument(
-            f"--{name}", type=int, default=getattr(defaults, name), help=f"{about} (default %(default)s)"
-        )
-    group.add_argument("--gpu", action="store_true", help="a host needs a GPU (see --device)")
+    group.add_argument(
+        "--memory", type=int, default=defaults.memory, metavar="MIB", help="that a host needs (default %(default)s)"
+    )
+    group.add_argument("--timeout", type=int, default=defaults.timeout, metavar="SECONDS",
+                       help="after which a chunk of shots is cancelled (default %(default)s)")  # fmt: skip
 
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
@@ -52,8 +46,6 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     tasks = [_absolute(task) for task in plan_layers(requests_of(options), **layer_options(options))]
     if options.bundle:
         return _write(tasks, options, report)
-    if not (options.cores or 1) > 0:
-        fail("--cores", str(options.cores), "a positive number is needed")
     if not options.output:
         fail("--cluster", "no folder for the layers", "-o names one")
     return _run(tasks, options, report)
@@ -65,13 +57,8 @@ def _absolute(task: BakeTask) -> BakeTask:
 
 
 def _write(tasks: Sequence[BakeTask], options: argparse.Namespace, report: Reporter) -> int:
-    for name in ("chunk", "memory", "timeout"):
-        if not getattr(options, name) > 0:
-            fail(f"--{name}", str(getattr(options, name)), "a positive number is needed")
-    if not options.seconds >= 0:
-        fail("--seconds", str(options.seconds), "no negative number is allowed")
-    chosen = BundleOptions(**{name: getattr(options, name) for name in BundleOptions.__dataclass_fields__})
-    write_bundle(options.bundle, tasks, options.output, chosen)
+    fixed = BundleOptions(memory=options.memory, timeout=options.timeout)
+    write_bundle(options.bundle, tasks, options.output, fixed)
     output = f" -p Output={options.output.absolute()}" if options.output else ""
     detail = {
         "bundle": str(options.bundle),
@@ -88,8 +75,7 @@ def _run(tasks: Sequence[BakeTask], options: argparse.Namespace, report: Reporte
 
     report(Started("farm", len(tasks), {"output": str(options.output)}))
     ended: list[TaskOutcome] = []
-    where = {"address": options.cluster or None, "cores": options.cores, "gpu": options.gpu}
-    for outcome in run_on_cluster(tasks, options.output, bake_here, **where):
+    for outcome in run_on_cluster(tasks, options.output, bake_here, address=options.cluster or None):
         ended.append(outcome)
         if outcome.error:
             report(GarmentEvent(outcome.task.name, Failed(outcome.error)))

@@ -75,7 +75,6 @@ def add_bake(verb: argparse.ArgumentParser) -> None:
         metavar="SECONDS",
         help="run-up to the first pose and after each cut, so that the garment has settled (default 0)",
     )
-    verb.add_argument("--root", metavar="PRIM", help="SkelRoot of the models that name none")
     _add_output(verb)
 
 
@@ -89,9 +88,6 @@ def _add_output(verb: argparse.ArgumentParser) -> None:
         default=0,
         metavar="N",
         help="iterations of the simulator's solver in each frame, from the network's state (default 0)",
-    )
-    verb.add_argument(
-        "--feedback", action="store_true", help="refined frames look back on refined ones instead of the network's"
     )
     verb.add_argument(
         "--refined-output",
@@ -122,14 +118,13 @@ def requests_of(options: argparse.Namespace) -> list[BakeRequest]:
             model=model,
             stage=options.stage,
             motion=motion,
-            root=root or options.root,
+            root=root,
             fps=options.fps,
             samples_per_frame=options.samples_per_frame,
             pre_roll=options.pre_roll,
             target=options.target,
             lbs=options.lbs,
             refine=options.refine,
-            feedback=options.feedback,
             refined_output=options.refined_output,
             device=options.device,
         )

@@ -49,8 +49,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
                       help="most iterations of the solver in each frame (default 100)")  # fmt: skip
     verb.add_argument("--batch", type=int, default=64, help="motions that advance together (default 64)")
     verb.add_argument("--sequence", type=int, metavar="FRAMES",
-                      help="restart from rest after so many frames, as 'ssilk evaluate --sequence' does "
-                      "(default: never)")  # fmt: skip
+                      help="restart from rest after so many frames (paper: 512; default: never)")  # fmt: skip
     verb.add_argument("--no-body", action="store_true", help="leave the body meshes out")
     verb.add_argument("--device", default="cpu", help="where it runs (default cpu)")
 

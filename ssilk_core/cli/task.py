@@ -24,7 +24,6 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("-o", "--output", type=Path, required=True, help="folder of the layers")
     verb.add_argument("--tasks", metavar="0-9,12", help="numbers of the tasks to bake (default: all)")
     verb.add_argument("--check", action="store_true", help="bake nothing; check that everything is done")
-    verb.add_argument("--again", action="store_true", help="bake what is current, too")
     verb.add_argument("--path-mapping", type=Path, metavar="FILE",
                       help="Open Job Description's rules for where the inputs lie on this machine")  # fmt: skip
     verb.add_argument("--openjd", action="store_true", help="progress and status as Open Job Description's sessions "
@@ -40,5 +39,5 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         check_tasks(tasks, options.output, report)
         return EXIT_OK
     chosen = [tasks[number] for number in numbers(options.tasks or f"0-{len(tasks) - 1}", len(tasks))]
-    failed = bake_tasks(chosen, options.output, report, again=options.again)
+    failed = bake_tasks(chosen, options.output, report)
     return EXIT_TASKS if failed else EXIT_OK

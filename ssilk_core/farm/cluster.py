@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -33,18 +33,18 @@ def run_on_cluster(
     *,
     address: str | None = None,
     cores: int | None = None,
-    gpu: bool = False,
 ) -> Iterator[TaskOutcome]:
     """Yield the outcome of each task as it ends, on an existing cluster or on the cores of this machine.
+
+    A task whose device is a GPU reserves one: it waits for it on a cluster that may grow.
 
     Args:
         bake: what a worker does (`bake_here`), a function of a module that workers can import.
         address: of the cluster; "auto" for the one that this machine is in; None starts one on this machine.
         cores: of this machine, for a cluster that is started here; None for all.
-        gpu: each task needs a GPU.
 
     Raises:
-        SsilkError: there is no such cluster.
+        SsilkError: there is no such cluster, or a task needs a GPU and this machine has none.
     """
     os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", ".")  # or Ray writes to standard output, among events
     import ray
@@ -55,9 +55,13 @@ def run_on_cluster(
     except (ConnectionError, RuntimeError, ValueError) as error:
         fail("--cluster", f"no cluster at {address} ({str(error).splitlines()[0]})", "start one with 'ray start'")
     try:
-        worker = ray.remote(num_cpus=1, num_gpus=int(gpu), max_retries=RETRIES)
-        remote = worker(_outcome)
-        pending = {remote.remote(bake, task, folder.absolute()): task for task in tasks}
+        if address is None and any(task.request.needs_gpu for task in tasks):
+            _need_gpu(ray.cluster_resources())
+        worker = ray.remote(num_cpus=1, max_retries=RETRIES)(_outcome)
+        pending = {
+            worker.options(num_gpus=int(task.request.needs_gpu)).remote(bake, task, folder.absolute()): task
+            for task in tasks
+        }
         while pending:
             (done, *_), _ = ray.wait(list(pending))
             task = pending.pop(done)
@@ -67,6 +71,12 @@ def run_on_cluster(
                 yield TaskOutcome(task, error=f"its workers died ({str(error).splitlines()[0]})")
     finally:
         ray.shutdown()
+
+
+def _need_gpu(resources: Mapping[str, float]) -> None:
+    """Fail where no GPU can come: Ray would wait for one for ever."""
+    if not resources.get("GPU"):
+        fail("--device", "a GPU", "this machine has none", "use --device cpu, or name a cluster")
 
 
 def _outcome(bake: BakeFunction, task: BakeTask, folder: Path) -> TaskOutcome:

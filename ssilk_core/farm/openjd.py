@@ -11,34 +11,36 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from ..bake import BakeTask
+from ..errors import fail
 from ..events import Event, Failed, GarmentEvent, Message, Progress, Result, Started, describe
 from ..files import replacing
 from .job import NAME, write_job
 
 TEMPLATE, VALUES, ASSETS = "template.json", "parameter_values.json", "asset_references.json"
+CHUNK, CHUNK_SECONDS = 10, 300  # tasks of a chunk at first, and how long one should take; both are parameters
 NOTICE = 30  # seconds that a worker has to stop
 _STOP = {"mode": "NOTIFY_THEN_TERMINATE", "notifyPeriodInSeconds": NOTICE}
 
 
 @dataclass(frozen=True, kw_only=True)
 class BundleOptions:
-    """How a job is divided and what its hosts need.
+    """What a template fixes, because the specification has no parameters for it.
 
     Attributes:
-        name: of the job.
-        chunk: tasks that a worker takes at once, at first.
-        seconds: how long a chunk should take [s]; farms adapt its size to it, 0 keeps the size.
         memory: of a host [MiB].
-        gpu: a host needs a GPU.
         timeout: seconds after which a chunk is cancelled.
+
+    Raises:
+        SsilkError: one of them is not positive.
     """
 
-    name: str = "SSILK bake"
-    chunk: int = 10
-    seconds: int = 300
     memory: int = 2048
-    gpu: bool = False
     timeout: int = 3600
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not value > 0:
+                fail(f"--{name}", str(value), "a positive number is needed")
 
 
 def write_bundle(folder: Path, tasks: Sequence[BakeTask], output: Path | None, options: BundleOptions) -> None:
@@ -48,7 +50,7 @@ def write_bundle(folder: Path, tasks: Sequence[BakeTask], output: Path | None, o
         SsilkError: it cannot be written.
     """
     write_job(folder / NAME, tasks)
-    _write(folder / TEMPLATE, template(len(tasks), options))
+    _write(folder / TEMPLATE, template(tasks, options))
     values = [] if output is None else [{"name": "Output", "value": str(output.absolute())}]
     _write(folder / VALUES, {"parameterValues": values})
     _write(folder / ASSETS, _asset_references(tasks, output))
@@ -67,28 +69,28 @@ def _asset_references(tasks: Sequence[BakeTask], output: Path | None) -> dict[st
     }
 
 
-def template(count: int, options: BundleOptions) -> dict[str, Any]:
-    """Return a job template of `count` tasks."""
+def template(tasks: Sequence[BakeTask], options: BundleOptions) -> dict[str, Any]:
+    """Return a job template; a task that needs a GPU makes every host of the job need one."""
     return {
         "specificationVersion": "jobtemplate-2023-09",
         "extensions": ["TASK_CHUNKING"],
-        "name": options.name,
-        "parameterDefinitions": _parameters(options),
+        "name": "SSILK bake",
+        "parameterDefinitions": _parameters(),
         "jobEnvironments": [_environment()],
-        "steps": [_bake_step(count, options), _check_step(options)],
+        "steps": [_bake_step(tasks, options), _check_step(options)],
     }
 
 
-def _parameters(options: BundleOptions) -> list[dict[str, Any]]:
+def _parameters() -> list[dict[str, Any]]:
     return [
         {"name": "Job", "type": "PATH", "objectType": "FILE", "dataFlow": "IN", "default": NAME,
          "description": "What is to be baked."},
         {"name": "Output", "type": "PATH", "objectType": "DIRECTORY", "dataFlow": "OUT", "default": "layers",
          "description": "Where the layers go."},
-        {"name": "ChunkSize", "type": "INT", "minValue": 1, "default": options.chunk,
+        {"name": "ChunkSize", "type": "INT", "minValue": 1, "default": CHUNK,
          "description": "Shots that a worker takes at once, at first."},
-        {"name": "ChunkSeconds", "type": "INT", "minValue": 0, "default": options.seconds,
-         "description": "How long a chunk should take; its size is adapted to it."},
+        {"name": "ChunkSeconds", "type": "INT", "minValue": 0, "default": CHUNK_SECONDS,
+         "description": "How long a chunk should take; its size is adapted to it, unless it is 0."},
         {"name": "Ssilk", "type": "STRING", "default": "ssilk", "description": "The command of SSILK on a worker."},
     ]  # fmt: skip
 
@@ -102,17 +104,17 @@ def _environment() -> dict[str, Any]:
     }
 
 
-def _bake_step(count: int, options: BundleOptions) -> dict[str, Any]:
+def _bake_step(tasks: Sequence[BakeTask], options: BundleOptions) -> dict[str, Any]:
     chunks = {
         "defaultTaskCount": "{{Param.ChunkSize}}",
         "targetRuntimeSeconds": "{{Param.ChunkSeconds}}",
         "rangeConstraint": "CONTIGUOUS",
     }
-    shots = {"name": "Shots", "type": "CHUNK[INT]", "range": f"0-{count - 1}", "chunks": chunks}
+    shots = {"name": "Shots", "type": "CHUNK[INT]", "range": f"0-{len(tasks) - 1}", "chunks": chunks}
     return {
         "name": "Bake",
         "parameterSpace": {"taskParameterDefinitions": [shots]},
-        "hostRequirements": _host(options),
+        "hostRequirements": _host(tasks, options),
         "script": _script(options, "--tasks", "{{Task.Param.Shots}}"),
     }
 
@@ -125,9 +127,10 @@ def _check_step(options: BundleOptions) -> dict[str, Any]:
     }
 
 
-def _host(options: BundleOptions) -> dict[str, Any]:
+def _host(tasks: Sequence[BakeTask], options: BundleOptions) -> dict[str, Any]:
     amounts = [{"name": "amount.worker.vcpu", "min": 1}, {"name": "amount.worker.memory", "min": options.memory}]
-    return {"amounts": [*amounts, *([{"name": "amount.worker.gpu", "min": 1}] if options.gpu else [])]}
+    gpu = any(task.request.needs_gpu for task in tasks)
+    return {"amounts": [*amounts, *([{"name": "amount.worker.gpu", "min": 1}] if gpu else [])]}
 
 
 def _script(options: BundleOptions, *words: str) -> dict[str, Any]:

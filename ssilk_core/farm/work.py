@@ -11,17 +11,13 @@ from ..errors import SsilkError, VerificationError
 from ..events import Event, Failed, GarmentEvent, Message, Progress, Reporter, Result, Started
 
 
-def bake_tasks(tasks: Sequence[BakeTask], folder: Path, report: Reporter, *, again: bool = False) -> list[BakeTask]:
-    """Bake tasks into a folder of layers; return those that failed, each of which fails alone.
-
-    Args:
-        again: bake what is there and current, too.
-    """
+def bake_tasks(tasks: Sequence[BakeTask], folder: Path, report: Reporter) -> list[BakeTask]:
+    """Bake tasks into a folder of layers; return those that failed, each of which fails alone."""
     layers, failed = LayerFolder(folder), []
     for index, task in enumerate(tasks):
         report(GarmentEvent(task.name, Started("bake", 1)))
         try:
-            result = layers.bake(task, again=again, report=_part(report, index, len(tasks)))
+            result = layers.bake(task, report=_part(report, index, len(tasks)))
             report(GarmentEvent(task.name, Result("bake", result.figures("layer"))))
         except SsilkError as error:
             failed.append(task)

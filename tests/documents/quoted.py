@@ -14,7 +14,7 @@ from ssilk_usd import memory
 from ssilk_core import checkpoint
 from ssilk_core.config import PRESETS
 from ssilk_core.fabrics import Fabric
-from ssilk_core.farm.openjd import BundleOptions
+from ssilk_core.farm.openjd import CHUNK_SECONDS
 
 from .measured import default, digits, fixed, micro, milli, percent, result, row, series
 from .quoted_results import results
@@ -94,7 +94,7 @@ def farm() -> Text:
     python, model = (
         start[f"seconds to {what}"] for what in ("start Python and its modules", "load the model and its character")
     )
-    chunk = BundleOptions.seconds
+    chunk = CHUNK_SECONDS
     yield f"{python:.1f} s to start and {model:.2f} s to load model and character"
     yield f"{percent((python + model) / chunk, 1)} % of a chunk of {chunk} s"
     cluster = {

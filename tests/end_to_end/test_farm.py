@@ -37,7 +37,7 @@ def farm(toy, tmp_path, monkeypatch):
         toy.write_clip(tmp_path / f"{name}.usda", frames=6 + index)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    run(f"{WORDS} --bundle bundle --chunk 2")
+    run(f"{WORDS} --bundle bundle")
     return tmp_path
 
 
@@ -81,6 +81,8 @@ def test_a_bundle_runs_unchanged_with_openjd(farm):
         "bundle/template.json",
         "-p",
         f"Ssilk={BIN / 'ssilk'}",
+        "-p",
+        "ChunkSize=2",
         "--timestamp-format",
         "utc",
     ]
@@ -194,6 +196,15 @@ def test_a_job_runs_where_its_inputs_lie_elsewhere(farm):
     Path("rules.json").write_text(json.dumps({"version": "pathmapping-1.0", "path_mapping_rules": rules}))
     assert task("--tasks 0") == 4
     assert task("--tasks 0 --path-mapping rules.json") == 0
+
+
+def test_tasks_do_not_wait_for_a_gpu_that_this_machine_does_not_have(farm, monkeypatch, capsys):
+    if importlib.util.find_spec("ray") is None:
+        pytest.skip("ray is not installed")
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    assert run(f"{WORDS} -o out --device cuda --cluster") == 2
+    assert "--device: a GPU; this machine has none" in capsys.readouterr().err
+    assert not sys.modules["ray"].is_initialized() and not Path("out").exists()
 
 
 def test_a_cluster_whose_workers_die_bakes_every_shot_once(farm, monkeypatch, capsys):

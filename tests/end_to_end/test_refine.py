@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from pxr import Usd, UsdGeom, Vt
 from ssilk_usd.play import Shot
 from ssilk_usd.provenance import read_provenance
 
+from ssilk_core.bake import BakeRequest, bake
 from ssilk_core.cli import main
 
 BAKE = ["bake", "model.safetensors", "--stage", "rigged.usda", "--motion", "brief.usda"]
@@ -90,7 +92,8 @@ def test_the_level_for_heroes_is_refined(there, capsys):
 
 
 def test_samples_within_frames_are_refined_too(there):
-    assert main([*BAKE, "-o", "blurred.usda", "--refine", "1", "--feedback", "--samples-per-frame", "2"]) == 0
+    request = BakeRequest(model="model.safetensors", stage="rigged.usda", motion="brief.usda")
+    bake(replace(request, refine=1, feedback=True, samples_per_frame=2), "blurred.usda")
     stage = Usd.Stage.Open("blurred.usda")
     assert UsdGeom.Mesh(stage.GetPrimAtPath("/Hero/Skirt")).GetPointsAttr().GetTimeSamples()[:3] == [0.0, 0.5, 1.0]
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from openjd.model import create_job, decode_job_template, preprocess_job_parameters
+from openjd.model import IntRangeExpr, create_job, decode_job_template, preprocess_job_parameters
 
 from ssilk_core.bake import BakeRequest, BakeResult, BakeTask, FrameSpan, Verification, plan_layers
 from ssilk_core.bake.record import RECORD, TaskRecord, current_record, read_record, task_key, write_record
@@ -176,13 +176,17 @@ def test_any_json_is_a_job_or_one_sentence(tmp_path, document):
         assert str(error).startswith(str(path)) and str(error).endswith(".")
 
 
-@pytest.mark.parametrize("gpu", [False, True])
-def test_a_template_passes_the_specification(gpu):
+@pytest.mark.parametrize(("device", "gpu"), [("cpu", False), ("auto", False), ("cuda", True), ("cuda:1", True)])
+def test_a_template_passes_the_specification(device, gpu):
+    tasks = [TASK, replace(TASK, shot="run", request=replace(REQUEST, device=device))]
     decoded = decode_job_template(
-        template=template(500, BundleOptions(chunk=7, seconds=60, gpu=gpu)), supported_extensions=["TASK_CHUNKING"]
+        template=template(tasks, BundleOptions(memory=4096, timeout=60)), supported_extensions=["TASK_CHUNKING"]
     )
     values = preprocess_job_parameters(
-        job_template=decoded, job_parameter_values={}, job_template_dir=Path("/bundle"), current_working_dir=Path("/")
+        job_template=decoded,
+        job_parameter_values={"ChunkSize": "7", "ChunkSeconds": "60"},
+        job_template_dir=Path("/bundle"),
+        current_working_dir=Path("/"),
     )
     job = create_job(job_template=decoded, job_parameter_values=values)
     assert values["Job"].value == "/bundle/job.json" and values["Output"].value == "/bundle/layers"
@@ -190,8 +194,17 @@ def test_a_template_passes_the_specification(gpu):
     chunks = bake.parameterSpace.taskParameterDefinitions["Shots"].chunks
     assert (int(chunks.defaultTaskCount), int(chunks.targetRuntimeSeconds)) == (7, 60)
     assert str(bake.script.actions.onRun.cancelation.mode.value) == "NOTIFY_THEN_TERMINATE"
-    assert ("amount.worker.gpu" in {amount.name for amount in bake.hostRequirements.amounts}) == gpu
+    needs = {amount.name: amount.min for amount in bake.hostRequirements.amounts}
+    assert needs["amount.worker.memory"] == 4096 and ("amount.worker.gpu" in needs) == gpu
+    assert bake.parameterSpace.taskParameterDefinitions["Shots"].range == IntRangeExpr.from_str("0-1")
+    assert bake.script.actions.onRun.timeout == 60
     assert [dependency.dependsOn for dependency in check.dependencies] == ["Bake"]
+
+
+@pytest.mark.parametrize("name", ["memory", "timeout"])
+def test_hosts_and_chunks_need_something(name):
+    with pytest.raises(SsilkError, match=f"--{name}: 0; a positive number is needed"):
+        BundleOptions(**{name: 0})
 
 
 def test_a_bundle_names_the_files_that_it_takes_and_gives(tmp_path):

@@ -25,6 +25,8 @@ from .read_stage import (
 )
 from .units import StageUnits
 
+_CHOOSE = "choose one with --root, or as MODEL:/ROOT in a bake"
+
 
 def find_skeleton(stage: Usd.Stage, *, root: str | None = None) -> SkelSource:
     """Find the one skeleton of a stage, or the one that `root` names (its SkelRoot or itself, path or name).
@@ -43,13 +45,13 @@ def find_skeleton(stage: Usd.Stage, *, root: str | None = None) -> SkelSource:
     chosen = found if root is None else _pairs_named(found, root)
     there_are = "there are " + ", ".join(f"{top.GetPath()} ({skeleton.GetName()})" for top, skeleton in found)
     if not chosen:
-        fail(where, f"no SkelRoot or Skeleton is named '{root}'", there_are, "choose one with --root")
+        fail(where, f"no SkelRoot or Skeleton is named '{root}'", there_are, _CHOOSE)
     if len(chosen) != 1:
         fail(
             where,
             f"{len(chosen)} skeletons could be the character's",
             there_are,
-            "choose one with --root, by the path of its Skeleton if need be",
+            f"{_CHOOSE}, by the path of its Skeleton if need be",
         )
     return _source(*chosen[0])
 
