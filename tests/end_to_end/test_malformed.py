@@ -494,7 +494,7 @@ MODELS = [
         folder_at("no.safetensors"),
     ),
     Case("truncated model", BAKE, ("model.safetensors", "truncated"), truncated("model.safetensors")),
-    Case("empty model", BAKE, ("model.safetensors", "no safetensors"), text("model.safetensors", "")),
+    Case("empty model", BAKE, ("model.safetensors", "not a safetensors"), text("model.safetensors", "")),
     Case(
         "foreign model",
         BAKE,
@@ -504,7 +504,7 @@ MODELS = [
     Case(
         "model is a stage",
         "bake rigged.usda --stage rigged.usda --motion clip.usda -o new.usdc",
-        ("rigged.usda", "no safetensors"),
+        ("rigged.usda", "not a safetensors"),
     ),
     Case(
         "model of another format",
@@ -722,7 +722,7 @@ def test_a_full_disk_leaves_nothing(command, room, file, toy, tmp_path, monkeypa
 
 COMMANDS = [
     ("rig hero.usda --garment Hat -o new.usda", ("'Hat'",)),
-    ("bake clip.usda --stage rigged.usda --motion clip.usda -o new.usdc", ("no safetensors",)),
+    ("bake clip.usda --stage rigged.usda --motion clip.usda -o new.usdc", ("not a safetensors",)),
     ("train rigged.usda", ("--motions",)),
 ]
 
