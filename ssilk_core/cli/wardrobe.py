@@ -26,7 +26,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..errors import SsilkError, fail
-from ..events import Failed, GarmentEvent, Message, Reporter, Result, TaskEvent, Started
+from ..events import Failed, GarmentEvent, Message, Reporter, Result, Started, TaskEvent
 from ..files import need_writable, sha256
 from ..wardrobe.listing import WardrobeEntry, read_list
 from ..wardrobe.panel import ProgressTable, table

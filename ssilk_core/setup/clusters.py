@@ -103,8 +103,8 @@ def build_cluster(
 ) -> Cluster:
     """Sample `proxies` vertices of a loose piece and connect them to the character's joints.
 
-    The first sample is the seam vertex nearest to the mean of all of them: the cloth
-    hinges there. The others are farthest points by geodesic distance within the piece.
+    The first sample is the seam vertex nearest to the mean of all of them: the cloth hinges there. The others are
+    farthest points by geodesic distance within the piece.
 
     Args:
         vertices: vertices of the piece, ascending, shape (M,).
