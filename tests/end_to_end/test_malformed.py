@@ -199,7 +199,7 @@ STAGES = [
         ("/Hero/Rig", "joint"),
         joints("hero.usda", "Hips", "Hips/Spine", "Hips/Spine/../../Hips"),
     ),
-    Case("repeated joints", RIG, ("'Hips'", "stands twice"), joints("hero.usda", "Hips", "Hips/Spine", "Hips")),
+    Case("repeated joints", RIG, ("'Hips'", "is listed twice"), joints("hero.usda", "Hips", "Hips/Spine", "Hips")),
     Case(
         "bind count mismatch",
         INSPECT,
