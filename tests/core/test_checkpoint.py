@@ -279,7 +279,7 @@ DAMAGE = {
         "incomplete.*3, which is not of type str",
     ),
     "fabric is a word": (set_header("fabric", "silk"), "incomplete"),
-    "a cycle of joints": (set_tensor("scene.skeleton.parents", [1, 2, 0]), "stands before its parent"),
+    "a cycle of joints": (set_tensor("scene.skeleton.parents", [1, 2, 0]), "precedes its parent"),
     "too few parents": (set_tensor("scene.skeleton.parents", [-1]), "1 parents for 3 joints"),
     "parents of two dimensions": (set_tensor("scene.skeleton.parents", np.zeros((3, 2))), "parent"),
     "faces past the points": (set_tensor("scene.mesh.faces", [[0, 1, 999]]), "outside 0 to 59"),
