@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Model files: safetensors that hold everything needed to run, with provenance in the header.
+"""Read and write model files: safetensors with everything that is needed to run, and the provenance in the header.
 
-Nothing is ever unpickled. Tensors are named "scene.*" (the garment, its rig and the skeleton) and "model.*"
-(parameters), each in the narrowest type that holds it; the header holds one JSON document under "ssilk". Packed
-matrices are 16-bit integers, "scale.model.*" beside them.
+Nothing is unpickled. Tensors are named "scene.*" (the garment, its rig and the skeleton) or "model.*" (the
+parameters). Each has the narrowest type that holds it. The header has one JSON document under "ssilk". Quantised
+matrices are 16-bit integers, with their scales in "scale.model.*".
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from .model.network import GarmentModel
 
 FORMAT = 4
-# Settings that format 3 stored under other names; older formats held other networks.
+# Settings that format 3 stores under other names. Formats before 3 hold networks of another architecture.
 RENAMED_SINCE_3 = {
     "config": {"bound": "latent_bound", "push": "max_latent_step"},
     "model": {"bound": "latent_bound", "push": "max_latent_step"},
@@ -56,7 +56,7 @@ RENAMED_SINCE_3 = {
         "surface": "closest_point",
     },
 }
-# Parts of the header that are no plain values, as tuples (JSON: lists) and dicts.
+# The header's lists and tables, as empty values of their types (tuples for JSON lists).
 HEADER: dict[str, Any] = {
     "joint_names": (), "proxy_names": (), "paths": {}, "config": {}, "fabric": {}, "provenance": {},
 }  # fmt: skip
@@ -65,15 +65,15 @@ WEIGHTS = ("scene.plain.weights", "scene.rig.weights")
 
 @dataclass(frozen=True, eq=False)
 class ModelFile:
-    """A model as it lies on disk.
+    """The contents of a model file.
 
     Attributes:
         scene: garment, rig and skeleton (no body meshes).
         config: sizes of the network.
-        fabric: material it was trained with.
-        joints: character joints in the descriptors.
+        fabric: material that the network was trained with.
+        joints: character joints in the descriptors, shape (J',).
         parameters: the network's tensors by name.
-        provenance: how it came to be (seed, schedule, versions, hashes of the inputs, validation).
+        provenance: seed, schedule, versions, hashes of the inputs and validation results.
     """
 
     scene: Scene
@@ -85,13 +85,13 @@ class ModelFile:
 
 
 def save_model(path: str | Path, model: ModelFile, *, pack: bool = False) -> None:
-    """Write a model file whole or not at all.
+    """Write a model file completely or not at all.
 
     Args:
         path: the file, .safetensors.
-        model: what it holds.
-        pack: matrices of parameters in 16 bits and skinning weights in single precision, which halves the file;
-            `benchmarks/precision.py` measures what it changes.
+        model: contents of the file.
+        pack: store parameter matrices in 16 bits and skinning weights in single precision, which halves the size
+            of the file. `benchmarks/precision.py` measures the effect on the result.
     """
     from safetensors.numpy import save
 
@@ -101,7 +101,7 @@ def save_model(path: str | Path, model: ModelFile, *, pack: bool = False) -> Non
 
 
 def _tensors(model: ModelFile) -> dict[str, Any]:
-    """Return a model's tensors as a file names them."""
+    """Return a model's tensors by their names in a file."""
     scene = model.scene
     skeleton, mesh, rig = scene.character.skeleton, scene.garment.mesh, scene.rig
     return {
@@ -126,7 +126,7 @@ def _tensors(model: ModelFile) -> dict[str, Any]:
 
 
 def _document(model: ModelFile) -> dict[str, Any]:
-    """Return what a model's header says."""
+    """Return the JSON document of a model's header."""
     skeleton, mesh, rig = model.scene.character.skeleton, model.scene.garment.mesh, model.scene.rig
     return {
         "format": FORMAT,
@@ -141,7 +141,10 @@ def _document(model: ModelFile) -> dict[str, Any]:
 
 
 def _packed(tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the tensors of a file with matrices packed; vectors stay as they are: errors in beta add up in time."""
+    """Return the tensors of a file with quantised matrices.
+
+    Vectors keep their precision, because errors in beta accumulate over time.
+    """
     weights = {name: tensors[name].astype(np.float32) for name in WEIGHTS}
     matrices = {
         name: quantize(value) for name, value in tensors.items() if name.startswith("model.") and value.ndim > 1
@@ -155,11 +158,11 @@ def load_model(path: str | Path, shapes: Callable[[ModelFile], Shapes] | None = 
 
     Args:
         path: the file, .safetensors.
-        shapes: says which shapes its parameters must have; those of a `GarmentModel` by default.
+        shapes: returns the shapes that its parameters must have; by default those of a `GarmentModel`.
 
     Raises:
-        SsilkError: there is no such file, it is truncated, foreign, of another format version, or its parameters
-            do not fit the sizes in its header.
+        SsilkError: the file is missing, truncated, not a model file or of an unsupported format, or its parameters
+            do not match the sizes in its header.
     """
     tensors, document = _read(Path(path))
     try:
@@ -185,8 +188,8 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     except ValueError as error:
         first = str(error).partition("\n")[0]
         raise SsilkError(
-            f"{path}: this is no safetensors file, or a truncated or damaged one ({first}); train again or fetch the "
-            "file again."
+            f"{path}: this is not a safetensors file, or it is truncated or damaged ({first}); train again or fetch "
+            "the file again."
         ) from error
     header = words.get("ssilk", "")
     if not header:
@@ -204,7 +207,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 
 def _from_format_3(document: dict[str, Any]) -> dict[str, Any]:
-    """Return the header of a model of format 3 as format 4 has it; what is damaged in it stays so."""
+    """Convert the header of a format 3 model to format 4; damaged values stay for `_need_header` to report."""
 
     def renamed(values: object, part: str) -> object:
         names = RENAMED_SINCE_3.get(part, {})
@@ -219,7 +222,7 @@ def _from_format_3(document: dict[str, Any]) -> dict[str, Any]:
 
 
 def _need_header(document: dict[str, Any]) -> None:
-    """Raise `TypeError` unless everything in a header has the type that was written."""
+    """Raise `TypeError` unless every value in a header has the type that `save_model` writes."""
     _need_types(document, HEADER)
     _need_types(document["config"], vars(ModelConfig()))
     _need_types(document["fabric"], vars(Fabric("")))
@@ -230,11 +233,11 @@ def _need_header(document: dict[str, Any]) -> None:
 
 
 def _need_types(values: Mapping[Any, object], likes: Mapping[Any, object]) -> None:
-    """Raise `TypeError` unless values from JSON have the types of those with the same names in `likes`."""
+    """Raise `TypeError` unless values from JSON have the types of the values of the same names in `likes`."""
     for name, value in values.items():
         kind = type(likes.get(name, value))
         if type(value) not in {float: (int, float), tuple: (list,)}.get(kind, (kind,)):
-            raise TypeError(f"{name!r} is {str(value)[:40]}, which is no {kind.__name__}")
+            raise TypeError(f"{name!r} is {str(value)[:40]}, which is not of type {kind.__name__}")
 
 
 def _model_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> ModelFile:
@@ -244,7 +247,7 @@ def _model_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Model
         fail(
             skeleton.path,
             f"descriptors of joints {joints.tolist()}",
-            f"they lie in 0 to {skeleton.joint_count - 1}",
+            f"joints must lie in 0 to {skeleton.joint_count - 1}",
             "train again",
         )
     return ModelFile(
@@ -258,7 +261,7 @@ def _model_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Model
 
 
 def _scene_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Scene:
-    """Return the garment, its rig and the skeleton of a file."""
+    """Return the garment, rig and skeleton of a file as a scene."""
     paths = document["paths"]
 
     def skin(name: str, path: str) -> SkinWeights:
@@ -291,14 +294,14 @@ def _scene_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Scene
 
 
 def _parameters(tensors: dict[str, np.ndarray], where: str) -> dict[str, np.ndarray]:
-    """Return the parameters of a file by name, unpacked where they are packed."""
+    """Return the parameters of a file by name, dequantised if necessary."""
     stored = {name: value for name, value in tensors.items() if name.startswith("model.")}
     for name, value in stored.items():
         if value.dtype.kind == "i":
             stored[name] = dequantize(value, tensors[f"scale.{name}"])
         finite = np.isfinite(stored[name]).all()
         if not finite:
-            fail(where, f"parameter '{name[6:]}' holds NaN or infinity", "all are finite", "train again")
+            fail(where, f"parameter '{name[6:]}' holds NaN or infinity", "all must be finite", "train again")
     return {name[6:]: value for name, value in stored.items()}
 
 
@@ -307,7 +310,7 @@ def _implied(model: ModelFile) -> Shapes:
 
 
 def _need_fit(model: ModelFile, expected: Shapes) -> None:
-    """Raise `SsilkError` unless the parameters have the shapes that the header implies."""
+    """Raise `SsilkError` unless the parameters have the `expected` shapes."""
     found = {name: value.shape for name, value in model.parameters.items()}
     odd = next((name for name in {**expected, **found} if expected.get(name) != found.get(name)), "")
     if odd:
@@ -320,13 +323,13 @@ def _need_fit(model: ModelFile, expected: Shapes) -> None:
 
 
 def model_file(model: GarmentModel, fabric: Fabric, provenance: dict[str, Any]) -> ModelFile:
-    """Return a network as it would be written."""
+    """Return a network as the contents of a model file."""
     parameters = {name: value.detach().cpu().numpy() for name, value in model.state_dict().items()}
     return ModelFile(model.scene, model.config, fabric, model.joints, parameters, provenance)
 
 
 def network(file: ModelFile, scene: Scene | None = None) -> GarmentModel:
-    """Return the network of a model file, on its own scene or on one that adds the character's body."""
+    """Build the network of a model file, on the file's scene or on one that also has the character's body."""
     import torch
 
     from .model.network import GarmentModel

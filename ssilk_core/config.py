@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can be chosen about a model and its training, with the presets."""
+"""Settings of a model and its training, and the presets."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from .errors import fail
 from .schemes import need_scheme
 
 CLOSEST_POINTS = ("triangles", "vertices")
-NO_BOUND = 1e9  # of anything that has no other bound
+NO_BOUND = 1e9  # upper limit of settings without a limit of their own
 
-# Constants of `model.integrators.SpringVerlet`, which explains them, shared with the numpy runtime.
+# Constants of `model.integrators.SpringVerlet`, shared with the numpy runtime and explained there.
 VELOCITY_SCALE, DISTANCE_SCALE, OUTPUT_SCALE = 10.0, 3.0, 0.1
-MAX_OUTPUT = 100.0  # of each output of S: finite, and far above what `max_latent_step` lets through
+MAX_OUTPUT = 100.0  # limit of each output of S: finite, and far above `max_latent_step`
 STATE_ALLOWANCE, RATE_ALLOWANCE = 0.5, 0.05
-DIVERGENCE_BOUND = 1e3  # of a latent: trained ones stay below ten, and no decoder knows what this means
-RECOVERY_FRAMES = 15  # frames at rest after a lost state, half a second of the usual rate
+DIVERGENCE_BOUND = 1e3  # a latent beyond this has diverged; those of trained models stay below ten
+RECOVERY_FRAMES = 15  # frames at rest after a diverged state, half a second at 30 frames per second
 
 
 def _need_between(config: object, low: float, high: float, *names: str) -> None:
-    """Raise `SsilkError` unless each of these settings lies between two numbers, themselves included."""
+    """Raise `SsilkError` unless each of these settings lies in [low, high]."""
     for name in names:
         value = getattr(config, name)
         if not low <= value <= high:
-            fail(f"setting '{name}'", f"{value:g}", f"it lies between {low:g} and {high:g}")
+            fail(f"setting '{name}'", f"{value:g}", f"it must lie between {low:g} and {high:g}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,16 +33,16 @@ class ModelConfig:
     """Shape of the network.
 
     Attributes:
-        latent: dimensions of the latent state z.
-        widths: hidden layers of the initialiser P, the stepper S and the decoder D.
-        shapes: blendshapes K; zero leaves proxies alone to deform the garment.
-        activations: what D gives for them, where it is more than K ("ssilk reduce"); zero for K itself.
+        latent: number of dimensions of the latent state z.
+        widths: widths of the hidden layers of the initialiser P, the stepper S and the decoder D.
+        shapes: number K of blendshapes; with zero only proxies deform the garment.
+        activations: number of activations that D outputs, if it differs from K ("ssilk reduce"); zero for K.
         scheme: name of the integration scheme in `schemes.SCHEMES`: "spring_verlet" is Eq. 3 with a spring to the
             quasi-static state, "quasi_static" is that state itself.
         latent_bound: soft bound on each latent dimension; zero for none, as in the paper.
         max_latent_step: soft bound on the sum of S and the spring in each dimension in one step; zero for none.
         stiffness: largest spring constant of "spring_verlet", in (0, 1].
-        fps: rate at which the model steps [1/s].
+        fps: steps of the model per second [1/s].
     """
 
     latent: int = 128
@@ -59,14 +59,14 @@ class ModelConfig:
         object.__setattr__(self, "widths", tuple(self.widths))
         need_scheme(self.scheme)
         if not min(self.widths) > 0:
-            fail("model", f"widths = {self.widths}", "each is at least 1")
+            fail("model", f"widths = {self.widths}", "each must be at least 1")
         _need_between(self, 1, NO_BOUND, "latent", "fps")
         _need_between(self, 0, NO_BOUND, "shapes", "activations", "latent_bound", "max_latent_step")
         _need_between(self, 1e-6, 1, "stiffness")
 
     @property
     def activation_count(self) -> int:
-        """How many activations D gives."""
+        """Return the number of activations that D outputs."""
         return self.activations or self.shapes
 
 
@@ -75,37 +75,38 @@ class TrainConfig:
     """How a model is trained (paper, Section 3.7; docs/training.md explains defaults that differ).
 
     Static training fits the initialiser P and the decoder D to single poses, in their quasi-static states. Dynamic
-    training then fits everything to windows of consecutive poses.
+    training then fits all networks to windows of consecutive poses.
 
     Attributes:
-        iterations: optimiser steps, static training included.
+        iterations: optimiser steps, including those of static training.
         static_fraction: share of the iterations that are static training.
         pretraining_batch: poses in each step of static training.
-        batch, window: windows in each step of dynamic training, and poses in each window; its first two are given.
-        state_reuse: share of windows that continue from the state in which the last window of their slot ended.
+        batch, window: windows in each step of dynamic training, and poses in each window. The states of the first
+            two poses are given.
+        state_reuse: share of windows that continue from the final state of the previous window in the same slot.
         rotated_fraction: share of windows with a random rotation, uniform on SO(3); the others stay upright.
-        recombinations: motions made of each one in addition, whose limbs move as in another motion.
-        static_batch: single poses on which dynamic training goes on fitting P, beside the windows.
-        noise_probability: chance in each frame that noise moves a reused state; a new window always starts with
-            noise.
+        recombinations: number of extra motions for each motion, whose limbs move as in another motion.
+        static_batch: single poses in each step of dynamic training, to which P is still fitted.
+        noise_probability: probability per frame of noise on a reused state. A new window always starts with noise.
         noise: standard deviation of the noise on the first two latents of a window.
-        noise_correlation: correlation of the noise on the first latent with that on the second; 0 is the paper's.
+        noise_correlation: correlation between the noise on the first and on the second latent; 0 in the paper.
         latent_regularization: weight [J] of the regularisation of the latents (Eq. 13); zero for none.
-        latent_regularization_scale: RMS distance between garments whose latents are one apart, for Eq. 13 [m].
+        latent_regularization_scale: RMS distance between garments per unit of distance between their latents, for
+            Eq. 13 [m].
         bptt: back-propagate through the whole window, as the paper does, instead of through each step by itself.
-        static_learning_rate: of Adam in static training, decaying to a tenth.
-        learning_rate, final_learning_rate: of Adam in dynamic training, after its warm-up and at the end of the
-            cosine.
+        static_learning_rate: initial learning rate of Adam in static training; it decays to a tenth.
+        learning_rate, final_learning_rate: learning rate of Adam in dynamic training after the warm-up, and at the
+            end of the cosine schedule.
         learning_rate_warmup: iterations over which the learning rate rises at the start of dynamic training.
         skin_learning_rate_scale: factor on the learning rate of skinning weights and of the integrator's parameters.
         shape_learning_rate_scale: factor on the learning rate of blendshapes, each of which moves many vertices.
-        ema_decay: of the exponential moving average of the parameters, which is validated and kept; 0 for none. It
-            is smaller at first: `training.step.averaging_decay`.
-        closest_point: body point that cloth meets: on the "triangles" around the nearest vertex, or that of
-            "vertices" itself, which is faster and coarser.
+        ema_decay: decay of the exponential moving average of the parameters, which is validated and saved; 0 for
+            none. It is smaller at first: `training.step.averaging_decay`.
+        closest_point: how the closest body point is found: on the "triangles" around the nearest vertex, or as the
+            nearest of the "vertices", which is faster and coarser.
         validate_every: iterations between validations.
         valid_frames: frames of each clip that are validated.
-        seed: of everything random.
+        seed: seed of all random numbers.
     """
 
     iterations: int = 250_000
@@ -168,7 +169,7 @@ class TrainConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class Preset:
-    """A model and a schedule under one name."""
+    """A named pair of model and training settings."""
 
     name: str
     model: ModelConfig
@@ -231,10 +232,10 @@ Config = TypeVar("Config")
 
 
 def apply_overrides(config: Config, assignments: list[str]) -> Config:
-    """Return `config` with "name=value" assignments applied, each converted to the field's own type.
+    """Return `config` with "name=value" assignments applied, each converted to the type of its field.
 
     Raises:
-        SsilkError: a name that is no field, or a value that does not convert.
+        SsilkError: a name is unknown, or a value cannot be converted.
     """
     types = {item.name: type(getattr(config, item.name)) for item in fields(config)}  # type: ignore[arg-type]
     changes: dict[str, Any] = {}

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cost model: what a trained garment takes in time, operations, memory and on disk.
+"""Cost model of a trained garment: time, operations, memory and bytes on disk.
 
-Times are measured on this machine. All other costs follow from sizes. Each frame costs, in multiply-adds,
+Times are measured on this machine. All other costs follow from sizes. The multiply-adds of a frame are
 
-    P, S, D         the weights of the networks; retraining alone changes P, S and all but D's last layer
+    P, S, D         the weights of the networks; only retraining changes P, S and all but the last layer of D
     readout         shapes * activations, in reduced models
     blendshapes     3 V shapes
     skinning        12 V influences to blend matrices, 9 V to apply them
 
-The share of blendshapes and influences grows with the vertices of the mesh, and that of the networks falls.
+With more vertices, the share of blendshapes and skinning grows and that of the networks falls.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from .runtime import Player
 from .runtime.playback import BLOCK
 
 POINT_BYTES = 12  # bytes of a vertex in a point cache
-TILE_PARAMETERS = ("decoder.shapes", "decoder.skin_offset")  # the runtime holds these only as tiles
-MIN_SECONDS, MIN_PASSES = 0.6, 3  # to measure for at least, and passes over the motion
+TILE_PARAMETERS = ("decoder.shapes", "decoder.skin_offset")  # the runtime stores these only as tiles
+MIN_SECONDS, MIN_PASSES = 0.6, 3  # least duration of a measurement [s], and least passes over the motion
 
 
 @dataclass(frozen=True)
 class Time:
-    """Milliseconds a frame, of blocks of consecutive frames: median and 95 % quantile."""
+    """Time per frame over blocks of consecutive frames: median and 95 % quantile [ms]."""
 
     median: float
     high: float
@@ -45,18 +45,18 @@ class Time:
 
 @dataclass(frozen=True)
 class ShotBytes:
-    """Bytes of a shot: those of its asset, without any frame, and those that each frame adds."""
+    """Size of a shot: its asset without frames [bytes], and each frame [bytes]."""
 
     asset: float
     frame: float
 
     def of(self, frames: int) -> float:
-        """Return the bytes of a shot of so many frames."""
+        """Return the size of a shot with this number of frames [bytes]."""
         return self.asset + self.frame * frames
 
 
 def play_time(player: Player, motion: Motion, *, seconds: float = MIN_SECONDS) -> Time:
-    """Measure what a frame takes to play: character, latents, decoder and all vertices, on a processor."""
+    """Measure the time to play a frame on the CPU: character, latents, decoder and all vertices."""
     _pass(player, motion)  # warms up
     blocks, passes, end = [], 0, time.perf_counter() + seconds
     while passes < MIN_PASSES or time.perf_counter() < end:
@@ -66,7 +66,7 @@ def play_time(player: Player, motion: Motion, *, seconds: float = MIN_SECONDS) -
 
 
 def _pass(player: Player, motion: Motion) -> list[float]:
-    """Play a motion once; return the milliseconds a frame of each block."""
+    """Play a motion once; return the time per frame of each block [ms]."""
     playback, found = player.play(motion), []
     for start in range(0, motion.frame_count, BLOCK):
         frames = range(start, min(start + BLOCK, motion.frame_count))
@@ -95,14 +95,14 @@ def _weights(file: ModelFile, network: str) -> int:
 
 
 def memory(player: Player) -> int:
-    """Return the bytes that playing keeps in memory: parameters, and the tiles of shapes and weights for skinning."""
+    """Return the memory that playback uses for parameters and for the tiles of shapes and weights [bytes]."""
     parameters = (value.size * 4 for name, value in player.file.parameters.items() if name not in TILE_PARAMETERS)
     tiles = (tile.shapes.nbytes + tile.weights.nbytes + tile.joints.nbytes for tile in player.tiles)
     return sum(parameters) + sum(tiles)
 
 
 def model_bytes(file: ModelFile, *, pack: bool) -> int:
-    """Return how large a model's file is."""
+    """Return the size of a model's file [bytes]."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "model.safetensors"
         save_model(path, file, pack=pack)

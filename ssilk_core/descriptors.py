@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the network sees of a motion (paper, Sections 3.1 and 3.2).
+"""Descriptors: the features of a motion that the network receives (paper, Sections 3.1 and 3.2).
 
-A garment hangs and swings the same wherever its character stands, whichever way it faces and however fast it
-glides, and turning character and gravity together only turns the result. The descriptors have these symmetries
-by construction: gravity enters as its direction in each joint's own frame, and the root enters through its
-angular motion and through accelerations, never through a position, a heading or a velocity. Augmenting with a
-rotation of the character is then the same as turning gravity the other way, which costs nothing.
+The state of a garment does not depend on the position, heading or constant velocity of its character. Rotating
+character and gravity together only rotates the result. The descriptors have these symmetries by construction.
+Gravity enters as its direction in the frame of each joint. The root enters through its angular motion and through
+accelerations, not through a position, a heading or a velocity. Augmentation by a rotation of the character is
+therefore equivalent to the inverse rotation of gravity, which costs nothing.
 """
 
 from __future__ import annotations
@@ -18,20 +18,18 @@ from .assets import Floats, Motion, Skeleton
 from .constants import GRAVITY
 from .kinematics import matrix_from_quaternion, motion_transforms
 
-# Time over which rates are expressed, so that everyday motion gives features of order one.
-RATE_TIME = 0.1  # [s]
-# Features of rates and accelerations saturate here: a teleport must not push the network out of its range.
-SATURATION = 4.0
+RATE_TIME = 0.1  # [s] unit of time of rates, which gives features of order one for everyday motion
+SATURATION = 4.0  # limit of dynamic features, so that a teleport keeps the network within its trained range
 
 
 @dataclass(frozen=True, eq=False)
 class PoseFeatures:
-    """Descriptors of a motion's frames, all but gravity, which depends on the augmentation.
+    """Descriptors of a motion's frames without gravity, which depends on the augmentation.
 
     Attributes:
-        static: 6D local rotations of the joints in view but the root, shape (F, S).
-        dynamic: first and second differences of those, the root's turning, and accelerations, shape (F, D).
-        down: joint-to-world rotations transposed, to bring gravity into each joint's frame, shape (F, J', 3, 3).
+        static: 6D local rotations of the descriptor joints except the root, shape (F, S).
+        dynamic: first and second differences of these, the root's rotation, and accelerations, shape (F, D).
+        down: world-to-joint rotations, which bring gravity into each joint's frame, shape (F, J', 3, 3).
     """
 
     static: Floats
@@ -40,7 +38,7 @@ class PoseFeatures:
 
 
 def descriptor_joints(skeleton: Skeleton, used: Floats) -> np.ndarray:
-    """Return the sorted joints that can matter: those flagged in `used` (J,) and all their ancestors."""
+    """Return the joints flagged in `used` (J,) and all their ancestors, sorted, shape (J',)."""
     keep = np.array(used, dtype=bool)
     for joint in range(skeleton.joint_count - 1, -1, -1):
         if keep[joint] and skeleton.parents[joint] >= 0:
@@ -51,9 +49,9 @@ def descriptor_joints(skeleton: Skeleton, used: Floats) -> np.ndarray:
 def pose_features(
     motion: Motion, skeleton: Skeleton, joints: np.ndarray, world: Floats | None = None
 ) -> PoseFeatures:
-    """Return the descriptors of every frame of a motion; the first frame also stands for what was before it.
+    """Return the descriptors of every frame of a motion; frames before the first repeat it.
 
-    `world` is `motion_transforms` of the motion where it is known already.
+    `world` is `motion_transforms` of the motion, if it is already computed.
     """
     world = (motion_transforms(motion, skeleton.parents) if world is None else world)[:, joints]
     local = matrix_from_quaternion(motion.rotations[:, joints])
@@ -76,12 +74,15 @@ def six_d(rotations: Floats) -> Floats:
 
 
 def _past(values: Floats, steps: int) -> Floats:
-    """Return the values `steps` frames earlier; before the first frame, the first holds."""
+    """Return the values `steps` frames earlier, and the first value before the first frame."""
     return values[np.maximum(np.arange(len(values)) - steps, 0)]
 
 
 def _differences(values: Floats, fps: float) -> tuple[Floats, Floats]:
-    """Return first and second backward differences over time, scaled by RATE_TIME; zero where history lacks."""
+    """Return first and second backward differences per RATE_TIME.
+
+    The first frame repeats the first difference of the next. The second difference is zero in the first two frames.
+    """
     first = np.zeros_like(values)
     first[1:] = values[1:] - values[:-1]
     if len(values) > 1:

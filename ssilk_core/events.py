@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Events of long work: a closed set, written as JSON lines or as text for people."""
+"""Events of long tasks: a closed set of types, reported as JSON lines or as text."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Started:
 
 @dataclass(frozen=True)
 class Progress:
-    """`done` of `total` steps; `seconds_left` is None until it can be estimated; `terms` are energies [J]."""
+    """`done` of `total` steps; `seconds_left` is None until there is an estimate; `terms` are energies [J]."""
 
     done: int
     total: int
@@ -54,22 +54,22 @@ class Failed:
     error: str
 
 
-Said = Started | Progress | Message | Checkpoint | Result | Failed
+TaskEvent = Started | Progress | Message | Checkpoint | Result | Failed
 
 
 @dataclass(frozen=True)
 class GarmentEvent:
-    """What one of several trainings, bakes or other tasks says."""
+    """An event of one of several concurrent tasks, with the task's name."""
 
     name: str
-    said: Said
+    said: TaskEvent
 
 
-Event = Said | GarmentEvent
+Event = TaskEvent | GarmentEvent
 
 
 class Reporter(Protocol):
-    """A function that takes events."""
+    """A function that receives events."""
 
     def __call__(self, event: Event) -> None: ...
 
@@ -79,7 +79,7 @@ def silent(event: Event) -> None:
 
 
 class JsonReporter:
-    """One JSON object per line on standard output: {"event": "progress", "done": ...}."""
+    """Print one JSON object per line, by default on standard output: {"event": "progress", "done": ...}."""
 
     def __init__(self, stream: TextIO | None = None) -> None:
         self.stream = stream or sys.stdout
@@ -94,25 +94,25 @@ def _document(event: Event) -> dict[str, Any]:
     return {"event": type(event).__name__.lower(), **finite(asdict(event))}
 
 
-def read_event(line: str) -> Said:
-    """Return the event of a line that `JsonReporter` wrote; events of several tasks (`GarmentEvent`) are refused.
+def read_event(line: str) -> TaskEvent:
+    """Parse a line that `JsonReporter` wrote for a single task (no `GarmentEvent`).
 
     Raises:
-        ValueError: it is no such line.
+        ValueError: the line is not such an event.
     """
     kinds = {kind.__name__.lower(): kind for kind in (Started, Progress, Message, Checkpoint, Result, Failed)}
     try:
         document = json.loads(line)
         event = kinds[document.pop("event")](**document)
     except (KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"no event: {line.strip()}") from error
+        raise ValueError(f"not an event: {line.strip()}") from error
     if isinstance(event, Progress):
         return replace(event, terms={name: math.nan if x is None else x for name, x in event.terms.items()})
     return event
 
 
 def finite(value: Any) -> Any:
-    """Return a value with None for NaN and infinity, which JSON lacks."""
+    """Return a value with NaN and infinity replaced by None, because JSON has neither."""
     if isinstance(value, dict):
         return {name: finite(item) for name, item in value.items()}
     if isinstance(value, list | tuple):
@@ -121,7 +121,7 @@ def finite(value: Any) -> Any:
 
 
 class TextReporter:
-    """Text for people: one line that is rewritten on a terminal, a line every ten seconds elsewhere."""
+    """Print events as text; progress rewrites one line on a terminal, and adds one every ten seconds elsewhere."""
 
     def __init__(self, stream: TextIO | None = None) -> None:
         self.stream = stream or sys.stderr
@@ -154,14 +154,14 @@ class TextReporter:
 
 
 def describe_progress(event: Progress) -> str:
-    """Return progress as one line: "40/500  3 min 05 s left  stretch 0.12"."""
+    """Format progress as one line: "40/500  3 min 05 s left  stretch 0.12"."""
     left = "" if event.seconds_left is None else f"  {format_seconds(event.seconds_left)} left"
     terms = "  ".join(f"{name} {value:.4g}" for name, value in event.terms.items())
     return f"{event.done}/{event.total}{left}  {terms}"
 
 
 def describe(event: Event) -> str:
-    """Return an event as text for people; empty for events that they need not see."""
+    """Format an event as text; empty for events that are not shown."""
     match event:
         case Started():
             return f"{event.task} ..."
@@ -177,7 +177,7 @@ def describe(event: Event) -> str:
 
 
 def format_seconds(seconds: float) -> str:
-    """Return a duration as people say it: "42 s", "3 min 05 s", "2 h 10 min"."""
+    """Format a duration: "42 s", "3 min 05 s", "2 h 10 min"."""
     whole = round(seconds)
     if whole < 60:
         return f"{whole} s"

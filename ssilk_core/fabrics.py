@@ -22,8 +22,8 @@ class Fabric:
         bending: dihedral stiffness [N m] (per radian squared).
         collision: penalty stiffness for each vertex [N/m, per vertex].
         margin: distance to the body at which the penalty starts [m].
-        drag: resistance of the air [kg/(m2 s)], for each area and velocity through air that moves with the
-            character's root. Half a second of swinging on for light cloth; zero is the paper's vacuum.
+        drag: air drag per area and velocity [kg/(m2 s)], relative to air that moves with the character's root.
+            The default stops light cloth from swinging within about half a second. Zero is the paper's vacuum.
     """
 
     name: str
@@ -43,7 +43,7 @@ class Fabric:
             fail(
                 f"fabric '{self.name}'",
                 f"stretch model '{self.stretch_model}'",
-                f"it is one of {', '.join(STRETCH_MODELS)}",
+                f"it must be one of {', '.join(STRETCH_MODELS)}",
             )
         for item in fields(self):
             value = getattr(self, item.name)
@@ -53,9 +53,9 @@ class Fabric:
             fail(f"fabric '{self.name}'", "a density of zero", "it must be positive")
 
 
-# Areal densities are common mid-weight values of each cloth. Stiffness is scaled from the neutral default
-# (NCS), ordered as the cloths are: real membranes are stiffer by orders of magnitude, which changes the look
-# less than the conditioning.
+# Areal densities are typical mid-weight values of each cloth. Stiffness is scaled from the neutral default of NCS
+# and keeps the order of real cloths. Real membranes are stiffer by orders of magnitude, which affects the
+# conditioning more than the appearance.
 FABRICS: dict[str, Fabric] = {
     fabric.name: fabric
     for fabric in (

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing files whole or not at all: under a temporary name beside the target, then renamed."""
+"""Write files completely or not at all: to a temporary file in the same folder, which is then renamed."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from pathlib import Path
 from .errors import SsilkError, fail
 
 WRITABLE = "choose an output folder that exists and that you may write to"
-UNFINISHED = ".{}.partial-"  # how temporary names begin, the stem of the target in place of the braces
+UNFINISHED = ".{}.partial-"  # start of temporary names; the braces stand for the stem of the target
 
 
 @contextmanager
 def replacing(target: str | Path, *, keep_same: bool = False) -> Iterator[Path]:
-    """Yield a temporary path beside `target`; rename it onto `target` on success, remove it on failure.
+    """Yield a temporary path beside `target`; rename it to `target` on success, remove it on failure.
 
-    With `keep_same` a target that holds the same bytes already is left alone, its time of change included.
+    With `keep_same`, a target that already has the same bytes keeps its modification time.
 
     The temporary name keeps the suffix of `target`, because USD chooses the file format by it. Errors that name the
-    temporary file are raised again with `target` in its place.
+    temporary file are raised again with the name of `target`.
 
     Raises:
         SsilkError: `target` cannot be written (no such folder, no permission, no space).
@@ -45,7 +45,7 @@ def replacing(target: str | Path, *, keep_same: bool = False) -> Iterator[Path]:
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)
         with temporary.open("rb+") as stream:
-            os.fsync(stream.fileno())  # or a loss of power could leave an empty file under the target's name
+            os.fsync(stream.fileno())  # without it a power failure could leave an empty target
         if not (keep_same and target.is_file() and filecmp.cmp(temporary, target, shallow=False)):
             temporary.replace(target)
     except SsilkError as error:
@@ -61,24 +61,24 @@ def replacing(target: str | Path, *, keep_same: bool = False) -> Iterator[Path]:
 def remove_unfinished(target: str | Path) -> None:
     """Remove temporary files that killed processes left beside `target`.
 
-    No other process may be writing `target` at the same time.
+    No other process may write `target` at the same time.
     """
     target = Path(target)
     name = glob.escape(UNFINISHED.format(target.stem))
-    for prefix in (name, f".{name}"):  # the latter from writing the temporary file of a file
+    for prefix in (name, f".{name}"):  # the second: a writer that itself replaces its file
         for path in target.parent.glob(f"{prefix}*{glob.escape(target.suffix)}"):
             path.unlink(missing_ok=True)
 
 
 def need_writable(target: str | Path) -> None:
-    """Check that `target` can be written, before long work; nothing is left behind.
+    """Check before a long task that `target` can be written; leave no file behind.
 
     Raises:
-        SsilkError: `target` is a folder, or its folder cannot be made or written to.
+        SsilkError: `target` is a folder, or its folder cannot be created or written to.
     """
     target = Path(target)
     if target.is_dir():
-        fail(str(target), "this is a folder", "a file is written", "add a file name")
+        fail(str(target), "this is a folder", "the output is a file", "add a file name")
     folder = next(above for above in target.absolute().parents if above.exists())
     try:
         with tempfile.TemporaryFile(dir=folder):
@@ -88,7 +88,7 @@ def need_writable(target: str | Path) -> None:
 
 
 def need_not_input(target: str | Path, *inputs: Path | str | None) -> None:
-    """Raise `SsilkError` where `target` is one of the `inputs`: they are never overwritten."""
+    """Raise `SsilkError` if `target` is one of the `inputs`, which are never overwritten."""
     target = Path(target)
     same = target.exists() and any(Path(path).exists() and target.samefile(path) for path in inputs if path)
     if same:

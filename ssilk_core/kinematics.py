@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rotations, forward kinematics and skinning in float64 numpy, the slow reference of every fast path."""
+"""Rotations, forward kinematics and skinning in float64 numpy, the reference implementation of the fast paths."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from .assets import Deformer, Floats, GarmentPose, Ints, Motion, ProxyRig, Scene, SkinWeights
 
-POSES_AT_ONCE = 256
+POSES_AT_ONCE = 256  # frames in each chunk of LBS poses
 
 
 def matrix_from_quaternion(quaternions: Floats) -> Floats:
@@ -29,7 +29,7 @@ def quaternion_from_matrix(matrices: Floats) -> Floats:
     m = np.asarray(matrices, dtype=np.float64)
     diagonal = np.moveaxis(np.diagonal(m, axis1=-2, axis2=-1), -1, 0)
     trace = diagonal.sum(axis=0)
-    # Four candidates, each exact where its own component is large; the largest is the well-conditioned one.
+    # Four candidates, each accurate where its own component is large; take the best-conditioned one.
     squares = np.stack([trace, *(2 * diagonal - trace)], axis=-1)
     a = m[..., 2, 1] - m[..., 1, 2]
     b = m[..., 0, 2] - m[..., 2, 0]
@@ -74,7 +74,7 @@ def slerp(p: Floats, q: Floats, t: Floats) -> Floats:
     q = np.where(cosine[..., None] < 0, -q, q)
     angle = np.arccos(np.clip(np.abs(cosine), 0.0, 1.0))
     sine = np.sin(angle)
-    near = sine < 1e-6  # here the arc is a line to machine precision
+    near = sine < 1e-6  # the arc is a line to machine precision
     safe = np.where(near, 1.0, sine)
     a = np.where(near, 1 - t, np.sin((1 - t) * angle) / safe)
     b = np.where(near, t, np.sin(t * angle) / safe)
@@ -98,7 +98,7 @@ def invert_rigid(transforms: Floats) -> Floats:
 
 
 def world_transforms(local: Floats, parents: Ints) -> Floats:
-    """Forward kinematics: joint to world, from joint to parent, both (..., J, 4, 4); parents come first."""
+    """Return joint-to-world from joint-to-parent transforms, both (..., J, 4, 4); parents precede children."""
     world = np.array(local, dtype=np.float64)
     for joint, parent in enumerate(parents):
         if parent >= 0:
@@ -107,7 +107,7 @@ def world_transforms(local: Floats, parents: Ints) -> Floats:
 
 
 def local_transforms(world: Floats, parents: Ints) -> Floats:
-    """Return joint to parent, from joint to world, both (..., J, 4, 4)."""
+    """Return joint-to-parent from joint-to-world transforms, both (..., J, 4, 4)."""
     local = np.array(world, dtype=np.float64)
     children = np.flatnonzero(np.asarray(parents) >= 0)
     above = np.asarray(parents)[children]
@@ -116,19 +116,23 @@ def local_transforms(world: Floats, parents: Ints) -> Floats:
 
 
 def motion_transforms(motion: Motion, parents: Ints) -> Floats:
-    """Return joint to world for every frame of a motion [m], shape (F, J, 4, 4)."""
+    """Return joint-to-world transforms for every frame of a motion [m], shape (F, J, 4, 4)."""
     return world_transforms(rigid(matrix_from_quaternion(motion.rotations), motion.translations), parents)
 
 
 def frames_at(frame_count: int, source: float, target: float) -> int:
-    """Return how many frames at rate `target` begin within frames at rate `source`, the first and last included."""
+    """Return the number of frames at rate `target` within the duration of `frame_count` frames at rate `source`.
+
+    Both ends of the duration count.
+    """
     return int(np.floor((frame_count - 1) * target / source + 1e-6)) + 1
 
 
 def resample(motion: Motion, fps: float, *, cover: bool = False) -> Motion:
-    """Return the motion at `fps`: slerp for rotations, lines for translations.
+    """Resample a motion to `fps`, with slerp for rotations and linear interpolation for translations.
 
-    The frames end at or before the motion's end; with `cover`, at or after it, its last pose being held.
+    The last frame lies at or before the end of the motion. With `cover` it lies at or after the end, and repeats
+    the last pose.
     """
     if abs(motion.fps - fps) < 1e-9 * fps:
         return motion
@@ -141,34 +145,34 @@ def resample(motion: Motion, fps: float, *, cover: bool = False) -> Motion:
     return Motion(motion.path, fps, rotations, translations)
 
 
-EASE = 0.25  # [s] in which a run-up comes from rest to the motion's own pace
+EASE = 0.25  # [s] in which a run-up accelerates from rest to the speed of the motion
 
 
 def run_up(motion: Motion, seconds: float) -> Motion:
-    """Return frames before a motion: its first pose, held, then eased into the pace of its first step.
+    """Return frames to put before a motion: its first pose at rest, then eased into the speed of its first step.
 
     Args:
-        seconds: how long they take, to the nearest frame and at least one [s].
+        seconds: duration [s], rounded to frames, at least one.
     """
     count = max(round(seconds * motion.fps), 1)
     easing = min(count, EASE * motion.fps)
     away = np.arange(count, 0, -1.0).clip(max=easing)
-    away -= away**2 / (2 * easing)  # steps before the first frame; their pace falls from one to zero
+    away -= away**2 / (2 * easing)  # distance from the first frame [steps]; the speed rises from zero to one
     first, second = (motion.clip(frame, frame + 1) for frame in (0, min(1, motion.frame_count - 1)))
     rotations = slerp(first.rotations, second.rotations, -away[:, None])
     translations = first.translations - away[:, None, None] * (second.translations - first.translations)
     return Motion(motion.path, motion.fps, rotations, translations)
 
 
-CUT_SPEED = 25.0  # [m/s]; a root that is so much faster than before and after has been moved, not animated
-CUT_WINDOW = 5  # frames to either side that say how fast a root moves anyway, be it in a car
+CUT_SPEED = 25.0  # [m/s] deviation from the median velocity above which the root was teleported, not animated
+CUT_WINDOW = 5  # frames on either side for that median, so that a fast vehicle is not a jump
 
 
 def split_at_cuts(motion: Motion, *, max_joint_speed: float = np.inf) -> list[Motion]:
-    """Return the spans of a motion between jumps of its root (a teleport, an edit), in order; mostly just one.
+    """Split a motion at jumps of its root (teleports, edits) and return the spans in order.
 
-    A jump is a step that the median of the steps around it does not explain. With `max_joint_speed` [rad/s] it is
-    also cut where any joint turns faster than that, as captured joints do that flip.
+    A jump is a step that deviates from the median of the steps around it by more than `CUT_SPEED`. With
+    `max_joint_speed` [rad/s] the motion is also split where a joint rotates faster, such as a flip in captured data.
     """
     step = _deviation_from_median(np.diff(motion.translations[:, 0], axis=0)) * motion.fps
     cosine = np.abs((motion.rotations[1:] * motion.rotations[:-1]).sum(-1)).clip(max=1.0)
@@ -178,7 +182,7 @@ def split_at_cuts(motion: Motion, *, max_joint_speed: float = np.inf) -> list[Mo
 
 
 def _deviation_from_median(steps: Floats) -> Floats:
-    """Return how far each step (N, 3) is from the median of those around it [m], shape (N,)."""
+    """Return the distance of each step (N, 3) from the median of those around it [m], shape (N,)."""
     if not len(steps):
         return np.zeros(0)
     padded = np.pad(steps, ((CUT_WINDOW, CUT_WINDOW), (0, 0)), mode="reflect")
@@ -197,12 +201,12 @@ def sample_motion(motion: Motion, position: Floats) -> tuple[Floats, Floats]:
 
 
 def skin_points(points: Floats, skin: SkinWeights, matrices: Floats) -> Floats:
-    """Linear blend skinning.
+    """Apply linear blend skinning.
 
     Args:
         points: rest positions [m], shape (V, 3) or (F, V, 3).
         skin: weights of the V points.
-        matrices: bind pose to posed world for each joint, shape (F, J, 4, 4).
+        matrices: transform of each joint from bind pose to posed world, shape (F, J, 4, 4).
 
     Returns:
         Posed positions [m], shape (F, V, 3).
@@ -216,12 +220,12 @@ def skin_points(points: Floats, skin: SkinWeights, matrices: Floats) -> Floats:
 
 
 def skinning_matrices(world: Floats, bind_transforms: Floats) -> Floats:
-    """Return bind pose to posed world for each joint, shape (F, J, 4, 4)."""
+    """Return the transform of each joint from bind pose to posed world, shape (F, J, 4, 4)."""
     return world @ invert_rigid(bind_transforms)
 
 
 def combined_transforms(deformer: Deformer, motion: Motion, pose: GarmentPose) -> Floats:
-    """Joint to world of character joints, then proxies, for the frames of `pose`, shape (F, J + P, 4, 4)."""
+    """Return joint-to-world transforms of joints, then proxies, for the frames of `pose`, shape (F, J + P, 4, 4)."""
     scene = deformer.scene
     skeleton, rig = scene.character.skeleton, scene.rig
     frames = slice(pose.start, pose.start + pose.frame_count)
@@ -235,7 +239,7 @@ def combined_transforms(deformer: Deformer, motion: Motion, pose: GarmentPose) -
 def deform(deformer: Deformer, motion: Motion, pose: GarmentPose) -> Floats:
     """Decode a pose to garment vertices in world space [m], shape (F, V, 3) (Eqs. 5 and 8).
 
-    `motion` is the character's motion over the whole shot; `pose.start` says where the pose stands in it.
+    `motion` is the character's motion over the whole shot; `pose.start` is the index of the pose's first frame.
     """
     scene = deformer.scene
     matrices = skinning_matrices(combined_transforms(deformer, motion, pose), scene.bind_transforms)
@@ -250,7 +254,7 @@ def lbs_deformer(scene: Scene) -> Deformer:
 
 
 def lbs_poses(frame_count: int) -> Iterator[GarmentPose]:
-    """Yield the poses of a `plain_deformer`, which hold nothing, some frames at a time."""
+    """Yield the poses of an `lbs_deformer`, which have no proxies and weights, in chunks of frames."""
     for start in range(0, frame_count, POSES_AT_ONCE):
         frames = min(POSES_AT_ONCE, frame_count - start)
         yield GarmentPose(start, np.zeros((frames, 0, 4)), np.zeros((frames, 0)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which parameters a network has, from its sizes alone, so that a file can be checked without building one."""
+"""Compute the shapes of a network's parameters, so that a file can be checked without building the network."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ def parameter_shapes(scene: Scene, config: ModelConfig, joints: Ints) -> Shapes:
 
 
 def descriptor_sizes(scene: Scene, joints: Ints) -> tuple[int, int]:
-    """Return how many numbers static descriptors have, gravity included, and how many dynamic ones add to them."""
+    """Return the number of static features, including gravity, and the number of dynamic features."""
     inner = int((scene.character.skeleton.parents[joints] >= 0).sum())
     return 6 * inner + 3 * len(joints), 12 * inner + 12 + 3 * len(joints)
 
 
 def _layers(name: str, sizes: tuple[int, ...], bias: bool = True) -> Shapes:
-    """Return the shapes of a perceptron's parameters; every second index is an activation, which has none."""
+    """Return the shapes of an MLP's parameters; odd indices are activations, which have none."""
     shapes: Shapes = {}
     for index, (inputs, outputs) in enumerate(pairwise(sizes)):
         shapes[f"{name}.{2 * index}.weight"] = (outputs, inputs)

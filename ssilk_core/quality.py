@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Quality levels by name, and the best model within a budget."""
+"""Named quality levels, and the search for the best model within a budget."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from .events import Message, Reporter
 from .reduction import ModelSize, ReducedModel, Reducer
 from .runtime import Player
 
-UNLIMITED = 1_000_000  # more than any garment has
+UNLIMITED = 1_000_000  # exceeds the number of shapes, joints or influences of any garment
 
 
 @dataclass(frozen=True, kw_only=True)
 class Quality:
-    """A level of quality: what is kept of a trained garment, at what rate, and how much it is refined.
+    """A quality level: the size to which a trained garment is reduced, its frame rate and its refinement.
 
     Attributes:
-        shapes, joints, influences: kept of what the model has.
-        fps: most frames per second of a shot [1/s]; None for those of its motion.
-        refine: solver iterations for each frame, from the network's state.
-        about: one line for people.
+        shapes, joints, influences: largest numbers of blendshapes, proxies, and influences per vertex.
+        fps: highest frame rate of a shot [1/s]; None for that of its motion.
+        refine: solver iterations per frame, starting from the network's state.
+        about: one-line description.
     """
 
     name: str
@@ -43,7 +43,7 @@ class Quality:
         return ModelSize(shapes=self.shapes, joints=self.joints, influences=self.influences)
 
     def rate(self, fps: float) -> float:
-        """Return the frames per second [1/s] of a shot whose motion has `fps`."""
+        """Return the frame rate [1/s] of a shot whose motion has the rate `fps`."""
         return fps if self.fps is None else min(self.fps, fps)
 
 
@@ -52,8 +52,8 @@ QUALITIES = {
     for quality in (
         Quality(name="crowd", shapes=12, joints=8, influences=4, fps=15.0, about="many characters, far away"),
         Quality(name="game", shapes=32, joints=16, influences=4, fps=30.0, about="real time, four influences"),
-        Quality(name="film", shapes=48, about="no visible difference from the whole model"),
-        Quality(name="hero", refine=4, about="the whole model, refined by the solver"),
+        Quality(name="film", shapes=48, about="no visible difference from the full model"),
+        Quality(name="hero", refine=4, about="the full model, refined by the solver"),
     )
 }
 
@@ -66,17 +66,17 @@ def quality_named(name: str) -> Quality:
 
 
 def size_at(quality: str | None, whole: ModelSize) -> ModelSize:
-    """Return what a level keeps of a model, or all of it without a level; raise `SsilkError` for an unknown name."""
+    """Return the size of a model at a level, or its full size without one; raise `SsilkError` for an unknown name."""
     return quality_named(quality).size.within(whole) if quality else whole
 
 
 @dataclass(frozen=True, kw_only=True)
 class SizeReduction:
-    """What is kept of a model, and what that loses.
+    """Sizes of a model before and after a reduction, and the resulting error.
 
     Attributes:
         whole, kept: sizes of the model before and after.
-        rms_mm, max_mm: distance of its vertices from the whole model's over the motions [mm]; RMS over the mass.
+        rms_mm, max_mm: RMS (weighted by mass) and maximum distance of vertices from the full model's [mm].
     """
 
     whole: ModelSize
@@ -86,11 +86,11 @@ class SizeReduction:
 
     @classmethod
     def of(cls, whole: ModelSize, found: ReducedModel) -> SizeReduction:
-        """Return what a reduced model keeps of a whole one."""
+        """Return the sizes and errors of a reduced model."""
         return cls(whole=whole, kept=found.size, rms_mm=1000 * found.rms, max_mm=1000 * found.largest)
 
     def to_metadata(self) -> dict[str, object]:
-        """Return figures, as files store them."""
+        """Return the entries that files store."""
         return {
             "blendshapes": f"{self.kept.shapes} of {self.whole.shapes}",
             "proxies": f"{self.kept.joints} of {self.whole.joints}",
@@ -102,7 +102,7 @@ class SizeReduction:
 
 @dataclass(frozen=True)
 class Budget:
-    """The most that something may cost, in `unit`: "ms" for each frame, or bytes on disk."""
+    """An upper limit of a cost in `unit`: "ms" per frame, or "bytes" on disk."""
 
     amount: float
     unit: str
@@ -115,7 +115,7 @@ BYTES = {"kB": 1e3, "MB": 1e6, "GB": 1e9}
 
 
 def format_amount(amount: float, unit: str) -> str:
-    """Return an amount as people read it: "0.31 ms", "1.96 MB"."""
+    """Format an amount: "0.31 ms", "1.96 MB"."""
     if unit == "ms":
         return f"{amount:.3g} ms"
     name = next((name for name, size in BYTES.items() if amount < 1000 * size), "GB")
@@ -123,10 +123,10 @@ def format_amount(amount: float, unit: str) -> str:
 
 
 def parse_budget(text: str) -> Budget:
-    """Read a budget: "0.3ms" for each frame, or "2MB" (kB, GB) on disk.
+    """Parse a budget: "0.3ms" per frame, or "2MB" (kB, GB) on disk.
 
     Raises:
-        SsilkError: it is none.
+        SsilkError: the text is not a budget.
     """
     found = re.fullmatch(r"\s*([0-9.eE+-]+?)\s*(ms|kB|MB|GB)\s*", text)
     try:
@@ -143,7 +143,7 @@ SHAPES, JOINTS, INFLUENCES = (1.0, 0.75, 0.5, 0.375, 0.25, 0.125, 0.0), (1.0, 0.
 
 
 def candidate_sizes(whole: ModelSize) -> list[ModelSize]:
-    """Return the sizes that are tried within a budget, from the whole model to none of it."""
+    """Return the candidate sizes for a budget, from the full model to one without shapes and proxies."""
     grid = product(JOINTS, INFLUENCES, SHAPES)  # shapes vary fastest: the reducer caches what the others need
     sizes = [
         ModelSize(shapes=round(share * whole.shapes), joints=round(joints * whole.joints), influences=most).within(
@@ -156,7 +156,7 @@ def candidate_sizes(whole: ModelSize) -> list[ModelSize]:
 
 @dataclass(frozen=True, eq=False)
 class BudgetChoice:
-    """The best model within a budget, and what it costs in the budget's unit."""
+    """The best model within a budget, and its cost in the budget's unit."""
 
     reduced: ReducedModel
     cost: float
@@ -165,14 +165,14 @@ class BudgetChoice:
 def best_within(
     reducer: Reducer, budget: Budget, cost: Callable[[ModelFile], float], most: ModelSize
 ) -> BudgetChoice:
-    """Return the model with the least predicted loss among those whose measured cost is within a budget.
+    """Return the model with the least predicted error among those whose measured cost is within a budget.
 
     Args:
-        most: what may be kept.
-        cost: measures a model in the budget's unit; keeping more never lowers it.
+        most: largest size.
+        cost: measures a model in the budget's unit; it must not decrease with size.
 
     Raises:
-        SsilkError: not even the smallest model fits.
+        SsilkError: even the smallest model exceeds the budget.
     """
     tried = []
     for found in _cheaper(reducer, candidate_sizes(most), cost):
@@ -182,13 +182,13 @@ def best_within(
     return fail(
         "--budget",
         f"nothing fits {budget}",
-        f"the smallest that this model can be cut to takes {format_amount(min(tried), budget.unit)}",
-        "allow more, or train a smaller network ('ssilk train --set widths=... --set latent=...')",
+        f"this model needs at least {format_amount(min(tried), budget.unit)}",
+        "raise the budget, or train a smaller network ('ssilk train --set widths=... --set latent=...')",
     )
 
 
 def _cheaper(reducer: Reducer, sizes: list[ModelSize], cost: Callable[[ModelFile], float]) -> Iterator[BudgetChoice]:
-    """Yield models by what they lose; skip those that keep at least as much as one before."""
+    """Yield models in order of predicted error; skip those at least as large as one already yielded."""
     tried: list[ModelSize] = []
     for size in sorted(sizes, key=lambda size: (reducer.predict_error(size), sum(vars(size).values()))):
         if not any(other.within(size) == other for other in tried):
@@ -205,16 +205,16 @@ def spend(
     size_bytes: Callable[[ModelFile], float],
     report: Reporter,
 ) -> ReducedModel:
-    """Return the best model within a budget, and report what it keeps and costs.
+    """Return the best model within a budget, and report its size and cost.
 
     Args:
-        text: the budget, as `parse_budget` reads it.
-        most: what may be kept.
-        motion: models are timed on it.
-        size_bytes: gives the bytes on disk that a model takes.
+        text: the budget, for `parse_budget`.
+        most: largest size.
+        motion: motion on which models are timed.
+        size_bytes: returns the size of a model on disk [bytes].
 
     Raises:
-        SsilkError: nothing fits, or the text is no budget.
+        SsilkError: nothing fits, or the text is not a budget.
     """
     budget = parse_budget(text)
 

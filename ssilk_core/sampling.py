@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Garment poses between frames."""
+"""Interpolate garment poses between frames."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from .kinematics import slerp
 
 
 def sample_pose(pose: GarmentPose, position: Floats, start: int = 0) -> GarmentPose:
-    """Return poses at fractional frames `position` (N,), counted from the first one given.
+    """Return poses at fractional frames `position` (N,), counted from the first frame of `pose`.
 
-    Rotations are interpolated by slerp and weights by lines; `start` is where the result stands in its shot.
+    Rotations are interpolated by slerp, and weights linearly. `start` is the first frame of the result in its shot.
     """
     low = np.minimum(position.astype(int), pose.frame_count - 1)
     high = np.minimum(low + 1, pose.frame_count - 1)

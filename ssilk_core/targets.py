@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Targets of a bake: the influences, units, axes and packaging that each receiver reads."""
+"""Targets of a bake: the influences, units, axes and file formats that each receiving application supports."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from .errors import fail
 
 @dataclass(frozen=True, kw_only=True)
 class Target:
-    """What one kind of receiver reads.
+    """Requirements of one kind of receiving application.
 
     Attributes:
-        influences: most joints that may move a vertex; None for as many as the garment has.
+        influences: largest number of joints per vertex; None for no limit.
         meters_per_unit, up_axis: units [m] and up axis of the file; None for those of the character's stage.
-        lean: leave joints at rest out of the animation, and store the root's path as a translation of the SkelRoot.
+        lean: omit joints at rest from the animation, and store the root's path as a translation of the SkelRoot.
             The layer is smaller, and exact far from the origin. The receiver must compose transforms as USD does.
-        suffixes: of the files that it takes; layers need ".usdc".
-        about: one line for people.
+        suffixes: file suffixes that it accepts; layers need ".usdc".
+        about: one-line description.
     """
 
     influences: int | None = None
@@ -31,7 +31,7 @@ class Target:
     about: str = ""
 
 
-# A new target is one more entry: options, checks, bakes and their tests read it here.
+# To add a target, add an entry: options, checks, bakes and their tests use this table.
 TARGETS = {
     "usd": Target(lean=True, about="film pipelines and renderers: the stage's units, nothing capped"),
     "blender": Target(meters_per_unit=1.0, up_axis="Z", about="metres, z up, every joint animated"),
@@ -44,22 +44,22 @@ TARGETS = {
 
 
 def check_influences(found: int, name: str, model: str) -> None:
-    """Raise `SsilkError` where `found` joints move a vertex of a model and target `name` takes fewer."""
+    """Raise `SsilkError` if a model has more influences per vertex, `found`, than target `name` supports."""
     most = TARGETS[name].influences
     if not (most is None or found <= most):
         fail(
             model,
             f"{found} joints move a vertex",
             f"--target {name} takes {most}",
-            f"fit fewer to the shots: 'ssilk reduce --influences {most}' with the motions of the shots",
+            f"reduce them with 'ssilk reduce --influences {most}' and the motions of the shots",
         )
 
 
 def cap_influences(deformer: Deformer, target: Target) -> Deformer:
-    """Return a garment and its character's bodies with each vertex moved by its heaviest influences alone.
+    """Keep only the heaviest influences of each vertex of a garment and its character's bodies.
 
-    The remaining weights of a vertex are scaled to a sum of one. This is for bodies and linear blend skinning: a
-    trained garment was already fitted to what its target takes, or refused (`check_influences`).
+    The remaining weights of a vertex are scaled to a sum of one. This serves bodies and linear blend skinning. A
+    trained garment with too many influences has already been reduced or refused (`check_influences`).
     """
     most = target.influences
     if most is None:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Safetensors files read with numpy alone, where the library is not at hand; nothing in them is trusted.
+"""Read safetensors files with only numpy, for environments without the library; the content is not trusted.
 
-A file is the length of its header (8 bytes, little endian), the header (JSON: of each tensor type, shape and place),
-and the tensors one after the other [huggingface.co/docs/safetensors].
+A file has the length of the header (8 bytes, little endian), the header (JSON with the type, shape and byte range of
+each tensor), and the tensors without gaps [huggingface.co/docs/safetensors].
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-HEADER_LIMIT = 64 << 20  # bytes; a header this large is damage or mischief, not a model
+HEADER_LIMIT = 64 << 20  # [bytes]; a larger header is damaged or malicious
 TYPES = {
     "BOOL": "?", "U8": "u1", "I8": "i1", "U16": "<u2", "I16": "<i2", "U32": "<u4", "I32": "<i4", "U64": "<u8",
     "I64": "<i8", "F16": "<f2", "F32": "<f4", "F64": "<f8",
@@ -27,7 +27,7 @@ Tensors = dict[str, NDArray]
 
 @dataclass(frozen=True)
 class Place:
-    """A tensor and where it lies among the others [bytes]."""
+    """Name, type, shape and byte range of a tensor, counted from the end of the header."""
 
     name: str
     kind: np.dtype
@@ -36,60 +36,60 @@ class Place:
     stop: int
 
     def read(self, data: bytes) -> NDArray:
-        """Return the tensor of its bytes."""
+        """Return the tensor with this content."""
         return np.frombuffer(bytearray(data), self.kind).reshape(self.shape)
 
 
 def read_tensors(path: Path) -> tuple[Tensors, dict[str, str]]:
-    """Return the tensors of a file by name, and the words in its header.
+    """Return the tensors of a file by name, and the text metadata in its header.
 
     Raises:
-        ValueError: the file is none of these, is damaged, or holds numbers that numpy lacks.
+        ValueError: the file is not a safetensors file, is damaged, or has a type that numpy lacks.
     """
     with path.open("rb") as stream:
         size = int.from_bytes(stream.read(8).ljust(8, b"\0"), "little")
         if not 0 < size <= HEADER_LIMIT:
-            raise ValueError("it has no header that fits")
+            raise ValueError("its header has an invalid length")
         header = _header(stream.read(size))
         words, left = header.pop("__metadata__", {}), path.stat().st_size - 8 - size
         if not isinstance(words, dict):
-            raise ValueError("its metadata are no words")
+            raise ValueError("its metadata is not a table of text")
         places = sorted(_entries(header), key=lambda place: (place.start, place.stop))
         _need_filled(places, left)
         return {place.name: place.read(stream.read(place.stop - place.start)) for place in places}, words
 
 
 def _need_filled(places: list[Place], size: int) -> None:
-    """Raise `ValueError` unless tensors fill their places, and these all of `size` bytes, one after the other."""
+    """Raise `ValueError` unless tensors match their byte ranges, and these fill `size` bytes without gaps."""
     end = 0
     for place in places:
         needed = math.prod(place.shape) * place.kind.itemsize
         if place.start != end or place.stop - place.start != needed:
-            raise ValueError(f"tensor '{place.name}' does not fill its place")
+            raise ValueError(f"tensor '{place.name}' does not match its byte range")
         end = place.stop
     if end != size:
-        raise ValueError(f"its tensors take {end} bytes, and it has {size}")
+        raise ValueError(f"its tensors take {end} bytes, but it has {size}")
 
 
 def _header(text: bytes) -> dict[str, Any]:
     try:
         header = json.loads(text)
     except RecursionError as error:
-        raise ValueError("its header is nested without end") from error
+        raise ValueError("its header is nested too deeply") from error
     if not isinstance(header, dict):
-        raise ValueError("its header is no table")
+        raise ValueError("its header is not a table")
     return header
 
 
 def _entries(header: dict[str, Any]) -> Iterator[Place]:
-    """Yield the places of all tensors; only the types of what describes them are checked."""
+    """Yield the entries of all tensors; only the types of their fields are checked."""
     for name, entry in header.items():
         try:
             kind, shape, (start, stop) = entry["dtype"], entry["shape"], entry["data_offsets"]
         except (TypeError, KeyError, ValueError) as error:
-            raise ValueError(f"tensor '{name}' is described in part") from error
+            raise ValueError(f"tensor '{name}' has an incomplete description") from error
         if not isinstance(kind, str) or kind not in TYPES:
-            raise ValueError(f"tensor '{name}' holds numbers of type {str(kind)[:40]}")
+            raise ValueError(f"tensor '{name}' has the unsupported type {str(kind)[:40]}")
         if not isinstance(shape, list) or any(type(each) is not int or each < 0 for each in (*shape, start, stop)):
-            raise ValueError(f"tensor '{name}' has a shape or place that is no number")
+            raise ValueError(f"tensor '{name}' has an invalid shape or byte range")
         yield Place(name, np.dtype(TYPES[kind]), shape, start, stop)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The world as arrays: skeleton, character, garment, proxy rig, motion, and the scene they make.
+"""Assets as arrays: skeleton, character, garment, proxy rig, motion, and the scene that combines them.
 
-Every class is a frozen dataclass, validated when built; arrays are made read-only. Conventions, everywhere
-inside the core: metres, y up, gravity along -y, column vectors (``x_world = T @ x_joint``), quaternions as
-(w, x, y, z), triangles counter-clockwise seen from outside. Readers convert to this, writers convert back.
+Every class is a frozen dataclass that validates its values and makes its arrays read-only. Conventions throughout
+the core: metres, y up, gravity along -y, column vectors (``x_world = T @ x_joint``), quaternions (w, x, y, z), and
+triangles counter-clockwise from outside. Readers convert to these conventions, and writers convert back.
 """
 
 from .arrays import UP, Floats, Ints

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arrays of assets: their types, made read-only, checked."""
+"""Types and checks of the arrays in assets."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ Ints = NDArray[np.integer]
 
 
 def frozen(array: object, dtype: type) -> NDArray:
-    """Return a read-only copy in one piece of memory."""
+    """Return a read-only, contiguous copy."""
     copy: NDArray = np.array(array, dtype=dtype, order="C")
     copy.flags.writeable = False
     return copy
 
 
 def assign(instance: object, **values: object) -> None:
-    """Set fields of a frozen dataclass while it is built."""
+    """Set fields of a frozen dataclass during its construction."""
     for name, value in values.items():
         object.__setattr__(instance, name, value)
 
 
 def need_finite(array: NDArray, where: str, what: str) -> None:
-    """Raise `SsilkError` where rows hold NaN or infinity."""
+    """Raise `SsilkError` if a row of `array` has NaN or infinity."""
     bad = np.flatnonzero(~np.isfinite(array).all(axis=tuple(range(1, array.ndim))))
     if len(bad) != 0:
         fail(

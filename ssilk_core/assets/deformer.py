@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A trained garment as any UsdSkel reader sees it, and its frames."""
+"""A trained garment in the form that UsdSkel defines, and its poses."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .skin import SkinWeights
 
 @dataclass(frozen=True, eq=False)
 class Deformer:
-    """A trained garment as any UsdSkel reader sees it: rest points, blendshapes, weights (Eqs. 5 and 8).
+    """A trained garment as UsdSkel defines it: rest points, blendshapes and skinning weights (Eqs. 5 and 8).
 
     Attributes:
         scene: the garment, its character and its rig.
@@ -45,7 +45,7 @@ class Deformer:
 
 @dataclass(frozen=True, eq=False)
 class GarmentPose:
-    """Some consecutive frames of a garment: what the network says and what a shot stores (Eq. 7).
+    """Poses of a garment in consecutive frames, as the network predicts and a shot stores them (Eq. 7).
 
     Attributes:
         start: index of the first frame within the shot.

@@ -21,9 +21,9 @@ class Garment:
     """A garment mesh fitted to the character's bind pose.
 
     Attributes:
-        mesh: the garment at rest; its rest shape for the energies.
-        skin: weights onto the character's joints ("linear blend skinning"), or None when none are authored.
-        classes: PINNED, TIGHT or LOOSE for each vertex, shape (V,), or None when none are authored.
+        mesh: the garment at rest, which is also the rest shape of the energies.
+        skin: weights over the character's joints for linear blend skinning, or None if not authored.
+        classes: PINNED, TIGHT or LOOSE for each vertex, shape (V,), or None if not authored.
     """
 
     mesh: Mesh

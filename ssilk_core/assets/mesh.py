@@ -19,8 +19,7 @@ class Mesh:
         path: prim path (and file), for messages and for writing back.
         points: positions [m], shape (V, 3).
         faces: triangles, shape (F, 3).
-        polygon_counts, polygon_indices: the faces as they were authored (n-gons), for writing back;
-            the triangles themselves when left out.
+        polygon_counts, polygon_indices: the authored polygons, for writing back; by default the triangles.
         uvs: texture coordinates per polygon corner, shape (len(polygon_indices), 2), or None.
     """
 

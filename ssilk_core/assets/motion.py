@@ -16,7 +16,7 @@ class Motion:
     """An animation of the character's joints at a constant rate.
 
     Attributes:
-        path: where it was read, for messages.
+        path: source of the motion, for messages.
         fps: frames per second [1/s].
         rotations: local joint rotations, unit quaternions (w, x, y, z), shape (F, J, 4).
         translations: local joint translations [m], shape (F, J, 3); roots are in world space.
@@ -53,7 +53,7 @@ class Motion:
         return len(self.rotations)
 
     def clip(self, start: int, stop: int) -> Motion:
-        """Return frames `start` (inclusive) to `stop` (exclusive) as a motion of its own."""
+        """Return frames `start` (inclusive) to `stop` (exclusive) as a separate motion."""
         return replace(
             self,
             rotations=self.rotations[start:stop],

@@ -17,12 +17,12 @@ from .skin import SkinWeights
 class ProxyRig:
     """Proxy joints of one garment and the initial weights of the whole garment (paper, Appendix A).
 
-    Joint indices here run over character joints first, then proxies: proxy p is joint J + p. A rig
-    without proxies (P = 0) is a garment on the character's joints alone.
+    Combined joint indices count the J character joints first, then the P proxies: proxy p is joint J + p. With no
+    proxies (P = 0) the garment follows only the character's joints.
 
     Attributes:
         joint_names: UsdSkel joint paths of the proxies, length P.
-        parents: combined index of each proxy's parent, shape (P,); a parent comes before its child.
+        parents: combined index of each proxy's parent, which precedes its children, shape (P,).
         bind_transforms: proxy to world at the bind pose, rigid, shape (P, 4, 4).
         skin: initial weights of every garment vertex over the combined joints.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a model is trained on."""
+"""The input of training and baking: a character with one prepared garment."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from .skin import SkinWeights
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What a model is trained on: a character, one prepared garment, and its proxy rig.
+    """A character, one prepared garment, and its proxy rig.
 
-    Built once the garment has weights and classes and the rig exists; everything downstream relies on it.
+    The garment must have weights and classes, so that training and baking need no further checks.
     """
 
     character: Character
@@ -62,8 +62,8 @@ class Scene:
         if not (late.size == 0 and (rig.parents >= 0).all()):
             fail(
                 rig.path,
-                "a proxy joint stands before its parent or has none",
-                "each proxy hangs from an earlier joint",
+                "a proxy joint precedes its parent or has none",
+                "the parent of each proxy must be an earlier joint",
             )
 
     @property

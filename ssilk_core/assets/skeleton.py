@@ -16,7 +16,7 @@ class Skeleton:
     """Joints of a character, parents before children.
 
     Attributes:
-        path: where it was read, for messages.
+        path: source of the skeleton, for messages.
         joint_names: UsdSkel joint paths ("Hips/Spine"), length J.
         parents: index of each joint's parent, -1 for roots, shape (J,).
         bind_transforms: joint to world at the bind pose, rigid, shape (J, 4, 4).
@@ -48,8 +48,8 @@ class Skeleton:
         if bad.size != 0:
             fail(
                 self.path,
-                f"joint '{self.joint_names[bad[0]] if bad.size else ''}' stands before its parent",
-                "parents come first and a joint is never its own ancestor",
+                f"joint '{self.joint_names[bad[0]] if bad.size else ''}' precedes its parent",
+                "parents must come first, and a joint must not be its own ancestor",
                 "reorder the joints",
             )
         check_rigid(self.bind_transforms, self.path, "bind transform", self.joint_names)
@@ -76,6 +76,6 @@ def check_rigid(transforms: Floats, where: str, what: str, names: tuple[str, ...
         fail(
             where,
             f"the {what} of joint '{names[bad[0]] if bad.size else ''}' scales, shears or mirrors",
-            "joints may rotate and move only",
+            "joints may only rotate and move",
             "apply the scale to the rig and export again",
         )

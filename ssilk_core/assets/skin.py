@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which joints move which vertices, and by how much."""
+"""Sparse skinning weights."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class SkinWeights:
             fail(
                 self.path,
                 f"{negative} skinning weights are negative",
-                "weights lie in [0, 1]",
+                "weights must lie in [0, 1]",
                 "normalise the weights and export again",
             )
         sums = self.weights.sum(axis=1)
@@ -52,7 +52,7 @@ class SkinWeights:
         return len(self.indices)
 
     def check_joints(self, joint_count: int) -> None:
-        """Raise `SsilkError` when an index points past the joints."""
+        """Raise `SsilkError` if an index is outside the joints."""
         bad = int(np.count_nonzero((self.indices < 0) | (self.indices >= joint_count)))
         if bad != 0:
             fail(
@@ -70,7 +70,7 @@ class SkinWeights:
 
     @classmethod
     def from_dense(cls, path: str, matrix: Floats, influences: int | None = None) -> SkinWeights:
-        """Keep the `influences` largest weights of each row (default: as many as any row uses)."""
+        """Keep the `influences` largest weights of each row of `matrix` (V, J); all of them by default."""
         used = int((matrix > 0).sum(axis=1).max())
         count = max(1, min(influences or used, used))
         order = np.argsort(-matrix, axis=1, kind="stable")[:, :count]

@@ -21,7 +21,7 @@ from . import options as shared
 if TYPE_CHECKING:
     from ssilk_usd.units import StageUnits
 
-    from ..preflight.inspection import Inspected
+    from ..preflight.inspection import PreflightInput
     from ..preflight.units import FileUnits
 
 
@@ -47,11 +47,11 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     from ..preflight.inspection import inspect
     from ..preflight.table import format_findings
 
-    world, repaired = _world(options, report), None
+    inputs, repaired = _read_inputs(options, report), None
     if options.fix:
-        repaired = _fix(options, world)
-        world = _world(_moved(options, options.fix), silent)
-    findings = inspect(world)
+        repaired = _fix(options, inputs)
+        inputs = _read_inputs(_moved(options, options.fix), silent)
+    findings = inspect(inputs)
     if options.json:
         detail = {"fixed": {"output": str(options.fix), "repaired": repaired}} if options.fix else {}
         report(Result("inspect", {"findings": findings, **detail}))
@@ -62,21 +62,22 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     return EXIT_BAD_INPUT if any(finding.severity == "error" for finding in findings) else EXIT_OK
 
 
-def _world(options: argparse.Namespace, report: Reporter) -> Inspected:
+def _read_inputs(options: argparse.Namespace, report: Reporter) -> PreflightInput:
     """Read everything that is inspected."""
     from ssilk_usd.facts import animated
     from ssilk_usd.read_motion import read_motions
     from ssilk_usd.repair import repair_lock
 
-    from ..preflight.inspection import Inspected
+    from ..preflight.inspection import PreflightInput
     from ..preflight.motion import MotionFile
 
     character, garment, rig = shared.read(options, report)
     file, prim = shared.wardrobe(options)
     motions = read_motions(options.motion, character.skeleton)
-    return Inspected(
-        character=character, garment=garment, rig=rig, stage=_units(options.stage), wardrobe=_units(file),
-        locked=repair_lock(file, prim), motions=motions, preset=preset_named(options.preset),
+    return PreflightInput(
+        character=character, garment=garment, rig=rig, character_units=_units(options.stage),
+        garment_units=_units(file), locked=repair_lock(file, prim), motions=motions,
+        preset=preset_named(options.preset),
         files=[MotionFile(motion.path, *animated(motion, character.skeleton)) for motion in motions],
     )  # fmt: skip
 
@@ -92,35 +93,38 @@ def _units(path: Path) -> FileUnits:
     )
 
 
-def _fix(options: argparse.Namespace, world: Inspected) -> list[str]:
+def _fix(options: argparse.Namespace, inputs: PreflightInput) -> list[str]:
     """Write the repaired copy; return what was repaired."""
     from ssilk_usd.repair import write_repaired, write_with_units
 
     from ..preflight.repair import plan_repair
 
     file, prim = shared.wardrobe(options)
-    units, stated = _corrected_units(world)
+    units, stated = _corrected_units(inputs)
     if options.fix.exists() and options.fix.samefile(file):
         fail(str(options.fix), "this is the file to repair", "--fix writes a copy", "name another file")
     shared.check_output(options.fix, options.stage)
     with replacing(options.fix) as half_done:
         # Units first: everything else is measured in them.
         write_with_units(file, half_done, units)
-        world = _world(_moved(options, half_done), silent)
-        repair = plan_repair(world.character, world.garment, world.rig, topology=not world.locked)
+        inputs = _read_inputs(_moved(options, half_done), silent)
+        repair = plan_repair(inputs.character, inputs.garment, inputs.rig, topology=not inputs.locked)
         write_repaired(half_done, half_done, repair, garment=prim, root=options.root)
     return [*stated, *repair.done]
 
 
-def _corrected_units(world: Inspected) -> tuple[StageUnits, list[str]]:
+def _corrected_units(inputs: PreflightInput) -> tuple[StageUnits, list[str]]:
     """Return the units that the garment's file should state, and in words those that it did not."""
     from ssilk_usd.units import StageUnits
 
-    from ..preflight.fit import misplacement
-    from ..preflight.units import misread
+    from ..preflight.fit import find_unit_correction
+    from ..preflight.units import find_upright_units
 
-    body, old = world.character.merged_body().mesh, world.wardrobe
-    units = old.corrected(misread(body) if world.stage == old else misplacement(world.garment.mesh, body))
+    body, old = inputs.character.merged_body().mesh, inputs.garment_units
+    shared_file = inputs.character_units == old
+    units = old.corrected(
+        find_upright_units(body) if shared_file else find_unit_correction(inputs.garment.mesh, body)
+    )
     told = [] if units == old else [f"metersPerUnit {units.meters_per_unit:g} and upAxis {units.up_axis} stated"]
     return StageUnits(units.meters_per_unit, units.up_axis), told
 

@@ -26,7 +26,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..errors import SsilkError, fail
-from ..events import Failed, GarmentEvent, Message, Reporter, Result, Said, Started
+from ..events import Failed, GarmentEvent, Message, Reporter, Result, Started, TaskEvent
 from ..files import need_writable, sha256
 from ..wardrobe.listing import WardrobeEntry, read_list
 from ..wardrobe.panel import ProgressTable, table
@@ -77,7 +77,7 @@ def _train(
 
     named = {training.entry.name: training for training in trainings}
 
-    def tell(name: str, event: Said) -> None:
+    def tell(name: str, event: TaskEvent) -> None:
         if isinstance(event, Failed):
             named[name].error = event.error
         show(GarmentEvent(name, event))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exact geodesic distances along a triangle mesh [m], and samples spread evenly by them (float64).
+"""Exact geodesic distances along a triangle mesh [m], and farthest-point sampling by them (float64).
 
-Two strips of cloth that hang side by side are a finger apart in space and far apart along the cloth. Distances
-here run along the cloth, and are infinite between islands.
+Two adjacent strips of cloth are close in space but far apart along the cloth. These distances run along the cloth
+and are infinite between islands.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 def distances(points: Floats, faces: Ints, sources: Ints) -> Floats:
     """Return the geodesic distance of each vertex to the nearest of `sources` [m], shape (V,).
 
-    Exact (Mitchell, Mount and Papadimitriou 1987, by libigl) over faces that share edges. Paths may not cross
-    degenerate faces or the third and later faces of a non-manifold edge; vertices that only an edge, a single
-    point or such a face connects are reached along edges. Vertices of islands without a source are infinite.
+    The distance is exact over faces that share edges (Mitchell, Mount and Papadimitriou 1987, from libigl). Paths
+    do not cross degenerate faces, or the third and later faces of a non-manifold edge. Vertices that are connected
+    only by an edge, a point or such a face are reached along edges. Islands without a source have infinite distance.
     """
     result = np.full(len(points), np.inf)
     result[sources] = 0
@@ -42,7 +42,7 @@ def distances(points: Floats, faces: Ints, sources: Ints) -> Floats:
 def within(points: Floats, faces: Ints, sources: Ints, reach: float) -> NDArray[np.bool_]:
     """Return which vertices lie within `reach` [m] of `sources` along the cloth, shape (V,).
 
-    No path along the cloth is shorter than the straight one: only faces near the sources are looked at.
+    Only faces near the sources are searched, because no path along the cloth is shorter than the straight line.
     """
     from scipy.spatial import cKDTree
 
@@ -53,10 +53,10 @@ def within(points: Floats, faces: Ints, sources: Ints, reach: float) -> NDArray[
 
 
 def nearest_sources(points: Floats, faces: Ints, sources: Ints) -> tuple[Floats, NDArray[np.int64]]:
-    """Return the distance to the nearest of `sources` [m], and that source (-1 where unreached), both (V,).
+    """Return the distance to the nearest of `sources` [m], and that source (-1 if unreachable), both (V,).
 
-    The distance is exact; the source is found by walking down the distance field along edges, so between two
-    sources that are equally far to within an edge either may be named.
+    The distance is exact. The source is found by descending the distance field along edges, so it may be either of
+    two sources whose distances differ by less than an edge.
     """
     distance = distances(points, faces, sources)
     pairs = edges(faces)
@@ -77,14 +77,14 @@ def nearest_sources(points: Floats, faces: Ints, sources: Ints) -> tuple[Floats,
 def farthest_points(
     points: Floats, faces: Ints, start: int, count: int, *, sampled: Callable[[], object] = lambda: None
 ) -> tuple[NDArray[np.int64], Floats]:
-    """Sample vertices so that each lies as far as possible from those before it, beginning with `start`.
+    """Sample vertices by farthest-point sampling, beginning with `start`.
 
     Args:
-        sampled: called after each of them.
+        sampled: called after each sample.
 
     Returns:
-        Up to `count` vertices of the island of `start`, shape (S,), fewer when all of its points are taken, and
-        the distance of every vertex to each sample [m], shape (S, V).
+        Up to `count` vertices of the island of `start`, shape (S,), or all of its vertices if it has fewer; and the
+        distance of every vertex to each sample [m], shape (S, V).
     """
     samples, rows = [start], [distances(points, faces, np.array([start]))]
     nearest = rows[0].copy()
@@ -110,9 +110,9 @@ def edge_graph(points: Floats, pairs: Ints) -> coo_matrix:
 
 
 def submesh(faces: Ints, mask: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the part of a mesh that lies within `mask` (V,): renumbered faces and the vertices they index, (M,).
+    """Return the part of a mesh within `mask` (V,): renumbered faces (N, 3), and the vertices they index (M,).
 
-    Edges are kept too, as faces without area, so that what only an edge connects stays connected.
+    Edges are also kept, as degenerate faces, so that parts connected only by an edge stay connected.
     """
     kept = np.flatnonzero(mask)
     number = np.full(len(mask), -1)
@@ -132,7 +132,7 @@ def _exact(points: Floats, faces: Ints, sources: Ints) -> Floats:
 
 
 def _manifold_faces(faces: Ints) -> NDArray[np.int64]:
-    """Return the faces, less the degenerate ones and those that would give an edge a third face."""
+    """Return the faces without degenerate ones and without the third and later faces of an edge."""
     faces = np.asarray(faces, dtype=np.int64)
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     pairs, uses = edge_use(faces)
@@ -144,7 +144,7 @@ def _manifold_faces(faces: Ints) -> NDArray[np.int64]:
 
 
 def _sheets(faces: Ints) -> list[NDArray[np.int64]]:
-    """Return the faces in groups that hang together by edges; touching at a point alone does not join them."""
+    """Return the groups of faces that are connected by shared edges; a shared point does not connect them."""
     owner, edge = np.repeat(np.arange(len(faces)), 3), edge_keys(half_edges(faces))
     by_edge = np.argsort(edge, kind="stable")
     same = np.diff(edge[by_edge]) == 0
@@ -154,7 +154,7 @@ def _sheets(faces: Ints) -> list[NDArray[np.int64]]:
 
 
 def _along_edges(distance: Floats, points: Floats, pairs: Ints) -> Floats:
-    """Carry finite distances along edges to the vertices that are still at infinity."""
+    """Propagate finite distances along edges to the vertices that are still infinite."""
     missing = ~np.isfinite(distance)
     heads, tails = np.concatenate([pairs, pairs[:, ::-1]]).T
     heads, tails = heads[missing[heads]], tails[missing[heads]]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which vertices, edges and faces of a triangle mesh meet, and their areas and normals (numpy only)."""
+"""Edges, hinges, components, areas and normals of triangle meshes (numpy only)."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from ..assets import Floats, Ints
 
-NO_AREA = 1e-7  # twice the area of a triangle to the square of its longest edge; single precision sees no less
-SLIVER = 50.0  # longest edge of a triangle to its height; clean cloth stays below 15
+NO_AREA = 1e-7  # ratio of twice a triangle's area to its longest edge squared; the limit of single precision
+SLIVER = 50.0  # ratio of a triangle's longest edge to its height; clean cloth stays below 15
 
 
 def edges(faces: Ints) -> NDArray[np.int64]:
@@ -31,7 +31,7 @@ def half_edges(faces: Ints) -> NDArray[np.int64]:
 
 
 def edge_keys(pairs: Ints) -> NDArray[np.int64]:
-    """Return one number for each pair of vertices (E, 2), alike in both directions, ascending with (low, high)."""
+    """Return one integer per pair of vertices (E, 2), independent of direction and ordered by (low, high)."""
     low, high = np.sort(pairs, axis=1).T
     return low * (high.max(initial=0) + 1) + high
 
@@ -50,10 +50,10 @@ def vertex_mask(indices: Ints, vertex_count: int) -> NDArray[np.bool_]:
 
 
 def hinges(faces: Ints) -> NDArray[np.int64]:
-    """Return the interior edges with the two vertices across from them, shape (H, 4).
+    """Return the interior edges with their two opposite vertices, shape (H, 4).
 
-    Each row is (v0, v1, o0, o1): the edge runs v0 -> v1 in the face that holds o0, and o1 lies in the other
-    face. Edges used by one face, or by more than two, have no hinge.
+    Each row is (v0, v1, o0, o1). The edge runs v0 -> v1 in the face of o0, and o1 belongs to the other face. Edges
+    with one face or more than two have no hinge.
     """
     half, opposite = half_edges(faces), np.roll(faces, 1, axis=1).reshape(-1)
     _, group, uses = np.unique(edge_keys(half), return_inverse=True, return_counts=True)
@@ -82,17 +82,20 @@ def vertex_normals(points: Floats, faces: Ints) -> Floats:
 
 
 def islands(faces: Ints, vertex_count: int) -> NDArray[np.int64]:
-    """Return the connected component of each vertex, shape (V,), numbered by first vertex; lone vertices count."""
+    """Return the connected component of each vertex, numbered by first vertex, shape (V,).
+
+    An isolated vertex is a component.
+    """
     return components(edges(faces), vertex_count)
 
 
 def components(pairs: Ints, vertex_count: int) -> NDArray[np.int64]:
-    """Return the connected component of each vertex under the edges `pairs` (E, 2), numbered by first vertex."""
+    """Return the component of each vertex under the edges `pairs` (E, 2), numbered by first vertex, shape (V,)."""
     label = np.arange(vertex_count)
     while True:
         lowest = np.minimum(label[pairs[:, 0]], label[pairs[:, 1]])
         merged = label.copy()
-        # Roots as well as vertices take the lower label, so that whole trees join at once.
+        # Both roots and vertices take the lower label, so that entire trees merge at once.
         for column in pairs.T:
             np.minimum.at(merged, label[column], lowest)
             np.minimum.at(merged, column, lowest)
@@ -105,7 +108,7 @@ def components(pairs: Ints, vertex_count: int) -> NDArray[np.int64]:
 def smooth(values: Floats, pairs: Ints, rounds: int) -> Floats:
     """Average each row of `values` (V, N) with those of its neighbours, `rounds` times.
 
-    `pairs` (E, 2) are undirected edges; the vertex itself counts as one neighbour. A constant stays constant.
+    `pairs` (E, 2) are undirected edges. A vertex counts as its own neighbour. Constants are preserved.
     """
     count = len(values)
     heads, tails = np.concatenate([pairs, pairs[:, ::-1]]).T

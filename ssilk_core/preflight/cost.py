@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a training will ask of the machine, and which joints it will look at."""
+"""Estimate the memory and time of a training, and find the joints that it ignores."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from ..assets import Motion, Scene
 from ..config import Preset, TrainConfig
 from ..events import format_seconds
 from ..kinematics import quaternion_from_matrix
-from .finding import Finding, Findings, joint_leaves, listing
+from .finding import Finding, Findings, format_joints, index_tuple
 
-# Seconds that one vertex in one frame takes, in a whole optimiser step of a garment of 2,700 vertices. Measured:
-# "draft", 64 frames, 0.2 s on two CPU threads; "preview", 1,280 frames, 3.7 ms on one H100. Devices that nobody has
-# measured are not listed.
+# Seconds per vertex and frame in a complete optimiser step, measured on a garment of 2,700 vertices: "draft",
+# 64 frames, takes 0.2 s on two CPU threads; "preview", 1,280 frames, takes 3.7 ms on one H100. Only measured devices
+# are listed.
 SECONDS_PER_VERTEX = {"cpu": 0.2 / (2700 * 64), "cuda": 0.0037 / (2700 * 1280)}
 
 
 def training_cost(scene: Scene, motions: Sequence[Motion], preset: Preset) -> Findings:
-    """Yield what training needs in memory and time here, and the joints that cannot matter to the garment.
+    """Yield the memory and time that training needs on this machine, and the joints that cannot affect the garment.
 
-    `motions` may be empty; the reach of the garment is then that of the rest pose.
+    If `motions` is empty, the rest pose determines which part of the body the garment can touch.
     """
     from ..collision import reachable_body
 
@@ -32,7 +32,7 @@ def training_cost(scene: Scene, motions: Sequence[Motion], preset: Preset) -> Fi
 
 
 def memory(scene: Scene, preset: Preset, body_vertices: int) -> Findings:
-    """Yield how much memory and time a preset takes with a garment that reaches `body_vertices`."""
+    """Yield the memory and time that a preset takes when the garment can touch `body_vertices` vertices."""
     from ..devices import select_device
     from ..memory import decoded_frames, fitting_batch, free_memory, step_memory
 
@@ -51,33 +51,36 @@ def memory(scene: Scene, preset: Preset, body_vertices: int) -> Findings:
         prim=scene.garment.mesh.path,
         found=f"preset '{preset.name}' needs about {needed / 2**30:.2g} of {free / 2**30:.2g} GiB free on {device}"
         + (note if lowered else ""),
-        why="smaller batches learn more slowly for each step" if lowered else "",
-        fix="free memory, take another device, or a smaller preset" if lowered else "",
+        why="training progresses more slowly per step with smaller batches" if lowered else "",
+        fix="free memory, or choose another device or a smaller preset" if lowered else "",
     )
     seconds = training_seconds(scene.garment.mesh.vertex_count, train, device.type)
     found = f"preset '{preset.name}' takes about {format_seconds(seconds)} on {device}" if seconds else (
-        f"the time that preset '{preset.name}' takes is not known: training was never measured on {device}"
+        f"the time that preset '{preset.name}' takes is unknown: training has not been measured on {device}"
     )  # fmt: skip
     why = (
         "scaled by vertices and frames from a garment of 2,700 vertices on two CPU threads or one H100; "
-        "yours may differ by half"
+        "the actual time may differ by half"
     )
     yield Finding(severity="info", code="time", prim=scene.garment.mesh.path, found=found, why=why if seconds else "")
 
 
 def training_seconds(vertices: int, train: TrainConfig, device: str) -> float | None:
-    """Return how long a training takes [s], by measured speed; None for a device that was not measured."""
+    """Return the estimated duration of a training [s]; None for a device that has not been measured."""
     if device not in SECONDS_PER_VERTEX:
         return None
     trained = (
         train.batch * (train.window - 2) + train.static_batch
-    )  # frames of a step, those that windows begin at left out
+    )  # frames of a step, without the two given ones of each window
     proper = (train.iterations - train.static_iterations) * trained
     return SECONDS_PER_VERTEX[device] * vertices * (train.static_iterations * train.pretraining_batch + proper)
 
 
 def irrelevant_joints(scene: Scene, colliding: np.ndarray) -> Findings:
-    """Yield the joints that neither carry the garment nor move the body that it reaches (flags `colliding`, (J,))."""
+    """Yield the joints that neither carry the garment nor move the body where it can touch it.
+
+    `colliding` flags the joints that move that part of the body, shape (J,).
+    """
     from ..model.network import model_joints
 
     skeleton = scene.character.skeleton
@@ -88,10 +91,10 @@ def irrelevant_joints(scene: Scene, colliding: np.ndarray) -> Findings:
             code="irrelevant-joints",
             prim=skeleton.path,
             count=len(unseen),
-            found=f"{joint_leaves(skeleton, unseen)} cannot matter to the garment",
-            why="they neither carry it nor move a part of the body that it reaches; the network does not see them",
+            found=f"{format_joints(skeleton, unseen)} cannot affect the garment",
+            why="they neither carry it nor move a part of the body that it can touch; the network ignores them",
             elements="joints",
-            indices=listing(unseen),
+            indices=index_tuple(unseen),
         )
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The preflight as a whole: every check, in the order in which an artist would go through them."""
+"""Run all checks of the preflight, in the order in which an artist would work through them."""
 
 from __future__ import annotations
 
@@ -13,70 +13,70 @@ from ..assets import Character, Garment, Motion, ProxyRig, Scene
 from ..config import Preset
 from ..errors import SsilkError
 from ..setup.prepare import prepare_scene
-from . import cost, fit, hold, motion, pose, units, winding
+from . import attachment, cost, fit, motion, pose, units, winding
 from . import mesh as meshes
 from .finding import SEVERITIES, Finding, Findings
 from .motion import MotionFile
 from .repair import merge_targets
 from .units import FileUnits
 
-# What --fix repairs by changing vertices or faces.
-RESHAPING = (
+# Findings that --fix repairs by changing vertices or faces.
+TOPOLOGY_FIXES = (
     "isolated-vertices", "duplicate-vertices", "duplicate-faces", "degenerate-faces", "inconsistent-winding",
     "inside-out",
 )  # fmt: skip
-# With these, automatic classes and proxies would only fail in other words.
+# Errors after which automatic classes and proxies would also fail, with a less specific message.
 BLOCKING = ("alignment", "character-size", "isolated-vertices", "degenerate-faces")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Inspected:
-    """All that the preflight looks at.
+class PreflightInput:
+    """Everything that the preflight checks.
 
     Attributes:
         rig: proxies authored for the garment, or None.
-        stage, wardrobe: units of the character's file and of the garment's, the same where they share one.
-        locked: why vertices and faces of the garment must stay as they are; empty if they may change.
-        motions, files: the motions, and what their files hold beside.
-        preset: the training that memory and time are estimated for.
+        character_units, garment_units: units of the character's and the garment's file; equal if they share a file.
+        locked: reason why the garment's vertices and faces must not change; empty if they may.
+        motions, files: the motions, and further facts about their files.
+        preset: settings for which memory and time are estimated.
     """
 
     character: Character
     garment: Garment
     rig: ProxyRig | None
-    stage: FileUnits
-    wardrobe: FileUnits
+    character_units: FileUnits
+    garment_units: FileUnits
     locked: str
     motions: Sequence[Motion]
     files: Sequence[MotionFile]
     preset: Preset
 
 
-def inspect(world: Inspected) -> list[Finding]:
-    """Return everything that there is to say, the worst first."""
-    found = [*_on_files(world), *_on_mesh(world), *_on_fit(world), *_on_motions(world)]
-    found = [_unfixable(finding, world.locked) if finding.code in RESHAPING else finding for finding in found]
-    found += _on_scene(world, any(finding.severity == "error" and finding.code in BLOCKING for finding in found))
+def inspect(inputs: PreflightInput) -> list[Finding]:
+    """Return all findings, the most severe first."""
+    found = [*_on_files(inputs), *_on_mesh(inputs), *_on_fit(inputs), *_on_motions(inputs)]
+    found = [_unfixable(finding, inputs.locked) if finding.code in TOPOLOGY_FIXES else finding for finding in found]
+    found += _on_scene(inputs, any(finding.severity == "error" and finding.code in BLOCKING for finding in found))
     return sorted(found, key=lambda finding: SEVERITIES.index(finding.severity))
 
 
 def _unfixable(finding: Finding, locked: str) -> Finding:
-    """Return a finding as one for the artist to fix, when the mesh is `locked`."""
-    reason = f"; --fix leaves the mesh alone because of its {locked}"
+    """Return a finding that the artist must fix because the mesh is `locked`."""
+    reason = f"; --fix does not change the mesh because of its {locked}"
     return replace(finding, fixable=False, fix=finding.fix + reason) if locked else finding
 
 
-def _on_files(world: Inspected) -> Findings:
-    own = world.stage == world.wardrobe
-    for file in dict.fromkeys((world.stage, world.wardrobe)):
-        for finding in units.unauthored(file):
-            yield replace(finding, fixable=file == world.wardrobe)  # the file that --fix copies
-    for finding in units.body_size(world.character.merged_body().mesh, world.stage):
+def _on_files(inputs: PreflightInput) -> Findings:
+    own = inputs.character_units == inputs.garment_units
+    for file in dict.fromkeys((inputs.character_units, inputs.garment_units)):
+        for finding in units.unauthored_units(file):
+            yield replace(finding, fixable=file == inputs.garment_units)  # the file that --fix copies
+    for finding in units.body_size(inputs.character.merged_body().mesh, inputs.character_units):
         yield replace(finding, fixable=finding.fixable and own)
 
 
-def _on_mesh(world: Inspected) -> Findings:
-    mesh, target = world.garment.mesh, merge_targets(world.garment, world.rig, world.character)
+def _on_mesh(inputs: PreflightInput) -> Findings:
+    mesh, target = inputs.garment.mesh, merge_targets(inputs.garment, inputs.rig, inputs.character)
     merged = np.flatnonzero(np.bincount(target, minlength=len(target))[target] > 1)
     corners = target[mesh.faces]
     yield from meshes.isolated_vertices(mesh)
@@ -87,62 +87,62 @@ def _on_mesh(world: Inspected) -> Findings:
     yield from winding.inconsistent_winding(mesh)
 
 
-def _on_fit(world: Inspected) -> Findings:
-    mesh, body, file = world.garment.mesh, world.character.merged_body().mesh, world.wardrobe
+def _on_fit(inputs: PreflightInput) -> Findings:
+    mesh, body, file = inputs.garment.mesh, inputs.character.merged_body().mesh, inputs.garment_units
     yield from fit.body_holes(body)
     yield from fit.body_inside_out(body)
-    free = file != world.stage and file.open_to(fit.misplacement(mesh, body))
+    free = file != inputs.character_units and file.allows(fit.find_unit_correction(mesh, body))
     misplaced = list(fit.alignment(mesh, body, fixable=free))
     yield from misplaced
-    if not misplaced:  # what lies elsewhere is neither inside the body nor inside out
+    if not misplaced:  # the other checks assume that the garment is on the body
         yield from fit.penetration(mesh, body)
         yield from winding.inside_out(mesh, body)
-        yield from pose.rest_pose(world.character, mesh)
+        yield from pose.rest_pose(inputs.character, mesh)
 
 
-def _on_motions(world: Inspected) -> Findings:
-    skeleton, preset = world.character.skeleton, world.preset
-    for clip in world.motions:
+def _on_motions(inputs: PreflightInput) -> Findings:
+    skeleton, preset = inputs.character.skeleton, inputs.preset
+    for clip in inputs.motions:
         yield from motion.root_jumps(clip)
-    for clip in world.motions:
+    for clip in inputs.motions:
         yield from motion.joint_snaps(clip, skeleton)
-    for clip in world.motions:
+    for clip in inputs.motions:
         yield from motion.short_motion(clip, preset.model.fps, preset.train.window)
-    for clip in world.motions:
+    for clip in inputs.motions:
         yield from motion.unusual_rate(clip)
-    for file in world.files:
+    for file in inputs.files:
         yield from motion.sample_gaps(file)
-    for file in world.files:
+    for file in inputs.files:
         yield from motion.missing_joints(file, skeleton)
-    if world.motions:
-        yield from motion.still_joints(world.motions, skeleton)
+    if inputs.motions:
+        yield from motion.still_joints(inputs.motions, skeleton)
 
 
-def _on_scene(world: Inspected, blocked: bool) -> Findings:
-    """Check what needs classes and a rig; these are made, as training would, where they are not authored."""
-    garment = world.garment
+def _on_scene(inputs: PreflightInput, blocked: bool) -> Findings:
+    """Check what needs classes and a rig; missing ones are generated as in training."""
+    garment = inputs.garment
     if blocked:
-        text = "classes, joints, memory and time were not looked at, because of the errors above"
+        text = "classes, joints, memory and time were not checked because of the errors above"
         yield Finding(severity="info", code="not-checked", prim=garment.mesh.path, found=text)
         return
     if garment.classes is not None:
-        yield from hold.class_coverage(garment.mesh, garment.classes)
-        yield from hold.unheld_islands(garment.mesh, garment.classes)
-        if any(hold.unheld_islands(garment.mesh, garment.classes)):
+        yield from attachment.class_coverage(garment.mesh, garment.classes)
+        yield from attachment.unattached_islands(garment.mesh, garment.classes)
+        if any(attachment.unattached_islands(garment.mesh, garment.classes)):
             return
     try:
-        scene = prepare_scene(world.character, garment, world.rig)
+        scene = prepare_scene(inputs.character, garment, inputs.rig)
     except SsilkError as error:
         yield Finding(severity="error", code="not-riggable", prim=garment.mesh.path, found=str(error))
         return
     if garment.classes is None:
-        yield from hold.class_coverage(garment.mesh, scene.classes)
-    yield from _on_training(scene, world)
+        yield from attachment.class_coverage(garment.mesh, scene.classes)
+    yield from _on_training(scene, inputs)
 
 
-def _on_training(scene: Scene, world: Inspected) -> Findings:
+def _on_training(scene: Scene, inputs: PreflightInput) -> Findings:
     if find_spec("torch"):
-        yield from cost.training_cost(scene, world.motions, world.preset)
+        yield from cost.training_cost(scene, inputs.motions, inputs.preset)
     else:
-        text = "joints, memory and time were not looked at: torch is not installed (pip install 'ssilk[train]')"
+        text = "joints, memory and time were not checked: torch is not installed (pip install 'ssilk[train]')"
         yield Finding(severity="info", code="not-checked", prim=scene.garment.mesh.path, found=text)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can be wrong with a garment's mesh by itself."""
+"""Check a garment's mesh on its own."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import numpy as np
 
 from ..assets import Floats, Ints, Mesh
 from ..mesh.topology import NO_AREA, SLIVER, edge_use, face_areas
-from .finding import Finding, Findings, amount, listing
+from .finding import Finding, Findings, format_count, index_tuple
 
-SAME_PLACE = 1e-6  # [m]; vertices closer than this share their place
+SAME_PLACE = 1e-6  # [m] size of the cells in which vertices count as coincident
 
 
 def isolated_vertices(mesh: Mesh) -> Findings:
@@ -21,17 +21,17 @@ def isolated_vertices(mesh: Mesh) -> Findings:
             code="isolated-vertices",
             prim=mesh.path,
             count=len(lone),
-            found=f"in no face, of {mesh.vertex_count:,}",
-            why="nothing holds them, so that no energy is defined for them",
+            found=f"not used by any face, out of {mesh.vertex_count:,}",
+            why="they have no mass and nothing attaches them",
             fix="delete loose geometry",
             fixable=True,
             elements="vertices",
-            indices=listing(lone),
+            indices=index_tuple(lone),
         )
 
 
 def duplicate_vertices(mesh: Mesh, mergeable: Ints) -> Findings:
-    """Yield the vertices that share their place with another one; `mergeable` (N,) are those that --fix merges."""
+    """Yield the vertices that coincide with another; `mergeable` (N,) are those that --fix merges."""
     copies = np.setdiff1d(
         np.flatnonzero(shared_places(mesh.points)), np.setdiff1d(np.arange(mesh.vertex_count), mesh.faces)
     )
@@ -42,7 +42,7 @@ def duplicate_vertices(mesh: Mesh, mergeable: Ints) -> Findings:
             code="duplicate-vertices",
             prim=mesh.path,
             count=len(copies),
-            found="at the same place as others: panels that are not sewn",
+            found="at the same position as others: panels that are not sewn",
             why="the cloth comes apart there as soon as it moves",
             fix="merge by distance, unless the cloth is meant to open there"
             + (
@@ -50,7 +50,7 @@ def duplicate_vertices(mesh: Mesh, mergeable: Ints) -> Findings:
             ),
             fixable=bool(merged.all()),
             elements="vertices",
-            indices=listing(copies),
+            indices=index_tuple(copies),
         )
 
 
@@ -64,17 +64,17 @@ def duplicate_faces(mesh: Mesh) -> Findings:
             code="duplicate-faces",
             prim=mesh.path,
             count=len(copies),
-            found="with the same vertices as an earlier one",
+            found="with the same vertices as an earlier face",
             why="the cloth is twice as heavy and stiff there, and does not bend along their edges",
-            fix="delete the doubles",
+            fix="delete the duplicates",
             fixable=True,
             elements="faces",
-            indices=listing(copies),
+            indices=index_tuple(copies),
         )
 
 
 def non_manifold_edges(mesh: Mesh) -> Findings:
-    """Yield the edges that more than two faces use; doubles and collapsed faces, told elsewhere, do not count."""
+    """Yield the edges that more than two faces use; duplicate and collapsed faces do not count."""
     pairs, uses = edge_use(distinct_faces(mesh.faces))
     bad = pairs[uses > 2]
     if len(bad):
@@ -83,16 +83,16 @@ def non_manifold_edges(mesh: Mesh) -> Findings:
             code="non-manifold-edges",
             prim=mesh.path,
             count=len(np.unique(bad)),
-            found=f"on {amount(len(bad), 'edges')} of more than two triangles",
-            why="cloth does not bend along such an edge, and distances along the cloth are less exact",
+            found=f"on {format_count(len(bad), 'edges')} shared by more than two triangles",
+            why="cloth does not bend along such an edge, and geodesic distances are less accurate",
             fix="delete inner faces, or split the parts that meet there",
             elements="vertices",
-            indices=listing(np.unique(bad)),
+            indices=index_tuple(np.unique(bad)),
         )
 
 
 def degenerate_faces(mesh: Mesh, collapsing: int) -> Findings:
-    """Yield the triangles without area and, apart, slivers; `collapsing` is how many of the former --fix removes."""
+    """Yield the triangles with zero area, of which --fix removes `collapsing`, and separately the slivers."""
     longest, area = _longest_edges(mesh), face_areas(mesh.points, mesh.faces)
     flat = 2 * area <= NO_AREA * longest**2
     sliver = ~flat & (longest**2 > SLIVER * 2 * area)
@@ -102,13 +102,13 @@ def degenerate_faces(mesh: Mesh, collapsing: int) -> Findings:
             code="degenerate-faces",
             prim=mesh.path,
             count=int(flat.sum()),
-            found=f"without area, of {len(mesh.faces):,}",
-            why="a membrane without area has no energy, and training refuses it",
+            found=f"with zero area, out of {len(mesh.faces):,}",
+            why="the membrane energy is undefined on a triangle with zero area, and training refuses it",
             fix="dissolve degenerate geometry"
-            + ("" if collapsing else "; --fix removes only faces whose corners coincide, others would leave a slit"),
+            + ("" if collapsing else "; --fix removes only faces whose corners coincide; others would leave a slit"),
             fixable=collapsing == flat.sum(),
             elements="faces",
-            indices=listing(np.flatnonzero(flat)),
+            indices=index_tuple(np.flatnonzero(flat)),
         )
     if sliver.any():
         yield Finding(
@@ -117,21 +117,21 @@ def degenerate_faces(mesh: Mesh, collapsing: int) -> Findings:
             prim=mesh.path,
             count=int(sliver.sum()),
             found=f"more than {SLIVER:.0f} times as long as high",
-            why="the cloth is wrong there: slivers resist less than they should, so as not to outweigh all else",
+            why="the cloth is too soft there: the stiffness of slivers is limited so that they do not dominate",
             fix="collapse their short edges or remesh",
             elements="faces",
-            indices=listing(np.flatnonzero(sliver)),
+            indices=index_tuple(np.flatnonzero(sliver)),
         )
 
 
 def distinct_faces(faces: Ints) -> Ints:
-    """Return each triangle with three different corners once, as its sorted corners, shape (N, 3)."""
+    """Return each triangle with three distinct corners once, with sorted corners, shape (N, 3)."""
     corners = np.unique(np.sort(faces, axis=1), axis=0)
     return corners[(np.diff(corners, axis=1) > 0).all(axis=1)]
 
 
 def shared_places(points: Floats) -> Ints:
-    """Return which points share their place, to a micrometre, with another, as a mask (V,)."""
+    """Return which points coincide with another to a micrometre, shape (V,)."""
     _, place, uses = np.unique(np.round(points / SAME_PLACE), axis=0, return_inverse=True, return_counts=True)
     return uses[place.reshape(-1)] > 1
 

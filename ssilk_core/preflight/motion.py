@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can be wrong with motions, and what they do not show."""
+"""Check motions for errors, and for joints that they do not animate."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ import numpy as np
 
 from ..assets import Floats, Ints, Motion, Skeleton
 from ..kinematics import CUT_SPEED, split_at_cuts
-from .finding import Finding, Findings, amount, joint_leaves, listing
+from .finding import Finding, Findings, format_count, format_joints, index_tuple
 
 MAX_FRAME_ROTATION = 120.0  # [degrees] in one frame; the fastest human joints turn by about 7,000 degrees a second
 STILL_ANGLE = 0.5  # [degrees]
-RATES = (15.0, 240.0)  # [1/s]
-MAX_SAMPLE_GAP = 0.5  # [s] without a sample, in a motion that otherwise has ten times as many
+USUAL_RATES = (15.0, 240.0)  # [1/s] lowest and highest
+MAX_SAMPLE_GAP = 0.5  # [s] gap that is reported if it is also ten times the usual sampling interval
 
 
 @dataclass(frozen=True, eq=False)
 class MotionFile:
-    """What a motion's file holds beside the motion: which joints it animates and when it was sampled.
+    """Facts about a motion's file: the joints that it animates and the times of its samples.
 
     Attributes:
         joints: indices of the skeleton's joints that it animates.
-        times: when it has samples [s], shape (S,).
+        times: times of the samples [s], shape (S,).
     """
 
     path: str
@@ -33,7 +33,7 @@ class MotionFile:
 
 
 def root_jumps(motion: Motion) -> Findings:
-    """Yield the frames at which the root has been moved rather than animated."""
+    """Yield the frames at which the root is teleported rather than animated."""
     starts = np.cumsum([span.frame_count for span in split_at_cuts(motion)])[:-1]
     if len(starts):
         root = motion.translations[:, 0]
@@ -44,15 +44,15 @@ def root_jumps(motion: Motion) -> Findings:
             prim=motion.path,
             count=len(starts),
             found=f"the root jumps, by up to {far:.2g} m (first to frame {starts[0]} of {motion.frame_count})",
-            why=f"a step so much faster ({CUT_SPEED:g} m/s) than those beside it is no movement; cloth starts anew",
+            why=f"a step {CUT_SPEED:g} m/s faster than those around it is not a movement; the cloth restarts there",
             fix="cut the clip there, or repair the root's curve",
             elements="frames",
-            indices=listing(starts),
+            indices=index_tuple(starts),
         )
 
 
 def joint_snaps(motion: Motion, skeleton: Skeleton) -> Findings:
-    """Yield the frames at which a joint flips over within one frame."""
+    """Yield the frames at which a joint flips."""
     angles = _angles(motion.rotations[1:], motion.rotations[:-1])
     frames = np.flatnonzero((angles > MAX_FRAME_ROTATION).any(axis=1))
     if len(frames):
@@ -62,44 +62,44 @@ def joint_snaps(motion: Motion, skeleton: Skeleton) -> Findings:
             code="joint-snaps",
             prim=motion.path,
             count=len(frames),
-            found=f"{joint_leaves(skeleton, [joint])} turns by {angles.max():.0f} degrees in one frame",
-            why="the cloth on it is whipped around; a flip in captured or Euler curves mostly, not a movement",
+            found=f"{format_joints(skeleton, [joint])} rotates by {angles.max():.0f} degrees in one frame",
+            why="this is usually a flip in captured or Euler curves, and it whips the cloth around",
             fix="filter the rotation curves, or leave the clip out",
             elements="frames",
-            indices=listing(frames + 1),
+            indices=index_tuple(frames + 1),
         )
 
 
 def short_motion(motion: Motion, fps: float, window: int) -> Findings:
-    """Yield that a motion has no span as long as a training window of `window` poses at `fps`."""
+    """Yield a warning if no span of a motion is as long as a training window of `window` poses at `fps`."""
     longest = max(int((span.frame_count - 1) * fps / motion.fps + 1e-6) + 1 for span in split_at_cuts(motion))
     if longest < window:
         yield Finding(
             severity="warning",
             code="short-motion",
             prim=motion.path,
-            found=f"it holds {longest} poses in a row at {fps:g} frames per second",
-            why=f"a training window has {window} poses; this clip is used for single poses at most",
-            fix="join it with others, or give a longer clip",
+            found=f"it has {longest} poses in a row at {fps:g} frames per second",
+            why=f"a training window has {window} poses; this clip only provides single poses",
+            fix="join it with other clips, or use a longer one",
         )
 
 
 def unusual_rate(motion: Motion) -> Findings:
-    """Yield a rate of frames at which cloth cannot be followed, or that nobody animates at."""
-    if not RATES[0] <= motion.fps <= RATES[1] and motion.frame_count > 1:
+    """Yield a frame rate that is too low for cloth, or implausibly high."""
+    if not USUAL_RATES[0] <= motion.fps <= USUAL_RATES[1] and motion.frame_count > 1:
         seconds = (motion.frame_count - 1) / motion.fps
         yield Finding(
             severity="warning",
             code="frame-rate",
             prim=motion.path,
-            found=f"{motion.fps:g} frames per second, so that its {motion.frame_count} frames last {seconds:.3g} s",
+            found=f"{motion.fps:g} frames per second: its {motion.frame_count} frames last {seconds:.3g} s",
             why="inertia depends on the true speed of a motion",
-            fix="set timeCodesPerSecond and framesPerSecond to what it was made at",
+            fix="set timeCodesPerSecond and framesPerSecond to the rate at which it was animated",
         )
 
 
 def sample_gaps(file: MotionFile) -> Findings:
-    """Yield stretches of a densely sampled motion that hold no samples."""
+    """Yield the gaps in the samples of an otherwise densely sampled motion."""
     steps = np.diff(file.times)
     if len(steps) > 2 and steps.max() > max(MAX_SAMPLE_GAP, 10 * np.median(steps)):
         at = int(steps.argmax())
@@ -109,7 +109,7 @@ def sample_gaps(file: MotionFile) -> Findings:
             prim=file.path,
             count=int(np.count_nonzero(steps > max(MAX_SAMPLE_GAP, 10 * np.median(steps)))),
             found=f"it has no samples for {steps.max():.2g} s from {file.times[at]:.3g} s on",
-            why="the pose is interpolated straight across the gap",
+            why="the pose is interpolated across the gap",
             fix="export the motion again, or cut it there",
         )
 
@@ -123,15 +123,15 @@ def missing_joints(file: MotionFile, skeleton: Skeleton) -> Findings:
             code="missing-joints",
             prim=file.path,
             count=len(missing),
-            found=f"it does not animate {joint_leaves(skeleton, missing)}",
+            found=f"it does not animate {format_joints(skeleton, missing)}",
             why="they stay in the rest pose",
             elements="joints",
-            indices=listing(missing),
+            indices=index_tuple(missing),
         )
 
 
 def still_joints(motions: Sequence[Motion], skeleton: Skeleton) -> Findings:
-    """Yield the joints that turn in none of the motions."""
+    """Yield the joints that do not rotate in any of the motions."""
     first = motions[0].rotations[:1]
     turned = np.max([_angles(motion.rotations, first).max(axis=0) for motion in motions], axis=0)
     still = np.flatnonzero(turned < STILL_ANGLE)
@@ -141,10 +141,10 @@ def still_joints(motions: Sequence[Motion], skeleton: Skeleton) -> Findings:
             code="still-joints",
             prim=skeleton.path,
             count=len(still),
-            found=f"{joint_leaves(skeleton, still)} never turn in {amount(len(motions), 'motions')}",
-            why="the garment cannot learn to follow what it never sees; in the shot these joints should be still too",
+            found=f"{format_joints(skeleton, still)} never rotate in {format_count(len(motions), 'motions')}",
+            why="the garment cannot learn the effect of these joints; they should not rotate in shots either",
             elements="joints",
-            indices=listing(still),
+            indices=index_tuple(still),
         )
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the garment was modelled on the bind pose or on another one."""
+"""Check that the garment was modelled on the bind pose."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ import numpy as np
 
 from ..assets import Character, Floats, Mesh, Skeleton
 from ..kinematics import invert_rigid, skin_points, skinning_matrices, world_transforms
-from .finding import Finding, Findings, listing
+from .finding import Finding, Findings, index_tuple
 from .fit import signed_distance
 
-MAX_ANGLE = 20.0  # [degrees] between bind and rest pose of a joint; cloth for one then does not fit the other
+MAX_ANGLE = 20.0  # [degrees] between bind and rest pose of a joint; above it one garment cannot fit both
 DEEP_PENETRATION = 0.01  # [m] inside the body
 MAX_DEEP_SHARE = 0.02  # share of deep vertices above which a garment does not fit a pose
 
 
 def rest_pose(character: Character, mesh: Mesh) -> Findings:
-    """Yield joints whose rest pose is far from the bind pose: an error if the garment fits the former instead."""
+    """Yield joints whose rest pose differs from the bind pose; an error if the garment fits the rest pose instead."""
     angles = rest_angles(character.skeleton)
     far = np.flatnonzero(angles > MAX_ANGLE)
     if not len(far):
@@ -31,24 +31,24 @@ def rest_pose(character: Character, mesh: Mesh) -> Findings:
         count=len(far),
         found=f"rest and bind pose of {len(far)} joints differ by more than {MAX_ANGLE:.0f} degrees, most at "
         f"'{character.skeleton.joint_names[worst]}' ({angles[worst]:.0f})"
-        + (f"; {fits_bind:.0%} of the garment is inside the body as bound, {fits_rest:.0%} at rest" if wrong else ""),
-        why="the garment is fitted to the bind pose; joints that a motion lacks stay in the rest pose",
+        + (f"; {fits_bind:.0%} of the garment is inside the body at bind, {fits_rest:.0%} at rest" if wrong else ""),
+        why="training assumes the bind pose; joints that a motion does not animate stay in the rest pose",
         fix="fit the garment to the bind pose, or bind the body in the pose that the garment was modelled on"
         if wrong
         else "",
         elements="joints",
-        indices=listing(far),
+        indices=index_tuple(far),
     )
 
 
 def rest_angles(skeleton: Skeleton) -> Floats:
-    """Return the angle between the rest and the bind pose of each joint, the roots aligned [degrees], shape (J,)."""
+    """Return the angle between rest and bind pose of each joint with aligned roots [degrees], shape (J,)."""
     turn = _rest_matrices(skeleton)[:, :3, :3]
     return np.degrees(np.arccos(np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1, 1)))
 
 
 def _rest_matrices(skeleton: Skeleton) -> Floats:
-    """Return bind pose to rest pose for each joint, placed where the first root is bound, shape (J, 4, 4)."""
+    """Return the transform of each joint from bind to rest pose, the first root kept in place, shape (J, 4, 4)."""
     rest = world_transforms(skeleton.rest_transforms, skeleton.parents)
     return skinning_matrices(skeleton.bind_transforms[0] @ invert_rigid(rest[0]) @ rest, skeleton.bind_transforms)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can be repaired on a garment without asking: planned as index maps, so that all data can follow."""
+"""Plan safe repairs of a garment as index maps, so that all per-vertex and per-corner data can follow."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from ..assets import Character, Floats, Garment, Ints, Mesh, ProxyRig
 from ..mesh.topology import border_vertices, edge_use, edges
-from .finding import amount
-from .fit import MARGIN, push_out
+from .finding import format_count
+from .fit import COLLISION_MARGIN, push_out
 from .mesh import SAME_PLACE, distinct_faces
 from .winding import outward_flips
 
@@ -20,18 +20,18 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class MeshRepair:
-    """A repaired mesh in terms of the old one.
+    """A repaired mesh in terms of the original one.
 
     Attributes:
-        kept: the old vertex of each new one, shape (V',).
-        new_index: the new vertex of each old one, -1 for those removed, shape (V,).
-        polygons: the old polygon of each new one, shape (P',).
-        corners: the old corner of each new one, shape (sum of counts,).
-        counts: corners of each new polygon, shape (P',).
-        flipped: which new polygons run the other way, shape (P',).
-        offsets: how far the new vertices move [m], shape (V', 3).
-        done: what was repaired, in words.
-        reshapes: whether vertices and faces may differ from the old ones, or only positions.
+        kept: original vertex of each new one, shape (V',).
+        new_index: new vertex of each original one, -1 for removed ones, shape (V,).
+        polygons: original polygon of each new one, shape (P',).
+        corners: original corner of each new one, shape (sum of counts,).
+        counts: number of corners of each new polygon, shape (P',).
+        flipped: whether the winding of each new polygon is reversed, shape (P',).
+        offsets: displacements of the new vertices [m], shape (V', 3).
+        done: descriptions of the repairs.
+        reshapes: whether vertices and faces may change, instead of only positions.
     """
 
     kept: Ints
@@ -48,16 +48,17 @@ class MeshRepair:
 def plan_repair(character: Character, garment: Garment, rig: ProxyRig | None, *, topology: bool = True) -> MeshRepair:
     """Plan all safe repairs of a garment.
 
-    Seams whose vertices share place, class and weights are sewn; faces that collapse by it or lie on others, and
-    vertices in no face, go; faces are wound alike and away from the body; shallow penetration is pushed out.
+    Coincident vertices with the same class and weights are merged. Faces that collapse as a result, duplicate faces
+    and isolated vertices are removed. Winding becomes consistent and faces away from the body. Shallow penetration
+    is pushed out.
 
     Args:
-        rig: proxies authored for the garment, whose weights must agree too where vertices merge.
+        rig: proxies authored for the garment; merged vertices must agree in these weights, too.
         topology: whether vertices and faces may change; if not, vertices are only pushed out.
     """
     mesh, body = garment.mesh, character.merged_body().mesh
     offsets = push_out(mesh.points, edges(mesh.faces), body)
-    pushed = {("vertices", f"pushed out to {1000 * MARGIN:g} mm"): int(offsets.any(axis=1).sum())}
+    pushed = {("vertices", f"pushed out to {1000 * COLLISION_MARGIN:g} mm"): int(offsets.any(axis=1).sum())}
     if not topology:
         return _moved_only(mesh, offsets, _told(pushed))
     target = merge_targets(garment, rig, character)
@@ -89,10 +90,10 @@ def _counts(mesh: Mesh) -> Ints:
 
 
 def merge_targets(garment: Garment, rig: ProxyRig | None, character: Character) -> Ints:
-    """Return the vertex that each one merges into, itself mostly, shape (V,).
+    """Return the vertex that each one merges into, usually itself, shape (V,).
 
-    Vertices merge where they share place, class and weights, at the borders of panels or along an edge without
-    length, and only as long as no edge comes to have more than two faces: layers that touch stay apart.
+    Vertices merge if they agree in position, class and weights and lie at the borders of panels or on an edge of
+    zero length. They do not merge if an edge would then have more than two faces, so touching layers stay separate.
     """
     mesh = garment.mesh
     same = _alike(garment, rig, character)
@@ -110,7 +111,7 @@ def merge_targets(garment: Garment, rig: ProxyRig | None, character: Character) 
 
 
 def _alike(garment: Garment, rig: ProxyRig | None, character: Character) -> Ints:
-    """Return a label for each vertex (V,), equal where place, class and weights are equal."""
+    """Return a label for each vertex, equal where position, class and weights are equal, shape (V,)."""
     joints = character.skeleton.joint_count
     columns = [np.round(garment.mesh.points / SAME_PLACE)]
     if garment.classes is not None:
@@ -123,14 +124,14 @@ def _alike(garment: Garment, rig: ProxyRig | None, character: Character) -> Ints
 
 
 def _crowded(faces: Ints, target: Ints) -> Mask:
-    """Return the vertices (V,) on edges that merging would give more faces than two, and more than before."""
+    """Return the vertices on edges that merging would make non-manifold, or more so than before, shape (V,)."""
     pairs, uses = edge_use(distinct_faces(target[faces]))
     worst = max(2, int(edge_use(distinct_faces(faces))[1].max()))
     return np.isin(target, pairs[uses > worst])
 
 
 def _kept_polygons(mesh: Mesh, target: Ints) -> tuple[Ints, Ints, Ints]:
-    """Return polygons, corners and counts that stay when vertices merge into `target` (V,)."""
+    """Return the polygons, corners and counts that remain when vertices merge into `target` (V,)."""
     counts, vertices = _counts(mesh), target[mesh.indices_of_corners]
     every, corners = np.arange(len(counts)), np.arange(len(vertices))
     owner = np.repeat(every, counts)
@@ -157,7 +158,7 @@ def _first_of_kind(owner: Ints, vertices: Ints, count: int) -> Mask:
 
 
 def _flipped_order(counts: Ints, flips: Mask) -> Ints:
-    """Return the order of corners in which the polygons `flips` (P,) run backwards."""
+    """Return the order of corners that reverses the polygons in `flips` (P,)."""
     start = np.repeat(np.cumsum(counts) - counts, counts)
     last = np.repeat(np.cumsum(counts) - 1, counts)
     position = np.arange(len(start))
@@ -165,4 +166,4 @@ def _flipped_order(counts: Ints, flips: Mask) -> Ints:
 
 
 def _told(counts: dict[tuple[str, str], int]) -> tuple[str, ...]:
-    return tuple(f"{amount(count, elements)} {what}" for (elements, what), count in counts.items() if count)
+    return tuple(f"{format_count(count, elements)} {what}" for (elements, what), count in counts.items() if count)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Findings as text for people: the worst first, findings of one kind together."""
+"""Format findings as text, the most severe first and grouped by kind."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import textwrap
 from collections.abc import Iterator, Sequence
 from itertools import groupby
 
-from .finding import SEVERITIES, Finding, amount
+from .finding import SEVERITIES, Finding, format_count
 
 WIDTH = 110
-MAX_PLACES = 5  # of one kind of finding that are printed; --json has all
+MAX_PLACES = 5  # findings of one kind that are printed; --json lists all
 
 
 def format_findings(findings: Sequence[Finding]) -> str:
-    """Return the findings grouped by severity and kind; for each: where, count, what, why and the fix."""
+    """Format findings grouped by severity and kind: place, count, what was found, why it matters and the fix."""
     lines: list[str] = []
     for severity in SEVERITIES:
         chosen = [finding for finding in findings if finding.severity == severity]
@@ -23,9 +23,9 @@ def format_findings(findings: Sequence[Finding]) -> str:
 
 
 def summary(findings: Sequence[Finding]) -> str:
-    """Return how many findings of each severity there are, in one line."""
+    """Format the numbers of errors and warnings as one line."""
     counts = [(severity, sum(finding.severity == severity for finding in findings)) for severity in SEVERITIES[:2]]
-    told = " and ".join(amount(count, f"{severity}s") for severity, count in counts if count)
+    told = " and ".join(format_count(count, f"{severity}s") for severity, count in counts if count)
     return f"{told}." if told else "Nothing wrong was found."
 
 
@@ -47,7 +47,7 @@ def _all_fixable(group: list[Finding]) -> bool:
 
 
 def _count(finding: Finding) -> str:
-    return f"{amount(finding.count, finding.elements)} in " if finding.elements else ""
+    return f"{format_count(finding.count, finding.elements)} in " if finding.elements else ""
 
 
 def _wrapped(text: str, indent: str) -> list[str]:

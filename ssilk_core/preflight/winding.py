@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which way polygons face: alike within a surface, and away from the body."""
+"""Check that polygons are wound consistently within a surface and face away from the body."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 from ..assets import Floats, Ints, Mesh
 from ..mesh.topology import components, edge_keys
 from ..setup.surface import closest_on_surface
-from .finding import Finding, Findings, listing
+from .finding import Finding, Findings, index_tuple
 
 Mask = NDArray[np.bool_]
-# Share of a surface that must face the body before it counts as inside out; cloth that hangs free faces anywhere.
+# Share of a surface's area that faces the body above which it is inside out; hanging cloth may face any direction.
 INWARD = 0.75
 
 
 def inconsistent_winding(mesh: Mesh) -> Findings:
-    """Yield the triangles that are wound against most others of their surface."""
+    """Yield the triangles whose winding is opposite to that of most others of their surface."""
     flips, surface = consistent_flips(np.full(len(mesh.faces), 3), mesh.faces.reshape(-1))
     wrong = np.flatnonzero(_minority(flips, surface))
     if len(wrong):
@@ -26,17 +26,17 @@ def inconsistent_winding(mesh: Mesh) -> Findings:
             code="inconsistent-winding",
             prim=mesh.path,
             count=len(wrong),
-            found=f"wound against their neighbours, of {len(mesh.faces):,}",
-            why="normals jump there: shading breaks, and proxies and classes are placed by normals",
+            found=f"wound opposite to their neighbours, out of {len(mesh.faces):,}",
+            why="normals flip there: shading breaks, and proxies and classes depend on normals",
             fix="recalculate the normals of the mesh",
             fixable=True,
             elements="faces",
-            indices=listing(wrong),
+            indices=index_tuple(wrong),
         )
 
 
 def inside_out(mesh: Mesh, body: Mesh) -> Findings:
-    """Yield the triangles of surfaces whose normals point into the body, when all are wound alike."""
+    """Yield the triangles of surfaces whose normals point into the body once they are wound consistently."""
     counts, corners = np.full(len(mesh.faces), 3), mesh.faces.reshape(-1)
     flips, surface = consistent_flips(counts, corners)
     flips = _minority(flips, surface)
@@ -48,17 +48,17 @@ def inside_out(mesh: Mesh, body: Mesh) -> Findings:
             code="inside-out",
             prim=mesh.path,
             count=len(wrong),
-            found=f"on surfaces that face the body, of {len(mesh.faces):,}",
-            why="it is shaded from the wrong side, and proxies are turned the wrong way",
+            found=f"on surfaces that face the body, out of {len(mesh.faces):,}",
+            why="shading uses the wrong side, and proxies have the wrong orientation",
             fix="flip the normals of the mesh",
             fixable=True,
             elements="faces",
-            indices=listing(wrong),
+            indices=index_tuple(wrong),
         )
 
 
 def outward_flips(points: Floats, counts: Ints, corners: Ints, body: Mesh) -> Mask:
-    """Return which polygons to flip so that each surface is wound alike and does not face the body, shape (P,)."""
+    """Return which polygons to flip so that each surface has one winding and faces away from the body, shape (P,)."""
     flips, surface = consistent_flips(counts, corners)
     flips = _minority(flips, surface)
     inward = inward_share(points, counts, corners, flips, surface, body)
@@ -66,21 +66,22 @@ def outward_flips(points: Floats, counts: Ints, corners: Ints, body: Mesh) -> Ma
 
 
 def consistent_flips(counts: Ints, corners: Ints) -> tuple[Mask, Ints]:
-    """Wind the polygons of each surface like its first one.
+    """Find the flips that wind all polygons of a surface like its first one.
 
-    A surface is what hangs together by edges that two polygons share; one that cannot be oriented stays as it is.
+    A surface is a set of polygons connected by edges that exactly two of them share. A non-orientable surface is
+    not changed.
 
     Args:
-        counts: corners of each polygon, shape (P,).
-        corners: their vertices, one polygon after another, shape (sum of counts,).
+        counts: number of corners of each polygon, shape (P,).
+        corners: vertices of the corners, polygon by polygon, shape (sum of counts,).
 
     Returns:
         Which polygons to flip, shape (P,), and the surface of each, numbered from 0, shape (P,).
     """
     count = len(counts)
     first, second, alike = _shared_edges(counts, corners)
-    # Each polygon stands twice, as it is and flipped (+ count); edges tie what agrees, so that a surface falls into
-    # two mirror images. The one that holds its first polygon as it is has the lower number.
+    # Each polygon has two nodes: unflipped, and flipped (+ count). Edges connect nodes with the same winding, so a
+    # surface forms two mirrored components. The one with the first polygon unflipped has the lower label.
     mirrored = np.where(alike, count, 0)
     pairs = np.concatenate([
         np.column_stack([first, second + mirrored]), np.column_stack([first + count, second + count - mirrored]),
@@ -102,13 +103,13 @@ def inward_share(points: Floats, counts: Ints, corners: Ints, flips: Mask, surfa
 
 
 def _minority(flips: Mask, surface: Ints) -> Mask:
-    """Return `flips` (P,), or for a surface of which they are more than half, all others."""
+    """Return `flips` (P,), inverted on each surface where they are more than half."""
     mostly = 2 * np.bincount(surface, flips) > np.bincount(surface)
     return flips ^ mostly[surface]
 
 
 def _shared_edges(counts: Ints, corners: Ints) -> tuple[Ints, Ints, Mask]:
-    """Return the two polygons at each edge that exactly two share, and whether both run along it the same way."""
+    """Return the two polygons at each edge with exactly two, and whether both traverse it in the same direction."""
     owner = np.repeat(np.arange(len(counts)), counts)
     after = np.arange(len(corners)) + 1
     after[np.cumsum(counts) - 1] -= counts

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which vertices of a garment are pinned, tight and loose, found from the body under it (paper, Section 3.4).
+"""Classify garment vertices as pinned, tight or loose, from the body under the garment (paper, Section 3.4).
 
-The paper paints these by hand. Here a vertex is held, and so tight, where the body is near and either carries
-the cloth from below or is wrapped in it; cloth that merely hangs close to a back is not held. Pinned is the band
-along the border from which an island hangs. All the rest is loose.
+The paper paints the classes by hand. Here a vertex is tight where the body is near and either supports the cloth
+from below or is enclosed by it. Cloth that only hangs close to the back is not tight. The band along the border
+from which an island hangs is pinned. All other vertices are loose.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from ..mesh.topology import components, edge_use, edges, islands, smooth, vertex
 from .surface import SurfacePoints, closest_on_surface
 
 Mask = NDArray[np.bool_]
-HANG_RADIUS = 0.06  # [m] around a border vertex: wide enough to look past a collar that curls in towards the neck
-HANG_DROP = 0.005  # [m] that a border from which cloth hangs stands above the mean of that neighbourhood
-TILT = (1.3e-3, -0.7e-3, 1.1e-3)  # turns rays off the axes, along which they slip through edges of regular meshes
+HANG_RADIUS = 0.06  # [m] neighbourhood of a border vertex; it must reach past a collar that curls towards the neck
+HANG_DROP = 0.005  # [m] least height of a border that carries the cloth, above the mean of that neighbourhood
+TILT = (1.3e-3, -0.7e-3, 1.1e-3)  # tilts rays off the axes, where they slip through edges of regular meshes
 
 
 @dataclass(frozen=True)
@@ -30,21 +30,21 @@ class ClassOptions:
     """Thresholds of `classify`.
 
     Attributes:
-        tight_distance: farthest that held cloth lies from the body [m].
-        tear_rate: change of skinning weights along an edge, half the sum of absolute differences per length
-            [1/m], above which linear blend skinning tears; bodies themselves stay below about 30.
-        tear_width: how far around a tear, along the cloth, it counts as torn [m].
-        torn_distance: farthest that torn cloth lies from the body and is still held [m].
-        support: least upward part of the body's normal where it carries cloth (cosine with up).
-        wrapped: least share of rays into the body that must meet the garment again where it is wrapped.
-        thickness: length of those rays in which the garment is not looked for, to clear folds nearby [m].
-        strip_width: cloth narrower than this hangs free, as fringes do, and wraps nothing [m].
-        rounds: rounds of averaging with the neighbours that tidy the border between held and loose.
-        speck_reach: patches that nowhere lead this far away from what surrounds them join it [m].
+        tight_distance: largest distance of tight cloth from the body [m].
+        tear_rate: rate of change of skinning weights along an edge (half the sum of absolute differences, per
+            length) above which linear blend skinning tears the cloth [1/m]. Bodies stay below about 30.
+        tear_width: distance along the cloth within which vertices around a tear count as torn [m].
+        torn_distance: largest distance of torn cloth from the body at which it is still tight [m].
+        support: least cosine between the body's normal and up where the body supports the cloth.
+        wrapped: least share of rays into the body that hit the garment again where it encloses the body.
+        thickness: initial length of those rays that is skipped, to pass folds nearby [m].
+        strip_width: cloth narrower than this, such as a fringe, hangs freely and encloses nothing [m].
+        rounds: rounds of averaging with the neighbours, which smooth the border between tight and loose.
+        speck_reach: a patch that stays within this distance of its surroundings takes their class [m].
         pinned_width: width of the pinned band, along the cloth [m].
-        pinned_distance: farthest that a border lies from the body and still pins the garment [m].
-        pinned_length: shortest border from which the garment hangs [m]; without one it is pinned at its top.
-        yoke_width: width of the band below that border, along the cloth, in which it holds near cloth [m].
+        pinned_distance: largest distance from the body of a border that pins the garment [m].
+        pinned_length: shortest border from which a garment hangs [m]. Without one, its top is pinned.
+        yoke_width: width of the band below that border, along the cloth, in which near cloth is tight [m].
     """
 
     tight_distance: float = 0.05
@@ -76,10 +76,10 @@ def classify(
 
     Args:
         mesh: the garment at the character's bind pose.
-        skin: its plain weights; unsmoothed ones show best where limbs part.
+        skin: its skinning weights for LBS. Unsmoothed weights show most clearly where limbs part.
 
     Raises:
-        SsilkError: an island of the garment is held nowhere.
+        SsilkError: an island of the garment has no pinned or tight vertex.
     """
     options = options or ClassOptions()
     pairs, island = edges(mesh.faces), islands(mesh.faces, mesh.vertex_count)
@@ -99,7 +99,7 @@ def classify(
 
 
 def _holding(mesh: Mesh, body: SurfacePoints, near: Mask, rim: Mask, options: ClassOptions) -> Mask:
-    """Return where the body or the rim holds the cloth: it carries it, is wrapped in it, or the rim is near, (V,)."""
+    """Return where the body supports the cloth or is enclosed by it, or the rim is near, shape (V,)."""
     carried = body.normals @ UP > options.support
     wrapped = _wrapped(mesh, body.normals, near, options.thickness) > options.wrapped
     strips = _strips(mesh, options.strip_width)
@@ -109,12 +109,12 @@ def _holding(mesh: Mesh, body: SurfacePoints, near: Mask, rim: Mask, options: Cl
 def _strips(mesh: Mesh, width: float) -> Mask:
     """Return the vertices of strips narrower than `width` [m] on islands that are wider elsewhere, shape (V,).
 
-    What lies too far from all cloth that has half the width around it (a morphological opening).
+    This is a morphological opening: a strip is too far from any cloth that has half the width on every side.
     """
     pairs, uses = edge_use(mesh.faces)
     to_border = distances(mesh.points, mesh.faces, np.unique(pairs[uses == 1]))
     to_middle = distances(mesh.points, mesh.faces, np.flatnonzero(to_border > width / 2))
-    return np.isfinite(to_middle) & (to_middle > 0.8 * width)  # a corner of 90 degrees is 0.71 away
+    return np.isfinite(to_middle) & (to_middle > 0.8 * width)  # a 90-degree corner is at 0.71 of the width
 
 
 def _band(mesh: Mesh, seeds: Mask, width: float) -> Mask:
@@ -123,7 +123,7 @@ def _band(mesh: Mesh, seeds: Mask, width: float) -> Mask:
 
 
 def _tear_rate(mesh: Mesh, weights: Floats, pairs: Ints) -> Floats:
-    """Return the fastest change of `weights` (V, J) along an edge at each vertex [1/m], shape (V,)."""
+    """Return the largest rate of change of `weights` (V, J) along the edges of each vertex [1/m], shape (V,)."""
     low, high = pairs.T
     length = np.linalg.norm(mesh.points[low] - mesh.points[high], axis=1)
     rate = 0.5 * np.abs(weights[low] - weights[high]).sum(axis=1) / np.maximum(length, 1e-6)
@@ -136,7 +136,7 @@ def _tear_rate(mesh: Mesh, weights: Floats, pairs: Ints) -> Floats:
 def _wrapped(mesh: Mesh, normals: Floats, near: Mask, thickness: float) -> Floats:
     """Return the share of rays through the body that meet `near` (V,) cloth on the other side, shape (V,).
 
-    From each vertex one ray runs against the body's normal (V, 3) and four lean 45 degrees off it.
+    From each vertex one ray runs against the body's normal (V, 3), and four are inclined by 45 degrees to it.
     """
     import igl
 
@@ -156,7 +156,7 @@ def _wrapped(mesh: Mesh, normals: Floats, near: Mask, thickness: float) -> Float
 
 
 def _with_specks(kind: Mask, mesh: Mesh, pairs: Ints, reach: float) -> Mask:
-    """Return `kind` (V,) with the patches outside it, specks and hems, that nowhere lead `reach` [m] away from it."""
+    """Return `kind` (V,) and the patches outside it, such as specks and hems, that stay within `reach` [m] of it."""
     away = distances(mesh.points, mesh.faces, np.flatnonzero(kind))
     patch = components(pairs[~kind[pairs].any(axis=1)], mesh.vertex_count)
     farthest = np.zeros(mesh.vertex_count)
@@ -172,13 +172,13 @@ def _need_held(held: Mask, mesh: Mesh, island: Ints) -> None:
             mesh.path,
             f"{len(adrift)} of {island.max() + 1} islands ({np.count_nonzero(lost)} vertices, the first "
             f"{np.flatnonzero(lost)[0]}) rest nowhere on the body",
-            "every island needs some pinned or tight vertices, or it falls off",
-            "move the garment to the body, or paint primvars:ssilk:class",
+            "every island needs a pinned or tight vertex, or it falls off",
+            "move the garment onto the body, or paint primvars:ssilk:class",
         )
 
 
 def _tops(mesh: Mesh, held: Mask, rim: Mask, island: Ints, options: ClassOptions) -> Mask:
-    """Return the highest held vertices of each island that has no rim to hang from, such as a closed hood, (V,)."""
+    """Return the highest tight vertices of each island without a rim, such as a closed hood, shape (V,)."""
     result = np.zeros(mesh.vertex_count, dtype=bool)
     for number in np.setdiff1d(island, island[rim]):
         height = np.where(held & (island == number), mesh.points @ UP, -np.inf)
@@ -187,9 +187,9 @@ def _tops(mesh: Mesh, held: Mask, rim: Mask, island: Ints, options: ClassOptions
 
 
 def _hanging_border(mesh: Mesh, near: Mask, island: Ints, shortest: float) -> Mask:
-    """Return, for each island, the highest stretch of `near` border that stands above the cloth around it, (V,).
+    """Return the highest stretch of `near` border of each island that lies above the cloth around it, shape (V,).
 
-    Stretches shorter than `shortest` [m], such as the lower half of an armhole, hold nothing up.
+    Stretches shorter than `shortest` [m], such as the lower half of an armhole, carry nothing.
     """
     pairs, uses = edge_use(mesh.faces)
     rims = pairs[(uses == 1) & near[pairs].all(axis=1)]
@@ -207,7 +207,7 @@ def _hanging_border(mesh: Mesh, near: Mask, island: Ints, shortest: float) -> Ma
 
 
 def _drops(mesh: Mesh, vertices: Ints) -> Floats:
-    """Return how far `vertices` (N,) stand above the mean of the cloth around them [m], shape (N,)."""
+    """Return the height of `vertices` (N,) above the mean of the cloth around them [m], shape (N,)."""
     from scipy.spatial import cKDTree
 
     areas, height = vertex_areas(mesh.points, mesh.faces), mesh.points @ UP

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loose part of a garment in connected clusters, each with its proxies in a hierarchy (paper, Appendix A)."""
+"""Split the loose part of a garment into connected clusters, each with a hierarchy of proxies (paper, Appendix A)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,12 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Seam:
-    """Where loose cloth meets the rest: how far each vertex is from it [m], and its nearest vertex there, (V,)."""
+    """The seam between loose cloth and the rest.
+
+    Attributes:
+        distance: geodesic distance of each vertex to the nearest one that is not loose [m], shape (V,).
+        nearest: that nearest vertex, shape (V,).
+    """
 
     distance: Floats
     nearest: Ints
@@ -31,15 +36,15 @@ class Cluster:
 
     Attributes:
         vertices: garment vertices of the piece, ascending, shape (M,).
-        beside: those that an edge joins to the rest of the garment, the seam, shape (M,).
-        samples: the garment vertices at which its proxies stand, shape (S,).
+        at_seam: whether an edge joins each of them to the rest of the garment, shape (M,).
+        samples: garment vertices at which the proxies are placed, shape (S,).
         distances: geodesic distance of each piece vertex to each sample [m], shape (S, M).
         parents: index of each proxy's parent among `samples`, -1 for roots, shape (S,).
-        joint: the character joint that carries the roots.
+        joint: character joint that is the parent of the roots.
     """
 
     vertices: Ints
-    beside: Mask
+    at_seam: Mask
     samples: Ints
     distances: Floats
     parents: Ints
@@ -47,10 +52,10 @@ class Cluster:
 
 
 def find_seam(mesh: Mesh, loose: Mask) -> Seam:
-    """Measure how far every vertex is from those that are not `loose` (V,).
+    """Measure the distance of every vertex to those that are not `loose` (V,).
 
     Raises:
-        SsilkError: an island has none that are not loose.
+        SsilkError: all vertices of an island are loose.
     """
     seam = Seam(*nearest_sources(mesh.points, mesh.faces, np.flatnonzero(~loose)))
     adrift = int(np.count_nonzero(seam.nearest < 0))
@@ -58,14 +63,14 @@ def find_seam(mesh: Mesh, loose: Mask) -> Seam:
         fail(
             mesh.path,
             f"{adrift} loose vertices lie on islands without a pinned or tight vertex",
-            "every island needs some, or it falls off",
+            "every island needs one, or it falls off",
             "paint primvars:ssilk:class",
         )
     return seam
 
 
 def find_pieces(mesh: Mesh, loose: Mask) -> list[Ints]:
-    """Return the vertices of each connected piece of `loose` (V,), the largest area first."""
+    """Return the vertices of each connected piece of `loose` (V,), in descending order of area."""
     faces, kept = submesh(mesh.faces, loose)
     label = components(edges(faces), len(kept))
     areas = np.bincount(label, vertex_areas(mesh.points, mesh.faces)[kept])
@@ -73,9 +78,10 @@ def find_pieces(mesh: Mesh, loose: Mask) -> list[Ints]:
 
 
 def distribute_proxies(areas: Floats, sizes: Ints, count: int) -> Ints:
-    """Share `count` proxies out among pieces, by area.
+    """Distribute `count` proxies among pieces in proportion to `areas` (N,).
 
-    The first pieces get one each as far as they go, and none gets more than its `sizes` in vertices, shape (N,).
+    Each piece gets one proxy first, in order, until none is left. A piece gets no more proxies than it has
+    vertices: `sizes`, shape (N,).
     """
     shares = (np.arange(len(areas)) < count).astype(int)
     while shares.sum() < min(count, sizes.sum()):
@@ -95,31 +101,31 @@ def build_cluster(
     roots: int,
     placed: Callable[[], object] = lambda: None,
 ) -> Cluster:
-    """Sample `proxies` vertices of a loose piece and hang them on the body.
+    """Sample `proxies` vertices of a loose piece and connect them to the character's joints.
 
-    The first sample is the vertex beside the seam nearest to the middle of that row, where the cloth hinges; the
-    others are farthest points by geodesic distance within the piece.
+    The first sample is the seam vertex nearest to the mean of all of them: the cloth hinges there. The others are
+    farthest points by geodesic distance within the piece.
 
     Args:
-        vertices: the piece, ascending, shape (M,).
-        body_weights: plain weights of all garment vertices, shape (V, J).
+        vertices: vertices of the piece, ascending, shape (M,).
+        body_weights: LBS weights of all garment vertices over the character's joints, shape (V, J).
         parents: parents of the character's joints, shape (J,).
         placed: called after each proxy.
     """
     inside = np.zeros(mesh.vertex_count, dtype=bool)
     inside[vertices] = True
     faces, _ = submesh(mesh.faces, inside)
-    beside = _beside(mesh, inside)[vertices]
+    at_seam = _at_seam(mesh, inside)[vertices]
     points = mesh.points[vertices]
-    off_middle = np.linalg.norm(points - points[beside].mean(axis=0), axis=1)
-    start = int(np.where(beside, off_middle, np.inf).argmin())
+    off_middle = np.linalg.norm(points - points[at_seam].mean(axis=0), axis=1)
+    start = int(np.where(at_seam, off_middle, np.inf).argmin())
     samples, spread = farthest_points(points, faces, start, proxies, sampled=placed)
-    order, above = hierarchy(spread, samples, seam.distance[vertices], beside, edges(faces), roots)
-    joint = carrying_joint(body_weights[seam.nearest[vertices[beside]]].sum(axis=0), parents)
-    return Cluster(vertices, beside, vertices[samples[order]], spread[order], above, joint)
+    order, above = hierarchy(spread, samples, seam.distance[vertices], at_seam, edges(faces), roots)
+    joint = carrying_joint(body_weights[seam.nearest[vertices[at_seam]]].sum(axis=0), parents)
+    return Cluster(vertices, at_seam, vertices[samples[order]], spread[order], above, joint)
 
 
-def _beside(mesh: Mesh, inside: Mask) -> Mask:
+def _at_seam(mesh: Mesh, inside: Mask) -> Mask:
     """Return the vertices of `inside` (V,) that an edge joins to a vertex outside it, shape (V,)."""
     pairs = edges(mesh.faces)
     result = np.zeros(mesh.vertex_count, dtype=bool)
@@ -128,10 +134,10 @@ def _beside(mesh: Mesh, inside: Mask) -> Mask:
 
 
 def carrying_joint(weights: Floats, parents: Ints) -> int:
-    """Return the deepest joint that carries, with the joints below it, over half of `weights` (J,).
+    """Return the deepest joint that has, together with its descendants, more than half of `weights` (J,).
 
-    The paper takes the heaviest joint of the nearest vertex, but every vertex of a seam is equally near, and a
-    skirt whose seam lies half on each thigh must hang from the hips. Where one joint dominates, this is that joint.
+    The paper takes the heaviest joint of the nearest vertex. But all vertices of a seam are equally near, and a
+    skirt whose seam lies half on each thigh must hang from the hips. Where one joint dominates, both rules agree.
     """
     carried = np.array(weights, dtype=np.float64)
     for joint in range(len(parents) - 1, 0, -1):
@@ -141,28 +147,29 @@ def carrying_joint(weights: Floats, parents: Ints) -> int:
 
 
 def hierarchy(
-    spread: Floats, samples: Ints, to_seam: Floats, beside: Mask, pairs: Ints, roots: int
+    spread: Floats, samples: Ints, to_seam: Floats, at_seam: Mask, pairs: Ints, roots: int
 ) -> tuple[Ints, Ints]:
-    """Order proxies breadth first, over proxies whose regions touch.
+    """Order proxies breadth first along the adjacency of their regions.
 
-    The roots are the `roots` nearest to the seam among the proxies whose regions (their share of the piece, by
-    distance) reach it. The rest follow level by level, each under its nearest neighbour of the level above.
+    The region of a proxy is its geodesic Voronoi cell in the piece. The roots are the `roots` proxies nearest to
+    the seam among those whose regions reach it. The others follow level by level. The parent of each is its
+    nearest neighbour on the level above.
 
     Args:
         spread: distance of every piece vertex to each sample [m], shape (S, M).
         samples: piece vertices of the samples, shape (S,).
         to_seam: distance of every piece vertex to the seam [m], shape (M,).
-        beside: piece vertices beside the seam, shape (M,).
+        at_seam: whether each piece vertex lies at the seam, shape (M,).
         pairs: edges of the piece, shape (E, 2).
 
     Returns:
-        The samples in order, shape (S,), and the position in that order of each one's parent, -1 for roots, (S,).
+        The samples in order, shape (S,), and the position of each one's parent in that order, -1 for roots, (S,).
     """
     count, region = len(samples), spread.argmin(axis=0)
     touching = np.zeros((count, count), dtype=bool)
     touching[tuple(region[pairs].T)] = touching[tuple(region[pairs[:, ::-1]].T)] = True
     between = np.where(touching, spread[:, samples], np.inf)
-    hinged = np.unique(region[beside])
+    hinged = np.unique(region[at_seam])
     order = hinged[np.argsort(to_seam[samples[hinged]], kind="stable")][:roots].tolist()
     above = [-1] * len(order)
     while len(order) < count:

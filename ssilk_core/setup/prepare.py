@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a character and a garment as they were authored to a scene that can be trained."""
+"""Prepare a scene for training from a character and a garment as authored."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ def prepare_scene(
     rig_options: RigOptions | None = None,
     report: events.Reporter = events.silent,
 ) -> Scene:
-    """Fill in the weights, classes and proxies that a garment lacks; what is authored stays as it is.
+    """Add the weights, classes and proxies that a garment lacks, and keep those that are authored.
 
     Args:
         garment: fitted to the character's bind pose, with or without weights and classes.
-        rig: proxies that were authored for it, or None.
-        report: told about everything that had to be assumed.
+        rig: proxies authored for the garment, or None.
+        report: receives a message about each thing that is added.
 
     Raises:
-        SsilkError: an island of the garment is held nowhere, or what was authored does not fit together.
+        SsilkError: an island of the garment has no pinned or tight vertex, or the authored parts do not match.
     """
     classes = garment.classes
     if classes is None:
         classes = _find_classes(character, garment, class_options, report)
     skin = garment.skin
     if skin is None:
-        report(events.Message(f"{garment.mesh.path}: no skinning weights, taken from the body"))
+        report(events.Message(f"{garment.mesh.path}: no skinning weights; they are transferred from the body"))
         skin = transfer_weights(character, garment.mesh, classes=classes, options=weight_options)
     garment = replace(garment, skin=skin, classes=classes)
     if rig is None:
@@ -51,18 +51,18 @@ def prepare_scene(
 def _find_classes(
     character: Character, garment: Garment, options: ClassOptions | None, report: events.Reporter
 ) -> Ints:
-    """Classify by authored weights, or by unsmoothed ones from the body: they jump where limbs part."""
+    """Classify by authored weights, or else by unsmoothed ones from the body, which jump where limbs part."""
     unsmoothed = WeightOptions(tight_rounds=0, loose_rounds=0)
     skin = garment.skin or transfer_weights(character, garment.mesh, options=unsmoothed)
     classes = classify(character, garment.mesh, skin, options)
     shares = ", ".join(f"{np.mean(classes == value):.0%} {name}" for value, name in enumerate(CLASS_NAMES))
-    report(events.Message(f"{garment.mesh.path}: no vertex classes, found {shares}"))
+    report(events.Message(f"{garment.mesh.path}: no vertex classes; classified as {shares}"))
     return classes
 
 
 def _describe_rig(rig: ProxyRig, any_loose: bool) -> str:
     if rig.proxy_count:
-        return f"{rig.path}: no proxy joints, {rig.proxy_count} placed on the loose part"
+        return f"{rig.path}: no proxy joints; {rig.proxy_count} are placed on the loose part"
     if any_loose:
-        return f"{rig.path}: no proxy joints, loose vertices follow the body"
-    return f"{rig.path}: nothing loose, no proxy joints needed"
+        return f"{rig.path}: no proxy joints; loose vertices follow the body"
+    return f"{rig.path}: no loose vertices, so no proxy joints are needed"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Proxy joints for the loose part of a garment (paper, Section 3.4 and Appendix A)."""
+"""Place proxy joints on the loose part of a garment (paper, Section 3.4 and Appendix A)."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ class RigOptions:
     """How proxies are placed.
 
     Attributes:
-        proxies: how many to spread over the loose part; 0 leaves the garment on the character's joints.
-        most_proxies: how far `proxies` may be raised to give each loose cluster (each strip of a fringe) one of
-            its own. Beyond that the smallest clusters follow the nearest proxies of their neighbours.
-        roots_per_cluster: how many proxies of a cluster hang directly from a character joint (the paper's j).
-        influences: how many proxies move a vertex.
+        proxies: number of proxies on the loose part; with 0 the garment follows the character's joints.
+        max_proxies: limit up to which `proxies` is raised so that each loose cluster (each strip of a fringe)
+            gets one. Beyond it the smallest clusters follow the nearest proxies of their neighbours.
+        roots_per_cluster: number of proxies of a cluster whose parent is a character joint (the paper's j).
+        influences: largest number of proxies per vertex.
         seam_blend: whether loose vertices near the seam keep a share of the body's weights.
     """
 
     proxies: int = 20
-    most_proxies: int = 64
+    max_proxies: int = 64
     roots_per_cluster: int = 4
     influences: int = 4
     seam_blend: bool = True
 
     def __post_init__(self) -> None:
-        for name, least in (("proxies", 0), ("most_proxies", 1), ("roots_per_cluster", 1), ("influences", 1)):
+        for name, least in (("proxies", 0), ("max_proxies", 1), ("roots_per_cluster", 1), ("influences", 1)):
             value = getattr(self, name)
             if not value >= least:
                 fail("proxy rig", f"{name} = {value}", f"it must be at least {least}")
@@ -53,29 +53,29 @@ def build_rig(
     *,
     report: events.Reporter = events.silent,
 ) -> ProxyRig:
-    """Spread proxy joints over the loose part of a garment and skin it to them.
+    """Place proxy joints on the loose part of a garment and skin it to them.
 
-    Each connected cluster of loose vertices gets a share of the proxies by its area, at least one. They are
-    farthest-point samples by geodesic distance, which start at the seam where the cloth hinges. Up to
-    `roots_per_cluster` of them, the nearest to the seam, hang from the character joint that carries the seam; a
-    breadth-first search over proxies whose regions touch attaches the rest, each to its nearest neighbour.
+    Each connected cluster of loose vertices gets a share of the proxies by its area, and at least one. They are
+    farthest-point samples by geodesic distance. The first lies at the seam, where the cloth hinges. Up to
+    `roots_per_cluster` of them, those nearest to the seam, are children of the character joint that carries the
+    seam. A breadth-first search over adjacent regions attaches each of the others to its nearest neighbour.
 
-    Weights fall off as exp(-(d/r)^2), r the mean spacing of the cluster's proxies. Beyond the paper, loose
-    vertices near the seam keep a share of the weights of their nearest vertex on it: without that the cloth tears
-    open there as soon as a root turns, because tight vertices follow the body alone.
+    Weights fall off as exp(-(d/r)^2), where r is the mean spacing of the cluster's proxies. Unlike in the paper,
+    loose vertices near the seam keep a share of the weights of the nearest vertex on it. Without this the cloth
+    tears there as soon as a root rotates, because tight vertices follow only the body.
 
     Args:
-        garment: with weights and classes.
-        report: told of each proxy that is placed, and when there are not as many as were asked for.
+        garment: has weights and classes.
+        report: receives progress after each proxy, and a message if the number of proxies was changed.
 
     Raises:
         SsilkError: the garment has no weights or classes, or an island has only loose vertices.
     """
     options = options or RigOptions()
     if garment.skin is None:
-        fail(garment.mesh.path, "no skinning weights", "weights are needed", "transfer them")
+        fail(garment.mesh.path, "no skinning weights", "weights are needed", "transfer them from the body")
     if garment.classes is None:
-        fail(garment.mesh.path, "no vertex classes", "classes are needed", "classify it")
+        fail(garment.mesh.path, "no vertex classes", "classes are needed", "classify the vertices")
     assert garment.skin is not None and garment.classes is not None
     loose: Mask = np.equal(garment.classes, LOOSE)
     if options.proxies == 0 or not loose.any():
@@ -104,7 +104,7 @@ def _clusters(
     options: RigOptions,
     report: events.Reporter,
 ) -> list[Cluster]:
-    """Return the clusters that get proxies of their own, the largest first."""
+    """Return the clusters that get proxies, in descending order of area."""
     pieces, areas = find_pieces(mesh, loose), vertex_areas(mesh.points, mesh.faces)
     count = _affordable(len(pieces), options, mesh.path, report)
     shares = distribute_proxies(
@@ -120,7 +120,7 @@ def _clusters(
 
 
 def _counting(total: int, report: events.Reporter) -> Callable[[], None]:
-    """Return what to call after each of `total` proxies; it tells how many there are, and the time left."""
+    """Return a function to call after each of `total` proxies; it reports the progress and the time left."""
     start, done = time.monotonic(), itertools.count(1)
 
     def placed() -> None:
@@ -131,21 +131,21 @@ def _counting(total: int, report: events.Reporter) -> Callable[[], None]:
 
 
 def _affordable(piece_count: int, options: RigOptions, path: str, report: events.Reporter) -> int:
-    """Return how many proxies to place, raised so that each piece has one as far as that goes, and say so."""
-    count = max(options.proxies, min(piece_count, options.most_proxies))
+    """Return the number of proxies, raised within the limit so that each piece gets one; report any change."""
+    count = max(options.proxies, min(piece_count, options.max_proxies))
     if count > options.proxies:
-        text = f"{path}: {piece_count} loose pieces need a proxy each: {count} proxies, not {options.proxies}"
+        text = f"{path}: {count} proxies instead of {options.proxies}: each of {piece_count} loose pieces needs one"
         report(events.Message(text))
     if count < piece_count:
         text = (
-            f"{path}: of {piece_count} loose pieces the {piece_count - count} smallest follow the proxies of others"
+            f"{path}: the {piece_count - count} smallest of {piece_count} loose pieces follow the proxies of others"
         )
         report(events.Message(text, "warning"))
     return count
 
 
 def _assemble(character: Character, mesh: Mesh, clusters: list[Cluster], weights: Floats, seam: Seam) -> ProxyRig:
-    """Return the rig of all clusters; proxies run cluster by cluster, breadth first within each."""
+    """Return the rig of all clusters; proxies are ordered by cluster, breadth first within each."""
     skeleton = character.skeleton
     parents: list[int] = []
     for cluster in clusters:
@@ -162,7 +162,7 @@ def _assemble(character: Character, mesh: Mesh, clusters: list[Cluster], weights
 
 
 def _names(path: str, joint_names: tuple[str, ...], parents: list[int]) -> tuple[str, ...]:
-    """Return a USD joint path for each proxy: its parent's, then "<garment>_proxy_<number>"."""
+    """Return a USD joint path for each proxy: the path of its parent, then "<garment>_proxy_<number>"."""
     garment = re.sub(r"\W", "_", path.rstrip("/").rsplit("/", 1)[-1], flags=re.ASCII)
     stem = garment if re.match("[A-Za-z_]", garment) else f"_{garment}"
     digits = max(2, len(str(len(parents) - 1)))
@@ -173,10 +173,11 @@ def _names(path: str, joint_names: tuple[str, ...], parents: list[int]) -> tuple
 
 
 def _bind_transforms(mesh: Mesh, samples: Ints, parents: Ints, seam: Seam) -> Floats:
-    """Return proxies at `samples` (P,) with y along the cloth away from the body and z along its normal, (P, 4, 4).
+    """Return bind transforms of proxies at `samples` (P,), shape (P, 4, 4).
 
-    y points to the middle of the children, or on from the parent where there are none; `parents` (P,) is
-    negative for roots, which then point on from the seam.
+    y runs along the cloth, away from the body, and z along the normal. y points to the mean of the children. A
+    proxy without children continues the direction from its parent, and a root without children that from the seam.
+    `parents` (P,) is negative for roots.
     """
     points = mesh.points[samples]
     came_from = np.where(parents[:, None] >= 0, points[np.maximum(parents, 0)], mesh.points[seam.nearest[samples]])
@@ -188,7 +189,7 @@ def _bind_transforms(mesh: Mesh, samples: Ints, parents: Ints, seam: Seam) -> Fl
 
 
 def _frame(along: Floats, normal: Floats) -> Floats:
-    """Return the rotation with y along `along` and z as near to `normal` as can be; any frame where they vanish."""
+    """Return the rotation with y along `along` and z as close as possible to `normal`; arbitrary if both vanish."""
     axes: list[Floats] = []
     for wanted in (along, normal, *np.eye(3)):
         rest = wanted - sum((axis * (axis @ wanted) for axis in axes), np.zeros(3))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the body's surface is, seen from points near it."""
+"""Closest points on the body's surface."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ class SurfacePoints:
     """The closest point of a triangle mesh for each of V queries.
 
     Attributes:
-        distance: how far it is [m], shape (V,).
-        corners: the vertices of its triangle, shape (V, 3).
-        barycentric: its barycentric coordinates there, rows sum to one, shape (V, 3).
-        normals: unit normals, interpolated from the vertices and so continuous, shape (V, 3).
+        distance: distance of the query to that point [m], shape (V,).
+        corners: vertices of the triangle that contains the point, shape (V, 3).
+        barycentric: barycentric coordinates of the point; rows sum to one, shape (V, 3).
+        normals: unit normals, continuous because interpolated from the vertices, shape (V, 3).
     """
 
     distance: Floats
@@ -41,7 +41,7 @@ def closest_on_surface(points: Floats, mesh: Mesh) -> SurfacePoints:
 
 
 def _barycentric(points: Floats, triangles: Floats) -> Floats:
-    """Return barycentric coordinates of points (V, 3) on triangles (V, 3, 3); slivers give their nearest corner."""
+    """Return barycentric coordinates of points (V, 3) on triangles (V, 3, 3); slivers snap to the nearest corner."""
     import igl
 
     corners = [np.ascontiguousarray(triangles[:, corner]) for corner in range(3)]

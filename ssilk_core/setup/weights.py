@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Skinning weights for a garment that has none, taken from the body beneath it."""
+"""Transfer skinning weights from the body to a garment that has none."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from .surface import closest_on_surface
 
 @dataclass(frozen=True)
 class WeightOptions:
-    """How body weights are carried over.
+    """How body weights are transferred.
 
     Attributes:
-        tight_rounds: rounds of averaging with the neighbours, everywhere.
-        loose_rounds: rounds in all for loose vertices, whose closest body points jump between limbs.
-        influences: how many joints a vertex keeps.
+        tight_rounds: rounds of averaging with the neighbours for all vertices.
+        loose_rounds: total rounds for loose vertices, whose closest body points jump between limbs.
+        influences: largest number of joints per vertex.
     """
 
     tight_rounds: int = 10
@@ -40,10 +40,10 @@ def transfer_weights(
 ) -> SkinWeights:
     """Take each vertex's weights from the closest point of the body's surface, then smooth them over the cloth.
 
-    Loose vertices (when `classes` are given) are smoothed longer, while the others hold their values. Vertices at
-    the same place count as one, so that panels which meet without being welded stay together. Pairing only
-    surfaces whose normals agree, and filling the gaps from their surroundings, was tried on armpits and
-    crotches: after smoothing it changes the strain under motion by less than one percent, so it is left out.
+    If `classes` are given, loose vertices are smoothed longer while the others keep their values. Vertices at the
+    same position count as one, so that panels which meet without being welded stay together. Surfaces are matched
+    regardless of their normals. Matching only those whose normals agree, and filling the gaps from their
+    surroundings, changed the strain under motion at armpits and crotches by less than one percent.
 
     Args:
         mesh: the garment at the character's bind pose.
@@ -59,7 +59,7 @@ def transfer_weights(
 
 
 def _smoothed(mesh: Mesh, weights: Floats, loose: Ints, options: WeightOptions) -> Floats:
-    """Average `weights` (V, J) over the cloth, and go on with the rows of `loose` (V,)."""
+    """Average `weights` (V, J) over the cloth, with more rounds for the rows of `loose` (V,)."""
     _, first, place = np.unique(mesh.points.round(6), axis=0, return_index=True, return_inverse=True)
     place = place.reshape(-1)
     pairs = np.unique(np.sort(place[edges(mesh.faces)], axis=1), axis=0)

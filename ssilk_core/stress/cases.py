@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The extremes that a garment is tested under, and the outcomes that each may have."""
+"""Stress cases of a garment, and the verdicts that each may have."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from math import pi
 import torch
 
 from ..errors import SsilkError
-from .drives import stopping
+from .drives import freeze_after
 from .measures import (
     Measure,
-    at_rate,
-    contorted,
-    counted,
-    driven,
-    in_precision,
-    interrupted,
+    bake_at_rate,
     jumps,
-    lasting,
-    made_of,
-    meshed,
-    moved,
     ride,
-    sized,
-    solved_of,
-    solved_with,
-    turned,
-    weighed,
+    roll_out_frames,
+    roll_out_motion,
+    roll_out_nan,
+    roll_out_path,
+    roll_out_precision,
+    roll_out_random_poses,
+    roll_out_rotated,
+    simulate_fabric,
+    simulate_gravity,
+    simulate_slivers,
+    train_at_size,
+    train_fabric,
+    train_slivers,
+    train_vertex_count,
 )
 from .outcome import CaseMeasurement, CaseOutcome, Verdict
 from .subject import StressSubject
@@ -40,12 +40,12 @@ UPWARD, FORWARD = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
 @dataclass(frozen=True)
 class Case:
-    """One extreme.
+    """One stress case.
 
     Attributes:
-        group, name: of the table's line.
-        measure: runs the case; it raises `SsilkError` to refuse.
-        allowed: verdicts that are no fault.
+        group, name: its labels in the table.
+        measure: runs the case; it raises `SsilkError` if the product refuses the input.
+        allowed: verdicts that are acceptable.
     """
 
     group: str
@@ -54,7 +54,7 @@ class Case:
     allowed: tuple[Verdict, ...] = ("works",)
 
     def matches(self, words: Sequence[str]) -> bool:
-        """Return whether the case's name contains one of some words, or there are none."""
+        """Return whether the case's name contains one of `words`; True if there are none."""
         return not words or any(word in f"{self.group}: {self.name}" for word in words)
 
     def run(self, subject: StressSubject) -> CaseOutcome:
@@ -73,34 +73,45 @@ class Case:
         return measured.verdict, measured.note, measured
 
 
-WIDE: tuple[Verdict, ...] = ("works", "falls back")
-RATES = (5, 12, 24, 60, 120, 240)
-FABRICS = (1e-3, 1.0, 1e3, 1e6)  # [N/m]
-HEIGHTS = (1e-2, 1e-4, 1e-6, 1e-8, 0.0)  # of slivers, to their base
-COUNTS = (100, 10_000, 200_000)
+MAY_FALL_BACK: tuple[Verdict, ...] = ("works", "falls back")
+FRAME_RATES = (5, 12, 24, 60, 120, 240)
+STIFFNESSES = (1e-3, 1.0, 1e3, 1e6)  # [N/m]
+SLIVER_HEIGHTS = (1e-2, 1e-4, 1e-6, 1e-8, 0.0)  # ratio of height to base
+VERTEX_COUNTS = (100, 10_000, 200_000)
 PRECISIONS = (torch.float64, torch.float32, torch.bfloat16, torch.float16)
 
 CASES = (
-    *(Case("length", f"{count:,} frames", lasting(count)) for count in (10_000, 100_000)),
-    *(Case("rate", f"{fps} frames per second", at_rate(fps)) for fps in RATES),
-    Case("gravity", "none", weighed(0.0), WIDE),
-    Case("gravity", "tenfold", weighed(10.0), WIDE),
-    Case("gravity", "sideways", turned(FORWARD, angle=pi / 2)),
-    Case("motion", "upside down", turned(FORWARD, angle=pi)),
-    Case("motion", "a teleport of 30 m each second", moved(jumps)),
-    Case("motion", "a ride at 50 m/s", moved(ride)),
-    Case("motion", "a spin of 30 rad/s", turned(UPWARD, speed=30.0)),
-    Case("motion", "tumbling at 30 rad/s", turned(FORWARD, speed=30.0)),
-    Case("motion", "a stop within one frame", driven(lambda subject, base: stopping(base, base.loop / 4))),
-    Case("motion", "one pose throughout", driven(lambda subject, base: stopping(base, 0.0))),
-    Case("motion", "poses of any joint angles", contorted(0.5)),
-    Case("motion", "other such poses in each frame", contorted(1e-3)),
-    Case("motion", "NaN in frame 7", interrupted(7), ("refuses",)),
-    *(Case("size", f"{metres:g} m", sized(metres)) for metres in (1e-3, 100.0)),
-    *(Case("fabric", f"{stiffness:g} N/m", made_of(stiffness)) for stiffness in FABRICS),
-    *(Case("slivers", f"{height:g} as high as long", meshed(height), (*WIDE, "refuses")) for height in HEIGHTS),
-    *(Case("simulator", f"{stiffness:g} N/m", solved_of(stiffness), WIDE) for stiffness in FABRICS),
-    Case("simulator", "slivers 0.0001 as high as long", solved_with(1e-4), WIDE),
-    *(Case("vertices", f"{count:,}", counted(count)) for count in COUNTS),
-    *(Case("precision", str(dtype).removeprefix("torch."), in_precision(dtype), WIDE) for dtype in PRECISIONS),
+    *(Case("length", f"{count:,} frames", roll_out_frames(count)) for count in (10_000, 100_000)),
+    *(Case("rate", f"{fps} frames per second", bake_at_rate(fps)) for fps in FRAME_RATES),
+    Case("gravity", "none", simulate_gravity(0.0), MAY_FALL_BACK),
+    Case("gravity", "tenfold", simulate_gravity(10.0), MAY_FALL_BACK),
+    Case("gravity", "sideways", roll_out_rotated(FORWARD, angle=pi / 2)),
+    Case("motion", "upside down", roll_out_rotated(FORWARD, angle=pi)),
+    Case("motion", "a teleport of 30 m each second", roll_out_path(jumps)),
+    Case("motion", "a ride at 50 m/s", roll_out_path(ride)),
+    Case("motion", "a spin of 30 rad/s", roll_out_rotated(UPWARD, speed=30.0)),
+    Case("motion", "tumbling at 30 rad/s", roll_out_rotated(FORWARD, speed=30.0)),
+    Case(
+        "motion", "a stop within one frame", roll_out_motion(lambda subject, base: freeze_after(base, base.loop / 4))
+    ),
+    Case("motion", "one pose throughout", roll_out_motion(lambda subject, base: freeze_after(base, 0.0))),
+    Case("motion", "poses of any joint angles", roll_out_random_poses(0.5)),
+    Case("motion", "other such poses in each frame", roll_out_random_poses(1e-3)),
+    Case("motion", "NaN in frame 7", roll_out_nan(7), ("refuses",)),
+    *(Case("size", f"{metres:g} m", train_at_size(metres)) for metres in (1e-3, 100.0)),
+    *(Case("fabric", f"{stiffness:g} N/m", train_fabric(stiffness)) for stiffness in STIFFNESSES),
+    *(
+        Case("slivers", f"{height:g} as high as long", train_slivers(height), (*MAY_FALL_BACK, "refuses"))
+        for height in SLIVER_HEIGHTS
+    ),
+    *(
+        Case("simulator", f"{stiffness:g} N/m", simulate_fabric(stiffness), MAY_FALL_BACK)
+        for stiffness in STIFFNESSES
+    ),
+    Case("simulator", "slivers 0.0001 as high as long", simulate_slivers(1e-4), MAY_FALL_BACK),
+    *(Case("vertices", f"{count:,}", train_vertex_count(count)) for count in VERTEX_COUNTS),
+    *(
+        Case("precision", str(dtype).removeprefix("torch."), roll_out_precision(dtype), MAY_FALL_BACK)
+        for dtype in PRECISIONS
+    ),
 )

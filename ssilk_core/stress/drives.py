@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motions as functions of time, and functions that change them.
+"""Motions as functions of time, and functions that modify them.
 
-A motion of any length takes the memory of one block, because it is sampled when it is played. A change, such as a
-spin or a teleport, wraps a motion and returns another.
+A motion is sampled block by block during playback, so its length does not affect memory. A modification, such as a
+spin or a teleport, wraps a motion and returns a new one.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from ..assets import Floats, Motion, Skeleton
 from ..kinematics import local_transforms, multiply_quaternions, quaternion_from_matrix, sample_motion, slerp
 
 BLOCK = 256  # frames
-SWAY = 4.0  # [s]
+SWAY = 4.0  # [s] period of the procedural motion
 
 Sampled = tuple[Floats, Floats]  # rotations (N, J, 4) and translations (N, J, 3) [m]
 Turn = Callable[[Floats], Floats]  # times [s] (N,) to quaternions (N, 4)
@@ -24,9 +24,9 @@ Turn = Callable[[Floats], Floats]  # times [s] (N,) to quaternions (N, 4)
 
 @dataclass(frozen=True, eq=False)
 class ProceduralMotion:
-    """A motion of `frames` frames at `fps`, given by joint rotations and translations at any times [s] (N,).
+    """A motion of `frames` frames at `fps`, where `at` returns rotations and translations at times [s] (N,).
 
-    `loop` is the time after which it repeats [s]; zero where it does not.
+    `loop` is its period [s], or zero if it does not repeat.
     """
 
     fps: float
@@ -35,10 +35,10 @@ class ProceduralMotion:
     loop: float = 0.0
 
     def motion(self, start: int = 0, stop: int | None = None) -> Motion:
-        """Return some frames, all by default.
+        """Return the frames from `start` to `stop` (exclusive), by default all.
 
         Raises:
-            SsilkError: a frame holds NaN.
+            SsilkError: a frame has NaN.
         """
         stop = self.frames if stop is None else min(stop, self.frames)
         return Motion("stress", self.fps, *self.at(np.arange(start, stop) / self.fps), start)
@@ -48,23 +48,23 @@ class ProceduralMotion:
         for start in range(0, self.frames, size):
             yield self.motion(start, start + size)
 
-    def lasting(self, seconds: float, fps: float | None = None) -> ProceduralMotion:
-        """Return the drive for some seconds, at another rate."""
+    def with_duration(self, seconds: float, fps: float | None = None) -> ProceduralMotion:
+        """Return the motion with a duration [s] and, optionally, another frame rate [1/s]."""
         fps = fps or self.fps
         return replace(self, fps=fps, frames=round(seconds * fps) + 1)
 
-    def looping(self, seconds: float) -> ProceduralMotion:
-        """Return the drive for whole loops, at least three, that take at least some seconds."""
+    def with_loops(self, seconds: float) -> ProceduralMotion:
+        """Return the motion with a whole number of loops, at least three, that last at least `seconds`."""
         loops = max(3, int(np.ceil(seconds / self.loop)))
-        return self.lasting(loops * self.loop)
+        return self.with_duration(loops * self.loop)
 
     def then(self, change: Callable[[Floats, Floats, Floats], Sampled]) -> ProceduralMotion:
-        """Return the drive with rotations and translations changed by a function of (times, both)."""
+        """Return the motion modified by a function of (times, rotations, translations)."""
         return replace(self, at=lambda times: change(times, *self.at(times)))
 
 
 def sway(skeleton: Skeleton, fps: float) -> ProceduralMotion:
-    """Return a made-up motion: every joint turns by its own sines about the bind pose, in a loop."""
+    """Return a looping motion in which every joint rotates by its own sines about the bind pose."""
     random, loop = np.random.default_rng(0), SWAY
     local = local_transforms(skeleton.bind_transforms, skeleton.parents)
     rest, places = quaternion_from_matrix(local[:, :3, :3]), local[:, :3, 3]
@@ -81,10 +81,10 @@ def sway(skeleton: Skeleton, fps: float) -> ProceduralMotion:
     return ProceduralMotion(fps, 1, at, loop)
 
 
-def looped(motion: Motion, fps: float) -> ProceduralMotion:
-    """Return a clip played forward and backward, slowing at both ends; a loop has whole frames at `fps`."""
+def loop_clip(motion: Motion, fps: float) -> ProceduralMotion:
+    """Return a clip played forward and backward with eased ends; a loop has a whole number of frames at `fps`."""
     last = motion.frame_count - 1
-    loop = max(1, round(np.pi * last / motion.fps * fps)) / fps  # at the clip's own speed in its middle
+    loop = max(1, round(np.pi * last / motion.fps * fps)) / fps  # the middle of the clip keeps its speed
 
     def at(times: Floats) -> Sampled:
         return sample_motion(motion, last * (1 - np.cos(2 * np.pi * times / loop)) / 2)
@@ -92,29 +92,29 @@ def looped(motion: Motion, fps: float) -> ProceduralMotion:
     return ProceduralMotion(fps, 1, at, loop)
 
 
-def turned(drive: ProceduralMotion, skeleton: Skeleton, turn: Turn) -> ProceduralMotion:
-    """Return the drive with the whole character turned about its first joint, by a function of time."""
+def rotate_character(drive: ProceduralMotion, skeleton: Skeleton, turn: Turn) -> ProceduralMotion:
+    """Rotate the character about its first joint by a function of time."""
     roots = np.flatnonzero(skeleton.parents < 0)
 
     def change(times: Floats, rotations: Floats, translations: Floats) -> Sampled:
         rotations, translations = rotations.copy(), translations.copy()
         q, centre = turn(times)[:, None], translations[:, :1]
         rotations[:, roots] = multiply_quaternions(q, rotations[:, roots])
-        translations[:, roots] = centre + rotated(q, translations[:, roots] - centre)
+        translations[:, roots] = centre + rotate_vectors(q, translations[:, roots] - centre)
         return rotations, translations
 
     return drive.then(change)
 
 
-def rotated(quaternions: Floats, vectors: Floats) -> Floats:
-    """Return vectors (..., 3) turned by unit quaternions (..., 4)."""
+def rotate_vectors(quaternions: Floats, vectors: Floats) -> Floats:
+    """Rotate vectors (..., 3) by unit quaternions (..., 4)."""
     pure = np.concatenate([np.zeros_like(vectors[..., :1]), vectors], axis=-1)
     inverse = quaternions * [1, -1, -1, -1]
     return multiply_quaternions(multiply_quaternions(quaternions, pure), inverse)[..., 1:]
 
 
 def about(axis: tuple[float, float, float], speed: float = 0.0, angle: float = 0.0) -> Turn:
-    """Return a turn about a unit axis: an angle [rad] that grows by a speed [rad/s]."""
+    """Return a rotation about a unit axis from an initial angle [rad] at a constant speed [rad/s]."""
 
     def turn(times: Floats) -> Floats:
         half = (angle + speed * times)[:, None] / 2
@@ -123,8 +123,10 @@ def about(axis: tuple[float, float, float], speed: float = 0.0, angle: float = 0
     return turn
 
 
-def carried(drive: ProceduralMotion, path: Callable[[Floats], Floats], skeleton: Skeleton) -> ProceduralMotion:
-    """Return the drive with the character moved by a path: times [s] (N,) to offsets [m] (N, 3)."""
+def translate_character(
+    drive: ProceduralMotion, path: Callable[[Floats], Floats], skeleton: Skeleton
+) -> ProceduralMotion:
+    """Translate the character along a path: times [s] (N,) to offsets [m] (N, 3)."""
     roots = np.flatnonzero(skeleton.parents < 0)
 
     def change(times: Floats, rotations: Floats, translations: Floats) -> Sampled:
@@ -135,13 +137,13 @@ def carried(drive: ProceduralMotion, path: Callable[[Floats], Floats], skeleton:
     return drive.then(change)
 
 
-def stopping(drive: ProceduralMotion, time: float) -> ProceduralMotion:
-    """Return the drive stopped at a time [s]: it keeps the pose of that moment."""
+def freeze_after(drive: ProceduralMotion, time: float) -> ProceduralMotion:
+    """Freeze the motion at its pose at a time [s]."""
     return replace(drive, at=lambda times: drive.at(np.minimum(times, time)))
 
 
-def contorted(drive: ProceduralMotion, skeleton: Skeleton, every: float) -> ProceduralMotion:
-    """Return the drive with random rotations of all joints but the roots: uniform on SO(3), new each `every` [s]."""
+def randomize_rotations(drive: ProceduralMotion, skeleton: Skeleton, every: float) -> ProceduralMotion:
+    """Replace the rotations of all joints except roots by random ones, uniform on SO(3), every `every` seconds."""
     random, inner = np.random.default_rng(1), skeleton.parents >= 0
     keys = random.normal(size=(64, skeleton.joint_count, 4))
     keys /= np.linalg.norm(keys, axis=-1, keepdims=True)
@@ -155,8 +157,8 @@ def contorted(drive: ProceduralMotion, skeleton: Skeleton, every: float) -> Proc
     return drive.then(change)
 
 
-def broken(drive: ProceduralMotion, frame: int) -> ProceduralMotion:
-    """Return the drive with NaN for all rotations of one frame."""
+def insert_nan(drive: ProceduralMotion, frame: int) -> ProceduralMotion:
+    """Replace all rotations of one frame by NaN."""
 
     def change(times: Floats, rotations: Floats, translations: Floats) -> Sampled:
         hit = np.isclose(times * drive.fps, frame)[:, None, None]
@@ -165,6 +167,6 @@ def broken(drive: ProceduralMotion, frame: int) -> ProceduralMotion:
     return drive.then(change)
 
 
-def enlarged(drive: ProceduralMotion, scale: float) -> ProceduralMotion:
-    """Return the drive of a character that is `scale` times as large."""
+def scale_motion(drive: ProceduralMotion, scale: float) -> ProceduralMotion:
+    """Scale the motion for a character that is `scale` times as large."""
     return drive.then(lambda times, rotations, translations: (rotations, scale * translations))

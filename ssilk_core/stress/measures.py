@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measures of extremes: each changes the world of a garment and measures what follows."""
+"""Measures of stress cases: each changes a garment's scene or motion and measures the result."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from .drives import ProceduralMotion
 from .meter import extent, positions, precision_errors
 from .outcome import CaseMeasurement
 from .subject import StressSubject
-from .trials import Trial, simulated, trained
+from .trials import Trial, simulate_trial, train_trial
 
-PATCH = 600  # vertices of what is simulated
+PATCH_VERTICES = 600  # size of the patch of a garment that is simulated
 
 Measure = Callable[[StressSubject], CaseMeasurement]
 
 
-def driven(change: Callable[[StressSubject, ProceduralMotion], ProceduralMotion]) -> Measure:
-    """Return a measure that rolls the model out over a changed motion."""
+def roll_out_motion(change: Callable[[StressSubject, ProceduralMotion], ProceduralMotion]) -> Measure:
+    """Return a measure that rolls the model out over a modified motion."""
     return lambda subject: CaseMeasurement(extent(subject.model, subject.fabric, change(subject, subject.base)))
 
 
-def lasting(frames: int) -> Measure:
+def roll_out_frames(frames: int) -> Measure:
     """Return a measure that rolls the model out over a number of frames."""
 
     def measure(subject: StressSubject) -> CaseMeasurement:
@@ -41,12 +41,12 @@ def lasting(frames: int) -> Measure:
     return measure
 
 
-def at_rate(fps: int) -> Measure:
+def bake_at_rate(fps: int) -> Measure:
     """Return a measure that bakes at another rate; the error is the distance from a bake at the model's rate [m]."""
 
     def measure(subject: StressSubject) -> CaseMeasurement:
         base = subject.base
-        drive = base.lasting((base.frames - 1) / base.fps, fps)
+        drive = base.with_duration((base.frames - 1) / base.fps, fps)
         error = rate_error(subject, drive) if subject.fps.is_integer() else None
         return CaseMeasurement(extent(subject.model, subject.fabric, drive), error, "m")
 
@@ -54,7 +54,7 @@ def at_rate(fps: int) -> Measure:
 
 
 def rate_error(subject: StressSubject, drive: ProceduralMotion) -> float:
-    """Return the largest distance of a vertex from the bake at the model's rate, at the times of both [m]."""
+    """Return the largest distance of a vertex from the bake at the model's rate, at their common times [m]."""
     fps, own = round(drive.fps), round(subject.fps)
     shared = gcd(fps, own)
     found, expected = (positions(subject.model, each) for each in (drive, subject.base))
@@ -63,66 +63,72 @@ def rate_error(subject: StressSubject, drive: ProceduralMotion) -> float:
     return float(np.linalg.norm(found[:count] - expected[:count], axis=2).max())
 
 
-def turned(axis: tuple[float, float, float], speed: float = 0.0, angle: float = 0.0) -> Measure:
-    """Return a measure that turns the character about its root, at a speed [rad/s] or by an angle [rad]."""
+def roll_out_rotated(axis: tuple[float, float, float], speed: float = 0.0, angle: float = 0.0) -> Measure:
+    """Return a measure that rotates the character about its root at a speed [rad/s] or by an angle [rad]."""
     turn = drives.about(axis, speed, angle)
-    return driven(lambda subject, base: drives.turned(base, subject.scene.character.skeleton, turn))
+    return roll_out_motion(
+        lambda subject, base: drives.rotate_character(base, subject.scene.character.skeleton, turn)
+    )
 
 
-def moved(path: Callable[[Floats], Floats]) -> Measure:
+def roll_out_path(path: Callable[[Floats], Floats]) -> Measure:
     """Return a measure that moves the character along a path."""
-    return driven(lambda subject, base: drives.carried(base, path, subject.scene.character.skeleton))
+    return roll_out_motion(
+        lambda subject, base: drives.translate_character(base, path, subject.scene.character.skeleton)
+    )
 
 
-def contorted(every: float) -> Measure:
-    """Return a measure that turns every joint at random, to a new rotation after each interval [s]."""
-    return driven(lambda subject, base: drives.contorted(base, subject.scene.character.skeleton, every))
+def roll_out_random_poses(every: float) -> Measure:
+    """Return a measure that rotates every joint at random, to a new rotation after each interval [s]."""
+    return roll_out_motion(
+        lambda subject, base: drives.randomize_rotations(base, subject.scene.character.skeleton, every)
+    )
 
 
-def interrupted(frame: int) -> Measure:
-    """Return a measure that puts NaN into all rotations of a frame."""
-    return driven(lambda subject, base: drives.broken(base, frame))
+def roll_out_nan(frame: int) -> Measure:
+    """Return a measure that replaces all rotations of a frame by NaN."""
+    return roll_out_motion(lambda subject, base: drives.insert_nan(base, frame))
 
 
-def weighed(factor: float) -> Measure:
-    """Return a measure that simulates under a multiple of gravity; networks know only its direction."""
-    return lambda subject: solved(subject, patch(subject), subject.fabric, factor * GRAVITY)
+def simulate_gravity(factor: float) -> Measure:
+    """Return a measure that simulates under scaled gravity; networks receive only its direction."""
+    return lambda subject: simulate_patch(subject, patch(subject), subject.fabric, factor * GRAVITY)
 
 
-def solved_of(stiffness: float) -> Measure:
-    """Return a measure that simulates a fabric of some stiffness [N/m]."""
-    return lambda subject: solved(subject, patch(subject), membrane(subject.fabric, stiffness))
+def simulate_fabric(stiffness: float) -> Measure:
+    """Return a measure that simulates a fabric with this stiffness [N/m]."""
+    return lambda subject: simulate_patch(subject, patch(subject), membrane(subject.fabric, stiffness))
 
 
-def solved_with(height: float) -> Measure:
-    """Return a measure that simulates slivers, `height` times as high as long."""
-    return lambda subject: solved(subject, worlds.pinched(patch(subject), height), subject.fabric)
+def simulate_slivers(height: float) -> Measure:
+    """Return a measure that simulates slivers with this ratio of height to base."""
+    return lambda subject: simulate_patch(subject, worlds.add_slivers(patch(subject), height), subject.fabric)
 
 
 def patch(subject: StressSubject) -> Scene:
-    """Return the part of a garment that is simulated."""
-    return worlds.resized(subject.scene, min(PATCH, subject.effort.vertices))
+    """Return the patch of a garment that is simulated."""
+    return worlds.resize_garment(subject.scene, min(PATCH_VERTICES, subject.effort.vertices))
 
 
-def solved(subject: StressSubject, scene: Scene, fabric: Fabric, gravity: float = GRAVITY) -> CaseMeasurement:
-    """Simulate some frames; the error is the largest residual at which the solver stopped [g]."""
+def simulate_patch(subject: StressSubject, scene: Scene, fabric: Fabric, gravity: float = GRAVITY) -> CaseMeasurement:
+    """Simulate some frames; the error is the largest final residual of the solver [g]."""
     motion = subject.base.motion(0, subject.effort.simulated)
-    found, residual = simulated(scene, fabric, motion, gravity)
+    found, residual = simulate_trial(scene, fabric, motion, gravity)
     return CaseMeasurement(
         found, residual, "g", f"simulated, {found.recovered} of {found.frames} frames not to tolerance"
     )
 
 
 def membrane(fabric: Fabric, stiffness: float) -> Fabric:
-    """Return a fabric with one stiffness [N/m] for each constant of its membranes."""
+    """Return a fabric with all membrane constants set to one stiffness [N/m]."""
     return replace(fabric, lame_mu=stiffness, lame_lambda=stiffness, stretch=stiffness, shear=stiffness)
 
 
-def measured(trial: Trial, note: str = "") -> CaseMeasurement:
-    """Return a trial training as a measurement; the error is that of single-precision forces, relative to them.
+def trial_measurement(trial: Trial, note: str = "") -> CaseMeasurement:
+    """Return the measurement of a trial training; its error is the relative error of single-precision forces.
 
     Raises:
-        ArithmeticError: most steps were undone because something was not finite.
+        ArithmeticError: most steps were undone because of values that are not finite.
     """
     undone = f"{trial.undone} of {trial.steps} steps undone" if trial.undone else ""
     if 2 * trial.undone > trial.steps:
@@ -130,55 +136,55 @@ def measured(trial: Trial, note: str = "") -> CaseMeasurement:
     return CaseMeasurement(trial.extent, trial.error, "of the force", "; ".join(filter(None, (note, undone))))
 
 
-def sized(metres: float) -> Measure:
-    """Return a measure that trains a garment of another size, on a body and motion scaled with it."""
+def train_at_size(metres: float) -> Measure:
+    """Return a measure that trains a garment at another size, with the body and motion scaled alike."""
 
     def measure(subject: StressSubject) -> CaseMeasurement:
         scale = metres / worlds.garment_size(subject.scene)
-        scene, drive = worlds.enlarged(subject.scene, scale), drives.enlarged(subject.base, scale)
+        scene, drive = worlds.scale_scene(subject.scene, scale), drives.scale_motion(subject.base, scale)
         body, units = scene.character.merged_body().mesh, FileUnits("", 1.0, "Y", True, True)
         warned = "; ".join(f"inspect: {finding.found}" for finding in body_size(body, units))
-        return measured(trained(scene, subject.fabric, drive, subject.effort.steps), warned)
+        return trial_measurement(train_trial(scene, subject.fabric, drive, subject.effort.steps), warned)
 
     return measure
 
 
-def made_of(stiffness: float) -> Measure:
-    """Return a measure that trains with one stiffness [N/m] for each constant of the membranes."""
+def train_fabric(stiffness: float) -> Measure:
+    """Return a measure that trains with all membrane constants set to one stiffness [N/m]."""
 
     def measure(subject: StressSubject) -> CaseMeasurement:
         fabric = membrane(subject.fabric, stiffness)
-        return measured(trained(subject.scene, fabric, subject.base, subject.effort.steps))
+        return trial_measurement(train_trial(subject.scene, fabric, subject.base, subject.effort.steps))
 
     return measure
 
 
-def meshed(height: float) -> Measure:
-    """Return a measure that trains with slivers among the triangles, `height` times as high as long."""
+def train_slivers(height: float) -> Measure:
+    """Return a measure that trains with slivers among the triangles, with this ratio of height to base."""
 
     def measure(subject: StressSubject) -> CaseMeasurement:
-        scene = worlds.pinched(subject.scene, height)
-        return measured(trained(scene, subject.fabric, subject.base, subject.effort.steps))
+        scene = worlds.add_slivers(subject.scene, height)
+        return trial_measurement(train_trial(scene, subject.fabric, subject.base, subject.effort.steps))
 
     return measure
 
 
-def counted(vertices: int) -> Measure:
-    """Return a measure that trains a garment of about a number of vertices."""
+def train_vertex_count(vertices: int) -> Measure:
+    """Return a measure that trains a garment with about this number of vertices."""
 
     def measure(subject: StressSubject) -> CaseMeasurement:
-        scene = worlds.resized(subject.scene, min(vertices, subject.effort.vertices))
+        scene = worlds.resize_garment(subject.scene, min(vertices, subject.effort.vertices))
         few = scene.garment.mesh.vertex_count > 50_000
         base, steps = subject.base, min(subject.effort.steps, 4) if few else subject.effort.steps
         drive = replace(base, frames=8) if few else base
-        trial = trained(scene, subject.fabric, drive, steps, windows=1 if few else 2)
-        return measured(trial, f"{scene.garment.mesh.vertex_count:,} vertices")
+        trial = train_trial(scene, subject.fabric, drive, steps, windows=1 if few else 2)
+        return trial_measurement(trial, f"{scene.garment.mesh.vertex_count:,} vertices")
 
     return measure
 
 
-def in_precision(dtype: torch.dtype) -> Measure:
-    """Return a measure that rolls out and skins in a precision; the error is the distance from float64 [m]."""
+def roll_out_precision(dtype: torch.dtype) -> Measure:
+    """Return a measure that rolls out and skins in `dtype`; the error is the distance from float64 [m]."""
 
     def measure(subject: StressSubject) -> CaseMeasurement:
         model, exact = subject.in_precision(dtype), subject.in_precision(torch.float64)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measuring rollouts: latents, speeds, distances from linear blend skinning, energies."""
+"""Measure rollouts: latents, speeds, distances from linear blend skinning, and energies."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ from .drives import ProceduralMotion
 from .worlds import garment_size
 
 ENERGY_EVERY = 4  # frames: energies take ten times as long as all else
-FAR = 2.0  # garment sizes from linear blend skinning, the bound: cloth that hangs the other way stays within it
-LONG = 4096  # frames; longer rollouts are streamed, and about this number of frames is decoded
+MAX_LBS_DISTANCE = 2.0  # [garment sizes] bound on the distance from LBS; cloth that hangs upside down stays within
+STREAMING_FRAMES = 4096  # longer rollouts are streamed, and about this number of their frames is decoded
 
 
 @dataclass(frozen=True)
 class Extent:
-    """How far a garment went.
+    """Extreme values of a rollout.
 
     Attributes:
-        frames: that were rolled.
-        finite: whether every number was.
-        speed: largest of any vertex, relative to the character's root [m/s].
-        distance: largest of any vertex from linear blend skinning [m].
-        allowed: largest distance that still counts as bounded [m].
-        latent: largest entry of any latent.
-        growth: mean elastic and kinetic energy in the last loop of the motion over that in the second; the first loop
-            holds the transient. 1 where there are fewer than three loops.
-        recovered: frames at which the state was lost, or a solver missed its tolerance.
+        frames: number of frames.
+        finite: whether all values are finite.
+        speed: largest speed of a vertex relative to the character's root [m/s].
+        distance: largest distance of a vertex from linear blend skinning [m].
+        allowed: largest distance that counts as bounded [m].
+        latent: largest magnitude of a latent.
+        growth: ratio of the mean elastic and kinetic energy in the last loop of the motion to that in the second. The
+            first loop has the transient. 1 for fewer than three loops.
+        recovered: number of frames at which the state diverged, or a solver missed its tolerance.
     """
 
     frames: int
@@ -57,12 +57,12 @@ class Extent:
 
 @dataclass(eq=False)
 class Latents:
-    """Largest latent that a model decodes, watched by a hook so that the rollout itself is the product's."""
+    """Records the largest latent that a model decodes, with a hook, so that the rollout code is unchanged."""
 
     largest: float = 0.0
 
-    def watched(self, model: GarmentModel) -> torch.utils.hooks.RemovableHandle:
-        """Begin to watch; the handle ends it."""
+    def watch(self, model: GarmentModel) -> torch.utils.hooks.RemovableHandle:
+        """Start recording; remove the returned handle to stop."""
         return model.output.register_forward_pre_hook(self._see)
 
     def _see(self, module: torch.nn.Module, inputs: tuple[Tensor, ...]) -> None:
@@ -70,7 +70,7 @@ class Latents:
 
 
 class ExtentMeter:
-    """Measures an `Extent` from blocks of frames of one garment; energies only in `spans` of frames."""
+    """Measures an `Extent` from blocks of frames of one garment, and energies in `spans` of frames."""
 
     def __init__(self, scene: Scene, fabric: Fabric, fps: float, spans: Sequence[range] = ()) -> None:
         self.scene, self.fps, self.spans = scene, fps, [span[::ENERGY_EVERY] for span in spans]
@@ -81,7 +81,7 @@ class ExtentMeter:
         self.energies: list[list[float]] = [[] for _ in spans]
 
     def add(self, motion: Motion, points: Floats) -> None:
-        """Take a block, whose first frame is number `motion.start`, and the garment's points there (F, V, 3) [m]."""
+        """Add a block of frames, which starts at frame `motion.start`, with the garment's points [m], (F, V, 3)."""
         self.finite &= bool(np.isfinite(points).all())
         matrices, origin = matrices_about_root(motion, self.scene)
         x = torch.as_tensor((points - origin).transpose(1, 2, 0))
@@ -102,19 +102,21 @@ class ExtentMeter:
 
     @property
     def growth(self) -> float:
-        """Mean energy in the last span over that in the first; 1 where there are none."""
+        """Ratio of the mean energy in the last span to that in the first; 1 without spans."""
         if not self.energies or not all(self.energies):
             return 1.0
         return float(np.mean(self.energies[-1]) / np.mean(self.energies[0]))
 
-    def extent(self, frames: int, *, latent: float = 0.0, recovered: int = 0, far: float = FAR) -> Extent:
-        """Return the extent; a garment is bounded within `far` times its size."""
-        allowed = far * garment_size(self.scene)
+    def extent(
+        self, frames: int, *, latent: float = 0.0, recovered: int = 0, max_distance: float = MAX_LBS_DISTANCE
+    ) -> Extent:
+        """Return the extent; a garment is bounded within `max_distance` times its size."""
+        allowed = max_distance * garment_size(self.scene)
         return Extent(frames, self.finite, self.speed, self.distance, allowed, latent, self.growth, recovered)
 
 
 def compared_loops(drive: ProceduralMotion) -> tuple[range, ...]:
-    """Return the frames of a drive's second and last loops; nothing where it has fewer than three."""
+    """Return the frames of a drive's second and last loops, or nothing if it has fewer than three."""
     length = round(drive.loop * drive.fps)
     loops = drive.frames // length if length else 0
     return tuple(range(loop * length, (loop + 1) * length) for loop in (1, loops - 1)) if loops >= 3 else ()
@@ -132,7 +134,7 @@ def matrices_about_root(motion: Motion, scene: Scene) -> tuple[Tensor, Floats]:
 
 @dataclass(eq=False)
 class StressRollout:
-    """The rollout of a model over a drive, as blocks of the motion and the garment's poses."""
+    """Rollout of a model over a drive, as blocks of the motion with the garment's poses."""
 
     model: GarmentModel
     drive: ProceduralMotion
@@ -140,16 +142,16 @@ class StressRollout:
 
     def __iter__(self) -> Iterator[tuple[Motion, GarmentPose]]:
         steady = self.drive.fps == self.model.config.fps
-        return self._streamed() if steady and self.drive.frames > LONG else self._baked()
+        return self._streamed() if steady and self.drive.frames > STREAMING_FRAMES else self._baked()
 
     def _baked(self) -> Iterator[tuple[Motion, GarmentPose]]:
-        """Yield the poses that a bake of the whole motion writes."""
+        """Yield the poses that a bake of the entire motion writes."""
         motion = self.drive.motion()
         for pose in garment_poses(self.model, motion, motion.fps, on_recovery=self.recovered.append):
             yield motion.clip(pose.start, pose.start + pose.frame_count), replace(pose, start=0)
 
     def _streamed(self) -> Iterator[tuple[Motion, GarmentPose]]:
-        """Yield the same in constant memory, for drives at the model's rate that are never cut."""
+        """Yield the same poses in constant memory, for drives at the model's rate without cuts."""
         for block, step in zip(self.drive.blocks(), roll_blocks(self.model, self.drive.blocks())):
             frames = step.recovered.nonzero().flatten().tolist()
             self.recovered += [range(step.start + frame, step.start + frame + 1) for frame in frames]
@@ -159,7 +161,7 @@ class StressRollout:
 def extent(model: GarmentModel, fabric: Fabric, drive: ProceduralMotion) -> Extent:
     """Roll a model out over a drive and measure it.
 
-    Of more than `LONG` frames, evenly spread blocks and those of the compared loops are decoded.
+    If there are more than `STREAMING_FRAMES` frames, only evenly spaced blocks and the compared loops are decoded.
 
     Raises:
         SsilkError: the motion cannot be played.
@@ -167,8 +169,8 @@ def extent(model: GarmentModel, fabric: Fabric, drive: ProceduralMotion) -> Exte
     course, latents = StressRollout(model, drive), Latents()
     spans = compared_loops(drive)
     meter = ExtentMeter(model.scene, fabric, drive.fps, spans)
-    skipped = -(-drive.frames // LONG)
-    handle = latents.watched(model)
+    skipped = -(-drive.frames // STREAMING_FRAMES)
+    handle = latents.watch(model)
     try:
         for number, (motion, pose) in enumerate(course):
             own = range(int(motion.start), int(motion.start) + motion.frame_count)
@@ -181,7 +183,7 @@ def extent(model: GarmentModel, fabric: Fabric, drive: ProceduralMotion) -> Exte
 
 
 def positions(model: GarmentModel, drive: ProceduralMotion) -> Floats:
-    """Return the garment's points over a drive, relative to the root (F, V, 3) [m]; all are held in memory."""
+    """Return the garment's points over a drive relative to the root [m], shape (F, V, 3), all in memory."""
     found = []
     for motion, pose in StressRollout(model, drive):
         found.append(decode(model, motion, pose) - matrices_about_root(motion, model.scene)[1])
@@ -189,7 +191,7 @@ def positions(model: GarmentModel, drive: ProceduralMotion) -> Floats:
 
 
 def precision_errors(model: GarmentModel, exact: GarmentModel, drive: ProceduralMotion) -> tuple[float, float]:
-    """Return the largest error of a vertex [m]: of the networks of `model` alone, and with its skinning."""
+    """Return the largest error of a vertex [m]: from the networks of `model` only, and including its skinning."""
     networks, whole = 0.0, 0.0
     for (motion, pose), (_, true) in zip(StressRollout(model, drive), StressRollout(exact, drive)):
         expected = decode(exact, motion, true)

@@ -17,7 +17,7 @@ HEADER = ("extreme", "what happens", "frames", "bounded", "speed [m/s]", "off li
 
 @dataclass(frozen=True)
 class CaseMeasurement:
-    """Figures of a case: an extent where there was a rollout, an error with its unit, and a note."""
+    """Results of a case: the extent of a rollout, if any, an error with its unit, and a note."""
 
     extent: Extent | None = None
     error: float | None = None
@@ -35,14 +35,14 @@ class CaseMeasurement:
 
 @dataclass(frozen=True)
 class CaseOutcome:
-    """One line of the table.
+    """One row of the table.
 
     Attributes:
-        name, group: of the case.
-        verdict: what the product did; "breaks" is always a fault.
-        said: the sentence of a refusal, or a note.
-        measured: figures; empty for a refusal.
-        seconds: duration of the case.
+        name, group: labels of the case.
+        verdict: behaviour of the product; "breaks" is always a fault.
+        said: error message of a refusal, or a note.
+        measured: results; empty for a refusal.
+        seconds: duration of the case [s].
     """
 
     name: str
@@ -54,7 +54,7 @@ class CaseOutcome:
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> CaseOutcome:
-        """Return an outcome from its JSON document, in which None stands for values that are not finite."""
+        """Return an outcome from its JSON document, in which None replaces values that are not finite."""
         found = dict(document["measured"])
         if found["extent"]:
             figures: dict[str, Any] = {k: nan if value is None else value for k, value in found["extent"].items()}
@@ -62,7 +62,7 @@ class CaseOutcome:
         return cls(**{**document, "measured": CaseMeasurement(**found)})
 
     def row(self) -> list[str]:
-        """Return the line as words."""
+        """Return the cells of the row."""
         found, error = self.measured.extent, self.measured.error
         figures = ["", "", "", "", "", ""]
         if found:

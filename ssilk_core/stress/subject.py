@@ -12,19 +12,19 @@ from ..assets import Motion, Scene
 from ..checkpoint import ModelFile, network
 from ..fabrics import Fabric
 from ..model.network import GarmentModel
-from .drives import ProceduralMotion, looped, sway
+from .drives import ProceduralMotion, loop_clip, sway
 
 
 @dataclass(frozen=True, kw_only=True)
 class Effort:
-    """How much each case tries.
+    """Amount of work in each case.
 
     Attributes:
-        seconds: length of the motion in most cases.
-        frames: share of the frames that long cases are named after.
-        steps: of trial trainings.
+        seconds: duration of the motion in most cases [s].
+        frames: share of the frames in the names of long cases that is computed.
+        steps: optimiser steps of trial trainings.
         simulated: frames of trial simulations.
-        vertices: the most of a trial garment.
+        vertices: largest number of vertices of a trial garment.
     """
 
     seconds: float = 20.0
@@ -40,7 +40,7 @@ QUICK = Effort(seconds=3.0, frames=0.1, steps=12, simulated=3, vertices=20_000)
 
 @dataclass(frozen=True, eq=False)
 class StressSubject:
-    """A model file, its scene with the character's bodies, and a clip; without a clip the motion is made up."""
+    """A model file, its scene with the character's bodies, and a clip (None for a procedural motion)."""
 
     file: ModelFile
     scene: Scene
@@ -57,15 +57,15 @@ class StressSubject:
 
     @cached_property
     def base(self) -> ProceduralMotion:
-        """The motion that every case begins from."""
+        """The motion that the cases modify."""
         skeleton = self.scene.character.skeleton
-        endless = looped(self.clip, self.fps) if self.clip else sway(skeleton, self.fps)
-        return endless.looping(self.effort.seconds)
+        endless = loop_clip(self.clip, self.fps) if self.clip else sway(skeleton, self.fps)
+        return endless.with_loops(self.effort.seconds)
 
     @cached_property
     def model(self) -> GarmentModel:
         return self.in_precision(torch.float32)
 
     def in_precision(self, dtype: torch.dtype) -> GarmentModel:
-        """Return the network with all its numbers in a precision."""
+        """Return the network with all parameters and buffers in `dtype`."""
         return network(self.file, self.scene).to(dtype)

@@ -23,14 +23,14 @@ from ..training.parts import build_parts
 from .drives import ProceduralMotion
 from .meter import Extent, ExtentMeter, extent, matrices_about_root
 
-SMALL = ModelConfig(latent=16, widths=(32, 32), shapes=8)
-PERTURBATION = 1e-3  # of points, relative to the garment's size, where energies of two precisions are compared
-ELASTIC = 1e4  # garment sizes that the softest fabric may stretch, as physics has it
+TRIAL_MODEL = ModelConfig(latent=16, widths=(32, 32), shapes=8)
+PERTURBATION = 1e-3  # [garment sizes] displacement of points at which forces in two precisions are compared
+MAX_ELASTIC_DISTANCE = 1e4  # [garment sizes] that the softest fabric may stretch physically
 
 
 @dataclass(frozen=True)
 class Trial:
-    """The outcome of a short training: the extent of its rollout, undone steps, and the error of single precision."""
+    """Result of a short training: extent of its rollout, undone steps, and error of single precision."""
 
     extent: Extent
     undone: int
@@ -38,8 +38,8 @@ class Trial:
     error: float
 
 
-def trained(scene: Scene, fabric: Fabric, drive: ProceduralMotion, steps: int, *, windows: int = 2) -> Trial:
-    """Train a small network for some steps, roll it out over the same drive, and compare the energies' precisions.
+def train_trial(scene: Scene, fabric: Fabric, drive: ProceduralMotion, steps: int, *, windows: int = 2) -> Trial:
+    """Train a small network for some steps, roll it out over the same drive, and compare forces in two precisions.
 
     Raises:
         SsilkError: the scene, the fabric or the motion is refused.
@@ -56,7 +56,7 @@ def trained(scene: Scene, fabric: Fabric, drive: ProceduralMotion, steps: int, *
         recombinations=0,
     )
     job = TrainJob(
-        scene=scene, motions=[motion], held_out=[motion], model=replace(SMALL, fps=drive.fps), train=config,
+        scene=scene, motions=[motion], held_out=[motion], model=replace(TRIAL_MODEL, fps=drive.fps), train=config,
         fabric=fabric, output=Path("stress"), device="cpu",
     )  # fmt: skip
     parts = build_parts(job, torch.device("cpu"))
@@ -67,10 +67,10 @@ def trained(scene: Scene, fabric: Fabric, drive: ProceduralMotion, steps: int, *
     return Trial(extent(model, fabric, drive), int(stepper.skipped.count), steps, error)
 
 
-def simulated(scene: Scene, fabric: Fabric, motion: Motion, gravity: float = GRAVITY) -> tuple[Extent, float]:
+def simulate_trial(scene: Scene, fabric: Fabric, motion: Motion, gravity: float = GRAVITY) -> tuple[Extent, float]:
     """Simulate a motion under a gravity [m/s2]; return its extent and the largest residual of a frame [g].
 
-    Frames that the solver left out of balance by more than its tolerance count as recovered.
+    Frames whose final residual exceeds the solver's tolerance count as recovered.
     """
     options = SimulationOptions(fps=motion.fps, gravity=(0.0, -gravity, 0.0))
     meter = ExtentMeter(scene, fabric, motion.fps)
@@ -78,14 +78,14 @@ def simulated(scene: Scene, fabric: Fabric, motion: Motion, gravity: float = GRA
     residual = [frame.residual for frame in frames]
     meter.add(motion, np.stack([frame.points for frame in frames]))
     unsolved = sum(value > options.solver.tolerance for value in residual)
-    return meter.extent(len(frames), recovered=unsolved, far=ELASTIC), max(residual)
+    return meter.extent(len(frames), recovered=unsolved, max_distance=MAX_ELASTIC_DISTANCE), max(residual)
 
 
 def gradient_error(scene: Scene, fabric: Fabric, motion: Motion) -> float:
-    """Return the relative error, in the norm, of the force of stretch and bending in single precision.
+    """Return the relative error of stretch and bending forces in single precision, by their norm.
 
-    Forces are taken at linear blend skinning in the first frame, with points moved at random by a thousandth of the
-    garment's size.
+    Forces are evaluated at linear blend skinning in the first frame, with points displaced at random by
+    `PERTURBATION`.
     """
     matrices, _ = matrices_about_root(motion, scene)
     skin, rest = Skinning(scene.lbs_skin).double(), torch.tensor(scene.garment.mesh.points)

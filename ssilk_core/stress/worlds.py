@@ -14,7 +14,7 @@ INFLUENCES = 8
 
 @dataclass(frozen=True, eq=False)
 class Cloth:
-    """A garment with dense weights: points (V, 3), plain (V, J) and rig weights (V, J + P), classes (V,)."""
+    """A garment with dense weights: points (V, 3), LBS (V, J) and rig weights (V, J + P), classes (V,)."""
 
     points: Floats
     lbs: Floats
@@ -23,12 +23,12 @@ class Cloth:
 
 
 def garment_size(scene: Scene) -> float:
-    """Return the diagonal of a garment's box at rest [m]."""
+    """Return the diagonal of a garment's bounding box at rest [m]."""
     return float(np.linalg.norm(np.ptp(scene.garment.mesh.points, axis=0)))
 
 
-def enlarged(scene: Scene, scale: float) -> Scene:
-    """Return everything `scale` times as large."""
+def scale_scene(scene: Scene, scale: float) -> Scene:
+    """Return the scene scaled by `scale`."""
     skeleton, rig, garment = scene.character.skeleton, scene.rig, scene.garment
     grown = replace(
         skeleton,
@@ -53,10 +53,10 @@ def _scaled(mesh: Mesh, scale: float) -> Mesh:
     return replace(mesh, points=scale * mesh.points)
 
 
-def pinched(scene: Scene, height: float, every: int = 100) -> Scene:
-    """Return a scene in which one triangle of `every` is a sliver, `height` times as high as its base is long.
+def add_slivers(scene: Scene, height: float, every: int = 100) -> Scene:
+    """Return the scene with one in `every` triangles turned into a sliver with ratio `height` of height to base.
 
-    Its tip is moved next to the middle of the opposite edge. Slivers share no vertices.
+    The tip of the triangle moves next to the middle of the opposite edge. Slivers share no vertices.
     """
     mesh = scene.garment.mesh
     points, used = np.array(mesh.points), np.zeros(mesh.vertex_count, dtype=bool)
@@ -71,8 +71,8 @@ def pinched(scene: Scene, height: float, every: int = 100) -> Scene:
     return replace(scene, garment=replace(scene.garment, mesh=Mesh(mesh.path, points, mesh.faces)))
 
 
-def resized(scene: Scene, count: int) -> Scene:
-    """Return a scene whose garment has about `count` vertices: a patch of it, subdivided as often as needed."""
+def resize_garment(scene: Scene, count: int) -> Scene:
+    """Return the scene with a garment of about `count` vertices: a patch of it, subdivided as often as needed."""
     skin, rig, faces = scene.lbs_skin, scene.rig.skin, scene.garment.mesh.faces
     lbs, whole = skin.dense(scene.character.skeleton.joint_count), rig.dense(len(scene.joint_names))
     cloth = Cloth(scene.garment.mesh.points, lbs, whole, scene.classes)
@@ -82,7 +82,7 @@ def resized(scene: Scene, count: int) -> Scene:
 
 
 def _subdivided(cloth: Cloth, faces: Ints) -> tuple[Cloth, Ints]:
-    """Split every triangle in four; a new vertex is the mean of two, and as loose as the looser of them."""
+    """Split every triangle into four; a new vertex is the mean of two, and takes the looser of their classes."""
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     pairs, index = np.unique(edges, axis=0, return_inverse=True)
     ab, bc, ca = (index.reshape(-1, 3) + len(cloth.points)).T
@@ -98,13 +98,13 @@ def _subdivided(cloth: Cloth, faces: Ints) -> tuple[Cloth, Ints]:
 
 
 def _patch(cloth: Cloth, faces: Ints, count: int) -> tuple[Cloth, Ints]:
-    """Keep the faces nearest to the border of loose cloth, as many as have `count` vertices."""
+    """Keep the faces nearest to the border of loose cloth, until they have `count` vertices."""
     points, classes = cloth.points, cloth.classes
     mixed = faces[np.ptp(classes[faces], axis=1) > 0]
     seed = points[mixed[0, 0] if len(mixed) else faces[0, 0]]
     order = np.argsort(np.linalg.norm(points[faces] - seed, axis=2).max(axis=1), kind="stable")
     _, first = np.unique(faces[order], return_index=True)
-    newly = np.bincount(first // 3, minlength=len(faces))  # vertices that each face, in this order, brings
+    newly = np.bincount(first // 3, minlength=len(faces))  # number of new vertices per face, in this order
     most = max(1, int(np.searchsorted(np.cumsum(newly), count, side="right")))
     used, compact = np.unique(faces[order[:most]], return_inverse=True)
     kept = Cloth(points[used], cloth.lbs[used], cloth.rig[used], classes[used])

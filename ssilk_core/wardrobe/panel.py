@@ -9,7 +9,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import TextIO
 
-from ..events import Event, GarmentEvent, Progress, Result, Said, describe, describe_progress, format_seconds
+from ..events import Event, GarmentEvent, Progress, Result, TaskEvent, describe, describe_progress, format_seconds
 
 REDRAW = 0.1  # seconds between two drawings of the lines
 REPEAT = 60.0  # seconds between two plain lines about the progress of one garment
@@ -32,7 +32,7 @@ class ProgressTable:
         elif not isinstance(event.said, Result):  # the table at the end has it
             self._hear(event.name, event.said)
 
-    def _hear(self, name: str, said: Said) -> None:
+    def _hear(self, name: str, said: TaskEvent) -> None:
         text = describe_progress(said) if isinstance(said, Progress) else describe(said)
         if self.live:
             self.lines[name] = text or self.lines[name]

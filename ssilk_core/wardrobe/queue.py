@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ..events import Failed, Result, Said, read_event
+from ..events import Failed, Result, TaskEvent, read_event
 
 Slot = Mapping[str, str]  # environment variables that give a task its device
 Take = Callable[[], "CommandTask | None"]
@@ -53,7 +53,7 @@ class _Running:
     explained: bool = False
     stopping: bool = False
 
-    def hear(self, event: Said) -> None:
+    def hear(self, event: TaskEvent) -> None:
         if isinstance(event, Result):
             self.result = event
         self.explained |= isinstance(event, Failed)
@@ -73,11 +73,11 @@ class Queue:
     """
 
     def __init__(
-        self, slots: Sequence[Slot], tell: Callable[[str, Said], None], ended: Callable[[str, End], None]
+        self, slots: Sequence[Slot], tell: Callable[[str, TaskEvent], None], ended: Callable[[str, End], None]
     ) -> None:
         self._free, self.tell, self.ended = deque(slots), tell, ended
         self._running: dict[str, _Running] = {}
-        self._heard: queue.Queue[tuple[str, Said | None]] = queue.Queue()
+        self._heard: queue.Queue[tuple[str, TaskEvent | None]] = queue.Queue()
 
     def run(self, take: Take, stop: threading.Event) -> None:
         """Run tasks until none is left.

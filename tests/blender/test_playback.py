@@ -168,7 +168,7 @@ def test_what_cannot_be_played_is_said(ready, trained, tmp_path):
     with pytest.raises(RuntimeError, match="has no model at"):
         ready.ops.ssilk.play_live()
     (tmp_path / "none.safetensors").write_bytes(b"nothing")
-    with pytest.raises(RuntimeError, match="no safetensors file"):
+    with pytest.raises(RuntimeError, match="not a safetensors file"):
         ready.ops.ssilk.play_live()
     trained.ssilk.model = ""
     ready.context.view_layer.objects.active = ready.data.objects["Rig"]

@@ -64,9 +64,9 @@ WRONG: dict[str, tuple[Callable[[], object], str]] = {
     "no joints": (lambda: skeleton(joint_names=()), "no joints"),
     "repeated joints": (lambda: skeleton(joint_names=("A", "A")), "joint names repeat"),
     "too many parents": (lambda: skeleton(parents=[-1, 0, 1]), "3 parents for 2 joints"),
-    "child first": (lambda: skeleton(parents=[1, -1]), "'A' stands before its parent"),
-    "own parent": (lambda: skeleton(parents=[-1, 1]), "'A/B' stands before its parent"),
-    "parent of no one": (lambda: skeleton(parents=[-1, -2]), "'A/B' stands before its parent"),
+    "child first": (lambda: skeleton(parents=[1, -1]), "'A' precedes its parent"),
+    "own parent": (lambda: skeleton(parents=[-1, 1]), "'A/B' precedes its parent"),
+    "parent of no one": (lambda: skeleton(parents=[-1, -2]), "'A/B' precedes its parent"),
     "bind transform that scales": (
         lambda: skeleton(bind_transforms=scaled(2.0)),
         "bind transform of joint 'A' scales",
@@ -138,8 +138,8 @@ WRONG: dict[str, tuple[Callable[[], object], str]] = {
         lambda: scene(proxies=rig(skin=SkinWeights("/w", [[0]], [[1.0]]))),
         "1 rig weight rows for 3",
     ),
-    "a proxy that hangs from itself": (lambda: scene(proxies=rig(parents=[2])), "before its parent or has none"),
-    "a proxy that hangs from nothing": (lambda: scene(proxies=rig(parents=[-1])), "before its parent or has none"),
+    "a proxy that hangs from itself": (lambda: scene(proxies=rig(parents=[2])), "precedes its parent or has none"),
+    "a proxy that hangs from nothing": (lambda: scene(proxies=rig(parents=[-1])), "precedes its parent or has none"),
     "shapes of another mesh": (
         lambda: Deformer(scene(), ONES, np.zeros((2, 5, 3))),
         r"blendshapes of shape \(2, 5, 3\)",

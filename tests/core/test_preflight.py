@@ -9,10 +9,10 @@ import trimesh
 
 from ssilk_core.assets import LOOSE, PINNED, TIGHT, Body, Character, Garment, Mesh, Motion, Skeleton, SkinWeights
 from ssilk_core.config import PRESETS
-from ssilk_core.preflight import cost, fit, hold, motion, pose, units, winding
+from ssilk_core.preflight import attachment, cost, fit, motion, pose, units, winding
 from ssilk_core.preflight import mesh as meshes
 from ssilk_core.preflight.finding import Finding
-from ssilk_core.preflight.inspection import Inspected, inspect
+from ssilk_core.preflight.inspection import PreflightInput, inspect
 from ssilk_core.preflight.motion import MotionFile
 from ssilk_core.preflight.repair import MeshRepair, merge_targets, plan_repair
 from ssilk_core.preflight.table import format_findings
@@ -204,10 +204,10 @@ def test_alignment(change, hint):
     cloth, body = tube(), pillar()
     assert not list(fit.alignment(cloth, body))
     moved = Mesh(cloth.path, change(cloth.points), cloth.faces)
-    found, guess = only(fit.alignment(moved, body)), fit.misplacement(moved, body)
+    found, guess = only(fit.alignment(moved, body)), fit.find_unit_correction(moved, body)
     assert found.severity == "error" and hint in found.found
     # A mere offset is nothing that units could explain, and what is authored is not contradicted.
-    assert CENTIMETRES_ASSUMED.open_to(guess) == (hint != "1.") and not METRES.open_to(guess)
+    assert CENTIMETRES_ASSUMED.allows(guess) == (hint != "1.") and not METRES.allows(guess)
 
 
 def test_a_wide_gown_is_not_misplaced():
@@ -261,7 +261,7 @@ def test_shallow_penetration_is_pushed_out_as_a_whole_patch_or_not_at_all():
     offsets = fit.push_out(points, edges(cloth.faces), body)
     assert np.flatnonzero(offsets.any(axis=1)).tolist() == list(range(32))
     after = fit.signed_distance((points + offsets)[:32], body)
-    assert after.min() >= fit.MARGIN and after.max() < 1.5 * fit.MARGIN
+    assert after.min() >= fit.COLLISION_MARGIN and after.max() < 1.5 * fit.COLLISION_MARGIN
     found = next(fit.penetration(Mesh(cloth.path, points, cloth.faces), body))
     inside = int((fit.signed_distance(points[:32], body) < 0).sum())  # the cylinder has corners
     assert not found.fixable and f": {inside} of these" in found.fix
@@ -284,8 +284,8 @@ def test_rest_pose():
 
 
 def test_unauthored_units():
-    assert not list(units.unauthored(METRES))
-    meters, axis = units.unauthored(CENTIMETRES_ASSUMED)
+    assert not list(units.unauthored_units(METRES))
+    meters, axis = units.unauthored_units(CENTIMETRES_ASSUMED)
     assert "metersPerUnit" in meters.found and "upAxis" in axis.found and meters.fixable
 
 
@@ -302,9 +302,9 @@ def test_a_character_that_lies_is_read_with_the_wrong_axis():
     lying = Mesh(body.path, body.points[:, [0, 2, 1]] * [1, -1, 1], body.faces)
     found = only(units.body_size(lying, CENTIMETRES_ASSUMED))
     assert "upAxis Z" in found.found and found.fixable
-    corrected = CENTIMETRES_ASSUMED.corrected(units.misread(lying))
+    corrected = CENTIMETRES_ASSUMED.corrected(units.find_upright_units(lying))
     assert (corrected.meters_per_unit, corrected.up_axis) == (0.01, "Z")
-    assert METRES.corrected(units.misread(lying)) == METRES  # what is authored stays
+    assert METRES.corrected(units.find_upright_units(lying)) == METRES  # what is authored stays
 
 
 # What holds the garment
@@ -315,13 +315,13 @@ def test_class_coverage_and_unheld_islands():
     two = Mesh(sheet.path, np.r_[sheet.points, sheet.points + 1, [[9, 9, 9]]], np.r_[sheet.faces, sheet.faces + 16])
     classes = np.full(33, LOOSE)
     classes[0], classes[1] = PINNED, TIGHT
-    assert "1 pinned, 1 tight, 31 loose" in only(hold.class_coverage(two, classes)).found
-    assert only(hold.unheld_islands(two, classes)).indices == tuple(
+    assert "1 pinned, 1 tight, 31 loose" in only(attachment.class_coverage(two, classes)).found
+    assert only(attachment.unattached_islands(two, classes)).indices == tuple(
         range(16, 32)
     )  # the lone vertex is another finding
     classes[20] = TIGHT
-    assert not list(hold.unheld_islands(two, classes))
-    assert "no proxies" in only(hold.class_coverage(two, np.full(33, TIGHT))).found
+    assert not list(attachment.unattached_islands(two, classes))
+    assert "no proxies" in only(attachment.class_coverage(two, np.full(33, TIGHT))).found
 
 
 # Motions
@@ -482,10 +482,10 @@ def test_a_locked_garment_is_only_pushed():
 # The whole
 
 
-def world(garment: Garment, motions: tuple[Motion, ...] = ()) -> Inspected:
-    return Inspected(
-        character=hero(), garment=garment, rig=None, stage=METRES, wardrobe=METRES, locked="", motions=motions,
-        files=(), preset=PRESETS["draft"],
+def world(garment: Garment, motions: tuple[Motion, ...] = ()) -> PreflightInput:
+    return PreflightInput(
+        character=hero(), garment=garment, rig=None, character_units=METRES, garment_units=METRES, locked="",
+        motions=motions, files=(), preset=PRESETS["draft"],
     )  # fmt: skip
 
 

@@ -88,7 +88,7 @@ def test_nothing_more_is_kept_than_may_be(reducer):
 
 
 def test_a_budget_for_nothing_is_refused_in_one_sentence(reducer):
-    message = r"nothing fits 1 kB; the smallest that this model can be cut to takes [\d.]+ kB; allow more, or train"
+    message = r"nothing fits 1 kB; this model needs at least [\d.]+ kB; raise the budget, or train"
     with pytest.raises(SsilkError, match=message):
         best_within(reducer, Budget(1000, "bytes"), packed_bytes, reducer.whole)
 

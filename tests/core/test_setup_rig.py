@@ -203,7 +203,7 @@ def test_two_proxies_on_a_strip_make_a_chain_that_hinges_at_the_seam(character):
 def test_strips_beyond_the_limit_follow_their_neighbours(character):
     garment = hanging(columns=24, slits=4)
     said: list[events.Event] = []
-    rig = build_rig(character, garment, RigOptions(proxies=1, most_proxies=3), report=said.append)
+    rig = build_rig(character, garment, RigOptions(proxies=1, max_proxies=3), report=said.append)
     assert rig.proxy_count == 3 and "warning" in {event.level for event in said if isinstance(event, events.Message)}
     assert (rig.skin.dense(6)[garment.classes == LOOSE, 3:].sum(axis=1) > 0).all()
 
@@ -262,7 +262,7 @@ def test_equally_near_proxies_share_what_there_is():
     np.testing.assert_allclose(falloff(np.ones((2, 5)), 1.0, 3).sum(axis=1), 1)
 
 
-@pytest.mark.parametrize("bad", [{"proxies": -1}, {"most_proxies": 0}, {"roots_per_cluster": 0}, {"influences": 0}])
+@pytest.mark.parametrize("bad", [{"proxies": -1}, {"max_proxies": 0}, {"roots_per_cluster": 0}, {"influences": 0}])
 def test_bad_options_are_named(bad):
     with pytest.raises(SsilkError, match=next(iter(bad))):
         RigOptions(**bad)

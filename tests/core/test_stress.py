@@ -16,7 +16,7 @@ from ssilk_core.stress import drives, measures, meter, worlds
 from ssilk_core.stress.cases import CASES, Case
 from ssilk_core.stress.outcome import CaseMeasurement, markdown
 from ssilk_core.stress.subject import Effort, StressSubject
-from ssilk_core.stress.trials import gradient_error, trained
+from ssilk_core.stress.trials import gradient_error, train_trial
 
 TINY = Effort(seconds=1.0, frames=0.02, steps=2, simulated=2, vertices=120)
 FABRIC = Fabric("toy", bending=1e-4)
@@ -31,7 +31,7 @@ def subject(scene, toy_model) -> StressSubject:
 
 @pytest.fixture(scope="module")
 def base(scene) -> drives.ProceduralMotion:
-    return drives.sway(scene.character.skeleton, 30.0).looping(1.0)
+    return drives.sway(scene.character.skeleton, 30.0).with_loops(1.0)
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.group}: {case.name}")
@@ -55,7 +55,7 @@ def test_names_are_unique_and_match():
 @pytest.mark.parametrize("points", [np.nan, 1e3])
 def test_what_leaves_all_bounds_is_a_fault(subject, monkeypatch, points):
     monkeypatch.setattr(meter, "decode", lambda model, motion, pose: np.full((pose.frame_count, 60, 3), points))
-    outcome = Case("motion", "none", measures.driven(lambda subject, base: base)).run(subject)
+    outcome = Case("motion", "none", measures.roll_out_motion(lambda subject, base: base)).run(subject)
     assert outcome.verdict == "breaks" and not outcome.measured.extent.bounded
 
 
@@ -74,7 +74,7 @@ def test_a_lost_rollout_falls_back(subject):
         file=replace(subject.file, config=replace(subject.file.config, latent_bound=0.0, max_latent_step=0.0)),
     )
     lost.file.parameters["integrator.beta"] = np.full(lost.file.config.latent, -3.0, dtype=np.float32)
-    outcome = Case("motion", "none", measures.driven(lambda subject, base: base), ("falls back",)).run(lost)
+    outcome = Case("motion", "none", measures.roll_out_motion(lambda subject, base: base), ("falls back",)).run(lost)
     assert outcome.verdict == "falls back" and outcome.measured.extent.recovered > 10
 
 
@@ -92,7 +92,7 @@ def test_drives_are_the_same_in_blocks_and_repeat(base):
 
 def test_a_clip_loops_there_and_back_at_its_own_speed(scene, toy_motion):
     clip = toy_motion(scene, 61, 30.0)
-    loop = drives.looped(clip, 30.0)
+    loop = drives.loop_clip(clip, 30.0)
     length = round(loop.loop * 30)
     motion = replace(loop, frames=2 * length + 1).motion()
     assert length == round(np.pi * 60)
@@ -103,7 +103,7 @@ def test_a_clip_loops_there_and_back_at_its_own_speed(scene, toy_motion):
 
 def test_a_turn_turns_everything_about_the_first_joint(scene, base):
     skeleton = scene.character.skeleton
-    spun = drives.turned(base, skeleton, drives.about((0, 1, 0), speed=30.0)).motion(0, 5)
+    spun = drives.rotate_character(base, skeleton, drives.about((0, 1, 0), speed=30.0)).motion(0, 5)
     before, after = (motion_transforms(motion, skeleton.parents) for motion in (base.motion(0, 5), spun))
     angle = 30.0 * np.arange(5) / 30
     turn = np.zeros((5, 1, 3, 3))
@@ -117,23 +117,25 @@ def test_a_turn_turns_everything_about_the_first_joint(scene, base):
 
 def test_rides_are_no_cuts_and_teleports_are(scene, base):
     skeleton = scene.character.skeleton
-    ride = drives.carried(base, measures.ride, skeleton).motion()
+    ride = drives.translate_character(base, measures.ride, skeleton).motion()
     steps = np.diff(ride.translations[:, 0, 0] - base.motion().translations[:, 0, 0])
     np.testing.assert_allclose(steps * 30, 50.0)
     assert len(split_at_cuts(ride)) == 1
-    assert len(split_at_cuts(drives.carried(base, measures.jumps, skeleton).motion())) == 13  # after each of 12 s
+    assert (
+        len(split_at_cuts(drives.translate_character(base, measures.jumps, skeleton).motion())) == 13
+    )  # after each of 12 s
 
 
 def test_stopped_contorted_and_broken_motions_are_what_they_say(scene, base):
     skeleton = scene.character.skeleton
-    held = drives.stopping(base, 0.5).motion().rotations
+    held = drives.freeze_after(base, 0.5).motion().rotations
     assert np.ptp(held[15:], axis=0).max() == 0 < np.ptp(held[:15], axis=0).max()
-    wild = drives.contorted(base, skeleton, 0.5).motion()
+    wild = drives.randomize_rotations(base, skeleton, 0.5).motion()
     roots = skeleton.parents < 0
     np.testing.assert_array_equal(wild.rotations[:, roots], base.motion().rotations[:, roots])
     assert np.abs((wild.rotations[0] * wild.rotations[15]).sum(-1))[~roots].min() < 0.9
     with pytest.raises(SsilkError, match="1 of 361 frames of rotations hold NaN or infinity, first number 7;"):
-        drives.broken(base, 7).motion()
+        drives.insert_nan(base, 7).motion()
 
 
 # What is measured
@@ -141,7 +143,9 @@ def test_stopped_contorted_and_broken_motions_are_what_they_say(scene, base):
 
 def test_a_garment_on_linear_blend_skinning_is_nowhere_else_and_moves_as_it_does(scene, base):
     """Pinned to a root that spins, a vertex at a distance r from the axis moves at r w."""
-    held = drives.turned(drives.stopping(base, 0.0), scene.character.skeleton, drives.about((0, 1, 0), speed=6.0))
+    held = drives.rotate_character(
+        drives.freeze_after(base, 0.0), scene.character.skeleton, drives.about((0, 1, 0), speed=6.0)
+    )
     motion = held.motion(0, 20)
     matrices, origin = meter.matrices_about_root(motion, scene)
     tool = meter.ExtentMeter(scene, FABRIC, 30.0, [range(1, 5), range(10, 20)])
@@ -161,7 +165,7 @@ def test_growth_compares_the_second_loop_with_the_last(base):
 
 def test_streaming_gives_what_a_bake_gives(subject, monkeypatch):
     baked = meter.positions(subject.model, subject.base)
-    monkeypatch.setattr(meter, "LONG", 100)
+    monkeypatch.setattr(meter, "STREAMING_FRAMES", 100)
     streamed = meter.positions(subject.model, subject.base)
     np.testing.assert_allclose(streamed, baked, atol=1e-5)
 
@@ -193,10 +197,10 @@ def test_double_precision_is_its_own_truth_and_half_is_not(subject):
 
 @pytest.mark.parametrize("scale", [1e-3, 100.0])
 def test_a_larger_scene_is_the_same_but_larger(scene, base, scale):
-    large = worlds.enlarged(scene, scale)
+    large = worlds.scale_scene(scene, scale)
     assert worlds.garment_size(large) == pytest.approx(scale * worlds.garment_size(scene))
     pair = []
-    for world, drive in ((scene, base), (large, drives.enlarged(base, scale))):
+    for world, drive in ((scene, base), (large, drives.scale_motion(base, scale))):
         tool = meter.ExtentMeter(world, FABRIC, 30.0)
         pair.append(
             tool.skin(tool.rest, None, tool.skin.weights, meter.matrices_about_root(drive.motion(0, 3), world)[0])
@@ -206,7 +210,7 @@ def test_a_larger_scene_is_the_same_but_larger(scene, base, scale):
 
 @pytest.mark.parametrize("count", [30, 60, 500, 2000])
 def test_a_garment_of_any_number_of_vertices(scene, count):
-    found = worlds.resized(scene, count)
+    found = worlds.resize_garment(scene, count)
     mesh = found.garment.mesh
     assert count - 3 <= mesh.vertex_count <= count
     assert len(np.unique(mesh.faces)) == mesh.vertex_count and set(found.classes) <= set(scene.classes)
@@ -216,7 +220,7 @@ def test_a_garment_of_any_number_of_vertices(scene, count):
 
 @pytest.mark.parametrize("height", [1e-2, 1e-5])
 def test_slivers_are_as_high_as_asked(scene, height):
-    mesh = worlds.pinched(scene, height, every=20).garment.mesh
+    mesh = worlds.add_slivers(scene, height, every=20).garment.mesh
     a, b, c = mesh.points[mesh.faces[::20]].swapaxes(0, 1)
     base = np.linalg.norm(b - a, axis=1)
     ratio = np.linalg.norm(np.cross(b - a, c - a), axis=1) / base**2
@@ -232,7 +236,9 @@ def stretched(world: Scene, motion: Motion) -> float:
 
 
 def test_slivers_do_not_outweigh_the_garment(scene, base):
-    found = [stretched(worlds.pinched(scene, height, every=20), base.motion(0, 1)) for height in (1e-2, 1e-3, 1e-5)]
+    found = [
+        stretched(worlds.add_slivers(scene, height, every=20), base.motion(0, 1)) for height in (1e-2, 1e-3, 1e-5)
+    ]
     assert max(found) < 3 * min(found)
 
 
@@ -241,13 +247,13 @@ def test_single_precision_costs_what_rounding_costs(scene, base):
 
 
 def test_a_trial_trains_what_it_says(scene, base):
-    trial = trained(scene, FABRIC, replace(base, frames=30), 2)
+    trial = train_trial(scene, FABRIC, replace(base, frames=30), 2)
     assert (trial.steps, trial.undone, trial.extent.frames) == (2, 0, 30) and trial.extent.bounded
 
 
 def test_a_training_that_never_moves_is_a_fault(subject):
     def measure(subject: StressSubject) -> CaseMeasurement:
-        trial = trained(subject.scene, FABRIC, replace(subject.base, frames=30), 2)
-        return measures.measured(replace(trial, undone=2))
+        trial = train_trial(subject.scene, FABRIC, replace(subject.base, frames=30), 2)
+        return measures.trial_measurement(replace(trial, undone=2))
 
     assert Case("", "", measure).run(subject).said == "ArithmeticError: 2 of 2 steps undone"

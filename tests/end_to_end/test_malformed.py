@@ -199,7 +199,7 @@ STAGES = [
         ("/Hero/Rig", "joint"),
         joints("hero.usda", "Hips", "Hips/Spine", "Hips/Spine/../../Hips"),
     ),
-    Case("repeated joints", RIG, ("'Hips'", "stands twice"), joints("hero.usda", "Hips", "Hips/Spine", "Hips")),
+    Case("repeated joints", RIG, ("'Hips'", "is listed twice"), joints("hero.usda", "Hips", "Hips/Spine", "Hips")),
     Case(
         "bind count mismatch",
         INSPECT,
@@ -495,7 +495,7 @@ MODELS = [
         folder_at("no.safetensors"),
     ),
     Case("truncated model", BAKE, ("model.safetensors", "truncated"), truncated("model.safetensors")),
-    Case("empty model", BAKE, ("model.safetensors", "no safetensors"), text("model.safetensors", "")),
+    Case("empty model", BAKE, ("model.safetensors", "not a safetensors"), text("model.safetensors", "")),
     Case(
         "foreign model",
         BAKE,
@@ -505,7 +505,7 @@ MODELS = [
     Case(
         "model is a stage",
         "bake rigged.usda --stage rigged.usda --motion clip.usda -o new.usdc",
-        ("rigged.usda", "no safetensors"),
+        ("rigged.usda", "not a safetensors"),
     ),
     Case(
         "model of another format",
@@ -723,7 +723,7 @@ def test_a_full_disk_leaves_nothing(command, room, file, toy, tmp_path, monkeypa
 
 COMMANDS = [
     ("rig hero.usda --garment Hat -o new.usda", ("'Hat'",)),
-    ("bake clip.usda --stage rigged.usda --motion clip.usda -o new.usdc", ("no safetensors",)),
+    ("bake clip.usda --stage rigged.usda --motion clip.usda -o new.usdc", ("not a safetensors",)),
     ("train rigged.usda", ("--motions",)),
 ]
 

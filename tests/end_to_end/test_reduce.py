@@ -62,7 +62,7 @@ def test_a_budget_is_kept_and_what_it_bought_is_said(world, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ("--budget 1kB", "--budget: nothing fits 1 kB; the smallest that this model can be cut to takes"),
+        ("--budget 1kB", "--budget: nothing fits 1 kB; this model needs at least"),
         ("--budget much", "not a budget"),
         ("--influences 0", "influences = 0"),
         ("--quality best", "invalid choice: 'best'"),

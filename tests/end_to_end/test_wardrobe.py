@@ -20,7 +20,7 @@ import pytest
 from ssilk_core.checkpoint import load_model
 from ssilk_core.cli import main
 from ssilk_core.errors import SsilkError
-from ssilk_core.events import GarmentEvent, JsonReporter, Message, Progress, Said, read_event
+from ssilk_core.events import GarmentEvent, JsonReporter, Message, Progress, TaskEvent, read_event
 from ssilk_core.wardrobe.listing import WardrobeEntry, read_list
 from ssilk_core.wardrobe.panel import ProgressTable, table
 from ssilk_core.wardrobe.queue import CommandTask, End, Queue
@@ -97,7 +97,7 @@ def test_bad_entries_are_told_in_one_sentence(tmp_path, text, says):
 
 BAD = {
     "setting": ("[cape]\nset = { speed = 3 }", "table 'cape': --set speed=3: no such setting; settings are latent"),
-    "value": ("[cape]\nset = { batch = 0 }", "table 'cape': setting 'batch': 0; it lies between 1 and"),
+    "value": ("[cape]\nset = { batch = 0 }", "table 'cape': setting 'batch': 0; it must lie between 1 and"),
     "file": ('[cape]\nmotions = "none.usda"', "there is no file"),
     "garment": ('[cape]\ngarment = "none.usda:/Cape"', "there is no file"),
 }
@@ -124,12 +124,12 @@ class Heard:
     """Runs tasks and keeps what they say."""
 
     def __init__(self, slots: list[dict[str, str]]) -> None:
-        self.said: list[tuple[str, Said]] = []
+        self.said: list[tuple[str, TaskEvent]] = []
         self.ends: dict[str, End] = {}
         self.stop = threading.Event()
         self.queue = Queue(slots, self.tell, self.ends.__setitem__)
 
-    def tell(self, name: str, event: Said) -> None:
+    def tell(self, name: str, event: TaskEvent) -> None:
         self.said.append((name, event))
 
     def run(self, *tasks: CommandTask) -> dict[str, End]:
@@ -187,7 +187,7 @@ time.sleep(60)
 
 def test_a_stop_asks_those_that_run_and_starts_no_more(tmp_path):
     class Stopping(Heard):
-        def tell(self, name: str, event: Said) -> None:
+        def tell(self, name: str, event: TaskEvent) -> None:
             super().tell(name, event)
             if [said for _, said in self.said] == [Message("begun")] * 2:
                 self.stop.set()
@@ -200,7 +200,7 @@ def test_a_stop_asks_those_that_run_and_starts_no_more(tmp_path):
 
 def test_a_second_interrupt_ends_all_at_once(tmp_path):
     class Impatient(Heard):
-        def tell(self, name: str, event: Said) -> None:
+        def tell(self, name: str, event: TaskEvent) -> None:
             raise KeyboardInterrupt
 
     heard = Impatient([{}])

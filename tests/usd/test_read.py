@@ -541,7 +541,7 @@ def two_clips(path: Path) -> Path:
 def test_of_several_animations_one_is_named_with_the_file(tmp_path):
     path = two_clips(tmp_path / "two.usda")
     with pytest.raises(
-        SsilkError, match=f"several animations: /Clip, /Other; one is read; name one, such as {path}:/Clip"
+        SsilkError, match=f"several animations: /Clip, /Other; one is needed; name one, such as {path}:/Clip"
     ):
         read_motion(path, SKELETON)
     motions = read_motions([f"{path}:/Other", Path(f"{path}:/Clip")], SKELETON)
@@ -617,7 +617,7 @@ BODY, RIG, WALK = "/Hero/Body", "/Hero/Rig", "/Hero/Rig/Walk"
 BAD_CHARACTERS = {
     "no skeleton": (lambda stage: stage.RemovePrim(RIG), "no SkelRoot with a Skeleton"),
     "unordered joints": (set_on(RIG, "joints", JOINTS[::-1]), "out of order"),
-    "repeated joint": (set_on(RIG, "joints", ("Hips",) * 5), "'Hips' stands twice"),
+    "repeated joint": (set_on(RIG, "joints", ("Hips",) * 5), "'Hips' is listed twice"),
     "no joints": (set_on(RIG, "joints", []), "no joints"),
     "no binds": (lambda stage: stage.GetPrimAtPath(RIG).RemoveProperty("bindTransforms"), "no bindTransforms"),
     "few binds": (set_on(RIG, "bindTransforms", [Gf.Matrix4d(1)]), "1 bindTransforms for 5 joints"),
@@ -629,7 +629,7 @@ BAD_CHARACTERS = {
     ),
     "squashed": (
         lambda stage: UsdGeom.Xformable(stage.GetPrimAtPath("/Hero")).AddScaleOp().Set((1, 2, 1)),
-        "scale unequally",
+        "scale non-uniformly",
     ),
     "no units": (lambda stage: stage.SetMetadata("metersPerUnit", 0.0), "metersPerUnit is 0"),
     "NaN points": (set_on(BODY, "points", [(NAN, 0, 0)] * 40), "40 of 40 points hold NaN"),
@@ -705,7 +705,7 @@ def test_broken_values_in_a_sample_are_found():
 BAD_CLASSES = {
     "count": (with_classes([0, 1]), "2 vertex classes for 6 points"),
     "range": (with_classes([0, 1, 2, 3, 4, 5]), "3 vertex classes are not 0, 1 or 2"),
-    "fractions": (with_classes([0.5] * 6, Sdf.ValueTypeNames.FloatArray), "6 vertex classes are no whole numbers"),
+    "fractions": (with_classes([0.5] * 6, Sdf.ValueTypeNames.FloatArray), "6 vertex classes are not integers"),
     "faces": (with_classes([0, 1], interpolation="uniform"), "uniform interpolation"),
 }
 
@@ -760,7 +760,7 @@ def test_what_is_assumed_is_said():
     stage.ClearMetadata("metersPerUnit")
     UsdSkel.BindingAPI(stage.GetPrimAtPath(BODY)).CreateSkinningMethodAttr("dualQuaternion")
     read_scene(stage, garment="Cape", report=said.append)
-    assert "dualQuaternion skinning is played as linear" in said[0].text
+    assert "dualQuaternion skinning is evaluated as linear" in said[0].text
     assert "metersPerUnit is not authored" in said[1].text
 
 

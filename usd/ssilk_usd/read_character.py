@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A character from a stage: its skeleton and the body meshes bound to it."""
+"""Read a character from a stage: its skeleton and the body meshes bound to it."""
 
 from __future__ import annotations
 
@@ -41,21 +41,21 @@ def read_character(
     garment: str | None = None,
     report: Reporter = silent,
 ) -> Character:
-    """Read a character; all drawn meshes bound to its skeleton that are no garments are its bodies.
+    """Read a character; its bodies are all drawn meshes bound to its skeleton, except garments.
 
     Points and bind transforms are in the core's bind space: UsdSkel's bind space (points after
-    geomBindTransform) in metres, y up, with the uniform scale of the character's xforms taken in, but not
-    their position; see `SkelSource.bind_to_core`. Rest transforms of root joints are in world.
+    geomBindTransform) in metres, y up. It includes the uniform scale of the character's xforms but not their
+    position; see `SkelSource.bind_to_core`. Rest transforms of root joints are in world space.
 
     Args:
         source: a file or an open stage.
-        root: SkelRoot or Skeleton, by path or name, where there are several.
-        bodies: meshes to take, by path or name; all when empty.
-        garment: a mesh that is a garment though nothing marks it as one, by path or name.
-        report: hears of bodies whose skinning differs from the core's.
+        root: SkelRoot or Skeleton, by path or name, if there are several.
+        bodies: body meshes, by path or name; all if empty.
+        garment: a garment mesh that is not marked as one, by path or name.
+        report: receives a warning about each body that does not use linear blend skinning.
 
     Raises:
-        SsilkError: no or several characters, an unknown mesh, or malformed data.
+        SsilkError: there is no character or several, a mesh is unknown, or the data is malformed.
     """
     skel = find_skeleton(open_stage(source), root=root)
     skeleton = character_skeleton(skel)
@@ -68,7 +68,7 @@ def read_character(
 
 
 def geom_to_core(prim: Usd.Prim, skel: SkelSource) -> Floats:
-    """Return a bound mesh's own space to the core's bind space [m], column vectors, shape (4, 4)."""
+    """Return the transform from a bound mesh's local space to the core's bind space [m], column vectors, (4, 4)."""
     bind = inherited(prim, GEOM_BIND)
     matrix = None if bind is None else bind.Get()
     return skel.bind_to_core if matrix is None else skel.bind_to_core @ column_matrix(matrix)
@@ -99,7 +99,7 @@ def _read_body(prim: Usd.Prim, skel: SkelSource, order: tuple[str, ...], report:
     method = inherited(prim, SKINNING_METHOD)
     if method is not None and method.Get() != UsdSkel.Tokens.classicLinear:
         report(
-            Message(f"{location(prim)}: its {method.Get()} skinning is played as linear blend skinning", "warning")
+            Message(f"{location(prim)}: its {method.Get()} skinning is evaluated as linear blend skinning", "warning")
         )
     mesh = read_mesh(prim, geom_to_core(prim, skel))
     skin = read_skin(prim, skel.joints, order)

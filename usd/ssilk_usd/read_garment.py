@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A garment from the character's stage or from a file of its own."""
+"""Read a garment from the character's stage or from its own file."""
 
 from __future__ import annotations
 
@@ -37,17 +37,17 @@ def read_garment(
 ) -> Garment:
     """Read a garment at rest, in the core's bind space [m], y up.
 
-    A mesh with influences is placed as UsdSkel binds it (geomBindTransform); one without, by where it stands in
-    world: in a stage with a character relative to where the character stands, in a file of its own as it is.
+    A mesh with influences is placed by its geomBindTransform, as in UsdSkel. A mesh without influences is placed by
+    its world transform: relative to the character in a stage with one, and absolutely in its own file.
 
     Args:
         source: the character's stage or a file with garments, each with its own units and axes.
-        skeleton: the character's; weights are remapped onto its joints by name.
-        garment: the mesh, by path or name, where there are several.
-        root: the character that it is fitted to, where its stage holds several.
+        skeleton: skeleton of the character; weights are remapped to its joints by name.
+        garment: the mesh, by path or name, if there are several.
+        root: the character that the garment is fitted to, if the stage has several.
 
     Raises:
-        SsilkError: no or several garments, or malformed data.
+        SsilkError: there is no garment or several, or the data is malformed.
     """
     stage = open_stage(source)
     prim = find_garment(stage, garment)
@@ -58,10 +58,10 @@ def read_garment(
 
 
 def find_garment(stage: Usd.Stage, garment: str | None = None) -> Usd.Prim:
-    """Find the garment mesh of a stage: the named one, or the only one (marked, or in a stage without character).
+    """Find the garment mesh of a stage: the named one, the only marked one, or the only mesh without a character.
 
     Raises:
-        SsilkError: there is none, several and no name, or no such mesh; the sentence lists them.
+        SsilkError: there is no such mesh, or no unique one; the message lists the meshes.
     """
     where = stage_name(stage)
     meshes = [prim for prim in Usd.PrimRange.Stage(stage, PRIMS) if prim.IsA(UsdGeom.Mesh)]
@@ -80,12 +80,12 @@ def find_garment(stage: Usd.Stage, garment: str | None = None) -> Usd.Prim:
                 "name it with --garment",
             )
     if len(found) != 1:
-        fail(where, f"there are several garments: {listed(found)}", "one is used", "choose with --garment")
+        fail(where, f"there are several garments: {listed(found)}", "one is needed", "choose one with --garment")
     return found[0]
 
 
 def fitted_skeleton(prim: Usd.Prim, root: str | None = None) -> SkelSource | None:
-    """Return the skeleton of its stage that a garment is fitted to; None in a stage without a character."""
+    """Return the skeleton in its stage that a garment is fitted to; None if the stage has no character."""
     stage = prim.GetStage()
     found, bound = skeletons(stage), bound_skeleton(prim)
     if not found:
@@ -96,7 +96,7 @@ def fitted_skeleton(prim: Usd.Prim, root: str | None = None) -> SkelSource | Non
 
 
 def garment_to_core(prim: Usd.Prim, skel: SkelSource | None) -> Floats:
-    """Return a garment mesh's own space to the core's bind space [m], column vectors, shape (4, 4)."""
+    """Return the transform from a garment's local space to the core's bind space [m], column vectors, (4, 4)."""
     if skel is None:
         return StageUnits.of(prim.GetStage()).matrix @ world_matrix(prim)
     if is_skinned(prim, skel):
@@ -105,7 +105,10 @@ def garment_to_core(prim: Usd.Prim, skel: SkelSource | None) -> Floats:
 
 
 def lbs_skin(prim: Usd.Prim, joints: tuple[str, ...], skeleton: Skeleton) -> SkinWeights | None:
-    """Return a garment's weights onto the character's joints alone, or None; those kept beside a rig go first."""
+    """Return a garment's LBS weights over the character's joints, or None.
+
+    Weights that were saved separately next to a proxy rig take precedence.
+    """
     if has_value(prim, LBS_SKIN[0]):
         influences = read_influences(prim, joints, LBS_SKIN)
         assert influences is not None
@@ -114,7 +117,7 @@ def lbs_skin(prim: Usd.Prim, joints: tuple[str, ...], skeleton: Skeleton) -> Ski
 
 
 def _classes(prim: Usd.Prim) -> Ints | None:
-    """Return whole-numbered vertex classes, or None; `Garment` checks their count and range."""
+    """Return integer vertex classes, or None; `Garment` checks their count and range."""
     primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar(CLASS.removeprefix("primvars:"))
     if not primvar or not primvar.HasAuthoredValue():
         return None
@@ -123,11 +126,11 @@ def _classes(prim: Usd.Prim) -> Ints | None:
         fail(
             where,
             f"{CLASS} has {interpolation} interpolation",
-            "classes are one value for each point (vertex interpolation)",
+            "classes need one value per point (vertex interpolation)",
             "paint them on points",
         )
     classes = np.array(primvar.ComputeFlattened(EARLIEST), dtype=np.float64).reshape(-1)
     broken = int(np.count_nonzero(classes != np.round(classes)))
     if broken:
-        fail(where, f"{broken} vertex classes are no whole numbers", "they are 0, 1 or 2", "paint them again")
+        fail(where, f"{broken} vertex classes are not integers", "classes are 0, 1 or 2", "paint them again")
     return classes.astype(np.int64)

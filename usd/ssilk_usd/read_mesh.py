@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""UsdGeom meshes to core meshes: points, triangles, polygons, texture coordinates."""
+"""Convert UsdGeom meshes to core meshes: points, triangles, polygons and texture coordinates."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from .read_stage import EARLIEST, apply, has_value, location, value
 
 
 def is_garment(prim: Usd.Prim) -> bool:
-    """Return whether a mesh carries vertex classes, a proxy rig, or `ssilk:garment = true`."""
+    """Return whether a mesh has vertex classes, a proxy rig, or `ssilk:garment = true`."""
     return has_value(prim, CLASS) or has_value(prim, PROXIES) or value(prim, GARMENT) is True
 
 
 def is_drawn(prim: Usd.Prim) -> bool:
-    """Return whether a prim is visible at its earliest time and no guide."""
+    """Return whether a prim is visible at its earliest time and not a guide."""
     imageable = UsdGeom.Imageable(prim)
     invisible = imageable.ComputeVisibility(EARLIEST) == UsdGeom.Tokens.invisible
     return not invisible and imageable.ComputePurpose() != UsdGeom.Tokens.guide
@@ -30,8 +30,8 @@ def read_mesh(prim: Usd.Prim, to_core: Floats) -> Mesh:
     """Read a UsdGeom.Mesh; its earliest points are its rest shape.
 
     Args:
-        prim: the mesh. Holes are left out, left-handed faces turned over.
-        to_core: the mesh's own space to the core's bind space [m], column vectors, shape (4, 4).
+        prim: the mesh. Hole faces are omitted, and left-handed faces are reversed.
+        to_core: transform from the mesh's local space to the core's bind space [m], column vectors, shape (4, 4).
 
     Raises:
         SsilkError: counts, indices or texture coordinates do not match, or points are not finite.
@@ -77,7 +77,7 @@ def _polygons(prim: Usd.Prim, point_count: int, where: str) -> tuple[Ints, Ints]
 
 
 def _kept_corners(prim: Usd.Prim, counts: Ints) -> tuple[Ints, Ints]:
-    """Return which face corners to keep, counter-clockwise seen from outside, and the counts of their faces."""
+    """Return the face corners to keep, counter-clockwise from outside, and the vertex counts of their faces."""
     keep = np.ones(len(counts), dtype=bool)
     holes = np.array(value(prim, "holeIndices") or [], dtype=np.int64)
     keep[holes[(holes >= 0) & (holes < len(counts))]] = False
@@ -101,7 +101,7 @@ def _texture_coordinates(prim: Usd.Prim, indices: Ints) -> Floats | None:
     elif chosen.GetInterpolation() in (UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying):
         expected, corners = len(value(prim, "points")), indices.astype(np.int64)
     else:
-        return None  # one value for a whole face maps no cloth
+        return None  # one value per face or mesh is not a mapping
     if len(uvs) != expected:
         fail(
             location(prim),

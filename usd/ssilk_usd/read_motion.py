@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motions from SkelAnimations, in files of their own or on characters in stages."""
+"""Read motions from SkelAnimations, in their own files or on characters in stages."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ _MOST_FRAMES = 200_000  # close to two hours at 30 frames a second
 
 
 def read_motions(paths: Iterable[str | Path], skeleton: Skeleton) -> list[Motion]:
-    """Read several motions, "file[:/Prim/Path]" each; a folder stands for all USD files in it, by name.
+    """Read several motions, each given as "file[:/Prim/Path]"; a folder means all USD files in it, sorted by name.
 
     Raises:
-        SsilkError: a folder without USD files, or any of `read_motion`.
+        SsilkError: a folder has no USD files; also as `read_motion`.
     """
     return [read_motion(path, skeleton) for path in _listed_folders(paths)]
 
@@ -50,7 +50,7 @@ def motion_files(paths: Iterable[str | Path]) -> list[Path]:
 
 
 def _listed_folders(paths: Iterable[str | Path]) -> list[Path]:
-    """Return the paths with the USD files of a folder in its place."""
+    """Return the paths, with each folder replaced by its USD files."""
     files: list[Path] = []
     for path in map(Path, paths):
         within = sorted(file for file in path.iterdir() if file.suffix in USD_SUFFIXES) if path.is_dir() else [path]
@@ -62,20 +62,21 @@ def _listed_folders(paths: Iterable[str | Path]) -> list[Path]:
 
 @needs_whole_files
 def read_motion(source: StageLike, skeleton: Skeleton, *, prim: str | None = None, root: str | None = None) -> Motion:
-    """Read a motion at its own rate: framesPerSecond where authored, else timeCodesPerSecond.
+    """Read a motion at its own rate: framesPerSecond if authored, else timeCodesPerSecond.
 
-    Frames run from the first to the last authored sample, USD interpolating between samples. On a character,
-    the xforms above its skeleton, also animated, are part of the root joints. Joints are matched by their paths,
-    then by unique leaf names; joints that the animation lacks stay at rest.
+    Frames run from the first to the last authored sample; USD interpolates between samples. On a character, the
+    root joints include the xforms above the skeleton, animated or not. Joints are matched by path, then by unique
+    leaf name. Joints that the animation lacks stay in the rest pose.
 
     Args:
         source: a file with a SkelAnimation, as "file[:/Prim/Path]", or a stage with an animated character.
-        skeleton: whose joints the motion is for.
-        prim: the SkelAnimation, by path or name, where there are several.
-        root: the character, by path or name, where several are animated.
+        skeleton: skeleton whose joints the motion is for.
+        prim: the SkelAnimation, by path or name, if there are several.
+        root: the character, by path or name, if several are animated.
 
     Raises:
-        SsilkError: no or several animations, an animation of another skeleton, scales, or malformed data.
+        SsilkError: there is no animation or several, it is for another skeleton or has scales, or the data is
+            malformed.
     """
     if not isinstance(source, Usd.Stage):
         source, asked = split_location(str(source))
@@ -103,7 +104,7 @@ def read_motion(source: StageLike, skeleton: Skeleton, *, prim: str | None = Non
 
 
 def find_animation(stage: Usd.Stage, prim: str | None, root: str | None) -> tuple[Usd.Prim, Usd.Prim | None]:
-    """Return the SkelAnimation and the Skeleton that it animates, None for an animation by itself."""
+    """Return the SkelAnimation and the Skeleton that it animates (None for an unbound animation)."""
     where = stage.GetRootLayer().identifier
     bound, own = {}, {}
     for top, skeleton in skeletons(stage):
@@ -126,14 +127,14 @@ def find_animation(stage: Usd.Stage, prim: str | None, root: str | None) -> tupl
         fail(
             where,
             f"there are several animations: {listed(found)}",
-            "one is read",
+            "one is needed",
             f"name one, such as {where}:{found[0].GetPath()}",
         )
     return found[0], bound.get(found[0])
 
 
 def _matched(joints: tuple[str, ...], skeleton: Skeleton, where: str) -> Ints:
-    """Return for each joint of the skeleton its index in the animation, or -1."""
+    """Return the index of each joint of the skeleton in the animation, or -1."""
     match = np.array(match_joints(skeleton.joint_names, joints))
     found, smaller = int(np.count_nonzero(match >= 0)), min(len(joints), skeleton.joint_count)
     missing = [name for name, index in zip(skeleton.joint_names, match) if index < 0]
@@ -183,7 +184,7 @@ def read_samples(animation: Usd.Prim, codes: Floats, count: int, where: str) -> 
         scales = _sampled(animation, "scales", codes, (count, 3), where)
         scaled = int(np.count_nonzero((np.abs(scales - 1) > _SCALE_TOLERANCE).any(axis=(0, 2))))
         if scaled:
-            fail(where, f"{scaled} joints are scaled", "joints may turn and move only", "bake the scale away")
+            fail(where, f"{scaled} joints are scaled", "joints may only rotate and move", "remove the scale")
     norms = np.linalg.norm(rotations, axis=-1, keepdims=True)
     if norms.min() <= 1e-6:
         fail(where, "a rotation is the zero quaternion", "rotations are unit quaternions", "repair it")
@@ -206,7 +207,7 @@ def _sampled(animation: Usd.Prim, name: str, codes: Floats, shape: tuple[int, in
 
 
 def _check_lengths(local: Floats, rest: Floats, parents: Ints, where: str) -> None:
-    """Refuse a motion whose bones are far longer or shorter than the skeleton's: its units are wrong."""
+    """Raise `SsilkError` if a motion's bones are far longer or shorter than the skeleton's: its units are wrong."""
     bones = np.linalg.norm(rest[:, :3, 3], axis=-1)
     kept = (parents >= 0) & (bones > 1e-3)
     if not kept.any():

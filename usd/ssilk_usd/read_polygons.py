@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Polygons to triangles: quads along their better diagonal, larger ones by ear clipping."""
+"""Triangulate polygons: quads along their better diagonal, larger polygons by ear clipping."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ def triangulate(points: Floats, counts: Ints, indices: Ints) -> Ints:
 
     Args:
         points: positions, shape (V, 3).
-        counts: corners of each polygon, at least 3, shape (P,).
-        indices: the polygons' corners one after another, shape (sum of counts,).
+        counts: number of corners of each polygon, at least 3, shape (P,).
+        indices: vertices of the corners, polygon by polygon, shape (sum of counts,).
 
     Returns:
-        Triangles, shape (sum of counts - 2, 3). Concave polygons are covered exactly; collinear corners kept.
+        Triangles, shape (sum of (counts - 2), 3). They cover concave polygons exactly and keep collinear corners.
     """
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
     parts = [(starts[counts == 3], indices[starts[counts == 3][:, None] + np.arange(3)][:, None])]
@@ -34,7 +34,7 @@ def triangulate(points: Floats, counts: Ints, indices: Ints) -> Ints:
 
 
 def _split_quads(points: Floats, quads: Ints) -> Ints:
-    """Split along the shorter diagonal, unless only the other one lies inside; shape (Q, 2, 3)."""
+    """Split each quad along the shorter diagonal, unless only the other one lies inside, shape (Q, 2, 3)."""
     options = np.array([[[0, 1, 2], [0, 2, 3]], [[0, 1, 3], [1, 2, 3]]])
     corners = points[quads]
     normal = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
@@ -49,7 +49,7 @@ def _split_quads(points: Floats, quads: Ints) -> Ints:
 
 
 def _clip_ears(corners: Floats) -> Ints:
-    """Triangulate one polygon (N, 3) in the plane of its Newell normal, shortest cuts first; shape (N - 2, 3)."""
+    """Triangulate a polygon (N, 3) in the plane of its Newell normal, shortest cuts first, shape (N - 2, 3)."""
     flat = _project(corners)
     left = list(range(len(flat)))
     triangles = []
@@ -61,7 +61,7 @@ def _clip_ears(corners: Floats) -> Ints:
 
 
 def _project(corners: Floats) -> Floats:
-    """Return the corners in a plane where the polygon runs counter-clockwise, shape (N, 2)."""
+    """Project the corners onto a plane in which the polygon runs counter-clockwise, shape (N, 2)."""
     normal = np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0)
     axis = np.eye(3)[np.argmin(np.abs(normal))]
     u = np.cross(axis, normal)
@@ -71,7 +71,7 @@ def _project(corners: Floats) -> Floats:
 
 
 def _best_ear(flat: Floats, left: list[int]) -> int:
-    """Return the position in `left` of the valid ear with the shortest cut (of a tangled polygon: any cut)."""
+    """Return the index in `left` of the valid ear with the shortest cut, or of the shortest cut if none is."""
     ring = flat[left]
     before, after = np.roll(ring, 1, axis=0), np.roll(ring, -1, axis=0)
     cut = np.linalg.norm(after - before, axis=-1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All that a stage says of one dressed character, in one call."""
+"""Read a dressed character from a stage: character, garment and proxy rig."""
 
 from __future__ import annotations
 
@@ -37,17 +37,17 @@ def read_scene(
     garment: str | None = None,
     report: Reporter = silent,
 ) -> tuple[Character, Garment, ProxyRig | None]:
-    """Read a character, one garment, and the garment's proxy rig where it has one.
+    """Read a character, one garment, and the garment's proxy rig if it has one.
 
     Args:
         source: the character's file or open stage.
-        root: SkelRoot or Skeleton, by path or name, where there are several.
-        bodies: body meshes, by path or name; all when empty.
+        root: SkelRoot or Skeleton, by path or name, if there are several.
+        bodies: body meshes, by path or name; all if empty.
         garment: a mesh of the stage, by path or name, or "FILE[:/Prim/Path]" for a garment in its own file.
-        report: hears what was assumed.
+        report: receives a message about each assumption.
 
     Raises:
-        SsilkError: as `read_character`, `read_garment` and `read_proxy_rig` do.
+        SsilkError: as `read_character`, `read_garment` and `read_proxy_rig`.
     """
     stage = open_stage(source)
     file, prim = split_location(garment) if garment else (None, None)
@@ -66,10 +66,10 @@ def read_scene(
 
 @needs_whole_files
 def read_rigged(source: StageLike) -> list[tuple[Skeleton, Garment, ProxyRig]]:
-    """Read each garment of a stage that has proxies, with its rig and the skeleton that the proxies hang from.
+    """Read each garment of a stage that has proxies, with its rig and the skeleton that the proxies belong to.
 
     Raises:
-        SsilkError: as `read_garment` and `read_proxy_rig` do.
+        SsilkError: as `read_garment` and `read_proxy_rig`.
     """
     stage = open_stage(source)
     prims = [prim for prim in Usd.PrimRange.Stage(stage, PRIMS) if prim.IsA(UsdGeom.Mesh) and value(prim, PROXIES)]
@@ -84,7 +84,5 @@ def read_rigged(source: StageLike) -> list[tuple[Skeleton, Garment, ProxyRig]]:
 
 def _announce_units(stage: Usd.Stage, report: Reporter) -> None:
     if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
-        text = (
-            f"{stage_name(stage)}: metersPerUnit is not authored; its lengths are taken as centimetres, as USD does"
-        )
+        text = f"{stage_name(stage)}: metersPerUnit is not authored; USD's default, centimetres, is used"
         report(Message(text, "warning"))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The meshes of a shot at rest, and a baked garment as bones and blendshapes."""
+"""Read the meshes of a shot at rest, and a baked garment as joints and blendshapes."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from .skinned import BakedGarment, SkinnedGarment
 
 @dataclass(frozen=True, eq=False)
 class ShotPart:
-    """A mesh of a shot at rest [m], and how its model was made; None for bodies and for what does not say."""
+    """A mesh of a shot at rest [m] and the provenance of its model (None if absent, as for bodies)."""
 
     mesh: Mesh
     record: GarmentRecord | None
 
 
 def read_parts(shot: Shot) -> list[ShotPart]:
-    """Return the meshes of a shot at rest, in their order: points without a time, or the earliest ones."""
+    """Return the meshes of a shot at rest, in order: default points, or else those of the earliest time."""
     return [_part(shot, shot.stage.GetPrimAtPath(mesh.path)) for mesh in shot.meshes]
 
 
@@ -49,20 +49,20 @@ def read_baked(source: StageLike) -> BakedGarment:
     """Read the garment of a shot that `write_shot` wrote.
 
     Raises:
-        SsilkError: no garment or several, one that is bound to no joints, or malformed data.
+        SsilkError: there is no garment or several, it is not bound to joints, or the data is malformed.
     """
     stage = open_stage(source)
     prim = find_garment(stage)
     skel = fitted_skeleton(prim)
     if skel is None:
-        fail(location(prim), "its stage has no skeleton", "joints move a baked garment", "choose a shot with joints")
+        fail(location(prim), "its stage has no skeleton", "a baked garment needs joints", "choose a shot with joints")
     skeleton = character_skeleton(skel)
     garment, rig = read_garment(stage, skeleton), read_proxy_rig(stage, skeleton)
     joints, binds, skin = skeleton.joint_names, skeleton.bind_transforms, garment.skin
     if rig is not None:
         joints, binds, skin = (*joints, *rig.joint_names), np.concatenate([binds, rig.bind_transforms]), rig.skin
     if skin is None:
-        fail(location(prim), "no joint moves it", "a baked garment has weights", "bake to joints, not to points")
+        fail(location(prim), "no joint moves it", "a baked garment needs weights", "bake to joints, not to points")
     names, shapes = _read_blendshapes(prim, garment_to_core(prim, skel)[:3, :3], garment.mesh.vertex_count)
     times = frame_times(stage)
     pose = _read_pose(find_animation(stage, None, None)[0], joints[skeleton.joint_count :], names, times)

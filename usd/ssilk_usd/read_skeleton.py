@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finding a character's skeleton in a stage, checking it, and telling its own joints from proxies."""
+"""Find and check a character's skeleton in a stage, and separate its own joints from proxies."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ _CHOOSE = "choose one with --root, or as MODEL:/ROOT in a bake"
 
 
 def find_skeleton(stage: Usd.Stage, *, root: str | None = None) -> SkelSource:
-    """Find the one skeleton of a stage, or the one that `root` names (its SkelRoot or itself, path or name).
+    """Find the only skeleton of a stage, or the one named by `root` (path or name of its SkelRoot or Skeleton).
 
     Raises:
-        SsilkError: there is none, there are several and `root` names none, or the skeleton is malformed.
+        SsilkError: there is no skeleton or no unique one, or the skeleton is malformed.
     """
     where, found = stage_name(stage), skeletons(stage)
     if not found:
@@ -57,13 +57,13 @@ def find_skeleton(stage: Usd.Stage, *, root: str | None = None) -> SkelSource:
 
 
 def _pairs_named(pairs: list[tuple[Usd.Prim, Usd.Prim]], name: str) -> list[tuple[Usd.Prim, Usd.Prim]]:
-    """Return the pairs whose SkelRoot, or else whose Skeleton, has this path or name."""
+    """Return the pairs whose SkelRoot has this path or name, or if there are none, whose Skeleton has it."""
     roots, skeletons_named = (named([pair[side] for pair in pairs], name) for side in (0, 1))
     return [pair for pair in pairs if pair[0] in roots] or [pair for pair in pairs if pair[1] in skeletons_named]
 
 
 def skeletons(stage: Usd.Stage) -> list[tuple[Usd.Prim, Usd.Prim]]:
-    """Return each outermost SkelRoot with each skeleton that its meshes are bound to, or else that it holds."""
+    """Return each outermost SkelRoot with the skeletons that its meshes are bound to, or else that it contains."""
     pairs = []
     prims = iter(Usd.PrimRange.Stage(stage, PRIMS))
     for prim in prims:
@@ -77,7 +77,7 @@ def skeletons(stage: Usd.Stage) -> list[tuple[Usd.Prim, Usd.Prim]]:
 
 
 def bound_skeleton(prim: Usd.Prim) -> Usd.Prim | None:
-    """Return the Skeleton that a prim is bound to, by itself or by its ancestors, or None."""
+    """Return the Skeleton that a prim or its nearest bound ancestor is bound to, or None."""
     target = inherited_target(prim, "skel:skeleton")
     return target if target and target.IsA(UsdSkel.Skeleton) else None
 
@@ -85,7 +85,7 @@ def bound_skeleton(prim: Usd.Prim) -> Usd.Prim | None:
 def character_skeleton(source: SkelSource) -> Skeleton:
     """Return the character's own joints, without proxies, as the core's skeleton.
 
-    Rest transforms of roots take the character's placement in, as a motion's do.
+    Rest transforms of root joints include the character's placement, as those of a motion do.
     """
     kept = source.character_joints
     position = np.full(len(source.joints) + 1, -1)
@@ -121,27 +121,27 @@ def _source(root: Usd.Prim, prim: Usd.Prim) -> SkelSource:
 
 
 def _parents(joints: tuple[str, ...], where: str) -> Ints:
-    """Return parent indices as UsdSkel reads them from joint paths: the nearest ancestor that is a joint."""
+    """Return parent indices by UsdSkel's rule: the parent is the nearest ancestor path that is a joint."""
     repeated = next((name for name in joints if joints.count(name) > 1), None)
     if repeated is not None:
-        fail(where, f"joint '{repeated}' stands twice", "each joint needs its own path", "rename one")
+        fail(where, f"joint '{repeated}' is listed twice", "each joint needs its own path", "rename one")
     broken = next((name for name in joints if not Sdf.Path.IsValidPathString(name)), None)
     if broken is not None:
-        fail(where, f"joint '{broken}' is no path", "joints are paths like 'Hips/Spine'", "rename it")
+        fail(where, f"joint '{broken}' is not a path", "joints are paths like 'Hips/Spine'", "rename it")
     topology = UsdSkel.Topology(joints)
     valid, reason = topology.Validate()
     if not valid:
         fail(
             where,
             f"the joints are out of order ({reason.partition('.')[0]})",
-            "parents come before their children and a joint is never its own ancestor",
+            "parents must precede their children, and a joint must not be its own ancestor",
             "reorder the joints",
         )
     return np.array(topology.GetParentIndices(), dtype=np.int64)
 
 
 def _matrices(prim: Usd.Prim, name: str, count: int) -> Floats | None:
-    """Return a skeleton's matrices as column vectors, checked against its joints; None where unauthored."""
+    """Return a skeleton's matrices for column vectors, checked against its joints; None if not authored."""
     matrices = value(prim, name)
     if matrices is None or not len(matrices):
         return None
@@ -157,7 +157,7 @@ def _matrices(prim: Usd.Prim, name: str, count: int) -> Floats | None:
         fail(location(prim), f"{name} hold NaN or infinity", "all must be finite", "repair it")
     singular = int(np.count_nonzero(np.abs(np.linalg.det(result)) < 1e-30))
     if singular:
-        fail(location(prim), f"{singular} {name} cannot be inverted", "joints may not have no size")
+        fail(location(prim), f"{singular} {name} cannot be inverted", "joints must not have zero scale")
     return result
 
 
@@ -169,7 +169,7 @@ def _rest_from_bind(bind: Floats, parents: Ints) -> Floats:
 
 
 def _owners(root: Usd.Prim, joints: tuple[str, ...], parents: Ints) -> tuple[str, ...]:
-    """Return for each joint the garment that it is a proxy of: by list, or because it descends from a proxy."""
+    """Return the garment that each joint is a proxy of: a listed joint or a descendant of one; empty for others."""
     listed_by: dict[int, str] = {}
     for prim in Usd.PrimRange(root, PRIMS):
         names = tuple(value(prim, PROXIES) or ()) if has_value(prim, PROXIES) else ()

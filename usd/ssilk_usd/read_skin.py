@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""UsdSkel influences to skinning weights over the joints that a reader asks for."""
+"""Read UsdSkel influences as skinning weights over a given joint order."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class AuthoredInfluences:
 
 
 def match_joints(names: tuple[str, ...], among: tuple[str, ...]) -> list[int]:
-    """Return where each joint stands in `among`: by its full path, else by a leaf name that is unique; else -1."""
+    """Return the index of each joint in `among`, matched by path or else by a unique leaf name; -1 if missing."""
     full = {name: index for index, name in enumerate(among)}
     leaves: dict[str, list[int]] = {}
     for index, name in enumerate(among):
@@ -57,15 +57,15 @@ def leaf(joint: str) -> str:
 
 
 def read_skin(prim: Usd.Prim, joints: tuple[str, ...], names: tuple[str, ...]) -> SkinWeights | None:
-    """Read a mesh's weights over the joints `names`; None when it has none.
+    """Read a mesh's weights over the joints `names`; return None if it has none.
 
     Args:
-        prim: a mesh whose influences are its own or inherited, of any element size, for each vertex or constant.
-        joints: the joint order of its skeleton; the mesh's own `skel:joints` goes before it.
-        names: the joint order wanted.
+        prim: a mesh with its own or inherited influences, of any element size, per vertex or constant.
+        joints: joint order of its skeleton; the mesh's own `skel:joints` takes precedence.
+        names: joint order of the result.
 
     Raises:
-        SsilkError: counts do not match, an index has no joint, or a joint in use is not among `names`.
+        SsilkError: counts do not match, an index has no joint, or a joint in use is not in `names`.
     """
     influences = read_influences(prim, joints)
     if influences is None:
@@ -85,7 +85,7 @@ def read_skin(prim: Usd.Prim, joints: tuple[str, ...], names: tuple[str, ...]) -
 def read_influences(
     prim: Usd.Prim, joints: tuple[str, ...], properties: tuple[str, str, str] = SKEL
 ) -> AuthoredInfluences | None:
-    """Read the influences of a mesh under the names `properties`, over its own joint order or else `joints`."""
+    """Read influences from the two primvars `properties`, over the mesh's own joint order or else `joints`."""
     where = location(prim)
     indices, weights = (inherited(prim, name) for name in properties[:2])
     if indices is None and weights is None:
@@ -113,7 +113,7 @@ def read_influences(
 
 
 def _rows(attribute: Usd.Attribute, point_count: int, where: str) -> Floats:
-    """Return a primvar as one row of `elementSize` values for each point; constant rows are repeated."""
+    """Return a primvar as one row of `elementSize` values per point; a constant row is repeated."""
     primvar = UsdGeom.Primvar(attribute)
     values, size = np.array(primvar.ComputeFlattened(EARLIEST) or []), primvar.GetElementSize()
     constant = primvar.GetInterpolation() == UsdGeom.Tokens.constant
@@ -129,7 +129,7 @@ def _rows(attribute: Usd.Attribute, point_count: int, where: str) -> Floats:
 
 
 def _checked(indices: Ints, weights: Floats, names: tuple[str, ...], where: str) -> Ints:
-    """Return indices with -1 where there is no weight; the others must name a joint."""
+    """Return indices with -1 where the weight is zero; all others must name a joint."""
     used = weights != 0
     bad = int(np.count_nonzero(used & ((indices < 0) | (indices >= len(names)))))
     if bad:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a stage's skeleton stands, and its way to the core.
+"""Convert between the spaces of a stage's skeleton and the core.
 
-Three spaces of a stage matter. *World* is what a viewer sees. *Skeleton space* is the Skeleton prim's own:
-local-to-world takes it to world. *Bind space* holds `bindTransforms`, and meshes after `geomBindTransform`;
-UsdSkel calls it world at bind time, many exporters write skeleton space. `SkelSource` tells them apart.
+A stage has three relevant spaces. *World space* is what a viewer shows. *Skeleton space* is the local space of the
+Skeleton prim. *Bind space* is the space of `bindTransforms`, and of meshes after `geomBindTransform`. UsdSkel
+defines it as world space at bind time, but many exporters write skeleton space. `SkelSource` distinguishes the two.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from .read_stage import location
 from .units import StageUnits, scaling
 
 _RIGID_TOLERANCE = 1e-3
-_TILTED = 0.5  # cosine below which a skeleton's up axis is not the stage's
+_TILTED = 0.5  # cosine between the up axes of skeleton and stage below which they differ
 
 
 @dataclass(frozen=True, eq=False)
 class SkelSource:
-    """A skeleton as authored, all joints with proxies, and its way to the core.
+    """A skeleton as authored, including proxies, with its transforms to the core's spaces.
 
     Attributes:
-        stage: kept, because prims do not keep theirs.
+        stage: referenced here because prims do not keep their stage alive.
         root, prim: the SkelRoot and the Skeleton.
-        units: of the stage.
+        units: units of the stage.
         joints, parents: UsdSkel joint paths and parent indices, -1 for roots, length N.
         bind, rest: joint to bind space, joint to parent; stage units, column vectors, shape (N, 4, 4).
         placement: skeleton space to world at the earliest time, a similarity, shape (4, 4).
-        owners: path of the garment mesh whose proxy a joint is; empty for the character's own joints.
+        owners: path of the garment mesh that each joint is a proxy of; empty for the character's own joints.
     """
 
     stage: Usd.Stage
@@ -51,20 +51,21 @@ class SkelSource:
 
     @property
     def character_joints(self) -> Ints:
-        """Indices of the joints that are no proxies."""
+        """Indices of the joints that are not proxies, shape (J,)."""
         return np.flatnonzero([not owner for owner in self.owners])
 
     @property
     def joint_scale(self) -> float:
-        """Metres per unit of length in joint and skeleton space."""
+        """Metres per unit of length in joint and skeleton space [m]."""
         return similarity_scale(self.placement) * self.units.meters_per_unit
 
     @property
     def bind_to_core(self) -> Floats:
         """Bind space to the core's bind space [m], a similarity, shape (4, 4).
 
-        Lengths become those that the posed character has in world. Axes become y up: the stage's, unless the
-        character's xforms tilt its bind space by a quarter turn (exporters convert axes so); then they are undone.
+        Lengths are those of the posed character in world space. The y axis points up, by the up axis of the stage. If
+        the character's xforms rotate its bind space by 90 degrees, as exporters do to convert axes, this rotation is
+        undone.
         """
         matrix = np.eye(4)
         matrix[:3, :3] = self.units.rotation @ self._tilt() * self.joint_scale / self._bind_scale
@@ -72,7 +73,7 @@ class SkelSource:
 
     @property
     def world_to_bind(self) -> Floats:
-        """World to bind space, where the character stands at the earliest time, shape (4, 4)."""
+        """World to bind space for the character's placement at the earliest time, shape (4, 4)."""
         return self._skeleton_to_bind() @ np.linalg.inv(self.placement)
 
     def binds_to_core(self, bind: Floats) -> Floats:
@@ -80,19 +81,19 @@ class SkelSource:
         return self.bind_to_core @ bind @ scaling(1 / self.joint_scale)
 
     def binds_from_core(self, bind: Floats) -> Floats:
-        """Return the core's bind transforms (..., 4, 4) as the stage holds them."""
+        """Return the core's bind transforms (..., 4, 4) in the stage's bind space."""
         return np.linalg.inv(self.bind_to_core) @ bind @ scaling(self.joint_scale)
 
     @property
     def _bind_scale(self) -> float:
-        """Scale that the bind transforms share: 1, or that of a scaled character where they are in world."""
+        """Scale of the bind transforms: 1, or the character's scale if they are in world space."""
         determinants = np.linalg.det(self.bind[:, :3, :3])
         scale = float(np.cbrt(determinants.mean()))
         common = scale > 0 and np.allclose(determinants, scale**3, rtol=_RIGID_TOLERANCE)
         return scale if common else 1.0
 
     def _skeleton_to_bind(self) -> Floats:
-        """Skeleton space to bind space: what takes the rest pose to the bind pose, where one transform does."""
+        """Skeleton space to bind space: the transform from rest to bind pose if a single one exists."""
         rest = world_transforms(self.rest, self.parents)
         matrix = self.bind[0] @ np.linalg.inv(rest[0])
         size = np.abs(self.bind[:, :3, 3]).max() + self._bind_scale
@@ -100,7 +101,7 @@ class SkelSource:
         return matrix if agree else scaling(self._bind_scale)
 
     def _tilt(self) -> Floats:
-        """Quarter turn (3, 3), in the stage's axes, that sets bind space upright; the identity if it is."""
+        """Rotation by 90 degrees in the stage's axes that makes bind space upright, or the identity, shape (3, 3)."""
         linear = np.linalg.inv(self.world_to_bind)[:3, :3]
         stage_up = self.units.rotation.T @ np.array([0.0, 1.0, 0.0])
         up = linear.T @ stage_up / np.cbrt(np.linalg.det(linear))
@@ -113,13 +114,13 @@ class SkelSource:
 
 
 def joints_to_core(local: Floats, parents: Ints, placement: Floats, units: StageUnits) -> Floats:
-    """Return joint-to-parent transforms in metres, y up, with the placement folded into the roots.
+    """Return joint-to-parent transforms in metres, y up, with the placement applied to the roots.
 
     Args:
         local: joint to parent in stage units, column vectors, shape (..., J, 4, 4).
-        parents: index of each joint's parent, -1 for roots.
+        parents: index of each joint's parent, -1 for roots, shape (J,).
         placement: skeleton space to world, similarities, shape (4, 4) or (..., 4, 4).
-        units: of the stage.
+        units: units of the stage.
     """
     scale = similarity_scale(placement) * units.meters_per_unit
     result = np.array(local, dtype=np.float64)
@@ -137,18 +138,18 @@ def similarity_scale(matrices: Floats) -> float:
 
 
 def need_similarity(prim: Usd.Prim, matrices: Floats) -> Floats:
-    """Return the world matrices of a skeleton, shape (..., 4, 4), if all scale uniformly and by the same factor.
+    """Return the world matrices of a skeleton, shape (..., 4, 4), after a check that all have one uniform scale.
 
     Raises:
-        SsilkError: they mirror, shear, scale differently along the axes, or change scale over time.
+        SsilkError: they mirror, shear, scale non-uniformly, or change scale over time.
     """
     linear, scale = matrices[..., :3, :3], similarity_scale(matrices)
     uniform = np.abs(np.swapaxes(linear, -1, -2) @ linear - np.eye(3) * scale**2) < _RIGID_TOLERANCE * scale**2
     if not (scale > 0 and uniform.all()):
         fail(
             location(prim),
-            "the xforms above the skeleton mirror, shear, animate scale or scale unequally",
-            "they may move, turn and scale uniformly by one factor",
+            "the xforms above the skeleton mirror, shear, animate scale or scale non-uniformly",
+            "they may only translate, rotate and scale uniformly by a constant factor",
             "apply the scale and export again",
         )
     return matrices

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Functions that all readers share: opening stages, naming prims, and reading values."""
+"""Functions shared by all readers: open stages, find prims by name, and read values."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ Reader = TypeVar("Reader", bound=Callable[..., Any])
 StageLike: TypeAlias = str | Path | Usd.Stage
 USD_SUFFIXES = (*LAYER_SUFFIXES, ".usdz")
 EARLIEST = Usd.TimeCode.EarliestTime()
-# Instance proxies are read too: a referenced character may be instanceable.
+# Readers traverse instance proxies, because a referenced character may be instanceable.
 PRIMS = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
-register_schema()  # before the first stage is opened: USD lists its schemas once
-_ALLOWED = f"a whole .usd, .usda, .usdc or .usdz file is needed, of arrays that fit into {{:g}} GiB ({VARIABLE})"
+register_schema()  # before the first stage is opened, because USD reads its schema list only once
+_ALLOWED = f"a complete .usd, .usda, .usdc or .usdz file is needed, with arrays of at most {{:g}} GiB ({VARIABLE})"
 _MISSING = (Pcp.ErrorInvalidAssetPath, Pcp.ErrorInvalidSublayerPath, Pcp.ErrorUnresolvedPrimPath)
 
 
 def needs_whole_files(read: Reader) -> Reader:
-    """Decorate a reader, whose first argument is its source: a damaged file raises one `SsilkError`."""
+    """Decorate a reader, whose first argument is its source, so that a damaged file raises one `SsilkError`."""
 
     @wraps(read)
     def reader(source: StageLike, *args: Any, **options: Any) -> Any:
@@ -45,29 +45,29 @@ def needs_whole_files(read: Reader) -> Reader:
             fail(where, "it declares arrays that do not fit into memory", _ALLOWED.format(allowed_gib()))
         except (Tf.ErrorException, UnicodeDecodeError) as error:
             where = stage_name(source) if isinstance(source, Usd.Stage) else str(source)
-            reason = usd_reason(error) if isinstance(error, Tf.ErrorException) else "it holds text that is no UTF-8"
+            reason = usd_reason(error) if isinstance(error, Tf.ErrorException) else "it holds text that is not UTF-8"
             fail(where, f"it cannot be read as USD ({reason})", _ALLOWED.format(allowed_gib()))
 
     return cast(Reader, reader)
 
 
 def usd_reason(error: Tf.ErrorException) -> str:
-    """Return the first thing that USD complains of, on one line."""
+    """Return the first message of a USD error on one line."""
     return " ".join(error.args[0].commentary.split()) if error.args else "unknown reason"
 
 
 @needs_whole_files
 def open_stage(source: StageLike) -> Usd.Stage:
-    """Open a stage with all its payloads, as the file is on disk now; a stage is returned as it is.
+    """Open a stage with all payloads from the current content of its file; return an open stage unchanged.
 
     Raises:
-        SsilkError: no such file, not USD, damaged, or a layer that it needs cannot be found.
+        SsilkError: the file is missing, damaged or not USD, or a layer that it needs cannot be found.
     """
     if isinstance(source, Usd.Stage):
         return source
     if not Path(source).is_file():
         fail(str(source), "there is no such file", "a USD file is needed", "check the path")
-    quiet = UsdUtils.CoalescingDiagnosticDelegate()  # what USD would print, the errors below say
+    quiet = UsdUtils.CoalescingDiagnosticDelegate()  # the errors below replace what USD would print
     stage = Usd.Stage.Open(str(source), Usd.Stage.LoadAll)
     stage.Reload()
     del quiet
@@ -83,7 +83,7 @@ def open_stage(source: StageLike) -> Usd.Stage:
 
 
 def _composition_errors(stage: Usd.Stage) -> list[Any]:
-    """Return what stays unresolved on a stage. Blender 4.2 has USD 24.5, which lists that by prim and layer stack."""
+    """Return the composition errors of a stage; USD 24.5 (Blender 4.2) lists them by prim and layer stack."""
     if hasattr(stage, "GetCompositionErrors"):
         return list(stage.GetCompositionErrors())
     root = stage.GetPseudoRoot()
@@ -94,7 +94,7 @@ def _composition_errors(stage: Usd.Stage) -> list[Any]:
 
 
 def content_hash(source: str | Path) -> str:
-    """Return a SHA-256 of what a stage is made of, wherever its files lie: its root layer and all that it uses.
+    """Return a SHA-256 of the contents of a stage's root layer and all files that it uses, whatever their paths.
 
     Raises:
         SsilkError: as `open_stage`.
@@ -105,7 +105,7 @@ def content_hash(source: str | Path) -> str:
 
 
 def _clips(stage: Usd.Stage) -> Iterator[str]:
-    """Yield the files of value clips, which USD opens only when their times come."""
+    """Yield the files of value clips, which USD opens only when a time in them is read."""
     for prim in Usd.PrimRange(stage.GetPseudoRoot(), PRIMS):
         clips = Usd.ClipsAPI(prim)
         for name in clips.GetClips() or {}:
@@ -118,25 +118,25 @@ def location(prim: Usd.Prim) -> str:
 
 
 def stage_name(stage: Usd.Stage) -> str:
-    """Return the path of a stage's root layer as its user gave it."""
+    """Return the path of a stage's root layer as the user gave it."""
     return stage.GetRootLayer().identifier
 
 
 def split_location(text: str) -> tuple[str, str | None]:
-    """Split "file[:/Prim/Path]" into file and prim path; None when there is no prim path."""
+    """Split "file[:/Prim/Path]" into file and prim path (None without one)."""
     file, colon, prim = text.rpartition(":/")
-    # "C:/file.usd" is a file: what stands before a prim path has a suffix.
+    # "C:/file.usd" is a file: the part before a prim path must have a suffix.
     return (file, f"/{prim}") if colon and Path(file).suffix else (text, None)
 
 
 def named(prims: list[Usd.Prim], name: str) -> list[Usd.Prim]:
-    """Return the prims whose path, or else whose name, is `name`."""
+    """Return the prims with the path `name`, or if there are none, those with that name."""
     by_path = [prim for prim in prims if str(prim.GetPath()) == name]
     return by_path or [prim for prim in prims if prim.GetName() == name]
 
 
 def listed(prims: list[Usd.Prim]) -> str:
-    """Return prim paths for a message."""
+    """Format prim paths for a message."""
     return ", ".join(str(prim.GetPath()) for prim in prims) or "none"
 
 
@@ -164,7 +164,7 @@ def value(prim: Usd.Prim, name: str) -> Any:
 
 
 def has_value(prim: Usd.Prim, name: str) -> bool:
-    """Return whether an attribute has an authored value; schemas declare some that no file holds."""
+    """Return whether an attribute has an authored value; schemas also declare attributes that are not authored."""
     return bool(prim.GetAttribute(name).HasAuthoredValue())
 
 
@@ -179,5 +179,5 @@ def world_matrix(prim: Usd.Prim, time: Usd.TimeCode = EARLIEST) -> Floats:
 
 
 def apply(matrix: Floats, points: Floats) -> Floats:
-    """Return points (..., 3) moved by an affine column-vector matrix (4, 4)."""
+    """Return points (..., 3) transformed by an affine column-vector matrix (4, 4)."""
     return points @ matrix[:3, :3].T + matrix[:3, 3]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When a character is hidden in its shot."""
+"""Read when a character is hidden in its shot."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from .read_stage import needs_whole_files, open_stage, split_location
 
 @needs_whole_files
 def read_hidden(source: str, motion: Motion, *, root: str | None = None) -> list[tuple[int, bool]]:
-    """Return from which frames on the character is hidden (True) or seen (False); empty where it is seen throughout.
+    """Return the frames at which the character becomes hidden (True) or visible (False); empty if always visible.
 
     Args:
-        source: "file[:/Prim/Path]", as `read_motion` read it.
-        motion: frames and rate to say it in.
-        root: the character, where several are animated.
+        source: "file[:/Prim/Path]", as for `read_motion`.
+        motion: gives the frames and their rate.
+        root: the character, if several are animated.
 
     Raises:
         SsilkError: as `read_motion`.
@@ -37,7 +37,7 @@ def read_hidden(source: str, motion: Motion, *, root: str | None = None) -> list
 
 
 def _varies(prim: Usd.Prim) -> bool:
-    """Return whether the visibility of a prim, or of what it is in, changes over time."""
+    """Return whether the visibility of a prim or one of its ancestors changes over time."""
     while prim and not prim.IsPseudoRoot():
         if UsdGeom.Imageable(prim) and UsdGeom.Imageable(prim).GetVisibilityAttr().ValueMightBeTimeVarying():
             return True

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What holds the garment on the body: vertex classes and islands."""
+"""Check the vertex classes and islands that keep the garment on the body."""
 
 from __future__ import annotations
 
@@ -7,28 +7,28 @@ import numpy as np
 
 from ..assets import CLASS_NAMES, LOOSE, Ints, Mesh
 from ..mesh.topology import islands
-from .finding import Finding, Findings, listing
+from .finding import Finding, Findings, index_tuple
 
 
 def class_coverage(mesh: Mesh, classes: Ints) -> Findings:
-    """Yield how many vertices are pinned, tight and loose, classes (V,)."""
+    """Yield the numbers of pinned, tight and loose vertices in `classes` (V,)."""
     counts = np.bincount(classes, minlength=len(CLASS_NAMES))
     told = ", ".join(f"{count:,} {name}" for name, count in zip(CLASS_NAMES, counts))
     notes = {
-        "; nothing is loose, so that no proxies are needed": counts[LOOSE] == 0,
-        "; nothing is loose or tight, so that it only follows the skeleton": counts[0] == mesh.vertex_count,
+        "; nothing is loose, so no proxies are needed": counts[LOOSE] == 0,
+        "; all are pinned, so the garment only follows the skeleton": counts[0] == mesh.vertex_count,
     }
     yield Finding(
         severity="info",
         code="classes",
         prim=mesh.path,
-        found=f"of {mesh.vertex_count:,} vertices {told}"
+        found=f"{told} of {mesh.vertex_count:,} vertices"
         + next((n for n, holds in reversed(notes.items()) if holds), ""),
     )
 
 
-def unheld_islands(mesh: Mesh, classes: Ints) -> Findings:
-    """Yield the islands of a garment without any pinned or tight vertex; vertices in no face are not counted."""
+def unattached_islands(mesh: Mesh, classes: Ints) -> Findings:
+    """Yield the islands of a garment without a pinned or tight vertex; isolated vertices do not count."""
     island = islands(mesh.faces, mesh.vertex_count)
     adrift = np.setdiff1d(island[np.unique(mesh.faces)], island[np.flatnonzero(classes != LOOSE)])
     if len(adrift):
@@ -39,8 +39,8 @@ def unheld_islands(mesh: Mesh, classes: Ints) -> Findings:
             prim=mesh.path,
             count=len(lost),
             found=f"{len(adrift)} of {len(np.unique(island[mesh.faces]))} islands have no pinned or tight vertex",
-            why="nothing holds them: they fall off the body",
-            fix="paint a part of each pinned or tight (primvars:ssilk:class), or sew it to the rest",
+            why="nothing attaches them, so they fall off the body",
+            fix="paint a part of each as pinned or tight (primvars:ssilk:class), or sew it to the rest",
             elements="vertices",
-            indices=listing(lost),
+            indices=index_tuple(lost),
         )
