@@ -59,9 +59,9 @@ def rolled(subject: Subject, clip: str, frames: int, options: Any) -> Looped:
     """Roll a model over a looped clip."""
     dressed = subject.dressed
     motion, length = back_and_forth(clip_of(options, clip, subject), dressed.fps, frames)
-    reel = build_take_set([Take(clip, 0, motion)], dressed, subject.model.joints)
-    network = Network(subject.model, reel)
-    values = recorded(dressed, reel, network, 0).values
+    take_set = build_take_set([Take(clip, 0, motion)], dressed, subject.model.joints)
+    network = Network(subject.model, take_set)
+    values = recorded(dressed, take_set, network, 0).values
     return Looped({name: values[name] for name in TERMS}, length, float(network.states[0].abs().max()))
 
 

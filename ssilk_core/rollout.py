@@ -119,10 +119,8 @@ def _advance(
     dynamic = torch.cat([static, tensor(features.dynamic)], dim=1)
     rest, diverged = _replace_diverged(model.initial(static))
     rest, pose = rest.unsqueeze(1), dynamic.unsqueeze(1)
-    static_batch = min(max(0, HISTORY - start), count)
-    return _roll_and_recover(
-        model, [*state, *rest[:static_batch]], rest[static_batch:], pose[static_batch:], diverged
-    )
+    starting = min(max(0, HISTORY - start), count)
+    return _roll_and_recover(model, [*state, *rest[:starting]], rest[starting:], pose[starting:], diverged)
 
 
 def _replace_diverged(states: Tensor) -> tuple[Tensor, Tensor]:

@@ -111,8 +111,8 @@ def with_torch(model: GarmentModel, skinner: Skinner, motion: Motion, chunk: int
     states: list[Tensor] = []
     for frames in spans(motion.frame_count, chunk):
         rest, pose = given.rest[frames], given.pose[frames]
-        static_batch = max(0, min(2 - frames.start, len(rest)))
-        states = model.roll([*states[-2:], *rest[:static_batch]], rest[static_batch:], pose[static_batch:])
+        starting = max(0, min(2 - frames.start, len(rest)))
+        states = model.roll([*states[-2:], *rest[:starting]], rest[starting:], pose[starting:])
         monitor.lap(LATENTS)
         activations, rotations = model.pose(torch.cat(states[-len(rest) :]))
         monitor.lap(DECODER)

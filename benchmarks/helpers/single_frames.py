@@ -30,10 +30,10 @@ class Times:
 
 
 @torch.no_grad()
-def frame_times(model: Baseline | GarmentModel, reel: TakeSet, frames: int) -> Times:
+def frame_times(model: Baseline | GarmentModel, take_set: TakeSet, frames: int) -> Times:
     """Time frames of the first take; descriptors and the skeleton's matrices are there already."""
-    network = method_over(model, reel)
-    taken = [_frame(network, 2 + number % (reel.takes[0].frame_count - 2)) for number in range(WARM_UP + frames)]
+    network = method_over(model, take_set)
+    taken = [_frame(network, 2 + number % (take_set.takes[0].frame_count - 2)) for number in range(WARM_UP + frames)]
     return Times(*(_spread(torch.tensor(part[WARM_UP:], dtype=torch.float64)) for part in zip(*taken)))
 
 

@@ -69,7 +69,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     try:
         for path, file in bench.files.items():
             meter = bench.meter(path, file)
-            results.judging = results.judging or judged(meter.dressed, meter.reel, meter.whole)
+            results.judging = results.judging or judged(meter.dressed, meter.take_set, meter.whole)
             sweep(
                 meter, variants(meter.reducer.whole, file.config.fps, refined=not options.no_refine), results, report
             )
@@ -136,9 +136,9 @@ class Bench:
         dressed = self._dressed(file)
         clips = {only: self.clips[only]} if only else self.clips
         takes = [take for name, clip in clips.items() for take in takes_of(name, clip, dressed.fps)]
-        reel = build_take_set(takes, dressed, file.joints)
+        take_set = build_take_set(takes, dressed, file.joints)
         reducer = Reducer(file, [self.clips[only]] if only else self.others)
-        return VariantMeter(path.stem, reducer, dressed, reel, self._weigh(path))
+        return VariantMeter(path.stem, reducer, dressed, take_set, self._weigh(path))
 
     def _dressed(self, file: ModelFile) -> EvaluationScene:
         """Put a garment on the character of the stage."""

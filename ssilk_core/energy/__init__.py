@@ -4,6 +4,6 @@
 Positions have the shape (V, 3, N): vertices, coordinates, frames. Every term returns [J] per frame, shape (N,).
 """
 
-from .garment import TERMS, GarmentEnergy
+from .garment import STATIC_TERMS, TERMS, GarmentEnergy
 
-__all__ = ["TERMS", "GarmentEnergy"]
+__all__ = ["STATIC_TERMS", "TERMS", "GarmentEnergy"]

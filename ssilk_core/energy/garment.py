@@ -21,6 +21,8 @@ from .stretch import column_weights, deformation_gradient_operator, stretch_dens
 
 TERMS = ("stretch", "bending", "gravity", "inertia", "collision")
 """The paper's terms. Drag is part of training but not of totals, so that these compare with the paper's."""
+STATIC_TERMS = tuple(term for term in TERMS if term != "inertia")
+"""Those that a pose at rest has."""
 
 
 class GarmentEnergy:

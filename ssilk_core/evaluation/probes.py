@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..energy import STATIC_TERMS
 from .figures import LoopDrift, MinimumErrors, Settling
 from .methods import EvaluationScene, Method, TakeSet
 from .metrics import kinetic_energy, mean_square, ratio, settling_time
@@ -19,7 +20,6 @@ from .takes import EASE, Take, back_and_forth, stopped
 REST_SPEED = 0.01  # [m/s], RMS over the mass
 RUN_UP = 4.0  # [s] that are played before a stop, and of a clip that loops
 LOOPS = 3
-STATIC = ("stretch", "bending", "gravity", "collision")
 
 
 def stopped_takes(takes: Sequence[Take], fps: float, count: int, hold: float) -> tuple[list[Take], list[int]]:
@@ -60,7 +60,7 @@ def _settling(dressed: EvaluationScene, take_set: TakeSet, method: Method, take:
         settling_time=time,
         static_distance=distance,
         max_static_distance=distance,
-        static_energy_excess=sum(float(ours[name] - theirs[name]) for name in STATIC),
+        static_energy_excess=sum(float(ours[name] - theirs[name]) for name in STATIC_TERMS),
         gravity_excess=ratio(float(ours["gravity"] - theirs["gravity"]), dressed.weight),
     )
 

@@ -173,6 +173,17 @@ class QuasiStatic(Integrator):
 
 
 def integrator(config: ModelConfig, rates: int = 0) -> Integrator:
-    """Return the integrator of a network's scheme; `rates` as in `Integrator`."""
-    module, _, name = SCHEMES[config.scheme].integrator.partition(":")
-    return getattr(importlib.import_module(module), name)(config, rates)
+    """Return the integrator of a network's scheme; `rates` as in `Integrator`.
+
+    Raises:
+        TypeError: its parameters are not those that the registry names, by which model files are checked.
+    """
+    scheme = SCHEMES[config.scheme]
+    module, _, name = scheme.integrator.partition(":")
+    built: Integrator = getattr(importlib.import_module(module), name)(config, rates)
+    found = {name for name, _ in built.named_parameters()}
+    if found != set(scheme.parameters):
+        raise TypeError(
+            f"scheme '{config.scheme}' has the parameters {found}; the registry names {scheme.parameters}"
+        )
+    return built

@@ -12,12 +12,12 @@ from ..assets import Floats, Mesh
 from ..collision import PosedBody, signed_distance
 from ..collision.one_ring import triangle_rings
 from ..constants import GRAVITY
-from ..energy import GarmentEnergy
+from ..energy import TERMS, GarmentEnergy
 from ..fabrics import Fabric
 from ..mesh.topology import vertex_normals
 
 SHARE = "inside the body"
-UNITS = {"total": "J", "stretch": "J", "bending": "J", "gravity": "J", "inertia": "J", "collision": "J", SHARE: "%"}
+UNITS = {"total": "J", **dict.fromkeys(TERMS, "J"), SHARE: "%"}
 
 
 @dataclass(eq=False)

@@ -35,7 +35,7 @@ class Player:
                 scene.garment.mesh.path,
                 f"the model's scheme is '{config.scheme}'",
                 "the runtime plays 'spring_verlet' and 'quasi_static'",
-                "use 'ssilk bake'",
+                "play it in PyTorch with ssilk_core.rollout, or train with one of these",
             )
         self.file, self.skeleton = file, scene.character.skeleton
         static, _ = descriptor_sizes(scene, file.joints)

@@ -39,10 +39,10 @@ class Judged:
 
 
 @torch.no_grad()
-def judged(dressed: EvaluationScene, reel: TakeSet, method: Method) -> list[Judged]:
+def judged(dressed: EvaluationScene, take_set: TakeSet, method: Method) -> list[Judged]:
     """Measure the first frames of the first take with each representation of the body."""
-    frames = range(min(FRAMES, reel.takes[0].frame_count))
-    x, character = method.vertices(0, frames), reel.character(0, frames)
+    frames = range(min(FRAMES, take_set.takes[0].frame_count))
+    x, character = method.vertices(0, frames), take_set.character(0, frames)
     whole, joints = dressed.scene.character.merged_body(), dressed.scene.character.skeleton.joint_count
     found = []
     for name, surface, every in BODIES:

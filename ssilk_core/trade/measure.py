@@ -37,7 +37,7 @@ class VariantMeter:
     Args:
         name: of the model.
         reducer: reduces it.
-        dressed, reel: the scene and the takes that it is measured on.
+        dressed, take_set: the scene and the takes that it is measured on.
         weigh: gives the size of its shots.
     """
 
@@ -46,11 +46,11 @@ class VariantMeter:
         name: str,
         reducer: Reducer,
         dressed: EvaluationScene,
-        reel: TakeSet,
+        take_set: TakeSet,
         weigh: Weigh,
     ) -> None:
-        self.name, self.reducer, self.dressed, self.reel, self.weigh = name, reducer, dressed, reel, weigh
-        self.whole = Played(name, reducer.player, dressed, reel, fps=dressed.fps)
+        self.name, self.reducer, self.dressed, self.take_set, self.weigh = name, reducer, dressed, take_set, weigh
+        self.whole = Played(name, reducer.player, dressed, take_set, fps=dressed.fps)
         self.base = self._tally(self.whole).totals().mean()
         self._cut = lru_cache(1)(lambda size: reducer.reduce(size).file)
         self._torch = lru_cache(1)(self._torch_time)
@@ -59,7 +59,7 @@ class VariantMeter:
         """Measure one variant."""
         cut = self._cut(variant.size)
         player = Player(variant.rounded(cut))
-        method = Played(variant.name, player, self.dressed, self.reel, fps=variant.fps, refine=variant.refine)
+        method = Played(variant.name, player, self.dressed, self.take_set, fps=variant.fps, refine=variant.refine)
         tally, timed = self._tally(method, self.whole), self._time(variant, method)
         shot = self._shot(variant, cut)
         total = float(tally.totals().mean())
@@ -88,12 +88,12 @@ class VariantMeter:
     @property
     def motion(self) -> Motion:
         """The motion that is timed."""
-        return self.reel.takes[0].motion
+        return self.take_set.takes[0].motion
 
     def _tally(self, method: Method, truth: Method | None = None) -> Tally:
-        takes = range(len(self.reel.takes))
-        records = {take: recorded(self.dressed, self.reel, method, take, truth) for take in takes}
-        return Tally(records, {take: self.reel.takes[take].clip for take in takes})
+        takes = range(len(self.take_set.takes))
+        records = {take: recorded(self.dressed, self.take_set, method, take, truth) for take in takes}
+        return Tally(records, {take: self.take_set.takes[take].clip for take in takes})
 
     def _time(self, variant: Variant, method: Played) -> Time:
         if variant.refine:

@@ -32,9 +32,9 @@ class Played:
     """
 
     def __init__(
-        self, name: str, player: Player, dressed: EvaluationScene, reel: TakeSet, *, fps: float, refine: int = 0
+        self, name: str, player: Player, dressed: EvaluationScene, take_set: TakeSet, *, fps: float, refine: int = 0
     ) -> None:
-        self.name, self.player, self.dressed, self.reel, self.fps = name, player, dressed, reel, fps
+        self.name, self.player, self.dressed, self.take_set, self.fps = name, player, dressed, take_set, fps
         self.options = RefineOptions(iterations=refine) if refine else None
         self.milliseconds: list[float] = []  # of a frame, for each take that was computed
         self._points = lru_cache(1)(self._take)
@@ -49,7 +49,7 @@ class Played:
 
     def _take(self, take: int) -> Floats:
         """Return all frames of a take, shape (N, V, 3)."""
-        motion, begun = self.reel.takes[take].motion, time.perf_counter()
+        motion, begun = self.take_set.takes[take].motion, time.perf_counter()
         points = self._finished(motion)
         self.milliseconds.append(1000 * (time.perf_counter() - begun) / len(points))
         return points - motion.translations[0, 0]

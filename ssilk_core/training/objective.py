@@ -104,7 +104,7 @@ class Objective:
         terms = self.quasi_static_terms(x, torch.cat([down[2 * batch :], direction]), character)
         count = (length - 2) * batch
         dynamic = {name: value[:count] for name, value in terms.items()}
-        static_batch = {name: value[count:] for name, value in terms.items()}
+        single = {name: value[count:] for name, value in terms.items()}
         path = torch.cat([past, x[..., : count - batch].detach()], dim=-1)
         root = bank.root[times].T
         dynamic["inertia"], dynamic["drag"] = self.energy.inertia_and_drag(
@@ -113,7 +113,7 @@ class Objective:
         if weight := sampler.config.latent_regularization:
             drawn, scale = torch.cat([rolled[-batch:], quiet]), sampler.config.latent_regularization_scale
             dynamic["latent regularization"] = weight * latent_distortion(model, self.energy.mass, drawn, scale)
-        return dynamic, static_batch, torch.stack(z[-2:]).detach()
+        return dynamic, single, torch.stack(z[-2:]).detach()
 
 
 def total(terms: Terms) -> Tensor:

@@ -93,13 +93,13 @@ class Stepper:
     def dynamic_step(self) -> None:
         """Do a step of dynamic training: all networks on one window of every slot, and P on single poses."""
         noise, poses = self.sampler.noise(), self.sampler.poses(self.config.static_batch)
-        dynamic, static_batch, latents = self.objective.window(self.sampler, noise, *poses)
-        moving, still = (next(iter(terms.values())).shape[0] for terms in (dynamic, static_batch))
+        dynamic, static, latents = self.objective.window(self.sampler, noise, *poses)
+        moving, still = (next(iter(terms.values())).shape[0] for terms in (dynamic, static))
         # All frames have the same weight, those of the single poses included.
-        loss = (total(dynamic) * moving + total(static_batch) * still) / (moving + still)
+        loss = (total(dynamic) * moving + total(static) * still) / (moving + still)
         means = {name: value.mean() for name, value in dynamic.items()}
-        beside = {f"static_batch {name}": value.mean() for name, value in static_batch.items()}
-        drawn = {"noise": noise, "static_batch frames": poses[0], "static_batch directions": poses[1]}
+        beside = {f"static {name}": value.mean() for name, value in static.items()}
+        drawn = {"noise": noise, "static frames": poses[0], "static directions": poses[1]}
         self._descend(loss, means, {**self.sampler.window(), **drawn}, beside)
         self.sampler.advance(latents)
 

@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 
 from ssilk_core.assets import LOOSE, PINNED, Scene
 from ssilk_core.collision import CollisionBody, PosedBody, SmoothedDistance
-from ssilk_core.energy import GarmentEnergy
+from ssilk_core.energy import TERMS, GarmentEnergy
 from ssilk_core.energy.bending import dihedral_angles
 from ssilk_core.energy.stretch import stretch_density
 from ssilk_core.errors import SsilkError
@@ -60,17 +60,20 @@ def test_the_energy_is_that_of_training(potential: IncrementalPotential, scene: 
     x, inputs = moving(scene)
     energy = GarmentEnergy(scene.garment.mesh, potential.fabric, dtype=torch.float64)
     body = PosedBody(inputs.body.points.double(), inputs.body.normals.double(), inputs.body.rings)
-    terms = [
-        energy.stretch(x),
-        energy.bending(x),
-        energy.gravity(x, DOWN),
-        energy.inertia(x, inputs.predicted, inputs.dt),
-        energy.drag(x, inputs.advected, inputs.dt),
-        energy.collision(x, body),
-    ]
-    assert min(float(term.abs().min()) for term in terms) > 0
+    terms = {
+        "stretch": energy.stretch(x),
+        "bending": energy.bending(x),
+        "gravity": energy.gravity(x, DOWN),
+        "inertia": energy.inertia(x, inputs.predicted, inputs.dt),
+        "drag": energy.drag(x, inputs.advected, inputs.dt),
+        "collision": energy.collision(x, body),
+    }
+    assert terms.keys() == {*TERMS, "drag"}, "a new term is part of the simulator too"
+    numbers = {name: value for name, value in vars(potential.fabric).items() if isinstance(value, float)}
+    assert all(numbers.values()), f"the parameter of a new term is tried here: {numbers}"
+    assert min(float(term.abs().min()) for term in terms.values()) > 0
     found = potential.energy(x, inputs, potential.body_distance(x, inputs))
-    torch.testing.assert_close(found, sum(terms), rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(found, sum(terms.values()), rtol=1e-6, atol=1e-9)
 
 
 def test_the_gradient_is_that_of_autograd(potential: IncrementalPotential, scene: Scene) -> None:

@@ -40,7 +40,7 @@ def model(scene, toy_model):
 
 @pytest.fixture(scope="module")
 def bench(scene, model, toy_motion):
-    """A reducer, and a dressed garment with a reel of two takes."""
+    """A reducer, and a dressed garment with a take_set of two takes."""
     file = model_file(model, FABRICS["silk"], {})
     dressed = EvaluationScene(scene, file.fabric, FPS, torch.device("cpu"))
     takes = [
@@ -91,9 +91,9 @@ def test_precisions_round_as_they_should():
 
 
 def test_the_whole_model_is_what_the_network_in_pytorch_is(meter, bench, model, points):
-    reducer, dressed, reel = bench
-    network = Network(model, reel)
-    records = [recorded(dressed, reel, network, take) for take in range(2)]
+    reducer, dressed, take_set = bench
+    network = Network(model, take_set)
+    records = [recorded(dressed, take_set, network, take) for take in range(2)]
     total = sum(
         torch.cat([r.values[name] for r in records])
         for name in ("stretch", "bending", "gravity", "inertia", "collision")
@@ -106,10 +106,10 @@ def test_the_whole_model_is_what_the_network_in_pytorch_is(meter, bench, model, 
 
 
 def test_errors_are_distances_and_speeds_from_the_whole_model(meter, bench, points):
-    reducer, dressed, reel = bench
+    reducer, dressed, take_set = bench
     small = Player(reducer.reduce(ModelSize(shapes=2, joints=2, influences=2)).file)
     mass, squares, speeds = dressed.energy.mass.numpy(), [], []
-    for take in reel.takes:
+    for take in take_set.takes:
         played = [player.play(take.motion) for player in (small, reducer.player)]
         mine, theirs = (np.stack([p.vertices(f) for f in range(take.frame_count)]) for p in played)
         squares.append(((mine - theirs) ** 2).sum(2) @ mass / mass.sum())
@@ -123,8 +123,8 @@ def test_errors_are_distances_and_speeds_from_the_whole_model(meter, bench, poin
 def test_collisions_are_told_with_any_body(meter, scene):
     fabric = replace(FABRICS["silk"], margin=0.2)  # as wide as the gap between the toy's garment and its body
     dressed = EvaluationScene(scene, fabric, FPS, torch.device("cpu"))
-    surface, points, few = judged(dressed, meter.reel, meter.whole)
-    body = dressed.body.pose(meter.reel.character(0, range(50)))
+    surface, points, few = judged(dressed, meter.take_set, meter.whole)
+    body = dressed.body.pose(meter.take_set.character(0, range(50)))
     met, nearest = dressed.contacts.distances(meter.whole.vertices(0, range(50)), body)
     assert surface.inside == pytest.approx(float((nearest < 0).double().mean()))
     assert surface.collision == pytest.approx(float(dressed.energy.collision_at(met).mean()))
@@ -145,9 +145,9 @@ def test_what_costs_less_is_seen_to_cost_less(points):
 
 
 def test_between_frames_of_a_shot_poses_are_interpolated(meter, bench, model):
-    reducer, dressed, reel = bench
-    motion = reel.takes[0].motion
-    slow = Played("slow", reducer.player, dressed, reel, fps=10.0).shown(motion)
+    reducer, dressed, take_set = bench
+    motion = take_set.takes[0].motion
+    slow = Played("slow", reducer.player, dressed, take_set, fps=10.0).shown(motion)
     np.testing.assert_allclose(slow[::3], every_frame(reducer, motion)[::3], atol=1e-5)  # frames of the shot
     shot, at = resample(motion, 10.0, cover=True), np.array([1 / 3])
     pose = sample_pose(next(iter(reducer.player.play(motion).poses())), np.array([3.0, 6.0]))

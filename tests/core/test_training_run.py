@@ -265,11 +265,11 @@ def poison(monkeypatch: pytest.MonkeyPatch, bad: Callable[[Stepper, int], bool],
         run(self, iteration)
 
     def spoiled(self: Objective, sampler: WindowSampler, *drawn: torch.Tensor):
-        dynamic, static_batch, latents = window(self, sampler, *drawn)
+        dynamic, static, latents = window(self, sampler, *drawn)
         if poisoned[0]:
-            kind = static_batch if name.startswith("static_batch ") else dynamic
-            kind[name.removeprefix("static_batch ")] = kind[name.removeprefix("static_batch ")] * float("nan")
-        return dynamic, static_batch, latents
+            kind = static if name.startswith("static ") else dynamic
+            kind[name.removeprefix("static ")] = kind[name.removeprefix("static ")] * float("nan")
+        return dynamic, static, latents
 
     monkeypatch.setattr(Stepper, "run", watched)
     monkeypatch.setattr(Objective, "window", spoiled)
@@ -281,11 +281,11 @@ def test_a_skipped_step_is_reported_by_term_and_iteration_and_counted_across_res
         poison(patch, lambda stepper, iteration: iteration == 7)
         train(spoiled, silent, stop_after(patch, 9))
     events: list[Event] = []
-    poison(monkeypatch, lambda stepper, iteration: iteration in (11, 12), "static_batch stretch")
+    poison(monkeypatch, lambda stepper, iteration: iteration in (11, 12), "static stretch")
     train(replace(spoiled, resume=True), events.append)
     told = [event.text for event in events if isinstance(event, Message) and "skipped" in event.text]
     assert told == [
-        "2 steps up to iteration 13 were skipped: static_batch stretch not finite.",
+        "2 steps up to iteration 13 were skipped: static stretch not finite.",
         "3 steps in total were skipped.",
     ]
     assert load_state(state_path(spoiled.output), spoiled.identity())[0].skipped == 3

@@ -4,33 +4,17 @@
 from __future__ import annotations
 
 import re
-import shlex
 from pathlib import Path
 
 import pytest
 from pxr import Sdf
 
-from ssilk_core.cli import parser
-
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = ("docs/pipeline.md", "docs/farm.md")
-WITH_COMMANDS = (*DOCUMENTS, "README.md", "docs/results.md", "docs/training.md")
 
 
 def blocks(document: str, language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", (ROOT / document).read_text(), flags=re.DOTALL)
-
-
-@pytest.mark.parametrize("document", WITH_COMMANDS)
-def test_commands_are_understood(document):
-    commands = "".join(blocks(document, "sh")).replace("\\\n", " ")
-    lines = [line for line in commands.splitlines() if line.startswith("ssilk ")]
-    assert lines
-    for line in lines:
-        words = shlex.split(
-            line.replace(" ...", " m.safetensors --stage s.usdc --motion w.usdc -o out"), comments=True
-        )
-        assert parser().parse_args(words[1:]).verb == words[1]
 
 
 def test_layers_of_artists_are_read():
