@@ -24,7 +24,7 @@ def work(*programs: str) -> Work:
 
 
 def wait(running: Work) -> Work:
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + 120
     while not running.poll():
         assert time.monotonic() < deadline
         time.sleep(0.01)
