@@ -50,10 +50,10 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Sweep; return 0."""
     from ..charts import write_chart
-    from ..trade.judging import judged
+    from ..trade.collision_cost import measure_collisions
     from ..trade.plot import trade_panels
     from ..trade.sweep import Results, sweep
-    from ..trade.table import judging_table, table
+    from ..trade.table import collision_table, table
     from ..trade.variants import variants
 
     if options.output:
@@ -69,7 +69,9 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     try:
         for path, file in bench.files.items():
             meter = bench.meter(path, file)
-            results.judging = results.judging or judged(meter.dressed, meter.take_set, meter.whole)
+            results.collision_costs = results.collision_costs or measure_collisions(
+                meter.dressed, meter.take_set, meter.whole
+            )
             sweep(
                 meter, variants(meter.reducer.whole, file.config.fps, refined=not options.no_refine), results, report
             )
@@ -77,7 +79,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         if results.points and options.output:
             write_chart(options.output.with_suffix(".png"), trade_panels(results.points), size=(4.6, 3.6))
         if not options.json:
-            print(table(results.points), judging_table(results.judging), sep="\n")
+            print(table(results.points), collision_table(results.collision_costs), sep="\n")
     report(Result("trade", {"points": [asdict(point) for point in results.points]} if options.json else {}))
     return EXIT_OK
 

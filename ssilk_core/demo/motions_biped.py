@@ -15,14 +15,14 @@ import numpy as np
 from ..assets import Floats, Motion, Skeleton
 from ..errors import fail
 from ..kinematics import invert_rigid, quaternion_from_matrix
-from .motions_curves import FPS, about, apply, ease, turned
+from .motions_curves import FPS, about, apply, ease, euler_rotations
 
-SIDES = ("Left", "Right")
-OUT = np.array([1.0, -1.0])  # the left points to +x
+SIDE_NAMES = ("Left", "Right")
+OUTWARD = np.array([1.0, -1.0])  # the left points to +x
 NEEDED = (
     "Hips",
     "Neck",
-    *(s + j for s in SIDES for j in ("UpLeg", "Leg", "Foot", "ToeBase", "Arm", "ForeArm", "Hand")),
+    *(s + j for s in SIDE_NAMES for j in ("UpLeg", "Leg", "Foot", "ToeBase", "Arm", "ForeArm", "Hand")),
 )
 
 
@@ -95,7 +95,7 @@ class Biped:
     def stance(self, width: float = 0.095) -> Floats:
         """Return where the two feet stand, `width` [m] from the middle, as ground points under the ankles, (2, 3)."""
         ankle = self.at("LeftFoot")
-        return np.stack([[side * width * self.scale, self.ground, ankle[2]] for side in OUT])
+        return np.stack([[side * width * self.scale, self.ground, ankle[2]] for side in OUTWARD])
 
     def ankle(self, feet: Floats, ground: Floats, *, heel: Floats | float = 0.0) -> Floats:
         """Return ankle positions of feet rolled over the ball of the foot, or over the heel as `heel` goes to 1.
@@ -132,11 +132,11 @@ class Biped:
         ):
             chain = [name for name in names if name in self.index]
             for step, name in enumerate(chain, 1):
-                turns[name] = turns[base] @ turned(angles * step / len(chain))
+                turns[name] = turns[base] @ euler_rotations(angles * step / len(chain))
             turns.setdefault("chest", turns[chain[-1]] if chain else turns[base])
-        for side, name in enumerate(SIDES):
+        for side, name in enumerate(SIDE_NAMES):
             lifted = np.radians(32) * ease((track.arms[:, side, 1] - np.radians(35)) / np.radians(130))
-            turns[name + "Shoulder"] = turns["chest"] @ about(2, OUT[side] * lifted)
+            turns[name + "Shoulder"] = turns["chest"] @ about(2, OUTWARD[side] * lifted)
         return turns
 
     def place(self, hips: Floats, turns: dict[str, Floats]) -> tuple[Floats, Floats]:
@@ -156,17 +156,17 @@ class Biped:
 
     def leg_turns(self, track: Track, side: int, points: Floats) -> dict[str, Floats]:
         """Return rotations of thigh, shin, foot and toes that bring the ankle to its place, knee forward."""
-        names = [SIDES[side] + part for part in ("UpLeg", "Leg", "Foot", "ToeBase")]
-        hinge = apply(track.pelvis, np.array([1.0, 0.0, -0.12 * OUT[side]]))  # knees point a little outward
+        names = [SIDE_NAMES[side] + part for part in ("UpLeg", "Leg", "Foot", "ToeBase")]
+        hinge = apply(track.pelvis, np.array([1.0, 0.0, -0.12 * OUTWARD[side]]))  # knees point a little outward
         upper, lower = self.two_bones(points[:, self.index[names[0]]], track.ankles[:, side], hinge, names[:3], -1.0)
         foot = track.feet[:, side]
         return dict(zip(names, (upper, lower, foot, foot @ about(0, -track.toes[:, side]))))
 
     def arm_turns(self, track: Track, side: int, points: Floats, turns: dict[str, Floats]) -> dict[str, Floats]:
         """Return rotations of upper arm and forearm from their angles, or from where the wrist is held."""
-        names = [SIDES[side] + part for part in ("Arm", "ForeArm", "Hand")]
+        names = [SIDE_NAMES[side] + part for part in ("Arm", "ForeArm", "Hand")]
         swing, lift, twist, bend = np.moveaxis(track.arms[:, side], -1, 0)
-        frame = about(2, OUT[side] * lift) @ about(0, -swing) @ about(1, -OUT[side] * twist)
+        frame = about(2, OUTWARD[side] * lift) @ about(0, -swing) @ about(1, -OUTWARD[side] * twist)
         frame = turns["chest"] @ frame
         down = np.array([0.0, -1.0, 0.0])
         first, second = (np.linalg.norm(self.at(b) - self.at(a)) for a, b in pairwise(names))

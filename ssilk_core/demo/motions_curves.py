@@ -37,7 +37,7 @@ def travel(x: ArrayLike, total: float, soft: float) -> Floats:
     return soft * (ramp(x / soft) - ramp((x - total) / soft + 1))
 
 
-def keyed(time: Floats, *keys: tuple[float, ArrayLike]) -> Floats:
+def keyframes(time: Floats, *keys: tuple[float, ArrayLike]) -> Floats:
     """Return a curve through (time, value) keys, at rest at each: so give the extremes of a movement alone."""
     value = np.broadcast_to(np.asarray(keys[0][1], dtype=np.float64), (*time.shape, *np.shape(keys[0][1])))
     for (start, low), (stop, high) in pairwise(keys):
@@ -64,7 +64,7 @@ def about(axis: int, angle: ArrayLike) -> Floats:
     return result
 
 
-def turned(angles: Floats) -> Floats:
+def euler_rotations(angles: Floats) -> Floats:
     """Return rotations (..., 3, 3) of (pitch forward, yaw to the left, roll to the left) [rad]; yaw acts last."""
     pitch, yaw, roll = np.moveaxis(angles, -1, 0)
     return about(1, yaw) @ about(0, pitch) @ about(2, -roll)

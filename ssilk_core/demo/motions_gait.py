@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..assets import Floats
-from .motions_biped import OUT, Biped, Track
-from .motions_curves import FPS, about, apply, bump, clock, ease, keyed, travel, turned
+from .motions_biped import OUTWARD, Biped, Track
+from .motions_curves import FPS, about, apply, bump, clock, ease, euler_rotations, keyframes, travel
 
-BEFORE, AFTER = 0.3, 0.6  # seconds of standing around a clip
-START = -0.25  # phase at which both feet carry; at 0 the left one is in the middle of its stance
+STAND_BEFORE, STAND_AFTER = 0.3, 0.6  # seconds of standing around a clip
+START_PHASE = -0.25  # phase at which both feet carry; at 0 the left one is in the middle of its stance
 
 
 @dataclass(frozen=True)
@@ -54,11 +54,11 @@ def locomotion(biped: Biped, gait: Gait, cycles: float, *turns: tuple[float, flo
     """
     spell = 0.55 * gait.rate  # cycles it takes to reach the full rate
     seconds = (cycles + spell) / gait.rate
-    time = clock(BEFORE + seconds + AFTER)
-    gone = travel((time - BEFORE) * gait.rate, cycles + spell, spell)
-    pace = ease((time - BEFORE) * gait.rate / spell) * ease((BEFORE + seconds - time) * gait.rate / spell)
+    time = clock(STAND_BEFORE + seconds + STAND_AFTER)
+    gone = travel((time - STAND_BEFORE) * gait.rate, cycles + spell, spell)
+    pace = ease((time - STAND_BEFORE) * gait.rate / spell) * ease((STAND_BEFORE + seconds - time) * gait.rate / spell)
     course = WalkPath(gait.stride * biped.scale, cycles - gait.soft, turns)
-    phase = gone + START
+    phase = gone + START_PHASE
     body = carry(biped, gait, phase, pace, travel(gone, cycles, gait.soft), course)
     return step(biped, gait, phase, pace, course, body)
 
@@ -79,7 +79,8 @@ class WalkPath:
     def heading(self, gone: Floats) -> Floats:
         """Return the heading [rad], to the left of +z."""
         return sum(
-            (keyed(gone, (start, 0.0), (stop, angle)) for start, stop, angle in self.turns), np.zeros_like(gone)
+            (keyframes(gone, (start, 0.0), (stop, angle)) for start, stop, angle in self.turns),
+            np.zeros_like(gone),
         )
 
     def point(self, gone: Floats) -> Floats:
@@ -103,11 +104,11 @@ def carry(biped: Biped, gait: Gait, phase: Floats, pace: Floats, gone: Floats, c
     )
     arms = still.arms.copy()
     arms[..., 0] += (
-        np.radians(gait.swing) * (pace * once)[:, None] * OUT - np.radians(0.1 * gait.elbow) * pace[:, None]
+        np.radians(gait.swing) * (pace * once)[:, None] * OUTWARD - np.radians(0.1 * gait.elbow) * pace[:, None]
     )
-    bent = np.radians(gait.elbow - 16) + np.radians(0.3 * gait.swing) * once[:, None] * OUT
+    bent = np.radians(gait.elbow - 16) + np.radians(0.3 * gait.swing) * once[:, None] * OUTWARD
     arms[..., 3] += pace[:, None] * bent
-    return replace(still, hips=hips, pelvis=turned(angles), spine=spine, head=-0.5 * spine, arms=arms)
+    return replace(still, hips=hips, pelvis=euler_rotations(angles), spine=spine, head=-0.5 * spine, arms=arms)
 
 
 def step(biped: Biped, gait: Gait, phase: Floats, pace: Floats, course: WalkPath, body: Track) -> Track:
@@ -151,10 +152,10 @@ def plants(
     biped: Biped, gait: Gait, course: WalkPath, centres: Floats, inner: Floats, side: int
 ) -> tuple[Floats, Floats]:
     """Return heading and ground point of each stand of a foot."""
-    at = np.clip(centres - START - gait.soft / 2, 0.0, course.cycles)
+    at = np.clip(centres - START_PHASE - gait.soft / 2, 0.0, course.cycles)
     heading = course.heading(at)
     home = biped.stance()[side]
-    width = (0.095 + inner * (gait.width - 0.095)) * biped.scale * OUT[side]
+    width = (0.095 + inner * (gait.width - 0.095)) * biped.scale * OUTWARD[side]
     # The course is the line of the pelvis, so a bend turns the stand about the pelvis.
     pelvis = biped.at("Hips")[2]
     offset = np.stack([width, 0 * width, 0 * width + home[2] - pelvis], axis=-1)

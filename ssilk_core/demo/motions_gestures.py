@@ -9,7 +9,7 @@ import numpy as np
 
 from ..assets import Floats
 from .motions_biped import Biped, Track
-from .motions_curves import clock, ease, keyed, turned
+from .motions_curves import clock, ease, euler_rotations, keyframes
 
 
 def idle(biped: Biped, seconds: float) -> Track:
@@ -47,7 +47,7 @@ def gesture(
     return replace(
         still,
         hips=still.hips + biped.scale * between(time, rest, hips, 3),
-        pelvis=turned(degrees(time, rest, pelvis, 3)),
+        pelvis=euler_rotations(degrees(time, rest, pelvis, 3)),
         spine=degrees(time, rest, spine, 3),
         head=degrees(time, rest, head, 3),
         arms=still.arms + arms,
@@ -57,7 +57,7 @@ def gesture(
 def between(time: Floats, rest: tuple[float, float], keys: tuple, size: int) -> Floats:
     """Return a curve through `keys` that is zero outside `rest`, shape (F, size)."""
     zero = np.zeros(size)
-    return keyed(time, (rest[0], zero), *keys, (rest[1], zero))
+    return keyframes(time, (rest[0], zero), *keys, (rest[1], zero))
 
 
 def degrees(time: Floats, rest: tuple[float, float], keys: tuple, size: int) -> Floats:

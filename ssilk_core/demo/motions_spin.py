@@ -9,13 +9,13 @@ import numpy as np
 
 from ..assets import Floats
 from .motions_biped import Biped, Track
-from .motions_curves import about, apply, clock, ease, keyed, travel
+from .motions_curves import about, apply, clock, ease, keyframes, travel
 
-BEGIN, WIND, OFF = 0.3, 0.85, 1.0  # seconds: the wind-up begins, is widest, the turn begins
+START, WIND_UP, TURN = 0.3, 0.85, 1.0  # seconds: the wind-up begins, is widest, the turn begins
 
 
 @dataclass(frozen=True)
-class Whirl:
+class SpinTiming:
     """How many turns, at how many a second, and when they end [s]."""
 
     turns: int
@@ -29,7 +29,7 @@ class Whirl:
     @property
     def stop(self) -> float:
         """When the turn ends."""
-        return OFF + (self.turns + self.spell) / self.rate
+        return TURN + (self.turns + self.spell) / self.rate
 
     @property
     def done(self) -> float:
@@ -39,14 +39,23 @@ class Whirl:
 
 def spin(biped: Biped, *, turns: int = 2, rate: float = 1.05) -> Track:
     """Return a pirouette of whole turns at a rate in turns per second."""
-    whirl = Whirl(turns, rate)
+    whirl = SpinTiming(turns, rate)
     time = clock(whirl.done + 0.5)
     still = biped.stand(len(time))
-    heading = 2 * np.pi * travel((time - OFF) * rate, turns + whirl.spell, whirl.spell)
-    up = ease((time - OFF + 0.1) / 0.45) * ease((whirl.stop + 0.2 - time) / 0.5)
-    sunk = keyed(time, (BEGIN, 0.0), (WIND, 1.0), (OFF + 0.35, 0.0), (whirl.stop - 0.1, 0.0), (whirl.stop + 0.3, 0.8),
-                 (whirl.done, 0.0))  # fmt: skip
-    twist = keyed(time, (BEGIN, 0.0), (WIND, -38.0), (OFF + 0.45, 8.0), (whirl.stop + 0.1, 12.0), (whirl.done, 0.0))
+    heading = 2 * np.pi * travel((time - TURN) * rate, turns + whirl.spell, whirl.spell)
+    up = ease((time - TURN + 0.1) / 0.45) * ease((whirl.stop + 0.2 - time) / 0.5)
+    sunk = keyframes(
+        time, (START, 0.0), (WIND_UP, 1.0), (TURN + 0.35, 0.0), (whirl.stop - 0.1, 0.0), (whirl.stop + 0.3, 0.8),
+        (whirl.done, 0.0),
+    )  # fmt: skip
+    twist = keyframes(
+        time,
+        (START, 0.0),
+        (WIND_UP, -38.0),
+        (TURN + 0.45, 8.0),
+        (whirl.stop + 0.1, 12.0),
+        (whirl.done, 0.0),
+    )
     twist, zero = np.radians(twist), np.zeros_like(time)
     hips = over_ball(biped, whirl, time)
     hips[:, 1] += biped.scale * (0.05 * up - 0.075 * sunk)
@@ -57,7 +66,7 @@ def spin(biped: Biped, *, turns: int = 2, rate: float = 1.05) -> Track:
     return with_feet(biped, heading, up, track)
 
 
-def over_ball(biped: Biped, whirl: Whirl, time: Floats) -> Floats:
+def over_ball(biped: Biped, whirl: SpinTiming, time: Floats) -> Floats:
     """Return the pelvis at standing height, moved over the ball of the left foot while it turns, (F, 3)."""
     home = biped.stand(1).hips[0]
     axis = biped.stance()[0] + 0.75 * ball_ahead(biped)
@@ -71,11 +80,25 @@ def ball_ahead(biped: Biped) -> Floats:
     return (biped.at("LeftToeBase") - biped.at("LeftFoot")) * np.array([0.0, 0.0, 1.0])
 
 
-def arms(whirl: Whirl, time: Floats) -> Floats:
+def arms(whirl: SpinTiming, time: Floats) -> Floats:
     """Return what the arms add to hanging, (F, 1, 4): held out, a little before the chest."""
-    lift = keyed(time, (BEGIN, 0.0), (WIND, 38.0), (OFF + 0.5, 62.0), (whirl.stop, 62.0), (whirl.done, 0.0))
-    swing = keyed(time, (BEGIN, 0.0), (WIND, 8.0), (OFF + 0.5, 32.0), (whirl.stop, 22.0), (whirl.done, 0.0))
-    bend = keyed(time, (BEGIN, 0.0), (OFF + 0.5, 38.0), (whirl.stop, 20.0), (whirl.done, 0.0))
+    lift = keyframes(
+        time,
+        (START, 0.0),
+        (WIND_UP, 38.0),
+        (TURN + 0.5, 62.0),
+        (whirl.stop, 62.0),
+        (whirl.done, 0.0),
+    )
+    swing = keyframes(
+        time,
+        (START, 0.0),
+        (WIND_UP, 8.0),
+        (TURN + 0.5, 32.0),
+        (whirl.stop, 22.0),
+        (whirl.done, 0.0),
+    )
+    bend = keyframes(time, (START, 0.0), (TURN + 0.5, 38.0), (whirl.stop, 20.0), (whirl.done, 0.0))
     return np.radians(np.stack([swing, lift, 0 * time, bend], axis=-1))[:, None]
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measure variants of a model: their costs, and their errors."""
+"""Measure the costs and errors of variants of a model."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ from ..kinematics import resample
 from ..reduction import ModelSize, Reducer
 from ..rollout import decode, garment_poses
 from ..runtime import Player
-from .played import Played
 from .point import SECONDS, TradePoint
+from .shot_method import ShotMethod
 from .variants import Variant
 
-HALVES = ("float16", "bfloat16")  # two bytes on disk for each parameter
+HALF_PRECISIONS = ("float16", "bfloat16")  # two bytes on disk for each parameter
 
 
 Weigh = Callable[[ModelFile, float], ShotBytes]
-"""Gives the size of a model's shots at a frame rate."""
+"""Returns the size of a model's shots at a frame rate."""
 
 
 class VariantMeter:
     """Measures variants of one model on takes.
 
     Args:
-        name: of the model.
-        reducer: reduces it.
-        dressed, take_set: the scene and the takes that it is measured on.
-        weigh: gives the size of its shots.
+        name: name of the model.
+        reducer: reduces the model.
+        dressed, take_set: the scene and the takes for the measurements.
+        weigh: returns the size of the model's shots.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class VariantMeter:
         weigh: Weigh,
     ) -> None:
         self.name, self.reducer, self.dressed, self.take_set, self.weigh = name, reducer, dressed, take_set, weigh
-        self.whole = Played(name, reducer.player, dressed, take_set, fps=dressed.fps)
+        self.whole = ShotMethod(name, reducer.player, dressed, take_set, fps=dressed.fps)
         self.base = self._tally(self.whole).totals().mean()
         self._cut = lru_cache(1)(lambda size: reducer.reduce(size).file)
         self._torch = lru_cache(1)(self._torch_time)
@@ -58,8 +58,8 @@ class VariantMeter:
     def point(self, variant: Variant) -> TradePoint:
         """Measure one variant."""
         cut = self._cut(variant.size)
-        player = Player(variant.rounded(cut))
-        method = Played(variant.name, player, self.dressed, self.take_set, fps=variant.fps, refine=variant.refine)
+        player = Player(variant.in_precision(cut))
+        method = ShotMethod(variant.name, player, self.dressed, self.take_set, fps=variant.fps, refine=variant.refine)
         tally, timed = self._tally(method, self.whole), self._time(variant, method)
         shot = self._shot(variant, cut)
         total = float(tally.totals().mean())
@@ -87,7 +87,7 @@ class VariantMeter:
 
     @property
     def motion(self) -> Motion:
-        """The motion that is timed."""
+        """The motion for time measurements."""
         return self.take_set.takes[0].motion
 
     def _tally(self, method: Method, truth: Method | None = None) -> Tally:
@@ -95,7 +95,7 @@ class VariantMeter:
         records = {take: recorded(self.dressed, self.take_set, method, take, truth) for take in takes}
         return Tally(records, {take: self.take_set.takes[take].clip for take in takes})
 
-    def _time(self, variant: Variant, method: Played) -> Time:
+    def _time(self, variant: Variant, method: ShotMethod) -> Time:
         if variant.refine:
             return Time.of(method.milliseconds)
         return play_time(method.player, resample(self.motion, variant.fps))
@@ -117,8 +117,8 @@ class VariantMeter:
 
 
 def _bytes(file: ModelFile, precision: str) -> int:
-    """Return the size of a model's file in a precision."""
-    if precision in HALVES:
+    """Return the size of a model's file in this precision [bytes]."""
+    if precision in HALF_PRECISIONS:
         parameters = {name: value.astype(np.float16) for name, value in file.parameters.items()}
         file = replace(file, parameters=parameters)
     return model_bytes(file, pack=precision == "int16")

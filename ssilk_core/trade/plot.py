@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The chart of a trade: error and energy over each cost, with the front that no variant passes."""
+"""Charts of a trade-off: error and energy over each cost, with the Pareto front."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ COSTS = {
     "shot_bytes": (f"shot of {SECONDS} s [MB]", 1e-6),
     "model_bytes": ("model [MB]", 1e-6),
 }
-# Label, unit, and the value below which the axis is linear, so that zero has a place on it.
+# Label, factor to its unit, and the value below which the axis is linear, so that it can show zero.
 ERRORS = {
     "position": ("RMS distance from the whole model [mm]", 1e3, 0.1),
     "excess": ("energy above the whole model [J]", 1.0, 1e-3),
 }
-NAMED = ("as trained", "level", "refinement")  # sweeps whose points all have their names beside them
+NAMED = ("as trained", "level", "refinement")  # sweeps whose points are all labelled
 
 
 def trade_panels(points: Sequence[TradePoint]) -> list[list[ChartPanel]]:
     """Return a row of panels for each error, with a panel for each cost.
 
-    Each sweep has a colour. The whole model, levels, refined variants and points of the front have names beside them.
+    Each sweep has a colour. The full model, levels, refined variants and points of the Pareto front are labelled.
     """
     return [[_panel(points, cost, error) for cost in COSTS] for error in ERRORS]
 

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The measurements of one variant, and the front of variants that no other beats."""
+"""Measurements of one variant, and the Pareto front of variants."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-SECONDS = 10  # length of the shots whose sizes are compared
+SECONDS = 10  # duration of the shots whose sizes are compared [s]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -16,16 +16,16 @@ class TradePoint:
     Attributes:
         model, swept, variant: names of the model, of the sweep, and of the variant.
         shapes, joints, influences, precision, fps, refine: as in `variants.Variant`.
-        milliseconds, high: median and 95 % quantile of a frame's time in the numpy runtime, on the processor.
-        torch: time of a frame of network and decoder in PyTorch, on the device [ms]; None if not measured.
-        operations: multiply-adds of a frame.
-        memory: bytes that playing holds.
-        model_bytes: size of the model's file.
-        shot_bytes: size of a shot of `SECONDS`, garment and skeleton.
+        milliseconds, high: median and 95 % quantile of the time per frame in the numpy runtime on the CPU [ms].
+        torch: time per frame of network and decoder in PyTorch on the device [ms]; None if not measured.
+        operations: multiply-adds per frame.
+        memory: memory used by playback [bytes].
+        model_bytes: size of the model's file [bytes].
+        shot_bytes: size of a shot of `SECONDS` with garment and skeleton [bytes].
         total: the paper's L_tot [J].
-        excess: over the model as trained [J].
+        excess: difference of `total` from the model as trained [J].
         collisions: share of the vertices inside the body.
-        position, velocity: RMS errors against the whole model [m], [m/s].
+        position, velocity: RMS errors against the full model [m], [m/s].
     """
 
     model: str
@@ -52,7 +52,7 @@ class TradePoint:
 
 
 def front(places: Sequence[tuple[float, float]]) -> list[int]:
-    """Return which of some (cost, error) no other equals at less cost or beats at equal cost, the cheapest first."""
+    """Return the indices of the (cost, error) pairs on the Pareto front, the cheapest first."""
     best: list[int] = []
     for index in sorted(range(len(places)), key=places.__getitem__):
         if not best or places[index][1] < places[best[-1]][1]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A sweep over variants of models that can be interrupted and continued."""
+"""Resumable sweep over variants of models."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 from ..errors import SsilkError
 from ..events import Message, Progress, Reporter, silent
 from ..files import replacing
-from .judging import Judged
+from .collision_cost import CollisionCost
 from .measure import VariantMeter
 from .point import TradePoint
 from .variants import Variant
@@ -20,21 +20,21 @@ from .variants import Variant
 
 @dataclass
 class Results:
-    """Points of a sweep, written to a file after each of them.
+    """Points of a sweep, which are written to a file after each measurement.
 
     Attributes:
         path: the file, or None.
-        asked: what was measured on what; points of a file with another value are not used.
-        judging: costs of detecting collisions, for the first model.
+        asked: identifies the models, scene and settings; points of a file with another value are ignored.
+        collision_costs: costs of detecting collisions, for the first model.
     """
 
     path: Path | None
     asked: Mapping[str, Any]
-    judging: Sequence[Judged] = ()
+    collision_costs: Sequence[CollisionCost] = ()
     points: list[TradePoint] = field(default_factory=list)
 
     def resume(self, report: Reporter) -> None:
-        """Read the points that an earlier run of the same sweep has measured."""
+        """Read the points that an earlier run of the same sweep measured."""
         if self.path is None or not self.path.exists():
             return
         try:
@@ -42,13 +42,13 @@ class Results:
             points = [TradePoint(**point) for point in document["points"]]
             same = document["asked"] == json.loads(json.dumps(self.asked))
         except (ValueError, TypeError, KeyError) as error:
-            raise SsilkError(f"{self.path}: not figures of 'ssilk trade' ({error}); name another file.") from error
+            raise SsilkError(f"{self.path}: not results of 'ssilk trade' ({error}); name another file.") from error
         self.points = points if same else []
         if self.points:
-            report(Message(f"{len(self.points)} variants were measured before and are kept"))
+            report(Message(f"{len(self.points)} variants were measured before and are reused"))
 
     def found(self, model: str, variant: Variant) -> bool:
-        """Return whether a variant was measured."""
+        """Return whether a variant has been measured."""
         return any((p.model, p.swept, p.variant) == (model, variant.swept, variant.name) for p in self.points)
 
     def add(self, point: TradePoint) -> None:
@@ -58,7 +58,7 @@ class Results:
             document = {
                 "units": "SI, times in ms",
                 "asked": self.asked,
-                "judging": [asdict(each) for each in self.judging],
+                "judging": [asdict(each) for each in self.collision_costs],
                 "points": [asdict(each) for each in self.points],
             }
             with replacing(self.path) as temporary:
@@ -66,7 +66,7 @@ class Results:
 
 
 def sweep(meter: VariantMeter, variants: Iterable[Variant], results: Results, report: Reporter = silent) -> None:
-    """Measure the variants of a model that `results` lacks, and add each when it is measured."""
+    """Measure the variants of a model that `results` lacks, and add each after its measurement."""
     tried = list(variants)
     for done, variant in enumerate(tried):
         report(Progress(done, len(tried)))

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Points of a trade as a table for people."""
+"""Tables of a trade-off's points."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 from ..evaluation.tables import aligned
-from .judging import Judged
+from .collision_cost import CollisionCost
 from .point import SECONDS, TradePoint, front
 
 HEADER = ("model", "swept", "variant", "size", "ms a frame", "95 %", "PyTorch", "memory [MB]", "model [MB]",
@@ -16,14 +16,14 @@ MARKS = {"milliseconds": "time", "shot_bytes": "shot", "model_bytes": "model"}
 
 
 def table(points: Sequence[TradePoint]) -> str:
-    """Return a line for each point; "best at" names the costs at which no other is nearer to the whole model."""
+    """Return a row for each point; "best at" lists the costs on whose Pareto front it is."""
     best = {mark: front([(getattr(p, cost), p.position) for p in points]) for cost, mark in MARKS.items()}
     rows = [_cells(point, [mark for mark, own in best.items() if row in own]) for row, point in enumerate(points)]
     return aligned(HEADER, rows, 3)
 
 
-def judging_table(found: Sequence[Judged]) -> str:
-    """Return a line for each representation of the body."""
+def collision_table(found: Sequence[CollisionCost]) -> str:
+    """Return a row for each representation of the body."""
     header = ("collisions with", "vertices", "ms a frame", "collision [J]", "inside")
     rows = [
         [j.body, f"{j.vertices:,}", f"{j.milliseconds:.3g}", f"{j.collision:.3g}", f"{j.inside:.2%}"] for j in found

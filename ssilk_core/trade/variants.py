@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The variants that a sweep tries: one change at a time, and the quality levels, which change several things."""
+"""Variants for a sweep: models with one change each, and the quality levels, which have several."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..quality import QUALITIES
 from ..reduction import ModelSize
 
 WHOLE = "as trained"
-SHAPES, JOINTS = (0.75, 0.5, 0.25, 0.125, 0.0), (0.75, 0.5, 0.25, 0.0)  # shares of what there is
+SHAPES, JOINTS = (0.75, 0.5, 0.25, 0.125, 0.0), (0.75, 0.5, 0.25, 0.0)  # shares of the model's numbers
 INFLUENCES, RATES, REFINED = (6, 4, 3, 2, 1), (1 / 2, 1 / 3), (1, 2)
 
 Array = np.ndarray
@@ -27,7 +27,7 @@ PRECISIONS: dict[str, Callable[[Array], Array]] = {
 
 
 def _bfloat16(values: Array) -> Array:
-    """Round to the 8 bits of mantissa that bfloat16 has, to the nearest, ties to even."""
+    """Round to the 8-bit mantissa of bfloat16, to nearest with ties to even."""
     bits = np.ascontiguousarray(values, dtype=np.float32).view(np.uint32)
     return ((bits + 0x7FFF + ((bits >> 16) & 1)) & 0xFFFF0000).view(np.float32)
 
@@ -37,9 +37,11 @@ class Variant:
     """One way to play a garment.
 
     Attributes:
-        swept: what it is tried for; name: what it is called in tables.
-        size: what is kept; precision: of the parameters; fps: of the shot [1/s].
-        refine: solver iterations in each frame.
+        swept, name: names of the sweep and of the variant, for tables.
+        size: size of the model.
+        precision: precision of the parameters, one of `PRECISIONS`.
+        fps: frame rate of the shot [1/s].
+        refine: solver iterations per frame.
     """
 
     swept: str
@@ -49,8 +51,8 @@ class Variant:
     fps: float
     refine: int = 0
 
-    def rounded(self, file: ModelFile) -> ModelFile:
-        """Return a model with its parameters in this precision."""
+    def in_precision(self, file: ModelFile) -> ModelFile:
+        """Return a model with its parameters rounded to this precision."""
         parameters = {name: PRECISIONS[self.precision](value) for name, value in file.parameters.items()}
         return replace(file, parameters=parameters)
 

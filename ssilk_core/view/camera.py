@@ -10,14 +10,14 @@ import numpy as np
 
 from ..assets import UP, Floats
 
-MARGIN = 1.08  # room around the action
-SMOOTHING = 0.5  # standard deviation of the camera's path [s]: slower than steps, faster than turns
-STATIC_CAMERA_TRAVEL = 0.4  # a figure that travels less than this share of its size needs no moving camera
+FRAMING_MARGIN = 1.08  # factor on the distance that leaves room around the figure
+PATH_SMOOTHING = 0.5  # [s] standard deviation of the path filter: slower than steps, faster than turns
+STATIC_CAMERA_TRAVEL = 0.4  # share of its size that a figure may travel in front of a static camera
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera at `position` looking at `target` [m]; `fov` is the vertical opening [degrees]."""
+    """A pinhole camera at `position` looking at `target` [m]; `fov` is the vertical field of view [degrees]."""
 
     position: Floats
     target: Floats
@@ -59,18 +59,18 @@ def follow_cameras(
     elevation: float = 8.0,
     fov: float = 28.0,
 ) -> list[Camera]:
-    """Return one camera for each frame; all look the same way and each holds all points of its frame in view.
+    """Return one camera per frame; all have the same direction, and each shows all points of its frame.
 
-    The target slides along the smoothed path of the figure at one height, and the distance changes slowly, so that
-    neither steps nor flapping cloth shake the picture; for a figure that stays where it is the camera stays too.
+    The target follows the smoothed path of the figure at a constant height, and the distance changes slowly, so that
+    steps and flapping cloth do not shake the picture. If the figure does not travel, the camera is static.
 
     Args:
-        frames: the points of each frame [m], each (N, 3); taken one by one.
-        fps: frames per second.
-        aspect: width divided by height of the picture.
-        azimuth: where the camera stands, turned from +z towards +x [degrees].
-        elevation: how far it looks down [degrees].
-        fov: vertical opening [degrees].
+        frames: the points of each frame [m], each (N, 3); iterated once.
+        fps: frames per second [1/s].
+        aspect: ratio of the picture's width to its height.
+        azimuth: direction of the camera, from +z towards +x [degrees].
+        elevation: angle of the camera above the horizon [degrees].
+        fov: vertical field of view [degrees].
     """
     turn, tilt = np.radians([azimuth, elevation])
     back = np.array([np.sin(turn) * np.cos(tilt), np.sin(tilt), np.cos(turn) * np.cos(tilt)])
@@ -78,23 +78,24 @@ def follow_cameras(
     right = view.axes()[0]
     level = np.stack([right, UP, np.cross(UP, right)])
     boxes = np.array([[seen.min(axis=0), seen.max(axis=0)] for seen in (points @ level.T for points in frames)])
-    centres, deviation = _centres(boxes), SMOOTHING * fps
+    centres, deviation = _centres(boxes), PATH_SMOOTHING * fps
     if _stays(boxes):
         targets = np.broadcast_to((centres.min(axis=0) + centres.max(axis=0)) / 2, centres.shape)
         distances = np.full(len(boxes), _distances(boxes, targets, view, level, aspect).max())
     else:
         reach = _reach(deviation)
-        # Going on past the ends as it came, the path does not lag there.
+        # The path is extrapolated past its ends, so that the filter does not lag there.
         path = np.pad(centres, ((reach, reach), (0, 0)), mode="reflect", reflect_type="odd")
         targets = np.stack([_smoothed(column, deviation) for column in path.T], axis=1)
         distances = _eased(_distances(boxes, targets, view, level, aspect), deviation)
     return [
-        Camera(target + MARGIN * away * back, target, fov=fov) for target, away in zip(targets @ level, distances)
+        Camera(target + FRAMING_MARGIN * away * back, target, fov=fov)
+        for target, away in zip(targets @ level, distances)
     ]
 
 
 def _centres(boxes: Floats) -> Floats:
-    """Return the centres (F, 3) of boxes (F, 2, 3), all at the height that suits the whole shot; up is axis 1."""
+    """Return the centres (F, 3) of boxes (F, 2, 3), all at one height for the entire shot; y is up."""
     centres = boxes.mean(axis=1)
     centres[:, 1] = (boxes[:, 0, 1].min() + boxes[:, 1, 1].max()) / 2
     return centres
@@ -107,7 +108,7 @@ def _stays(boxes: Floats) -> bool:
 
 
 def _distances(boxes: Floats, targets: Floats, view: Camera, level: Floats, aspect: float) -> Floats:
-    """Return for each frame the least distance from its target at which its whole box is in view [m], shape (F,)."""
+    """Return the least distance from the target of each frame at which its entire box is visible [m], shape (F,)."""
     pick = np.indices((2, 2, 2)).reshape(3, 8)
     corners = np.stack([boxes[:, pick[k], k] for k in range(3)], axis=-1) - targets[:, None]
     right, up, forward = np.moveaxis(corners @ level @ view.axes().T, -1, 0)
@@ -116,7 +117,7 @@ def _distances(boxes: Floats, targets: Floats, view: Camera, level: Floats, aspe
 
 
 def _eased(needed: Floats, deviation: float) -> Floats:
-    """Return a smooth curve that is nowhere below what is needed: a sliding maximum, then as wide a filter."""
+    """Return a smooth upper bound of `needed` (F,): a sliding maximum, then a filter of the same width."""
     reach = _reach(deviation)
     padded = np.pad(needed, 2 * reach, mode="edge")
     return _smoothed(np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1).max(axis=1), deviation)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The stage: a floor with a faint grid that fades into a plain backdrop, and the shadows on it."""
+"""Render the stage: a floor with a faint grid that fades into a plain backdrop, and the shadows on it."""
 
 from __future__ import annotations
 
@@ -7,13 +7,16 @@ import numpy as np
 
 from ..assets import Floats
 from .camera import Camera
-from .light import LAMP_RAYS, Lighting, Lit, sky_directions, sky_radiance
+from .light import LAMP_RAYS, Lighting, LitGeometry, sky_directions, sky_radiance
 from .surface import linear
 
 BACKDROP, HAZE, FLOOR = linear([0.70, 0.735, 0.775]), linear([0.90, 0.91, 0.92]), linear([0.855, 0.86, 0.868])
 GRID_LINE_BRIGHTNESS = 0.86  # brightness of grid lines against the floor
-SPACING, LINE_WIDTH = 0.5, 0.008  # of the grid [m]
-NEAR, FAR = 0.4, 3.3  # the floor fades into the backdrop between these distances from the target, in view distances
+GRID_SPACING, GRID_LINE_WIDTH = 0.5, 0.008  # of the grid [m]
+FADE_START, FADE_END = (
+    0.4,
+    3.3,
+)  # [view distances] from the target between which the floor fades
 KEY_SHADE = 0.42  # darkness of the key lamp's shadow
 SKY_SHADE = 0.75  # darkness where the floor sees no sky
 PENUMBRA = 0.15  # how far the key lamp's shadow may spread past its centre [m]
@@ -22,22 +25,22 @@ SKY_SHADE_CELL = 0.06  # its grid [m]
 FLOOR_RAYS = 160  # directions over the sphere, of which the floor sees half
 
 
-def stage(lit: Lit, rig: Lighting, camera: Camera, directions: Floats, height: float) -> Floats:
+def render_stage(lit: LitGeometry, rig: Lighting, camera: Camera, directions: Floats, height: float) -> Floats:
     """Return the linear colours of the stage, shape (H, W, 3).
 
     Args:
-        lit: what stands on it.
+        lit: the geometry on the stage.
         rig: the lamps.
         camera: the camera.
         directions: unit rays through the pixels, shape (H, W, 3).
-        height: of the floor [m].
+        height: height of the floor [m].
     """
     distance = floor_distance(camera, directions, height)
     run = np.where(np.isfinite(distance), distance, 0)
     x, z = (np.float32(camera.position[k]) + run * directions[..., k] for k in (0, 2))
     away = np.hypot(x - np.float32(camera.target[0]), z - np.float32(camera.target[2]))
     reach = np.float32(np.linalg.norm(camera.target - camera.position))
-    haze = np.where(np.isfinite(distance), np.clip((away / reach - NEAR) / (FAR - NEAR), 0, 1), 1)
+    haze = np.where(np.isfinite(distance), np.clip((away / reach - FADE_START) / (FADE_END - FADE_START), 0, 1), 1)
     haze = haze * (1.5 - 0.5 * haze)
     lines = 1 - (1 - GRID_LINE_BRIGHTNESS) * np.maximum(_line_cover(x), _line_cover(z))
     shade = lines * _sky_shade(lit, x, z, height) * _key_shade(lit, rig, x, z, height)
@@ -47,26 +50,26 @@ def stage(lit: Lit, rig: Lighting, camera: Camera, directions: Floats, height: f
 
 
 def floor_distance(camera: Camera, directions: Floats, height: float) -> Floats:
-    """Return how far unit rays (..., 3) run to the floor [m], infinity where they never meet it, shape (...)."""
+    """Return the distance along unit rays (..., 3) to the floor [m], infinite without a hit, shape (...)."""
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = np.float32(height - camera.position[1]) / directions[..., 1]
     return np.where(distance > 0, distance, np.float32(np.inf))
 
 
 def _line_cover(coordinate: Floats) -> Floats:
-    """Return the share of each pixel that grid lines cover: a box filter as wide as the pixel is on the floor."""
+    """Return the share of each pixel that grid lines cover, by a box filter of the pixel's width on the floor."""
     down, across = (np.abs(np.gradient(coordinate, axis=axis)) for axis in (0, 1))
     width = np.maximum(down + across, 1e-6)
 
     def covered_until(position: Floats) -> Floats:
-        cell = np.floor(position / SPACING)
-        return cell * LINE_WIDTH + np.minimum(position - cell * SPACING, LINE_WIDTH)
+        cell = np.floor(position / GRID_SPACING)
+        return cell * GRID_LINE_WIDTH + np.minimum(position - cell * GRID_SPACING, GRID_LINE_WIDTH)
 
-    start = coordinate + LINE_WIDTH / 2 - width / 2
+    start = coordinate + GRID_LINE_WIDTH / 2 - width / 2
     return np.clip((covered_until(start + width) - covered_until(start)) / width, 0, 1)
 
 
-def _key_shade(lit: Lit, rig: Lighting, x: Floats, z: Floats, height: float) -> Floats:
+def _key_shade(lit: LitGeometry, rig: Lighting, x: Floats, z: Floats, height: float) -> Floats:
     """Return the floor's brightness (H, W) under the key lamp, with a soft edge."""
     points = lit.geometry.points
     cast = points[:, ::2] - (points[:, 1:2] - height) * (rig.key[::2] / rig.key[1])
@@ -75,7 +78,7 @@ def _key_shade(lit: Lit, rig: Lighting, x: Floats, z: Floats, height: float) -> 
     inside = (x > low[0]) & (x < high[0]) & (z > low[1]) & (z < high[1])
     floor = np.stack([x[inside], np.full(np.count_nonzero(inside), height, np.float32), z[inside]], axis=1)
     blocked = _blocked_lamps(lit, rig.lamp[:4], floor)
-    edge = (blocked > 0) & (blocked < 4)  # only there do the other points of the lamp matter
+    edge = (blocked > 0) & (blocked < 4)  # only the shadow's edge needs the other points of the lamp
     blocked[~edge] *= LAMP_RAYS / 4
     blocked[edge] += _blocked_lamps(lit, rig.lamp[4:], floor[edge])
     shade = np.ones(x.shape, dtype=np.float32)
@@ -83,12 +86,12 @@ def _key_shade(lit: Lit, rig: Lighting, x: Floats, z: Floats, height: float) -> 
     return shade
 
 
-def _blocked_lamps(lit: Lit, lamps: Floats, points: Floats) -> Floats:
+def _blocked_lamps(lit: LitGeometry, lamps: Floats, points: Floats) -> Floats:
     """Return how many points of the lamp (L, 3) are hidden from points (N, 3), shape (N,)."""
     return np.sum([lit.tracer.blocked(points, lamp) for lamp in lamps], axis=0, dtype=np.float32)
 
 
-def _sky_shade(lit: Lit, x: Floats, z: Floats, height: float) -> Floats:
+def _sky_shade(lit: LitGeometry, x: Floats, z: Floats, height: float) -> Floats:
     """Return the floor's brightness (H, W) under the sky, computed on a grid around the figure and interpolated."""
     points = lit.geometry.points[:, ::2]
     low = np.floor((points.min(axis=0) - SKY_SHADE_RADIUS) / SKY_SHADE_CELL) * SKY_SHADE_CELL
@@ -102,7 +105,7 @@ def _sky_shade(lit: Lit, x: Floats, z: Floats, height: float) -> Floats:
     )
 
 
-def _sky_share(lit: Lit, points: Floats) -> Floats:
+def _sky_share(lit: LitGeometry, points: Floats) -> Floats:
     """Return the share of the sky's light that reaches level points (N, 3), shape (N,)."""
     directions = sky_directions(FLOOR_RAYS)
     directions = directions[directions[:, 1] > 0]
@@ -113,7 +116,7 @@ def _sky_share(lit: Lit, points: Floats) -> Floats:
 
 
 def _softened(values: Floats) -> Floats:
-    """Blur a grid with a binomial filter, which hides that the sky is made of single directions."""
+    """Blur a grid with a binomial filter, to hide artefacts of the discrete sky directions."""
     for axis in (0, 1):
         padded = np.pad(values, [(2, 2) if k == axis else (0, 0) for k in (0, 1)], mode="edge")
         shifted = [np.take(padded, np.arange(k, k + values.shape[axis]), axis=axis) for k in range(5)]

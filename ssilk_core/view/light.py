@@ -16,8 +16,8 @@ from .camera import Camera
 from .surface import Geometry
 from .trace import Tracer
 
-SKY_RAYS = 48  # over the whole sphere
-LAMP_RAYS = 16  # points of the lamp, one for each place in a tile of 4 x 4 samples
+SKY_RAYS = 48  # directions over the entire sphere
+LAMP_RAYS = 16  # points of the lamp, one per position in a tile of 4 x 4 samples
 LAMP_RADIUS = np.tan(np.radians(1.8))
 KEY = np.array([1.02, 0.98, 0.93], dtype=np.float32)
 RIM = np.array([0.20, 0.22, 0.26], dtype=np.float32)
@@ -29,15 +29,15 @@ OFFSET = 1e-3  # rays start this far off the surface [m], past the error of floa
 
 @dataclass(frozen=True, eq=False)
 class Lighting:
-    """Unit directions to the lamps `key` and `rim`, shape (3,), and to points all over the key lamp, (16, 3)."""
+    """Unit directions to the lamps `key` and `rim`, shape (3,), and to sample points of the key lamp, (16, 3)."""
 
     key: Floats
     rim: Floats
     lamp: Floats
 
     @classmethod
-    def beside(cls, camera: Camera) -> Lighting:
-        """Return lamps that go with the view: the key above its left shoulder, the rim behind on the right."""
+    def for_camera(cls, camera: Camera) -> Lighting:
+        """Return lamps for a camera: the key light above its left side, and the rim light behind on the right."""
         right = camera.axes()[0]
         level = np.cross(UP, right)  # into the picture
         key = _unit(1.3 * UP - 1.0 * right - 0.75 * level)
@@ -54,7 +54,7 @@ def _disc_around(axis: Floats) -> Floats:
     across = _unit(np.cross(axis, UP))
     steps = np.arange(LAMP_RAYS)
     radius, angle = LAMP_RADIUS * np.sqrt((steps + 0.5) / LAMP_RAYS), steps * np.pi * (3 - np.sqrt(5))
-    # A stride of 7 scatters the spiral: any few samples in a row then lie all over the disc.
+    # A stride of 7 scatters the spiral, so that consecutive samples are spread over the disc.
     order = steps * 7 % LAMP_RAYS
     offsets = (radius * np.cos(angle))[order, None] * across + (radius * np.sin(angle))[order, None] * np.cross(
         axis, across
@@ -71,7 +71,7 @@ def sky_directions(count: int) -> Floats:
 
 
 def sky_radiance(directions: Floats) -> Floats:
-    """Return the light that comes from the sky and, from below, off the floor, shape (N, 3)."""
+    """Return the light from the sky and, from below, from the floor, shape (N, 3)."""
     height = directions[:, 1:2]
     return np.where(height > 0, HORIZON + (ZENITH - HORIZON) * np.clip(height, 0, 1), FLOOR)
 
@@ -79,8 +79,8 @@ def sky_radiance(directions: Floats) -> Floats:
 def sky_light(tracer: Tracer, points: Floats, normals: Floats, thin: np.ndarray) -> tuple[Floats, Floats]:
     """Return the sky's light on the outside and on the inside of vertices, each (V, 3).
 
-    Cosine-weighted means over the hemisphere of each side, with what other faces hide left out. The insides of
-    vertices that are not `thin` are never seen and stay dark.
+    It is the cosine-weighted mean over the unoccluded hemisphere of each side. The insides of vertices that are not
+    `thin` are never visible and stay dark.
     """
     directions = sky_directions(SKY_RAYS)
     cosine = normals @ directions.T
@@ -95,8 +95,8 @@ def sky_light(tracer: Tracer, points: Floats, normals: Floats, thin: np.ndarray)
 
 
 @dataclass(frozen=True, eq=False)
-class Lit:
-    """A geometry with the sky's light on either side of its vertices, ready to be shaded."""
+class LitGeometry:
+    """A geometry with the sky's light on both sides of its vertices, ready for shading."""
 
     geometry: Geometry
     tracer: Tracer
@@ -104,7 +104,7 @@ class Lit:
     sky_inside: Floats
 
     @classmethod
-    def of(cls, geometry: Geometry) -> Lit:
-        """Trace the sky's light on every vertex of a geometry."""
+    def of(cls, geometry: Geometry) -> LitGeometry:
+        """Compute the sky's light on every vertex of a geometry."""
         tracer = Tracer(geometry)
         return cls(geometry, tracer, *sky_light(tracer, geometry.points, geometry.normals, geometry.thin))

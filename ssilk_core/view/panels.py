@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures side by side, with words on them."""
+"""Arrange pictures side by side and add captions."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 from .render import Image
 
 GAP = 4  # between panels [pixels]
-PAPER = 255
-INK = (38, 42, 48)
+BACKGROUND = 255
+TEXT_COLOUR = (38, 42, 48)
 
 
-def captioned(image: Image, *, top: str = "", bottom: str = "") -> Image:
-    """Return the image with words in its upper and lower left corner."""
+def add_captions(image: Image, *, top: str = "", bottom: str = "") -> Image:
+    """Return the image with text in its upper left and lower left corner."""
     if not (top or bottom):
         return image
     from PIL import Image as Pictures
@@ -26,8 +26,8 @@ def captioned(image: Image, *, top: str = "", bottom: str = "") -> Image:
     font = ImageFont.load_default(size=max(11, height // 24))
     edge = max(6, height // 40)
     draw = ImageDraw.Draw(picture)
-    draw.text((edge, edge), top, fill=INK, font=font, anchor="la")
-    draw.text((edge, height - edge), bottom, fill=INK, font=font, anchor="ld")
+    draw.text((edge, edge), top, fill=TEXT_COLOUR, font=font, anchor="la")
+    draw.text((edge, height - edge), bottom, fill=TEXT_COLOUR, font=font, anchor="ld")
     return np.asarray(picture)
 
 
@@ -36,7 +36,7 @@ def contact_sheet(images: Sequence[Image], *, columns: int) -> Image:
     height, width, _ = images[0].shape
     rows = -(-len(images) // columns)
     shape = rows * (height + GAP) - GAP, columns * (width + GAP) - GAP, 3
-    sheet = np.full(shape, PAPER, dtype=np.uint8)
+    sheet = np.full(shape, BACKGROUND, dtype=np.uint8)
     for number, image in enumerate(images):
         row, column = divmod(number, columns)
         y, x = row * (height + GAP), column * (width + GAP)

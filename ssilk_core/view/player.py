@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the viewer asks of a shot, whatever file it came from."""
+"""The viewer's interface to a shot, independent of its file format."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class ShotPlayer(Protocol):
 
     @property
     def frame_times(self) -> Sequence[float]:
-        """What to hand to `points` for each frame, in order."""
+        """The argument of `points` for each frame, in order."""
 
     @property
     def meshes(self) -> Sequence[PlayerMesh]: ...

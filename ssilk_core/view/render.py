@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from ..assets import Floats, Ints
 from ..errors import fail
 from .camera import Camera
-from .ground import floor_distance, stage
-from .light import Lighting, Lit
+from .ground import floor_distance, render_stage
+from .light import Lighting, LitGeometry
 from .shade import shade
 from .surface import Geometry, Surface
 
@@ -42,9 +42,9 @@ def render(
     geometry = Geometry.of(surfaces)
     if not len(geometry.faces):
         fail("rendering", "the surfaces have no faces", "at least one triangle is needed")
-    lit, rig = Lit.of(geometry), Lighting.beside(camera)
+    lit, rig = LitGeometry.of(geometry), Lighting.for_camera(camera)
     view = View(lit, rig, camera, width, height, ground)
-    picture = stage(lit, rig, camera, view.rays(*np.mgrid[:height, :width] + 0.5), ground)
+    picture = render_stage(lit, rig, camera, view.rays(*np.mgrid[:height, :width] + 0.5), ground)
     _draw(picture, view, samples)
     return _encoded(picture)
 
@@ -53,7 +53,7 @@ def render(
 class View:
     """A lit geometry as one camera sees it."""
 
-    lit: Lit
+    lit: LitGeometry
     rig: Lighting
     camera: Camera
     width: int

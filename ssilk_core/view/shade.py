@@ -1,28 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The colour of points on surfaces."""
+"""Shade points on surfaces."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from ..assets import Floats, Ints
-from .light import KEY, OFFSET, RIM, Lighting, Lit
+from .light import KEY, OFFSET, RIM, Lighting, LitGeometry
 from .trace import Hits
 
-SHEEN = 0.16  # light that fibres of cloth catch at grazing angles
-FILL = 0.10  # light from the camera, so that nothing is quite black
-GLOSS = 0.10  # highlight of skin
+SHEEN = 0.16  # strength of the sheen of cloth at grazing angles
+FILL = 0.10  # strength of the fill light from the camera, so that nothing is black
+GLOSS = 0.10  # strength of the highlight on skin
 
 
-def shade(lit: Lit, hits: Hits, view: Floats, rig: Lighting, lamps: Ints) -> Floats:
+def shade(lit: LitGeometry, hits: Hits, view: Floats, rig: Lighting, lamps: Ints) -> Floats:
     """Return the linear colours of hits, shape (N, 3).
 
     Args:
         lit: the geometry and the sky's light on it.
-        hits: where rays met it (N).
+        hits: N ray hits on the geometry.
         view: unit directions of those rays, shape (N, 3).
         rig: the lamps.
-        lamps: which sample of the key lamp each hit looks at, shape (N,).
+        lamps: index of the key lamp's sample for each hit, shape (N,).
     """
     geometry, corners = lit.geometry, lit.geometry.faces[hits.faces]
     normals = _mixed(geometry.normals, corners, hits)
@@ -57,15 +57,15 @@ def _of_side(outside: Floats, inside: Floats, seen_inside: np.ndarray, corners: 
     return mixed
 
 
-def _faces_away(lit: Lit, corners: Ints, view: Floats) -> np.ndarray:
+def _faces_away(lit: LitGeometry, corners: Ints, view: Floats) -> np.ndarray:
     a, b, c = np.moveaxis(lit.geometry.points[corners], 1, 0)
     return _dot(np.cross(b - a, c - a), view) > 0
 
 
-def _smooth_points(lit: Lit, corners: Ints, hits: Hits) -> Floats:
-    """Lift hits from flat faces to the round surface that their normals suggest, shape (N, 3).
+def _smooth_points(lit: LitGeometry, corners: Ints, hits: Hits) -> Floats:
+    """Move hits from flat faces onto the curved surface implied by the vertex normals, shape (N, 3).
 
-    Without it shadow rays from coarse faces meet their own neighbours and the edge of the shade shows the triangles
+    Otherwise shadow rays from coarse faces hit adjacent faces, and the shadow's edge shows the triangles
     (Hanika, "Hacking the Shadow Terminator", Ray Tracing Gems II, 2021).
     """
     points = _mixed(lit.geometry.points, corners, hits)
@@ -74,8 +74,8 @@ def _smooth_points(lit: Lit, corners: Ints, hits: Hits) -> Floats:
     return points - np.einsum("nk,nkc->nc", hits.barycentric * depth, corner_normals)
 
 
-def _key_light(lit: Lit, points: Floats, normals: Floats, rig: Lighting, lamps: Ints) -> Floats:
-    """Return how much of the key lamp reaches points with these normals, shape (N,)."""
+def _key_light(lit: LitGeometry, points: Floats, normals: Floats, rig: Lighting, lamps: Ints) -> Floats:
+    """Return the share of the key lamp's light that reaches points with these normals, shape (N,)."""
     towards = rig.lamp[lamps]
     cosine = _dot(normals, towards)
     facing = np.flatnonzero(cosine > 0)

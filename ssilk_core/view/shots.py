@@ -15,9 +15,9 @@ from ..errors import fail
 from ..events import Progress, Reporter, silent
 from .camera import Camera, follow_cameras
 from .colours import BODY, fabric_colour
-from .ordered import in_order
+from .ordered_map import ordered_map
 from .output import FILM, PICTURE, check_suffix, write_film, write_image
-from .panels import captioned, compare, contact_sheet
+from .panels import add_captions, compare, contact_sheet
 from .player import ShotPlayer
 from .render import Image, render
 from .surface import Surface
@@ -193,10 +193,10 @@ def _drawn(panels: Iterator[Picture], look: Look, total: int, report: Reporter) 
         image = render(
             panel.surfaces, panel.camera, look.width, look.height, samples=look.samples, ground=panel.ground
         )
-        return captioned(image, top=panel.top, bottom=panel.bottom)
+        return add_captions(image, top=panel.top, bottom=panel.bottom)
 
     start = None
-    for done, image in enumerate(in_order(draw, panels, look.workers)):
+    for done, image in enumerate(ordered_map(draw, panels, look.workers)):
         start = start or time.monotonic()
         left = (time.monotonic() - start) / done * (total - done - 1) if done else None
         report(Progress(done + 1, total, seconds_left=left))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is drawn: triangle surfaces with colours, and all surfaces of a picture as one geometry."""
+"""Coloured triangle surfaces, and the geometry that merges all surfaces of a picture."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from ..assets import Floats, Ints
 from ..errors import fail
 
-INSIDE_SHADE = 0.75  # brightness of the inside of cloth, against its outside
+INSIDE_SHADE = 0.75  # brightness of the inside of cloth relative to its outside
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class Surface:
         points: positions [m], y up, shape (V, 3).
         faces: triangles, counter-clockwise seen from outside, shape (F, 3).
         colour: sRGB in [0, 1], shape (3,) for the whole surface or (V, 3) for each vertex.
-        two_sided: True for cloth, whose inside is seen too; False for the skin of a solid.
+        two_sided: True for cloth, whose inside is visible too; False for the skin of a solid.
     """
 
     name: str
@@ -46,7 +46,7 @@ class Surface:
             fail(where, f"{bad} of {len(points)} points hold NaN or infinity", "all must be finite")
         bad = int(np.count_nonzero((faces < 0) | (faces >= len(points))))
         if bad != 0:
-            fail(where, f"{bad} face indices point at no vertex", f"they lie in 0 to {len(points) - 1}")
+            fail(where, f"{bad} face indices point at no vertex", f"they must lie in 0 to {len(points) - 1}")
         shape = np.shape(self.colour)
         if shape not in ((3,), (len(points), 3)):
             fail(where, f"colours of shape {shape}", f"(3,) or ({len(points)}, 3) is needed")
@@ -56,7 +56,7 @@ class Surface:
 class Geometry:
     """All surfaces of one picture: float32 arrays over their V vertices and F faces.
 
-    `outside` and `inside` are linear colours of either side, shape (V, 3); `thin` marks the vertices of cloth.
+    `outside` and `inside` are the linear colours of the two sides, shape (V, 3). `thin` marks the vertices of cloth.
     """
 
     points: Floats
@@ -68,7 +68,7 @@ class Geometry:
 
     @classmethod
     def of(cls, surfaces: Sequence[Surface]) -> Geometry:
-        """Join surfaces into one geometry, in their order."""
+        """Merge surfaces into one geometry, in order."""
         counts = [len(surface.points) for surface in surfaces]
         starts = np.cumsum([0, *counts])
         colours = [np.broadcast_to(linear(s.colour), (n, 3)) for s, n in zip(surfaces, counts)]
@@ -88,7 +88,7 @@ def _joined(arrays: Sequence[np.ndarray], dtype: type) -> np.ndarray:
 
 
 def linear(colour: ArrayLike) -> Floats:
-    """Return sRGB colours in [0, 1] as linear light (a plain 2.2 power)."""
+    """Convert sRGB colours in [0, 1] to linear light, with a power of 2.2."""
     return np.clip(np.asarray(colour, dtype=np.float32), 0.0, 1.0) ** 2.2
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rays against triangles, by Embree."""
+"""Ray casting against triangles with Embree."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .surface import Geometry
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Rays that met a face: `rays` (N,) says which, `faces` (N,), `barycentric` (N, 3), `distances` [m] (N,)."""
+    """Rays that hit a face: indices `rays` (N,), `faces` (N,), `barycentric` (N, 3), `distances` [m] (N,)."""
 
     rays: Ints
     faces: Ints
@@ -26,7 +26,7 @@ class Hits:
 
 
 class Tracer:
-    """The triangles of a geometry, ready for rays; runs outside Python's lock, so that threads share the work."""
+    """Ray caster for the triangles of a geometry; it releases the GIL, so threads run in parallel."""
 
     def __init__(self, geometry: Geometry) -> None:
         from embreex.mesh_construction import TriangleMesh
@@ -44,6 +44,6 @@ class Tracer:
         return Hits(rays, found["primID"][rays], np.stack([1 - u - v, u, v], axis=1), found["tfar"][rays])
 
     def blocked(self, origins: Floats, directions: Floats) -> np.ndarray:
-        """Return whether rays (N, 3) from points (N, 3) meet any face, shape (N,)."""
+        """Return whether rays (N, 3) from points (N, 3) hit any face, shape (N,)."""
         directions = np.broadcast_to(directions, origins.shape).astype(np.float32)
         return self.scene.run(np.ascontiguousarray(origins, np.float32), directions, query="OCCLUDED") >= 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lists of garments to train: a TOML file with defaults and one table for each garment."""
+"""Read wardrobe lists: TOML files with defaults and one table for each garment to train."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class WardrobeEntry:
 
 @dataclass(frozen=True)
 class Key:
-    """The values that a key may have, and its option of 'ssilk train'; "" stands for a positional argument."""
+    """Allowed values of a key, and its option of 'ssilk train'; "" for a positional argument."""
 
     option: str
     fits: Callable[[Any], bool]
@@ -61,7 +61,7 @@ NEEDED = ("stage", "motions")
 
 
 def read_list(path: Path) -> list[WardrobeEntry]:
-    """Return the garments of a list in its order; paths in it are relative to its folder.
+    """Read the garments of a list, in order; paths in it are relative to its folder.
 
     Raises:
         SsilkError: the file is missing or not TOML, or an entry is wrong.
@@ -81,7 +81,7 @@ def read_list(path: Path) -> list[WardrobeEntry]:
 
 
 def _need_table(path: Path, name: str, table: Any) -> None:
-    """Raise `SsilkError` unless a name suits files and its table holds known keys with values of their types."""
+    """Raise `SsilkError` unless a name is a valid file name and its table has known keys with valid values."""
     if not isinstance(table, dict):
         fail(
             f"{path}: key '{name}'",
@@ -116,14 +116,14 @@ def _words(path: Path, name: str, table: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _option(option: str, value: Any) -> list[str]:
-    """Return an option with its value as words of a command line."""
+    """Return an option and its value as command-line arguments."""
     if isinstance(value, dict):
         return [word for name, item in value.items() for word in (option, f"{name}={_text(item)}")]
     return [*filter(None, [option]), *(value if isinstance(value, list) else [str(value)])]
 
 
 def _text(value: Any) -> str:
-    """Return a value as it is written in "name=value"."""
+    """Format a value for "name=value"."""
     if isinstance(value, bool):
         return str(value).lower()
     return ",".join(map(str, value)) if isinstance(value, list) else str(value)

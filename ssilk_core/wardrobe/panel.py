@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Showing several trainings at once: one line for each that is redrawn, or plain lines, and a final table."""
+"""Show several trainings at once, as one redrawn line each or as plain lines, and a final table."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typing import TextIO
 
 from ..events import Event, GarmentEvent, Progress, Result, TaskEvent, describe, describe_progress, format_seconds
 
-REDRAW = 0.1  # seconds between two drawings of the lines
-REPEAT = 60.0  # seconds between two plain lines about the progress of one garment
+REDRAW = 0.1  # [s] interval between two redraws
+REPEAT = 60.0  # [s] interval between two plain progress lines of one garment
 
 
 class ProgressTable:
@@ -53,7 +53,7 @@ class ProgressTable:
         self._drawn = False
 
     def draw(self) -> None:
-        """Draw the lines over the last drawing."""
+        """Redraw the lines."""
         width = max(map(len, self.lines))
         rows = (f"{name:<{width}}  {text}"[: self.columns - 1] for name, text in self.lines.items())
         up = f"\x1b[{len(self.lines)}A" if self._drawn else ""
@@ -62,9 +62,9 @@ class ProgressTable:
 
 
 def table(rows: Sequence[Mapping[str, object]]) -> str:
-    """Return rows with the same keys as aligned columns: the first and the last to the left, the others to the right.
+    """Format rows with the same keys as columns; the first and last are left-aligned, the others right-aligned.
 
-    The column "time" is in seconds; None is shown as an empty cell.
+    The column "time" is in seconds. None is an empty cell.
     """
     cells = [[*rows[0]], *([_cell(name, value) for name, value in row.items()] for row in rows)]
     widths = [max(map(len, column)) for column in zip(*cells)]

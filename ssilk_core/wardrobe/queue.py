@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands side by side, each a process of its own, one at a time in each slot."""
+"""Run commands in parallel, each in its own process, one at a time per slot."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from ..events import Failed, Result, TaskEvent, read_event
 
 Slot = Mapping[str, str]  # environment variables that give a task its device
 Take = Callable[[], "CommandTask | None"]
-LOOK = 0.2  # seconds between two looks at whether to stop
+LOOK = 0.2  # [s] interval between two checks of whether to stop
 
 
 @dataclass(frozen=True)
 class CommandTask:
-    """A command, the folder to run it in, and the log of all that it prints.
+    """A command, its working folder, and the log of its output.
 
-    Lines that it prints are events as `events.JsonReporter` writes them; other lines go to the log alone.
+    The command prints events as `events.JsonReporter` writes them. Other lines only go to the log.
     """
 
     name: str
@@ -36,7 +36,7 @@ class CommandTask:
 
 @dataclass(frozen=True)
 class End:
-    """How a task ended: its exit code (negative for a signal), its time [s], and the last `Result` it reported."""
+    """The end of a task: exit code (negative for a signal), duration [s], and the last `Result` that it reported."""
 
     code: int
     seconds: float
@@ -65,11 +65,11 @@ class _Running:
 
 
 class Queue:
-    """Runs tasks, as many at once as there are slots.
+    """Runs tasks in parallel, one per slot.
 
     Args:
-        tell: called with a task's name and each of its events; a task that dies without a `Failed` is given one.
-        ended: called with a task's name and how it ended.
+        tell: called with a task's name and each of its events, and with a `Failed` if a task dies without one.
+        ended: called with a task's name and its end.
     """
 
     def __init__(
@@ -82,12 +82,12 @@ class Queue:
     def run(self, take: Take, stop: threading.Event) -> None:
         """Run tasks until none is left.
 
-        Whatever else ends this call, such as a second interrupt, kills the tasks that run.
+        An exception in this call, such as a second interrupt, kills the running tasks.
 
         Args:
-            take: returns the next task, or None where none can begin now. It is called whenever a slot is free, and
-                again after each event, as long as any task runs.
-            stop: once it is set, no task begins, and those that run are asked to stop.
+            take: returns the next task, or None if none can start now. It is called when a slot is free, and again
+                after each event while any task runs.
+            stop: once set, no further task starts, and running tasks are asked to stop.
         """
         try:
             while True:
@@ -120,7 +120,7 @@ class Queue:
         threading.Thread(target=self._read, args=(task, process), daemon=True).start()
 
     def _read(self, task: CommandTask, process: subprocess.Popen[str]) -> None:
-        """Pass on what a process prints; in a thread of its own."""
+        """Forward the output of a process; runs in its own thread."""
         assert process.stdout is not None
         with open(task.log, "a", encoding="utf-8") as log:
             for line in process.stdout:
@@ -133,7 +133,7 @@ class Queue:
         self._heard.put((task.name, None))
 
     def _listen(self) -> None:
-        """Wait a moment for an event, and pass it on."""
+        """Wait briefly for an event, and forward it."""
         try:
             name, event = self._heard.get(timeout=LOOK)
         except queue.Empty:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The training of one garment of a list: what is left to do, and how it ended."""
+"""The training of one garment of a list: remaining work, and result."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class GarmentTraining:
 
     Attributes:
         state: "waiting", "finished", "stopped" or "failed".
-        code: exit code of the training; that of an interrupt where it did not begin.
-        error: why it failed.
-        plan: a sentence about what happens to it; empty for a training that begins from nothing.
+        code: exit code of the training; that of an interrupt if it did not start.
+        error: reason of a failure.
+        plan: message about how it will run; empty for a new training.
     """
 
     def __init__(self, entry: WardrobeEntry, folder: Path, request: str) -> None:
@@ -57,7 +57,7 @@ class GarmentTraining:
         return CommandTask(self.entry.name, [sys.executable, "-m", "ssilk_core", "train", *words], source, log)
 
     def end(self, end: End) -> None:
-        """Record how it ended."""
+        """Record the end of the training."""
         self.code = end.code if end.code >= 0 else EXIT_INTERNAL
         self.state = {EXIT_OK: "finished", EXIT_INTERRUPTED: "stopped"}.get(end.code, "failed")
         self.figures = {} if end.result is None else end.result.detail

@@ -293,7 +293,7 @@ DAMAGE = {
     "descriptors of no joint": (set_tensor("joints", [7]), "0 to 2"),
     "descriptors of joints in a table": (set_tensor("joints", [[0], [1], [2]]), "0 to 2"),
     "descriptors of part of a joint": (set_tensor("joints", [0.5]), "0 to 2"),
-    "proxies before their parents": (set_tensor("scene.rig.parents", [4, 1]), "before its parent"),
+    "proxies before their parents": (set_tensor("scene.rig.parents", [4, 1]), "precedes its parent"),
     "bind transforms that scale": (
         set_tensor("scene.rig.bind_transforms", np.diag([2.0, 2, 2, 1])[None].repeat(2, 0)),
         "scale",

@@ -15,7 +15,7 @@ from ssilk_core import kinematics
 from ssilk_core.assets import Character, Motion, Skeleton
 from ssilk_core.demo.motions import GESTURES, MOTIONS, build_motion, chain, demo_shot, mirrored, training_motions
 from ssilk_core.demo.motions_biped import Biped
-from ssilk_core.demo.motions_curves import bump, ease, keyed, ramp, travel
+from ssilk_core.demo.motions_curves import bump, ease, keyframes, ramp, travel
 from ssilk_core.demo.motions_gait import WALK, locomotion
 from ssilk_core.errors import SsilkError
 
@@ -239,4 +239,4 @@ def test_curves_against_their_definitions() -> None:
     assert travel(10.0, 10.0, 2.0) == pytest.approx(8.0)
     assert travel(5.0, 10.0, 2.0) == pytest.approx(4.0)
     time = np.array([0.0, 1.0, 2.0, 3.0, 9.0])
-    assert np.allclose(keyed(time, (1.0, 5.0), (2.0, -1.0), (3.0, 2.0)), [5.0, 5.0, -1.0, 2.0, 2.0])
+    assert np.allclose(keyframes(time, (1.0, 5.0), (2.0, -1.0), (3.0, 2.0)), [5.0, 5.0, -1.0, 2.0, 2.0])

@@ -21,13 +21,13 @@ from ssilk_core.kinematics import deform, resample, sample_motion
 from ssilk_core.reduction import ModelSize, Reducer
 from ssilk_core.runtime import Player
 from ssilk_core.sampling import sample_pose
-from ssilk_core.trade.judging import judged
+from ssilk_core.trade.collision_cost import measure_collisions
 from ssilk_core.trade.measure import VariantMeter
-from ssilk_core.trade.played import Played
 from ssilk_core.trade.plot import trade_panels
 from ssilk_core.trade.point import TradePoint, front
+from ssilk_core.trade.shot_method import ShotMethod
 from ssilk_core.trade.sweep import Results, sweep
-from ssilk_core.trade.table import judging_table, table
+from ssilk_core.trade.table import collision_table, table
 from ssilk_core.trade.variants import PRECISIONS, variants
 
 FPS = 30.0
@@ -123,14 +123,14 @@ def test_errors_are_distances_and_speeds_from_the_whole_model(meter, bench, poin
 def test_collisions_are_told_with_any_body(meter, scene):
     fabric = replace(FABRICS["silk"], margin=0.2)  # as wide as the gap between the toy's garment and its body
     dressed = EvaluationScene(scene, fabric, FPS, torch.device("cpu"))
-    surface, points, few = judged(dressed, meter.take_set, meter.whole)
+    surface, points, few = measure_collisions(dressed, meter.take_set, meter.whole)
     body = dressed.body.pose(meter.take_set.character(0, range(50)))
     met, nearest = dressed.contacts.distances(meter.whole.vertices(0, range(50)), body)
     assert surface.inside == pytest.approx(float((nearest < 0).double().mean()))
     assert surface.collision == pytest.approx(float(dressed.energy.collision_at(met).mean()))
     assert surface.vertices == points.vertices == scene.character.merged_body().mesh.vertex_count
     assert few.vertices == -(-points.vertices // 4) and few.collision != points.collision
-    assert len(judging_table([surface, points, few]).splitlines()) == 5
+    assert len(collision_table([surface, points, few]).splitlines()) == 5
 
 
 def test_what_costs_less_is_seen_to_cost_less(points):
@@ -147,7 +147,7 @@ def test_what_costs_less_is_seen_to_cost_less(points):
 def test_between_frames_of_a_shot_poses_are_interpolated(meter, bench, model):
     reducer, dressed, take_set = bench
     motion = take_set.takes[0].motion
-    slow = Played("slow", reducer.player, dressed, take_set, fps=10.0).shown(motion)
+    slow = ShotMethod("slow", reducer.player, dressed, take_set, fps=10.0).unrefined(motion)
     np.testing.assert_allclose(slow[::3], every_frame(reducer, motion)[::3], atol=1e-5)  # frames of the shot
     shot, at = resample(motion, 10.0, cover=True), np.array([1 / 3])
     pose = sample_pose(next(iter(reducer.player.play(motion).poses())), np.array([3.0, 6.0]))
@@ -200,7 +200,7 @@ def test_a_sweep_that_was_stopped_goes_on(meter, points, tmp_path, monkeypatch):
 @pytest.mark.parametrize("text", ["", "[]", '{"asked": 1}', '{"asked": {}, "points": [{"model": "m"}]}'])
 def test_files_that_hold_something_else_are_refused(tmp_path, text):
     (tmp_path / "other.json").write_text(text)
-    with pytest.raises(SsilkError, match=r"other.json: not figures of 'ssilk trade'"):
+    with pytest.raises(SsilkError, match=r"other.json: not results of 'ssilk trade'"):
         Results(tmp_path / "other.json", {}).resume(lambda event: None)
 
 

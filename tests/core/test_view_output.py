@@ -13,7 +13,7 @@ from PIL import Image
 from ssilk_core.errors import SsilkError
 from ssilk_core.view import output
 from ssilk_core.view.output import write_film, write_image
-from ssilk_core.view.panels import GAP, captioned, compare, contact_sheet
+from ssilk_core.view.panels import GAP, add_captions, compare, contact_sheet
 
 
 def pictures(count: int, shape=(48, 64, 3)):
@@ -115,8 +115,8 @@ def test_a_contact_sheet_puts_its_images_in_rows():
 
 def test_captions_stand_in_their_corners():
     lbs = np.full((120, 160, 3), 200, dtype=np.uint8)
-    changed = (captioned(lbs, top="linear blend skinning") != lbs).any(axis=2)
+    changed = (add_captions(lbs, top="linear blend skinning") != lbs).any(axis=2)
     assert changed[:30].any() and not changed[40:].any()
-    changed = (captioned(lbs, bottom="1.25 s") != lbs).any(axis=2)
+    changed = (add_captions(lbs, bottom="1.25 s") != lbs).any(axis=2)
     assert changed[90:].any() and not changed[:80].any()
     assert (lbs == 200).all()

@@ -81,7 +81,7 @@ def test_the_shadow_falls_where_the_lamp_is_hidden():
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     rays = camera.directions(x, y, WIDTH, HEIGHT)
     floor = camera.position - camera.position[1] / rays[..., 1:2] * rays
-    key = Lighting.beside(camera).key
+    key = Lighting.for_camera(camera).key
     apart = np.linalg.norm(np.cross(centre - floor, key), axis=-1)  # from the ball's centre to the ray at the lamp
     seen = (rays[..., 1] < 0) & (np.linalg.norm(np.cross(centre - camera.position, rays), axis=-1) > 1.1 * radius)
     penumbra = 1.2 * LAMP_RADIUS * centre[1] / key[1]
@@ -92,7 +92,7 @@ def test_the_shadow_falls_where_the_lamp_is_hidden():
 
 
 def test_surfaces_cast_shadows_on_each_other():
-    key = Lighting.beside(AHEAD).key
+    key = Lighting.for_camera(AHEAD).key
     alone = render([sheet(GREY)], AHEAD, WIDTH, HEIGHT, ground=FAR_BELOW)
     # A ball outside the picture, between the middle of the sheet and the lamp.
     shaded = render([sheet(GREY), ball(8 * key, 0.6)], AHEAD, WIDTH, HEIGHT, ground=FAR_BELOW)

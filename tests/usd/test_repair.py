@@ -197,7 +197,7 @@ def test_units_are_stated(tmp_path):
     write_with_units(path, tmp_path / "out.usda", StageUnits(1.0, "Z"))
     after = stage_facts(tmp_path / "out.usda")
     assert after.meters_authored and after.axis_authored and after.units == StageUnits(1.0, "Z")
-    with pytest.raises(SsilkError, match=r"out\.obj: the suffix is '\.obj'; it is one of"):
+    with pytest.raises(SsilkError, match=r"out\.obj: the suffix is '\.obj'; it must be one of"):
         write_with_units(path, tmp_path / "out.obj", StageUnits())
 
 

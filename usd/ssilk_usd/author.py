@@ -78,7 +78,7 @@ def define_asset(
 
 
 def prim_names(paths: Sequence[str]) -> list[str]:
-    """Return a valid and unique prim name for each path, made from the path's last part."""
+    """Return a valid and unique prim name for each path, based on its last element."""
     names: list[str] = []
     for path in paths:
         word = re.search(r"\w+", path.rsplit("/", 1)[-1])
@@ -100,7 +100,7 @@ def _define_animation(stage: Usd.Stage, path: Sdf.Path, joints: Sequence[str], s
 
 
 def _bind_root(root: UsdSkel.Root, skeleton: UsdSkel.Skeleton, animation: Sdf.Path) -> None:
-    """Make the SkelRoot the component that the stage is about, and bind skeleton and animation to it."""
+    """Make the SkelRoot the default prim and a component, and bind skeleton and animation to it."""
     prim = root.GetPrim()
     prim.GetStage().SetDefaultPrim(prim)
     Usd.ModelAPI(prim).SetKind(Kind.Tokens.component)
@@ -139,14 +139,14 @@ def define_skeleton(
 
 
 def _rest_transforms(skeleton: Skeleton, binds: Floats, parents: Ints, units: StageUnits) -> Floats:
-    """Joint to parent at rest in the stage's units: as authored for the character, as bound for the proxies."""
+    """Return joint-to-parent rest transforms in stage units; those of proxies follow from their bind transforms."""
     proxies = local_transforms(binds, parents)[skeleton.joint_count :]
     world = world_transforms(np.concatenate([skeleton.rest_transforms, proxies]), parents)
     return local_transforms(units.transforms_from_core(world), parents)
 
 
 def matrix_array(transforms: Floats) -> Vt.Matrix4dArray:
-    """Return column-vector transforms (N, 4, 4) as USD holds them, for row vectors."""
+    """Convert column-vector transforms (N, 4, 4) to USD's row-vector matrices."""
     return Vt.Matrix4dArray.FromNumpy(np.ascontiguousarray(np.swapaxes(transforms, -1, -2), dtype=np.float64))
 
 
@@ -172,7 +172,7 @@ def extent_array(low: Floats, high: Floats) -> Vt.Vec3fArray:
 
 
 def mark_garment(prim: Usd.Prim, classes: Ints | None, proxies: Sequence[str] | None) -> None:
-    """Author a garment's vertex classes and the joint paths of its proxies; neither where it is None."""
+    """Author a garment's vertex classes and the joint paths of its proxies, each unless None."""
     if classes is not None:
         _author_rows(prim, CLASS, classes[:, None].astype(np.int32))
     if proxies is not None:
@@ -180,20 +180,20 @@ def mark_garment(prim: Usd.Prim, classes: Ints | None, proxies: Sequence[str] | 
 
 
 def keep_lbs_skin(prim: Usd.Prim, skin: SkinWeights, joints: Sequence[str]) -> None:
-    """Author a garment's weights over the character's joints alone, in addition to those of its rig."""
+    """Author a garment's LBS weights over the character's joints, in addition to those of its rig."""
     _author_names(prim, LBS_SKIN[2], joints)
     for name, rows in zip(LBS_SKIN[:2], sorted_influences(skin)):
         _author_rows(prim, name, rows)
 
 
 def _author_names(prim: Usd.Prim, name: str, names: Sequence[str]) -> None:
-    """Author a list of names that does not vary over time."""
+    """Author a uniform list of names."""
     attribute = prim.CreateAttribute(name, Sdf.ValueTypeNames.TokenArray, False, Sdf.VariabilityUniform)
     attribute.Set(Vt.TokenArray(list(names)))
 
 
 def _author_rows(prim: Usd.Prim, name: str, rows: np.ndarray) -> None:
-    """Author a vertex primvar of whole numbers or floats, shape (V, elementSize)."""
+    """Author a vertex primvar of integers or floats, shape (V, elementSize)."""
     whole = np.issubdtype(rows.dtype, np.integer)
     kind = Sdf.ValueTypeNames.IntArray if whole else Sdf.ValueTypeNames.FloatArray
     array = (Vt.IntArray if whole else Vt.FloatArray).FromNumpy(np.ascontiguousarray(rows).reshape(-1))
@@ -204,7 +204,7 @@ def _author_rows(prim: Usd.Prim, name: str, rows: np.ndarray) -> None:
 
 
 def bind_skin(mesh: UsdGeom.Mesh, skin: SkinWeights, skeleton: UsdSkel.Skeleton) -> None:
-    """Bind a mesh to a skeleton; influences sorted by weight, padded with zeros, of sum one in float32."""
+    """Bind a mesh to a skeleton; influences are sorted, padded with zeros, and sum to one in float32."""
     indices, weights = sorted_influences(skin)
     binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
     binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
@@ -225,7 +225,7 @@ def sorted_influences(skin: SkinWeights) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _define_blendshapes(mesh: UsdGeom.Mesh, names: Sequence[str], offsets: Floats, units: StageUnits) -> None:
-    """Define blendshapes beneath a bound mesh, storing only the rows that move; offsets [m], shape (K, V, 3)."""
+    """Define blendshapes below a bound mesh, with only the nonzero rows of their offsets [m], shape (K, V, 3)."""
     if not names:
         return
     binding, path = UsdSkel.BindingAPI(mesh), mesh.GetPath()

@@ -29,7 +29,7 @@ _SEVERITIES = {
 
 
 def check_shot(path: str | Path) -> list[ShotFinding]:
-    """Return what is wrong with a shot: UsdValidation's findings, then our own; empty when nothing is.
+    """Return the findings about a shot: those of UsdValidation, then those of our checks; empty if it is valid.
 
     Extents are compared with the skinned points only where nothing else is wrong.
 
@@ -53,7 +53,7 @@ def _validate(stage: Usd.Stage) -> Iterator[ShotFinding]:
 
 
 def _check_stage(stage: Usd.Stage) -> Iterator[ShotFinding]:
-    """Check default prim, kind, rates, units and frame range, and that there is one SkelRoot."""
+    """Check the default prim, kind, rates, units and frame range, and that there is exactly one SkelRoot."""
     top, root = stage.GetPseudoRoot(), stage.GetDefaultPrim()
     yield from error_unless(root, top, "there is no default prim")
     if root:
@@ -102,7 +102,7 @@ def _check_binding(prim: Usd.Prim) -> Iterator[ShotFinding]:
 
 
 def _check_extents(shot: Shot) -> Iterator[ShotFinding]:
-    """Check that the SkelRoot's extent holds everything skinned, at each frame."""
+    """Check that the SkelRoot's extent contains everything skinned at each frame."""
     root = next(prim for prim in Usd.PrimRange(shot.stage.GetPseudoRoot(), PRIMS) if prim.IsA(UsdSkel.Root))
     within = [mesh.path.startswith(f"{root.GetPath()}/") for mesh in shot.meshes]
     extent = UsdGeom.Boundable(root).GetExtentAttr()

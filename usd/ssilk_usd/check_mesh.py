@@ -74,7 +74,7 @@ def _check_weights(prim: Usd.Prim, indices: np.ndarray, weights: np.ndarray) -> 
 
 
 def check_blendshapes(prim: Usd.Prim, animated: Sequence[str]) -> Iterator[ShotFinding]:
-    """Check a mesh's blendshapes against its targets, its points and the names that the animation knows."""
+    """Check a mesh's blendshapes against its targets, its points and the names in the animation."""
     binding = UsdSkel.BindingAPI(prim)
     names = list(binding.GetBlendShapesAttr().Get() or [])
     targets = binding.GetBlendShapeTargetsRel().GetTargets()

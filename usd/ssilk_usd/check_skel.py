@@ -14,7 +14,7 @@ UNIT_TOLERANCE = 1e-3  # of quaternions
 
 
 def check_skeleton(prim: Usd.Prim) -> Iterator[ShotFinding]:
-    """Check joints, bind and rest transforms of a Skeleton."""
+    """Check the joints, bind transforms and rest transforms of a Skeleton."""
     skeleton = UsdSkel.Skeleton(prim)
     joints = list(skeleton.GetJointsAttr().Get() or [])
     yield from error_unless(joints, prim, "it has no joints")
@@ -47,7 +47,7 @@ def check_animation(prim: Usd.Prim, joints: Sequence[str], frames: Sequence[floa
 
 
 def check_samples(attribute: Usd.Attribute, length: int, frames: Sequence[float]) -> Iterator[ShotFinding]:
-    """Check that an array has a value at each frame, or one for all time, and one length at all samples."""
+    """Check that an array has a value at each frame, or one default value, and the same length at all samples."""
     prim, name, times = attribute.GetPrim(), attribute.GetName(), attribute.GetTimeSamples()
     yield from error_unless(attribute.HasAuthoredValue(), prim, f"{name} has no value")
     missing = np.setdiff1d(frames, times) if times else ()
@@ -59,7 +59,7 @@ def check_samples(attribute: Usd.Attribute, length: int, frames: Sequence[float]
 
 
 def _samples(attribute: Usd.Attribute) -> Iterator[tuple[float | str, Sequence]]:
-    """Yield each time sample and its value, or the value for all time."""
+    """Yield each time sample with its value, or the default value."""
     for time in attribute.GetTimeSamples():
         yield time, attribute.Get(time)
     if not attribute.GetTimeSamples() and attribute.HasAuthoredValue():

@@ -26,14 +26,14 @@ ZIP_HEADER, EXTRA_HEADER, EXTRA_FIELD, ALIGNMENT = 30, 4, 0x1986, 64  # bytes, a
 
 
 def need_layer_suffix(out: str | Path) -> None:
-    """Raise `SsilkError` unless a name ends as a USD layer's does."""
+    """Raise `SsilkError` unless a name has the suffix of a USD layer."""
     suffix, allowed = Path(out).suffix, ", ".join(LAYER_SUFFIXES)
     if suffix not in LAYER_SUFFIXES:
-        fail(str(out), f"the suffix is '{suffix}'", f"it is one of {allowed}")
+        fail(str(out), f"the suffix is '{suffix}'", f"it must be one of {allowed}")
 
 
 def new_stage(path: Path, units: StageUnits) -> Usd.Stage:
-    """Return a stage on a new layer at `path`, in some units; without a session layer, which would hold nothing."""
+    """Create a stage on a new layer at `path` with these units, without a session layer."""
     stage = Usd.Stage.Open(Sdf.Layer.CreateNew(str(path)), None)
     UsdGeom.SetStageMetersPerUnit(stage, units.meters_per_unit)
     UsdGeom.SetStageUpAxis(stage, units.up_axis)
@@ -41,7 +41,7 @@ def new_stage(path: Path, units: StageUnits) -> Usd.Stage:
 
 
 def save(layer: Sdf.Layer, name: str | Path) -> None:
-    """Write what is pending in a layer to its file; `name` is what messages call it."""
+    """Write pending changes of a layer to its file; messages call it `name`."""
     try:
         layer.Save()
     except Tf.ErrorException as error:
@@ -53,7 +53,7 @@ def export(layer: Sdf.Layer, out: str | Path) -> None:
     """Write a layer in the format of the file's suffix.
 
     Raises:
-        SsilkError: another suffix than .usdc, .usd or .usda, or the file cannot be written.
+        SsilkError: the suffix is not .usdc, .usd or .usda, or the file cannot be written.
     """
     need_layer_suffix(out)
     with replacing(out) as temporary:
@@ -65,7 +65,7 @@ def export(layer: Sdf.Layer, out: str | Path) -> None:
 
 @contextmanager
 def packaged(out: str | Path) -> Iterator[Path]:
-    """Yield a layer to write: `out` itself, or one beside it that is then packed into it where it ends in .usdz.
+    """Yield the path of a layer to write: `out`, or for .usdz a temporary layer that is then packed into `out`.
 
     Raises:
         OSError: the package cannot be written.

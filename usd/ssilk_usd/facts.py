@@ -17,7 +17,7 @@ from .units import StageUnits
 
 @dataclass(frozen=True)
 class StageFacts:
-    """A stage's units as read, and which of them it states itself."""
+    """A stage's units, and which of them are authored."""
 
     path: str
     units: StageUnits

@@ -40,7 +40,7 @@ FRAMES_PER_SAVE = 128  # of points: 5 MB in memory for a garment of 3,000 vertic
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the files of one garment in one shot lie; `garment` is the name of its prim as well."""
+    """Paths of the files of one garment in one shot; `garment` is also the name of its prim."""
 
     folder: Path
     garment: str
@@ -69,7 +69,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class WrittenAsset:
-    """An asset on disk: the paths of its prims, and changes that may break layers above."""
+    """An asset on disk: the paths of its prims, and changes that may break stronger layers."""
 
     asset: Asset
     changes: tuple[str, ...]
@@ -106,7 +106,7 @@ def write_asset(
 
 
 def _facts_before(layout: Layout) -> tuple[AssetFacts | None, tuple[str, ...]]:
-    """Return the facts of the asset that is there; None without one, or, with a sentence, where it is damaged."""
+    """Return the facts of an existing asset; None if there is none, or if it is damaged, with a message."""
     if not (layout.asset.is_file() and layout.geometry.is_file()):
         return None, ()
     try:
@@ -116,7 +116,7 @@ def _facts_before(layout: Layout) -> tuple[AssetFacts | None, tuple[str, ...]]:
 
 
 def _extent(stage: Usd.Stage, asset: Asset) -> Vt.Vec3fArray:
-    """Return the bounds of every mesh at its bind pose."""
+    """Return the bounds of each mesh at its bind pose."""
     meshes = [prim for prim in stage.GetPrimAtPath(asset.root).GetChildren() if prim.IsA(UsdGeom.Mesh)]
     corners = np.stack([np.array(UsdGeom.Mesh(prim).GetExtentAttr().Get()) for prim in meshes])
     return extent_array(corners[:, 0].min(axis=0), corners[:, 1].max(axis=0))
@@ -260,7 +260,7 @@ def write_points(
 
 
 def write_stage(garments: Sequence[Layout]) -> None:
-    """Write the stage of a shot, each garment by reference, over all frames of theirs; same bytes are left alone."""
+    """Write the stage of a shot, which references each garment and spans all frames; keep an identical file."""
     layout = garments[0]
     stages = [open_stage(garment.animation) for garment in garments]
     layers = [stage.GetRootLayer() for stage in stages]

@@ -57,7 +57,7 @@ class Shot:
         everything = Usd.PrimRange(self.stage.GetPseudoRoot(), PRIMS)
         prims = [prim for prim in everything if prim.IsA(UsdGeom.Mesh) and is_drawn(prim)]
         if not prims:
-            fail(self.name, "no visible mesh", "a shot holds at least one", "check that this is the right file")
+            fail(self.name, "no visible mesh", "a shot has at least one", "check that this is the right file")
         self._players = [
             _SkinnedMesh(prim, *skinned[prim]) if prim in skinned else _PlainMesh(prim) for prim in prims
         ]
@@ -72,7 +72,7 @@ class Shot:
 
     @property
     def is_skinned(self) -> bool:
-        """Return whether joints move the garment; else its points are stored."""
+        """Return whether joints move the garment; otherwise its points are stored."""
         garment = self._garment()
         return isinstance(garment, _SkinnedMesh) and bool(garment.skinning.HasJointInfluences())
 
@@ -141,7 +141,7 @@ class _SkinnedMesh:
 
 
 class _PlainMesh:
-    """A mesh whose points are stored, one set or one for each time sample."""
+    """A mesh with stored points, static or time-sampled."""
 
     def __init__(self, prim: Usd.Prim) -> None:
         self.prim, self.samples = prim, UsdGeom.Mesh(prim).GetPointsAttr()
@@ -157,13 +157,13 @@ def _describe(prim: Usd.Prim) -> ShotMesh:
 
 
 def frame_times(stage: Usd.Stage, per_frame: int = 1) -> tuple[float, ...]:
-    """Return the time codes of a stage's frames, one apart, or of so many samples in each frame."""
+    """Return the time codes of a stage's frames, or of several samples per frame."""
     start, end = _time_range(stage)
     return tuple(start + index / per_frame for index in range(int(np.floor((end - start) * per_frame + 1e-6)) + 1))
 
 
 def _time_range(stage: Usd.Stage) -> tuple[float, float]:
-    """First and last time code: as authored, else of the samples of whatever is animated."""
+    """Return the first and last time code: as authored, or else of all animated attributes."""
     if stage.HasAuthoredTimeCodeRange():
         return stage.GetStartTimeCode(), stage.GetEndTimeCode()
     prims = Usd.PrimRange(stage.GetPseudoRoot(), PRIMS)

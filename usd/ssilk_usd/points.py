@@ -73,7 +73,7 @@ class PointCache:
         self.layer.SetTimeSample(self.garment.AppendProperty(name), time, value)
 
     def save(self) -> None:
-        """Write what is pending to the file."""
+        """Write pending changes to the file."""
         save(self.layer, self.path)
         self.unsaved_count = 0
 
@@ -124,13 +124,13 @@ def point_cache(
         yield cache
         missing = int((~cache.written).sum())
         if missing:
-            fail(str(path), f"{missing} of {motion.frame_count} frames have no points", "each needs some")
+            fail(str(path), f"{missing} of {motion.frame_count} frames have no points", "every frame needs points")
         cache.save()
         del cache  # the file is closed before it is renamed
 
 
 def _unbind(stage: Usd.Stage) -> Sdf.Path:
-    """Take the garment of a shot off its skeleton, and return its path."""
+    """Unbind the garment of a shot from its skeleton, and return its path."""
     prim = next(p for p in Usd.PrimRange(stage.GetPseudoRoot(), PRIMS) if p.IsA(UsdGeom.Mesh) and is_garment(p))
     prim.RemoveAPI(UsdSkel.BindingAPI)
     for name in prim.GetAuthoredPropertyNames():

@@ -28,7 +28,7 @@ _LOCKS = {
 
 
 def repair_lock(source: str | Path, garment: str | None = None) -> str:
-    """Return why vertices and faces of a garment cannot be removed; empty if they can."""
+    """Return the reason why a garment's vertices and faces cannot be removed; empty if they can."""
     stage = open_stage(source)  # prims live only as long as their stage
     prim = find_garment(stage, garment)
     held = [words for name, words in _LOCKS.items() if _has(prim, name)]
@@ -38,7 +38,7 @@ def repair_lock(source: str | Path, garment: str | None = None) -> str:
 
 @needs_whole_files
 def write_with_units(source: str | Path, out: str | Path, units: StageUnits) -> None:
-    """Write a flattened copy of a file that states its units.
+    """Write a flattened copy of a file with authored units.
 
     Raises:
         SsilkError: the output cannot be written.

@@ -57,7 +57,7 @@ def _reshape(mesh: UsdGeom.Mesh, repair: MeshRepair) -> None:
 
 
 def _authored_corners(mesh: UsdGeom.Mesh, repair: MeshRepair) -> Ints:
-    """Return the authored corners of the new faces; of left-handed meshes, `read_mesh` turns all faces over."""
+    """Return the authored corners of the new faces; `read_mesh` reverses all faces of left-handed meshes."""
     if mesh.GetOrientationAttr().Get() != UsdGeom.Tokens.leftHanded:
         return repair.corners
     counts = np.array(value(mesh.GetPrim(), "faceVertexCounts"), dtype=np.int64)
@@ -65,7 +65,7 @@ def _authored_corners(mesh: UsdGeom.Mesh, repair: MeshRepair) -> Ints:
 
 
 def _backwards(counts: Ints) -> Ints:
-    """Return the order of corners in which every face runs backwards, shape (sum of counts,)."""
+    """Return the order of corners that reverses every face, shape (sum of counts,)."""
     first, last = np.cumsum(counts) - counts, np.cumsum(counts) - 1
     return np.repeat(first + last, counts) - np.arange(counts.sum())
 
@@ -103,7 +103,7 @@ def _rewrite_normals(mesh: UsdGeom.Mesh, repair: MeshRepair, old: Ints, corners:
 
 
 def _turned(interpolation: str, repair: MeshRepair, vertices: Ints) -> np.ndarray:
-    """Return which new rows of an interpolation lie on faces that are turned over."""
+    """Return which new rows of an interpolation belong to flipped faces."""
     if interpolation == UsdGeom.Tokens.uniform:
         return repair.flipped
     on_corners = np.repeat(repair.flipped, repair.counts)
@@ -113,7 +113,7 @@ def _turned(interpolation: str, repair: MeshRepair, vertices: Ints) -> np.ndarra
 
 
 def _rows_of(interpolation: str, split: bool, repair: MeshRepair, old: Ints, corners: Ints) -> Ints | None:
-    """Return which old rows become the new ones; None for one value for all."""
+    """Return the old row of each new row; None for constant interpolation."""
     if split:
         return old[corners]
     if interpolation in _VERTEX:
@@ -139,7 +139,7 @@ def _check_length(attribute: Usd.Attribute, size: int, interpolation: str, repai
 
 
 def _torn(attribute: Usd.Attribute, size: int, repair: MeshRepair) -> bool:
-    """Return whether vertices that merge differ in any value of an attribute with `size` values for each."""
+    """Return whether merged vertices differ in an attribute with `size` values per vertex."""
     old = np.flatnonzero(repair.new_index >= 0)
     into = repair.kept[repair.new_index[old]]
     values = [np.array(attribute.Get(time)) for time in _times(attribute)]
@@ -158,13 +158,13 @@ def _rewrite_subsets(prim: Usd.Prim, repair: MeshRepair) -> None:
 
 
 def _renumbered(indices: Ints, onto: Ints) -> Ints:
-    """Return the indices that stay, in their new numbers."""
+    """Return the remaining indices, renumbered."""
     new = onto[indices]
     return np.unique(new[new >= 0])
 
 
 def _taken(values: np.ndarray, rows: Ints, size: int = 1) -> np.ndarray:
-    """Return the rows of flat values that hold `size` values for each row."""
+    """Return the selected rows of a flat array with `size` values per row."""
     item = values.shape[1:]
     return values.reshape(-1, size, *item)[rows].reshape(-1, *item)
 
@@ -174,7 +174,7 @@ def _times(attribute: Usd.Attribute) -> list[Usd.TimeCode | float]:
 
 
 def _change(attribute: Usd.Attribute, change: Change) -> None:
-    """Replace the value of an attribute and each of its time samples, where it has any."""
+    """Replace the value of an attribute and each of its time samples."""
     if attribute.HasAuthoredValue():
         for time in _times(attribute):
             _set(attribute, change(np.array(attribute.Get(time))), time)

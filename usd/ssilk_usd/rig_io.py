@@ -120,13 +120,13 @@ def _find(prim: Usd.Prim, skel: SkelSource) -> list[int]:
 
 
 def _proxy_parents(skel: SkelSource, mine: Ints, skeleton: Skeleton, where: str) -> Ints:
-    """Return the combined index of each proxy's parent."""
+    """Return the combined joint index of each proxy's parent."""
     own = {int(index): skeleton.joint_count + proxy for proxy, index in enumerate(mine)}
     parents = []
     for index in mine:
         above = int(skel.parents[index])
         if above < 0:
-            fail(where, f"proxy '{skel.joints[index]}' has no parent", "proxies hang from joints", "reparent it")
+            fail(where, f"proxy '{skel.joints[index]}' has no parent", "its parent must be a joint", "reparent it")
         combined = own.get(above, -1)
         if combined < 0 and not skel.owners[above]:
             combined = match_joints((skel.joints[above],), skeleton.joint_names)[0]
@@ -144,7 +144,7 @@ def _proxy_parents(skel: SkelSource, mine: Ints, skeleton: Skeleton, where: str)
 def _rig_skin(
     prim: Usd.Prim, skel: SkelSource, skeleton: Skeleton, names: tuple[str, ...], report: Reporter
 ) -> SkinWeights:
-    """Return the garment's weights over the combined joints; rows whose joints are all gone take LBS weights."""
+    """Return the garment's weights over the combined joints; rows without remaining joints take LBS weights."""
     influences = read_influences(prim, skel.joints)
     if influences is None:
         fail(
@@ -176,7 +176,7 @@ def _padded(array: Floats | Ints, width: int) -> Floats | Ints:
 
 
 def _flattened(source: str | Path, scene: Scene) -> Sdf.Layer:
-    """Return the source as one layer, with no instance where the rig will be written."""
+    """Flatten the source into one layer, without instances on the paths of the rig."""
     stage = open_stage(source)
     stage.SetEditTarget(stage.GetSessionLayer())
     for path in (_prim_path(scene.character.path), _prim_path(scene.garment.mesh.path)):
@@ -217,7 +217,7 @@ def _place_garment(
 
 
 def _copy_garment(stage: Usd.Stage, skel: SkelSource, garment: Garment) -> UsdGeom.Mesh:
-    """Define the garment beneath the SkelRoot in the stage's bind space, in place of an older copy."""
+    """Define the garment below the SkelRoot in the stage's bind space; replace an older copy."""
     name = prim_names([garment.mesh.path])[0]
     older = stage.GetPrimAtPath(skel.root.GetPath().AppendChild(name))
     if older and is_garment(older):
@@ -239,7 +239,7 @@ def _move(stage: Usd.Stage, prim: Usd.Prim, to: Sdf.Path) -> Usd.Prim:
 
 
 def _append_proxies(skel: SkelSource, garment: str, scene: Scene) -> tuple[str, ...]:
-    """Append the rig's joints to the skeleton, drop older ones of the garment; return the proxies' joint paths."""
+    """Replace the garment's joints in the skeleton by those of the rig; return the proxies' joint paths."""
     kept = [index for index, owner in enumerate(skel.owners) if owner != garment]
     if len(kept) < len(skel.joints):
         _keep_joint_names(skel)
@@ -268,7 +268,7 @@ def _keep_joint_names(skel: SkelSource) -> None:
 
 
 def _proxy_paths(scene: Scene, taken: tuple[str, ...]) -> tuple[str, ...]:
-    """Return joint paths that spell the proxies' parents, with leaf names that no other joint has."""
+    """Return joint paths that match the proxies' parents, with unique leaf names."""
     leaves = {leaf(name) for name in taken}
     paths = list(scene.character.skeleton.joint_names)
     for name, parent in zip(scene.rig.joint_names, scene.rig.parents):

@@ -99,7 +99,7 @@ class Samples:
         return result
 
     def _extents(self, pose: GarmentPose, world: Floats) -> Iterator[Vt.Vec3fArray]:
-        """Yield, for each frame, the bounds of everything skinned."""
+        """Yield the bounds of everything skinned at each frame."""
         scene = self.deformer.scene
         matrices = skinning_matrices(world, scene.bind_transforms)
         bodies = [body.mesh.points for body in self.asset.bodies]
@@ -111,7 +111,7 @@ class Samples:
             yield extent_array(posed.min(axis=0), posed.max(axis=0))
 
     def save(self, name: str | Path) -> None:
-        """Write what is pending to the file; `name` is what messages call it."""
+        """Write pending changes to the file; messages call it `name`."""
         save(self.layer, name)
         self.unsaved_count = 0
 
@@ -121,7 +121,7 @@ def _vectors(points: Floats) -> Iterator[Gf.Vec3d]:
 
 
 def _stored_translations(deformer: Deformer, motion: Motion, lean: bool) -> Floats:
-    """Return the character's local translations [m], shape (F, J, 3), without the path of its root where `lean`."""
+    """Return the character's local translations [m], without the path of its root if `lean`, shape (F, J, 3)."""
     translations = np.array(motion.translations)
     if lean:
         roots = np.flatnonzero(deformer.scene.character.skeleton.parents < 0)
@@ -130,7 +130,7 @@ def _stored_translations(deformer: Deformer, motion: Motion, lean: bool) -> Floa
 
 
 def root_path(deformer: Deformer, motion: Motion) -> Floats:
-    """Return how far the first root joint is from its rest [m] at each frame, shape (F, 3)."""
+    """Return the offset of the first root joint from its rest position at each frame [m], shape (F, 3)."""
     return motion.translations[:, 0] - deformer.scene.character.skeleton.rest_transforms[0, :3, 3]
 
 
@@ -155,7 +155,7 @@ def kept_joints(deformer: Deformer, motion: Motion, lean: bool) -> Ints:
 
 
 class _Surface:
-    """Skinning weights as UsdSkel's compiled skinning takes them."""
+    """Skinning weights in the form that UsdSkel's compiled skinning needs."""
 
     def __init__(self, skin: SkinWeights) -> None:
         indices, weights = sorted_influences(skin)

@@ -28,7 +28,7 @@ FRAMES_PER_SAVE = 4096
 
 @dataclass(frozen=True)
 class ShotSummary:
-    """What a written shot holds; `start` and `end` are time codes."""
+    """Summary of a written shot; `start` and `end` are time codes."""
 
     path: str
     frame_count: int
@@ -117,13 +117,13 @@ class TimeSpan:
 
     @classmethod
     def of(cls, motion: Motion, start: float, samples_per_frame: int = 1) -> TimeSpan:
-        """Return the span of a motion with so many samples for each frame."""
+        """Return the span of a motion with this number of samples per frame."""
         step = 1 / samples_per_frame
         return cls(start, start + step * (motion.frame_count - 1), step, motion.fps * step)
 
 
 def summary(path: str | Path, deformer: Deformer, motion: Motion, span: TimeSpan, shapes: int) -> ShotSummary:
-    """Return what a written shot holds."""
+    """Return the summary of a written shot."""
     return ShotSummary(
         path=str(path),
         frame_count=motion.frame_count,
@@ -137,7 +137,7 @@ def summary(path: str | Path, deformer: Deformer, motion: Motion, span: TimeSpan
 
 
 def set_metadata(stage: Usd.Stage, span: TimeSpan, units: StageUnits) -> None:
-    """Author units, axis, rate and range of a stage."""
+    """Author the units, up axis, frame rate and frame range of a stage."""
     UsdGeom.SetStageMetersPerUnit(stage, units.meters_per_unit)
     UsdGeom.SetStageUpAxis(stage, units.up_axis)
     stage.SetTimeCodesPerSecond(span.fps)
@@ -147,7 +147,7 @@ def set_metadata(stage: Usd.Stage, span: TimeSpan, units: StageUnits) -> None:
 
 
 def set_visibility(stage: Usd.Stage, root: Sdf.Path, span: TimeSpan, hidden: Sequence[tuple[int, bool]]) -> None:
-    """Author from which frames on a prim is hidden or seen; nothing where it is seen throughout."""
+    """Author the frames at which a prim becomes hidden or visible; nothing if it is always visible."""
     if not hidden:
         return
     visibility = UsdGeom.Imageable(stage.GetPrimAtPath(root)).CreateVisibilityAttr()
@@ -166,7 +166,7 @@ def _metadata(value: object) -> object:
 
 
 def _checked(poses: Iterable[GarmentPose], deformer: Deformer, motion: Motion) -> Iterator[GarmentPose]:
-    """Yield the chunks; raise unless they are of this garment and cover the motion in order."""
+    """Yield the chunks; raise `SsilkError` unless they belong to this garment and cover the motion in order."""
     where, count = deformer.scene.garment.mesh.path, 0
     for pose in poses:
         if pose.start != count:

@@ -32,7 +32,7 @@ class SkinnedGarment:
 
     @classmethod
     def of(cls, deformer: Deformer) -> SkinnedGarment:
-        """Return a trained garment with the blendshapes that a shot of it would have, and those that move nothing."""
+        """Return a trained garment with all blendshapes, including those without effect, which a shot omits."""
         scene = deformer.scene
         names = tuple(map(shape_name, range(deformer.shape_count)))
         points = scene.garment.mesh.points

@@ -17,7 +17,7 @@ _held: dict[str, list[Sdf.Spec]] = {}
 
 
 def free_when_closed(layers: Iterable[Sdf.Layer]) -> None:
-    """Hold all specs of layers until these are closed; let go of those of layers that are."""
+    """Keep all specs of layers alive until the layers are closed; release those of closed layers."""
     for name in [name for name, specs in _held.items() if specs[-1].expired]:
         del _held[name]
     for layer in layers:
@@ -27,7 +27,7 @@ def free_when_closed(layers: Iterable[Sdf.Layer]) -> None:
 
 
 def _specs(layer: Sdf.Layer) -> list[Sdf.Spec]:
-    """Return what is at each path of a layer, its root last; targets of relationships are no specs of their own."""
+    """Return the spec at each path of a layer, the root last; relationship targets have no specs."""
     paths: list[Sdf.Path] = []
     layer.Traverse(Sdf.Path.absoluteRootPath, paths.append)
     return [layer.GetObjectAtPath(path) for path in paths if not path.IsTargetPath()]

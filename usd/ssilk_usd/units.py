@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Units and axes of a stage, and the way to metres, y up, and back.
+"""Convert between the units and axes of a stage and metres, y up.
 
-A change of units and axes turns and scales the world, not the joints: of a hierarchy of joints it changes the
-roots' transforms, and of all other joints the length of their translations alone.
+A change of units and axes rotates and scales the world, not the joints. In a joint hierarchy it changes the
+transforms of the roots, and only the lengths of the translations of all other joints.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class StageUnits:
 
     @classmethod
     def of(cls, stage: Usd.Stage) -> StageUnits:
-        """Read the units of `stage`; unauthored ones are USD's own (centimetres, y up).
+        """Read the units of `stage`; USD's defaults are centimetres and y up.
 
         Raises:
             SsilkError: metersPerUnit is not positive, or the up axis is neither Y nor Z.
@@ -45,7 +45,7 @@ class StageUnits:
             fail(where, f"metersPerUnit is {meters}", "it must be positive", "set it in the file")
         axis = str(UsdGeom.GetStageUpAxis(stage))
         if axis not in _TO_Y_UP:
-            fail(where, f"upAxis is '{axis}'", "it is Y or Z", "set it in the file")
+            fail(where, f"upAxis is '{axis}'", "it must be Y or Z", "set it in the file")
         return cls(meters, axis)
 
     @property
@@ -55,28 +55,28 @@ class StageUnits:
 
     @property
     def matrix(self) -> Floats:
-        """Stage world to core world [m], shape (4, 4), column vectors."""
+        """Transform from stage world to core world [m], column vectors, shape (4, 4)."""
         matrix = np.eye(4)
         matrix[:3, :3] = self.rotation * self.meters_per_unit
         return matrix
 
     def points_to_core(self, points: Floats) -> Floats:
-        """Return points in the stage's units and axes, shape (..., 3), in metres, y up."""
+        """Convert points (..., 3) from the stage's units and axes to metres, y up."""
         return np.asarray(points) @ self.rotation.T * self.meters_per_unit
 
     def transforms_to_core(self, transforms: Floats) -> Floats:
-        """Return rigid joint-to-world transforms of the stage, shape (..., 4, 4), in metres, y up."""
+        """Convert rigid joint-to-world transforms (..., 4, 4) from the stage's units and axes to metres, y up."""
         return self.matrix @ transforms @ scaling(1 / self.meters_per_unit)
 
     def points_from_core(self, points: Floats) -> Floats:
-        """Return points or offsets [m], y up, shape (..., 3), in the stage's units and axes."""
+        """Convert points or offsets (..., 3) from metres, y up, to the stage's units and axes."""
         return np.asarray(points) @ self.rotation / self.meters_per_unit
 
     def transforms_from_core(self, transforms: Floats) -> Floats:
-        """Return rigid joint-to-world transforms [m], y up, shape (..., 4, 4), in the stage's units and axes."""
+        """Convert rigid joint-to-world transforms (..., 4, 4) from metres, y up, to the stage's units and axes."""
         return np.linalg.inv(self.matrix) @ transforms @ scaling(self.meters_per_unit)
 
 
 def scaling(factor: float) -> Floats:
-    """Return the matrix (4, 4) that scales by one factor."""
+    """Return the uniform scaling matrix, shape (4, 4)."""
     return np.diag([factor, factor, factor, 1.0])

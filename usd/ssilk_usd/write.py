@@ -57,7 +57,7 @@ def write_scene(
 
 
 def write_garment(path: str | Path, mesh: Mesh) -> None:
-    """Write a mesh as a file of its own, in metres and y up."""
+    """Write a mesh to its own file, in metres and y up."""
     with replacing(path) as temporary:
         stage = new_stage(temporary, CORE_UNITS)
         prim = define_mesh(stage, _root_path(mesh.path), mesh, CORE_UNITS).GetPrim()
@@ -67,7 +67,7 @@ def write_garment(path: str | Path, mesh: Mesh) -> None:
 
 
 def write_motion(path: str | Path, motion: Motion, skeleton: Skeleton) -> None:
-    """Write a motion as a SkelAnimation of its own, one time code for each frame, in metres and y up."""
+    """Write a motion as a SkelAnimation in its own file, one time code per frame, in metres and y up."""
     with replacing(path) as temporary:
         stage = new_stage(temporary, CORE_UNITS)
         animation = UsdSkel.Animation.Define(stage, "/Animation")

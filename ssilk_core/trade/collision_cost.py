@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cost of detecting collisions with the body as a surface or as points, all of them or a subset.
+"""Measure the cost of collision detection against the body as a surface, as vertices, or as some of its vertices.
 
-Training, refining and measuring pay it; playing needs no body.
+Training, refinement and measurement have this cost. Playback needs no body.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from ..collision import CollisionBody, Contacts
 from ..evaluation.methods import EvaluationScene, Method, TakeSet
 
 BODIES = (("triangles", True, 1), ("vertices", False, 1), ("every 4th vertex", False, 4))
-FRAMES = 64  # that are measured
+FRAMES = 64  # number of measured frames
 
 
 @dataclass(frozen=True)
-class Judged:
-    """Collisions with one representation of the body.
+class CollisionCost:
+    """Cost and result of collision detection with one representation of the body.
 
     Attributes:
         body: name of the representation.
-        vertices: of the body.
-        milliseconds: of a frame, to pose the body and compute the garment's distances from it.
-        collision: energy [J]; tight vertices collide with the part of the body under them.
+        vertices: number of vertices of the body.
+        milliseconds: time per frame to pose the body and compute the garment's distances from it [ms].
+        collision: collision energy [J]; tight vertices collide with the part of the body under them.
         inside: share of the garment's vertices inside any part of the body.
     """
 
@@ -39,8 +39,8 @@ class Judged:
 
 
 @torch.no_grad()
-def judged(dressed: EvaluationScene, take_set: TakeSet, method: Method) -> list[Judged]:
-    """Measure the first frames of the first take with each representation of the body."""
+def measure_collisions(dressed: EvaluationScene, take_set: TakeSet, method: Method) -> list[CollisionCost]:
+    """Measure collision detection in the first frames of the first take with each representation of the body."""
     frames = range(min(FRAMES, take_set.takes[0].frame_count))
     x, character = method.vertices(0, frames), take_set.character(0, frames)
     whole, joints = dressed.scene.character.merged_body(), dressed.scene.character.skeleton.joint_count
@@ -53,5 +53,5 @@ def judged(dressed: EvaluationScene, take_set: TakeSet, method: Method) -> list[
         met, nearest = contacts.distances(x, body.pose(character, surface=surface))
         inside, energy = float((nearest < 0).double().mean()), float(dressed.energy.collision_at(met).mean())
         each = 1000 * (time.perf_counter() - begun) / len(frames)
-        found.append(Judged(name, len(chosen), each, energy, inside))
+        found.append(CollisionCost(name, len(chosen), each, energy, inside))
     return found

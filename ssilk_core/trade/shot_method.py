@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Garments as readers play them, for the evaluation: at any frame rate, refined or not."""
+"""Evaluation method for garments as USD readers play their shots, at any frame rate, with or without refinement."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from ..runtime.character import character_matrices
 from ..runtime.skinning import skin_garment
 from ..sampling import sample_pose
 
-POSED = 64  # frames whose vertices are computed together
+BLOCK_FRAMES = 64  # frames in each block of vertex computations
 
 
-class Played:
-    """A `Method` of the evaluation: a garment over takes, as a reader of its shot shows it.
+class ShotMethod:
+    """A `Method` of the evaluation that plays a garment's shots of the takes as a USD reader does.
 
     Args:
-        fps: of the shot. Poses of garment and character are interpolated between its frames, as USD does.
-        refine: solver iterations in each frame; 0 leaves the solver out.
+        fps: frame rate of the shot [1/s]. Poses of garment and character are interpolated between frames, as in USD.
+        refine: solver iterations per frame; 0 for no refinement.
     """
 
     def __init__(
@@ -40,12 +40,12 @@ class Played:
         self._points = lru_cache(1)(self._take)
 
     def vertices(self, take: int, frames: range) -> Tensor:
-        """Return positions [m] of consecutive frames of a take about its first root, shape (V, 3, N)."""
+        """Return positions in consecutive frames of a take, relative to its first root position [m], (V, 3, N)."""
         points = self._points(take)[frames.start : frames.stop]
         return torch.as_tensor(points.transpose(1, 2, 0).copy(), dtype=torch.float32, device=self.dressed.device)
 
     def still(self, take: int, frames: range) -> None:
-        """Return None: only moving shots are compared."""
+        """Return None, because only moving shots are compared."""
 
     def _take(self, take: int) -> Floats:
         """Return all frames of a take, shape (N, V, 3)."""
@@ -55,14 +55,14 @@ class Played:
         return points - motion.translations[0, 0]
 
     def _finished(self, motion: Motion) -> Floats:
-        """Return the vertices at the frames of a motion [m], refined if asked for, shape (N, V, 3)."""
-        points, dressed = self.shown(motion), self.dressed
+        """Return the vertices at the frames of a motion, with refinement if enabled [m], shape (N, V, 3)."""
+        points, dressed = self.unrefined(motion), self.dressed
         if self.options is None:
             return points
         refiner = Refiner(dressed.scene, dressed.fabric, self.options, fps=motion.fps, device=dressed.device)
         return np.stack([frame.points for frame in refiner.frames(motion, points)])
 
-    def shown(self, motion: Motion) -> Floats:
+    def unrefined(self, motion: Motion) -> Floats:
         """Return the vertices at the frames of a motion before refinement [m], shape (N, V, 3)."""
         if abs(self.fps - motion.fps) < 1e-6:
             playback = self.player.play(motion)
@@ -72,8 +72,8 @@ class Played:
         frames = np.minimum(np.arange(shot.frame_count) * steps, last)
         stored = sample_pose(_joined(self.player.play(motion).poses()), frames)
         at = np.arange(motion.frame_count) / steps
-        starts = range(0, motion.frame_count, POSED)
-        return np.concatenate([self._between(shot, stored, at[start : start + POSED]) for start in starts])
+        starts = range(0, motion.frame_count, BLOCK_FRAMES)
+        return np.concatenate([self._between(shot, stored, at[start : start + BLOCK_FRAMES]) for start in starts])
 
     def _between(self, shot: Motion, stored: GarmentPose, at: Floats) -> Floats:
         """Return the vertices at fractional frames (N,) of a shot."""
