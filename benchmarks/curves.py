@@ -24,6 +24,7 @@ from ssilk_core.energy import TERMS
 from ssilk_core.errors import fail
 from ssilk_core.events import format_seconds
 from ssilk_core.training.curve import curve_path
+from ssilk_core.training.verdict import curve_lbs
 
 PANELS = ("total", *TERMS, "collisions")
 SHOWN = 0.9  # share of the values that a panel shows: the first ones would flatten all others
@@ -74,7 +75,7 @@ def read_run(text: str) -> Run:
         fail(str(path), "the curve has no point yet", "one validation at least is needed", "train longer")
     values = {key: np.array([point["validation"][key] for point in points]) for key in PANELS}
     iterations, seconds = (np.array([point[key] for point in points]) for key in ("iteration", "seconds"))
-    return Run(name or Path(model).stem, iterations, seconds, values, document["lbs"]["total"])
+    return Run(name or Path(model).stem, iterations, seconds, values, curve_lbs(document)["total"])
 
 
 def bounds(values: Iterable[np.ndarray]) -> tuple[float, float]:

@@ -29,7 +29,7 @@ HEADER = ("garment, clip", "iterations", "looks back on", "s a frame", "energy [
 
 
 @dataclass(frozen=True, eq=False)
-class Take:
+class NetworkTake:
     """A garment over a stretch of a clip, as the network has it."""
 
     subject: Subject
@@ -38,7 +38,7 @@ class Take:
     points: Floats
 
     @classmethod
-    def of(cls, subject: Subject, clip: Motion, frames: int) -> Take:
+    def of(cls, subject: Subject, clip: Motion, frames: int) -> NetworkTake:
         """Roll the network over the first frames of a clip."""
         motion = resample(clip, subject.file.config.fps).clip(0, frames)
         poses = list(garment_poses(subject.model, motion, motion.fps))
@@ -73,7 +73,7 @@ class Take:
         }
 
 
-def refined(take: Take, iterations: int, feedback: bool) -> dict[str, float]:
+def refined(take: NetworkTake, iterations: int, feedback: bool) -> dict[str, float]:
     """Return the figures of one budget; none for no iterations."""
     if not iterations:
         return {"seconds": 0.0, **take.measured(take.points)}
@@ -83,7 +83,7 @@ def refined(take: Take, iterations: int, feedback: bool) -> dict[str, float]:
     return {"seconds": seconds, **take.measured(points), **take.put_back(points)}
 
 
-def simulated(take: Take) -> dict[str, float]:
+def simulated(take: NetworkTake) -> dict[str, float]:
     """Return the figures of the simulator."""
     dressed, begun = take.subject.dressed, time.perf_counter()
     options = SimulationOptions(fps=take.motion.fps)
@@ -101,7 +101,7 @@ def row(where: str, iterations: str, past: str, found: dict[str, float]) -> list
     return [*line, *lost, f"{found['joints energy']:.4f}", f"{found['joints inside']:.2%}"]
 
 
-def measure(take: Take, where: str, budgets: list[int]) -> tuple[list[list[str]], dict[str, Any]]:
+def measure(take: NetworkTake, where: str, budgets: list[int]) -> tuple[list[list[str]], dict[str, Any]]:
     """Return the rows of one garment and clip, and their figures."""
     rows, figures = [], {}
     for iterations in budgets:
@@ -124,7 +124,7 @@ def main() -> None:
     for path in options.models:
         subject = open_subject(path, options.stage, options.device)
         for clip in options.clips:
-            take = Take.of(subject, clip_of(options, clip, subject), options.frames)
+            take = NetworkTake.of(subject, clip_of(options, clip, subject), options.frames)
             more, measured[f"{subject.name} {clip}"] = measure(take, f"{subject.name}, {clip}", options.budgets)
             rows += more
     write_results(options, table(HEADER, rows), measured)

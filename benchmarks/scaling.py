@@ -113,7 +113,7 @@ def work_in_team(options: argparse.Namespace) -> None:
 
 
 @dataclass
-class Case:
+class ScalingCase:
     """One kind of step at one batch: times [s], those of the exchange by itself, whether parameters stayed alike."""
 
     step: str
@@ -144,22 +144,22 @@ def plan(options: argparse.Namespace) -> dict[int, list[str]]:
     return {processes: [*dict.fromkeys(batches)] for processes, batches in sorted(found.items())}
 
 
-def measure_all(options: argparse.Namespace) -> list[Case]:
+def measure_all(options: argparse.Namespace) -> list[ScalingCase]:
     """Return all cases, with what was found in all rounds."""
-    measured: dict[tuple[str, int, str], Case] = {}
+    measured: dict[tuple[str, int, str], ScalingCase] = {}
     for number in range(options.rounds):
         for processes, batches in plan(options).items():
             for batch, found in launched(processes, batches).items():
                 print(f"round {number + 1}, processes {processes}, batch {batch}: {found}", flush=True)
                 for step, times in found["times"].items():
-                    case = measured.setdefault((step, processes, batch), Case(step, processes, batch))
+                    case = measured.setdefault((step, processes, batch), ScalingCase(step, processes, batch))
                     case.times += times
                     case.exchanges.append(found["exchange"])
                     case.alike &= found["alike"]
     return sorted(measured.values(), key=lambda case: case.step)
 
 
-def rows(measured: list[Case]) -> Iterator[list[object]]:
+def rows(measured: list[ScalingCase]) -> Iterator[list[object]]:
     """Yield a line of the table for each case; speed-ups are over one process with the whole batch."""
     medians = {(case.step, case.processes, case.batch): np.median(case.times) for case in measured}
     for case in measured:

@@ -38,6 +38,8 @@ def stage(target: Path, wheel: Path | None = None) -> None:
     listed = ", ".join(f'"./{WHEELS}/{path.name}"' for path in sorted(wheels.iterdir()))
     manifest = target / MANIFEST
     own, table, rest = manifest.read_text(encoding="utf-8").partition("\n[permissions]\n")
+    if not table:
+        raise SystemExit(f"{manifest}: no table [permissions]; the list of wheels goes before it.")
     manifest.write_text(f"{own}wheels = [{listed}]\n{table}{rest}", encoding="utf-8")
 
 
@@ -66,10 +68,12 @@ def copy_project(target: Path) -> None:
 def stamp_version(project: Path) -> None:
     """Add a hash of its sources to a project's version: Blender keeps an installed wheel of the same version."""
     digest, settings = hashlib.sha256(), project / "pyproject.toml"
-    for path in sorted(project.rglob("*.py")):
-        digest.update(path.read_bytes())
+    for path in sorted(path for path in project.rglob("*") if path.is_file()):
+        digest.update(str(path.relative_to(project)).encode() + path.read_bytes())
     text = settings.read_text(encoding="utf-8")
-    stamped = re.sub(r'^version = "(.+)"$', rf'version = "\1+g{digest.hexdigest()[:8]}"', text, count=1, flags=re.M)
+    stamped = re.sub(
+        r'^version = "(.+)"$', rf'version = "\1+src.{digest.hexdigest()[:8]}"', text, count=1, flags=re.M
+    )
     settings.write_text(stamped, encoding="utf-8")
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ssilk_core.events import format_seconds
-from ssilk_core.training.verdict import ADVICE, NO_DYNAMICS
+from ssilk_core.training.verdict import ADVICE, NO_DYNAMICS, curve_lbs
 
 from .jobs import JobState
 
@@ -40,7 +40,7 @@ def findings(state: JobState, curve: Mapping[str, Any], *, moves: bool) -> list[
     """
     if not curve.get("points"):
         return [("No validation yet: too early to say what is being learned", False)] if state.alive else []
-    score, lbs = curve["points"][-1]["validation"], curve["lbs"]
+    score, lbs = curve["points"][-1]["validation"], curve_lbs(curve)
     share = 1 - score["total"] / lbs["total"]
     found = [
         (f"{abs(share):.1%} {'less' if share >= 0 else 'more'} energy than linear blend skinning", share < 0),

@@ -154,7 +154,7 @@ def _moved_back(armature: bpy.types.Object, joints: Joints, skinned: SkinnedGarm
     away = np.abs(back @ now - trained)
     away[:, :3, 3] /= _size(skinned)
     worst = int(away.max(axis=(1, 2)).argmax())
-    if away[worst].max() > TURNED:
+    if not away[worst].max() <= TURNED:
         raise SetupError(
             f"The bone '{joints.names[there[worst]]}' of '{armature.name}' was moved since the garment was trained; "
             "undo that, or train again."
@@ -171,7 +171,7 @@ def _need_same_points(garment: bpy.types.Object, to_trained: np.ndarray, skinned
             "again."
         )
     away = np.abs(rest_points(garment) @ to_trained[:3, :3].T + to_trained[:3, 3] - skinned.points).max()
-    if away > MOVED * _size(skinned):
+    if not away <= MOVED * _size(skinned):
         raise SetupError(
             f"'{garment.name}' has another shape or place at rest than when it was trained; undo that, or train "
             "again."

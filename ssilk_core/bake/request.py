@@ -70,6 +70,10 @@ class BakeRequest:
             fail("--samples-per-frame", found, f"1 to {MAX_SAMPLES_PER_FRAME} are allowed")
         if not 0 <= self.pre_roll <= MAX_PRE_ROLL:
             fail("--pre-roll", f"{self.pre_roll:g} seconds", f"0 to {MAX_PRE_ROLL:g} are allowed")
+        if self.fps is not None and not 0 < self.fps < float("inf"):
+            fail("--fps", f"{self.fps:g} frames per second", "a positive rate is needed")
+        if self.refine < 0 or int(self.refine) != self.refine:
+            fail("--refine", f"{self.refine:g} iterations", "a whole number, zero or more, is needed")
         if self.refined_output not in REFINED_OUTPUTS:
             fail("--refined-output", f"'{self.refined_output}'", f"it is one of {', '.join(REFINED_OUTPUTS)}")
         if self.lbs and self.keep:

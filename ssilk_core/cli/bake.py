@@ -8,11 +8,11 @@ stage for each shot. Layers that are current are left alone.
 A file that fails verification (exit code 3) is not kept, and an older file of its name stays as it was. --lbs bakes
 the same garments under linear blend skinning, to compare with.
 
---refine continues from the network with the simulator's solver in every frame, for hero shots: it moves vertices out
-of the body and adds wrinkles that no blendshape has. The garment is then written as time-sampled points, bound to no
-skeleton; in a folder of layers, it is the variant "points" of "deformation", beside the joints.
---refined-output joints fits joints and blendshapes to the refined points instead. That loses much of the refinement;
-the result says how much.
+--refine continues from the network with the simulator's solver in every frame, for hero shots: it lowers the energy
+of each frame and adds wrinkles that no blendshape has. The garment is then written as time-sampled points, bound to
+no skeleton; in a folder of layers, it is the variant "points" of "deformation", beside the joints. --refined-output
+joints fits joints and blendshapes to the refined points instead. That loses much of the refinement; the result says
+how much.
 """
 
 from __future__ import annotations

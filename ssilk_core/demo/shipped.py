@@ -32,7 +32,12 @@ def open_shipped(garment: str, mesh: Mesh) -> ModelFile:
     """
     path = shipped_path(garment)
     if not path.is_file():
-        fail(str(path), "the shipped model is missing", "it comes with the package", "install the package again")
+        fail(
+            str(path),
+            "the shipped model is missing",
+            "it comes with the project's own wheel and clone, not with the Blender extension's",
+            "install ssilk from a clone",
+        )
     file = load_model(path)
     need_trained_on(mesh, file, path)
     return file

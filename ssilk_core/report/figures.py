@@ -13,6 +13,7 @@ from ..errors import SsilkError, fail
 from ..stress.outcome import HEADER, CaseOutcome
 from ..trade.plot import trade_panels
 from ..trade.point import TradePoint
+from ..training.verdict import curve_lbs
 from .page import Section, facts, flattened, table
 from .terms import SHARE
 
@@ -95,7 +96,7 @@ def records(found: Sequence[Mapping[str, Any]]) -> str:
 
 def learning(document: Mapping[str, Any]) -> Section:
     """Return the section of the learning curve that a training writes beside its model."""
-    points, lbs = document["points"], document["lbs"]
+    points, lbs = document["points"], curve_lbs(document)
     best = min(range(len(points)), key=lambda number: points[number]["validation"]["total"])
     times = [point["seconds"] for point in points]
     totals, inside = ([point["validation"][name] for point in points] for name in ("total", "collisions"))

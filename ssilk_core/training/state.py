@@ -25,6 +25,7 @@ from .validation import Score
 
 Tensors = dict[str, Tensor]
 
+FORMAT = 2  # of training states; settings had other names in format 1
 SAMPLER_PREFIX = "sampler."  # of the sampler's tensors; all others are parameters or optimiser state
 
 
@@ -122,7 +123,7 @@ def load_state(path: Path, asked: dict[str, Any]) -> tuple[RunState, Tensors]:
         )
     with _name_damage(path):
         with safe_open(path, "pt") as stream:
-            state = _state_of(json.loads((stream.metadata() or {})["ssilk_state"]))
+            state = _state_of(path, json.loads((stream.metadata() or {})["ssilk_state"]))
             tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
         _need_same(path, asked, state.asked)
     return state, tensors
@@ -172,10 +173,17 @@ def _group(tensors: Tensors, prefix: str) -> Tensors:
 def _document(state: RunState) -> dict[str, Any]:
     document = asdict(state)
     document["undone"] = document.pop("skipped")
-    return document
+    return {"format": FORMAT, **document}
 
 
-def _state_of(document: dict[str, Any]) -> RunState:
+def _state_of(path: Path, document: dict[str, Any]) -> RunState:
+    if (found := document.pop("format", 1)) != FORMAT:
+        fail(
+            str(path),
+            f"a training state of format {found}",
+            f"this version resumes format {FORMAT}",
+            "finish it with the version that began it, or train without --resume",
+        )
     best, lowered, curve = document.pop("best"), document.pop("lowered"), document.pop("curve")
     return RunState(
         skipped=document.pop("undone"),

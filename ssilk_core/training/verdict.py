@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import isfinite
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..events import Message
 
@@ -14,6 +15,12 @@ if TYPE_CHECKING:
 # A rollout closer than this to the quasi-static state of each pose has learned no dynamics.
 NO_DYNAMICS = 2e-3  # [m]
 ADVICE = "nothing dynamic is being learned: train longer, or check that the motions move"
+
+
+def curve_lbs(curve: Mapping[str, Any]) -> Mapping[str, float]:
+    """Return the score of linear blend skinning in a learning curve; earlier versions named it "plain"."""
+    found: Mapping[str, float] = curve["plain"] if "plain" in curve else curve["lbs"]
+    return found
 
 
 def non_finite_terms(score: Score) -> list[str]:

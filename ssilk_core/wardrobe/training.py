@@ -7,7 +7,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from ..errors import EXIT_INTERNAL, EXIT_INTERRUPTED, EXIT_OK
+from ..errors import EXIT_INTERNAL, EXIT_INTERRUPTED, EXIT_OK, fail
 from ..files import sha256
 from ..work_record import WorkRecord, read_record, write_record
 from .listing import WardrobeEntry
@@ -34,12 +34,21 @@ class GarmentTraining:
         finished = self.record.is_done(folder)
         self.resumed = same and not finished and self._file(".resume.safetensors").exists()
         self.state, self.code = ("finished", EXIT_OK) if finished else ("waiting", EXIT_INTERRUPTED)
-        self.seconds = float(self.record.detail.get("seconds", 0.0))
+        detail = self.record.detail
+        if not isinstance(detail.get("seconds", 0.0), int | float) or (finished and "result" not in detail):
+            fail(
+                str(self._file(".json")),
+                "this record of finished work is damaged",
+                "it says what need not be done again",
+                "delete it to train again",
+            )
+        self.seconds = float(detail.get("seconds", 0.0))
         self.figures, self.error = self.record.detail["result"] if finished else {}, ""
         self.plan = (
             "finished before; skipped" if finished
             else "resumes where it stopped" if self.resumed
             else "its entry or inputs have changed; trains again" if before is not None and not same
+            else "its model was changed or removed; trains again" if before is not None and before.files
             else ""
         )  # fmt: skip
 

@@ -256,3 +256,12 @@ def test_loading_and_playing_load_no_torch(model, motion, tmp_path: Path):
     subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True)
     expected = expected_vertices(model, motion)[70]
     np.testing.assert_allclose(np.load(tmp_path / "points.npy"), expected, rtol=0, atol=1e-5)
+
+
+def test_other_schemes_are_refused(scene, toy_model, monkeypatch):
+    from benchmarks.helpers.paper_schemes import PAPER_SCHEMES
+    from ssilk_core.schemes import SCHEMES
+
+    monkeypatch.setitem(SCHEMES, "verlet", PAPER_SCHEMES["verlet"])
+    with pytest.raises(SsilkError, match="the model's scheme is 'verlet'; the runtime plays 'spring_verlet'"):
+        player_of(toy_model(scene, scale=0.1, scheme="verlet"))
