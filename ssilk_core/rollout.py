@@ -132,7 +132,7 @@ def _replace_diverged(states: Tensor) -> tuple[Tensor, Tensor]:
 def _roll_and_recover(
     model: GarmentModel, states: list[Tensor], rest: Tensor, pose: Tensor, diverged: Tensor
 ) -> tuple[list[Tensor], Tensor]:
-    """Roll over the frames of `rest` and `pose`; after a diverged state the garment rests, then goes on."""
+    """Roll over the frames of `rest` and `pose`; after a diverged state the garment rests, then continues."""
     done = 0
     while done < len(rest):
         rolled = model.roll(states, rest[done:], pose[done:])[len(states) :]
@@ -174,7 +174,7 @@ def garment_poses(
     """Yield what a shot stores, at `fps`, over a motion of any rate: the frames of `resample(motion, fps)`.
 
     The model rolls at its own rate; where the shot's differs, rotations are interpolated by slerp and weights by
-    lines between the two nearest steps. After a cut of the motion (a root that jumps) the garment starts anew from
+    lines between the two nearest steps. After a cut of the motion (a root that jumps) the garment restarts from
     the initialiser, `pre_roll` seconds before (see `roll`), and nothing is interpolated across it. `on_recovery` is
     told the shot's frames of which `roll_blocks` had to take the rest state.
     """

@@ -178,7 +178,7 @@ def baseline(scene: Scene, config: BaselineConfig, joints: Ints, seed: int = 0) 
     Args:
         scene: character, garment and rig.
         config: says which network.
-        joints: character joints in the descriptors, as `model.descriptors.descriptor_joints` gives them.
+        joints: character joints in the descriptors, as `ssilk_core.descriptors.descriptor_joints` gives them.
         seed: of the initial parameters.
     """
     with torch.random.fork_rng(devices=[]):

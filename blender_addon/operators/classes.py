@@ -67,7 +67,7 @@ class TakeUpPainting(ClassOperator, bpy.types.Operator):
 
 
 class ShowClasses(ClassOperator, bpy.types.Operator):
-    """Show classes as colours, made anew from the stored ones; in Solid shading, in this view"""
+    """Show classes as colours, made again from the stored ones; in Solid shading, in this view"""
 
     bl_idname = "ssilk.show_classes"
     bl_label = "Show Classes"

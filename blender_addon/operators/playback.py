@@ -54,7 +54,7 @@ class StopLive(LiveOperator, bpy.types.Operator):
 
 
 class RefreshLive(LiveOperator, bpy.types.Operator):
-    """Read what the armature does over the scene's frames anew: after edits, or when the frame range changed"""
+    """Read what the armature does over the scene's frames again: after edits, or when the frame range changed"""
 
     bl_idname = "ssilk.refresh_live"
     bl_label = "Read Motion Again"

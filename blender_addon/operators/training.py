@@ -111,7 +111,7 @@ class RemoveMotion(MotionOperator, bpy.types.Operator):
 
 
 class Train(tasks.OutsideOperator, bpy.types.Operator):
-    """Train the garment on the chosen motions, outside Blender: it goes on when Blender closes"""
+    """Train the garment on the chosen motions, outside Blender: it continues when Blender closes"""
 
     bl_idname = "ssilk.train"
     bl_label = "Train"

@@ -17,7 +17,7 @@ _pictures: bpy.utils.previews.ImagePreviewCollection | None = None
 
 
 def plot(name: str, version: object, lines: Sequence[np.ndarray]) -> int:
-    """Return the icon of a plot, which is drawn anew when `version` is another one."""
+    """Return the icon of a plot, which is drawn again when `version` is another one."""
     return _icon(name, version, lambda: picture(lines, SIZE))
 
 

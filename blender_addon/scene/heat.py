@@ -96,7 +96,7 @@ def showing(garment: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Iterat
 
 
 def show(garment: bpy.types.Object, measured: HeatMap, red: float) -> None:
-    """Colour a garment by what was measured, and anew at each frame from now on.
+    """Colour a garment by what was measured, and again at each frame from now on.
 
     Args:
         red: the value that is red, in metres or as a share.

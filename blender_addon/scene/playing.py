@@ -14,7 +14,7 @@ from ssilk_core.errors import SsilkError
 from .live import Live
 from .models import model_of
 
-PATIENCE = 0.3  # seconds after an edit before the motion is read anew
+PATIENCE = 0.3  # seconds after an edit before the motion is read again
 BETWEEN = 0.01  # seconds between two slices of reading, for the artist
 _played: dict[int, Live] = {}
 _reasons: dict[int, str] = {}
@@ -52,7 +52,7 @@ def stop(garment: bpy.types.Object) -> None:
 
 
 def refresh(garment: bpy.types.Object) -> None:
-    """Read the motion of a garment that is played anew."""
+    """Read the motion of a garment before it is played again."""
     _outdated.discard(garment.session_uid)
     _played[garment.session_uid].refresh()
     _read_soon(0.0)
@@ -146,7 +146,7 @@ def _frame_changed(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> No
 
 @persistent
 def _edited(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    """Read the motion anew when keys were edited; what else may move the armature is for the artist to say."""
+    """Read the motion again when keys were edited; what else may move the armature is for the artist to say."""
     if not _played or not any(isinstance(update.id, bpy.types.Action) for update in depsgraph.updates):
         return
     for uid, played in list(_played.items()):

@@ -35,7 +35,7 @@ class SampledTake:
     """A motion that is being sampled.
 
     Attributes:
-        worlds: joint to world of the frames that were sampled yet, rigid, in Blender's units, shape (J, 4, 4) each.
+        worlds: joint to world of the frames sampled so far, rigid, in Blender's units, shape (J, 4, 4) each.
         placements: object to world of the armature at these frames, shape (4, 4) each.
     """
 

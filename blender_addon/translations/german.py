@@ -139,7 +139,7 @@ WORDS = {
         "Die Klassen aller Kleidungsstücke in 3D-Ansichten darüberlegen, in jedem Modus; die Datei bleibt unberührt"
     ),
     "Show Classes": "Klassen zeigen",
-    "Show classes as colours, made anew from the stored ones; in Solid shading, in this view": (
+    "Show classes as colours, made again from the stored ones; in Solid shading, in this view": (
         "Klassen als Farben zeigen, neu aus den gespeicherten; in fester Schattierung, in dieser Ansicht"
     ),
     "Mirror Classes": "Klassen spiegeln",
@@ -230,7 +230,7 @@ WORDS = {
         "Ordner des Trainings dieses Kleidungsstücks, relativ zur Blend-Datei"
     ),
     "Train": "Trainieren",
-    "Train the garment on the chosen motions, outside Blender: it goes on when Blender closes": (
+    "Train the garment on the chosen motions, outside Blender: it continues when Blender closes": (
         "Das Kleidungsstück mit den gewählten Bewegungen außerhalb von Blender trainieren: läuft ohne Blender weiter"
     ),
     "Cancel Training": "Training beenden",
@@ -293,7 +293,7 @@ WORDS = {
         "Das Kleidungsstück nicht länger spielen; es bleibt wie in diesem Bild"
     ),
     "Read Motion Again": "Bewegung neu lesen",
-    "Read what the armature does over the scene's frames anew: after edits, or when the frame range changed": (
+    "Read what the armature does over the scene's frames again: after edits, or when the frame range changed": (
         "Neu lesen, was das Skelett über die Bilder der Szene tut: nach Änderungen, oder bei anderem Bildbereich"
     ),
     "Quality": "Qualität",

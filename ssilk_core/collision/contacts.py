@@ -115,21 +115,21 @@ class Contacts:
         gathered = no_contact(x)
         for group in self._groups:
             found = find(x.index_select(0, group.rows), body, group.blocks, group.patches)
-            for whole, part in zip(gathered, found, strict=True):
-                whole.index_copy_(0, group.rows, part)
+            for full, part in zip(gathered, found, strict=True):
+                full.index_copy_(0, group.rows, part)
         return gathered
 
     def distances(self, x: Tensor, body: PosedBody) -> tuple[Tensor, Tensor]:
         """Return signed distances of x (V, 3, N) [m] to these planes and to the whole body, both (V, N)."""
-        met = signed_distance_to_planes(x, *self.planes(x, body))
-        nearest = met.clone()
+        planes = signed_distance_to_planes(x, *self.planes(x, body))
+        nearest = planes.clone()
         for group in self._groups:
             if group.patches is not None:
                 part = x.index_select(0, group.rows)
                 nearest.index_copy_(
                     0, group.rows, signed_distance_to_planes(part, *nearest_planes(part, body, group.blocks))
                 )
-        return met, nearest
+        return planes, nearest
 
 
 def no_planes(x: Tensor) -> tuple[Tensor, Tensor]:

@@ -35,8 +35,8 @@ class SmoothedDistance:
         normal: gradients, shorter than 1 on creases, shape (V, 3, N).
         offset: normal . x - d [m], shape (V, N).
         curvature: approximate negative second derivatives, positive semi-definite [1/m]: of the smoothed crease
-            outside of the body, and of the distance to the nearest edge or corner inside, float32 of shape (V, 3, 3,
-            N).
+            outside of the body, and of the distance to the nearest edge or corner inside, float32,
+            shape (V, 3, 3, N).
     """
 
     normal: Tensor

@@ -54,7 +54,7 @@ class EvaluationOptions:
     """What is measured besides the energies.
 
     Attributes:
-        sequence: frames after which a clip starts anew, as in the paper (512); None for whole clips.
+        sequence: frames after which a clip restarts, as in the paper (512); None for whole clips.
         stops: stops in each clip after which poses are held; none for zero.
         hold: how long they are held [s].
         minimum: whether the simulator minimises the energy of held poses.

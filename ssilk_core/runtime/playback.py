@@ -45,7 +45,7 @@ class Block:
 class Playback:
     """A garment over a motion. The order in which frames are requested does not change any result.
 
-    After a cut in the motion the garment starts anew. At another rate than the model's, poses are interpolated
+    After a cut in the motion the garment restarts. At another rate than the model's, poses are interpolated
     between the two nearest steps, as in `rollout.garment_poses`. Negative frames count from the end; frames out of
     range raise `IndexError`.
 

@@ -29,9 +29,7 @@ from .incremental_potential import IncrementalPotential, StepInputs
 ARMIJO = 1e-4  # required decrease relative to the slope
 MAX_BACKTRACKS = 12
 REDUCTION = 0.1  # of the residual by each linear solve
-MAX_DISPLACEMENT = (
-    0.1  # of a vertex in one step, relative to the garment's size: stiff systems are solved inaccurately
-)
+MAX_DISPLACEMENT = 0.1  # of a vertex in one step, relative to the garment's size: a bound on inexact solutions
 SHORT_STEP = 0.25  # step length from which on obstructing vertices are fixed
 OBSTRUCTING = 0.1  # share of the predicted decrease that an obstructing vertex consumes
 EXACT_HESSIAN_BELOW = 2.0  # [g] of residual

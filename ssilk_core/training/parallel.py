@@ -100,9 +100,8 @@ class ProcessGroup:
         except RuntimeError as error:
             reason = str(error).partition("\n")[0].partition(". ")[0]
             raise SsilkError(
-                f"process {self.rank + 1} of {self.size}: the others cannot be reached ({reason}); read their "
-                "messages "
-                "for the cause, then train again with --resume."
+                f"process {self.rank + 1} of {self.size}: the others cannot be reached ({reason}); read "
+                "their messages for the cause, then train again with --resume."
             ) from error
 
 
@@ -127,8 +126,7 @@ def join_process_group(device: str) -> Iterator[tuple[ProcessGroup, str]]:
     group = ProcessGroup(dist.get_rank(), dist.get_world_size())
     yield group, str(own)
     # Not reached after an error, when the others may never arrive. Otherwise all leave together, because torchrun
-    # ends
-    # those that remain. Captured graphs must be freed before the communicator that they hold.
+    # ends those that remain. Captured graphs must be freed before the communicator that they hold.
     group.gather(None)
     gc.collect()
     dist.destroy_process_group()

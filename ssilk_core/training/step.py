@@ -77,7 +77,7 @@ class Stepper:
         self.ema_model = copy.deepcopy(model).requires_grad_(False)
         self.terms: dict[str, Tensor] = {}
         self.skipped = SkippedSteps(self.device)
-        # Tensors: a captured graph reads them anew in each replay.
+        # Tensors: each replay of a captured graph reads them.
         self._iteration = torch.zeros((), dtype=torch.int64, device=self.device)
         self._decay = torch.zeros((), device=self.device)
         self._graph: torch.cuda.CUDAGraph | None = None

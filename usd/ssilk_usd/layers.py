@@ -112,7 +112,7 @@ def _facts_before(layout: Layout) -> tuple[AssetFacts | None, tuple[str, ...]]:
     try:
         return asset_facts(layout.asset), ()
     except SsilkError as error:
-        return None, (f"what was there could not be read and is written anew ({str(error).rstrip('.')})",)
+        return None, (f"the file that was there could not be read and is replaced ({str(error).rstrip('.')})",)
 
 
 def _extent(stage: Usd.Stage, asset: Asset) -> Vt.Vec3fArray:
