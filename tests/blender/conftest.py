@@ -7,7 +7,7 @@ SSILK_PYTHON, else this one, else .venv of the repository.
 
 from __future__ import annotations
 
-import importlib.metadata
+import importlib.util
 import os
 import sys
 from collections.abc import Iterator
@@ -27,11 +27,7 @@ BONES = ("Hips", "Spine", "Head")
 @pytest.fixture(scope="session")
 def ssilk_python() -> str:
     """The path of a Python that has ssilk installed, with what `ssilk rig` needs."""
-    try:
-        importlib.metadata.version("ssilk")
-        here = [sys.executable]
-    except importlib.metadata.PackageNotFoundError:
-        here = []
+    here = [sys.executable] if importlib.util.find_spec("torch") else []
     candidates = [os.environ.get("SSILK_PYTHON", ""), *here, str(ROOT / ".venv" / "bin" / "python")]
     found = next((path for path in candidates if path and Path(path).exists()), None)
     if found is None:

@@ -225,8 +225,8 @@ def test_what_cannot_be_measured_is_said(bpy, dressed):
     assert not dressed.ssilk.heat and "SSILK Heat" not in dressed.data.color_attributes
 
 
-def test_plain_skinning_stands_beside_and_goes(ready, skirt, ssilk_python, tmp_path):
-    """The copy is what the model's plain weights give; nothing of it is left afterwards."""
+def test_linear_blend_skinning_stands_beside_and_goes(ready, skirt, ssilk_python, tmp_path):
+    """The copy is what the model's LBS weights give; nothing of it is left afterwards."""
     bpy = ready
     rig_and_animate(bpy, skirt)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "beside.blend"))
@@ -240,7 +240,7 @@ def test_plain_skinning_stands_beside_and_goes(ready, skirt, ssilk_python, tmp_p
     bpy.ops.ssilk.show_heat(kind="STRETCH")
     before = {kind: len(getattr(bpy.data, kind)) for kind in ("objects", "meshes", "collections", "shape_keys")}
     assert bpy.ops.ssilk.toggle_lbs() == {"FINISHED"}
-    copy = bpy.data.objects["Skirt plain"]
+    copy = bpy.data.objects["Skirt LBS"]
     assert not copy.ssilk.live and not copy.ssilk.heat and "SSILK Heat" not in copy.data.attributes
     assert not copy.data.color_attributes and "SSILK Classes" in skirt.data.color_attributes
     assert skirt.ssilk.live and skirt.ssilk.heat and "SSILK Heat" in skirt.data.attributes
@@ -251,8 +251,8 @@ def test_plain_skinning_stands_beside_and_goes(ready, skirt, ssilk_python, tmp_p
         if each.is_instance and each.object.type == "MESH"
     ]
     found -= [1.3 * max(skirt.dimensions[:2]), 0, 0]
-    plain = plainly_skinned(bpy, skirt)
-    assert np.abs(found - plain).max() < 1e-4
+    lbs = linearly_skinned(bpy, skirt)
+    assert np.abs(found - lbs).max() < 1e-4
     assert bpy.ops.ssilk.toggle_lbs() == {"FINISHED"}
     assert {kind: len(getattr(bpy.data, kind)) for kind in before} == before
 
@@ -262,8 +262,8 @@ def world_points(evaluated, world) -> np.ndarray:
     return points @ np.array(world)[:3, :3].T + np.array(world)[:3, 3]
 
 
-def plainly_skinned(bpy, skirt) -> np.ndarray:
-    """Skin by the model's plain weights and Blender's own pose matrices."""
+def linearly_skinned(bpy, skirt) -> np.ndarray:
+    """Skin by the model's LBS weights and Blender's own pose matrices."""
     from blender_addon.scene.models import model_of
     from ssilk_core.checkpoint import load_model
 
