@@ -206,11 +206,11 @@ def test_two_processes_write_the_same_bytes(copy, output):
     assert found[0] == found[1] and found[0]
 
 
-@pytest.mark.parametrize("name", [*TARGETS, "a target of the test"])
+@pytest.mark.parametrize("name", [*TARGETS, "target-of-the-test"])
 def test_targets_get_what_they_take_and_their_error_is_measured(copy, capsys, monkeypatch, name):
     """Each target, and one that somebody adds by one entry."""
     added = Target(influences=3, meters_per_unit=0.01, up_axis="Z", suffixes=(".usda",), about="centimetres, z up")
-    monkeypatch.setitem(TARGETS, "a target of the test", added)
+    monkeypatch.setitem(TARGETS, "target-of-the-test", added)
     target = TARGETS[name]
     output = f"new{target.suffixes[0]}"
     _, *events = said(capsys, f"--motion walk.usda --target {name} -o {output}")
