@@ -73,7 +73,7 @@ class BakeRequest:
         if self.fps is not None and not 0 < self.fps < float("inf"):
             fail("--fps", f"{self.fps:g} frames per second", "a positive rate is needed")
         if self.refine < 0 or int(self.refine) != self.refine:
-            fail("--refine", f"{self.refine:g} iterations", "a whole number, zero or more, is needed")
+            fail("--refine", f"{self.refine:g} iterations", "1 to 10000 are allowed, or 0 for none")
         if self.refined_output not in REFINED_OUTPUTS:
             fail("--refined-output", f"'{self.refined_output}'", f"it is one of {', '.join(REFINED_OUTPUTS)}")
         if self.lbs and self.keep:

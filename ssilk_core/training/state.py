@@ -177,7 +177,7 @@ def _document(state: RunState) -> dict[str, Any]:
 
 
 def _state_of(path: Path, document: dict[str, Any]) -> RunState:
-    if (found := document.pop("format", 1)) != FORMAT:
+    if (found := document.pop("format", 1 if "undone" in document else FORMAT)) != FORMAT:
         fail(
             str(path),
             f"a training state of format {found}",
