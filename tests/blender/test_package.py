@@ -83,7 +83,7 @@ def test_the_wheel_for_blender_is_built_without_the_demos_models(tmp_path):
     version, own = (
         tomllib.loads((root / "pyproject.toml").read_text())["project"]["version"] for root in (tmp_path, ROOT)
     )
-    assert re.fullmatch(rf"{re.escape(own)}\+g[0-9a-f]{{8}}", version)  # or Blender would keep an older wheel
+    assert re.fullmatch(rf"{re.escape(own)}\+src\.[0-9a-f]{{8}}", version)  # or Blender would keep an older wheel
 
 
 def test_the_manifest_says_what_the_code_says():
