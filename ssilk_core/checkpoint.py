@@ -60,6 +60,8 @@ RENAMED_SINCE_3 = {
 HEADER: dict[str, Any] = {
     "joint_names": (), "proxy_names": (), "paths": {}, "config": {}, "fabric": {}, "provenance": {},
 }  # fmt: skip
+# What a model's fabric was before contact acted on surfaces.
+FABRIC_OF_VERTICES = {"contact_model": "vertex", "thickness": 0.0}
 WEIGHTS = ("scene.plain.weights", "scene.rig.weights")
 
 
@@ -253,7 +255,7 @@ def _model_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Model
     return ModelFile(
         scene,
         ModelConfig(**document["config"]),
-        Fabric(**document["fabric"]),
+        Fabric(**(FABRIC_OF_VERTICES | document["fabric"])),
         joints.astype(np.int64),
         _parameters(tensors, scene.garment.mesh.path),
         document["provenance"],

@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields
 from .errors import fail
 
 STRETCH_MODELS = ("stvk", "baraff_witkin")
+CONTACT_MODELS = ("surface", "vertex")
 
 
 @dataclass(frozen=True)
@@ -20,8 +21,11 @@ class Fabric:
         lame_mu, lame_lambda: Lame parameters of the membrane [N/m]; used by "stvk".
         stretch, shear: stiffness along and across the threads [N/m]; used by "baraff_witkin".
         bending: dihedral stiffness [N m] (per radian squared).
-        collision: penalty stiffness for each vertex [N/m, per vertex].
-        margin: distance to the body at which the penalty starts [m].
+        contact_model: "surface" (`energy.collision`) or "vertex", the paper's penalty, which depends on the mesh.
+        contact: stiffness of contact at the skin, for each area [N/m3]; used by "surface".
+        collision: penalty stiffness for each vertex [N/m, per vertex]; used by "vertex".
+        margin: gap between the fabric and the body at which contact begins [m].
+        thickness: of the fabric, whose mesh lies in its middle [m].
         drag: air drag per area and velocity [kg/(m2 s)], relative to air that moves with the character's root.
             The default stops light cloth from swinging within about half a second. Zero is the paper's vacuum.
     """
@@ -34,8 +38,11 @@ class Fabric:
     stretch: float = 20.0
     shear: float = 2.0
     bending: float = 1e-5
+    contact_model: str = "surface"
+    contact: float = 1e6
     collision: float = 10.0
-    margin: float = 4e-3
+    margin: float = 6e-3
+    thickness: float = 1e-3
     drag: float = 0.3
 
     def __post_init__(self) -> None:
@@ -44,6 +51,12 @@ class Fabric:
                 f"fabric '{self.name}'",
                 f"stretch model '{self.stretch_model}'",
                 f"it must be one of {', '.join(STRETCH_MODELS)}",
+            )
+        if self.contact_model not in CONTACT_MODELS:
+            fail(
+                f"fabric '{self.name}'",
+                f"contact model '{self.contact_model}'",
+                f"it must be one of {', '.join(CONTACT_MODELS)}",
             )
         for item in fields(self):
             value = getattr(self, item.name)
@@ -60,11 +73,13 @@ FABRICS: dict[str, Fabric] = {
     fabric.name: fabric
     for fabric in (
         Fabric("default"),
-        Fabric("silk", density=0.08, lame_mu=15.0, lame_lambda=28.0, stretch=14.0, shear=1.2, bending=3e-6),
-        Fabric("cotton", density=0.15, lame_mu=30.0, lame_lambda=45.0, stretch=27.0, shear=3.0, bending=1.5e-5),
-        Fabric("denim", density=0.40, lame_mu=80.0, lame_lambda=100.0, stretch=70.0, shear=10.0, bending=1e-4),
-        Fabric("wool", density=0.30, lame_mu=35.0, lame_lambda=50.0, stretch=30.0, shear=4.0, bending=5e-5),
-        Fabric("leather", density=0.60, lame_mu=120.0, lame_lambda=160.0, stretch=110.0, shear=25.0, bending=4e-4),
+        # The energy of the paper's tables.
+        Fabric("paper", contact_model="vertex", margin=4e-3, thickness=0.0),
+        Fabric("silk", density=0.08, lame_mu=15.0, lame_lambda=28.0, stretch=14.0, shear=1.2, bending=3e-6, thickness=3e-4),
+        Fabric("cotton", density=0.15, lame_mu=30.0, lame_lambda=45.0, stretch=27.0, shear=3.0, bending=1.5e-5, thickness=6e-4),
+        Fabric("denim", density=0.40, lame_mu=80.0, lame_lambda=100.0, stretch=70.0, shear=10.0, bending=1e-4, thickness=1.2e-3),
+        Fabric("wool", density=0.30, lame_mu=35.0, lame_lambda=50.0, stretch=30.0, shear=4.0, bending=5e-5, thickness=2e-3),
+        Fabric("leather", density=0.60, lame_mu=120.0, lame_lambda=160.0, stretch=110.0, shear=25.0, bending=4e-4, thickness=1.5e-3),
     )
 }
 

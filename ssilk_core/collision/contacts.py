@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The part of the body that each garment vertex can touch.
+"""The part of the body that each sample of the cloth can touch.
 
 The nearest body point does not tell which side the cloth came from. A sleeve that one bad step takes through the arm
-would be pushed out on the far side and stay there. Loose vertices can touch any part of the body. A tight vertex can
-touch only the patch of the body that lies beneath it in the bind pose: it is always pushed back to its own side, and
-is not caught where a body intersects itself, as in an armpit.
+would be pushed out on the far side and stay there. Loose cloth can touch any part of the body. Tight cloth can touch
+only the patch of the body that lies beneath it in the bind pose: it is always pushed back to its own side, and is not
+caught where a body intersects itself, as in an armpit.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from .distance import (
     smoothed_planes,
 )
 from .nearest_vertex import GARMENT_BLOCK, compact_blocks
+from .samples import ContactSamples
 from .smoothed_distance import SmoothedDistance
 
 PATCH_RADIUS = 1 / 12  # geodesic, relative to the diagonal of the body's bounding box: half the girth of an upper arm
@@ -41,7 +42,7 @@ NO_CONTACT_DISTANCE = 1e6  # [m]
 
 @dataclass(frozen=True, eq=False)
 class _Group:
-    """Garment vertices that query the body in the same way: their indices, compact blocks and body patches."""
+    """Samples that query the body in the same way: their indices, compact blocks and body patches."""
 
     rows: Tensor
     blocks: Tensor
@@ -49,29 +50,37 @@ class _Group:
 
 
 class Contacts:
-    """Finds the tangent plane of the body that each garment vertex can touch.
+    """Finds the tangent plane of the body that each sample of the cloth can touch.
 
     Args:
+        samples: of the garment, which are queried; S positions are expected.
         vertices: the body vertices that are posed, all by default.
-        pinned: whether pinned vertices collide too. Training, which cannot move them, leaves them out.
+        pinned: whether pinned cloth collides too. Training, which cannot move them, leaves them out.
     """
 
     def __init__(
-        self, scene: Scene, *, vertices: Ints | None = None, pinned: bool = True, device: torch.device
+        self,
+        scene: Scene,
+        samples: ContactSamples,
+        *,
+        vertices: Ints | None = None,
+        pinned: bool = True,
+        device: torch.device,
     ) -> None:
-        body, garment = scene.character.merged_body().mesh, scene.garment.mesh
+        body = scene.character.merged_body().mesh
+        points, classes = samples.points(scene.garment.mesh.points), samples.classes(scene.classes)
         chosen = np.arange(body.vertex_count) if vertices is None else vertices
-        tight = np.flatnonzero(scene.classes == TIGHT)
-        patches = patches_beneath(garment.points[tight], body, chosen)
+        tight = np.flatnonzero(classes == TIGHT)
+        patches = patches_beneath(points[tight], body, chosen)
         covered = patches[:, 0] > 0
-        elsewhere = np.ones(garment.vertex_count, dtype=bool) if pinned else scene.classes != PINNED
+        elsewhere = np.ones(len(points), dtype=bool) if pinned else classes != PINNED
         elsewhere[tight[covered]] = False
 
         def tensor(values: Ints) -> Tensor:
             return torch.as_tensor(values, device=device)
 
         def group(rows: Ints, found: Patches | None = None) -> _Group:
-            return _Group(tensor(rows), tensor(compact_blocks(garment.points[rows], GARMENT_BLOCK)), found)
+            return _Group(tensor(rows), tensor(compact_blocks(points[rows], GARMENT_BLOCK)), found)
 
         self._groups = [group(np.flatnonzero(elsewhere))] if elsewhere.any() else []
         if covered.any():
@@ -80,16 +89,16 @@ class Contacts:
             self._groups.append(group(tight[covered], Patches(tensor(vertices.astype(np.int32)), tensor(faces))))
 
     def planes(self, x: Tensor, body: PosedBody) -> tuple[Tensor, Tensor]:
-        """Return unit normals (V, 3, N) and offsets (V, N) of the planes that x (V, 3, N) can touch, without
+        """Return unit normals (S, 3, N) and offsets (S, N) of the planes that x (S, 3, N) can touch, without
         gradients.
 
-        Vertices that can touch nothing get planes far below them.
+        Samples that can touch nothing get planes far below them.
         """
         normal, offset = self._query_groups(x, body, nearest_planes, no_planes)
         return normal, offset
 
     def smoothed(self, x: Tensor, body: PosedBody) -> SmoothedDistance:
-        """Return smoothed distances of x (V, 3, N) to the body, in the precision of x."""
+        """Return smoothed distances of x (S, 3, N) to the body, in the precision of x."""
 
         def find(*asked: Any) -> Sequence[Tensor]:
             return smoothed_planes(*asked).tensors()
@@ -106,9 +115,9 @@ class Contacts:
         find: Callable[..., Sequence[Tensor]],
         no_contact: Callable[[Tensor], Sequence[Tensor]],
     ) -> Sequence[Tensor]:
-        """Return the results of `find` for all groups, and of `no_contact` for other vertices.
+        """Return the results of `find` for all groups, and of `no_contact` for other samples.
 
-        Vertices come first.
+        Samples come first.
         """
         if len(self._groups) == 1 and len(self._groups[0].rows) == len(x):
             return find(x, body, self._groups[0].blocks, self._groups[0].patches)
@@ -120,7 +129,7 @@ class Contacts:
         return gathered
 
     def distances(self, x: Tensor, body: PosedBody) -> tuple[Tensor, Tensor]:
-        """Return signed distances of x (V, 3, N) [m] to these planes and to the whole body, both (V, N)."""
+        """Return signed distances of x (S, 3, N) [m] to these planes and to the whole body, both (S, N)."""
         planes = signed_distance_to_planes(x, *self.planes(x, body))
         nearest = planes.clone()
         for group in self._groups:
@@ -133,7 +142,7 @@ class Contacts:
 
 
 def no_planes(x: Tensor) -> tuple[Tensor, Tensor]:
-    """Return planes that no vertex of x (V, 3, N) touches."""
+    """Return planes that no sample of x (S, 3, N) touches."""
     return x.new_zeros(x.shape), x.new_full((len(x), x.shape[2]), -NO_CONTACT_DISTANCE)
 
 

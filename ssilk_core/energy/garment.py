@@ -10,13 +10,14 @@ from torch import Tensor
 from .. import kernels
 from ..assets import Floats, Ints, Mesh
 from ..collision import PosedBody, signed_distance, signed_distance_to_planes
+from ..collision.samples import SampledCloth, contact_samples
 from ..fabrics import Fabric
 from ..kernels.corners import elastic_tables
 from ..mesh import topology
 from ..mesh.topology import SLIVER
 from .bending import bending_energy, dihedral_angles
-from .collision import collision_energy
-from .operators import difference_operator
+from .collision import ContactLaw
+from ..operators import difference_operator
 from .stretch import column_weights, deformation_gradient_operator, stretch_density, stretched_areas
 
 TERMS = ("stretch", "bending", "gravity", "inertia", "collision")
@@ -30,6 +31,7 @@ class GarmentEnergy:
 
     Attributes:
         mass: lumped vertex masses [kg], shape (V,).
+        cloth: the samples of the cloth, at which it meets the body.
     """
 
     def __init__(
@@ -45,6 +47,8 @@ class GarmentEnergy:
         self.fabric = fabric
         self.area = tensor(areas)[:, None]
         self.mass = tensor(fabric.density * topology.vertex_areas(mesh.points, mesh.faces))
+        self.cloth = SampledCloth(contact_samples(mesh, fabric), device, dtype)
+        self.law = ContactLaw.of(fabric)
         self._gradient = deformation_gradient_operator(mesh, device, dtype)
         heads = hinges[:, [1, 2, 3]].T.reshape(-1)
         self._hinge = difference_operator(heads, np.tile(hinges[:, 0], 3), mesh.vertex_count, device, dtype)
@@ -80,11 +84,11 @@ class GarmentEnergy:
         return weight @ ((x - advected.detach()) ** 2).sum(1) / (2 * dt)
 
     def collision(self, x: Tensor, body: PosedBody) -> Tensor:
-        return self.collision_at(signed_distance(x, body))
+        return self.collision_at(signed_distance(self.cloth.positions(x), body))
 
     def collision_at(self, distance: Tensor) -> Tensor:
-        """Return the penalty of given signed distances (V, N)."""
-        return collision_energy(distance, self.fabric.collision, self.fabric.margin).sum(0)
+        """Return the energy of contact at given signed distances of the samples (S, N)."""
+        return (self.cloth.area * self.law.energy(distance)).sum(0)
 
     def elastic(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Return stretch and bending; this and the next two methods use fused kernels where available."""
@@ -95,19 +99,24 @@ class GarmentEnergy:
         return elastic_kernel(x, self._tables, self.fabric)
 
     def gravity_and_collision(
-        self, x: Tensor, root: Tensor, gravity: Tensor, normal: Tensor, offset: Tensor
+        self, x: Tensor, root: Tensor, gravity: Tensor, sampled: Tensor, normal: Tensor, offset: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return gravity, with heights relative to `root` (3, N), and the collision with one plane for each vertex.
+        """Return gravity, with heights relative to `root` (3, N), and the collision with one plane for each sample.
 
-        The planes, with unit normals (V, 3, N) and offsets (V, N), and `root` have no gradient.
+        Args:
+            sampled: positions of the samples (S, 3, N), with the gradient of x.
+            normal, offset: unit normals (S, 3, N) and offsets (S, N) of the planes; they have no gradient.
         """
         normal, offset, root = normal.detach(), offset.detach(), root.detach()
         if not kernels.supports(x):
-            return self.gravity(x - root, gravity), self.collision_at(signed_distance_to_planes(x, normal, offset))
-        from ..kernels.pointwise import gravity_and_collision_kernel
+            collision = self.collision_at(signed_distance_to_planes(sampled, normal, offset))
+            return self.gravity(x - root, gravity), collision
+        from ..kernels.pointwise import contact_kernel, gravity_kernel
 
-        return gravity_and_collision_kernel(
-            x, self.mass, root, gravity, (normal, offset), self.fabric.collision, self.fabric.margin
+        law = self.law.stiffness, self.law.start, self.law.ramp
+        return (
+            gravity_kernel(x, self.mass, root, gravity),
+            contact_kernel(sampled, self.cloth.area, (normal, offset), *law),
         )
 
     def inertia_and_drag(

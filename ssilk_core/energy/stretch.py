@@ -11,7 +11,7 @@ from ..assets import Floats, Mesh
 from ..errors import fail
 from ..fabrics import Fabric
 from ..mesh.topology import NO_AREA, SLIVER
-from .operators import SparseOperator
+from ..operators import SparseOperator
 
 
 def rest_frames(mesh: Mesh) -> tuple[Floats, Floats]:

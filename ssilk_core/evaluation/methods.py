@@ -80,7 +80,7 @@ class EvaluationScene:
         self.columns = deformation_gradient_operator(mesh, device, torch.float32)
         skeleton = scene.character.skeleton
         self.body = CollisionBody(scene.character.merged_body(), skeleton.joint_count, device=device)
-        self.contacts = Contacts(scene, device=device)
+        self.contacts = Contacts(scene, self.energy.cloth.samples, device=device)
         self.skin = Skinning(scene.lbs_skin).to(device)
         self.rest = torch.tensor(mesh.points, dtype=torch.float32, device=device)
         self.weight = float(self.energy.mass.sum()) * GRAVITY * float(np.ptp(mesh.points[:, 1]))

@@ -19,25 +19,28 @@ FRAMES, WARPS = 128, 2  # frames and warps of one program
 VERTICES = 16  # vertices that one program sums over
 
 
-def gravity_and_collision_kernel(
-    x: Tensor,
-    mass: Tensor,
-    root: Tensor,
-    gravity: Tensor,
-    planes: tuple[Tensor, Tensor],
-    stiffness: float,
-    margin: float,
-) -> tuple[Tensor, Tensor]:
-    """Return -sum m g.(x - root) and sum stiffness min(n.x - offset - margin, 0)^2 [J], both (N,).
+def gravity_kernel(x: Tensor, mass: Tensor, root: Tensor, gravity: Tensor) -> Tensor:
+    """Return -sum m g.(x - root) [J], (N,).
 
     Args:
         x: positions (V, 3, N), the only argument with a gradient; mass: (V,).
         root: origin of heights (3, N); gravity: acceleration (3, N) or (3, 1).
-        planes: unit normals (V, 3, N) and offsets (V, N) of the plane that each vertex collides with.
     """
     rows = [values.detach().expand(3, x.shape[-1]).contiguous() for values in (root, gravity)]
+    return _Gravity.apply(x.contiguous(), mass, *rows)
+
+
+def contact_kernel(
+    x: Tensor, area: Tensor, planes: tuple[Tensor, Tensor], stiffness: float, start: float, ramp: float
+) -> Tensor:
+    """Return the energy of contact of samples with planes [J], (N,); the law is `energy.collision.ContactLaw`.
+
+    Args:
+        x: positions of the samples (S, 3, N), the only argument with a gradient; area: (S, 1).
+        planes: unit normals (S, 3, N) and offsets (S, N) of the plane that each sample collides with.
+    """
     normal, offset = (values.detach().contiguous() for values in planes)
-    return _GravityAndCollision.apply(x.contiguous(), mass, *rows, normal, offset, stiffness, margin)
+    return _Contact.apply(x.contiguous(), area, normal, offset, stiffness, start, ramp)
 
 
 def inertia_and_drag_kernel(
@@ -64,33 +67,46 @@ def _blocks(frames: int) -> int:
     return triton.cdiv(frames, FRAMES)
 
 
-class _GravityAndCollision(Function):
+class _Gravity(Function):
     @staticmethod
-    def forward(ctx, x, mass, root, gravity, normal, offset, stiffness, margin):
+    def forward(ctx, x, mass, root, gravity):
         vertices, _, frames = x.shape
-        ctx.save_for_backward(x, mass, gravity, normal, offset)
-        ctx.penalty = stiffness, margin
-        shares = x.new_empty(2, triton.cdiv(vertices, VERTICES), frames)
-        _gravity_and_collision[shares.shape[1], _blocks(frames)](
-            *(x, mass, root, gravity, normal, offset, shares),
-            *(stiffness, margin, vertices, frames, VERTICES, FRAMES),
-            num_warps=WARPS,
+        ctx.save_for_backward(mass, gravity)
+        shares = x.new_empty(triton.cdiv(vertices, VERTICES), frames)
+        _gravity[shares.shape[0], _blocks(frames)](
+            *(x, mass, root, gravity, shares, vertices, frames, VERTICES, FRAMES), num_warps=WARPS
         )
-        return tuple(shares.sum(1))
+        return shares.sum(0)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, *upstream):
-        x = ctx.saved_tensors[0]
-        vertices, _, frames = x.shape
-        grad = x.new_empty(x.shape)
-        _gravity_and_collision_gradient[vertices, _blocks(frames)](
-            *ctx.saved_tensors,
-            *(values.contiguous() for values in upstream),
-            *(grad, *ctx.penalty, frames, FRAMES),
-            num_warps=WARPS,
+    def backward(ctx, upstream):
+        mass, gravity = ctx.saved_tensors
+        return -mass[:, None, None] * (gravity * upstream), *[None] * 3
+
+
+class _Contact(Function):
+    @staticmethod
+    def forward(ctx, x, area, normal, offset, *law):
+        samples, _, frames = x.shape
+        ctx.save_for_backward(x, area, normal, offset)
+        ctx.law = law
+        shares = x.new_empty(triton.cdiv(samples, VERTICES), frames)
+        _contact[shares.shape[0], _blocks(frames)](
+            *(x, area, normal, offset, shares, *law, samples, frames, VERTICES, FRAMES), num_warps=WARPS
         )
-        return grad, *[None] * 7
+        return shares.sum(0)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, upstream):
+        x = ctx.saved_tensors[0]
+        samples, _, frames = x.shape
+        grad = x.new_empty(x.shape)
+        _contact_gradient[samples, _blocks(frames)](
+            *(*ctx.saved_tensors, upstream.contiguous(), grad, *ctx.law, frames, FRAMES), num_warps=WARPS
+        )
+        return grad, *[None] * 6
 
 
 class _InertiaAndDrag(Function):
@@ -124,61 +140,56 @@ class _InertiaAndDrag(Function):
 
 
 @triton.jit
-def _depth(px, py, pz, nx, ny, nz, offset, margin):
-    """Penetration of a point into the margin: negative, else zero."""
-    depth = dot(nx, ny, nz, px, py, pz) - offset - margin
-    return tl.where(depth > 0, 0.0, depth)  # unlike a minimum this propagates NaN
-
-
-@triton.jit
-def _gravity_and_collision(
-    x,
-    mass,
-    root,
-    gravity,
-    normal,
-    offset,
-    shares,
-    stiffness,
-    margin,
-    vertices,
-    frames,
-    chunk: tl.constexpr,
-    block: tl.constexpr,
-):
+def _gravity(x, mass, root, gravity, shares, vertices, frames, chunk: tl.constexpr, block: tl.constexpr):
     part = tl.program_id(0).to(tl.int64)
     n = tl.program_id(1) * block + tl.arange(0, block)
     inside = n < frames
     rx, ry, rz = load3(root, frames, n, inside)
     gx, gy, gz = load3(gravity, frames, n, inside)
-    weight, penalty = tl.zeros((block,), tl.float32), tl.zeros((block,), tl.float32)
+    weight = tl.zeros((block,), tl.float32)
     first = part * chunk
     for v in range(first, tl.minimum(first + chunk, vertices)):
         px, py, pz = load3(x + v * 3 * frames, frames, n, inside)
-        nx, ny, nz = load3(normal + v * 3 * frames, frames, n, inside)
-        depth = _depth(px, py, pz, nx, ny, nz, tl.load(offset + v * frames + n, mask=inside, other=0.0), margin)
-        penalty += depth * depth
         weight += tl.load(mass + v) * dot(px - rx, py - ry, pz - rz, gx, gy, gz)
-    share = shares + part * frames + n
-    tl.store(share, -weight, mask=inside)
-    tl.store(share + tl.num_programs(0).to(tl.int64) * frames, stiffness * penalty, mask=inside)
+    tl.store(shares + part * frames + n, -weight, mask=inside)
 
 
 @triton.jit
-def _gravity_and_collision_gradient(
-    x, mass, gravity, normal, offset, to_gravity, to_collision, grad, stiffness, margin, frames, block: tl.constexpr
-):
-    v = tl.program_id(0).to(tl.int64)
+def _depth(x, normal, offset, s, frames, n, inside, start):
+    """Normal and depth of a sample below the distance at which contact begins; no depth is zero."""
+    px, py, pz = load3(x + s * 3 * frames, frames, n, inside)
+    nx, ny, nz = load3(normal + s * 3 * frames, frames, n, inside)
+    depth = start - dot(nx, ny, nz, px, py, pz) + tl.load(offset + s * frames + n, mask=inside, other=0.0)
+    return nx, ny, nz, tl.where(depth < 0, 0.0, depth)  # unlike a maximum this propagates NaN
+
+
+@triton.jit
+def _contact(x, area, normal, offset, shares, stiffness, start, ramp, samples, frames,
+             chunk: tl.constexpr, block: tl.constexpr):  # fmt: skip
+    part = tl.program_id(0).to(tl.int64)
     n = tl.program_id(1) * block + tl.arange(0, block)
     inside = n < frames
-    px, py, pz = load3(x + v * 3 * frames, frames, n, inside)
-    nx, ny, nz = load3(normal + v * 3 * frames, frames, n, inside)
-    gx, gy, gz = load3(gravity, frames, n, inside)
-    depth = _depth(px, py, pz, nx, ny, nz, tl.load(offset + v * frames + n, mask=inside, other=0.0), margin)
-    out = 2 * stiffness * depth * tl.load(to_collision + n, mask=inside, other=0.0)
-    down = -tl.load(mass + v) * tl.load(to_gravity + n, mask=inside, other=0.0)
-    base = grad + v * 3 * frames
-    store3(base, frames, n, inside, out * nx + down * gx, out * ny + down * gy, out * nz + down * gz)
+    energy = tl.zeros((block,), tl.float32)
+    first = part * chunk
+    for s in range(first, tl.minimum(first + chunk, samples)):
+        _, _, _, depth = _depth(x, normal, offset, s, frames, n, inside, start)
+        soft = depth * depth * depth / (6 * tl.maximum(ramp, 1e-12))
+        deep = 0.5 * depth * (depth - ramp) + ramp * ramp / 6
+        energy += tl.load(area + s) * tl.where(depth < ramp, soft, tl.where(depth == 0, 0.0, deep))
+    tl.store(shares + part * frames + n, stiffness * energy, mask=inside)
+
+
+@triton.jit
+def _contact_gradient(x, area, normal, offset, upstream, grad, stiffness, start, ramp, frames,
+                      block: tl.constexpr):  # fmt: skip
+    s = tl.program_id(0).to(tl.int64)
+    n = tl.program_id(1) * block + tl.arange(0, block)
+    inside = n < frames
+    nx, ny, nz, depth = _depth(x, normal, offset, s, frames, n, inside, start)
+    deep = tl.where(depth == 0, 0.0, depth - 0.5 * ramp)
+    pressure = tl.where(depth < ramp, depth * depth / (2 * tl.maximum(ramp, 1e-12)), deep)
+    out = -stiffness * tl.load(area + s) * pressure * tl.load(upstream + n, mask=inside, other=0.0)
+    store3(grad + s * 3 * frames, frames, n, inside, out * nx, out * ny, out * nz)
 
 
 @triton.jit

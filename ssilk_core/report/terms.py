@@ -88,8 +88,8 @@ class TermsMeter:
             return {"collision": 0.0, SHARE: 0.0}
         normals = vertex_normals(body, self.body.faces)
         at, towards = (torch.as_tensor(values, dtype=torch.float32)[:, :, None] for values in (body, normals))
-        distance = signed_distance(x, PosedBody(at, towards, self.rings))
-        inside = 100 * float((distance < 0).double().mean())
+        distance = signed_distance(self.energy.cloth.positions(x), PosedBody(at, towards, self.rings))
+        inside = 100 * float((distance[: len(x)] < 0).double().mean())
         return {"collision": float(self.energy.collision_at(distance)), SHARE: inside}
 
 

@@ -18,16 +18,11 @@ from torch import Tensor
 
 from .. import kernels
 from ..assets import Ints
-from ..energy.operators import SparseOperator
+from ..operators import SparseOperator
 from .conjugate_gradient import CHECK_EVERY, inverse_blocks, solve
 
 if TYPE_CHECKING:
     from ..kernels.conjugate_gradient import BlockTable
-
-
-def adjoint(operator: SparseOperator, y: Tensor) -> Tensor:
-    """Apply the transpose of an operator to `y` (rows, 3, N)."""
-    return (operator.transposed @ y.flatten(1)).reshape(-1, *y.shape[1:])
 
 
 @dataclass(frozen=True, eq=False)

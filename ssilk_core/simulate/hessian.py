@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from ..assets import Ints
-from ..energy.operators import SparseOperator
+from ..collision.samples import ContactSamples
+from ..operators import SparseOperator
 from .blocks import BlockMatrix, BlockPattern
 from .hinges import Hinges
 from .membrane import Membrane, outer
@@ -23,10 +24,11 @@ class Hessian:
 
     Args:
         corners: vertices of the hinges, shape (H, 4).
+        samples: of contact, each within a face.
     """
 
     def __init__(
-        self, membrane: Membrane, hinges: Hinges | None, corners: Ints, free: Ints, vertex_count: int
+        self, membrane: Membrane, hinges: Hinges | None, corners: Ints, samples: ContactSamples, free: Ints
     ) -> None:
         device = membrane.area.device
         self.membrane, self.hinges, self.free_count = membrane, hinges, len(free)
@@ -38,8 +40,9 @@ class Hessian:
         near = np.concatenate([faces[:, pair] for pair in combinations_with_replacement(range(3), 2)])
         sides = list(combinations_with_replacement(range(4), 2))
         across = np.concatenate([np.take_along_axis(corners, order, axis=1)[:, side] for side in sides])
-        self.pattern = BlockPattern(np.concatenate([near, across]), free, vertex_count, device)
+        self.pattern = BlockPattern(np.concatenate([near, across]), free, samples.vertex_count, device)
         self.sum_faces = self._face_sum(near, weights)
+        self.sum_samples = self._sample_sum(samples)
         if hinges:
             slopes = order * len(corners) + np.arange(len(corners))[:, None]  # rows of Hinges.slopes
             self.left, self.right = (
@@ -62,6 +65,18 @@ class Hessian:
         parts = [np.concatenate(part) for part in (rows, sources, products)]
         return self.pattern.summation(parts[0], parts[1], parts[2], 4 * count)
 
+    def _sample_sum(self, samples: ContactSamples) -> SparseOperator:
+        """Return the operator from a block of each sample (S) to blocks: w_i w_j of it for the corners i, j."""
+        slots, sources, products = [], [], []
+        for i, j in combinations_with_replacement(range(3), 2):
+            product = samples.weights[:, i] * samples.weights[:, j]
+            used = np.flatnonzero(product)
+            slots.append(self.pattern.slots(samples.corners[used][:, [i, j]]))
+            sources.append(used)
+            products.append(product[used])
+        parts = [np.concatenate(part) for part in (slots, sources, products)]
+        return self.pattern.summation(parts[0], parts[1], parts[2], len(samples.area))
+
     def __call__(
         self,
         x: Tensor,
@@ -74,7 +89,7 @@ class Hessian:
 
         Args:
             weight: isotropic stiffness of each free vertex [N/m], shape (U, 1).
-            contact: block added at each free vertex, shape (U, 3, 3, N), or None.
+            contact: block of each sample, shape (S, 3, 3, N), or None.
             fixed: free vertices that are stiffened so that a solution hardly moves them, shape (U, N), or None.
             exact_hessian: see `Membrane.stiffness`.
         """
@@ -82,10 +97,10 @@ class Hessian:
         if self.hinges:
             slopes = self.hinges.slopes(x)
             blocks += self.sum_hinges(outer(slopes[self.left], slopes[self.right]))
+        if contact is not None:
+            blocks += self.sum_samples(contact.float().flatten(1, 2)).view_as(blocks)
         diagonal = blocks[: self.free_count]
         diagonal += weight[:, None, None] * torch.eye(3, device=x.device)[:, :, None]
-        if contact is not None:
-            diagonal += contact.float()
         if fixed is not None:
             stiff = (
                 FIXED_STIFFNESS_FACTOR

@@ -13,8 +13,7 @@ from torch import Tensor
 from ..assets import Ints
 from ..energy import GarmentEnergy
 from ..energy.bending import bending_energy, cross, dihedral_angles, wrapped_difference
-from ..energy.operators import difference_operator
-from .blocks import adjoint
+from ..operators import difference_operator
 
 TINY = 1e-18
 
@@ -35,7 +34,7 @@ class Hinges:
         """Return the gradient [N], shape (V, 3, N)."""
         arms = self.operator(x).chunk(3)
         moment = 2 * self.stiffness * wrapped_difference(dihedral_angles(*arms), self.rest)
-        return adjoint(self.operator, torch.cat([moment[:, None] * slope for slope in angle_gradients(*arms)]))
+        return self.operator.adjoint(torch.cat([moment[:, None] * slope for slope in angle_gradients(*arms)]))
 
     def slopes(self, x: Tensor) -> Tensor:
         """Return sqrt(2 k) grad(theta) at the four vertices of each hinge, float32, shape (4 H, 3, N)."""

@@ -22,7 +22,6 @@ from ..assets import PINNED, Scene
 from ..collision import Contacts, PosedBody, SmoothedDistance
 from ..constants import GRAVITY
 from ..energy import GarmentEnergy
-from ..energy.collision import collision_energy
 from ..fabrics import Fabric
 from ..mesh import topology
 from .blocks import BlockMatrix
@@ -76,16 +75,17 @@ class IncrementalPotential:
         self.fabric, self.dtype = fabric, dtype
         self.mass: Tensor = energy.mass[:, None]
         self.size = float(np.linalg.norm(np.ptp(mesh.points, axis=0)))
-        self.contacts = Contacts(scene, device=device)
+        self.cloth, self.law = energy.cloth, energy.law
+        self.contacts = Contacts(scene, self.cloth.samples, device=device)
         self.membrane = Membrane(mesh, fabric, device, dtype)
         self.hinges = Hinges(hinges, energy, mesh.vertex_count) if len(hinges) else None
         free = np.flatnonzero((scene.classes != PINNED) & (topology.vertex_areas(mesh.points, mesh.faces) > 0))
         self.free = torch.as_tensor(free, device=device)
-        self._hessian = Hessian(self.membrane, self.hinges, hinges, free, mesh.vertex_count)
+        self._hessian = Hessian(self.membrane, self.hinges, hinges, self.cloth.samples, free)
 
     def body_distance(self, x: Tensor, inputs: StepInputs) -> SmoothedDistance | None:
-        """Return the distances of x to the body, to second order."""
-        return None if inputs.body is None else self.contacts.smoothed(x, inputs.body)
+        """Return the distances of the samples of x to the body, to second order."""
+        return None if inputs.body is None else self.contacts.smoothed(self.cloth.positions(x), inputs.body)
 
     def energy(self, x: Tensor, inputs: StepInputs, body_distance: SmoothedDistance | None) -> Tensor:
         """Return the energy [J] of each frame, shape (N,), at the distances `body_distance` of x."""
@@ -97,12 +97,14 @@ class IncrementalPotential:
         return total + self.collision(x, body_distance).sum(0)
 
     def collision(self, x: Tensor, body_distance: SmoothedDistance | None) -> Tensor:
-        """Return the collision energy of each vertex [J], shape (V, N)."""
-        return torch.zeros_like(x[:, 0]) if body_distance is None else self.collision_at(body_distance.distance(x))
+        """Return the collision energy of each sample [J], shape (S, N)."""
+        if body_distance is None:
+            return torch.zeros_like(x[:, 0])
+        return self.collision_at(body_distance.distance(self.cloth.positions(x)))
 
     def collision_at(self, distance: Tensor) -> Tensor:
-        """Return the collision energy of vertices at given distances [J], shape (V, N)."""
-        return collision_energy(distance, self.fabric.collision, self.fabric.margin)
+        """Return the collision energy of samples at given distances [J], shape (S, N)."""
+        return self.cloth.area * self.law.energy(distance)
 
     def gradient(self, x: Tensor, inputs: StepInputs, body_distance: SmoothedDistance | None) -> Tensor:
         """Return the gradient [N] at all vertices, shape (V, 3, N)."""
@@ -112,7 +114,7 @@ class IncrementalPotential:
         for weight, target in self._anchors(inputs):
             total += weight[:, None] * (x - target)
         if body_distance:
-            total -= self._push(x, body_distance)[:, None] * body_distance.normal
+            total -= self.cloth.to_vertices(self._push(x, body_distance)[:, None] * body_distance.normal)
         return total
 
     def hessian(
@@ -134,11 +136,12 @@ class IncrementalPotential:
         weight = sum((weight for weight, _ in [*self._anchors(inputs), *still]), torch.zeros_like(self.mass))
         contact = None
         if body_distance:
-            push, normal = self._push(x, body_distance)[self.free], body_distance.normal[self.free]
-            stiffness = 2 * self.fabric.collision * (push > 0)
+            distance, normal = body_distance.distance(self.cloth.positions(x)), body_distance.normal
+            push, stiffness = (
+                self.cloth.area * part for part in (self.law.pressure(distance), self.law.curvature(distance))
+            )
             contact = (
-                stiffness[:, None, None] * outer(normal, normal)
-                + push[:, None, None] * body_distance.curvature[self.free]
+                stiffness[:, None, None] * outer(normal, normal) + push[:, None, None] * body_distance.curvature
             )
         fixed = None if fixed is None else fixed[self.free]
         return self._hessian(x, weight[self.free].float(), contact, fixed, exact_hessian)
@@ -158,5 +161,5 @@ class IncrementalPotential:
         return found
 
     def _push(self, x: Tensor, body_distance: SmoothedDistance) -> Tensor:
-        """Return the force along the gradient of the distance on each vertex within the margin [N], shape (V, N)."""
-        return 2 * self.fabric.collision * (self.fabric.margin - body_distance.distance(x)).clamp_min(0)
+        """Return the force along the gradient of the distance on each sample [N], shape (S, N)."""
+        return self.cloth.area * self.law.pressure(body_distance.distance(self.cloth.positions(x)))

@@ -18,7 +18,6 @@ from torch import Tensor
 from ..assets import Mesh
 from ..energy.stretch import deformation_gradient_operator, stretch_density, stretched_areas
 from ..fabrics import Fabric
-from .blocks import adjoint
 
 Symmetric = tuple[Tensor, Tensor, Tensor]  # entries uu, uv, vv of 2 x 2 matrices, each (F, N)
 MIN_SQUARED_LENGTH = 1e-12  # floor for squared column lengths, as in the density
@@ -41,7 +40,7 @@ class Membrane:
         w_u, w_v = self.operator(x).chunk(2)
         uu, uv, vv = ((self.area * s)[:, None] for s in second_piola_kirchhoff(w_u, w_v, self.fabric))
         stress = torch.cat([uu * w_u + uv * w_v, uv * w_u + vv * w_v])
-        return adjoint(self.operator, stress)
+        return self.operator.adjoint(stress)
 
     def stiffness(self, x: Tensor, exact_hessian: Tensor | None = None) -> Tensor:
         """Return the positive semi-definite Hessian in the columns of F [J], float32.

@@ -281,8 +281,13 @@ def line_search(
 
 
 def excess_collision(potential: IncrementalPotential, state: State, trial: State, moved: Tensor) -> Tensor:
-    """Return the collision energy of each vertex in a trial minus its second-order prediction [J], (V, N)."""
+    """Return the collision energy in a trial minus its second-order prediction [J], of each vertex (V, N).
+
+    That of a sample is distributed to its corners.
+    """
     if state.body_distance is None:
         return torch.zeros_like(moved[:, 0])
-    expected = potential.collision_at(state.body_distance.expected(trial.x, moved))
-    return potential.collision(trial.x, trial.body_distance) - expected
+    positions = potential.cloth.positions
+    expected = potential.collision_at(state.body_distance.expected(positions(trial.x), positions(moved)))
+    excess = potential.collision(trial.x, trial.body_distance) - expected
+    return potential.cloth.to_vertices(excess[:, None])[:, 0]

@@ -44,14 +44,14 @@ def measure_collisions(dressed: EvaluationScene, take_set: TakeSet, method: Meth
     frames = range(min(FRAMES, take_set.takes[0].frame_count))
     x, character = method.vertices(0, frames), take_set.character(0, frames)
     whole, joints = dressed.scene.character.merged_body(), dressed.scene.character.skeleton.joint_count
-    found = []
+    cloth, found = dressed.energy.cloth, []
     for name, surface, every in BODIES:
         chosen = np.arange(0, whole.mesh.vertex_count, every)
         body = CollisionBody(whole, joints, vertices=chosen, device=dressed.device)
-        contacts = Contacts(dressed.scene, vertices=chosen, device=dressed.device)
+        contacts = Contacts(dressed.scene, cloth.samples, vertices=chosen, device=dressed.device)
         begun = time.perf_counter()
-        met, nearest = contacts.distances(x, body.pose(character, surface=surface))
-        inside, energy = float((nearest < 0).double().mean()), float(dressed.energy.collision_at(met).mean())
+        met, nearest = contacts.distances(cloth.positions(x), body.pose(character, surface=surface))
+        inside, energy = float((nearest[: len(x)] < 0).double().mean()), float(dressed.energy.collision_at(met).mean())
         each = 1000 * (time.perf_counter() - begun) / len(frames)
         found.append(CollisionCost(name, len(chosen), each, energy, inside))
     return found

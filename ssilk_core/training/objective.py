@@ -38,20 +38,23 @@ class Objective:
         self.surface = surface
         self.body, device = body, bank.static.device
         if body:
-            self.contacts = Contacts(model.scene, vertices=body.vertices, pinned=False, device=device)
+            self.contacts = Contacts(
+                model.scene, energy.cloth.samples, vertices=body.vertices, pinned=False, device=device
+            )
         self.dt = 1 / model.config.fps
 
     def quasi_static_terms(self, x: Tensor, direction: Tensor, character: Tensor) -> Terms:
         """Return all terms but inertia and drag of positions x (V, 3, N) under gravity directions (N, 3)."""
         energy, root = self.energy, character[0, :, 3]  # heights over the root keep the value of gravity small
         stretch, bending = energy.elastic(x)
+        sampled = energy.cloth.positions(x)
         gravity, collision = energy.gravity_and_collision(
-            x, root, GRAVITY * direction.T, *self._planes(x.detach(), character)
+            x, root, GRAVITY * direction.T, sampled, *self._planes(sampled.detach(), character)
         )
         return {"stretch": stretch, "bending": bending, "gravity": gravity, "collision": collision}
 
     def _planes(self, x: Tensor, character: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the plane that each vertex of x (V, 3, N) can touch: normals (V, 3, N) and offsets (V, N)."""
+        """Return the plane that each sample x (S, 3, N) can touch: normals (S, 3, N) and offsets (S, N)."""
         if self.body is None:
             return no_planes(x)
         return self.contacts.planes(x, self.body.pose(character, surface=self.surface))

@@ -54,7 +54,7 @@ class Validator:
     ) -> None:
         self.bank, self.energy, self.body, self.fps, self.group = bank, energy, body, fps, group
         self.lbs = Skinning(scene.lbs_skin).to(rest.device)
-        self.contacts = Contacts(scene, vertices=body.vertices, device=rest.device)
+        self.contacts = Contacts(scene, energy.cloth.samples, vertices=body.vertices, device=rest.device)
         self.rest = rest
         self.clips = [
             range(int(start), min(int(stop), int(start) + frames)) for start, stop in zip(bank.starts, bank.stops)

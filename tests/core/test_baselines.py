@@ -197,7 +197,7 @@ def test_the_terms_of_a_window_are_those_of_its_frames(scene, motions, method, j
             "bending": energy.bending(x),
             "gravity": energy.gravity(x - character[0, :, 3], GRAVITY * down.T),
             "collision": energy.collision_at(
-                signed_distance_to_planes(x, *objective.contacts.planes(x, objective.body.pose(character)))
+                sample_distance(objective, x, character)
             ),
             "inertia": energy.inertia(x[..., 2:], 2 * x[..., 1:-1] - x[..., :-2], 1 / 30),
             "drag": energy.drag(x[..., 2:], x[..., 1:-1] + root[:, 2:] - root[:, 1:-1], 1 / 30),

@@ -22,6 +22,7 @@ from ssilk_core.collision import (
 )
 from ssilk_core.collision.contacts import faces_around, patches_beneath
 from ssilk_core.collision.one_ring import triangle_rings
+from ssilk_core.collision.samples import vertex_samples
 
 CPU = torch.device("cpu")
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"  # on a CPU kernels run in Triton's interpreter
@@ -62,7 +63,7 @@ def test_tight_cloth_that_went_through_a_limb_is_sent_back(scene, kind, options)
     dressed, body = on_limb(scene, np.array([RADIUS + 0.005, 0, 0.01]), kind)
     x = torch.tensor(dressed.garment.mesh.points, dtype=torch.float32)[..., None]
     pulled = x - torch.tensor([RADIUS + 0.025, 0, 0])[:, None]
-    contacts = Contacts(dressed, device=CPU)
+    contacts = Contacts(dressed, vertex_samples(len(dressed.classes)), device=CPU)
     normal, offset = contacts.planes(pulled, still(body, **options))
     side = 1 if kind == TIGHT else -1
     assert (side * normal[:, 0] > 0.5).all()
@@ -87,7 +88,7 @@ def test_where_cloth_is_near_its_own_side_nothing_changes(scene):
     x = x.float()[..., None]
     for options in ({}, {"exact": True}):
         posed = still(body, **options)
-        for found, expected in zip(Contacts(dressed, device=CPU).planes(x, posed), nearest_planes(x, posed)):
+        for found, expected in zip(Contacts(dressed, vertex_samples(len(dressed.classes)), device=CPU).planes(x, posed), nearest_planes(x, posed)):
             np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
@@ -99,7 +100,7 @@ def test_rounded_distances_are_those_of_the_planes_that_tight_and_loose_cloth_me
     dressed = replace(dressed, garment=replace(dressed.garment, classes=classes))
     x = torch.tensor(dressed.garment.mesh.points, dtype=dtype)[..., None]
     pulled = x - torch.tensor([RADIUS + 0.025, 0, 0])[:, None].to(dtype)
-    contacts, posed = Contacts(dressed, device=CPU), still(body, exact=True)
+    contacts, posed = Contacts(dressed, vertex_samples(len(dressed.classes)), device=CPU), still(body, exact=True)
     found, met = (
         contacts.smoothed(pulled, posed),
         signed_distance_to_planes(pulled.float(), *contacts.planes(pulled.float(), posed)),
@@ -108,14 +109,14 @@ def test_rounded_distances_are_those_of_the_planes_that_tight_and_loose_cloth_me
     torch.testing.assert_close(found.distance(pulled).float(), met, rtol=0.03, atol=1e-6)
     assert (met[1::2] < -RADIUS).all() and (met[::2] > -RADIUS).all()
     pinned = replace(dressed, garment=replace(dressed.garment, classes=np.full_like(classes, PINNED)))
-    nowhere = Contacts(pinned, pinned=False, device=CPU).smoothed(pulled, posed)
+    nowhere = Contacts(pinned, vertex_samples(len(pinned.classes)), pinned=False, device=CPU).smoothed(pulled, posed)
     assert (nowhere.distance(pulled) > 1e5).all() and nowhere.curvature.abs().max() == 0
 
 
 def test_pinned_cloth_meets_nothing_unless_it_is_measured(scene):
     dressed, body = on_limb(scene, np.array([0.0, 0, 0]), PINNED)
     x = torch.tensor(dressed.garment.mesh.points, dtype=torch.float32)[..., None]
-    free, measured = (Contacts(dressed, pinned=pinned, device=CPU) for pinned in (False, True))
+    free, measured = (Contacts(dressed, vertex_samples(len(dressed.classes)), pinned=pinned, device=CPU) for pinned in (False, True))
     assert (signed_distance_to_planes(x, *free.planes(x, still(body))) > 1e5).all()
     assert (measured.distances(x, still(body))[0] < 0).all()
 
@@ -128,7 +129,7 @@ def test_tight_cloth_far_from_the_body_may_meet_all_of_it(scene):
     dressed, body = on_limb(scene, np.array([RADIUS + 0.1, 0, 0]), TIGHT)
     x = torch.tensor(dressed.garment.mesh.points, dtype=torch.float32)[..., None]
     pulled = x - torch.tensor([RADIUS + 0.12, 0, 0])[:, None]
-    assert (Contacts(dressed, device=CPU).planes(pulled, still(body))[0][:, 0] < -0.5).all()
+    assert (Contacts(dressed, vertex_samples(len(dressed.classes)), device=CPU).planes(pulled, still(body))[0][:, 0] < -0.5).all()
 
 
 def shape_of(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:

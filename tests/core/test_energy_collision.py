@@ -2,6 +2,7 @@
 """Distance to a body, its penalty, and the search for the nearest body vertex on every path."""
 
 import importlib.util
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -15,8 +16,8 @@ from ssilk_core.collision import CollisionBody, PosedBody, distance, nearest_pla
 from ssilk_core.collision.nearest_vertex import compact_blocks
 from ssilk_core.collision.one_ring import nearest_on_rings, triangle_rings
 from ssilk_core.energy import GarmentEnergy
-from ssilk_core.energy.collision import collision_energy
-from ssilk_core.fabrics import Fabric
+from ssilk_core.energy.collision import ContactLaw
+from ssilk_core.fabrics import FABRICS, Fabric
 from ssilk_core.kinematics import skin_points
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"  # on a CPU kernels run in Triton's interpreter
@@ -50,16 +51,16 @@ def test_distance_to_a_sphere_is_the_radius_short_of_its_facets():
     assert ((distance < 0) == (radius < 0.3))[np.abs(radius - 0.3) > 1e-3].all()
 
 
-def test_penalty_starts_at_the_margin_and_grows_with_the_square():
+def test_the_papers_penalty_starts_at_the_margin_and_grows_with_the_square():
     distance = torch.tensor([[0.01, 0.004, 0.003, 0.0, -0.006]]).double()
     expected = 10 * np.array([0, 0, 1e-3, 4e-3, 10e-3]) ** 2
-    np.testing.assert_allclose(collision_energy(distance, 10.0, 4e-3)[0], expected, atol=1e-18)
+    np.testing.assert_allclose(ContactLaw.of(FABRICS["paper"]).energy(distance)[0], expected, atol=1e-18)
 
 
 def test_a_garments_penalty_is_summed_over_vertices_for_each_frame(toy_grid):
     points, faces = toy_grid(4, 3)
     flat = np.stack([points[:, 0], np.zeros(len(points)), points[:, 1]], axis=1)
-    energy = GarmentEnergy(Mesh("/sheet", flat, faces), Fabric("f", collision=50.0, margin=0.01), dtype=torch.float64)
+    energy = GarmentEnergy(Mesh("/sheet", flat, faces), replace(FABRICS["paper"], collision=50.0, margin=0.01), dtype=torch.float64)
     heights = np.array([0.52, 0.505, 0.48])
     x = torch.tensor(flat[:, :, None] + heights * np.array([[0], [1], [0]]))
     body = PosedBody(*(v.expand(-1, -1, 3) for v in (plane().points, plane().normals)))

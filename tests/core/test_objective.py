@@ -43,7 +43,7 @@ def at_frame(objective: Objective, z: torch.Tensor, frame: torch.Tensor, down: t
         "bending": energy.bending(x),
         "gravity": energy.gravity(x - character[0, :, 3], GRAVITY * down.T),
         "collision": energy.collision_at(
-            signed_distance_to_planes(x, *objective.contacts.planes(x, objective.body.pose(character)))
+            sample_distance(objective, x, character)
         ),
     }
     return x, terms

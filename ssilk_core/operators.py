@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..assets import Floats, Ints
+from .assets import Floats, Ints
 
 
 class _Apply(torch.autograd.Function):
@@ -47,6 +47,10 @@ class SparseOperator:
         """Apply the operator to `x`, shape (vertices, 3, frames)."""
         flat = x.reshape(x.shape[0], -1)
         return _Apply.apply(flat, self.matrix, self.transposed).reshape(-1, *x.shape[1:])
+
+    def adjoint(self, y: Tensor) -> Tensor:
+        """Apply the transposed operator to `y`, shape (rows, 3, frames); without gradients."""
+        return (self.transposed @ y.flatten(1)).reshape(-1, *y.shape[1:])
 
 
 def _csr(
