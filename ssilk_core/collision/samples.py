@@ -18,6 +18,7 @@ from torch import Tensor
 from .. import kernels
 from ..assets import LOOSE, PINNED, TIGHT, Floats, Ints, Mesh
 from ..fabrics import Fabric
+from ..mesh import topology
 from ..operators import SparseOperator
 
 MAX_SPACING = 0.016  # [m] between the samples of a triangle, at rest
@@ -68,7 +69,7 @@ def contact_samples(mesh: Mesh, fabric: Fabric) -> ContactSamples:
         return vertices
     faces = mesh.faces
     a, b, c = (mesh.points[faces[:, corner]] for corner in range(3))
-    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    area = topology.face_areas(mesh.points, faces)
     longest = np.max([np.linalg.norm(side, axis=1) for side in (b - a, c - b, a - c)], axis=0)
     # The middles of equal triangles are apart by 1 / sqrt(3) of their edge.
     divisions = np.ceil(longest / np.sqrt(3) / MAX_SPACING).clip(1, MAX_DIVISIONS).astype(int)

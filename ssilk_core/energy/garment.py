@@ -15,9 +15,9 @@ from ..fabrics import Fabric
 from ..kernels.corners import elastic_tables
 from ..mesh import topology
 from ..mesh.topology import SLIVER
+from ..operators import difference_operator
 from .bending import bending_energy, dihedral_angles
 from .collision import ContactLaw
-from ..operators import difference_operator
 from .stretch import column_weights, deformation_gradient_operator, stretch_density, stretched_areas
 
 TERMS = ("stretch", "bending", "gravity", "inertia", "collision")

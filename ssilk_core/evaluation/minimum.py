@@ -51,7 +51,9 @@ class Minima:
         """Return the share of vertices inside any part of the body, shape (N,)."""
         body = self.simulator.inputs(self.poses, None).body
         assert body is not None
-        _, nearest = self.simulator.potential.contacts.distances(self.simulator.potential.cloth.positions(x).float(), body)
+        _, nearest = self.simulator.potential.contacts.distances(
+            self.simulator.potential.cloth.positions(x).float(), body
+        )
         return (nearest[: len(x)] < 0).double().mean(0)
 
     def distance(self) -> Tensor:

@@ -140,9 +140,7 @@ class IncrementalPotential:
             push, stiffness = (
                 self.cloth.area * part for part in (self.law.pressure(distance), self.law.curvature(distance))
             )
-            contact = (
-                stiffness[:, None, None] * outer(normal, normal) + push[:, None, None] * body_distance.curvature
-            )
+            contact = stiffness[:, None, None] * outer(normal, normal) + push[:, None, None] * body_distance.curvature
         fixed = None if fixed is None else fixed[self.free]
         return self._hessian(x, weight[self.free].float(), contact, fixed, exact_hessian)
 

@@ -51,7 +51,10 @@ def measure_collisions(dressed: EvaluationScene, take_set: TakeSet, method: Meth
         contacts = Contacts(dressed.scene, cloth.samples, vertices=chosen, device=dressed.device)
         begun = time.perf_counter()
         met, nearest = contacts.distances(cloth.positions(x), body.pose(character, surface=surface))
-        inside, energy = float((nearest[: len(x)] < 0).double().mean()), float(dressed.energy.collision_at(met).mean())
+        inside, energy = (
+            float((nearest[: len(x)] < 0).double().mean()),
+            float(dressed.energy.collision_at(met).mean()),
+        )
         each = 1000 * (time.perf_counter() - begun) / len(frames)
         found.append(CollisionCost(name, len(chosen), each, energy, inside))
     return found

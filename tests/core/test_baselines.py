@@ -191,13 +191,16 @@ def test_the_terms_of_a_window_are_those_of_its_frames(scene, motions, method, j
         states = torch.cat(model.roll([*rest[:2]], rest[2:], pose[2:, None]))
         character = objective.bank.character(frames)
         x = model.vertices(states, character)
+        sampled = energy.cloth.positions(x)
         root = objective.bank.root[frames].T
         direct = {
             "stretch": energy.stretch(x),
             "bending": energy.bending(x),
             "gravity": energy.gravity(x - character[0, :, 3], GRAVITY * down.T),
             "collision": energy.collision_at(
-                sample_distance(objective, x, character)
+                signed_distance_to_planes(
+                    sampled, *objective.contacts.planes(sampled, objective.body.pose(character))
+                )
             ),
             "inertia": energy.inertia(x[..., 2:], 2 * x[..., 1:-1] - x[..., :-2], 1 / 30),
             "drag": energy.drag(x[..., 2:], x[..., 1:-1] + root[:, 2:] - root[:, 1:-1], 1 / 30),

@@ -88,7 +88,10 @@ def test_where_cloth_is_near_its_own_side_nothing_changes(scene):
     x = x.float()[..., None]
     for options in ({}, {"exact": True}):
         posed = still(body, **options)
-        for found, expected in zip(Contacts(dressed, vertex_samples(len(dressed.classes)), device=CPU).planes(x, posed), nearest_planes(x, posed)):
+        for found, expected in zip(
+            Contacts(dressed, vertex_samples(len(dressed.classes)), device=CPU).planes(x, posed),
+            nearest_planes(x, posed),
+        ):
             np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
@@ -116,7 +119,9 @@ def test_rounded_distances_are_those_of_the_planes_that_tight_and_loose_cloth_me
 def test_pinned_cloth_meets_nothing_unless_it_is_measured(scene):
     dressed, body = on_limb(scene, np.array([0.0, 0, 0]), PINNED)
     x = torch.tensor(dressed.garment.mesh.points, dtype=torch.float32)[..., None]
-    free, measured = (Contacts(dressed, vertex_samples(len(dressed.classes)), pinned=pinned, device=CPU) for pinned in (False, True))
+    free, measured = (
+        Contacts(dressed, vertex_samples(len(dressed.classes)), pinned=pinned, device=CPU) for pinned in (False, True)
+    )
     assert (signed_distance_to_planes(x, *free.planes(x, still(body))) > 1e5).all()
     assert (measured.distances(x, still(body))[0] < 0).all()
 
@@ -129,7 +134,10 @@ def test_tight_cloth_far_from_the_body_may_meet_all_of_it(scene):
     dressed, body = on_limb(scene, np.array([RADIUS + 0.1, 0, 0]), TIGHT)
     x = torch.tensor(dressed.garment.mesh.points, dtype=torch.float32)[..., None]
     pulled = x - torch.tensor([RADIUS + 0.12, 0, 0])[:, None]
-    assert (Contacts(dressed, vertex_samples(len(dressed.classes)), device=CPU).planes(pulled, still(body))[0][:, 0] < -0.5).all()
+    assert (
+        Contacts(dressed, vertex_samples(len(dressed.classes)), device=CPU).planes(pulled, still(body))[0][:, 0]
+        < -0.5
+    ).all()
 
 
 def shape_of(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:

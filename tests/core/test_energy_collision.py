@@ -17,7 +17,7 @@ from ssilk_core.collision.nearest_vertex import compact_blocks
 from ssilk_core.collision.one_ring import nearest_on_rings, triangle_rings
 from ssilk_core.energy import GarmentEnergy
 from ssilk_core.energy.collision import ContactLaw
-from ssilk_core.fabrics import FABRICS, Fabric
+from ssilk_core.fabrics import FABRICS
 from ssilk_core.kinematics import skin_points
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"  # on a CPU kernels run in Triton's interpreter
@@ -60,7 +60,9 @@ def test_the_papers_penalty_starts_at_the_margin_and_grows_with_the_square():
 def test_a_garments_penalty_is_summed_over_vertices_for_each_frame(toy_grid):
     points, faces = toy_grid(4, 3)
     flat = np.stack([points[:, 0], np.zeros(len(points)), points[:, 1]], axis=1)
-    energy = GarmentEnergy(Mesh("/sheet", flat, faces), replace(FABRICS["paper"], collision=50.0, margin=0.01), dtype=torch.float64)
+    energy = GarmentEnergy(
+        Mesh("/sheet", flat, faces), replace(FABRICS["paper"], collision=50.0, margin=0.01), dtype=torch.float64
+    )
     heights = np.array([0.52, 0.505, 0.48])
     x = torch.tensor(flat[:, :, None] + heights * np.array([[0], [1], [0]]))
     body = PosedBody(*(v.expand(-1, -1, 3) for v in (plane().points, plane().normals)))

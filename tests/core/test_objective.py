@@ -38,12 +38,13 @@ def at_frame(objective: Objective, z: torch.Tensor, frame: torch.Tensor, down: t
     """Positions and potential terms of one state at one frame."""
     character, energy = objective.bank.character(frame), objective.energy
     x = objective.model.vertices(z, character)
+    sampled = energy.cloth.positions(x)
     terms = {
         "stretch": energy.stretch(x),
         "bending": energy.bending(x),
         "gravity": energy.gravity(x - character[0, :, 3], GRAVITY * down.T),
         "collision": energy.collision_at(
-            sample_distance(objective, x, character)
+            signed_distance_to_planes(sampled, *objective.contacts.planes(sampled, objective.body.pose(character)))
         ),
     }
     return x, terms

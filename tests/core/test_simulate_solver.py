@@ -198,7 +198,9 @@ def test_the_assembled_hessian_is_the_gauss_newton_hessian(potential: Incrementa
     expected += torch.einsum("hia,hjb->iajb", slopes, slopes)
     inertia = potential.mass[:, 0] * (900 + potential.fabric.drag / potential.fabric.density * 30)
     contact = potential.cloth.area * potential.law.curvature(body_distance.distance(potential.cloth.positions(x)))
-    corners, shares = (torch.as_tensor(part) for part in (potential.cloth.samples.corners, potential.cloth.samples.weights))
+    corners, shares = (
+        torch.as_tensor(part) for part in (potential.cloth.samples.corners, potential.cloth.samples.weights)
+    )
     mixed = torch.zeros(len(shares), count, dtype=torch.float64).scatter_add_(1, corners, shares)
     n = body_distance.normal[..., 0]
     expected += torch.einsum("s,si,sa,sb,sj->iajb", contact[:, 0], mixed, n, n, mixed)
