@@ -10,6 +10,7 @@ import torch
 
 from ssilk_core.assets import Mesh
 from ssilk_core.collision import PosedBody
+from ssilk_core.collision.samples import MAX_DIVISIONS, MAX_SPACING
 from ssilk_core.energy import GarmentEnergy
 from ssilk_core.fabrics import Fabric
 
@@ -189,14 +190,36 @@ def drag(case: Case, x: np.ndarray, frame: int) -> tuple[float, np.ndarray]:
     return float(np.sum(weight * offset**2) / 2), weight * offset
 
 
+def contact_of_a_point(case: Case, point: np.ndarray, frame: int) -> tuple[float, np.ndarray]:
+    """Energy and gradient for each area, by the pressure integrated over the depth."""
+    nearest = np.argmin(np.linalg.norm(case.points[..., frame] - point, axis=1))
+    normal, m = case.normals[nearest, :, frame], STVK.margin
+    depth = max(m + STVK.thickness / 2 - normal @ (point - case.points[nearest, :, frame]), 0)
+    soft, deep = min(depth, m), max(depth - m, 0)
+    energy = STVK.contact * (soft**3 / (6 * m) + m * deep / 2 + deep**2 / 2)
+    return energy, -STVK.contact * (soft**2 / (2 * m) + deep) * normal
+
+
 def collision(case: Case, x: np.ndarray, frame: int) -> tuple[float, np.ndarray]:
+    """A quarter of each triangle's area is at its corners, the rest in the middles of equal parts."""
     total, gradient = 0.0, np.zeros_like(x)
-    for vertex, point in enumerate(x):
-        nearest = np.argmin(np.linalg.norm(case.points[..., frame] - point, axis=1))
-        normal = case.normals[nearest, :, frame]
-        depth = min(normal @ (point - case.points[nearest, :, frame]) - STVK.margin, 0)
-        total += STVK.collision * depth**2
-        gradient[vertex] = 2 * STVK.collision * depth * normal
+    for face in case.mesh.faces:
+        a, b, c = case.mesh.points[face]
+        area = np.linalg.norm(np.cross(b - a, c - a)) / 2
+        longest = max(np.linalg.norm(b - a), np.linalg.norm(c - b), np.linalg.norm(a - c))
+        n = min(max(int(np.ceil(longest / np.sqrt(3) / MAX_SPACING)), 1), MAX_DIVISIONS)
+        parts = [(weights, area / 12) for weights in np.eye(3)]
+        for i in range(n):
+            for j in range(n - i):
+                thirds = [(1, 1)] if i + j == n - 1 else [(1, 1), (2, 2)]
+                parts += [
+                    (np.array([n - i - j - (s + t) / 3, i + s / 3, j + t / 3]) / n, 0.75 * area / n**2)
+                    for s, t in thirds
+                ]
+        for weights, share in parts:
+            energy, slope = contact_of_a_point(case, weights @ x[face], frame)
+            total += share * energy
+            gradient[face] += share * weights[:, None] * slope
     return total, gradient
 
 
