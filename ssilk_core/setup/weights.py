@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..assets import LOOSE, Character, Floats, Ints, Mesh, SkinWeights
+from ..assets import LOOSE, Character, Ints, Mesh, SkinWeights
 from ..errors import fail
-from ..mesh.topology import edges, smooth
+from ..mesh.topology import edges, smooth, vertex_areas, vertex_mask
+from .binding import bind_to_skin
 from .surface import closest_on_surface
 
 
@@ -40,10 +41,11 @@ def transfer_weights(
 ) -> SkinWeights:
     """Take each vertex's weights from the closest point of the body's surface, then smooth them over the cloth.
 
-    If `classes` are given, loose vertices are smoothed longer while the others keep their values. Vertices at the
-    same position count as one, so that panels which meet without being welded stay together. Surfaces are matched
-    regardless of their normals. Matching only those whose normals agree, and filling the gaps from their
-    surroundings, changed the strain under motion at armpits and crotches by less than one percent.
+    If `classes` are given, loose vertices are smoothed longer, and the weights of the others are fitted so that they
+    stay over the skin beneath them (`bind_to_skin`). Vertices at the same position count as one, so that panels
+    which meet without being welded stay together. Surfaces are matched regardless of their normals. Matching only
+    those whose normals agree, and filling the gaps from their surroundings, changed the strain under motion at
+    armpits and crotches by less than one percent.
 
     Args:
         mesh: the garment at the character's bind pose.
@@ -51,23 +53,34 @@ def transfer_weights(
     """
     options = options or WeightOptions()
     body = character.merged_body()
-    closest = closest_on_surface(mesh.points, body.mesh)
-    dense = body.skin.dense(character.skeleton.joint_count)
-    weights = np.einsum("vk,vkj->vj", closest.barycentric, dense[closest.corners])
-    loose = np.zeros(mesh.vertex_count, dtype=bool) if classes is None else np.asarray(classes) == LOOSE
-    return SkinWeights.from_dense(mesh.path, _smoothed(mesh, weights, loose, options), options.influences)
-
-
-def _smoothed(mesh: Mesh, weights: Floats, loose: Ints, options: WeightOptions) -> Floats:
-    """Average `weights` (V, J) over the cloth, with more rounds for the rows of `loose` (V,)."""
     _, first, place = np.unique(mesh.points.round(6), axis=0, return_index=True, return_inverse=True)
     place = place.reshape(-1)
     pairs = np.unique(np.sort(place[edges(mesh.faces)], axis=1), axis=0)
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
-    weights = smooth(weights[first], pairs, options.tight_rounds)
-    moving = np.zeros(len(first), dtype=bool)
-    moving[place[loose]] = True
-    if moving.any():
-        for _ in range(options.tight_rounds, options.loose_rounds):
-            weights[moving] = smooth(weights, pairs, 1)[moving]
-    return weights[place]
+    closest = closest_on_surface(mesh.points[first], body.mesh)
+    dense = body.skin.dense(character.skeleton.joint_count)
+    copied = np.einsum("vk,vkj->vj", closest.barycentric, dense[closest.corners])
+    weights = smooth(copied, pairs, options.tight_rounds)
+    if classes is not None:
+        loose = vertex_mask(place[np.asarray(classes) == LOOSE], len(first))
+        areas = np.bincount(place, vertex_areas(mesh.points, mesh.faces)).astype(np.float64)
+        held = np.flatnonzero(~loose)
+        weights[held] = bind_to_skin(
+            character,
+            mesh.points[first[held]],
+            areas[held],
+            _among(pairs, held, len(first)),
+            (copied + weights)[held] / 2,
+            options.influences,
+        )
+        for _ in range(options.tight_rounds, options.loose_rounds if loose.any() else 0):
+            weights[loose] = smooth(weights, pairs, 1)[loose]
+    return SkinWeights.from_dense(mesh.path, weights[place], options.influences)
+
+
+def _among(pairs: Ints, chosen: Ints, count: int) -> Ints:
+    """Return the pairs (E, 2) of which both are `chosen` out of `count`, as places among these."""
+    place = np.full(count, -1)
+    place[chosen] = np.arange(len(chosen))
+    pairs = place[pairs]
+    return pairs[(pairs >= 0).all(axis=1)]
