@@ -86,6 +86,7 @@ class TrainConfig:
         state_reuse: share of windows that continue from the final state of the previous window in the same slot.
         rotated_fraction: share of windows with a random rotation, uniform on SO(3); the others stay upright.
         recombinations: number of extra motions for each motion, whose limbs move as in another motion.
+        perturbations: number of extra motions for each motion with joints turned at random.
         static_batch: single poses in each step of dynamic training, to which P is still fitted.
         noise_probability: probability per frame of noise on a reused state. A new window always starts with noise.
         noise: standard deviation of the noise on the first two latents of a window.
@@ -117,6 +118,7 @@ class TrainConfig:
     state_reuse: float = 0.97
     rotated_fraction: float = 0.5
     recombinations: int = 3
+    perturbations: int = 1
     static_batch: int = 256
     noise_probability: float = 0.03
     noise: float = 0.1
@@ -159,7 +161,7 @@ class TrainConfig:
         )
         _need_between(self, 0, NO_BOUND, "latent_regularization")
         _need_between(self, 1e-9, NO_BOUND, "latent_regularization_scale")
-        _need_between(self, 0, 1000, "recombinations")
+        _need_between(self, 0, 1000, "recombinations", "perturbations")
         _need_between(self, 0, 2**63 - 1, "seed")
 
     @property
@@ -192,6 +194,7 @@ PRESETS = {
                 state_reuse=0.7,
                 static_batch=8,
                 recombinations=0,
+                perturbations=0,
                 rotated_fraction=0.3,
                 learning_rate=6e-4,
                 final_learning_rate=1e-4,

@@ -12,6 +12,7 @@ from ..assets import LOOSE, PINNED, Motion, Scene
 from ..config import ModelConfig, TrainConfig
 from ..errors import fail
 from ..fabrics import Fabric
+from .perturb import perturb_motions
 from .recombine import recombine_motions
 from .state import json_round_trip, scene_digest
 
@@ -49,7 +50,15 @@ class TrainJob:
             object.__setattr__(self, "train", replace(self.train, state_reuse=0, noise=0))
         if not self.is_trainable:
             object.__setattr__(self, "model", replace(self.model, latent=1, widths=(1,), shapes=1))
-            least = replace(self.train, iterations=1, batch=1, pretraining_batch=1, static_batch=1, recombinations=0)
+            least = replace(
+                self.train,
+                iterations=1,
+                batch=1,
+                pretraining_batch=1,
+                static_batch=1,
+                recombinations=0,
+                perturbations=0,
+            )
             object.__setattr__(self, "train", least)
 
     @property
@@ -63,9 +72,10 @@ class TrainJob:
         return bool((self.scene.classes != PINNED).any())
 
     def training_motions(self) -> list[Motion]:
-        """Return the motions and those recombined from them."""
-        skeleton = self.scene.character.skeleton
-        return [*self.motions, *recombine_motions(self.motions, skeleton, self.train.recombinations, self.train.seed)]
+        """Return the motions, and those recombined from them and perturbed."""
+        skeleton, train = self.scene.character.skeleton, self.train
+        more = recombine_motions(self.motions, skeleton, train.recombinations, train.seed)
+        return [*self.motions, *more, *perturb_motions(self.motions, train.perturbations, train.seed)]
 
     def identity(self) -> dict[str, Any]:
         """Return the inputs that a resumed run must share, as JSON stores them."""

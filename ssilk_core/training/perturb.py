@@ -16,10 +16,10 @@ LARGE_PROBABILITY = 0.1  # that a joint turns far
 SLOWEST, FASTEST = 0.1, 0.7  # [Hz] of the turns
 
 
-def perturb_motions(motions: Sequence[Motion], seed: int) -> list[Motion]:
-    """Return the motions with slow random turns of every joint but the root, about random axes."""
+def perturb_motions(motions: Sequence[Motion], copies: int, seed: int) -> list[Motion]:
+    """Return `copies` of each motion with slow random turns of every joint but the root, about random axes."""
     generator = np.random.default_rng(seed)
-    return [_perturbed(motion, generator) for motion in motions]
+    return [_perturbed(motion, generator) for motion in [*motions] * copies]
 
 
 def _perturbed(motion: Motion, generator: np.random.Generator) -> Motion:
