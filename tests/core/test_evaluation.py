@@ -160,7 +160,7 @@ def test_errors_against_a_reference_are_those_of_the_offset(dressed, take_set):
     mass = float(dressed.energy.mass.sum())
     lifted = mass * GRAVITY * float(path[:, 1].mean())
     assert found.gravity_excess == pytest.approx(lifted / dressed.weight, rel=1e-3)
-    own = figures(tally, reference, dressed.weight)
+    own = figures(tally, reference, dressed.weight, dressed.covered)
     assert found.total_excess == pytest.approx(own.total - found.reference_total) and found.frames == 40
     assert own.static_distance == pytest.approx(expected[0], rel=1e-3)
     assert own.gravity_excess == pytest.approx(found.gravity_excess, rel=1e-3)
@@ -353,7 +353,7 @@ def test_every_method_gets_its_row_in_every_split(scene, dressed, motion, toy_mo
     text = tables(rows)
     first = [line.split("|")[2].strip() for line in text.split("\n\n")[0].splitlines()[2:]]
     assert first == ["valid"] * 4 + ["flips"] * 4  # the methods of a split stand together
-    assert text.count("| garment") == 7 and len({len(line) for line in text.split("\n\n")[0].splitlines()}) == 1
+    assert text.count("| garment") == 8 and len({len(line) for line in text.split("\n\n")[0].splitlines()}) == 1
 
 
 def test_a_character_that_never_moves_has_no_jerk_to_compare_with(scene, dressed, motion, toy_model):
