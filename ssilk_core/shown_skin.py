@@ -11,12 +11,14 @@ class ShownSkin:
     """The share of covered skin that shows, over frames.
 
     Attributes:
+        frames: that were counted.
         covered: points that the garment covers.
         mean, worst: mean share over frames, and that of the worst frame.
         clip, frame: the worst frame; of several equal ones the first.
         regions: share of what shows, of all frames together, at the joints that move most of it, largest first.
     """
 
+    frames: int
     covered: int
     mean: float
     worst: float
@@ -24,8 +26,24 @@ class ShownSkin:
     frame: int
     regions: dict[str, float]
 
+    @property
+    def where(self) -> str:
+        """The regions in words; empty where nothing shows, or where joints are not known."""
+        return ", ".join(f"{joint} {share:.0%}" for joint, share in self.regions.items())
+
+    def summary(self) -> dict[str, str]:
+        """Return figures for people."""
+        return {
+            "covered skin that shows": f"{self.mean:.3%}",
+            "in the worst frame": f"{self.worst:.2%}, {self.clip} at {self.frame}",
+            **({"most at": self.where} if self.where else {}),
+        }
+
+    def to_metadata(self) -> dict[str, object]:
+        """Return figures of four digits, as a shot stores them."""
+        rounded = {name: float(f"{getattr(self, name):.4g}") for name in ("mean", "worst")}
+        return {**vars(self), **rounded, "regions": {joint: round(share, 4) for joint, share in self.regions.items()}}
+
     def __str__(self) -> str:
-        """Say where in brackets: "0.78% of the covered skin shows, 2.0% in the worst frame (walk, frame 31: ...)"."""
-        where = ", ".join(f"{joint} {share:.0%}" for joint, share in self.regions.items())
-        worst = f"{self.clip}, frame {self.frame}" + (f"; most at {where}" if where else "")
+        worst = f"{self.clip}, frame {self.frame}" + (f"; most at {self.where}" if self.where else "")
         return f"{self.mean:.3%} of the covered skin shows, {self.worst:.2%} in the worst frame ({worst})"

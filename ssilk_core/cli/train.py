@@ -83,11 +83,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
                 "linear blend skinning [J]": round(trained.lbs.total, 5),
                 ("lower by" if share >= 0 else "higher by"): f"{abs(share):.1%}",
                 "collisions": f"{trained.score.collisions:.2%}",
-                **(
-                    {"skin that shows": f"{shown.mean:.3%}", "in the worst frame": f"{shown.worst:.2%}"}
-                    if shown
-                    else {}
-                ),
+                **(shown.summary() if shown else {}),
                 **{f"{k} [J]": round(v, 5) for k, v in trained.score.terms.items()},
             },
         )

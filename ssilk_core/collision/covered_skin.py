@@ -20,12 +20,12 @@ from ..assets import Floats, Ints, Mesh, Scene, SkinWeights
 from ..mesh import topology
 from ..shown_skin import ShownSkin
 from ..skinning import Skinning
-from .nearest_vertex import compact_blocks
 from .ray_casting import RayCaster, RayHits
 
 SKIN_POINTS = 8000
 COVER_REACH, SHOW_DEPTH = 0.08, 0.03  # [m]
 NAMED_REGIONS = 3
+MORTON_BITS = 12  # cells of half a millimetre on a person
 PLASTIC = 1.32471795724474602596  # root of x^3 = x + 1; its powers make the most even sequence in the plane
 
 
@@ -178,6 +178,7 @@ def shown_skin(
         return None
     clip, worst = max(clips, key=lambda each: float(each[1].shares.max()))
     return ShownSkin(
+        frames=len(together.shares),
         covered=len(together.points),
         mean=float(together.shares.mean()),
         worst=float(worst.shares.max()),
@@ -197,6 +198,13 @@ def _covered(mesh: Mesh, normals: Floats, faces: Ints, weights: Floats, cloth: M
     return caster.cast(*asked, above=COVER_REACH, beneath=0.0).above[:, 0].numpy()
 
 
+def _cells(points: Floats) -> Ints:
+    """Return the places of points (P, 3) on a Morton curve, along which neighbours mostly lie close together."""
+    low = points.min(axis=0)
+    cells = ((points - low) / max(float(np.ptp(points, axis=0).max()), 1e-9) * (2**MORTON_BITS - 1)).astype(np.int64)
+    return sum(((cells[:, axis] >> bit) & 1) << (3 * bit + axis) for bit in range(MORTON_BITS) for axis in range(3))
+
+
 def spread_points(mesh: Mesh, count: int) -> tuple[Ints, Floats]:
     """Spread points evenly by area over a mesh, always in the same way.
 
@@ -206,7 +214,7 @@ def spread_points(mesh: Mesh, count: int) -> tuple[Ints, Floats]:
     Returns:
         The triangle of each point (P,), and its barycentric coordinates (P, 3).
     """
-    path = compact_blocks(mesh.points[mesh.faces].mean(axis=1), 1)[:, 0]
+    path = np.argsort(_cells(mesh.points[mesh.faces].mean(axis=1)), kind="stable")
     ends = np.cumsum(topology.face_areas(mesh.points, mesh.faces)[path])
     number = np.arange(count)
     place = np.searchsorted(ends, (number + 0.5) / count * ends[-1], side="right")

@@ -13,7 +13,7 @@ from ..work_record import WorkRecord, read_record, write_record
 from .listing import WardrobeEntry
 from .queue import CommandTask, End
 
-COLUMNS = ("garment", "iterations", "total [J]", "lower by", "collisions", "skin that shows", "time", "state")
+COLUMNS = ("garment", "iterations", "total [J]", "lower by", "collisions", "skin shows", "time", "state")
 
 
 class GarmentTraining:
@@ -86,6 +86,6 @@ class GarmentTraining:
             found.get("total [J]"),
             lower,
             found.get("collisions"),
-            found.get("skin that shows"),
+            found.get("covered skin that shows"),
         ]
         return dict(zip(COLUMNS, [self.entry.name, *figures, round(self.seconds, 1), self.state]))
