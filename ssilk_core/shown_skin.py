@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+COVER_REACH, SHOW_DEPTH = 0.08, 0.03  # [m]: how far cloth above covers a point, and how far beneath it is seen
+
 
 @dataclass(frozen=True, kw_only=True)
 class ShownSkin:

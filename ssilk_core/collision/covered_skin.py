@@ -18,12 +18,11 @@ from torch import Tensor
 
 from ..assets import Floats, Ints, Mesh, Scene, SkinWeights
 from ..mesh import topology
-from ..shown_skin import ShownSkin
+from ..shown_skin import COVER_REACH, SHOW_DEPTH, ShownSkin
 from ..skinning import Skinning
 from .ray_casting import RayCaster, RayHits
 
 SKIN_POINTS = 8000
-COVER_REACH, SHOW_DEPTH = 0.08, 0.03  # [m]
 NAMED_REGIONS = 3
 MORTON_BITS = 12  # cells of half a millimetre on a person
 PLASTIC = 1.32471795724474602596  # root of x^3 = x + 1; its powers make the most even sequence in the plane
