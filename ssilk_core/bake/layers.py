@@ -21,6 +21,7 @@ from .refinement import refined
 from .request import BakeRequest
 from .result import BakeResult
 from .rollout import BakeRollout
+from .skin import SkinMeter
 from .task import BakeTask, plan_layers
 from .verification import verify_file
 from .write import result_of
@@ -198,6 +199,7 @@ def _write_layer(layout: Layout, asset: Asset, rollout: BakeRollout, task: BakeT
     from ssilk_usd import layers
 
     rollout = refined(rollout, report)
+    skin = SkinMeter(rollout)
     common: dict[str, Any] = {
         "units": rollout.units,
         "start": rollout.start,
@@ -212,16 +214,16 @@ def _write_layer(layout: Layout, asset: Asset, rollout: BakeRollout, task: BakeT
             asset,
             rollout.deformer,
             rollout.motion,
-            rollout.poses(),
+            skin.poses(),
             **common,
             hidden=rollout.hidden,
-            provenance=shot_metadata(rollout, layout.animation),
+            provenance=shot_metadata(rollout, layout.animation, skin.stated),
             path=unverified,
             points=task.points,
         )
         verification = verify_file(rollout, unverified, report) if task.verify else None
     rollout.warn(report)
-    return result_of(rollout, layout.animation, summary, verification)
+    return result_of(skin, layout.animation, summary, verification)
 
 
 def _own_files(layout: Layout) -> tuple[Path, ...]:

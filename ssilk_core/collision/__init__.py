@@ -6,7 +6,7 @@ Positions have the shape (V, 3, N): vertices, coordinates, frames.
 
 from .body import CollisionBody
 from .contacts import Contacts
-from .covered_skin import CoveredSkin, ShownCounts, ShownSkin
+from .covered_skin import CoveredPoints, CoveredSkin, ShownCounts
 from .distance import (
     Patches,
     PosedBody,
@@ -22,6 +22,7 @@ from .smoothed_distance import SmoothedDistance
 __all__ = [
     "CollisionBody",
     "Contacts",
+    "CoveredPoints",
     "CoveredSkin",
     "Patches",
     "PosedBody",
@@ -29,7 +30,6 @@ __all__ = [
     "RayHits",
     "ReachableBody",
     "ShownCounts",
-    "ShownSkin",
     "SmoothedDistance",
     "nearest_planes",
     "reachable_body",
