@@ -30,26 +30,26 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
 POSES = 64
-LARGEST_TURN = np.radians(60)  # of each joint, about a random axis
+LARGEST_TURN = np.radians(80)  # of each joint, about a random axis
 TANGENT_SHARE = 0.3  # weight of squared distances along the skin, relative to those along its normal
 BELOW_FACTOR = 100.0  # additional weight of squared distances below the clearance
 CLEARANCE = 0.005  # [m] above the skin that is kept, or the rest distance where that is smaller
 FAR = 0.03  # [m] from the skin at which a vertex counts half
 SMOOTHING = 1.5e-6  # [m4] weight of the squared gradient of skinning weights, relative to squared distances
 REWEIGHTINGS = 5  # times that vertices below their clearance are found again
-ITERATIONS = 120  # of projected gradient descent after each
+ITERATIONS = 30  # of projected gradient descent after each
 
 
 @dataclass(frozen=True, eq=False)
 class _Offsets:
-    """Where each candidate joint alone would put a vertex, from its place on the posed skin, for V vertices.
+    """Where each of K candidate joints alone would put V vertices, from their targets in N poses.
 
     Attributes:
-        tangential: offsets [m], with three coordinates for each of N poses, float32, shape (V, K, 3 N).
-        normal: their part along the skin's normal [m], float32, shape (V, K, N).
+        square: the products of every two candidates' offsets, summed over the poses [m2], shape (V, K, K).
+        normal: the offsets along the normal of the skin [m], float32, shape (V, K, N).
     """
 
-    tangential: NDArray[np.float32]
+    square: Floats
     normal: NDArray[np.float32]
 
 
@@ -119,8 +119,9 @@ def _offsets(
     body: Body, points: Floats, skin: SurfacePoints, gap: Floats, candidates: Ints, matrices: Floats
 ) -> _Offsets:
     """Return the offsets from the targets under skinning matrices (N, J, 4, 4); `gap` (V,) is along the normal."""
-    shape = *candidates.shape, len(matrices)
-    result = _Offsets(np.empty((*shape, 3), np.float32), np.empty(shape, np.float32))
+    vertices, count = candidates.shape
+    square = np.zeros((vertices, count, count))
+    along = np.empty((vertices, count, len(matrices)), np.float32)
     own = _on_skin(body.skin.dense(matrices.shape[1]), skin)
     aside = points - _on_skin(body.mesh.points, skin) - gap[:, None] * skin.normals
     for number, pose in enumerate(matrices):
@@ -131,9 +132,9 @@ def _offsets(
         target = _on_skin(posed, skin) + gap[:, None] * normals + turned
         moved = (pose[candidates, :3, :3] @ points[:, None, :, None])[..., 0] + pose[candidates, :3, 3]
         away = moved - target[:, None]
-        result.tangential[..., number, :] = away
-        result.normal[..., number] = (away * normals[:, None]).sum(axis=-1)
-    return _Offsets(result.tangential.reshape(*candidates.shape, -1), result.normal)
+        square += away @ away.transpose(0, 2, 1)
+        along[..., number] = (away * normals[:, None]).sum(axis=-1)
+    return _Offsets(square, along)
 
 
 def _laplacian(points: Floats, areas: Floats, pairs: Ints) -> csr_matrix:
@@ -158,13 +159,13 @@ def _fit(
     """
     allowed = start > 0
     weights = to_simplex(np.where(allowed, start / start.sum(axis=1, keepdims=True), -np.inf))
-    along, normal = offsets.tangential, offsets.normal
+    normal = offsets.normal
     scale = (importance / normal.shape[2])[:, None, None]
-    base = TANGENT_SHARE * along @ along.transpose(0, 2, 1) + (1 - TANGENT_SHARE) * normal @ normal.transpose(0, 2, 1)
+    base = TANGENT_SHARE * offsets.square + (1 - TANGENT_SHARE) * normal @ normal.transpose(0, 2, 1)
     lifted = normal + slack.astype(np.float32)[:, None, None]  # from the clearance instead of the target
     for _ in range(REWEIGHTINGS):
         below = np.where((weights[:, None] @ lifted) < 0, lifted, 0)
-        form = scale * (base + BELOW_FACTOR * below @ below.transpose(0, 2, 1)).astype(np.float64)
+        form = scale * (base + BELOW_FACTOR * below @ below.transpose(0, 2, 1))
         weights = _descend(weights, allowed, candidates, form, couplings)
     return weights
 

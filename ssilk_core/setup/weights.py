@@ -65,14 +65,9 @@ def transfer_weights(
         loose = vertex_mask(place[np.asarray(classes) == LOOSE], len(first))
         areas = np.bincount(place, vertex_areas(mesh.points, mesh.faces)).astype(np.float64)
         held = np.flatnonzero(~loose)
-        weights[held] = bind_to_skin(
-            character,
-            mesh.points[first[held]],
-            areas[held],
-            _among(pairs, held, len(first)),
-            (copied + weights)[held] / 2,
-            options.influences,
-        )
+        cloth = mesh.points[first[held]], areas[held], _among(pairs, held, len(first))
+        if len(held):
+            weights[held] = bind_to_skin(character, *cloth, (copied + weights)[held] / 2, options.influences)
         for _ in range(options.tight_rounds, options.loose_rounds if loose.any() else 0):
             weights[loose] = smooth(weights, pairs, 1)[loose]
     return SkinWeights.from_dense(mesh.path, weights[place], options.influences)
