@@ -41,7 +41,7 @@ class Fabric:
     contact_model: str = "surface"
     contact: float = 1e6
     collision: float = 10.0
-    margin: float = 6e-3
+    margin: float = 8e-3
     thickness: float = 1e-3
     drag: float = 0.3
 

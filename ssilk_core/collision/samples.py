@@ -21,7 +21,7 @@ from ..fabrics import Fabric
 from ..mesh import topology
 from ..operators import SparseOperator
 
-MAX_SPACING = 0.016  # [m] between the samples of a triangle, at rest
+MAX_SPACING = 0.02  # [m] between the samples of a triangle, at rest
 MAX_DIVISIONS = 8  # of an edge: 64 samples in a large triangle
 VERTEX_SHARE = 0.25  # of a triangle's area; with its middle this integrates quadratic functions exactly
 

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How much covered skin shows on whole clips: under the network, refined by the simulator, and under plain skinning.
+
+    python benchmarks/shown_skin.py cape.safetensors --stage character.usdc --motions FOLDER --index FOLDER/index.json
+
+Shares are means over all frames of a split, and those of its worst frame. Stretch is the mean energy. The simulator
+and the refined network are measured on the first `--frames` frames of `--refined` clips; nothing is refined without.
+"""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from helpers.reports import table, write_results
+from helpers.subjects import Subject, arguments, clip_of, open_subject, parsed
+from refine import NetworkTake
+from torch import Tensor
+
+from ssilk_core.collision import CoveredSkin
+from ssilk_core.collision.covered_skin import ShownCounts
+from ssilk_core.evaluation.splits import read_index
+from ssilk_core.kinematics import motion_transforms, skinning_matrices
+from ssilk_core.motion_bank import roll_states
+from ssilk_core.simulate import SimulationOptions, simulate
+
+SPLITS = ("valid", "test", "flips")
+HEADER = ("garment", "split", "method", "frames", "shows, mean [%]", "worst frame [%]", "in", "stretch [J]")
+CHUNK = 256  # frames in memory at once
+ITERATIONS = 4
+
+
+def whole_clip(
+    subject: Subject, skin: CoveredSkin, options: Namespace, clip: str
+) -> Iterator[tuple[str, Tensor, Tensor]]:
+    """Yield method, shares of skin that shows and stretch energies of every frame of a clip."""
+    validator = subject.validator(clip_of(options, clip, subject))
+    (span,) = validator.clips
+    states = roll_states(subject.model, validator.bank, [span], validator.down)[0]
+    for method in ("network", "linear blend skinning"):
+        shares, stretch = [], []
+        for start in range(0, len(span), CHUNK):
+            frames = torch.arange(span[start], span[min(start + CHUNK, len(span)) - 1] + 1, device=subject.device)
+            character = validator.bank.character(frames)
+            at = subject.model.vertices(states[start : start + CHUNK], character)
+            x = at if method == "network" else validator.lbs_vertices(character)
+            shares.append(ShownCounts.of(skin.shows(x, character)).shares)
+            stretch.append(subject.energy.stretch(x).cpu())
+        yield method, torch.cat(shares), torch.cat(stretch)
+
+
+def solved(
+    subject: Subject, skin: CoveredSkin, options: Namespace, clip: str
+) -> Iterator[tuple[str, Tensor, Tensor]]:
+    """Yield the same of the first frames of a clip: the network, refined, and the simulator."""
+    take = NetworkTake.of(subject, clip_of(options, clip, subject), options.frames)
+    dressed, motion = subject.dressed, take.motion
+    refined = np.stack([frame.points for frame in take.refiner(ITERATIONS, True).frames(motion, take.points)])
+    simulation = SimulationOptions(fps=motion.fps, precision="float32")
+    (simulated,) = simulate(dressed.scene, dressed.fabric, [motion], simulation, device=subject.device)
+    skeleton = dressed.scene.character.skeleton
+    matrices = skinning_matrices(motion_transforms(motion, skeleton.parents), skeleton.bind_transforms)
+    character = torch.tensor(matrices[:, :, :3].transpose(1, 2, 3, 0), dtype=torch.float32, device=subject.device)
+    for method, points in (("network", take.points), (f"refine {ITERATIONS}", refined), ("simulator", simulated)):
+        x = torch.tensor(points.transpose(1, 2, 0), dtype=torch.float32, device=subject.device)
+        yield method, ShownCounts.of(skin.shows(x, character)).shares, subject.energy.stretch(x).cpu()
+
+
+def figures(found: list[tuple[str, Tensor, Tensor]]) -> dict[str, Any]:
+    """Return the figures of one method over clips, each with its name, shares and energies."""
+    shares, stretch = (torch.cat([each[part] for each in found]) for part in (1, 2))
+    worst = max(found, key=lambda each: float(each[1].max()))
+    return {
+        "frames": len(shares), "mean": float(shares.mean()), "worst": float(shares.max()), "in": worst[0],
+        "stretch": float(stretch.mean()), "clips": {name: float(own.mean()) for name, own, _ in found},
+    }  # fmt: skip
+
+
+@torch.no_grad()
+def measure(subject: Subject, options: Namespace) -> dict[str, Any]:
+    """Return the figures of a garment by split and method."""
+    skin = CoveredSkin(subject.scene, device=subject.device)
+    result: dict[str, Any] = {"covered": len(skin)}
+    splits = {split: [entry.clip for entry in read_index(options.index) if entry.split == split] for split in SPLITS}
+    runs = [(split, clips, whole_clip) for split, clips in splits.items()]
+    if options.refined:
+        runs.append((f"first {options.frames} frames", options.refined, solved))
+    for split, clips, run in runs:
+        methods: dict[str, list[tuple[str, Tensor, Tensor]]] = {}
+        for clip in clips:
+            for method, shares, stretch in run(subject, skin, options, clip):
+                methods.setdefault(method, []).append((clip, shares, stretch))
+        result[split] = {method: figures(found) for method, found in methods.items()}
+    return result
+
+
+def rows(garment: str, found: dict[str, Any]) -> list[list[str]]:
+    """Return the lines of a garment."""
+    return [
+        [garment, split, method, str(at["frames"]), f"{at['mean']:.3%}", f"{at['worst']:.2%}", at["in"],
+         f"{at['stretch']:.3f}"]
+        for split, methods in found.items() if isinstance(methods, dict) for method, at in methods.items()
+    ]  # fmt: skip
+
+
+def main() -> None:
+    parser = arguments(__doc__.splitlines()[0])
+    parser.add_argument("--index", type=Path, required=True, help="JSON list of clips and their splits")
+    parser.add_argument("--refined", nargs="*", default=[], metavar="CLIP", help="clips to refine and to simulate")
+    parser.add_argument("--frames", type=int, default=60, help="frames of these (default 60)")
+    options = parsed(parser)
+    lines, measured = [], {}
+    for path in options.models:
+        subject = open_subject(path, options.stage, options.device)
+        measured[subject.name] = found = measure(subject, options)
+        lines += rows(subject.name, found)
+        write_results(options, table(HEADER, lines), measured)
+
+
+if __name__ == "__main__":
+    main()
