@@ -12,7 +12,7 @@ skin were not there:
 - At least one of these rays meets cloth: a mouth is no covered skin.
 
 A triangle is covered when points all over it are, in all frames. What is hidden keeps a distance of `APART`, and of
-one triangle, from whatever is not covered: from hems, collars and holes.
+one triangle, from skin without cloth along its normal: from hems, collars and holes.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from .blocked_rays import NO_TRIANGLE, BlockedRays
 from .topology import vertex_normals
 
 REACH, DEPTH = 0.08, 0.03  # [m] above and beneath the skin
-FAN = ((40.0, 4), (70.0, 8))  # tilts from the normal [degrees], and how many directions at each
+FAN = ((40.0, 4), (70.0, 12))  # tilts from the normal [degrees], and how many directions at each
 SPACING = 0.02  # [m]; points on a triangle are at most so far apart
 APART = 0.03  # [m]
 LIFT = 0.002  # [m] of the start of rays above the skin, so that they do not start in the body where that is concave
@@ -45,6 +45,8 @@ class HiddenFaces:
 
     Attributes:
         covered: triangles that were covered in every frame, shape (F,).
+        bare: triangles that were covered until a frame in which points on them had no cloth along the normal,
+            shape (F,).
     """
 
     def __init__(self, body: Mesh, cloth: Mesh) -> None:
@@ -52,12 +54,19 @@ class HiddenFaces:
         self._cloth_rays = BlockedRays(cloth.points, cloth.faces)
         self._body_rays = BlockedRays(body.points, body.faces)
         self.covered = np.ones(len(self._faces), dtype=bool)
-        self._corners, self._weights, self._owners = _points_on(body)
+        self.bare = np.zeros(len(self._faces), dtype=bool)
         self._fan = _fan().astype(np.float32)
+        for inside in (False, True):  # vertices alone tell of most triangles that nothing covers
+            self._spread_points(inside)
+            self.add(body.points, cloth.points)
+
+    def _spread_points(self, inside: bool) -> None:
+        """Spread points over the triangles that are still covered: their vertices, and with `inside` more on each."""
+        chosen = np.flatnonzero(self.covered)
+        self._corners, self._weights, self._owners = _points_on(self._body, chosen, inside)
         self._above, self._facing = (np.full(len(self._corners), NO_TRIANGLE) for _ in range(2))
         self._around = np.full((len(self._corners), len(self._fan)), NO_TRIANGLE)
         self._by_body = np.zeros(self._around.shape, dtype=bool)
-        self.add(body.points, cloth.points)
 
     def add(self, body: Floats, cloth: Floats) -> None:
         """Take a frame into account: vertices of the body (B, 3) and of the garment (V, 3) [m] in one space."""
@@ -67,23 +76,22 @@ class HiddenFaces:
         body, cloth = ((points - middle).astype(np.float32) for points in (body, cloth))
         normals = vertex_normals(body, self._faces).astype(np.float32)
         heights = self._heights(body, cloth, normals)
+        before = self.covered.copy()
         self._keep(~np.isinf(heights))
+        self.bare |= before & ~self.covered
         if self.covered.any():
             self._keep(self._is_closed(body, cloth, normals, heights[self._kept]))
 
     def mask(self) -> NDArray[np.bool_]:
-        """Return which triangles may be hidden, shape (F,): those covered, apart from all that are not."""
-        points, hidden = self._body.points, self.covered.copy()
-        if hidden.all():
-            return hidden
-        seen = np.unique(self._faces[~hidden])
-        inner = np.unique(self._faces[hidden])
+        """Return which triangles may be hidden, shape (F,): those covered, apart from bare ones."""
+        points, hidden = self._body.points, self.covered
+        seen, inner = np.unique(self._faces[self.bare]), np.unique(self._faces[hidden])
         near = np.zeros(len(points), dtype=bool)
         near[seen] = True
-        many = max(1, DISTANCES_AT_ONCE // len(seen))
+        many = max(1, DISTANCES_AT_ONCE // max(1, len(seen)))
         for part in (inner[first : first + many] for first in range(0, len(inner), many)):
             square = (points[part] ** 2).sum(axis=1)[:, None] + (points[seen] ** 2).sum(axis=1)
-            near[part] |= (square - 2 * points[part] @ points[seen].T).min(axis=1) < APART**2
+            near[part] |= (square - 2 * points[part] @ points[seen].T).min(axis=1, initial=np.inf) < APART**2
         return hidden & ~near[self._faces].any(axis=1)
 
     def _keep(self, good: NDArray[np.bool_]) -> None:
@@ -144,7 +152,7 @@ class HiddenFaces:
         found, by_body = np.full(around.shape, NO_TRIANGLE), self._by_body.copy()
         shows = np.broadcast_to(touched[:, None], by_body.shape)
         leaves: Floats = -(LIFT + LEAVING) / self._fan[:, 2] + 0 * low
-        passes: tuple[tuple[BlockedRays, Floats, NDArray[np.bool_], bool, Floats, Floats], ...] = (
+        passes: tuple[tuple[BlockedRays, Floats, NDArray, bool, NDArray, NDArray], ...] = (
             (self._body_rays, body, by_body, True, 0 * low, high),  # first what blocked a ray before
             (self._cloth_rays, cloth, np.ones_like(by_body), False, low, high),
             (self._body_rays, body, ~by_body, True, 0 * low, high),
@@ -161,23 +169,24 @@ class HiddenFaces:
         return (found != NO_TRIANGLE).all(axis=1) & meets_cloth
 
 
-def _points_on(mesh: Mesh) -> tuple[Ints, Floats, Ints]:
-    """Spread points over a mesh: its vertices, and middles of equal parts of each triangle.
+def _points_on(mesh: Mesh, chosen: Ints, inside: bool) -> tuple[Ints, Floats, Ints]:
+    """Spread points over some triangles of a mesh: their vertices and, with `inside`, middles of equal parts of each.
 
     Returns:
         The corners that they lie between (P, 3), their barycentric coordinates (P, 3), and for the points inside a
         triangle its index, -1 for vertices, (P,). The first corner of a vertex is that vertex.
     """
-    corners, faces = mesh.points[mesh.faces], mesh.faces
-    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    parts = np.maximum(1, np.ceil(longest / SPACING)).astype(int)
+    faces = mesh.faces[chosen]
+    corners = mesh.points[faces]
     used, first = np.unique(faces.reshape(-1), return_index=True)
     turned = np.stack([np.roll(faces, -k, axis=1) for k in range(3)], axis=1).reshape(-1, 3)[first]
     found = [(turned, np.tile([1.0, 0.0, 0.0], (len(used), 1)), np.full(len(used), -1))]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    parts = np.maximum(1, np.ceil(longest / SPACING)).astype(int) if inside else np.zeros(0, dtype=int)
     for count in np.unique(parts):
-        inside, which = _middles(count), np.flatnonzero(parts == count)
-        each = np.repeat(which, len(inside))
-        found.append((faces[each], np.tile(inside, (len(which), 1)), each))
+        weights, which = _middles(count), np.flatnonzero(parts == count)
+        each = np.repeat(which, len(weights))
+        found.append((faces[each], np.tile(weights, (len(which), 1)), chosen[each]))
     indices, weights, owners = (np.concatenate(part) for part in zip(*found))
     return indices, weights.astype(np.float32), owners
 
