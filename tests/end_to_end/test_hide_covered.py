@@ -19,6 +19,15 @@ from ssilk_core.farm.job import read_job
 from ssilk_core.targets import TARGETS
 
 BAKE = "bake skirt.safetensors --stage rigged.usda --motion walk.usda --hide-covered"
+MINE = f"""#usda 1.0
+( subLayers = [@layers/shots/walk/shot.usda@] )
+over "Shot"
+{{
+    over "skirt" ( variants = {{ string {BODY} = "{FULL}" }} )
+    {{
+    }}
+}}
+"""
 LOW, HIGH = 0.9, 1.3  # of the skirt where it is within reach of the pillar; its upper border
 
 
@@ -122,10 +131,7 @@ def test_layers_hide_covered_faces_of_a_shot_and_leave_the_asset_whole(copy):
         need_hidden_well_under_the_cloth(stage, whole_body())
         assert np.array_equal(faces(full), whole_body())
     assert np.array_equal(faces_in("layers/assets/skirt/asset.usda"), whole_body())
-    Path("mine.usda").write_text(
-        "#usda 1.0\n(subLayers = [@layers/shots/walk/shot.usda@])\n"
-        f'over "Shot" {{ over "skirt" (variants = {{ string {BODY} = "{FULL}" }}) {{}} }}\n'
-    )
+    Path("mine.usda").write_text(MINE)
     assert np.array_equal(faces_in("mine.usda"), whole_body())
     assert len(Shot(path).meshes) == 2
 
