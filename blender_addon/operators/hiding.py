@@ -45,11 +45,11 @@ class HideCoveredSkin(MeasuringOperator, bpy.types.Operator):
         return f"{hidden} of {total} faces of the body are hidden under '{self.called}'."
 
 
-class ShowSkin(QualityOperator, bpy.types.Operator):
+class ShowCoveredSkin(QualityOperator, bpy.types.Operator):
     """Show the skin under the garment again"""
 
-    bl_idname = "ssilk.show_skin"
-    bl_label = "Show Skin"
+    bl_idname = "ssilk.show_covered"
+    bl_label = "Show Covered Skin"
 
     @classmethod
     def refusal(cls, context: bpy.types.Context) -> str:
@@ -62,4 +62,4 @@ class ShowSkin(QualityOperator, bpy.types.Operator):
         return f"All skin under '{context.object.name}' is shown."
 
 
-CLASSES = (HideCoveredSkin, ShowSkin)
+CLASSES = (HideCoveredSkin, ShowCoveredSkin)

@@ -34,4 +34,4 @@ class BakingPanel(SidebarPanel, bpy.types.Panel):
         layout.operator("ssilk.bake", icon="REC")
         layout.operator("ssilk.remove_bake", icon="TRASH")
         layout.operator("ssilk.hide_covered", icon="HIDE_ON")
-        layout.operator("ssilk.show_skin", icon="HIDE_OFF")
+        layout.operator("ssilk.show_covered", icon="HIDE_OFF")

@@ -6,7 +6,7 @@ from __future__ import annotations
 import bpy
 
 from ..scene.garment import unusable
-from ..scene.heat import PENETRATION, STRETCH
+from ..scene.heat import PENETRATION, SKIN, STRETCH
 from ..scene.lbs_copy import find_copy
 from .base import SidebarPanel
 
@@ -30,6 +30,7 @@ class QualityPanel(SidebarPanel, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         draw_kind(layout, PENETRATION, text="Show Penetration")
+        draw_kind(layout, SKIN, text="Show Skin")
         draw_kind(layout, STRETCH, text="Show Stretch")
         row = layout.row(align=True)
         if context.object.ssilk.heat:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Penetration and stretch of a garment in the frame that is shown, and their colours on its mesh.
+"""Penetration and stretch of a garment in the frame that is shown, the skin that shows, and their colours.
 
-Both come a little at a time: to find what is nearest to 20,000 vertices takes a tenth of a second.
+All come a little at a time: to find what is nearest to 20,000 vertices takes a tenth of a second.
 """
 
 from __future__ import annotations
@@ -14,15 +14,17 @@ import bpy
 import numpy as np
 from mathutils.bvhtree import BVHTree
 
+from ssilk_core.shown_skin import COVER_REACH, SHOW_DEPTH
+
 from .. import heat
 from ..errors import SetupError
 from .garment import armature_of, bodies_of
 from .masks import need_unmasked
 from .meshes import need_same_vertices, world_points
-from .shapes import rest_points
+from .shapes import mixed_points, rest_points
 
 ATTRIBUTE = "SSILK Heat"
-PENETRATION, STRETCH = "PENETRATION", "STRETCH"
+PENETRATION, STRETCH, SKIN = "PENETRATION", "STRETCH", "SKIN"
 CHUNK = 1000  # vertices at a time
 
 Result = TypeVar("Result")
@@ -33,8 +35,9 @@ class HeatMap:
     """A garment in one frame.
 
     Attributes:
-        kind: PENETRATION or STRETCH.
-        values: of each vertex: depth inside the body [m], negative outside, or elongation; shape (V,).
+        kind: PENETRATION, STRETCH or SKIN.
+        values: of each vertex: depth inside the body [m], negative outside, or elongation; shape (V,). For SKIN those
+            of `heat.shown_depths` [m], of all bodies' vertices.
     """
 
     kind: str
@@ -44,10 +47,19 @@ class HeatMap:
     def most(self) -> float:
         return float(self.values.max())
 
+    @property
+    def badness(self) -> float:
+        """What frames are compared by: the share of the covered skin that shows, or the largest value."""
+        if self.kind != SKIN:
+            return self.most
+        return float((self.values > 0).sum() / max(1, (self.values >= 0).sum()))
+
     def summary(self) -> str:
         """Return the worst value in words."""
         if self.kind == STRETCH:
             return f"{self.most:.0%} longer at most"
+        if self.kind == SKIN:
+            return f"{self.badness:.2%} of the covered skin shows" if self.badness else "No skin shows"
         inside = int((self.values > 0).sum())
         return f"{inside} vertices inside, {1000 * self.most:.1f} mm at most" if inside else "Nothing is inside"
 
@@ -63,6 +75,8 @@ def measuring(
         SetupError: it has no body or one with hidden skin, or its modifiers change how many vertices there are.
     """
     need_same_vertices(garment, depsgraph)
+    if kind == SKIN:
+        return HeatMap(kind, (yield from _shown(garment, depsgraph)))
     points = world_points(garment.evaluated_get(depsgraph))
     if kind == STRETCH:
         world = np.array(garment.matrix_world)[:3, :3]
@@ -95,12 +109,12 @@ def showing(garment: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Iterat
         hide(garment)
         return
     for thing in [thing for thing in bpy.data.objects if thing.session_uid == uid]:  # none if it was deleted
-        if thing.ssilk.heat == kind and thing.mode == "OBJECT" and len(thing.data.vertices) == len(measured.values):
-            _paint(thing.data, measured, thing.ssilk.heat_red)
+        if thing.ssilk.heat == kind and thing.mode == "OBJECT" and _fits(thing, measured):
+            _paint(thing, measured, thing.ssilk.heat_red)
 
 
 def show(garment: bpy.types.Object, measured: HeatMap, red: float) -> None:
-    """Colour a garment by what was measured, and again at each frame from now on.
+    """Colour a garment, or for SKIN its bodies, by what was measured, and again at each frame from now on.
 
     Args:
         red: the value that is red, in metres or as a share.
@@ -108,26 +122,45 @@ def show(garment: bpy.types.Object, measured: HeatMap, red: float) -> None:
     Raises:
         SetupError: it has other vertices by now.
     """
-    same = len(garment.data.vertices) == len(measured.values)
-    if not same:
+    if not _fits(garment, measured):
         raise SetupError(f"'{garment.name}' was edited while it was measured; look again.")
+    hide(garment)
     garment.ssilk.heat, garment.ssilk.heat_red = measured.kind, red
-    _paint(garment.data, measured, red)
+    _paint(garment, measured, red)
 
 
 def hide(garment: bpy.types.Object) -> None:
-    """Remove the colours."""
-    garment.ssilk.heat, colors = "", garment.data.color_attributes
-    if ATTRIBUTE in colors:
-        colors.remove(colors[ATTRIBUTE])
+    """Remove the colours of a garment, and those that it gave its bodies."""
+    kind, garment.ssilk.heat = garment.ssilk.heat, ""
+    for thing in (garment, *(_coloured(garment, kind) if kind == SKIN else ())):
+        colors = thing.data.color_attributes
+        if ATTRIBUTE in colors:
+            colors.remove(colors[ATTRIBUTE])
 
 
-def _paint(mesh: bpy.types.Mesh, measured: HeatMap, red: float) -> None:
-    layer = mesh.color_attributes.get(ATTRIBUTE) or mesh.color_attributes.new(ATTRIBUTE, "FLOAT_COLOR", "POINT")
+def _coloured(garment: bpy.types.Object, kind: str) -> list[bpy.types.Object]:
+    """Return the meshes that are coloured: for SKIN the bodies, none where the garment has lost them."""
+    if kind != SKIN:
+        return [garment]
+    try:
+        return bodies_of(garment, armature_of(garment))
+    except SetupError:
+        return []
+
+
+def _fits(garment: bpy.types.Object, measured: HeatMap) -> bool:
+    return sum(len(thing.data.vertices) for thing in _coloured(garment, measured.kind)) == len(measured.values)
+
+
+def _paint(garment: bpy.types.Object, measured: HeatMap, red: float) -> None:
     colors = heat.colors_of(measured.values, red).astype(np.float32)
-    layer.data.foreach_set("color_srgb", colors.reshape(-1))
-    mesh.color_attributes.active_color = layer
-    mesh.update()
+    for thing in _coloured(garment, measured.kind):
+        mesh, count = thing.data, len(thing.data.vertices)
+        layer = mesh.color_attributes.get(ATTRIBUTE) or mesh.color_attributes.new(ATTRIBUTE, "FLOAT_COLOR", "POINT")
+        layer.data.foreach_set("color_srgb", colors[:count].reshape(-1))
+        mesh.color_attributes.active_color = layer
+        mesh.update()
+        colors = colors[count:]
 
 
 def _triangles(mesh: bpy.types.Mesh) -> np.ndarray:
@@ -143,6 +176,57 @@ def _surface(body: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
     if body.matrix_world.determinant() < 0:  # mirrored, and so are its faces
         triangles = triangles[:, ::-1]
     return world_points(body), triangles
+
+
+def _shown(garment: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Generator[float, None, np.ndarray]:
+    """Find how far beneath the skin the cloth is where skin shows [m], as `heat.shown_depths`, of all bodies."""
+    bodies, scale = bodies_of(garment, armature_of(garment)), bpy.context.scene.unit_settings.scale_length
+    need_unmasked(bodies)
+    for body in bodies:
+        need_same_vertices(body, depsgraph)
+    cloth, triangles = _surface(garment.evaluated_get(depsgraph))
+    trees = [
+        BVHTree.FromPolygons(points.tolist(), triangles.tolist(), all_triangles=True)
+        for points in (_in_world(garment, rest_points(garment)), cloth)
+    ]
+    skins = [(_in_world(body, mixed_points(body)), *_surface(body.evaluated_get(depsgraph))) for body in bodies]
+    found = []
+    for number, (rest, now, faces) in enumerate(skins):
+        steps = _shown_on(rest, now, faces, *trees, 1 / scale)
+        found.append((yield from scaled(steps, number / len(skins), 1 / len(skins))))
+    return np.concatenate([np.where(values > 0, scale * values, values) for values in found])
+
+
+def _shown_on(
+    rest: np.ndarray, now: np.ndarray, faces: np.ndarray, cloth_at_rest: BVHTree, cloth: BVHTree, metre: float
+) -> Generator[float, None, np.ndarray]:
+    """Return `heat.shown_depths` of one body's vertices, at rest and now, in world units; a metre is so many."""
+    normals = heat.corner_normals(rest, faces)
+    above = yield from scaled(_distances(cloth_at_rest, rest, normals, COVER_REACH * metre), 0.0, 1 / 3)
+    covered = np.isfinite(above)
+    outward, reached = heat.corner_normals(now, faces)[covered], np.full((2, len(now)), np.inf)
+    for row, (side, reach) in enumerate(((1, COVER_REACH), (-1, SHOW_DEPTH))):
+        steps = _distances(cloth, now[covered], side * outward, reach * metre)
+        reached[row, covered] = yield from scaled(steps, (1 + row) / 3, 1 / 3)
+    return heat.shown_depths(covered, *reached)
+
+
+def _distances(
+    tree: BVHTree, points: np.ndarray, directions: np.ndarray, reach: float
+) -> Generator[float, None, np.ndarray]:
+    """Return how far a surface is along a direction from each point, infinity where beyond reach, shape (N,)."""
+    found = np.full(len(points), np.inf)
+    for start in range(0, len(points), CHUNK):
+        yield start / len(points)
+        rays = zip(points[start : start + CHUNK].tolist(), directions[start : start + CHUNK].tolist())
+        hits = [tree.ray_cast(*ray, reach)[3] for ray in rays]
+        found[start : start + CHUNK] = [np.inf if distance is None else distance for distance in hits]
+    return found
+
+
+def _in_world(thing: bpy.types.Object, points: np.ndarray) -> np.ndarray:
+    world = np.array(thing.matrix_world)
+    return points @ world[:3, :3].T + world[:3, 3]
 
 
 def _depths(points: np.ndarray, surface: np.ndarray, triangles: np.ndarray) -> Generator[float, None, np.ndarray]:

@@ -55,7 +55,7 @@ def need_unmasked(bodies: Sequence[bpy.types.Object]) -> None:
     """Raise `SetupError` if skin of a body is hidden under a garment, since cloth is measured against all of it."""
     hidden = next((body.name for body in bodies if _masks_of(body)), None)
     if hidden:
-        raise SetupError(f"Skin of '{hidden}' is hidden under a garment; choose Show Skin first.")
+        raise SetupError(f"Skin of '{hidden}' is hidden under a garment; choose Show Covered Skin first.")
 
 
 def _masks_of(thing: bpy.types.Object) -> list[str]:

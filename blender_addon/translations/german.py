@@ -288,7 +288,7 @@ WORDS = {
         "Flächen des Körpers ausblenden, die das Kleidungsstück in jedem Bild bedeckt, als letztes Mittel gegen "
         "sichtbare Haut"
     ),
-    "Show Skin": "Haut zeigen",
+    "Show Covered Skin": "Verdeckte Haut zeigen",
     "Show the skin under the garment again": "Die Haut unter dem Kleidungsstück wieder zeigen",
     "Live Playback": "Live-Wiedergabe",
     "Play Live": "Live spielen",
@@ -307,12 +307,18 @@ WORDS = {
     "Penetration": "Durchdringung",
     "Show Penetration": "Durchdringung zeigen",
     "How deep vertices lie inside the body": "Wie tief Vertices im Körper liegen",
+    "Skin": "Haut",
+    "Show Skin": "Haut zeigen",
+    "Where covered skin shows through the cloth; on the body, by the depth of the cloth beneath": (
+        "Wo bedeckte Haut durch den Stoff tritt; auf dem Körper, nach der Tiefe des Stoffs darunter"
+    ),
     "Show Stretch": "Dehnung zeigen",
     "How much longer the cloth is than at rest": "Um wie viel länger der Stoff ist als in Ruhe",
     "Show": "Zeigen",
     "Show Heat": "Wärmebild zeigen",
-    "Colour the garment by penetration or stretch, frame by frame; in Solid shading, in this view": (
-        "Das Kleidungsstück nach Durchdringung oder Dehnung färben, Bild für Bild; in der Solid-Ansicht, hier"
+    "Colour the garment by penetration or stretch, the body by skin that shows, frame by frame; in Solid shading": (
+        "Das Kleidungsstück nach Durchdringung oder Dehnung, oder den Körper nach Haut färben, die durchtritt, Bild "
+        "für Bild; in der Solid-Ansicht"
     ),
     "Red Depth": "Rote Tiefe",
     "Depth that is red": "Tiefe, die rot ist",
@@ -324,8 +330,9 @@ WORDS = {
     "Markers": "Marken",
     "How many frames are marked at most": "Wie viele Bilder höchstens markiert werden",
     "Mark Worst Frames": "Schlechteste Bilder markieren",
-    "Go through the scene's frames and mark those in which penetration or stretch is worst": (
-        "Die Bilder der Szene durchgehen und jene markieren, in denen Durchdringung oder Dehnung am größten ist"
+    "Go through the scene's frames and mark those in which penetration, stretch or skin that shows is worst": (
+        "Die Bilder der Szene durchgehen und jene markieren, in denen Durchdringung, Dehnung oder durchtretende Haut "
+        "am größten ist"
     ),
     "Clear Marks": "Marken entfernen",
     "Remove the markers of worst frames": "Die Marken der schlechtesten Bilder entfernen",

@@ -22,6 +22,7 @@ from .refinement import refined
 from .request import BakeRequest
 from .result import BakeResult
 from .rollout import BakeRollout
+from .skin import SkinMeter
 from .task import BakeTask, plan_layers
 from .verification import verify_file
 from .write import result_of
@@ -203,6 +204,7 @@ def _write_layer(layout: Layout, asset: Asset, rollout: BakeRollout, task: BakeT
     if task.request.hide_covered and not task.include_body:
         text = f"{task.name}: the body comes with another garment; faces that this one covers are not hidden"
         report(Message(text, "warning"))
+    skin = SkinMeter(rollout)
     common: dict[str, Any] = {
         "units": rollout.units,
         "start": rollout.start,
@@ -217,17 +219,17 @@ def _write_layer(layout: Layout, asset: Asset, rollout: BakeRollout, task: BakeT
             asset,
             rollout.deformer,
             rollout.motion,
-            rollout.poses(),
+            skin.poses(),
             **common,
             hidden=rollout.hidden,
             hidden_polygons=hidden,
-            provenance=shot_metadata(rollout, layout.animation),
+            provenance=shot_metadata(rollout, layout.animation, skin.stated),
             path=unverified,
             points=task.points,
         )
         verification = verify_file(rollout, unverified, report) if task.verify else None
     rollout.warn(report)
-    return result_of(rollout, layout.animation, summary, verification, hidden)
+    return result_of(skin, layout.animation, summary, verification, hidden)
 
 
 def _own_files(layout: Layout) -> tuple[Path, ...]:

@@ -15,8 +15,8 @@ from .origin import shot_metadata
 from .refinement import refined
 from .request import BakeRequest, need_body
 from .result import BakeResult, Verification
-from .rollout import BakeRollout
 from .sizing import load_sized
+from .skin import SkinMeter
 from .verification import verify_file
 
 if TYPE_CHECKING:
@@ -57,21 +57,23 @@ def bake(
     report(Started("bake", rollout.motion.frame_count, {"output": str(path)}))
     rollout = refined(rollout, report)
     hidden = covered_polygons(rollout, report) if request.hide_covered else None
-    summary, verification = _write_verified(rollout, path, include_body, hidden, verify, report)
-    result = result_of(rollout, path, summary, verification, hidden)
+    skin = SkinMeter(rollout)
+    summary, verification = _write_verified(skin, path, include_body, hidden, verify, report)
+    result = result_of(skin, path, summary, verification, hidden)
     rollout.warn(report)
     report(Result("bake", result.figures()))
     return result
 
 
 def result_of(
-    rollout: BakeRollout,
+    skin: SkinMeter,
     path: Path,
     summary: ShotSummary,
     verification: Verification | None,
     hidden: HiddenPolygons | None,
 ) -> BakeResult:
     """Return the result of a rollout that was written."""
+    rollout = skin.rollout
     return BakeResult(
         path=path,
         frames=summary.frame_count,
@@ -85,6 +87,7 @@ def result_of(
         refinement=rollout.refinement.summary if rollout.refinement else None,
         hidden_faces=None if hidden is None else sum(int(mask.sum()) for mask in hidden.masks),
         recovered=tuple(rollout.recovered),
+        shown_skin=skin.shown(),
     )
 
 
@@ -100,7 +103,7 @@ def _check_output(request: BakeRequest, path: Path) -> None:
 
 
 def _write_verified(
-    rollout: BakeRollout,
+    skin: SkinMeter,
     output: Path,
     include_body: bool,
     hidden: HiddenPolygons | None,
@@ -112,19 +115,20 @@ def _write_verified(
 
     with replacing(output) as unverified:
         with packaged(unverified) as layer:
-            summary = _write(layer, rollout, output, include_body, hidden)
+            summary = _write(layer, skin, output, include_body, hidden)
         if not verify:
             report(Message("not verified, as asked", "warning"))
-        return summary, verify_file(rollout, unverified, report) if verify else None
+        return summary, verify_file(skin.rollout, unverified, report) if verify else None
 
 
 def _write(
-    layer: Path, rollout: BakeRollout, output: Path, include_body: bool, hidden: HiddenPolygons | None
+    layer: Path, skin: SkinMeter, output: Path, include_body: bool, hidden: HiddenPolygons | None
 ) -> ShotSummary:
     """Write a shot of joints and blendshapes, or of refined points."""
     from ssilk_usd.points import point_cache
     from ssilk_usd.shot import write_shot
 
+    rollout = skin.rollout
     common: dict[str, Any] = {
         "units": rollout.units,
         "start": rollout.start,
@@ -132,11 +136,12 @@ def _write(
         "include_body": include_body,
         "hidden": rollout.hidden,
         "hidden_polygons": hidden,
-        "provenance": shot_metadata(rollout, output),
+        "provenance": shot_metadata(rollout, output, skin.stated),
         "record": rollout.record,
     }
     if not rollout.request.writes_points:
-        return write_shot(layer, rollout.deformer, rollout.motion, rollout.poses(), **common)
+        return write_shot(layer, rollout.deformer, rollout.motion, skin.poses(), **common)
+    skin.add_points()
     with point_cache(layer, rollout.deformer.scene, rollout.motion, **common) as cache:
         for frame, points in enumerate(rollout.points()):
             cache.write(frame, points)

@@ -52,7 +52,13 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     text = page(options.subject.name, [*measured, *given, provenance])
     with replacing(options.output) as temporary:
         temporary.write_text(text, encoding="utf-8")
-    report(Result("report", {"page": str(options.output), "bytes": options.output.stat().st_size}))
+    figures = {name: value for section in measured for name, value in section.figures.items()}
+    page_bytes = options.output.stat().st_size
+    report(
+        Result(
+            "report", {"page": str(options.output), "bytes": page_bytes, **({"garments": figures} if figures else {})}
+        )
+    )
     return EXIT_OK
 
 

@@ -48,10 +48,10 @@ def test_covered_skin_is_hidden_shown_and_hidden_anew(bpy, skirt, pillar):
     assert bpy.ops.ssilk.hide_covered() == {"FINISHED"}
     assert whole - shown_faces(bpy, pillar) < hidden and bpy.context.scene.frame_current == 1
     assert [modifier.type for modifier in pillar.modifiers] == ["ARMATURE", "MASK"]
-    assert bpy.ops.ssilk.show_skin() == {"FINISHED"}
+    assert bpy.ops.ssilk.show_covered() == {"FINISHED"}
     assert shown_faces(bpy, pillar) == whole
     assert len(pillar.vertex_groups) == groups and len(pillar.modifiers) == 1
-    assert not bpy.ops.ssilk.show_skin.poll()
+    assert not bpy.ops.ssilk.show_covered.poll()
 
 
 def test_hiding_is_one_step_to_undo(bpy, skirt, pillar):
@@ -64,7 +64,7 @@ def test_hiding_is_one_step_to_undo(bpy, skirt, pillar):
 
 def test_what_is_measured_is_the_whole_body(bpy, skirt, pillar):
     assert bpy.ops.ssilk.hide_covered() == {"FINISHED"}
-    with pytest.raises(RuntimeError, match="Skin of 'Pillar' is hidden under a garment; choose Show Skin first"):
+    with pytest.raises(RuntimeError, match="Skin of .Pillar. is hidden.*choose Show Covered Skin first"):
         bpy.ops.ssilk.show_heat()
     assert bpy.ops.ssilk.show_heat(kind="STRETCH") == {"FINISHED"}
 
@@ -95,7 +95,7 @@ def test_what_cannot_be_compared_is_refused_and_nothing_changes(bpy, skirt, pill
 def test_the_panel_offers_both(bpy, skirt, pillar):
     from blender_addon.panels.baking import BakingPanel
 
-    assert {"ssilk.hide_covered", "ssilk.show_skin"} <= set(drawn(BakingPanel, bpy.context))
+    assert {"ssilk.hide_covered", "ssilk.show_covered"} <= set(drawn(BakingPanel, bpy.context))
 
 
 @pytest.mark.parametrize("variants", [False, True])

@@ -163,7 +163,9 @@ def set_visibility(stage: Usd.Stage, root: Sdf.Path, span: TimeSpan, hidden: Seq
 def _metadata(value: object) -> object:
     """Return nested mappings and lists as USD's metadata can hold them: lists become strings, empty ones nothing."""
     if isinstance(value, Mapping):
-        return {str(key): _metadata(item) for key, item in value.items() if item is not None and item != []}
+        return {
+            str(key): _metadata(item) for key, item in value.items() if item is not None and item != [] and item != {}
+        }
     if isinstance(value, list | tuple):
         return Vt.StringArray([str(item) for item in value])
     return value
