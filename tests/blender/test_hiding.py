@@ -64,7 +64,7 @@ def test_hiding_is_one_step_to_undo(bpy, skirt, pillar):
 
 def test_what_is_measured_is_the_whole_body(bpy, skirt, pillar):
     assert bpy.ops.ssilk.hide_covered() == {"FINISHED"}
-    with pytest.raises(RuntimeError, match="Skin of .Pillar. is hidden.*choose Show Covered Skin first"):
+    with pytest.raises(RuntimeError, match=r"Skin of .Pillar. is hidden.*choose Show Covered Skin first"):
         bpy.ops.ssilk.show_heat()
     assert bpy.ops.ssilk.show_heat(kind="STRETCH") == {"FINISHED"}
 
