@@ -7,8 +7,9 @@ skin were not there:
 - Along its normal there is cloth within `REACH` above it; or other skin, as in an armpit; or cloth within `DEPTH`
   beneath it and no skin before. In the last case skin shows through the cloth, which is what hiding is for.
 - So it is in a fan of directions tilted from the normal: cloth not higher than `REACH` above the point, or the body,
-  blocks a ray. Where cloth touches the skin, or skin shows through, the line of a ray may also meet cloth within
-  `DEPTH` beneath the skin, or leave a round limb before it gets there.
+  blocks a ray. Of the flat ones `FLAT_FREE` may be free. Where cloth touches the skin, or skin shows through, the line
+  of a ray may also meet cloth within `DEPTH` beneath the skin, or leave a round limb before it gets there. Flat rays
+  do not count where cloth is less than `SHALLOW` beneath: `APART` keeps openings further away than they look.
 - At least one of these rays meets cloth: a mouth is no covered skin.
 
 A triangle is covered when points all over it are, in all frames. What is hidden keeps a distance of `APART`, and of
@@ -30,6 +31,9 @@ REACH, DEPTH = 0.08, 0.03  # [m] above and beneath the skin
 FAN = ((40.0, 4), (70.0, 12))  # tilts from the normal [degrees], and how many directions at each
 SPACING = 0.02  # [m]; points on a triangle are at most so far apart
 APART = 0.03  # [m]
+SHALLOW = 0.01  # [m]
+STEEP = float(np.cos(np.radians(55)))  # cosine of the tilt that parts them
+FLAT_FREE = 1  # flat rays of a point that may be free: an opening nearby lets several pass
 LIFT = 0.002  # [m] of the start of rays above the skin, so that they do not start in the body where that is concave
 TOUCHING = 0.005  # [m]; where cloth is not higher, lines of rays may also meet cloth beneath the skin
 LEAVING = 0.001  # [m]; a ray into the body does not meet the skin that it starts from
@@ -146,27 +150,31 @@ class HiddenFaces:
         rays = np.einsum("dx,pxy->pdy", self._fan, np.stack([east, np.cross(up, east), up], axis=1))
         upright = np.isfinite(rays).all(axis=(1, 2))
         touched = heights < TOUCHING
-        starts, high = points + LIFT * up, _all(REACH, points)[:, None] / self._fan[:, 2]
-        low = -(LIFT + DEPTH * touched)[:, None] / self._fan[:, 2]
+        lifted, high = points + LIFT * up, _all(REACH, points)[:, None] / self._fan[:, 2]
+        low = -DEPTH * touched[:, None] / self._fan[:, 2]
         around = np.where(self._around == NO_TRIANGLE, self._above[:, None], self._around)
-        found, by_body = np.full(around.shape, NO_TRIANGLE), self._by_body.copy()
+        found, by_body = np.full(around.shape, NO_TRIANGLE), self._by_body & (self._around != NO_TRIANGLE)
         shows = np.broadcast_to(touched[:, None], by_body.shape)
-        leaves: Floats = -(LIFT + LEAVING) / self._fan[:, 2] + 0 * low
-        passes: tuple[tuple[BlockedRays, Floats, NDArray, bool, NDArray, NDArray], ...] = (
-            (self._body_rays, body, by_body, True, 0 * low, high),  # first what blocked a ray before
-            (self._cloth_rays, cloth, np.ones_like(by_body), False, low, high),
-            (self._body_rays, body, ~by_body, True, 0 * low, high),
-            (self._body_rays, body, shows, True, leaves - DEPTH / self._fan[:, 2], leaves),
+        leaves: Floats = -LEAVING / self._fan[:, 2] + 0 * low
+        passes: tuple[tuple[BlockedRays, Floats, Floats, NDArray, bool, NDArray, NDArray], ...] = (
+            (self._body_rays, body, lifted, by_body, True, 0 * low, high),  # first what blocked a ray before
+            (self._cloth_rays, cloth, points, np.ones_like(by_body), False, low, high),
+            (self._body_rays, body, lifted, ~by_body, True, 0 * low, high),
+            (self._body_rays, body, points, shows, True, leaves - DEPTH / self._fan[:, 2], leaves),
         )
-        for mesh, vertices, tried, is_body, start, end in passes:
-            point, ray = np.nonzero((found == NO_TRIANGLE) & tried & upright[:, None])
+        flat = self._fan[:, 2] < STEEP
+        shallow = (heights < 0) & (heights > -SHALLOW)
+        asked = upright[:, None] & ~(shallow[:, None] & flat)
+        for mesh, vertices, starts, tried, is_body, start, end in passes:
+            point, ray = np.nonzero((found == NO_TRIANGLE) & tried & asked)
             guesses = np.where(by_body[point, ray] == is_body, around[point, ray], NO_TRIANGLE)
             lines = starts[point], rays[point, ray], start[point, ray], end[point, ray]
             found[point, ray], _ = mesh.find(vertices, *lines, guesses)
             self._by_body[point, ray] = is_body
         self._around = found
-        meets_cloth = np.isfinite(heights) | ~self._by_body.all(axis=1)
-        return (found != NO_TRIANGLE).all(axis=1) & meets_cloth
+        meets_cloth = np.isfinite(heights) | ((found != NO_TRIANGLE) & ~self._by_body).any(axis=1)
+        free = (found == NO_TRIANGLE) & asked
+        return upright & meets_cloth & ~free[:, ~flat].any(axis=1) & (free[:, flat].sum(axis=1) <= FLAT_FREE)
 
 
 def _points_on(mesh: Mesh, chosen: Ints, inside: bool) -> tuple[Ints, Floats, Ints]:

@@ -145,16 +145,15 @@ def pipeline() -> Text:
 
 def hidden_skin() -> Text:
     (low, few), (high, many) = hidden_faces.FAN
-    reach, depth, touching, apart, spacing = (
-        f"{1000 * length:.0f} mm"
-        for length in (
-            hidden_faces.REACH, hidden_faces.DEPTH, hidden_faces.TOUCHING, hidden_faces.APART, hidden_faces.SPACING
-        )
-    )  # fmt: skip
+    names = ("REACH", "DEPTH", "TOUCHING", "APART", "SPACING", "SHALLOW")
+    lengths = (getattr(hidden_faces, name) for name in names)
+    reach, depth, touching, apart, spacing, shallow = (f"{1000 * length:.0f} mm" for length in lengths)
     yield f"points at most {spacing} apart"
     yield f"cloth within {reach} above the skin"
     yield f"cloth within {depth} beneath it counts, unless"
-    yield f"{few + many} rays, tilted by {low:.0f} or {high:.0f} degrees"
+    yield f"{few} steep rays, tilted by {low:.0f} degrees"
+    yield f"{many} flat rays, tilted by {high:.0f} degrees, but for {hidden_faces.FLAT_FREE} at most"
+    yield f"less than {shallow} beneath"
     yield f"cloth at most {reach} above the skin"
     yield f"less than {touching} above the skin, or beneath it, cloth within {depth} beneath it"
     yield f"a distance of {apart} and one face"
