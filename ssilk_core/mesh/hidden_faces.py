@@ -7,9 +7,9 @@ skin were not there:
 - Along its normal there is cloth within `REACH` above it; or other skin, as in an armpit; or cloth within `DEPTH`
   beneath it and no skin before. In the last case skin shows through the cloth, which is what hiding is for.
 - So it is in a fan of directions tilted from the normal: cloth not higher than `REACH` above the point, or the body,
-  blocks a ray. Of the flat ones `FLAT_FREE` may be free. Where cloth touches the skin, or skin shows through, the line
-  of a ray may also meet cloth within `DEPTH` beneath the skin, or leave a round limb before it gets there. Flat rays
-  do not count where cloth is less than `SHALLOW` beneath: `APART` keeps openings further away than they look.
+  blocks a ray. Of the flat ones `FLAT_FREE` may be free. Where cloth touches the skin, or skin shows through, the
+  line of a ray may also meet cloth within `DEPTH` beneath the skin, or leave a round limb before. Flat rays do not
+  count where cloth is less than `SHALLOW` beneath: `APART` keeps openings further away than they look.
 - At least one of these rays meets cloth: a mouth is no covered skin.
 
 A triangle is covered when points all over it are, in all frames. What is hidden keeps a distance of `APART`, and of
