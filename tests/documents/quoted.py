@@ -155,7 +155,7 @@ def hidden_skin() -> Text:
     yield f"{many} flat rays, tilted by {high:.0f} degrees, but for {hidden_faces.FLAT_FREE} at most"
     yield f"less than {shallow} beneath"
     yield f"cloth at most {reach} above the skin"
-    yield f"less than {touching} above the skin, or beneath it, cloth within {depth} beneath it"
+    yield f"less than {touching} above the skin, or beneath it, cloth within {depth} beneath it blocks"
     yield f"a distance of {apart} and one face"
     yield f"flatter than {90 - high:.0f} degrees"
 
