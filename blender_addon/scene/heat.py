@@ -19,6 +19,8 @@ from ssilk_core.shown_skin import COVER_REACH, SHOW_DEPTH
 from .. import heat
 from ..errors import SetupError
 from .garment import armature_of, bodies_of
+from .masks import need_unmasked
+from .meshes import need_same_vertices, world_points
 from .shapes import mixed_points, rest_points
 
 ATTRIBUTE = "SSILK Heat"
@@ -70,18 +72,20 @@ def measuring(
     All that it needs of the frame is read before the first yield.
 
     Raises:
-        SetupError: it has no body, or its modifiers change how many vertices there are.
+        SetupError: it has no body or one with hidden skin, or its modifiers change how many vertices there are.
     """
-    _need_same_vertices(garment, depsgraph)
+    need_same_vertices(garment, depsgraph)
     if kind == SKIN:
         return HeatMap(kind, (yield from _shown(garment, depsgraph)))
-    points = _world_points(garment.evaluated_get(depsgraph))
+    points = world_points(garment.evaluated_get(depsgraph))
     if kind == STRETCH:
         world = np.array(garment.matrix_world)[:3, :3]
         rest = rest_points(garment) @ world.T
         return HeatMap(kind, heat.elongations(rest, points, _triangles(garment.data)))
     scale, depths = bpy.context.scene.unit_settings.scale_length, []
-    surfaces = [_surface(body.evaluated_get(depsgraph)) for body in bodies_of(garment, armature_of(garment))]
+    bodies = bodies_of(garment, armature_of(garment))
+    need_unmasked(bodies)
+    surfaces = [_surface(body.evaluated_get(depsgraph)) for body in bodies]
     for surface in surfaces:
         depths.append((yield from scaled(_depths(points, *surface), len(depths) / len(surfaces), 1 / len(surfaces))))
     return HeatMap(kind, scale * np.max(depths, axis=0))
@@ -159,22 +163,6 @@ def _paint(garment: bpy.types.Object, measured: HeatMap, red: float) -> None:
         colors = colors[count:]
 
 
-def _need_same_vertices(garment: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> None:
-    shown, count = len(garment.evaluated_get(depsgraph).data.vertices), len(garment.data.vertices)
-    if shown != count:
-        raise SetupError(
-            f"A modifier gives '{garment.name}' {shown} vertices where its mesh has {count}; switch it off in "
-            "viewports."
-        )
-
-
-def _world_points(thing: bpy.types.Object) -> np.ndarray:
-    """Return the vertices of an evaluated object in the world, shape (V, 3)."""
-    points = np.empty(len(thing.data.vertices) * 3, dtype=np.float32)
-    thing.data.vertices.foreach_get("co", points)
-    return _in_world(thing, points.reshape(-1, 3))
-
-
 def _triangles(mesh: bpy.types.Mesh) -> np.ndarray:
     mesh.calc_loop_triangles()
     triangles = np.empty(len(mesh.loop_triangles) * 3, dtype=np.int32)
@@ -187,14 +175,15 @@ def _surface(body: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
     triangles = _triangles(body.data)
     if body.matrix_world.determinant() < 0:  # mirrored, and so are its faces
         triangles = triangles[:, ::-1]
-    return _world_points(body), triangles
+    return world_points(body), triangles
 
 
 def _shown(garment: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Generator[float, None, np.ndarray]:
     """Find how far beneath the skin the cloth is where skin shows [m], as `heat.shown_depths`, of all bodies."""
     bodies, scale = bodies_of(garment, armature_of(garment)), bpy.context.scene.unit_settings.scale_length
+    need_unmasked(bodies)
     for body in bodies:
-        _need_same_vertices(body, depsgraph)
+        need_same_vertices(body, depsgraph)
     cloth, triangles = _surface(garment.evaluated_get(depsgraph))
     trees = [
         BVHTree.FromPolygons(points.tolist(), triangles.tolist(), all_triangles=True)

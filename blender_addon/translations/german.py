@@ -283,6 +283,13 @@ WORDS = {
     "Remove the keys and shape keys that were baked or played live, and give the garment its own weights back": (
         "Gebackene oder live gespielte Schlüsselbilder und Formschlüssel entfernen, eigene Gewichte zurückgeben"
     ),
+    "Hide Covered Skin": "Verdeckte Haut ausblenden",
+    "Hide faces of the body that the garment covers in every frame, a last resort where skin shows": (
+        "Flächen des Körpers ausblenden, die das Kleidungsstück in jedem Bild bedeckt, als letztes Mittel gegen "
+        "sichtbare Haut"
+    ),
+    "Show Covered Skin": "Verdeckte Haut zeigen",
+    "Show the skin under the garment again": "Die Haut unter dem Kleidungsstück wieder zeigen",
     "Live Playback": "Live-Wiedergabe",
     "Play Live": "Live spielen",
     "Play the trained garment on the armature as it is, frame by frame, without a bake": (

@@ -14,6 +14,7 @@ from ..errors import fail
 from ..events import Message, Reporter, Result, Started, silent
 from ..files import remove_unfinished, replacing, sha256
 from ..targets import check_influences
+from .hiding import covered_polygons
 from .load import LoadedGarment, load_garment
 from .origin import shot_metadata
 from .record import RECORD, TaskRecord, current_record, read_record, task_key, write_record
@@ -199,6 +200,10 @@ def _write_layer(layout: Layout, asset: Asset, rollout: BakeRollout, task: BakeT
     from ssilk_usd import layers
 
     rollout = refined(rollout, report)
+    hidden = covered_polygons(rollout, report) if task.request.hide_covered and task.include_body else None
+    if task.request.hide_covered and not task.include_body:
+        text = f"{task.name}: the body comes with another garment; faces that this one covers are not hidden"
+        report(Message(text, "warning"))
     skin = SkinMeter(rollout)
     common: dict[str, Any] = {
         "units": rollout.units,
@@ -217,13 +222,14 @@ def _write_layer(layout: Layout, asset: Asset, rollout: BakeRollout, task: BakeT
             skin.poses(),
             **common,
             hidden=rollout.hidden,
+            hidden_polygons=hidden,
             provenance=shot_metadata(rollout, layout.animation, skin.stated),
             path=unverified,
             points=task.points,
         )
         verification = verify_file(rollout, unverified, report) if task.verify else None
     rollout.warn(report)
-    return result_of(skin, layout.animation, summary, verification)
+    return result_of(skin, layout.animation, summary, verification, hidden)
 
 
 def _own_files(layout: Layout) -> tuple[Path, ...]:

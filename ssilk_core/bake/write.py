@@ -10,15 +10,17 @@ from typing import TYPE_CHECKING, Any
 from ..errors import fail
 from ..events import Message, Reporter, Result, Started, silent
 from ..files import need_not_input, need_writable, replacing
+from .hiding import covered_polygons
 from .origin import shot_metadata
 from .refinement import refined
-from .request import BakeRequest
+from .request import BakeRequest, need_body
 from .result import BakeResult, Verification
 from .sizing import load_sized
 from .skin import SkinMeter
 from .verification import verify_file
 
 if TYPE_CHECKING:
+    from ssilk_usd.body_faces import HiddenPolygons
     from ssilk_usd.shot import ShotSummary
 
 
@@ -48,20 +50,28 @@ def bake(
     """
     path = Path(output)
     _check_output(request, path)
+    need_body(request, include_body)
     rollout = load_sized(
         request, quality=quality, budget=budget, suffix=path.suffix, include_body=include_body, report=report
     )
     report(Started("bake", rollout.motion.frame_count, {"output": str(path)}))
     rollout = refined(rollout, report)
+    hidden = covered_polygons(rollout, report) if request.hide_covered else None
     skin = SkinMeter(rollout)
-    summary, verification = _write_verified(skin, path, include_body, verify, report)
-    result = result_of(skin, path, summary, verification)
+    summary, verification = _write_verified(skin, path, include_body, hidden, verify, report)
+    result = result_of(skin, path, summary, verification, hidden)
     rollout.warn(report)
     report(Result("bake", result.figures()))
     return result
 
 
-def result_of(skin: SkinMeter, path: Path, summary: ShotSummary, verification: Verification | None) -> BakeResult:
+def result_of(
+    skin: SkinMeter,
+    path: Path,
+    summary: ShotSummary,
+    verification: Verification | None,
+    hidden: HiddenPolygons | None,
+) -> BakeResult:
     """Return the result of a rollout that was written."""
     rollout = skin.rollout
     return BakeResult(
@@ -75,6 +85,7 @@ def result_of(skin: SkinMeter, path: Path, summary: ShotSummary, verification: V
         verification=verification,
         reduction=rollout.reduction,
         refinement=rollout.refinement.summary if rollout.refinement else None,
+        hidden_faces=None if hidden is None else sum(int(mask.sum()) for mask in hidden.masks),
         recovered=tuple(rollout.recovered),
         shown_skin=skin.shown(),
     )
@@ -92,20 +103,27 @@ def _check_output(request: BakeRequest, path: Path) -> None:
 
 
 def _write_verified(
-    skin: SkinMeter, output: Path, include_body: bool, verify: bool, report: Reporter
+    skin: SkinMeter,
+    output: Path,
+    include_body: bool,
+    hidden: HiddenPolygons | None,
+    verify: bool,
+    report: Reporter,
 ) -> tuple[ShotSummary, Verification | None]:
     """Write a file that appears once it is verified; return what it holds."""
     from ssilk_usd.export import packaged
 
     with replacing(output) as unverified:
         with packaged(unverified) as layer:
-            summary = _write(layer, skin, output, include_body)
+            summary = _write(layer, skin, output, include_body, hidden)
         if not verify:
             report(Message("not verified, as asked", "warning"))
         return summary, verify_file(skin.rollout, unverified, report) if verify else None
 
 
-def _write(layer: Path, skin: SkinMeter, output: Path, include_body: bool) -> ShotSummary:
+def _write(
+    layer: Path, skin: SkinMeter, output: Path, include_body: bool, hidden: HiddenPolygons | None
+) -> ShotSummary:
     """Write a shot of joints and blendshapes, or of refined points."""
     from ssilk_usd.points import point_cache
     from ssilk_usd.shot import write_shot
@@ -117,6 +135,7 @@ def _write(layer: Path, skin: SkinMeter, output: Path, include_body: bool) -> Sh
         "samples_per_frame": rollout.request.samples_per_frame,
         "include_body": include_body,
         "hidden": rollout.hidden,
+        "hidden_polygons": hidden,
         "provenance": shot_metadata(rollout, output, skin.stated),
         "record": rollout.record,
     }

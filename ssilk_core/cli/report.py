@@ -76,6 +76,7 @@ def _check(options: argparse.Namespace) -> None:
 
 def _shot(path: Path, report: Reporter) -> list[Section]:
     """Return the sections of a shot, its provenance last."""
+    from ssilk_usd.body_faces import open_with_full_bodies
     from ssilk_usd.play import Shot
     from ssilk_usd.provenance import read_provenance
     from ssilk_usd.read_shot import read_parts
@@ -83,7 +84,7 @@ def _shot(path: Path, report: Reporter) -> list[Section]:
     from ..report.page import Section, facts
     from ..report.shots import ShotGarment, shot_sections
 
-    shot = Shot(path)
+    shot = Shot(open_with_full_bodies(path))  # cloth is measured against all of the body
     parts = read_parts(shot)
     report(Started("report", len(shot.frame_times)))
     garments = [
