@@ -72,7 +72,7 @@ def solved(
 
 def figures(found: list[tuple[str, Tensor, Tensor]]) -> dict[str, Any]:
     """Return the figures of one method over clips, each with its name, shares and energies."""
-    shares, stretch = (torch.cat([each[part] for each in found]) for part in (1, 2))
+    shares, stretch = torch.cat([each[1] for each in found]), torch.cat([each[2] for each in found])
     worst = max(found, key=lambda each: float(each[1].max()))
     return {
         "frames": len(shares), "mean": float(shares.mean()), "worst": float(shares.max()), "in": worst[0],

@@ -20,7 +20,7 @@ from . import __version__
 from .assets import Character, Garment, Mesh, ProxyRig, Scene, Skeleton, SkinWeights
 from .config import ModelConfig
 from .errors import SsilkError, fail
-from .fabrics import Fabric
+from .fabrics import FABRIC_OF_VERTICES, Fabric
 from .files import replacing
 from .packing import dequantize, narrowest, quantize
 from .parameters import Shapes, parameter_shapes
@@ -60,8 +60,6 @@ RENAMED_SINCE_3 = {
 HEADER: dict[str, Any] = {
     "joint_names": (), "proxy_names": (), "paths": {}, "config": {}, "fabric": {}, "provenance": {},
 }  # fmt: skip
-# What a model's fabric was before contact acted on surfaces.
-FABRIC_OF_VERTICES = {"contact_model": "vertex", "thickness": 0.0}
 WEIGHTS = ("scene.plain.weights", "scene.rig.weights")
 
 

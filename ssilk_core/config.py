@@ -87,6 +87,8 @@ class TrainConfig:
         rotated_fraction: share of windows with a random rotation, uniform on SO(3); the others stay upright.
         recombinations: number of extra motions for each motion, whose limbs move as in another motion.
         perturbations: number of extra motions for each motion with joints turned at random.
+        outlier_energy: stretch and collision at which a frame counts half in the loss, relative to the garment's
+            weight times its size; zero for the plain mean over frames, as in the paper (`training.objective.total`).
         static_batch: single poses in each step of dynamic training, to which P is still fitted.
         noise_probability: probability per frame of noise on a reused state. A new window always starts with noise.
         noise: standard deviation of the noise on the first two latents of a window.
@@ -119,6 +121,7 @@ class TrainConfig:
     rotated_fraction: float = 0.5
     recombinations: int = 3
     perturbations: int = 1
+    outlier_energy: float = 0.5
     static_batch: int = 256
     noise_probability: float = 0.03
     noise: float = 0.1
@@ -158,6 +161,7 @@ class TrainConfig:
             "learning_rate_warmup",
             "skin_learning_rate_scale",
             "shape_learning_rate_scale",
+            "outlier_energy",
         )
         _need_between(self, 0, NO_BOUND, "latent_regularization")
         _need_between(self, 1e-9, NO_BOUND, "latent_regularization_scale")

@@ -4,11 +4,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 from .errors import fail
 
 STRETCH_MODELS = ("stvk", "baraff_witkin")
 CONTACT_MODELS = ("surface", "vertex")
+# What files state of a fabric from before contact acted on surfaces: nothing of these.
+FABRIC_OF_VERTICES: dict[str, Any] = {"contact_model": "vertex", "thickness": 0.0}
 
 
 @dataclass(frozen=True)

@@ -164,7 +164,9 @@ def _units(stage: Usd.Stage, target: Target) -> StageUnits:
 def _record(file: ModelFile, model_hash: str) -> GarmentRecord:
     from ssilk_usd.garment_api import GarmentRecord
 
-    numbers = {name: float(value) for name, value in asdict(file.fabric).items() if isinstance(value, int | float)}
+    unused = "collision" if file.fabric.contact_model == "surface" else "contact"
+    values = asdict(file.fabric).items()
+    numbers = {name: float(value) for name, value in values if isinstance(value, int | float) and name != unused}
     return GarmentRecord(
         model_hash=model_hash,
         version=str(file.provenance.get("ssilk", "")),

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import EXIT_OK, fail
 from ..events import Reporter, Result, Started
-from ..fabrics import Fabric
+from ..fabrics import FABRIC_OF_VERTICES, Fabric
 from ..files import replacing
 from .options import check_output
 
@@ -108,7 +108,8 @@ def _fabric(record: GarmentRecord | None) -> Fabric:
         return Fabric("default")
     known = {item.name for item in fields(Fabric)}
     numbers: dict[str, Any] = {name: value for name, value in record.parameters.items() if name in known}
-    return replace(Fabric(record.fabric), **numbers)
+    contact: dict[str, Any] = {} if "contact" in numbers else FABRIC_OF_VERTICES
+    return Fabric(record.fabric, **(contact | numbers))
 
 
 def _model(options: argparse.Namespace, report: Reporter) -> list[Section]:

@@ -200,10 +200,7 @@ class Refiner:
         """Yield frames with their changes."""
         mass = self.potential.mass
         after = State.at(self.potential, (refined - root).to(before.x.dtype), inputs)
-        inside = [
-            torch.zeros_like(state.energy) if distance is None else (distance < 0).double().mean(0)
-            for distance in (self.potential.vertex_distance(state.x, state.body_distance) for state in (before, after))
-        ]
+        inside = [self.potential.inside(state.x, state.body_distance) for state in (before, after)]
         moved = ((mass * ((after.x - before.x) ** 2).sum(1)).sum(0) / mass.sum()).sqrt()
         residual = self.potential.residual(self.potential.gradient(after.x, inputs, after.body_distance))
         figures = torch.stack([before.energy, after.energy, *inside, moved, residual], dim=1).tolist()

@@ -87,9 +87,11 @@ class IncrementalPotential:
         """Return the distances of the samples of x to the body, to second order."""
         return None if inputs.body is None else self.contacts.smoothed(self.cloth.positions(x), inputs.body)
 
-    def vertex_distance(self, x: Tensor, body_distance: SmoothedDistance | None) -> Tensor | None:
-        """Return the distances of the vertices [m], shape (V, N), from those of their samples."""
-        return None if body_distance is None else body_distance.distance(self.cloth.positions(x))[: len(x)]
+    def inside(self, x: Tensor, body_distance: SmoothedDistance | None) -> Tensor:
+        """Return the share of vertices inside the part of the body that they can touch, shape (N,)."""
+        if body_distance is None:
+            return x.new_zeros(x.shape[-1])
+        return (body_distance.distance(self.cloth.positions(x))[: len(x)] < 0).to(x.dtype).mean(0)
 
     def energy(self, x: Tensor, inputs: StepInputs, body_distance: SmoothedDistance | None) -> Tensor:
         """Return the energy [J] of each frame, shape (N,), at the distances `body_distance` of x."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,6 +21,9 @@ Terms = dict[str, Tensor]
 
 class Objective:
     """Computes energies of a model's decoded states; each term is [J] per frame, unreduced.
+
+    Attributes:
+        scale: the garment's weight times the diagonal of its bounding box at rest [J].
 
     Args:
         body: the part of the body that the garment can touch, None for nothing. Pinned vertices do not collide,
@@ -42,6 +46,8 @@ class Objective:
                 model.scene, energy.cloth.samples, vertices=body.vertices, pinned=False, device=device
             )
         self.dt = 1 / model.config.fps
+        size = float(np.linalg.norm(np.ptp(model.scene.garment.mesh.points, axis=0)))
+        self.scale = GRAVITY * float(energy.mass.sum()) * size
 
     def quasi_static_terms(self, x: Tensor, direction: Tensor, character: Tensor) -> Terms:
         """Return all terms but inertia and drag of positions x (V, 3, N) under gravity directions (N, 3)."""
@@ -119,6 +125,17 @@ class Objective:
         return dynamic, single, torch.stack(z[-2:]).detach()
 
 
-def total(terms: Terms) -> Tensor:
-    """Return the sum of all terms, averaged over frames [J]."""
-    return sum(value.mean() for value in terms.values())  # type: ignore[return-value]
+def total(terms: Terms, half: float = 0.0) -> Tensor:
+    """Return the sum of all terms, averaged over frames [J].
+
+    Poses in which body parts lie inside one another have no good state. Their energies are a thousand times those of
+    others, and a network that is trained on the mean gives up the others for them. So each frame is divided by
+    1 + (stretch + collision) / half, without a gradient: every pose keeps its minimum.
+
+    Args:
+        half: stretch and collision at which a frame counts half [J]; zero for the plain mean.
+    """
+    share = torch.ones(())
+    if half:
+        share = half / (half + (terms["stretch"] + terms["collision"]).detach())
+    return sum((value * share if value.shape == share.shape else value).mean() for value in terms.values())  # type: ignore[return-value]

@@ -11,7 +11,7 @@ import numpy as np
 from ..assets import Floats, Motion
 from ..kinematics import multiply_quaternions
 
-USUAL_TURN, LARGE_TURN = np.radians(12), np.radians(45)  # standard deviation about each axis
+USUAL_TURN, LARGE_TURN = np.radians(12), np.radians(35)  # standard deviation about each axis
 LARGE_PROBABILITY = 0.1  # that a joint turns far
 SLOWEST, FASTEST = 0.1, 0.7  # [Hz] of the turns
 

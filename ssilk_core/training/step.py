@@ -80,6 +80,7 @@ class Stepper:
         # Tensors: each replay of a captured graph reads them.
         self._iteration = torch.zeros((), dtype=torch.int64, device=self.device)
         self._decay = torch.zeros((), device=self.device)
+        self._half = config.outlier_energy * objective.scale
         self._graph: torch.cuda.CUDAGraph | None = None
         self._phase, self._eager = "", 0
 
@@ -88,7 +89,7 @@ class Stepper:
         frames, direction = self.sampler.poses(self.config.pretraining_batch)
         terms = self.objective.static(frames, direction)
         means = {name: value.mean() for name, value in terms.items()}
-        self._descend(sum(means.values()), means, {"frames": frames, "directions": direction})  # type: ignore[arg-type]
+        self._descend(total(terms, self._half), means, {"frames": frames, "directions": direction})
 
     def dynamic_step(self) -> None:
         """Do a step of dynamic training: all networks on one window of every slot, and P on single poses."""
@@ -96,7 +97,7 @@ class Stepper:
         dynamic, static, latents = self.objective.window(self.sampler, noise, *poses)
         moving, still = (next(iter(terms.values())).shape[0] for terms in (dynamic, static))
         # All frames have the same weight, those of the single poses included.
-        loss = (total(dynamic) * moving + total(static) * still) / (moving + still)
+        loss = (total(dynamic, self._half) * moving + total(static, self._half) * still) / (moving + still)
         means = {name: value.mean() for name, value in dynamic.items()}
         beside = {f"static {name}": value.mean() for name, value in static.items()}
         drawn = {"noise": noise, "static frames": poses[0], "static directions": poses[1]}

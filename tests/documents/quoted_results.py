@@ -9,7 +9,7 @@ from itertools import product
 from statistics import mean
 
 from ssilk_core.config import PRESETS
-from ssilk_core.fabrics import Fabric
+from ssilk_core.fabrics import FABRICS
 from ssilk_core.quality import QUALITIES
 
 from .measured import (
@@ -326,7 +326,7 @@ def inside_the_body() -> Text:
             *(share(simulator / ours) for simulator, ours in pairs),
             milli_1(result("collisions")[garment]["model"]["depth"][0]),
         )
-    fabric = Fabric("default")
+    fabric = FABRICS["paper"]
     yield f"{fabric.collision:g} N/m for each vertex"
     yield f"{milli(fabric.margin)} mm margin"
 
