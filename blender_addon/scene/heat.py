@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Penetration and stretch of a garment in the frame that is shown, and their colours on its mesh.
+"""Penetration and stretch of a garment in the frame that is shown, what was pushed out, and colours on its mesh.
 
 Both come a little at a time: to find what is nearest to 20,000 vertices takes a tenth of a second.
 """
@@ -17,10 +17,11 @@ from mathutils.bvhtree import BVHTree
 from .. import heat
 from ..errors import SetupError
 from .garment import armature_of, bodies_of
+from .repairs import displacements
 from .shapes import rest_points
 
 ATTRIBUTE = "SSILK Heat"
-PENETRATION, STRETCH = "PENETRATION", "STRETCH"
+PENETRATION, STRETCH, PUSHED_OUT = "PENETRATION", "STRETCH", "PUSHED_OUT"
 CHUNK = 1000  # vertices at a time
 
 Result = TypeVar("Result")
@@ -31,8 +32,9 @@ class HeatMap:
     """A garment in one frame.
 
     Attributes:
-        kind: PENETRATION or STRETCH.
-        values: of each vertex: depth inside the body [m], negative outside, or elongation; shape (V,).
+        kind: PENETRATION, STRETCH or PUSHED_OUT.
+        values: of each vertex: depth inside the body [m], negative outside; elongation; or how far it was pushed out
+            of the body [m]; shape (V,).
     """
 
     kind: str
@@ -46,6 +48,8 @@ class HeatMap:
         """Return the worst value in words."""
         if self.kind == STRETCH:
             return f"{self.most:.0%} longer at most"
+        if self.kind == PUSHED_OUT:
+            return f"{int((self.values > 0).sum())} vertices were pushed out, {1000 * self.most:.1f} mm at most"
         inside = int((self.values > 0).sum())
         return f"{inside} vertices inside, {1000 * self.most:.1f} mm at most" if inside else "Nothing is inside"
 
@@ -58,10 +62,12 @@ def measuring(
     All that it needs of the frame is read before the first yield.
 
     Raises:
-        SetupError: it has no body, or its modifiers change how many vertices there are.
+        SetupError: it has no body, was not pushed out, or its modifiers change how many vertices there are.
     """
     _need_same_vertices(garment, depsgraph)
     points = _world_points(garment.evaluated_get(depsgraph))
+    if kind == PUSHED_OUT:
+        return HeatMap(kind, displacements(garment))
     if kind == STRETCH:
         world = np.array(garment.matrix_world)[:3, :3]
         rest = rest_points(garment) @ world.T

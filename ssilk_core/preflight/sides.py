@@ -16,11 +16,11 @@ from .winding import consistent_flips
 
 Mask = NDArray[np.bool_]
 BURIED = 1e-3  # [m] in front of a face of the body; where this is inside the body, the face is buried in it
-NEAR = 0.03  # [m] from the surface; points farther from it keep their side from one query to the next
 CROSSING = 2e-3  # [m] depth of an edge's middle from which the edge leads through the body
 REACH = 0.05  # [m] distance to the body over which the direction of cloth tells less and less about its side
 INSIDE_WEIGHT = 0.01  # how much vertices inside the body tell about the winding of cloth, relative to those outside
 VOTE_COUPLING = 0.1  # how much neighbours agree on their winding, relative to what vertices outside tell
+SMOOTHING = 4  # rounds over which normals are averaged, so that a dent hardly turns them
 MINOR = 0.2  # share of an island's area below which a part beyond the body may have passed through it
 OPPOSITE = 0.6  # cosine between cloth's normal and that of the surface beneath, below minus which it is the wrong one
 MUCH_FARTHER = 2.0  # times the distance of the nearest surface, which is right unless the cloth is opposite to it
@@ -90,20 +90,18 @@ class OuterSurface:
         normals, found, distance = _closest(points, self.mesh)
         return _oriented(points, normals, found, self.inside(points), distance)
 
-    def belonging(self, points: Floats, facing: Floats, doubtful: Mask, crossed: Mask) -> SurfaceSide:
+    def belonging(self, points: Floats, inside: Mask, facing: Floats, doubtful: Mask, crossed: Mask) -> SurfaceSide:
         """Return the points of the surface that cloth belongs to.
 
         That is the nearest point, unless the surface there faces away from where doubtful cloth should face.
 
         Args:
             points: of the cloth [m], shape (S, 3).
+            inside: whether they lie in the body, shape (S,).
             facing: unit directions, shape (S, 3).
             doubtful, crossed: as in `Facing`, shape (S,).
         """
         normals, found, distance = _closest(points, self.mesh)
-        near = distance < NEAR
-        inside = doubtful & ~near  # deep points were inside from the start
-        inside[near | doubtful] = self.inside(points[near | doubtful])
         agreement = np.einsum("sc,sc->s", normals, facing)
         wrong = (doubtful & inside & (agreement < FACING)) | (crossed & ~inside & (agreement < -OPPOSITE))
         beyond = np.zeros(len(points), dtype=bool)
@@ -140,7 +138,7 @@ def find_facing(points: Floats, faces: Ints, surface: OuterSurface) -> Facing:
     count, pairs = len(points), edges(faces)
     flips = consistent_flips(np.full(len(faces), 3), faces.reshape(-1))[0]
     normals = vertex_normals(points, np.where(flips[:, None], faces[:, ::-1], faces))
-    normals = _unit(smooth(normals, pairs, 2))
+    normals = _unit(smooth(normals, pairs, SMOOTHING))
     side = surface.nearest(points)
     agreement = np.einsum("vc,vc->v", normals, closest_on_surface(points, surface.mesh).normals)
     middle = surface.nearest(points[pairs].mean(axis=1))

@@ -9,9 +9,10 @@ import numpy as np
 
 from ssilk_core.assets import Floats, Ints, Mesh
 from ssilk_core.mesh.topology import edges
-from ssilk_core.preflight.settle import GAP, sample_cloth, settle
+from ssilk_core.preflight.cloth_samples import sample_cloth
+from ssilk_core.preflight.settle import GAP, settle
 
-RADIUS, COLUMNS, ROWS = 0.1, 48, 41
+RADIUS, COLUMNS, ROWS = 0.1, 32, 27
 
 
 def tube(radius: float, columns: int = COLUMNS, rows: int = ROWS, height: float = 0.6, name: str = "Tube") -> Mesh:
@@ -71,7 +72,6 @@ def test_a_dent_comes_out_smoothly_and_all_else_stays():
     each[deep] *= np.where([True, False, True], ((RADIUS + GAP) / (RADIUS + height_above(each)))[deep, None], 1)
     ours, theirs = strain(cloth.points, points, cloth.faces), strain(cloth.points, each, cloth.faces)
     assert ours.max() < 0.6 * theirs.max() and ours[ours > 1e-9].mean() < theirs[theirs > 1e-9].mean()
-    assert np.array_equal(settle(cloth, limb()).offsets, found.offsets)
 
 
 def test_cloth_that_is_clear_of_the_body_is_left_alone():
@@ -89,6 +89,7 @@ def test_seams_stay_closed():
     faces[beyond] = copy[faces[beyond]]
     cut = Mesh("Cut", np.r_[whole.points, whole.points[seam]], faces)
     found = settle(cut, limb())
+    assert np.array_equal(settle(cut, limb()).offsets, found.offsets)
     assert found.offsets[seam].any() and np.array_equal(found.offsets[seam], found.offsets[copy[seam]])
 
 
