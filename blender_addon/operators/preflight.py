@@ -26,7 +26,7 @@ from ..scene.takes import ChosenMotions
 from .reporting import ReportingOperator
 from .rig import RigOperator
 
-LEFT = "left "  # begins what `ssilk inspect --fix` says of cloth that stays inside
+MOVED, LEFT = "moved ", "left "  # begin what `ssilk inspect --fix` says of settled cloth, and of what stays inside
 PUSHED = ("penetration", "inside-margin")
 
 
@@ -164,15 +164,16 @@ class PushOut(InspectOperator, bpy.types.Operator):
             raise SetupError(
                 f"'{garment.name}' has other findings to fix first: vertices would be merged or removed."
             )
+        told = work.result["fixed"]["repaired"]
+        left = "".join(f"; {said}" for said in told if said.startswith(LEFT))
+        if not any(said.startswith(MOVED) for said in told):
+            raise SetupError(f"'{garment.name}' stays as it is{left}.")
         moved = 1000 * move_points(garment, points)
         forget(context)
-        left = [said for said in work.result["fixed"]["repaired"] if said.startswith(LEFT)]
-        if not moved.any():
-            raise SetupError(f"'{garment.name}' stays as it is; {'; '.join(left) or 'nothing is inside'}.")
-        there = "".join(f"; {said}" for said in left)
         return (
-            f"{np.count_nonzero(moved)} vertices of '{garment.name}' were pushed out, by {moved[moved > 0].mean():.1f} "
-            f"mm on average and {moved.max():.1f} mm at most{there}. Show Heat colours them; inspect it again."
+            f"{np.count_nonzero(moved)} vertices of '{garment.name}' were pushed out, by "
+            f"{moved[moved > 0].mean():.1f} mm on average and {moved.max():.1f} mm at most{left}. Show Pushed Out colours "
+            "them; inspect it again."
         )
 
 

@@ -27,11 +27,11 @@ def tube(radius: float, columns: int = COLUMNS, rows: int = ROWS, height: float 
 
 def limb(radius: float = RADIUS) -> Mesh:
     """Return a closed cylinder about the y axis, longer than the tube."""
-    side = tube(radius, 96, 3, 1.0)
+    side = tube(radius, 96, 21, 1.0)
     ends = np.array([[0.0, 0, 0], [0, 1, 0]])
-    ring, last = np.arange(96), 192 + np.arange(96)
-    low = np.c_[np.roll(ring, -1), ring, np.full(96, 288)]
-    high = np.c_[last, np.roll(last, -1), np.full(96, 289)]
+    ring, last = np.arange(96), 20 * 96 + np.arange(96)
+    low = np.c_[np.roll(ring, -1), ring, np.full(96, 21 * 96)]
+    high = np.c_[last, np.roll(last, -1), np.full(96, 21 * 96 + 1)]
     return Mesh("Limb", np.r_[side.points, ends] - [0, 0.2, 0], np.r_[side.faces, low, high])
 
 
