@@ -172,8 +172,8 @@ class PushOut(InspectOperator, bpy.types.Operator):
         forget(context)
         return (
             f"{np.count_nonzero(moved)} vertices of '{garment.name}' were pushed out, by "
-            f"{moved[moved > 0].mean():.1f} mm on average and {moved.max():.1f} mm at most{left}. Show Pushed Out colours "
-            "them; inspect it again."
+            f"{moved[moved > 0].mean():.1f} mm on average and {moved.max():.1f} mm at most{left}. Show Pushed Out "
+            "colours them; inspect it again."
         )
 
 
