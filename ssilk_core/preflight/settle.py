@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 Mask = NDArray[np.bool_]
 GAP = 4e-3  # [m] that settled cloth keeps from the body; contact with the default fabric begins there
-DEEPEST = 0.06  # [m] from which a garment is not fitted to this body at all
+DEEPEST = 0.04  # [m] from which a garment is not fitted to this body at all
 TOLERANCE = 4e-4  # [m] that a sample may lie nearer than it should; cloth is settled so much beyond the gap
-SLOPE = 8.0  # cloth takes part as far from a sample as this many times the way that the sample moves ...
+SLOPE = 10.0  # cloth takes part as far from a sample as this many times the way that the sample moves ...
 LEAST_REACH = 0.04  # [m] ... and this much
 PENALTY = 2e3  # stiffness of contact, relative to that of an edge
 ITERATIONS = 30

@@ -253,7 +253,7 @@ def test_signed_distance_against_a_sphere():
 def test_what_stays_inside_is_told_with_its_place():
     deep = Mesh("cape.usda:/Tube", tube(0.17).points * [0.4, 1, 0.4], tube().faces)  # 80 mm, not fitted at all
     found = next(fit.penetration(deep, pillar()))
-    assert not found.fixable and "more than 60 mm deep" in found.fix
+    assert not found.fixable and "more than 40 mm deep" in found.fix
     (told,) = plan_repair(hero(), Garment(deep), None, topology=False).done
     assert told.startswith("left 416 vertices inside the body, up to 8") and "at Spine, Hips" in told
 
