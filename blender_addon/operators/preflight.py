@@ -180,7 +180,7 @@ class PushOut(InspectOperator, bpy.types.Operator):
 def fixer(item: FindingItem) -> str:
     """Return the operator that repairs a finding; empty where none does."""
     if item.code in PUSHED:
-        return PushOut.bl_idname
+        return PushOut.bl_idname if item.code == PUSHED[0] or item.fixable else ""
     safe = item.fixable or item.code == "body-inside-out"
     return FixFinding.bl_idname if safe and (item.code in REPAIRS or item.code == SCALE) else ""
 

@@ -172,7 +172,7 @@ def penetration(mesh: Mesh, body: Mesh) -> Findings:
             found=f"the nearest of them is {1000 * signed[near].min():.1f} mm from the body; collisions start at "
             f"{1000 * COLLISION_MARGIN:g} mm",
             why="collisions push the cloth slightly outward there, even at rest",
-            fixable=not settled.left,
+            fixable=settled.moved > 0 and not settled.left,
             elements="vertices",
             indices=index_tuple(near),
         )

