@@ -57,9 +57,20 @@ def depths(
     """
     corners = triangles[nearest]
     shares = _barycentric(places, body[corners])
-    normals = (shares[:, :, None] * _corner_normals(body, triangles)[corners]).sum(axis=1)
+    normals = (shares[:, :, None] * corner_normals(body, triangles)[corners]).sum(axis=1)
     away = points - places
     return np.where((away * normals).sum(axis=1) < 0, 1, -1) * np.linalg.norm(away, axis=1)
+
+
+def shown_depths(covered: np.ndarray, above: np.ndarray, beneath: np.ndarray) -> np.ndarray:
+    """Return how far beneath the skin the cloth is where skin shows; zero where it is covered, else -1; shape (V,).
+
+    Args:
+        covered: whether cloth is above each vertex in the bind pose.
+        above, beneath: distance of the cloth above and beneath it, infinity where none is within reach.
+    """
+    shows = covered & np.isinf(above) & np.isfinite(beneath)
+    return np.where(shows, np.maximum(beneath, np.finfo(np.float32).tiny), np.where(covered, 0.0, -1.0))
 
 
 def _barycentric(places: np.ndarray, corners: np.ndarray) -> np.ndarray:
@@ -71,7 +82,7 @@ def _barycentric(places: np.ndarray, corners: np.ndarray) -> np.ndarray:
     return (opposite * whole).sum(axis=2) / np.maximum((whole**2).sum(axis=2), 1e-30)
 
 
-def _corner_normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+def corner_normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Return the normals of points, of their triangles' weighted by the angle at the point, shape (V, 3)."""
     corners = points[triangles]
     faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -12,6 +12,7 @@ from .operators import (
     environment,
     fill,
     garments,
+    hiding,
     playback,
     preflight,
     quality_view,
@@ -41,6 +42,7 @@ CLASSES = (
     *baking.CLASSES,
     *playback.CLASSES,
     *quality_view.CLASSES,
+    *hiding.CLASSES,
     *panels.CLASSES,
 )
 

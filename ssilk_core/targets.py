@@ -19,6 +19,8 @@ class Target:
         meters_per_unit, up_axis: units [m] and up axis of the file; None for those of the character's stage.
         lean: omit joints at rest from the animation, and store the root's path as a translation of the SkelRoot.
             The layer is smaller, and exact far from the origin. The receiver must compose transforms as USD does.
+        variants: it selects variants, so that a single file keeps hidden faces of bodies as one. For others these
+            faces are left out of it. Layers keep them for all, because whoever reads layers composes them.
         suffixes: file suffixes that it accepts; layers need ".usdc".
         about: one-line description.
     """
@@ -27,14 +29,15 @@ class Target:
     meters_per_unit: float | None = None
     up_axis: Literal["Y", "Z"] | None = None
     lean: bool = False
+    variants: bool = False
     suffixes: tuple[str, ...] = (".usdc", ".usd", ".usda", ".usdz")
     about: str = ""
 
 
 # To add a target, add an entry: options, checks, bakes and their tests use this table.
 TARGETS = {
-    "usd": Target(lean=True, about="film pipelines and renderers: the stage's units, nothing capped"),
-    "blender": Target(meters_per_unit=1.0, up_axis="Z", about="metres, z up, every joint animated"),
+    "usd": Target(lean=True, variants=True, about="film pipelines and renderers: the stage's units, nothing capped"),
+    "blender": Target(meters_per_unit=1.0, up_axis="Z", variants=True, about="metres, z up, every joint animated"),
     "game8": Target(influences=8, meters_per_unit=1.0, up_axis="Y", about="8 influences, as two sets of glTF hold"),
     "game4": Target(influences=4, meters_per_unit=1.0, up_axis="Y", about="4 influences, as one set of glTF holds"),
     "arkit": Target(

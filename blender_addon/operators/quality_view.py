@@ -20,6 +20,7 @@ from .reporting import ReportingOperator
 
 KINDS = [
     (heat.PENETRATION, "Penetration", "How deep vertices lie inside the body"),
+    (heat.SKIN, "Skin", "Where covered skin shows through the cloth; on the body, by the depth of the cloth beneath"),
     (heat.STRETCH, "Stretch", "How much longer the cloth is than at rest"),
 ]
 PUSHED_OUT = (heat.PUSHED_OUT, "Pushed Out", "How far Push Out moved the rest shape")
@@ -54,7 +55,7 @@ class MeasuringOperator(tasks.OutsideOperator):
 
 
 class ShowHeat(MeasuringOperator, bpy.types.Operator):
-    """Colour the garment by penetration, stretch or what was pushed out; in Solid shading, in this view"""
+    """Colour the garment by penetration, stretch or Push Out, the body by skin that shows; in Solid shading"""
 
     bl_idname = "ssilk.show_heat"
     bl_label = "Show Heat"
@@ -104,7 +105,7 @@ class HideHeat(QualityOperator, bpy.types.Operator):
 
 
 class FindWorst(MeasuringOperator, bpy.types.Operator):
-    """Go through the scene's frames and mark those in which penetration or stretch is worst"""
+    """Go through the scene's frames and mark those in which penetration, stretch or skin that shows is worst"""
 
     bl_idname = "ssilk.find_worst"
     bl_label = "Mark Worst Frames"
@@ -129,7 +130,7 @@ class FindWorst(MeasuringOperator, bpy.types.Operator):
             scene.frame_set(before)
 
     def finish(self, context: bpy.types.Context, work: Work) -> str:
-        scene, values = context.scene, np.array([each.most for each in self.found])
+        scene, values = context.scene, np.array([each.badness for each in self.found])
         fps = scene.render.fps / scene.render.fps_base
         worst = worst_frames(values, self.count, max(1, round(APART * fps)))
         clear_markers(scene)

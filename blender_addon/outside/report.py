@@ -46,6 +46,10 @@ def findings(state: JobState, curve: Mapping[str, Any], *, moves: bool) -> list[
         (f"{abs(share):.1%} {'less' if share >= 0 else 'more'} energy than linear blend skinning", share < 0),
         (f"{score['collisions']:.2%} of the vertices inside the body", False),
     ]
+    if shown := score.get("shown_skin"):
+        found.append(
+            (f"{shown['mean']:.2%} of the covered skin shows, {shown['worst']:.2%} in the worst frame", False)
+        )
     if moves:
         found.append(dynamics(score["dynamics"]))
     if state.checkpoint is not None:

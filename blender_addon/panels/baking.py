@@ -33,3 +33,5 @@ class BakingPanel(SidebarPanel, bpy.types.Panel):
         draw_text(layout, model_line(context.object))
         layout.operator("ssilk.bake", icon="REC")
         layout.operator("ssilk.remove_bake", icon="TRASH")
+        layout.operator("ssilk.hide_covered", icon="HIDE_ON")
+        layout.operator("ssilk.show_covered", icon="HIDE_OFF")

@@ -6,7 +6,7 @@ from __future__ import annotations
 import bpy
 
 from ..scene.garment import unusable
-from ..scene.heat import PENETRATION, PUSHED_OUT, STRETCH
+from ..scene.heat import PENETRATION, PUSHED_OUT, SKIN, STRETCH
 from ..scene.lbs_copy import find_copy
 from ..scene.repairs import DISPLACEMENT
 from .base import SidebarPanel
@@ -31,6 +31,7 @@ class QualityPanel(SidebarPanel, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         draw_kind(layout, PENETRATION, text="Show Penetration")
+        draw_kind(layout, SKIN, text="Show Skin")
         draw_kind(layout, STRETCH, text="Show Stretch")
         if DISPLACEMENT in context.object.data.attributes:
             layout.operator("ssilk.show_heat", text="Show Pushed Out", icon="SHADING_RENDERED").kind = PUSHED_OUT

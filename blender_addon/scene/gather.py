@@ -19,6 +19,7 @@ from ..names import identifiers
 from .armature import read_joints
 from .attributes import current_classes
 from .garment import armature_of, bodies_of, need_undeformed_shape, shaping_modifiers
+from .masks import unmasked
 from .trained_weights import own_groups
 from .units import scene_units
 from .weights import PLAIN, read_groups, read_kept
@@ -136,7 +137,8 @@ def _at_rest(armature: bpy.types.Object) -> Iterator[bpy.types.Depsgraph]:
     before = armature.data.pose_position
     armature.data.pose_position = "REST"
     try:
-        yield bpy.context.evaluated_depsgraph_get()
+        with unmasked():
+            yield bpy.context.evaluated_depsgraph_get()
     finally:
         armature.data.pose_position = before
 

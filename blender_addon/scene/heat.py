@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Penetration and stretch of a garment in the frame that is shown, what was pushed out, and colours on its mesh.
+"""Penetration and stretch of a garment in the frame that is shown, the skin that shows, what was pushed out; colours.
 
-Both come a little at a time: to find what is nearest to 20,000 vertices takes a tenth of a second.
+All come a little at a time: to find what is nearest to 20,000 vertices takes a tenth of a second.
 """
 
 from __future__ import annotations
@@ -14,14 +14,18 @@ import bpy
 import numpy as np
 from mathutils.bvhtree import BVHTree
 
+from ssilk_core.shown_skin import COVER_REACH, SHOW_DEPTH
+
 from .. import heat
 from ..errors import SetupError
 from .garment import armature_of, bodies_of
+from .masks import need_unmasked
+from .meshes import need_same_vertices, world_points
 from .repairs import displacements
-from .shapes import rest_points
+from .shapes import mixed_points, rest_points
 
 ATTRIBUTE = "SSILK Heat"
-PENETRATION, STRETCH, PUSHED_OUT = "PENETRATION", "STRETCH", "PUSHED_OUT"
+PENETRATION, STRETCH, SKIN, PUSHED_OUT = "PENETRATION", "STRETCH", "SKIN", "PUSHED_OUT"
 CHUNK = 1000  # vertices at a time
 
 Result = TypeVar("Result")
@@ -32,9 +36,9 @@ class HeatMap:
     """A garment in one frame.
 
     Attributes:
-        kind: PENETRATION, STRETCH or PUSHED_OUT.
+        kind: PENETRATION, STRETCH, SKIN or PUSHED_OUT.
         values: of each vertex: depth inside the body [m], negative outside; elongation; or how far it was pushed out
-            of the body [m]; shape (V,).
+            of the body [m]; shape (V,). For SKIN those of `heat.shown_depths` [m], of all bodies' vertices.
     """
 
     kind: str
@@ -44,12 +48,21 @@ class HeatMap:
     def most(self) -> float:
         return float(self.values.max())
 
+    @property
+    def badness(self) -> float:
+        """What frames are compared by: the share of the covered skin that shows, or the largest value."""
+        if self.kind != SKIN:
+            return self.most
+        return float((self.values > 0).sum() / max(1, (self.values >= 0).sum()))
+
     def summary(self) -> str:
         """Return the worst value in words."""
         if self.kind == STRETCH:
             return f"{self.most:.0%} longer at most"
         if self.kind == PUSHED_OUT:
             return f"{int((self.values > 0).sum())} vertices were pushed out, {1000 * self.most:.1f} mm at most"
+        if self.kind == SKIN:
+            return f"{self.badness:.2%} of the covered skin shows" if self.badness else "No skin shows"
         inside = int((self.values > 0).sum())
         return f"{inside} vertices inside, {1000 * self.most:.1f} mm at most" if inside else "Nothing is inside"
 
@@ -62,18 +75,23 @@ def measuring(
     All that it needs of the frame is read before the first yield.
 
     Raises:
-        SetupError: it has no body, was not pushed out, or its modifiers change how many vertices there are.
+        SetupError: it has no body or one with hidden skin, was not pushed out, or its modifiers change how many
+            vertices there are.
     """
-    _need_same_vertices(garment, depsgraph)
-    points = _world_points(garment.evaluated_get(depsgraph))
+    need_same_vertices(garment, depsgraph)
     if kind == PUSHED_OUT:
         return HeatMap(kind, displacements(garment))
+    if kind == SKIN:
+        return HeatMap(kind, (yield from _shown(garment, depsgraph)))
+    points = world_points(garment.evaluated_get(depsgraph))
     if kind == STRETCH:
         world = np.array(garment.matrix_world)[:3, :3]
         rest = rest_points(garment) @ world.T
         return HeatMap(kind, heat.elongations(rest, points, _triangles(garment.data)))
     scale, depths = bpy.context.scene.unit_settings.scale_length, []
-    surfaces = [_surface(body.evaluated_get(depsgraph)) for body in bodies_of(garment, armature_of(garment))]
+    bodies = bodies_of(garment, armature_of(garment))
+    need_unmasked(bodies)
+    surfaces = [_surface(body.evaluated_get(depsgraph)) for body in bodies]
     for surface in surfaces:
         depths.append((yield from scaled(_depths(points, *surface), len(depths) / len(surfaces), 1 / len(surfaces))))
     return HeatMap(kind, scale * np.max(depths, axis=0))
@@ -97,12 +115,12 @@ def showing(garment: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Iterat
         hide(garment)
         return
     for thing in [thing for thing in bpy.data.objects if thing.session_uid == uid]:  # none if it was deleted
-        if thing.ssilk.heat == kind and thing.mode == "OBJECT" and len(thing.data.vertices) == len(measured.values):
-            _paint(thing.data, measured, thing.ssilk.heat_red)
+        if thing.ssilk.heat == kind and thing.mode == "OBJECT" and _fits(thing, measured):
+            _paint(thing, measured, thing.ssilk.heat_red)
 
 
 def show(garment: bpy.types.Object, measured: HeatMap, red: float) -> None:
-    """Colour a garment by what was measured, and again at each frame from now on.
+    """Colour a garment, or for SKIN its bodies, by what was measured, and again at each frame from now on.
 
     Args:
         red: the value that is red, in metres or as a share.
@@ -110,43 +128,45 @@ def show(garment: bpy.types.Object, measured: HeatMap, red: float) -> None:
     Raises:
         SetupError: it has other vertices by now.
     """
-    same = len(garment.data.vertices) == len(measured.values)
-    if not same:
+    if not _fits(garment, measured):
         raise SetupError(f"'{garment.name}' was edited while it was measured; look again.")
+    hide(garment)
     garment.ssilk.heat, garment.ssilk.heat_red = measured.kind, red
-    _paint(garment.data, measured, red)
+    _paint(garment, measured, red)
 
 
 def hide(garment: bpy.types.Object) -> None:
-    """Remove the colours."""
-    garment.ssilk.heat, colors = "", garment.data.color_attributes
-    if ATTRIBUTE in colors:
-        colors.remove(colors[ATTRIBUTE])
+    """Remove the colours of a garment, and those that it gave its bodies."""
+    kind, garment.ssilk.heat = garment.ssilk.heat, ""
+    for thing in (garment, *(_coloured(garment, kind) if kind == SKIN else ())):
+        colors = thing.data.color_attributes
+        if ATTRIBUTE in colors:
+            colors.remove(colors[ATTRIBUTE])
 
 
-def _paint(mesh: bpy.types.Mesh, measured: HeatMap, red: float) -> None:
-    layer = mesh.color_attributes.get(ATTRIBUTE) or mesh.color_attributes.new(ATTRIBUTE, "FLOAT_COLOR", "POINT")
+def _coloured(garment: bpy.types.Object, kind: str) -> list[bpy.types.Object]:
+    """Return the meshes that are coloured: for SKIN the bodies, none where the garment has lost them."""
+    if kind != SKIN:
+        return [garment]
+    try:
+        return bodies_of(garment, armature_of(garment))
+    except SetupError:
+        return []
+
+
+def _fits(garment: bpy.types.Object, measured: HeatMap) -> bool:
+    return sum(len(thing.data.vertices) for thing in _coloured(garment, measured.kind)) == len(measured.values)
+
+
+def _paint(garment: bpy.types.Object, measured: HeatMap, red: float) -> None:
     colors = heat.colors_of(measured.values, red).astype(np.float32)
-    layer.data.foreach_set("color_srgb", colors.reshape(-1))
-    mesh.color_attributes.active_color = layer
-    mesh.update()
-
-
-def _need_same_vertices(garment: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> None:
-    shown, count = len(garment.evaluated_get(depsgraph).data.vertices), len(garment.data.vertices)
-    if shown != count:
-        raise SetupError(
-            f"A modifier gives '{garment.name}' {shown} vertices where its mesh has {count}; switch it off in "
-            "viewports."
-        )
-
-
-def _world_points(thing: bpy.types.Object) -> np.ndarray:
-    """Return the vertices of an evaluated object in the world, shape (V, 3)."""
-    points = np.empty(len(thing.data.vertices) * 3, dtype=np.float32)
-    thing.data.vertices.foreach_get("co", points)
-    world = np.array(thing.matrix_world)
-    return points.reshape(-1, 3) @ world[:3, :3].T + world[:3, 3]
+    for thing in _coloured(garment, measured.kind):
+        mesh, count = thing.data, len(thing.data.vertices)
+        layer = mesh.color_attributes.get(ATTRIBUTE) or mesh.color_attributes.new(ATTRIBUTE, "FLOAT_COLOR", "POINT")
+        layer.data.foreach_set("color_srgb", colors[:count].reshape(-1))
+        mesh.color_attributes.active_color = layer
+        mesh.update()
+        colors = colors[count:]
 
 
 def _triangles(mesh: bpy.types.Mesh) -> np.ndarray:
@@ -161,7 +181,58 @@ def _surface(body: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
     triangles = _triangles(body.data)
     if body.matrix_world.determinant() < 0:  # mirrored, and so are its faces
         triangles = triangles[:, ::-1]
-    return _world_points(body), triangles
+    return world_points(body), triangles
+
+
+def _shown(garment: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Generator[float, None, np.ndarray]:
+    """Find how far beneath the skin the cloth is where skin shows [m], as `heat.shown_depths`, of all bodies."""
+    bodies, scale = bodies_of(garment, armature_of(garment)), bpy.context.scene.unit_settings.scale_length
+    need_unmasked(bodies)
+    for body in bodies:
+        need_same_vertices(body, depsgraph)
+    cloth, triangles = _surface(garment.evaluated_get(depsgraph))
+    trees = [
+        BVHTree.FromPolygons(points.tolist(), triangles.tolist(), all_triangles=True)
+        for points in (_in_world(garment, rest_points(garment)), cloth)
+    ]
+    skins = [(_in_world(body, mixed_points(body)), *_surface(body.evaluated_get(depsgraph))) for body in bodies]
+    found = []
+    for number, (rest, now, faces) in enumerate(skins):
+        steps = _shown_on(rest, now, faces, *trees, 1 / scale)
+        found.append((yield from scaled(steps, number / len(skins), 1 / len(skins))))
+    return np.concatenate([np.where(values > 0, scale * values, values) for values in found])
+
+
+def _shown_on(
+    rest: np.ndarray, now: np.ndarray, faces: np.ndarray, cloth_at_rest: BVHTree, cloth: BVHTree, metre: float
+) -> Generator[float, None, np.ndarray]:
+    """Return `heat.shown_depths` of one body's vertices, at rest and now, in world units; a metre is so many."""
+    normals = heat.corner_normals(rest, faces)
+    above = yield from scaled(_distances(cloth_at_rest, rest, normals, COVER_REACH * metre), 0.0, 1 / 3)
+    covered = np.isfinite(above)
+    outward, reached = heat.corner_normals(now, faces)[covered], np.full((2, len(now)), np.inf)
+    for row, (side, reach) in enumerate(((1, COVER_REACH), (-1, SHOW_DEPTH))):
+        steps = _distances(cloth, now[covered], side * outward, reach * metre)
+        reached[row, covered] = yield from scaled(steps, (1 + row) / 3, 1 / 3)
+    return heat.shown_depths(covered, *reached)
+
+
+def _distances(
+    tree: BVHTree, points: np.ndarray, directions: np.ndarray, reach: float
+) -> Generator[float, None, np.ndarray]:
+    """Return how far a surface is along a direction from each point, infinity where beyond reach, shape (N,)."""
+    found = np.full(len(points), np.inf)
+    for start in range(0, len(points), CHUNK):
+        yield start / len(points)
+        rays = zip(points[start : start + CHUNK].tolist(), directions[start : start + CHUNK].tolist())
+        hits = [tree.ray_cast(*ray, reach)[3] for ray in rays]
+        found[start : start + CHUNK] = [np.inf if distance is None else distance for distance in hits]
+    return found
+
+
+def _in_world(thing: bpy.types.Object, points: np.ndarray) -> np.ndarray:
+    world = np.array(thing.matrix_world)
+    return points @ world[:3, :3].T + world[:3, 3]
 
 
 def _depths(points: np.ndarray, surface: np.ndarray, triangles: np.ndarray) -> Generator[float, None, np.ndarray]:

@@ -12,7 +12,7 @@ import numpy as np
 from ..classes import COLOR_ATTRIBUTE
 from .armature import read_joints
 from .garment import armature_of
-from .heat import hide
+from .heat import ATTRIBUTE
 from .models import model_of
 from .trained import TrainedGarment
 from .weights import write_groups
@@ -53,11 +53,12 @@ def remove_copy(shown: bpy.types.Object) -> None:
     bpy.data.objects.remove(shown)
 
 
-def _clear_classes(mesh: bpy.types.Mesh) -> None:
-    """Remove the colours of classes: beside a heat map they would be read as heat."""
+def _clear_colors(mesh: bpy.types.Mesh) -> None:
+    """Remove the colours of heat, and of classes: beside a heat map they would be read as heat."""
     colors = mesh.color_attributes
-    if COLOR_ATTRIBUTE in colors:
-        colors.remove(colors[COLOR_ATTRIBUTE])
+    for name in (ATTRIBUTE, COLOR_ATTRIBUTE):
+        if name in colors:
+            colors.remove(colors[name])
 
 
 def _clear_shapes(copy: bpy.types.Object) -> None:
@@ -76,8 +77,8 @@ def _lbs_copy(garment: bpy.types.Object, trained: TrainedGarment) -> bpy.types.O
     copy.data, copy.name = garment.data.copy(), f"{garment.name} LBS"
     copy[OWNER] = garment
     copy.ssilk.live = False
-    hide(copy)  # the heat of the garment is not its own
-    _clear_classes(copy.data)
+    copy.ssilk.heat = ""  # the heat of the garment is not its own
+    _clear_colors(copy.data)
     _clear_shapes(copy)
     copy.vertex_groups.clear()
     skin, names = trained.player.file.scene.lbs_skin, trained.joints.names

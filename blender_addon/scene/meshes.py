@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Meshes opened as a BMesh, where Python reads and writes per-vertex lists many times faster."""
+"""Meshes opened as a BMesh, where Python reads and writes per-vertex lists many times faster; evaluated vertices."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from contextlib import contextmanager
 
 import bmesh
 import bpy
+import numpy as np
+
+from ..errors import SetupError
 
 
 @contextmanager
@@ -28,3 +31,21 @@ def edited(mesh: bpy.types.Mesh) -> Iterator[bmesh.types.BMesh]:
         yield content
         content.to_mesh(mesh)
     mesh.update()
+
+
+def need_same_vertices(thing: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> None:
+    """Raise `SetupError` if an object's modifiers change how many vertices it has."""
+    shown, count = len(thing.evaluated_get(depsgraph).data.vertices), len(thing.data.vertices)
+    if shown != count:
+        raise SetupError(
+            f"A modifier gives '{thing.name}' {shown} vertices where its mesh has {count}; switch it off in "
+            "viewports."
+        )
+
+
+def world_points(thing: bpy.types.Object) -> np.ndarray:
+    """Return the vertices of an evaluated object in the world, shape (V, 3)."""
+    points = np.empty(len(thing.data.vertices) * 3, dtype=np.float32)
+    thing.data.vertices.foreach_get("co", points)
+    world = np.array(thing.matrix_world)
+    return points.reshape(-1, 3) @ world[:3, :3].T + world[:3, 3]

@@ -283,6 +283,13 @@ WORDS = {
     "Remove the keys and shape keys that were baked or played live, and give the garment its own weights back": (
         "Gebackene oder live gespielte Schlüsselbilder und Formschlüssel entfernen, eigene Gewichte zurückgeben"
     ),
+    "Hide Covered Skin": "Verdeckte Haut ausblenden",
+    "Hide faces of the body that the garment covers in every frame, a last resort where skin shows": (
+        "Flächen des Körpers ausblenden, die das Kleidungsstück in jedem Bild bedeckt, als letztes Mittel gegen "
+        "sichtbare Haut"
+    ),
+    "Show Covered Skin": "Verdeckte Haut zeigen",
+    "Show the skin under the garment again": "Die Haut unter dem Kleidungsstück wieder zeigen",
     "Live Playback": "Live-Wiedergabe",
     "Play Live": "Live spielen",
     "Play the trained garment on the armature as it is, frame by frame, without a bake": (
@@ -300,6 +307,11 @@ WORDS = {
     "Penetration": "Durchdringung",
     "Show Penetration": "Durchdringung zeigen",
     "How deep vertices lie inside the body": "Wie tief Vertices im Körper liegen",
+    "Skin": "Haut",
+    "Show Skin": "Haut zeigen",
+    "Where covered skin shows through the cloth; on the body, by the depth of the cloth beneath": (
+        "Wo bedeckte Haut durch den Stoff tritt; auf dem Körper, nach der Tiefe des Stoffs darunter"
+    ),
     "Show Stretch": "Dehnung zeigen",
     "How much longer the cloth is than at rest": "Um wie viel länger der Stoff ist als in Ruhe",
     "Show Pushed Out": "Herausgedrücktes zeigen",
@@ -307,8 +319,9 @@ WORDS = {
     "How far Push Out moved the rest shape": "Wie weit Herausdrücken die Ruheform verschoben hat",
     "Show": "Zeigen",
     "Show Heat": "Wärmebild zeigen",
-    "Colour the garment by penetration, stretch or what was pushed out; in Solid shading, in this view": (
-        "Das Kleidungsstück nach Durchdringung, Dehnung oder Herausgedrücktem färben; in der Solid-Ansicht, hier"
+    "Colour the garment by penetration, stretch or Push Out, the body by skin that shows; in Solid shading": (
+        "Das Kleidungsstück nach Durchdringung, Dehnung oder Herausdrücken färben, oder den Körper nach Haut, die "
+        "durchtritt; in der Solid-Ansicht"
     ),
     "Red Depth": "Rote Tiefe",
     "Depth that is red": "Tiefe, die rot ist",
@@ -320,8 +333,9 @@ WORDS = {
     "Markers": "Marken",
     "How many frames are marked at most": "Wie viele Bilder höchstens markiert werden",
     "Mark Worst Frames": "Schlechteste Bilder markieren",
-    "Go through the scene's frames and mark those in which penetration or stretch is worst": (
-        "Die Bilder der Szene durchgehen und jene markieren, in denen Durchdringung oder Dehnung am größten ist"
+    "Go through the scene's frames and mark those in which penetration, stretch or skin that shows is worst": (
+        "Die Bilder der Szene durchgehen und jene markieren, in denen Durchdringung, Dehnung oder durchtretende Haut "
+        "am größten ist"
     ),
     "Clear Marks": "Marken entfernen",
     "Remove the markers of worst frames": "Die Marken der schlechtesten Bilder entfernen",

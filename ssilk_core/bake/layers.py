@@ -14,6 +14,7 @@ from ..errors import fail
 from ..events import Message, Reporter, Result, Started, silent
 from ..files import remove_unfinished, replacing, sha256
 from ..targets import check_influences
+from .hiding import covered_polygons
 from .load import LoadedGarment, load_garment
 from .origin import shot_metadata
 from .record import RECORD, TaskRecord, current_record, read_record, task_key, write_record
@@ -21,6 +22,7 @@ from .refinement import refined
 from .request import BakeRequest
 from .result import BakeResult
 from .rollout import BakeRollout
+from .skin import SkinMeter
 from .task import BakeTask, plan_layers
 from .verification import verify_file
 from .write import result_of
@@ -198,6 +200,11 @@ def _write_layer(layout: Layout, asset: Asset, rollout: BakeRollout, task: BakeT
     from ssilk_usd import layers
 
     rollout = refined(rollout, report)
+    hidden = covered_polygons(rollout, report) if task.request.hide_covered and task.include_body else None
+    if task.request.hide_covered and not task.include_body:
+        text = f"{task.name}: the body comes with another garment; faces that this one covers are not hidden"
+        report(Message(text, "warning"))
+    skin = SkinMeter(rollout)
     common: dict[str, Any] = {
         "units": rollout.units,
         "start": rollout.start,
@@ -212,16 +219,17 @@ def _write_layer(layout: Layout, asset: Asset, rollout: BakeRollout, task: BakeT
             asset,
             rollout.deformer,
             rollout.motion,
-            rollout.poses(),
+            skin.poses(),
             **common,
             hidden=rollout.hidden,
-            provenance=shot_metadata(rollout, layout.animation),
+            hidden_polygons=hidden,
+            provenance=shot_metadata(rollout, layout.animation, skin.stated),
             path=unverified,
             points=task.points,
         )
         verification = verify_file(rollout, unverified, report) if task.verify else None
     rollout.warn(report)
-    return result_of(rollout, layout.animation, summary, verification)
+    return result_of(skin, layout.animation, summary, verification, hidden)
 
 
 def _own_files(layout: Layout) -> tuple[Path, ...]:

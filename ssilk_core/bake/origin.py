@@ -13,11 +13,15 @@ from .request import BakeRequest
 from .rollout import BakeRollout
 
 
-def shot_metadata(rollout: BakeRollout, output: Path) -> dict[str, object]:
-    """Return what a shot says of its origin; `recovered` fills while the poses are written."""
+def shot_metadata(rollout: BakeRollout, output: Path, skin: Mapping[str, object]) -> dict[str, object]:
+    """Return what a shot says of its origin and quality; `recovered` and `skin` fill while the poses are written.
+
+    Args:
+        skin: figures of the covered skin that shows.
+    """
     refined = {"refined": rollout.refinement.summary.to_metadata()} if rollout.refinement else {}
     beside = _beside(rollout.request, output)
-    return {**rollout.provenance, "beside": beside, "recovered": rollout.recovered, **refined}
+    return {**rollout.provenance, "beside": beside, "recovered": rollout.recovered, "shown_skin": skin, **refined}
 
 
 def _beside(request: BakeRequest, output: Path) -> dict[str, str]:

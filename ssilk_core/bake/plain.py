@@ -29,13 +29,15 @@ def from_plain(kind: type[T], document: object) -> T:
 
 
 def _value(kind: Any, name: str, value: object) -> Any:
-    """Return a plain value as `kind`: a dataclass, a tuple of one type, a union, or a plain type itself."""
+    """Return a plain value as `kind`: a dataclass, a tuple or dictionary of one type, a union, or a plain type."""
     if get_origin(kind) is UnionType:
         if value is None and type(None) in get_args(kind):
             return None
         (kind,) = (each for each in get_args(kind) if each is not type(None))
     if get_origin(kind) is tuple and isinstance(value, list | tuple):
         return tuple(_value(get_args(kind)[0], name, item) for item in value)
+    if get_origin(kind) is dict and isinstance(value, Mapping):
+        return {str(key): _value(get_args(kind)[1], f"{name}.{key}", item) for key, item in value.items()}
     if is_dataclass(kind):
         return from_plain(kind, value)  # type: ignore[arg-type]
     if isinstance(value, kind if kind is not float else (int, float)) and isinstance(value, bool) == (kind is bool):

@@ -38,6 +38,7 @@ class BakeRequest:
         refine: iterations of the simulator's solver in each frame, from the network's state; 0 for none.
         feedback: refined frames look back on refined frames instead of the network's.
         refined_output: "points" writes refined frames as points, "joints" fits joints and blendshapes to them.
+        hide_covered: hide the body's faces that the garment covers in every frame (see `mesh.hidden_faces`).
         keep: what is kept of the model, cut to be best for this motion; None for all.
         device: where the network runs.
 
@@ -57,6 +58,7 @@ class BakeRequest:
     refine: int = 0
     feedback: bool = False
     refined_output: str = "points"
+    hide_covered: bool = False
     keep: ModelSize | None = None
     device: str = "cpu"
 
@@ -127,3 +129,9 @@ class BakeRequest:
         if isinstance(document, Mapping) and isinstance(document.get("keep"), str):
             document = {**document, "keep": vars(ModelSize.of(document["keep"]))}
         return from_plain(cls, document)
+
+
+def need_body(request: BakeRequest, include_body: bool) -> None:
+    """Raise `SsilkError` where faces of a body are to be hidden that is not written."""
+    if request.hide_covered and not include_body:
+        fail("--hide-covered", "no body in the shot", "its faces are what is hidden", "leave --no-body out")

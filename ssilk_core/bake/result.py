@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..quality import SizeReduction
+from ..shown_skin import ShownSkin
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,9 @@ class BakeResult:
         verification: None where none was asked for.
         reduction: what was kept of the model, where less than all.
         refinement: what the solver changed, where it was asked to.
+        hidden_faces: faces of the bodies that are hidden; None where that was not asked for.
         recovered: frames at which the rollout was lost and the garment was put to rest.
+        shown_skin: the share of the covered skin that shows; None where the garment covers nothing.
         current: the file was there already and nothing was baked; the other figures are those of its bake.
     """
 
@@ -116,7 +119,9 @@ class BakeResult:
     verification: Verification | None = None
     reduction: SizeReduction | None = None
     refinement: RefinementSummary | None = None
+    hidden_faces: int | None = None
     recovered: tuple[FrameSpan, ...] = ()
+    shown_skin: ShownSkin | None = None
     current: bool = False
 
     def figures(self, kind: str = "shot") -> dict[str, object]:
@@ -134,6 +139,8 @@ class BakeResult:
             "bytes": self.size_bytes,
             **(self.reduction.to_metadata() if self.reduction else {}),
             **{f"refined: {name}": value for name, value in refined.items()},
+            **(self.shown_skin.summary() if self.shown_skin else {}),
             **(self.verification.figures() if self.verification else {}),
+            **({} if self.hidden_faces is None else {"hidden faces of the body": self.hidden_faces}),
             **({"put to rest": [str(span) for span in self.recovered]} if self.recovered else {}),
         }

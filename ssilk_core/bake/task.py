@@ -12,7 +12,7 @@ from pathlib import Path
 from ..checkpoint import load_model
 from ..errors import fail
 from ..targets import check_influences
-from .request import BakeRequest
+from .request import BakeRequest, need_body
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +56,7 @@ def plan_layers(
             none, or all shots of a garment could not share one asset.
     """
     requests = list(requests)
-    _need_for_layers(requests)
+    _need_for_layers(requests, include_body)
     garments = {(request.model, request.root): _garment_name(request) for request in requests}
     shots = {request.motion: _shot_name(request) for request in requests}
     _need_unique(list(garments.values()), "MODEL", "garments")
@@ -81,8 +81,9 @@ def plan_layers(
     return tasks
 
 
-def _need_for_layers(requests: Sequence[BakeRequest]) -> None:
+def _need_for_layers(requests: Sequence[BakeRequest], include_body: bool) -> None:
     for request in requests:
+        need_body(request, include_body)
         if request.keep:
             fail(
                 request.model,

@@ -10,15 +10,17 @@ from typing import TYPE_CHECKING, Any
 from ..errors import fail
 from ..events import Message, Reporter, Result, Started, silent
 from ..files import need_not_input, need_writable, replacing
+from .hiding import covered_polygons
 from .origin import shot_metadata
 from .refinement import refined
-from .request import BakeRequest
+from .request import BakeRequest, need_body
 from .result import BakeResult, Verification
-from .rollout import BakeRollout
 from .sizing import load_sized
+from .skin import SkinMeter
 from .verification import verify_file
 
 if TYPE_CHECKING:
+    from ssilk_usd.body_faces import HiddenPolygons
     from ssilk_usd.shot import ShotSummary
 
 
@@ -48,22 +50,30 @@ def bake(
     """
     path = Path(output)
     _check_output(request, path)
+    need_body(request, include_body)
     rollout = load_sized(
         request, quality=quality, budget=budget, suffix=path.suffix, include_body=include_body, report=report
     )
     report(Started("bake", rollout.motion.frame_count, {"output": str(path)}))
     rollout = refined(rollout, report)
-    summary, verification = _write_verified(rollout, path, include_body, verify, report)
-    result = result_of(rollout, path, summary, verification)
+    hidden = covered_polygons(rollout, report) if request.hide_covered else None
+    skin = SkinMeter(rollout)
+    summary, verification = _write_verified(skin, path, include_body, hidden, verify, report)
+    result = result_of(skin, path, summary, verification, hidden)
     rollout.warn(report)
     report(Result("bake", result.figures()))
     return result
 
 
 def result_of(
-    rollout: BakeRollout, path: Path, summary: ShotSummary, verification: Verification | None
+    skin: SkinMeter,
+    path: Path,
+    summary: ShotSummary,
+    verification: Verification | None,
+    hidden: HiddenPolygons | None,
 ) -> BakeResult:
     """Return the result of a rollout that was written."""
+    rollout = skin.rollout
     return BakeResult(
         path=path,
         frames=summary.frame_count,
@@ -75,7 +85,9 @@ def result_of(
         verification=verification,
         reduction=rollout.reduction,
         refinement=rollout.refinement.summary if rollout.refinement else None,
+        hidden_faces=None if hidden is None else sum(int(mask.sum()) for mask in hidden.masks),
         recovered=tuple(rollout.recovered),
+        shown_skin=skin.shown(),
     )
 
 
@@ -91,35 +103,45 @@ def _check_output(request: BakeRequest, path: Path) -> None:
 
 
 def _write_verified(
-    rollout: BakeRollout, output: Path, include_body: bool, verify: bool, report: Reporter
+    skin: SkinMeter,
+    output: Path,
+    include_body: bool,
+    hidden: HiddenPolygons | None,
+    verify: bool,
+    report: Reporter,
 ) -> tuple[ShotSummary, Verification | None]:
     """Write a file that appears once it is verified; return what it holds."""
     from ssilk_usd.export import packaged
 
     with replacing(output) as unverified:
         with packaged(unverified) as layer:
-            summary = _write(layer, rollout, output, include_body)
+            summary = _write(layer, skin, output, include_body, hidden)
         if not verify:
             report(Message("not verified, as asked", "warning"))
-        return summary, verify_file(rollout, unverified, report) if verify else None
+        return summary, verify_file(skin.rollout, unverified, report) if verify else None
 
 
-def _write(layer: Path, rollout: BakeRollout, output: Path, include_body: bool) -> ShotSummary:
+def _write(
+    layer: Path, skin: SkinMeter, output: Path, include_body: bool, hidden: HiddenPolygons | None
+) -> ShotSummary:
     """Write a shot of joints and blendshapes, or of refined points."""
     from ssilk_usd.points import point_cache
     from ssilk_usd.shot import write_shot
 
+    rollout = skin.rollout
     common: dict[str, Any] = {
         "units": rollout.units,
         "start": rollout.start,
         "samples_per_frame": rollout.request.samples_per_frame,
         "include_body": include_body,
         "hidden": rollout.hidden,
-        "provenance": shot_metadata(rollout, output),
+        "hidden_polygons": hidden,
+        "provenance": shot_metadata(rollout, output, skin.stated),
         "record": rollout.record,
     }
     if not rollout.request.writes_points:
-        return write_shot(layer, rollout.deformer, rollout.motion, rollout.poses(), **common)
+        return write_shot(layer, rollout.deformer, rollout.motion, skin.poses(), **common)
+    skin.add_points()
     with point_cache(layer, rollout.deformer.scene, rollout.motion, **common) as cache:
         for frame, points in enumerate(rollout.points()):
             cache.write(frame, points)

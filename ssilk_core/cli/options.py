@@ -97,6 +97,11 @@ def _add_output(verb: argparse.ArgumentParser) -> None:
         "blendshapes, with the error stated",
     )
     verb.add_argument("--no-body", action="store_true", help="leave the body meshes out")
+    verb.add_argument(
+        "--hide-covered",
+        action="store_true",
+        help="hide the body's faces that the garment covers in every frame, where skin shows through: a last resort",
+    )
     verb.add_argument("--no-verify", action="store_true", help="do not re-skin the written files")
     verb.add_argument("--device", default="cpu", help="where the network runs (default cpu)")
 
@@ -126,6 +131,7 @@ def requests_of(options: argparse.Namespace) -> list[BakeRequest]:
             lbs=options.lbs,
             refine=options.refine,
             refined_output=options.refined_output,
+            hide_covered=options.hide_covered,
             device=options.device,
         )
         for model, root in named

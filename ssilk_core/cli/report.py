@@ -52,7 +52,13 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     text = page(options.subject.name, [*measured, *given, provenance])
     with replacing(options.output) as temporary:
         temporary.write_text(text, encoding="utf-8")
-    report(Result("report", {"page": str(options.output), "bytes": options.output.stat().st_size}))
+    figures = {name: value for section in measured for name, value in section.figures.items()}
+    page_bytes = options.output.stat().st_size
+    report(
+        Result(
+            "report", {"page": str(options.output), "bytes": page_bytes, **({"garments": figures} if figures else {})}
+        )
+    )
     return EXIT_OK
 
 
@@ -70,6 +76,7 @@ def _check(options: argparse.Namespace) -> None:
 
 def _shot(path: Path, report: Reporter) -> list[Section]:
     """Return the sections of a shot, its provenance last."""
+    from ssilk_usd.body_faces import open_with_full_bodies
     from ssilk_usd.play import Shot
     from ssilk_usd.provenance import read_provenance
     from ssilk_usd.read_shot import read_parts
@@ -77,7 +84,7 @@ def _shot(path: Path, report: Reporter) -> list[Section]:
     from ..report.page import Section, facts
     from ..report.shots import ShotGarment, shot_sections
 
-    shot = Shot(path)
+    shot = Shot(open_with_full_bodies(path))  # cloth is measured against all of the body
     parts = read_parts(shot)
     report(Started("report", len(shot.frame_times)))
     garments = [

@@ -72,7 +72,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     with join_process_group(options.device) as (group, device), stop_on_signals() as stop:
         report = report if group.is_first else silent
         trained = train(training_job(options, device, report), report, stop, group)
-    share = 1 - trained.score.total / trained.lbs.total
+    share, shown = 1 - trained.score.total / trained.lbs.total, trained.score.shown_skin
     report(
         Result(
             "train",
@@ -83,6 +83,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
                 "linear blend skinning [J]": round(trained.lbs.total, 5),
                 ("lower by" if share >= 0 else "higher by"): f"{abs(share):.1%}",
                 "collisions": f"{trained.score.collisions:.2%}",
+                **(shown.summary() if shown else {}),
                 **{f"{k} [J]": round(v, 5) for k, v in trained.score.terms.items()},
             },
         )

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The posed body, and the distance of garment vertices to it.
+"""The posed body, the distance of garment vertices to it, and the skin that shows.
 
 Positions have the shape (V, 3, N): vertices, coordinates, frames.
 """
 
 from .body import CollisionBody
 from .contacts import Contacts
+from .covered_skin import CoveredPoints, CoveredSkin, ShownCounts
 from .distance import (
     Patches,
     PosedBody,
@@ -14,15 +15,21 @@ from .distance import (
     signed_distance_to_planes,
     smoothed_planes,
 )
+from .ray_casting import RayCaster, RayHits
 from .reach import ReachableBody, reachable_body
 from .smoothed_distance import SmoothedDistance
 
 __all__ = [
     "CollisionBody",
     "Contacts",
+    "CoveredPoints",
+    "CoveredSkin",
     "Patches",
     "PosedBody",
+    "RayCaster",
+    "RayHits",
     "ReachableBody",
+    "ShownCounts",
     "SmoothedDistance",
     "nearest_planes",
     "reachable_body",

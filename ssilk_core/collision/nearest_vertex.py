@@ -7,28 +7,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..assets import Floats, Ints
+from ..mesh.blocks import compact_blocks as compact_blocks
 
 MAX_SCORES = 1 << 27  # in memory at once, in batched matrix products
 GARMENT_BLOCK, BODY_GROUP = 32, 8  # vertices of the garment and of the body that the kernel processes together
-
-
-def compact_blocks(points: Floats, size: int) -> Ints:
-    """Return indices of points (P, 3) in compact blocks, int32 (ceil(P / size), size), by bisecting the widest side.
-
-    The last block is padded with its last index.
-    """
-    blocks, parts = [], [np.arange(len(points))]
-    while parts:
-        part = parts.pop()
-        if len(part) <= size:
-            blocks.append(np.pad(part, (0, size - len(part)), mode="edge"))
-            continue
-        widest = np.ptp(points[part], axis=0).argmax()
-        part = part[np.argsort(points[part, widest], kind="stable")]
-        half = -(-len(part) // size) // 2 * size  # only whole blocks to the left
-        parts += [part[half:], part[:half]]
-    return np.stack(blocks).astype(np.int32)
 
 
 def consecutive_blocks(count: int, size: int, device: torch.device) -> Tensor:

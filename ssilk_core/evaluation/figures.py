@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ..shown_skin import ShownSkin
+
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceErrors:
@@ -125,6 +127,7 @@ class Figures:
         clips, frames: how many.
         total: the paper's L_tot [J], the sum of `terms`; gravity is relative to linear blend skinning.
         collisions: share of vertices inside the body.
+        shown_skin: share of the covered skin that shows; None where the garment covers nothing.
         clip_totals: smallest, median and largest total of a clip [J].
         gravity_excess: gravity energy above that of linear blend skinning [m g L].
         kinetic_energy: [J].
@@ -146,6 +149,7 @@ class Figures:
     jerk: float
     jerk_ratio: float
     stretch_quantiles: tuple[float, ...]
+    shown_skin: ShownSkin | None = None
     reference: ReferenceErrors | None = None
     pose_novelty: PoseNovelty | None = None
     settling: Settling | None = None

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ..assets import PINNED, Floats, Scene
-from ..collision import CollisionBody, Contacts
+from ..collision import CollisionBody, Contacts, CoveredSkin
 from ..constants import GRAVITY
 from ..energy import GarmentEnergy
 from ..energy.stretch import deformation_gradient_operator
@@ -89,6 +89,11 @@ class EvaluationScene:
     def name(self) -> str:
         """Name of the garment's prim."""
         return self.scene.garment.mesh.path.rpartition("/")[2]
+
+    @cached_property
+    def covered(self) -> CoveredSkin:
+        """The skin that the garment covers in the bind pose."""
+        return CoveredSkin(self.scene, device=self.device)
 
     @cached_property
     def simulator(self) -> Simulator:

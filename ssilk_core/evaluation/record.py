@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ..collision import ShownCounts
 from ..energy.frames import FRAMES_PER_CHUNK, energy_terms
 from .methods import EvaluationScene, Method, TakeSet
 from .metrics import BINS, derivative, kinetic_energy, mean_square, principal_stretches, stretch_histogram
@@ -25,10 +26,12 @@ class TakeRecord:
             "kinetic energy" [J], "largest stretch", and mean squares of "jerk", of "static distance", that to the
             method's own static state, and of `ERRORS`. NaN where a take has too short a past.
         stretches: histogram of the larger principal stretch of all triangles.
+        shown: the covered skin that shows, by frames of the clip.
     """
 
     values: dict[str, Tensor]
     stretches: Tensor
+    shown: ShownCounts
 
 
 @torch.no_grad()
@@ -36,15 +39,17 @@ def recorded(
     dressed: EvaluationScene, take_set: TakeSet, method: Method, take: int, reference: Method | None = None
 ) -> TakeRecord:
     """Measure a method over a take, and its errors where there is a `reference`."""
-    parts, stretches = [], torch.zeros(BINS, dtype=torch.float64)
+    parts, shown, stretches = [], [], torch.zeros(BINS, dtype=torch.float64)
     ours, theirs = _Past(method, take), _Past(reference, take) if reference else None
-    count = take_set.takes[take].frame_count
+    count, first = take_set.takes[take].frame_count, take_set.takes[take].first
     for start in range(0, count, FRAMES_PER_CHUNK):
         frames = range(start, min(start + FRAMES_PER_CHUNK, count))
         path, still = ours.joined(frames), method.still(take, frames)
         x = path[..., -len(frames) :]
         stretch = principal_stretches(dressed.columns(x))[0]
         stretches += stretch_histogram(stretch)
+        shows = dressed.covered.shows(x, take_set.character(take, frames))
+        shown.append(ShownCounts.of(shows, range(first + frames.start, first + frames.stop)))
         values = {
             **frame_energies(dressed, take_set, take, frames, path),
             **_moving(dressed, path, len(frames)),
@@ -53,7 +58,8 @@ def recorded(
             **({} if theirs is None else _errors(dressed, path - theirs.joined(frames), len(frames))),
         }
         parts.append({name: value.double().cpu() for name, value in values.items()})
-    return TakeRecord({name: torch.cat([part[name] for part in parts]) for name in parts[0]}, stretches)
+    joined = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+    return TakeRecord(joined, stretches, ShownCounts.joined(shown))
 
 
 def frame_energies(

@@ -171,7 +171,7 @@ class _Run:
 
     def _figures(self, tally: Tally) -> Figures:
         takes, weight = list(tally.records), self.dressed.weight
-        found = figures(tally, self.lbs.only(takes), weight)
+        found = figures(tally, self.lbs.only(takes), weight, self.dressed.covered)
         return replace(found, reference=reference_errors(tally, self.simulator.only(takes), weight))
 
     def simulator_rows(self) -> Iterator[ResultRow]:

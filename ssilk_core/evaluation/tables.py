@@ -8,6 +8,7 @@ from math import degrees, isfinite
 from typing import Any
 
 from ..energy import TERMS
+from ..shown_skin import ShownSkin
 from .figures import Figures, LoopDrift, MinimumErrors, PoseNovelty, ReferenceErrors, Settling
 from .run import ResultRow
 
@@ -45,6 +46,8 @@ def _table(
 
 ENERGIES = ("frames", "L_tot [J]", *(f"{name} [J]" for name in TERMS), "vertices inside the body [%]",
             "gravity excess over LBS [% m g L]", "L_tot of a clip, min / median / max [J]")  # fmt: skip
+SHOWN_SKIN = ("covered points", "covered skin that shows [%]", "in the worst frame [%]", "clip", "frame",
+              "where, share of what shows")  # fmt: skip
 MOTION = ("kinetic energy [J]", "RMS distance to static state [mm]", "RMS jerk [m/s3]", "RMS jerk / LBS",
           "larger principal stretch, 50 / 95 / 99 / 100 %")  # fmt: skip
 REFERENCE = ("frames", "L_tot excess over simulator [J]", "simulator L_tot [J]",
@@ -66,6 +69,10 @@ def _energies(f: Figures) -> list[str]:
     terms = [f"{f.terms[name]:.4g}" for name in TERMS]
     spread = " / ".join(f"{value:.3g}" for value in f.clip_totals)
     return [str(f.frames), f"{f.total:.4g}", *terms, _percent(f.collisions), _signed(f.gravity_excess, 1), spread]
+
+
+def _shown_skin(f: ShownSkin) -> list[str]:
+    return [str(f.covered), _percent(f.mean, 3), _percent(f.worst), f.clip, str(f.frame), f.where]
 
 
 def _motion(f: Figures) -> list[str]:
@@ -116,6 +123,7 @@ def _millimetres(value: float) -> str:
 
 KINDS: tuple[tuple[Callable[[Figures], Any], Sequence[str], Callable[[Any], list[str]]], ...] = (
     (lambda figures: figures, ENERGIES, _energies),
+    (lambda figures: figures.shown_skin, SHOWN_SKIN, _shown_skin),
     (lambda figures: figures.reference, REFERENCE, _reference),
     (lambda figures: figures, MOTION, _motion),
     (lambda figures: figures.settling, SETTLING, _settling),

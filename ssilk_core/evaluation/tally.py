@@ -9,7 +9,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ..collision import CoveredSkin
 from ..energy import TERMS
+from ..shown_skin import ShownSkin
 from .figures import Figures, PoseNovelty, ReferenceErrors
 from .metrics import histogram_quantiles, ratio
 from .record import ERRORS, TakeRecord
@@ -45,6 +47,10 @@ class Tally:
         """Return the same of some of the takes."""
         return Tally({take: self.records[take] for take in takes if take in self.records}, self.clips)
 
+    def shown_skin(self, covered: CoveredSkin) -> ShownSkin | None:
+        """Return the share of the covered skin that shows; None where nothing is covered."""
+        return covered.figures([(self.clips[take], record.shown) for take, record in self.records.items()])
+
     def clip_totals(self) -> tuple[float, float, float]:
         """Return the smallest, the median and the largest mean total of a clip [J]."""
         names = dict.fromkeys(self.clips[take] for take in self.records)
@@ -57,12 +63,13 @@ def takes_in(clips: Mapping[int, str], names: Collection[str]) -> list[int]:
     return [take for take, clip in clips.items() if clip in names]
 
 
-def figures(tally: Tally, lbs: Tally, weight: float) -> Figures:
+def figures(tally: Tally, lbs: Tally, weight: float, covered: CoveredSkin) -> Figures:
     """Return the figures of a method.
 
     Args:
         lbs: linear blend skinning on the same takes.
         weight: m g L of the garment [J].
+        covered: the skin that it covers.
     """
     jerk = tally.root("jerk")
     stretches = sum((record.stretches for record in tally.records.values()), torch.zeros(()))
@@ -73,6 +80,7 @@ def figures(tally: Tally, lbs: Tally, weight: float) -> Figures:
         total=float(tally.totals().mean()),
         terms={name: tally.mean(name) for name in TERMS},
         collisions=tally.mean("collisions"),
+        shown_skin=tally.shown_skin(covered),
         clip_totals=tally.clip_totals(),
         gravity_excess=ratio(tally.mean("gravity"), weight),
         kinetic_energy=tally.mean("kinetic energy"),

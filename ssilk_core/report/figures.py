@@ -10,12 +10,13 @@ from typing import Any
 
 from ..charts import ChartPanel, svg_chart
 from ..errors import SsilkError, fail
+from ..shown_skin import ShownSkin
 from ..stress.outcome import HEADER, CaseOutcome
 from ..trade.plot import trade_panels
 from ..trade.point import TradePoint
 from ..training.verdict import curve_lbs
 from .page import Section, facts, flattened, table
-from .terms import SHARE
+from .terms import SHARE, SHOWN
 
 
 def read_json(path: Path) -> Any:
@@ -74,8 +75,7 @@ def extremes(document: Mapping[str, Any]) -> Section:
 
 def trade(document: Mapping[str, Any]) -> Section:
     """Return the charts and the tables of 'ssilk trade'."""
-    names = TradePoint.__dataclass_fields__
-    points = [TradePoint(**{name: each[name] for name in names}) for each in document["points"]]
+    points = [TradePoint.of(each) for each in document["points"]]
     chart = svg_chart("errors over costs", trade_panels(points), size=(4.0, 3.4)) if points else ""
     judged = records(document.get("judging", ()))
     return Section("Trade", chart + records(document["points"]) + judged + facts(document["asked"]))
@@ -101,6 +101,9 @@ def learning(document: Mapping[str, Any]) -> Section:
     times = [point["seconds"] for point in points]
     totals, inside = ([point["validation"][name] for point in points] for name in ("total", "collisions"))
     shown = {"total at validation": ("J", totals), SHARE: ("%", [100 * share for share in inside])}
+    skin = [point["validation"].get("shown_skin") for point in points]
+    if all(skin):
+        shown[SHOWN] = ("%", [100 * found["mean"] for found in skin])
     rows = [
         [ChartPanel(title=title, x="training time [s]", y=unit, curves={"": (times, values)},
                     marks={"best": (times[best], values[best])})]
@@ -110,4 +113,6 @@ def learning(document: Mapping[str, Any]) -> Section:
         f"Best: {totals[best]:.4g} J at {times[best]:.0f} s. "
         f"Linear blend skinning: {lbs['total']:.4g} J, {lbs['collisions']:.2%} inside the body."
     )
+    if skin[best]:
+        words += f" At the best, {ShownSkin(**skin[best])}."
     return Section("Training", svg_chart("validations during training", rows) + f'<p class="note">{words}</p>')

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from html import escape
 from io import BytesIO
 from typing import Any
@@ -35,10 +35,11 @@ figcaption, .note { font-size: 13px; opacity: .8; }
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the page: its heading and its HTML."""
+    """A part of the page: its heading, its HTML, and figures of it for programs."""
 
     title: str
     body: str
+    figures: Mapping[str, Any] = field(default_factory=dict)
 
 
 def page(title: str, sections: Sequence[Section]) -> str:

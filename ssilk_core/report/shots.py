@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -17,9 +17,10 @@ from ..view.player import ShotPlayer
 from ..view.render import Image, render
 from ..view.shots import shot_surfaces
 from .page import Section, figure, table
-from .terms import SHARE, UNITS, TermsMeter, worst_frames
+from .terms import SHARE, SHOWN, UNITS, TermsMeter, worst_frames
 
-PICTURES, APART = 4, 0.5  # worst frames to show, and the least time between them [s]
+PICTURES, SKIN_PICTURES = 4, 2  # worst frames to show: of the energy, and of the skin that shows
+APART = 0.5  # the least time between them [s]
 WIDTH, HEIGHT = 300, 400  # of a picture [pixels]
 LETTERS = "ABCDEFGH"
 
@@ -65,9 +66,17 @@ def joined(meshes: Sequence[Mesh]) -> Mesh | None:
 def _sections(player: ShotPlayer, garment: ShotGarment, meter: TermsMeter) -> list[Section]:
     values = {name: np.array(found) for name, found in meter.values.items()}
     bad = values["total"] - values["gravity"]  # a raised garment is no worse
-    worst = worst_frames(bad, PICTURES, max(1, round(APART * player.fps)))
+    apart = max(1, round(APART * player.fps))
+    worst = worst_frames(bad, PICTURES, apart)
+    worst += [
+        frame
+        for frame in worst_frames(values[SHOWN], SKIN_PICTURES, apart)
+        if values[SHOWN][frame] > 0 and frame not in worst
+    ]
     times, marks = np.arange(len(values["total"])) / player.fps, dict(zip(worst, LETTERS))
-    shown = [name for name in UNITS if meter.body or name not in ("collision", SHARE)]
+    shown = [name for name in UNITS if meter.body or name not in ("collision", SHARE, SHOWN)]
+    if meter.covered is None and SHOWN in shown:
+        shown.remove(SHOWN)
     panels = [
         ChartPanel(
             title=name, x="time [s]", y=UNITS[name], curves={"": (times, values[name])},
@@ -78,12 +87,20 @@ def _sections(player: ShotPlayer, garment: ShotGarment, meter: TermsMeter) -> li
     charts = svg_chart(f"{', '.join(shown)} over time", [[panel] for panel in panels])
     rows = [[f"{name} [{UNITS[name]}]", *_spread(values[name])] for name in shown]
     name = player.meshes[garment.index].name
+
+    def skin(frame: int) -> str:
+        return f", {values[SHOWN][frame]:.2f} % of the covered skin shows" if SHOWN in shown else ""
+
     pictures = "".join(
-        figure(picture(player, frame), f"{letter}: {times[frame]:.2f} s, {bad[frame]:.4g} J without gravity")
+        figure(
+            picture(player, frame), f"{letter}: {times[frame]:.2f} s, {bad[frame]:.4g} J without gravity{skin(frame)}"
+        )
         for frame, letter in marks.items()
     )
+    found = meter.shown_skin(name)
+    charts += table(("", "mean", "median", "95 %", "most"), rows)
     return [
-        Section(f"{name}: energies over time", charts + table(("", "mean", "median", "95 %", "most"), rows)),
+        Section(f"{name}: energies over time", charts, {name: {"shown_skin": asdict(found)}} if found else {}),
         Section(f"{name}: its worst frames", f'<div class="pictures">{pictures}</div>'),
     ]
 

@@ -9,15 +9,17 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..assets import Floats, Mesh
-from ..collision import PosedBody, signed_distance
+from ..collision import CoveredPoints, PosedBody, ShownCounts, signed_distance
+from ..collision.covered_skin import showing, shown_skin
 from ..collision.one_ring import triangle_rings
 from ..constants import GRAVITY
 from ..energy import TERMS, GarmentEnergy
 from ..fabrics import Fabric
 from ..mesh.topology import vertex_normals
+from ..shown_skin import ShownSkin
 
-SHARE = "inside the body"
-UNITS = {"total": "J", **dict.fromkeys(TERMS, "J"), SHARE: "%"}
+SHARE, SHOWN = "inside the body", "covered skin that shows"
+UNITS = {"total": "J", **dict.fromkeys(TERMS, "J"), SHARE: "%", SHOWN: "%"}
 
 
 @dataclass(eq=False)
@@ -32,7 +34,8 @@ class TermsMeter:
         garment: the mesh at rest.
         body: all body meshes at rest as one, or None.
         fps: frames per second.
-        values: by name, one for each frame: energies [J], and the share of vertices inside the body [%].
+        values: by name, one for each frame: energies [J], the share of vertices inside the body, and that of the
+            covered skin that shows [%].
     """
 
     garment: Mesh
@@ -42,12 +45,15 @@ class TermsMeter:
     values: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in UNITS})
 
     def __post_init__(self) -> None:
+        self.energy = GarmentEnergy(self.garment, self.fabric)
+        self.shows: list = []
+        self.past: deque = deque(maxlen=2)
         import torch
 
-        self.energy = GarmentEnergy(self.garment, self.fabric)
-        self.past: deque = deque(maxlen=2)
-        self.rings = None
+        self.rings, self.covered = None, None
         if self.body:
+            covered = CoveredPoints(self.body, self.garment, device=torch.device("cpu"))
+            self.covered = covered if len(covered) else None
             self.rings = torch.as_tensor(triangle_rings(self.body.faces, self.body.vertex_count))
         self.rest = self._height(self.garment.points, None if self.body is None else self.body.points)
 
@@ -69,6 +75,12 @@ class TermsMeter:
         for name, value in {"total": total, **found}.items():
             self.values[name].append(value)
 
+    def shown_skin(self, name: str) -> ShownSkin | None:
+        """Return the share of the covered skin that shows in the shot `name`; None where nothing is covered."""
+        import torch
+
+        return shown_skin([(name, ShownCounts.of(torch.cat(self.shows, dim=1)))]) if self.covered else None
+
     def _height(self, points: Floats, body: Floats | None) -> float:
         """Return the garment's weight times its height above the middle of the body, or above y = 0 [J]."""
         ground = 0.0 if body is None else float(body[:, 1].mean())
@@ -85,12 +97,17 @@ class TermsMeter:
         import torch
 
         if body is None or self.body is None:
-            return {"collision": 0.0, SHARE: 0.0}
+            return {"collision": 0.0, SHARE: 0.0, SHOWN: 0.0}
         normals = vertex_normals(body, self.body.faces)
         at, towards = (torch.as_tensor(values, dtype=torch.float32)[:, :, None] for values in (body, normals))
         distance = signed_distance(x, PosedBody(at, towards, self.rings))
         inside = 100 * float((distance < 0).double().mean())
-        return {"collision": float(self.energy.collision_at(distance)), SHARE: inside}
+        found = {"collision": float(self.energy.collision_at(distance)), SHARE: inside, SHOWN: 0.0}
+        if self.covered:
+            vertices = self.covered.vertices
+            self.shows.append(showing(self.covered.hits(x, at[vertices], towards[vertices])))
+            found[SHOWN] = 100 * float(self.shows[-1].double().mean())
+        return found
 
 
 def worst_frames(values: Floats, count: int, apart: int) -> list[int]:

@@ -81,6 +81,7 @@ class VariantMeter:
             total=total,
             excess=total - float(self.base),
             collisions=tally.mean("collisions"),
+            shown_skin=tally.shown_skin(self.dressed.covered),
             position=tally.root("position error"),
             velocity=tally.root("velocity error"),
         )

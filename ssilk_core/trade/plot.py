@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import isfinite
 
 from ..charts import ChartPanel
 from .point import SECONDS, TradePoint, front
@@ -17,6 +18,7 @@ COSTS = {
 ERRORS = {
     "position": ("RMS distance from the whole model [mm]", 1e3, 0.1),
     "excess": ("energy above the whole model [J]", 1.0, 1e-3),
+    "mean_shown_skin": ("covered skin that shows [%]", 1e2, 1e-2),
 }
 NAMED = ("as trained", "level", "refinement")  # sweeps whose points are all labelled
 
@@ -26,7 +28,8 @@ def trade_panels(points: Sequence[TradePoint]) -> list[list[ChartPanel]]:
 
     Each sweep has a colour. The full model, levels, refined variants and points of the Pareto front are labelled.
     """
-    return [[_panel(points, cost, error) for cost in COSTS] for error in ERRORS]
+    measured = [error for error in ERRORS if all(isfinite(getattr(point, error)) for point in points)]
+    return [[_panel(points, cost, error) for cost in COSTS] for error in measured]
 
 
 def _panel(points: Sequence[TradePoint], cost: str, error: str) -> ChartPanel:

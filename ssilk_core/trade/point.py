@@ -3,8 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, dataclass, fields
+from math import nan
+from typing import Any
+
+from ..shown_skin import ShownSkin
 
 SECONDS = 10  # duration of the shots whose sizes are compared [s]
 
@@ -25,6 +29,8 @@ class TradePoint:
         total: the paper's L_tot [J].
         excess: difference of `total` from the model as trained [J].
         collisions: share of the vertices inside the body.
+        shown_skin: share of the covered skin that shows; None where the garment covers nothing, or where an earlier
+            version did not measure it.
         position, velocity: RMS errors against the full model [m], [m/s].
     """
 
@@ -49,6 +55,23 @@ class TradePoint:
     collisions: float
     position: float
     velocity: float
+    shown_skin: ShownSkin | None = None
+
+    @classmethod
+    def of(cls, document: Mapping[str, Any]) -> TradePoint:
+        """Return a point from its JSON document, whatever else that holds.
+
+        Raises:
+            KeyError: a value is missing.
+        """
+        values = {item.name: document[item.name] for item in fields(cls) if item.default is MISSING}
+        shown = document.get("shown_skin")
+        return cls(**values, shown_skin=ShownSkin(**shown) if shown else None)
+
+    @property
+    def mean_shown_skin(self) -> float:
+        """Mean share of the covered skin that shows; NaN where there is none."""
+        return self.shown_skin.mean if self.shown_skin else nan
 
 
 def front(places: Sequence[tuple[float, float]]) -> list[int]:

@@ -39,7 +39,7 @@ class Results:
             return
         try:
             document = json.loads(self.path.read_text())
-            points = [TradePoint(**point) for point in document["points"]]
+            points = [TradePoint.of(point) for point in document["points"]]
             same = document["asked"] == json.loads(json.dumps(self.asked))
         except (ValueError, TypeError, KeyError) as error:
             raise SsilkError(f"{self.path}: not results of 'ssilk trade' ({error}); name another file.") from error

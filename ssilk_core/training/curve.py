@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -53,5 +53,8 @@ def write_curve(path: Path, curve: list[CurvePoint], lbs: Score) -> None:
 
 
 def summary(score: Score) -> dict[str, Any]:
-    """Return a score as numbers by name: each term and the total [J], collisions, dynamics [m]."""
-    return {**score.terms, "total": score.total, "collisions": score.collisions, "dynamics": score.dynamics}
+    """Return a score by name: each term and the total [J], collisions, dynamics [m], the skin that shows if any."""
+    shown = {"shown_skin": asdict(score.shown_skin)} if score.shown_skin else {}
+    return {
+        **score.terms, "total": score.total, "collisions": score.collisions, "dynamics": score.dynamics, **shown
+    }  # fmt: skip

@@ -11,7 +11,7 @@ from ..collision import CollisionBody, reachable_body
 from ..config import TrainConfig
 from ..energy import GarmentEnergy
 from ..model.network import GarmentModel, model_joints
-from ..motion_bank import MAX_JOINT_SPEED, MotionBank, build_bank
+from ..motion_bank import MAX_JOINT_SPEED, MotionBank, build_bank, usable_spans
 from .job import TrainJob
 from .objective import Objective
 from .parallel import SINGLE_PROCESS, ProcessGroup
@@ -81,5 +81,6 @@ def build_parts(job: TrainJob, device: torch.device, group: ProcessGroup = SINGL
     # Validation uses the whole body, to detect collisions with parts that training leaves out.
     whole = CollisionBody(body, count, device=device)
     rest, frames = model.decoder.rest, job.train.valid_frames
-    validator = Validator(held, energy, whole, scene, rest, fps, frames, group)
+    spans = usable_spans(job.held_out, fps)
+    validator = Validator(held, energy, whole, scene, rest, fps, frames, group, spans)
     return TrainingParts(model, bank, energy, touched, validator, len(reach.vertices), device, group)

@@ -187,9 +187,9 @@ def _state_of(path: Path, document: dict[str, Any]) -> RunState:
     best, lowered, curve = document.pop("best"), document.pop("lowered"), document.pop("curve")
     return RunState(
         skipped=document.pop("undone"),
-        best=None if best is None else Best(best["iteration"], Score(**best["score"])),
+        best=None if best is None else Best(best["iteration"], Score.of(best["score"])),
         lowered=[ReducedSettings(**item) for item in lowered],
-        curve=[CurvePoint(**{**item, "score": Score(**item["score"])}) for item in curve],
+        curve=[CurvePoint(**{**item, "score": Score.of(item["score"])}) for item in curve],
         **document,
     )
 

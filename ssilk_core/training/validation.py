@@ -3,19 +3,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import accumulate, pairwise
+from pathlib import PurePath
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from ..assets import Scene
-from ..collision import CollisionBody, Contacts
+from ..assets import Motion, Scene
+from ..collision import CollisionBody, Contacts, CoveredSkin, ShownCounts
 from ..energy import TERMS, GarmentEnergy
 from ..energy.frames import FRAMES_PER_CHUNK, energy_terms
 from ..motion_bank import LatentModel, MotionBank, roll_states
+from ..shown_skin import ShownSkin
 from ..skinning import Skinning
 from .parallel import SINGLE_PROCESS, ProcessGroup
+
+SHOWN_FRAMES = 32, 256  # in which the skin that shows is counted, on a CPU and on a GPU; rays take long on a CPU
 
 
 @dataclass(frozen=True)
@@ -26,11 +33,20 @@ class Score:
         terms: each energy [J]; gravity is relative to linear blend skinning.
         collisions: share of garment vertices inside the body.
         dynamics: RMS distance between the rollout and the quasi-static states of the same poses [m].
+        shown_skin: share of the covered skin that shows, in `SHOWN_FRAMES` spread evenly over all clips; None where
+            the garment covers nothing.
     """
 
     terms: dict[str, float]
     collisions: float
     dynamics: float = 0.0
+    shown_skin: ShownSkin | None = None
+
+    @classmethod
+    def of(cls, document: Mapping[str, Any]) -> Score:
+        """Return a score from its JSON document; earlier versions did not measure the skin that shows."""
+        shown = document.get("shown_skin")
+        return cls(**{**document, "shown_skin": ShownSkin(**shown) if shown else None})
 
     @property
     def total(self) -> float:
@@ -39,7 +55,12 @@ class Score:
 
 
 class Validator:
-    """Rolls a model over whole clips and scores it against linear blend skinning on the same frames."""
+    """Rolls a model over whole clips and scores it against linear blend skinning on the same frames.
+
+    Args:
+        frames: most frames of a clip.
+        spans: the motions that the bank's clips were made of, which name them; numbers by default.
+    """
 
     def __init__(
         self,
@@ -51,14 +72,21 @@ class Validator:
         fps: float,
         frames: int,
         group: ProcessGroup = SINGLE_PROCESS,
+        spans: Sequence[Motion] | None = None,
     ) -> None:
         self.bank, self.energy, self.body, self.fps, self.group = bank, energy, body, fps, group
         self.lbs = Skinning(scene.lbs_skin).to(rest.device)
         self.contacts = Contacts(scene, vertices=body.vertices, device=rest.device)
+        self.covered = CoveredSkin(scene, device=rest.device)
         self.rest = rest
         self.clips = [
             range(int(start), min(int(stop), int(start) + frames)) for start, stop in zip(bank.starts, bank.stops)
         ]
+        self.names = [f"clip {number + 1}" for number in range(len(self.clips))]
+        self.first = [0] * len(self.clips)  # frames from time zero on, at the model's rate
+        if spans is not None:
+            self.names = [PurePath(span.path.rpartition(":/")[0] or span.path).stem for span in spans]
+            self.first = [round(span.start * fps / span.fps) for span in spans]
         self.down = torch.tensor([0.0, -1.0, 0.0], device=rest.device)
 
     def lbs_vertices(self, character: Tensor) -> Tensor:
@@ -81,7 +109,34 @@ class Validator:
         dealt = self.group.gather([{name: value.cpu() for name, value in terms.items()} for terms in own])
         scores = [dealt[index % self.group.size][index // self.group.size] for index in range(len(self.clips))]
         joined = {name: float(torch.cat([score[name] for score in scores]).mean()) for name in scores[0]}
-        return Score({name: joined[name] for name in TERMS}, joined["collisions"], joined["dynamics"] ** 0.5)
+        shown = self._shown(model, states)
+        return Score({name: joined[name] for name in TERMS}, joined["collisions"], joined["dynamics"] ** 0.5, shown)
+
+    @torch.no_grad()
+    def _shown(self, model: LatentModel | None, states: Sequence[Tensor | None]) -> ShownSkin | None:
+        """Return how much of the covered skin shows; all processes of the group get the same."""
+        own, counts = range(self.group.rank, len(self.clips), self.group.size), {}
+        for number, latents in zip(own, states):
+            clip, chosen = self.clips[number], self._sampled[number]
+            if not chosen:
+                continue
+            frames = torch.tensor(chosen, device=self.rest.device)
+            character = self.bank.character(clip.start + frames)
+            x = self.lbs_vertices(character)
+            if model is not None and latents is not None:
+                x = model.vertices(latents[frames], character)
+            numbers = [self.first[number] + frame for frame in chosen]
+            counts[number] = ShownCounts.of(self.covered.shows(x, character), numbers)
+        joined = {number: found for part in self.group.gather(counts) for number, found in part.items()}
+        return self.covered.figures([(self.names[number], joined[number]) for number in sorted(joined)])
+
+    @cached_property
+    def _sampled(self) -> list[list[int]]:
+        """Frames of each clip, spread evenly over all clips."""
+        ends = list(accumulate(map(len, self.clips), initial=0))
+        count = min(SHOWN_FRAMES[self.rest.is_cuda], ends[-1])
+        spread = [(2 * number + 1) * ends[-1] // (2 * count) for number in range(count)]
+        return [[frame - first for frame in spread if first <= frame < end] for first, end in pairwise(ends)]
 
     def frame_terms(self, clip: range, model: LatentModel | None) -> dict[str, Tensor]:
         """Return the values that `Score` averages for each frame of a range of the bank, shape (N,).

@@ -13,7 +13,7 @@ from ..work_record import WorkRecord, read_record, write_record
 from .listing import WardrobeEntry
 from .queue import CommandTask, End
 
-COLUMNS = ("garment", "iterations", "total [J]", "lower by", "collisions", "time", "state")
+COLUMNS = ("garment", "iterations", "total [J]", "lower by", "collisions", "skin shows", "time", "state")
 
 
 class GarmentTraining:
@@ -81,5 +81,11 @@ class GarmentTraining:
         """Return its line of the final table, by the names in `COLUMNS`; the time is in seconds."""
         found = self.figures
         lower = found.get("lower by") or (f"-{found['higher by']}" if "higher by" in found else None)
-        figures = [found.get("iterations"), found.get("total [J]"), lower, found.get("collisions")]
+        figures = [
+            found.get("iterations"),
+            found.get("total [J]"),
+            lower,
+            found.get("collisions"),
+            found.get("covered skin that shows"),
+        ]
         return dict(zip(COLUMNS, [self.entry.name, *figures, round(self.seconds, 1), self.state]))

@@ -167,6 +167,45 @@ def test_heat_is_shown_follows_frames_and_goes(bpy, dressed):
     assert "SSILK Heat" not in dressed.data.color_attributes and not dressed.ssilk.heat
 
 
+def test_skin_that_shows_is_coloured_on_the_body(bpy, dressed):
+    """A sleeve 20 mm off the pillar covers it over its length; a shape key takes its upper half 20 mm inside."""
+    pillar = bpy.data.objects["Pillar"]
+    points = np.array([vertex.co for vertex in dressed.data.vertices])
+    points[:, 2] = 0.65 + (points[:, 2] - 0.6) * 0.6 / 0.7  # no vertex of the pillar is at its ends
+    points[:, :2] *= 0.17 / np.linalg.norm(points[:, :2], axis=1, keepdims=True)
+    dressed.data.vertices.foreach_set("co", points.astype(np.float32).reshape(-1))
+    dressed.shape_key_add(name="Basis")
+    key = dressed.shape_key_add(name="Tight")
+    for point in key.data:
+        if point.co.z > 0.99:
+            point.co.x, point.co.y = 0.13 / 0.17 * point.co.x, 0.13 / 0.17 * point.co.y
+    for frame, value in ((1, 0.0), (2, 1.0)):
+        key.value = value
+        key.keyframe_insert("value", frame=frame)
+    bpy.context.scene.frame_start, bpy.context.scene.frame_end = 1, 2
+    bpy.context.scene.frame_set(1)
+    assert bpy.ops.ssilk.show_heat(kind="SKIN", deepest=0.02) == {"FINISHED"}
+    np.testing.assert_allclose(colors(pillar)[:, :3], np.tile(heat.GREY, (288, 1)), atol=2e-3)
+    assert bpy.ops.ssilk.find_worst(kind="SKIN") == {"FINISHED"}
+    (mark,) = bpy.context.scene.timeline_markers
+    z = np.array([vertex.co.z for vertex in pillar.data.vertices])
+    covered, high = (z > 0.65) & (z < 1.25), (z > 0.95) & (z < 1.25)
+    assert mark.frame == 2 and mark.name == f"SSILK {high.sum() / covered.sum():.2%} of the covered skin shows"
+    bpy.context.scene.frame_set(2)
+    assert bpy.ops.ssilk.show_heat(kind="SKIN", deepest=0.02) == {"FINISHED"}
+    found = colors(pillar)[:, :3]
+    deep = high & (z > 1.05)
+    np.testing.assert_allclose(found[deep], np.tile(RED, (deep.sum(), 1)), atol=0.15)
+    assert (np.abs(found[high] - heat.GREY).max(axis=1) > 0.1).all()
+    np.testing.assert_allclose(found[~high], np.tile(heat.GREY, ((~high).sum(), 1)), atol=2e-3)
+    assert "SSILK Heat" not in dressed.data.color_attributes
+    assert bpy.ops.ssilk.show_heat(kind="STRETCH") == {"FINISHED"}
+    assert "SSILK Heat" not in pillar.data.color_attributes and "SSILK Heat" in dressed.data.color_attributes
+    bpy.ops.ssilk.show_heat(kind="SKIN")
+    assert bpy.ops.ssilk.hide_heat() == {"FINISHED"}
+    assert "SSILK Heat" not in pillar.data.color_attributes and not dressed.ssilk.heat
+
+
 def test_heat_is_not_tinted_by_the_overlay_of_classes(bpy, dressed, monkeypatch):
     from blender_addon import overlay
 
@@ -179,7 +218,7 @@ def test_heat_is_not_tinted_by_the_overlay_of_classes(bpy, dressed, monkeypatch)
 def test_the_panel_offers_to_hide_what_is_shown(bpy, dressed):
     from blender_addon.panels.quality import QualityPanel
 
-    shown = ["ssilk.show_heat", "ssilk.find_worst"] * 2
+    shown = ["ssilk.show_heat", "ssilk.find_worst"] * 3
     assert drawn(QualityPanel, bpy.context) == [*shown, "ssilk.clear_worst", "ssilk.toggle_lbs"]
     bpy.ops.ssilk.show_heat()
     assert drawn(QualityPanel, bpy.context) == [*shown, "ssilk.hide_heat", "ssilk.clear_worst", "ssilk.toggle_lbs"]

@@ -17,7 +17,7 @@ from ssilk_core.reduction import ModelSize
 INPUTS = {"model": "cape.safetensors", "stage": "hero.usdc", "motion": "walk.usdc:/Clip"}
 CHANGED = BakeRequest(
     **INPUTS, root="/Hero", fps=24.0, samples_per_frame=2, pre_roll=0.5, target="game8", refine=3, feedback=True,
-    refined_output="joints", keep=ModelSize(shapes=8, joints=4, influences=2), device="cuda",
+    refined_output="joints", hide_covered=True, keep=ModelSize(shapes=8, joints=4, influences=2), device="cuda",
 )  # fmt: skip
 
 

@@ -43,7 +43,7 @@ from ssilk_core.evaluation.probes import (
     stopped_takes,
 )
 from ssilk_core.evaluation.record import recorded
-from ssilk_core.evaluation.run import SIMULATOR, EvaluationClips, EvaluationOptions, evaluate
+from ssilk_core.evaluation.run import SIMULATOR, EvaluationClips, EvaluationOptions, ResultRow, evaluate
 from ssilk_core.evaluation.splits import chosen, read_index, splits_of
 from ssilk_core.evaluation.tables import aligned, tables
 from ssilk_core.evaluation.takes import Take, back_and_forth, stopped, takes_of
@@ -160,11 +160,34 @@ def test_errors_against_a_reference_are_those_of_the_offset(dressed, take_set):
     mass = float(dressed.energy.mass.sum())
     lifted = mass * GRAVITY * float(path[:, 1].mean())
     assert found.gravity_excess == pytest.approx(lifted / dressed.weight, rel=1e-3)
-    own = figures(tally, reference, dressed.weight)
+    own = figures(tally, reference, dressed.weight, dressed.covered)
     assert found.total_excess == pytest.approx(own.total - found.reference_total) and found.frames == 40
     assert own.static_distance == pytest.approx(expected[0], rel=1e-3)
     assert own.gravity_excess == pytest.approx(found.gravity_excess, rel=1e-3)
     assert own.jerk_ratio == pytest.approx(found.jerk_ratio)
+
+
+def test_skin_that_shows_is_counted_where_cloth_sinks_into_the_body(dressed, motion, monkeypatch):
+    """In one frame of the second take the cloth is pushed into the ball."""
+    takes = takes_of("sway", motion, FPS, longest=20)
+    take_set = build_take_set(takes, dressed, JOINTS)
+    pushed = torch.zeros(20, 3)
+    pushed[7, 2] = 0.05
+    lbs, into = LinearBlendSkinning(dressed, take_set), Still(dressed, take_set, pushed)
+    monkeypatch.setattr("ssilk_core.evaluation.record.FRAMES_PER_CHUNK", 8)
+    records = {take: recorded(dressed, take_set, method, take) for take, method in enumerate((lbs, into))}
+    found = Tally(records, {0: "sway", 1: "sway"}).shown_skin(dressed.covered)
+    calm = [
+        dressed.covered.shows(lbs.vertices(take, range(20)), take_set.character(take, range(20))) for take in (0, 1)
+    ]
+    bad = dressed.covered.shows(into.vertices(1, range(7, 8)), take_set.character(1, range(7, 8)))
+    assert (found.frames, found.covered, found.clip, found.frame) == (40, len(dressed.covered), "sway", 27)
+    assert found.worst == pytest.approx(float(bad.double().mean())) and found.worst > 0.02
+    calm[1][:, 7] = bad[:, 0]
+    assert found.mean == pytest.approx(float(torch.cat(calm, dim=1).double().mean()))
+    assert sum(found.regions.values()) == pytest.approx(1) and set(found.regions) <= {"Hips", "Spine", "Arm"}
+    assert "sway" in tables([ResultRow("strip", "pushed", "valid", figures(Tally(records, {0: "sway", 1: "sway"}),
+                                       Tally(records, {0: "sway", 1: "sway"}), 1.0, dressed.covered))])  # fmt: skip
 
 
 def test_collisions_can_be_with_the_whole_body(scene, dressed, take_set):
@@ -353,7 +376,7 @@ def test_every_method_gets_its_row_in_every_split(scene, dressed, motion, toy_mo
     text = tables(rows)
     first = [line.split("|")[2].strip() for line in text.split("\n\n")[0].splitlines()[2:]]
     assert first == ["valid"] * 4 + ["flips"] * 4  # the methods of a split stand together
-    assert text.count("| garment") == 7 and len({len(line) for line in text.split("\n\n")[0].splitlines()}) == 1
+    assert text.count("| garment") == 8 and len({len(line) for line in text.split("\n\n")[0].splitlines()}) == 1
 
 
 def test_a_character_that_never_moves_has_no_jerk_to_compare_with(scene, dressed, motion, toy_model):

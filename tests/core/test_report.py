@@ -15,7 +15,7 @@ from ssilk_core.fabrics import Fabric
 from ssilk_core.report.figures import learning_of, section_of
 from ssilk_core.report.page import Section, facts, figure, flattened, page, table
 from ssilk_core.report.shots import joined
-from ssilk_core.report.terms import SHARE, TermsMeter, worst_frames
+from ssilk_core.report.terms import SHARE, SHOWN, TermsMeter, worst_frames
 
 CLOTH = Fabric("toy", density=0.2, margin=0.0, collision=7.0)
 
@@ -53,6 +53,23 @@ def test_what_is_inside_the_body_is_counted_and_costs_its_depth(sheet):
     assert meter.values[SHARE] == [pytest.approx(100 * np.mean(depth > 0), abs=2)]
     assert meter.values["collision"][0] == pytest.approx(7.0 * (depth.clip(0) ** 2).sum(), rel=0.03)
     assert meter.values["gravity"][0] == pytest.approx(9.81 * 0.022 * 0.275, rel=1e-6)
+
+
+def test_skin_that_shows_through_a_sheet_is_a_cap_of_the_ball(toy_grid):
+    """A wide sheet in front of a ball, then 20 mm behind its foremost point: a cap of height 20 mm shows."""
+    points, faces = toy_grid(40, 40, height=1.0, width=1.0)
+    cover = Mesh("/cover", points + [0, 0.5, -0.31], faces)
+    body = ball()
+    meter = TermsMeter(cover, body, CLOTH, 30.0)
+    for depth in (0.0, 0.03):
+        meter.add(cover.points + [0, 0, depth], body.points)
+    found = meter.shown_skin("shot")
+    # A ray along the normal at an angle a from the axis meets the plane at d / cos(a) from the centre.
+    first, second = 1 - 0.31 / 0.38, 1 - 0.28 / 0.3
+    assert found.covered == pytest.approx(8000 * first / 2, rel=0.02)
+    assert meter.values[SHOWN] == [0, pytest.approx(100 * second / first, rel=0.03)]
+    assert (found.clip, found.frame, found.regions) == ("shot", 1, {})
+    assert 100 * found.worst == meter.values[SHOWN][1] and found.mean == found.worst / 2
 
 
 def test_bodies_are_joined_in_their_order():
@@ -145,6 +162,24 @@ def test_a_learning_curve_marks_its_best(tmp_path):
     (section,) = learning_of(path)
     assert "Best: 0.5 J at 18 s. Linear blend skinning: 2 J, 1.00% inside the body." in section.body
     assert section.body.count("<svg") == 1 and section.body.count(">best</text>") == 2
+    shown = {
+        "frames": 9,
+        "covered": 80,
+        "mean": 0.01,
+        "worst": 0.02,
+        "clip": "walk",
+        "frame": 3,
+        "regions": {"Hips": 1.0},
+    }
+    for point in points:
+        point["validation"]["shown_skin"] = shown
+    path.write_text(json.dumps({"lbs": score, "points": points}))
+    (section,) = learning_of(path)
+    assert section.body.count(">best</text>") == 3
+    assert (
+        "1.000% of the covered skin shows, 2.00% in the worst frame (walk, frame 3; most at Hips 100%)"
+        in section.body
+    )
     path.write_text(json.dumps({"lbs": score, "points": []}))
     assert learning_of(path) == []
     path.write_text(json.dumps({"points": points}))

@@ -6,7 +6,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +15,15 @@ import torch
 from safetensors import safe_open
 
 from ssilk_core.checkpoint import load_model
+from ssilk_core.collision import CollisionBody, CoveredSkin
 from ssilk_core.config import ModelConfig, TrainConfig
 from ssilk_core.devices import select_device
+from ssilk_core.energy import GarmentEnergy
 from ssilk_core.errors import SsilkError
 from ssilk_core.events import Checkpoint, Event, Message, Progress, Started, silent
 from ssilk_core.fabrics import Fabric
 from ssilk_core.model.network import GarmentModel
+from ssilk_core.motion_bank import build_bank
 from ssilk_core.training import run as training
 from ssilk_core.training import validation
 from ssilk_core.training.curve import CurvePoint, append_point, curve_path
@@ -32,7 +35,7 @@ from ssilk_core.training.run_files import RunFiles
 from ssilk_core.training.signals import stop_on_signals
 from ssilk_core.training.state import RunState, learned_tensors, load_state, state_path
 from ssilk_core.training.step import EAGER_STEPS, Stepper, learning_rate
-from ssilk_core.training.validation import Score
+from ssilk_core.training.validation import Score, Validator
 from ssilk_core.training.windows import WindowSampler
 
 SHORT = TrainConfig(
@@ -610,3 +613,30 @@ def test_step_sizes_warm_up_and_decay_in_each_phase():
 
 def test_nothing_else_is_left_beside_the_models(uninterrupted):
     assert not [path for path in Path(uninterrupted.output).parent.iterdir() if path.name.startswith(".")]
+
+
+def test_a_validation_counts_the_skin_that_shows_in_frames_spread_over_all_clips(
+    scene, toy_motion, toy_model, monkeypatch
+):
+    monkeypatch.setattr("ssilk_core.training.validation.SHOWN_FRAMES", (5, 5))
+    clips = [toy_motion(scene, count, path=f"/clips/{name}.usdc:/Anim") for count, name in ((20, "a"), (30, "b"))]
+    clips[1] = replace(clips[1], start=7)
+    model, energy = toy_model(scene), GarmentEnergy(scene.garment.mesh, Fabric("toy"))
+    body = CollisionBody(scene.character.merged_body(), 3, device=torch.device("cpu"))
+    bank = build_bank(clips, scene.character.skeleton, model.joints, 30.0, torch.device("cpu"))
+    validator = Validator(bank, energy, body, scene, model.decoder.rest, 30.0, 50, spans=clips)
+    into = torch.tensor([[0.0], [0.0], [0.05]])  # into the ball, which is in front of the strip
+    monkeypatch.setattr(model, "vertices", lambda z, character: validator.lbs_vertices(character) + into)
+    found = validator.score(model).shown_skin
+    picked = torch.tensor([5, 15, 25, 35, 45])
+    character = bank.character(picked)
+    shows = CoveredSkin(scene, device=torch.device("cpu")).shows(validator.lbs_vertices(character) + into, character)
+    shares = shows.double().mean(0)
+    assert found.mean == pytest.approx(float(shares.mean())) and found.worst == pytest.approx(float(shares.max()))
+    names = [("a", 5), ("a", 15), ("b", 12), ("b", 22), ("b", 32)]
+    assert (found.clip, found.frame) == names[int(shares.argmax())] and found.frames == 5
+    assert found.mean > 0.01 > validator.lbs_score().shown_skin.mean
+    document = json.loads(json.dumps(asdict(validator.score(model))))
+    assert Score.of(document).shown_skin == found
+    del document["shown_skin"]  # as earlier versions wrote it
+    assert Score.of(document).shown_skin is None

@@ -15,6 +15,7 @@ from ssilk_core import checkpoint
 from ssilk_core.config import PRESETS
 from ssilk_core.fabrics import Fabric
 from ssilk_core.farm.openjd import CHUNK_SECONDS
+from ssilk_core.mesh import hidden_faces
 
 from .measured import default, digits, fixed, micro, milli, percent, result, row, series
 from .quoted_results import results
@@ -139,6 +140,24 @@ def pipeline() -> Text:
     yield f"The 4 heaviest influences alone would be up to {milli(heaviest['largest'])} mm off"
     yield f"takes {cache_share()} of the point cache"
     yield f"{micro(shot_row()['largest'], 1)} µm"
+    yield from hidden_skin()
+
+
+def hidden_skin() -> Text:
+    (low, few), (high, many) = hidden_faces.FAN
+    names = ("REACH", "DEPTH", "TOUCHING", "APART", "SPACING", "SHALLOW")
+    lengths = (getattr(hidden_faces, name) for name in names)
+    reach, depth, touching, apart, spacing, shallow = (f"{1000 * length:.0f} mm" for length in lengths)
+    yield f"points at most {spacing} apart"
+    yield f"cloth within {reach} above the skin"
+    yield f"cloth within {depth} beneath it counts, unless"
+    yield f"{few} steep rays, tilted by {low:.0f} degrees"
+    yield f"{many} flat rays, tilted by {high:.0f} degrees, but for {hidden_faces.FLAT_FREE} at most"
+    yield f"less than {shallow} beneath"
+    yield f"cloth at most {reach} above the skin"
+    yield f"less than {touching} above the skin, or beneath it, cloth within {depth} beneath it blocks"
+    yield f"a distance of {apart} and one face"
+    yield f"flatter than {90 - high:.0f} degrees"
 
 
 # CHANGELOG.md

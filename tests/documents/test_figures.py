@@ -13,10 +13,13 @@ import shlex
 import pytest
 
 from benchmarks.helpers.paper_schemes import PAPER_SCHEMES
+from ssilk_core.bake.skin import SKIN_FRAMES
 from ssilk_core.cli import parser
+from ssilk_core.collision.covered_skin import SKIN_POINTS
 from ssilk_core.config import ModelConfig, TrainConfig, apply_overrides
 from ssilk_core.fabrics import Fabric
 from ssilk_core.schemes import SCHEMES
+from ssilk_core.shown_skin import COVER_REACH, SHOW_DEPTH
 from tests.documents import measured
 from tests.documents.measured import RESULTS, ROOT
 from tests.documents.quoted import QUOTED
@@ -36,6 +39,12 @@ CONSTANTS: dict[str, tuple[str, ...]] = {
         r"\b130 when\s+interrupted",
     ),
     "part of a definition": (r"\[(0|−1), 1\]", r"gravity \(0, −9\.81, 0\)", r"at most 1 cm/s|under 1 cm/s"),
+    "part of the definition of the skin that shows": (
+        rf"\b{SKIN_POINTS:,} points are spread",
+        rf"within {1000 * COVER_REACH:.0f} mm above",
+        rf"within {1000 * SHOW_DEPTH:.0f} mm beneath",
+        rf"at most {SKIN_FRAMES} samples",
+    ),
     "an example of a message": (r"\*12 of 900 vertices",),
     "the shape of a tensor": (r"the shape \(\w+(, \w+)*\)",),
     "a rate of motion": (r"at 30 frames\s+a second",),

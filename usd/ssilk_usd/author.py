@@ -15,6 +15,7 @@ from ssilk_core.assets import Body, Deformer, Floats, Ints, Mesh, ProxyRig, Skel
 from ssilk_core.errors import fail
 from ssilk_core.kinematics import local_transforms, world_transforms
 
+from .body_faces import HiddenPolygons, author_faces, hide_polygons
 from .garment_api import GarmentRecord, apply_garment_api
 from .names import CLASS, LBS_SKIN, PROXIES, shape_name
 from .units import StageUnits
@@ -28,7 +29,7 @@ class Asset:
         root: the SkelRoot.
         garment: the garment's mesh.
         animation: the SkelAnimation; what moves (rotations, translations, blendShapeWeights) has no value yet.
-        bodies: the bodies whose meshes were written.
+        bodies, body_paths: the bodies whose meshes were written, and the prims of these.
         shapes: the blendshapes that were written, as indices into the deformer's; others move nothing.
     """
 
@@ -36,6 +37,7 @@ class Asset:
     garment: Sdf.Path
     animation: Sdf.Path
     bodies: tuple[Body, ...]
+    body_paths: tuple[Sdf.Path, ...]
     shapes: Ints
 
 
@@ -47,12 +49,14 @@ def define_asset(
     *,
     name: str | None = None,
     record: GarmentRecord | None = None,
+    hidden: HiddenPolygons | None = None,
 ) -> Asset:
     """Define SkelRoot, Skeleton, SkelAnimation, the garment's mesh with its blendshapes, and body meshes.
 
     Args:
         name: of the SkelRoot (default: the character's).
         record: how the garment was made, kept on its mesh.
+        hidden: polygons of the bodies to hide.
 
     Raises:
         SsilkError: the joint paths spell another hierarchy than the parents.
@@ -74,7 +78,9 @@ def define_asset(
     _define_blendshapes(garment, shape_names, deformer.shapes[shapes], units)
     for path, body in zip(paths[3:], bodies):
         bind_skin(define_mesh(stage, path, body.mesh, units), body.skin, skeleton)
-    return Asset(root.GetPath(), paths[2], paths[1], bodies, shapes)
+    if hidden is not None:
+        hide_polygons(stage, root.GetPath(), paths[3:], [body.mesh for body in bodies], hidden)
+    return Asset(root.GetPath(), paths[2], paths[1], bodies, tuple(paths[3:]), shapes)
 
 
 def prim_names(paths: Sequence[str]) -> list[str]:
@@ -155,14 +161,9 @@ def define_mesh(stage: Usd.Stage, path: Sdf.Path, mesh: Mesh, units: StageUnits)
     points = np.asarray(units.points_from_core(mesh.points), dtype=np.float32)
     prim = UsdGeom.Mesh.Define(stage, path)
     prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
-    prim.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.asarray(mesh.polygon_counts, dtype=np.int32)))
-    prim.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.asarray(mesh.polygon_indices, dtype=np.int32)))
+    author_faces(prim, mesh)
     prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     prim.CreateExtentAttr(extent_array(points.min(axis=0), points.max(axis=0)))
-    if mesh.uvs is not None:
-        primvars = UsdGeom.PrimvarsAPI(prim)
-        coordinates = primvars.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
-        coordinates.Set(Vt.Vec2fArray.FromNumpy(np.asarray(mesh.uvs, dtype=np.float32)))
     return prim
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,7 @@ from ssilk_core.errors import SsilkError
 from ssilk_core.files import replacing
 
 from .author import Asset, define_asset, extent_array
+from .body_faces import HiddenPolygons, hide_polygons
 from .export import new_stage, save
 from .garment_api import GarmentRecord
 from .layers_facts import AssetFacts, asset_facts
@@ -161,6 +162,7 @@ def write_animation(
     samples_per_frame: int = 1,
     lean: bool = True,
     hidden: Sequence[tuple[int, bool]] = (),
+    hidden_polygons: HiddenPolygons | None = None,
     points: bool = False,
     provenance: Mapping[str, object] | None = None,
     path: Path | None = None,
@@ -170,6 +172,7 @@ def write_animation(
     Args:
         motion, poses, start, samples_per_frame, hidden: as `shot.write_shot` takes them.
         lean: see `samples.Samples`.
+        hidden_polygons: polygons of the bodies that this shot hides, in a variant.
         points: offer the point cache that `write_points` writes as a variant.
         path: the file to write, where it is not yet that of `layout`, which must be in the same folder.
 
@@ -185,6 +188,9 @@ def write_animation(
         if lean:
             UsdGeom.Xformable(stage.GetPrimAtPath(asset.root)).AddTranslateOp(opSuffix=PATH_OP.rpartition(":")[2])
         set_visibility(stage, asset.root, span, hidden)
+        if hidden_polygons and asset.bodies:
+            meshes = [body.mesh for body in asset.bodies]
+            hide_polygons(stage, asset.root, asset.body_paths, meshes, replace(hidden_polygons, variants=True))
         if points:
             _define_points(stage, asset, layout)
         free_when_closed(stage.GetUsedLayers())

@@ -16,6 +16,7 @@ from ssilk_core.files import replacing
 from ssilk_core.kinematics import lbs_deformer, lbs_poses
 
 from .author import extent_array
+from .body_faces import HiddenPolygons
 from .export import need_layer_suffix, save
 from .garment_api import GarmentRecord
 from .read_mesh import is_garment
@@ -89,6 +90,7 @@ def point_cache(
     samples_per_frame: int = 1,
     include_body: bool = True,
     hidden: Sequence[tuple[int, bool]] = (),
+    hidden_polygons: HiddenPolygons | None = None,
     provenance: Mapping[str, object] | None = None,
     record: GarmentRecord | None = None,
 ) -> Iterator[PointCache]:
@@ -100,7 +102,8 @@ def point_cache(
         path: the file to write: .usdc, .usd, or .usda for people.
         motion: the character's motion at the samples of the shot, whose rate becomes the shot's.
         start: time code of the first frame, by default the motion's own.
-        units, samples_per_frame, include_body, hidden, provenance, record: as `write_shot` takes them.
+        units, samples_per_frame, include_body, hidden, hidden_polygons, provenance, record: as `write_shot` takes
+            them.
 
     Raises:
         SsilkError: frames are missing at the end, or the file cannot be written.
@@ -117,6 +120,7 @@ def point_cache(
             samples_per_frame=samples_per_frame,
             include_body=include_body,
             hidden=hidden,
+            hidden_polygons=hidden_polygons,
             provenance=provenance,
             record=record,
         )

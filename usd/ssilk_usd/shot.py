@@ -15,6 +15,7 @@ from ssilk_core.errors import fail
 from ssilk_core.files import replacing
 
 from .author import define_asset
+from .body_faces import HiddenPolygons
 from .export import need_layer_suffix
 from .garment_api import GarmentRecord
 from .samples import Samples
@@ -51,6 +52,7 @@ def write_shot(
     samples_per_frame: int = 1,
     include_body: bool = True,
     hidden: Sequence[tuple[int, bool]] = (),
+    hidden_polygons: HiddenPolygons | None = None,
     provenance: Mapping[str, object] | None = None,
     record: GarmentRecord | None = None,
 ) -> ShotSummary:
@@ -65,6 +67,7 @@ def write_shot(
         samples_per_frame: how many of the motion's frames make one of the shot's, for motion blur.
         include_body: write the character's body meshes as well.
         hidden: from which frames of the motion on the garment is hidden (True) or seen (False).
+        hidden_polygons: polygons of the bodies to hide.
         provenance: where the shot came from, kept as the layer's `customLayerData["ssilk"]`; looked at once the
             poses are written, so that it may say what came of them.
 
@@ -77,7 +80,8 @@ def write_shot(
     with replacing(path) as temporary:
         layer = Sdf.Layer.CreateNew(str(temporary))
         stage = Usd.Stage.Open(layer, None)
-        asset = define_asset(stage, deformer, bodies, units, record=record)
+        hiding = hidden_polygons if include_body else None
+        asset = define_asset(stage, deformer, bodies, units, record=record, hidden=hiding)
         span = TimeSpan.of(motion, start, samples_per_frame)
         set_metadata(stage, span, units)
         set_visibility(stage, asset.root, span, hidden)
@@ -159,7 +163,9 @@ def set_visibility(stage: Usd.Stage, root: Sdf.Path, span: TimeSpan, hidden: Seq
 def _metadata(value: object) -> object:
     """Return nested mappings and lists as USD's metadata can hold them: lists become strings, empty ones nothing."""
     if isinstance(value, Mapping):
-        return {str(key): _metadata(item) for key, item in value.items() if item is not None and item != []}
+        return {
+            str(key): _metadata(item) for key, item in value.items() if item is not None and item != [] and item != {}
+        }
     if isinstance(value, list | tuple):
         return Vt.StringArray([str(item) for item in value])
     return value

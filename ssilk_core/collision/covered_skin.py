@@ -1,0 +1,222 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The skin that a garment covers in the bind pose, and where it shows through the cloth.
+
+Points are spread evenly over the body. A point is covered when cloth lies within `COVER_REACH` above it, along its
+normal, in the bind pose. A covered point shows when cloth lies within `SHOW_DEPTH` beneath it and none within
+`COVER_REACH` above it. The share of vertices inside the body counts cloth; this share counts what is seen.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..assets import Floats, Ints, Mesh, Scene, SkinWeights
+from ..mesh import topology
+from ..shown_skin import COVER_REACH, SHOW_DEPTH, ShownSkin
+from ..skinning import Skinning
+from .ray_casting import RayCaster, RayHits
+
+SKIN_POINTS = 8000
+NAMED_REGIONS = 3
+MORTON_BITS = 12  # cells of half a millimetre on a person
+PLASTIC = 1.32471795724474602596  # root of x^3 = x + 1; its powers make the most even sequence in the plane
+
+
+@dataclass(frozen=True, eq=False)
+class ShownCounts:
+    """How much of the covered skin shows in frames of one clip; on the CPU.
+
+    Attributes:
+        shares: share of the covered points that show in each frame, shape (N,).
+        points: frames in which each covered point shows, shape (P,).
+        frames: numbers of the frames in the clip, shape (N,).
+    """
+
+    shares: Tensor
+    points: Tensor
+    frames: Tensor
+
+    @classmethod
+    def of(cls, shows: Tensor, frames: Sequence[int] | None = None) -> ShownCounts:
+        """Return the counts of a clip, from what shows (P, N) in `frames`, by default the first N."""
+        numbers = torch.arange(shows.shape[1]) if frames is None else torch.tensor(frames)
+        return cls(shows.double().mean(0).cpu(), shows.sum(1).cpu(), numbers)
+
+    @classmethod
+    def joined(cls, parts: Sequence[ShownCounts]) -> ShownCounts:
+        """Return the counts of several parts together."""
+        return cls(
+            torch.cat([part.shares for part in parts]),
+            torch.stack([part.points for part in parts]).sum(0),
+            torch.cat([part.frames for part in parts]),
+        )
+
+
+class CoveredPoints:
+    """Evenly spread points of a body that cloth covers in the bind pose.
+
+    Args:
+        body, cloth: in the bind pose.
+        count: points on the whole body.
+
+    Attributes:
+        faces: the triangle of the body that each covered point lies on, shape (P,).
+        weights: its barycentric coordinates there, shape (P, 3).
+        vertices: vertices of the body at the corners of these triangles, shape (C,).
+    """
+
+    def __init__(self, body: Mesh, cloth: Mesh, *, count: int = SKIN_POINTS, device: torch.device) -> None:
+        faces, weights = spread_points(body, count)
+        normals = topology.vertex_normals(body.points, body.faces)
+        covered = _covered(body, normals, faces, weights, cloth)
+        self.faces, self.weights = faces[covered], weights[covered]
+        self.vertices, place = np.unique(body.faces[self.faces], return_inverse=True)
+        self._corners = torch.as_tensor(place.reshape(-1, 3), device=device)
+        self._weights = torch.as_tensor(self.weights, dtype=torch.float32, device=device)[..., None, None]
+        self._caster = RayCaster(cloth, device=device)
+
+    def __len__(self) -> int:
+        return len(self.faces)
+
+    def place(self, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the points [m] and unit normals, both (P, 3, N), on a body with these at `vertices` (C, 3, N)."""
+        points, normals = ((values[self._corners] * self._weights).sum(1) for values in (points, normals))
+        return points, normals / normals.norm(dim=1, keepdim=True).clamp_min(1e-8)
+
+    def hits(self, x: Tensor, points: Tensor, normals: Tensor) -> RayHits:
+        """Tell above and beneath which points cloth lies.
+
+        Args:
+            x: vertices of the cloth [m], shape (V, 3, N).
+            points, normals: of the body at `vertices`, in the same frames [m], both (C, 3, N).
+        """
+        return self._caster.cast(*self.place(points, normals), x, above=COVER_REACH, beneath=SHOW_DEPTH)
+
+
+def showing(hits: RayHits) -> Tensor:
+    """Tell which points show, bool (P, N)."""
+    return hits.beneath & ~hits.above
+
+
+class CoveredSkin:
+    """The skin of a character that a garment covers in the bind pose.
+
+    Attributes:
+        points: evenly spread ones.
+        regions: the joint with the largest skinning weight at each point, shape (P,).
+        joint_names: names of the character's joints.
+    """
+
+    def __init__(self, scene: Scene, *, count: int = SKIN_POINTS, device: torch.device) -> None:
+        body, skin = scene.character.merged_body().mesh, scene.character.merged_body().skin
+        self.points = CoveredPoints(body, scene.garment.mesh, count=count, device=device)
+        self.joint_names = scene.character.skeleton.joint_names
+        corners, vertices = body.faces[self.points.faces], self.points.vertices
+        influence = np.zeros((len(corners), len(self.joint_names)))
+        shares = skin.weights[corners] * self.points.weights[..., None]
+        np.add.at(influence, (np.arange(len(corners))[:, None, None], skin.indices[corners]), shares)
+        self.regions = influence.argmax(axis=1)
+        self._skinning = None
+        if len(vertices):
+            moved = SkinWeights(skin.path, skin.indices[vertices], skin.weights[vertices])
+            self._skinning = Skinning(moved).to(device)
+        normals = topology.vertex_normals(body.points, body.faces)
+        self._rest, self._normals = (
+            torch.as_tensor(values[vertices], dtype=torch.float32, device=device) for values in (body.points, normals)
+        )
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @torch.no_grad()
+    def shows(self, x: Tensor, character: Tensor) -> Tensor:
+        """Tell which covered points show, bool (P, N).
+
+        Args:
+            x: garment positions [m], shape (V, 3, N).
+            character: skinning matrices of the character's joints in the same frames, shape (J, 3, 4, N).
+        """
+        if self._skinning is None:
+            return torch.zeros(0, x.shape[2], dtype=torch.bool, device=x.device)
+        return showing(self.points.hits(x, *self._skinning.surface(self._rest, self._normals, character)))
+
+    def figures(self, clips: Sequence[tuple[str, ShownCounts]]) -> ShownSkin | None:
+        """Return the figures of clips by name; None where the garment covers nothing.
+
+        Raises:
+            ValueError: there is no frame.
+        """
+        return shown_skin(clips, self._regions)
+
+    def _regions(self, shown_frames: Tensor) -> dict[str, float]:
+        """Return the shares of what shows at the joints with the largest ones."""
+        shown = np.bincount(self.regions, shown_frames.numpy(), len(self.joint_names))
+        largest = Counter(dict(enumerate(shown.tolist()))).most_common(NAMED_REGIONS)
+        return {self.joint_names[j].rpartition("/")[2]: n / float(shown.sum()) for j, n in largest if n}
+
+
+def shown_skin(
+    clips: Sequence[tuple[str, ShownCounts]], regions: Callable[[Tensor], dict[str, float]] = lambda points: {}
+) -> ShownSkin | None:
+    """Return the figures of clips by name; None where nothing is covered.
+
+    Args:
+        regions: tells where, from how often each point shows, shape (P,).
+
+    Raises:
+        ValueError: there is no frame.
+    """
+    together = ShownCounts.joined([counts for _, counts in clips])
+    if not len(together.points):
+        return None
+    clip, worst = max(clips, key=lambda each: float(each[1].shares.max()))
+    return ShownSkin(
+        frames=len(together.shares),
+        covered=len(together.points),
+        mean=float(together.shares.mean()),
+        worst=float(worst.shares.max()),
+        clip=clip,
+        frame=int(worst.frames[worst.shares.argmax()]),
+        regions=regions(together.points),
+    )
+
+
+def _covered(mesh: Mesh, normals: Floats, faces: Ints, weights: Floats, cloth: Mesh) -> np.ndarray:
+    """Tell above which points of the body cloth lies in the bind pose, bool (P,)."""
+    corners = mesh.faces[faces]
+    points, directions = ((values[corners] * weights[..., None]).sum(1) for values in (mesh.points, normals))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True).clip(1e-8)
+    asked = (torch.from_numpy(values)[:, :, None] for values in (points, directions, cloth.points.copy()))
+    caster = RayCaster(cloth, device=torch.device("cpu"))
+    return caster.cast(*asked, above=COVER_REACH, beneath=0.0).above[:, 0].numpy()
+
+
+def _cells(points: Floats) -> Ints:
+    """Return the places of points (P, 3) on a Morton curve, along which neighbours mostly lie close together."""
+    low = points.min(axis=0)
+    cells = ((points - low) / max(float(np.ptp(points, axis=0).max()), 1e-9) * (2**MORTON_BITS - 1)).astype(np.int64)
+    return sum(((cells[:, axis] >> bit) & 1) << (3 * bit + axis) for bit in range(MORTON_BITS) for axis in range(3))
+
+
+def spread_points(mesh: Mesh, count: int) -> tuple[Ints, Floats]:
+    """Spread points evenly by area over a mesh, always in the same way.
+
+    The surface is cut into so many parts of equal area, along a path through triangles that lie close together, and
+    the point of each is on the triangle in its middle. Points on one triangle follow a sequence of low discrepancy.
+
+    Returns:
+        The triangle of each point (P,), and its barycentric coordinates (P, 3).
+    """
+    path = np.argsort(_cells(mesh.points[mesh.faces].mean(axis=1)), kind="stable")
+    ends = np.cumsum(topology.face_areas(mesh.points, mesh.faces)[path])
+    number = np.arange(count)
+    place = np.searchsorted(ends, (number + 0.5) / count * ends[-1], side="right")
+    u, v = ((0.5 + (number + 1) / PLASTIC**power) % 1 for power in (1, 2))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)  # the square's other half, turned onto it
+    return path[place.clip(max=len(path) - 1)], np.stack([1 - u - v, u, v], axis=1)
