@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
+import numpy as np
 
 from ..errors import SetupError
 from ..findings import Clip, read_findings
@@ -19,12 +20,13 @@ from ..scene.garment import armature_of
 from ..scene.gather import gather
 from ..scene.handover import MOTIONS, REPAIRED, hand_over, inspect_command, loading_usd
 from ..scene.objects import Pair
-from ..scene.repairs import REPAIRS, apply_scale, push_points, repair_mesh
+from ..scene.repairs import REPAIRS, apply_scale, move_points, repair_mesh
 from ..scene.selecting import select_bones, select_elements
 from ..scene.takes import ChosenMotions
 from .reporting import ReportingOperator
 from .rig import RigOperator
 
+MOVED, LEFT = "moved ", "left "  # begin what `ssilk inspect --fix` says of settled cloth, and of what stays inside
 PUSHED = ("penetration", "inside-margin")
 
 
@@ -146,7 +148,7 @@ class FixFinding(ReportingOperator, bpy.types.Operator):
 
 
 class PushOut(InspectOperator, bpy.types.Operator):
-    """Push shallow patches out of the body to where collisions begin, with all shape keys"""
+    """Settle the garment out of the body with little change of shape, with all shape keys"""
 
     bl_idname = "ssilk.push_out"
     bl_label = "Push Out"
@@ -162,15 +164,23 @@ class PushOut(InspectOperator, bpy.types.Operator):
             raise SetupError(
                 f"'{garment.name}' has other findings to fix first: vertices would be merged or removed."
             )
-        moved = push_points(garment, points)
+        told = work.result["fixed"]["repaired"]
+        left = "".join(f"; {said}" for said in told if said.startswith(LEFT))
+        if not any(said.startswith(MOVED) for said in told):
+            raise SetupError(f"'{garment.name}' stays as it is{left}.")
+        moved = 1000 * move_points(garment, points)
         forget(context)
-        return f"{moved} vertices of '{garment.name}' were pushed out; inspect it again."
+        return (
+            f"{np.count_nonzero(moved)} vertices of '{garment.name}' were pushed out, by "
+            f"{moved[moved > 0].mean():.1f} mm on average and {moved.max():.1f} mm at most{left}. Show Pushed Out "
+            "colours them; inspect it again."
+        )
 
 
 def fixer(item: FindingItem) -> str:
     """Return the operator that repairs a finding; empty where none does."""
     if item.code in PUSHED:
-        return PushOut.bl_idname if item.fixable else ""
+        return PushOut.bl_idname if item.code == PUSHED[0] or item.fixable else ""
     safe = item.fixable or item.code == "body-inside-out"
     return FixFinding.bl_idname if safe and (item.code in REPAIRS or item.code == SCALE) else ""
 

@@ -23,6 +23,7 @@ KINDS = [
     (heat.SKIN, "Skin", "Where covered skin shows through the cloth; on the body, by the depth of the cloth beneath"),
     (heat.STRETCH, "Stretch", "How much longer the cloth is than at rest"),
 ]
+PUSHED_OUT = (heat.PUSHED_OUT, "Pushed Out", "How far Push Out moved the rest shape")
 MARKER = "SSILK "  # begins the names of markers
 APART = 0.5  # seconds between two of the worst frames
 
@@ -54,13 +55,13 @@ class MeasuringOperator(tasks.OutsideOperator):
 
 
 class ShowHeat(MeasuringOperator, bpy.types.Operator):
-    """Colour the garment by penetration or stretch, the body by skin that shows, frame by frame; in Solid shading"""
+    """Colour the garment by penetration, stretch or Push Out, the body by skin that shows; in Solid shading"""
 
     bl_idname = "ssilk.show_heat"
     bl_label = "Show Heat"
     undo = "Show Heat"
 
-    kind: EnumProperty(name="Show", items=KINDS)
+    kind: EnumProperty(name="Show", items=[*KINDS, PUSHED_OUT])
     deepest: FloatProperty(
         name="Red Depth", description="Depth that is red", default=0.01, min=1e-4, subtype="DISTANCE", unit="LENGTH"
     )

@@ -6,8 +6,9 @@ from __future__ import annotations
 import bpy
 
 from ..scene.garment import unusable
-from ..scene.heat import PENETRATION, SKIN, STRETCH
+from ..scene.heat import PENETRATION, PUSHED_OUT, SKIN, STRETCH
 from ..scene.lbs_copy import find_copy
+from ..scene.repairs import DISPLACEMENT
 from .base import SidebarPanel
 
 
@@ -32,6 +33,8 @@ class QualityPanel(SidebarPanel, bpy.types.Panel):
         draw_kind(layout, PENETRATION, text="Show Penetration")
         draw_kind(layout, SKIN, text="Show Skin")
         draw_kind(layout, STRETCH, text="Show Stretch")
+        if DISPLACEMENT in context.object.data.attributes:
+            layout.operator("ssilk.show_heat", text="Show Pushed Out", icon="SHADING_RENDERED").kind = PUSHED_OUT
         row = layout.row(align=True)
         if context.object.ssilk.heat:
             row.operator("ssilk.hide_heat")

@@ -83,7 +83,8 @@ def hand_over(scene: GatheredScene, pair: Pair, folder: Path) -> Handover:
 def rig_command(python: str, folder: Path, handover: Handover, options: Sequence[str]) -> list[str]:
     """Return the command that rigs what was handed over."""
     stage, rigged = str(folder / STAGE), str(folder / RIGGED)
-    return [python, "-m", "ssilk_core", "rig", stage, "--garment", handover.prim, "-o", rigged, "--json", *options]
+    known = ["--garment", handover.prim, "-o", rigged, "--json", "--keep-shape"]  # the mesh in Blender stays as it is
+    return [python, "-m", "ssilk_core", "rig", stage, *known, *options]
 
 
 def inspect_command(python: str, folder: Path, handover: Handover, options: Sequence[str]) -> list[str]:

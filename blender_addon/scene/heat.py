@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Penetration and stretch of a garment in the frame that is shown, the skin that shows, and their colours.
+"""Penetration and stretch of a garment in the frame that is shown, the skin that shows, what was pushed out; colours.
 
 All come a little at a time: to find what is nearest to 20,000 vertices takes a tenth of a second.
 """
@@ -21,10 +21,11 @@ from ..errors import SetupError
 from .garment import armature_of, bodies_of
 from .masks import need_unmasked
 from .meshes import need_same_vertices, world_points
+from .repairs import displacements
 from .shapes import mixed_points, rest_points
 
 ATTRIBUTE = "SSILK Heat"
-PENETRATION, STRETCH, SKIN = "PENETRATION", "STRETCH", "SKIN"
+PENETRATION, STRETCH, SKIN, PUSHED_OUT = "PENETRATION", "STRETCH", "SKIN", "PUSHED_OUT"
 CHUNK = 1000  # vertices at a time
 
 Result = TypeVar("Result")
@@ -35,9 +36,9 @@ class HeatMap:
     """A garment in one frame.
 
     Attributes:
-        kind: PENETRATION, STRETCH or SKIN.
-        values: of each vertex: depth inside the body [m], negative outside, or elongation; shape (V,). For SKIN those
-            of `heat.shown_depths` [m], of all bodies' vertices.
+        kind: PENETRATION, STRETCH, SKIN or PUSHED_OUT.
+        values: of each vertex: depth inside the body [m], negative outside; elongation; or how far it was pushed out
+            of the body [m]; shape (V,). For SKIN those of `heat.shown_depths` [m], of all bodies' vertices.
     """
 
     kind: str
@@ -58,6 +59,8 @@ class HeatMap:
         """Return the worst value in words."""
         if self.kind == STRETCH:
             return f"{self.most:.0%} longer at most"
+        if self.kind == PUSHED_OUT:
+            return f"{int((self.values > 0).sum())} vertices were pushed out, {1000 * self.most:.1f} mm at most"
         if self.kind == SKIN:
             return f"{self.badness:.2%} of the covered skin shows" if self.badness else "No skin shows"
         inside = int((self.values > 0).sum())
@@ -72,9 +75,12 @@ def measuring(
     All that it needs of the frame is read before the first yield.
 
     Raises:
-        SetupError: it has no body or one with hidden skin, or its modifiers change how many vertices there are.
+        SetupError: it has no body or one with hidden skin, was not pushed out, or its modifiers change how many
+            vertices there are.
     """
     need_same_vertices(garment, depsgraph)
+    if kind == PUSHED_OUT:
+        return HeatMap(kind, displacements(garment))
     if kind == SKIN:
         return HeatMap(kind, (yield from _shown(garment, depsgraph)))
     points = world_points(garment.evaluated_get(depsgraph))

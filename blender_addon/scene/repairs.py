@@ -15,6 +15,7 @@ from ssilk_core.preflight.mesh import SAME_PLACE
 from ..errors import SetupError
 from .meshes import edited
 
+DISPLACEMENT = "SSILK Displacement"  # mesh attribute: how far vertices moved, in the mesh's own space
 MERGE = 2 * SAME_PLACE  # [m]; longer than the diagonal of a cell in which ssilk takes vertices for one
 Repair = Callable[[bmesh.types.BMesh, Sequence[int], float], None]
 
@@ -58,10 +59,13 @@ def apply_scale(armature: bpy.types.Object) -> None:
         child.matrix_world = place
 
 
-def push_points(thing: bpy.types.Object, points: np.ndarray) -> int:
-    """Move the vertices of a mesh to places in the world, shape (V, 3), its shape keys with them; return how many.
+def move_points(thing: bpy.types.Object, points: np.ndarray) -> np.ndarray:
+    """Move the vertices of a mesh to places in the world, shape (V, 3), its shape keys with them.
 
-    Vertices that would not move stay exactly as they are.
+    Vertices that would not move stay exactly as they are. The mesh attribute `DISPLACEMENT` holds how they moved.
+
+    Returns:
+        How far each vertex moved [m], shape (V,).
     """
     mesh, inverse = thing.data, np.array(thing.matrix_world.inverted())
     target = points @ inverse[:3, :3].T + inverse[:3, 3]
@@ -69,8 +73,25 @@ def push_points(thing: bpy.types.Object, points: np.ndarray) -> int:
     offset = np.where(np.abs(target - old).max(axis=1, keepdims=True) > 1e-6, target - old, 0.0)
     for items in [mesh.vertices, *(block.data for block in (mesh.shape_keys.key_blocks if mesh.shape_keys else ()))]:
         items.foreach_set("co", (_coordinates(items) + offset).astype(np.float32).reshape(-1))
+    layer = mesh.attributes.get(DISPLACEMENT) or mesh.attributes.new(DISPLACEMENT, "FLOAT_VECTOR", "POINT")
+    layer.data.foreach_set("vector", offset.astype(np.float32).reshape(-1))
     mesh.update()
-    return int(offset.any(axis=1).sum())
+    return displacements(thing)
+
+
+def displacements(thing: bpy.types.Object) -> np.ndarray:
+    """Return how far each vertex was moved by the last `move_points` [m], shape (V,).
+
+    Raises:
+        SetupError: none was.
+    """
+    layer = thing.data.attributes.get(DISPLACEMENT)
+    if layer is None or layer.domain != "POINT" or layer.data_type != "FLOAT_VECTOR":
+        raise SetupError(f"'{thing.name}' was not pushed out; there is nothing to show.")
+    moved = np.empty(len(layer.data) * 3, dtype=np.float32)
+    layer.data.foreach_get("vector", moved)
+    world = np.array(thing.matrix_world)[:3, :3] * bpy.context.scene.unit_settings.scale_length
+    return np.linalg.norm(moved.reshape(-1, 3) @ world.T, axis=1)
 
 
 def _coordinates(items: bpy.types.bpy_prop_collection) -> np.ndarray:

@@ -102,8 +102,8 @@ WORDS = {
         "Beheben, was gefunden wurde, wo nichts zu entscheiden ist; danach neu prüfen"
     ),
     "Push Out": "Herausdrücken",
-    "Push shallow patches out of the body to where collisions begin, with all shape keys": (
-        "Flache Stellen aus dem Körper drücken, bis dorthin, wo Kollisionen beginnen, mit allen Formschlüsseln"
+    "Settle the garment out of the body with little change of shape, with all shape keys": (
+        "Das Kleidungsstück mit wenig Formänderung aus dem Körper drücken, mit allen Formschlüsseln"
     ),
     # Classes
     "Class": "Klasse",
@@ -314,11 +314,14 @@ WORDS = {
     ),
     "Show Stretch": "Dehnung zeigen",
     "How much longer the cloth is than at rest": "Um wie viel länger der Stoff ist als in Ruhe",
+    "Show Pushed Out": "Herausgedrücktes zeigen",
+    "Pushed Out": "Herausgedrückt",
+    "How far Push Out moved the rest shape": "Wie weit Herausdrücken die Ruheform verschoben hat",
     "Show": "Zeigen",
     "Show Heat": "Wärmebild zeigen",
-    "Colour the garment by penetration or stretch, the body by skin that shows, frame by frame; in Solid shading": (
-        "Das Kleidungsstück nach Durchdringung oder Dehnung, oder den Körper nach Haut färben, die durchtritt, Bild "
-        "für Bild; in der Solid-Ansicht"
+    "Colour the garment by penetration, stretch or Push Out, the body by skin that shows; in Solid shading": (
+        "Das Kleidungsstück nach Durchdringung, Dehnung oder Herausdrücken färben, oder den Körper nach Haut, die "
+        "durchtritt; in der Solid-Ansicht"
     ),
     "Red Depth": "Rote Tiefe",
     "Depth that is red": "Tiefe, die rot ist",

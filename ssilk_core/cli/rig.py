@@ -2,19 +2,24 @@
 """Give a garment weights, classes and proxy joints, written into a copy of the stage.
 
 The proxies are joints at the end of the skeleton and can be edited by hand like any other joint. Weights, classes and
-proxies that the stage already has are kept.
+proxies that the stage already has are kept. A garment that lies in the body is settled out of it first.
 """
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..errors import EXIT_OK
-from ..events import Reporter, Result, Started
+from ..events import Message, Reporter, Result, Started
 from ..setup.classes import ClassOptions
 from ..setup.rig import RigOptions
 from . import options as shared
+
+if TYPE_CHECKING:
+    from ..assets import Character, Garment
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -32,6 +37,9 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         "--roots", type=int, default=RigOptions.roots_per_cluster, metavar="N",
         help="proxies of each connected loose part that hang from the character itself (default %(default)s)",
     )  # fmt: skip
+    verb.add_argument(
+        "--keep-shape", action="store_true", help="leave the garment as it is, even where it lies inside the body"
+    )
 
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
@@ -40,16 +48,22 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     from ssilk_usd.rig_io import write_rigged_stage
 
     from ..assets import CLASS_NAMES
+    from ..setup.prepare import prepare_scene
 
     shared.check_output(options.output, options.stage, shared.wardrobe(options)[0])
     report(Started("rig", options.proxies))
-    scene = shared.load_scene(
-        options,
-        report,
-        classes=ClassOptions(tight_distance=options.tight_distance),
-        rigging=RigOptions(proxies=options.proxies, roots_per_cluster=options.roots),
+    character, garment, rig = shared.read(options, report)
+    settled = None if options.keep_shape else settled_garment(character, garment, report)
+    scene = prepare_scene(
+        character,
+        settled or garment,
+        rig,
+        class_options=ClassOptions(tight_distance=options.tight_distance),
+        rig_options=RigOptions(proxies=options.proxies, roots_per_cluster=options.roots),
+        report=report,
     )
-    write_rigged_stage(options.stage, scene, options.output)
+    moved = settled.mesh.points - garment.mesh.points if settled else None
+    write_rigged_stage(options.stage, scene, options.output, moved=moved)
     counts = np.bincount(scene.classes, minlength=3)
     report(
         Result(
@@ -63,3 +77,21 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         )
     )
     return EXIT_OK
+
+
+def settled_garment(character: Character, garment: Garment, report: Reporter) -> Garment | None:
+    """Return the garment settled out of the body, and say what moves; None if nothing of it lies in the body."""
+    from ..preflight.fit import describe_left, describe_move
+    from ..preflight.settle import settle
+
+    mesh = garment.mesh
+    settled = settle(mesh, character.merged_body().mesh)
+    if not len(settled.before.vertices):
+        return None
+    deep = f"{len(settled.before.vertices)} vertices lay inside the body, up to {1000 * settled.before.depth:.1f} mm"
+    if settled.moved:
+        report(Message(f"{mesh.path}: {deep} deep; settling {describe_move(settled, 'moves')}"))
+    left = describe_left(settled, mesh, character)
+    if left:
+        report(Message(f"{mesh.path}: {left}", "warning"))
+    return replace(garment, mesh=replace(mesh, points=mesh.points + settled.offsets)) if settled.moved else None

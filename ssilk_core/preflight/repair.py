@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from ..assets import Character, Floats, Garment, Ints, Mesh, ProxyRig
 from ..mesh.topology import border_vertices, edge_use, edges
 from .finding import format_count
-from .fit import COLLISION_MARGIN, push_out
+from .fit import describe_left, describe_move
 from .mesh import SAME_PLACE, distinct_faces
+from .settle import settle
 from .winding import outward_flips
 
 Mask = NDArray[np.bool_]
@@ -49,18 +50,19 @@ def plan_repair(character: Character, garment: Garment, rig: ProxyRig | None, *,
     """Plan all safe repairs of a garment.
 
     Coincident vertices with the same class and weights are merged. Faces that collapse as a result, duplicate faces
-    and isolated vertices are removed. Winding becomes consistent and faces away from the body. Shallow penetration
-    is pushed out.
+    and isolated vertices are removed. Winding becomes consistent and faces away from the body. Cloth in the body is
+    settled out of it (`settle`).
 
     Args:
         rig: proxies authored for the garment; merged vertices must agree in these weights, too.
-        topology: whether vertices and faces may change; if not, vertices are only pushed out.
+        topology: whether vertices and faces may change; if not, vertices only move.
     """
     mesh, body = garment.mesh, character.merged_body().mesh
-    offsets = push_out(mesh.points, edges(mesh.faces), body)
-    pushed = {("vertices", f"pushed out to {1000 * COLLISION_MARGIN:g} mm"): int(offsets.any(axis=1).sum())}
+    settled = settle(mesh, body)
+    offsets, left = settled.offsets, describe_left(settled, mesh, character)
+    moved = (*([describe_move(settled, "moved")] if settled.moved else []), *([left] if left else []))
     if not topology:
-        return _moved_only(mesh, offsets, _told(pushed))
+        return _moved_only(mesh, offsets, moved)
     target = merge_targets(garment, rig, character)
     polygons, corners, counts = _kept_polygons(mesh, target)
     vertices = target[mesh.indices_of_corners[corners]]
@@ -72,10 +74,10 @@ def plan_repair(character: Character, garment: Garment, rig: ProxyRig | None, *,
     done = _told({
         ("vertices", "merged into others"): merged,
         ("isolated vertices", "removed"): mesh.vertex_count - len(kept) - merged,
-        ("faces", "removed"): len(_counts(mesh)) - len(polygons), ("faces", "flipped"): int(flipped.sum()), **pushed,
+        ("faces", "removed"): len(_counts(mesh)) - len(polygons), ("faces", "flipped"): int(flipped.sum()),
     })  # fmt: skip
     order = _flipped_order(counts, flipped)
-    return MeshRepair(kept, new_index[target], polygons, corners[order], counts, flipped, offsets[kept], done)
+    return MeshRepair(kept, new_index[target], polygons, corners[order], counts, flipped, offsets[kept], done + moved)
 
 
 def _moved_only(mesh: Mesh, offsets: Floats, done: tuple[str, ...]) -> MeshRepair:

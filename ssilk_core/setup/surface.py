@@ -34,13 +34,13 @@ def closest_on_surface(points: Floats, mesh: Mesh) -> SurfacePoints:
 
     squared, face, found = igl.point_mesh_squared_distance(np.ascontiguousarray(points), mesh.points, mesh.faces)
     corners = mesh.faces[face]
-    barycentric = _barycentric(found, mesh.points[corners])
+    barycentric = barycentric_coordinates(found, mesh.points[corners])
     normals = np.einsum("vk,vkc->vc", barycentric, vertex_normals(mesh.points, mesh.faces)[corners])
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return SurfacePoints(np.sqrt(squared), corners, barycentric, normals / np.maximum(length, 1e-12))
 
 
-def _barycentric(points: Floats, triangles: Floats) -> Floats:
+def barycentric_coordinates(points: Floats, triangles: Floats) -> Floats:
     """Return barycentric coordinates of points (V, 3) on triangles (V, 3, 3); slivers snap to the nearest corner."""
     import igl
 

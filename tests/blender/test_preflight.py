@@ -178,6 +178,16 @@ def test_cloth_in_the_body_is_pushed_out_with_its_shape_keys(ready, skirt):
     assert np.isclose(wide.data[7].co.x - skirt.data.vertices[7].co.x, 0.1)
     untouched = [vertex.index for vertex in skirt.data.vertices if vertex.co.z < 0.8]
     assert all(skirt.data.vertices[index].co == before[index] for index in untouched)
+    shift = np.array([vertex.co - old for vertex, old in zip(skirt.data.vertices, before)])
+    stored = np.array([item.vector for item in skirt.data.attributes["SSILK Displacement"].data])
+    np.testing.assert_allclose(stored, shift, atol=1e-6)
+    assert ready.ops.ssilk.show_heat(kind="PUSHED_OUT") == {"FINISHED"}
+    assert skirt.ssilk.heat == "PUSHED_OUT" and "SSILK Heat" in skirt.data.color_attributes
+
+
+def test_what_was_not_pushed_out_cannot_be_shown(ready, skirt):
+    with pytest.raises(RuntimeError, match="'Skirt' was not pushed out"):
+        ready.ops.ssilk.show_heat(kind="PUSHED_OUT")
 
 
 def test_an_unequal_scale_is_found_and_applied(ready, skirt):

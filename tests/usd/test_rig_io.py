@@ -163,6 +163,18 @@ def test_a_written_rig_reads_back(where, meters, up, tmp_path):
     np.testing.assert_allclose(rig.skin.dense(6), WEIGHTS, atol=1e-7)
 
 
+@pytest.mark.parametrize("where", ["skelroot", "beside", "own file"])
+def test_a_settled_garment_is_written_where_it_was_moved(where, tmp_path):
+    source, name = hero(tmp_path, where, meters=0.1, up="Z")
+    scene, moved = dress(source, name), np.random.default_rng(0).normal(0, 0.01, (6, 3))
+    mesh = replace(scene.garment.mesh, points=scene.garment.mesh.points + moved)
+    settled = replace(scene, garment=replace(scene.garment, mesh=mesh))
+    write_rigged_stage(source, settled, tmp_path / "out.usdc", moved=moved)
+    found = read_scene(tmp_path / "out.usdc")[1]
+    np.testing.assert_allclose(found.mesh.points, mesh.points, atol=1e-6)
+    np.testing.assert_array_equal(found.mesh.uvs, mesh.uvs)
+
+
 def test_garments_with_proxies_are_found(tmp_path):
     _, source, out = rigged(tmp_path)
     ((skeleton, garment, rig),) = read_rigged(out)

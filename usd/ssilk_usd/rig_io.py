@@ -46,6 +46,7 @@ from .read_stage import (
     split_location,
     value,
 )
+from .repair_mesh import move_points
 from .units import StageUnits
 
 
@@ -90,7 +91,7 @@ def read_proxy_rig(
     )
 
 
-def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path) -> None:
+def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path, *, moved: Floats | None = None) -> None:
     """Write a flattened copy of the character's stage with the garment bound to its proxy rig.
 
     The copy keeps the stage's units and axes. Proxies are appended to the skeleton's joints, in place of older ones
@@ -101,6 +102,7 @@ def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path) -> Non
         source: the stage that `scene.character` was read from.
         scene: the character, its garment (from the same stage or from another file) and the rig.
         out: the file to write: .usdc, .usd or .usda.
+        moved: how far the garment's points are from where its file has them [m], shape (V, 3); None if nowhere.
 
     Raises:
         SsilkError: the output cannot be written.
@@ -109,7 +111,7 @@ def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path) -> Non
     layer = _flattened(source, scene)
     stage = Usd.Stage.Open(layer)
     skel = find_skeleton(stage, root=_prim_path(scene.character.skeleton.path))
-    mesh, to_bind = _place_garment(stage, skel, source, scene.garment)
+    mesh, to_bind = _place_garment(stage, skel, source, scene.garment, moved)
     proxies = _append_proxies(skel, str(mesh.GetPath()), scene)
     _bind_garment(mesh, to_bind, skel, scene, proxies)
     export(layer, out)
@@ -199,18 +201,22 @@ def _prim_path(where: str) -> str:
 
 
 def _place_garment(
-    stage: Usd.Stage, skel: SkelSource, source: str | Path, garment: Garment
+    stage: Usd.Stage, skel: SkelSource, source: str | Path, garment: Garment, moved: Floats | None
 ) -> tuple[UsdGeom.Mesh, Floats]:
     """Return the garment's mesh beneath the SkelRoot, and its own space to bind space, shape (4, 4).
 
-    A mesh of the stage keeps its points, and moves if it stands elsewhere; one from its own file is copied.
+    A mesh of the stage keeps its points but for what `moved`, and is moved if it stands elsewhere; one from its own
+    file is copied.
     """
     file, path = split_location(garment.mesh.path)
     old = stage.GetPrimAtPath(path or "/")
     same = Path(file).exists() and Path(file).samefile(source)
     if not (same and old and old.IsA(UsdGeom.Mesh)):
         return _copy_garment(stage, skel, garment), np.eye(4)
-    to_bind = np.linalg.inv(skel.bind_to_core) @ garment_to_core(old, skel)
+    to_core = garment_to_core(old, skel)
+    to_bind = np.linalg.inv(skel.bind_to_core) @ to_core
+    if moved is not None:
+        move_points(UsdGeom.Mesh(old), moved @ np.linalg.inv(to_core[:3, :3]).T)
     if not old.GetPath().HasPrefix(skel.root.GetPath()):
         old = _move(stage, old, _free_path(skel, old.GetName()))
     return UsdGeom.Mesh(old), to_bind

@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Garments are settled out of the body with little change of shape, on their own side, seams and layers together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ssilk_core.assets import Floats, Ints, Mesh
+from ssilk_core.mesh.topology import edges
+from ssilk_core.preflight.cloth_samples import sample_cloth
+from ssilk_core.preflight.settle import GAP, settle
+
+RADIUS, COLUMNS, ROWS = 0.1, 32, 27
+
+
+def tube(radius: float, columns: int = COLUMNS, rows: int = ROWS, height: float = 0.6, name: str = "Tube") -> Mesh:
+    """Return a tube about the y axis, its normals outward."""
+    angle, y = np.arange(columns) * 2 * np.pi / columns, np.linspace(0, height, rows)
+    rings = np.broadcast_arrays(radius * np.sin(angle), y[:, None], radius * np.cos(angle))
+    row, column = (part.reshape(-1) for part in np.mgrid[0 : rows - 1, 0:columns])
+    a, b = row * columns + column, row * columns + (column + 1) % columns
+    faces = np.r_[np.c_[a, b, b + columns], np.c_[a, b + columns, a + columns]]
+    return Mesh(name, np.stack(rings, axis=-1).reshape(-1, 3), faces)
+
+
+def limb(radius: float = RADIUS) -> Mesh:
+    """Return a closed cylinder about the y axis, longer than the tube."""
+    side = tube(radius, 96, 21, 1.0)
+    ends = np.array([[0.0, 0, 0], [0, 1, 0]])
+    ring, last = np.arange(96), 20 * 96 + np.arange(96)
+    low = np.c_[np.roll(ring, -1), ring, np.full(96, 21 * 96)]
+    high = np.c_[last, np.roll(last, -1), np.full(96, 21 * 96 + 1)]
+    return Mesh("Limb", np.r_[side.points, ends] - [0, 0.2, 0], np.r_[side.faces, low, high])
+
+
+def dented(mesh: Mesh, depth: float = 0.01, width: float = 0.06) -> Mesh:
+    """Return the tube with a patch pressed in, to a depth below the limb's surface."""
+    near = np.exp(-((np.linalg.norm(mesh.points - [0, 0.3, RADIUS], axis=1) / width) ** 4))
+    inward = near * (np.hypot(mesh.points[:, 0], mesh.points[:, 2]) - RADIUS + depth)
+    return replace(mesh, points=mesh.points - inward[:, None] * outward(mesh.points))
+
+
+def outward(points: Floats) -> Floats:
+    flat = points * [1, 0, 1]
+    return flat / np.linalg.norm(flat, axis=1, keepdims=True)
+
+
+def height_above(points: Floats, radius: float = RADIUS) -> Floats:
+    return np.hypot(points[:, 0], points[:, 2]) - radius
+
+
+def strain(rest: Floats, points: Floats, faces: Ints) -> Floats:
+    first, second = edges(faces).T
+    length = np.linalg.norm(rest[first] - rest[second], axis=1)
+    return np.abs(np.linalg.norm(points[first] - points[second], axis=1) / length - 1)
+
+
+def test_a_dent_comes_out_smoothly_and_all_else_stays():
+    clean = tube(RADIUS + 0.006)
+    cloth = dented(clean)
+    found = settle(cloth, limb())
+    points, samples = cloth.points + found.offsets, sample_cloth(cloth.points, cloth.faces)
+    assert abs(found.before.depth - 0.01) < 3e-4 and not found.left
+    assert height_above(samples.of(points)).min() > GAP - 2e-4  # the limb has 96 corners
+    moved = found.offsets.any(axis=1)
+    assert found.moved == moved.sum() and not moved[np.abs(cloth.points[:, 1] - 0.3) > 0.27].any()
+    assert not moved[cloth.points[:, 2] < -0.09].any()
+    each = cloth.points.copy()
+    deep = height_above(each) < GAP
+    each[deep] *= np.where([True, False, True], ((RADIUS + GAP) / (RADIUS + height_above(each)))[deep, None], 1)
+    ours, theirs = strain(cloth.points, points, cloth.faces), strain(cloth.points, each, cloth.faces)
+    assert ours.max() < 0.7 * theirs.max() and ours[ours > 1e-9].mean() < theirs[theirs > 1e-9].mean()
+
+
+def test_cloth_that_is_clear_of_the_body_is_left_alone():
+    found = settle(tube(RADIUS + 0.006), limb())
+    assert not found.offsets.any() and not found.left and found.before.depth == 0
+
+
+def test_seams_stay_closed():
+    whole = dented(tube(RADIUS + 0.006))
+    seam = np.arange(0, whole.vertex_count, COLUMNS)  # through the middle of the dent
+    copy = np.arange(whole.vertex_count)
+    copy[seam] = whole.vertex_count + np.arange(len(seam))
+    faces = whole.faces.copy()
+    beyond = (faces % COLUMNS == COLUMNS - 1).any(axis=1)
+    faces[beyond] = copy[faces[beyond]]
+    cut = Mesh("Cut", np.r_[whole.points, whole.points[seam]], faces)
+    found = settle(cut, limb())
+    assert np.array_equal(settle(cut, limb()).offsets, found.offsets)
+    assert found.offsets[seam].any() and np.array_equal(found.offsets[seam], found.offsets[copy[seam]])
+
+
+def test_cloth_beyond_a_thin_limb_comes_back_to_its_own_side():
+    thin = 0.02
+    sleeve = tube(thin + 0.006, 20, 31, 0.3)
+    points = sleeve.points.copy()
+    lost = np.flatnonzero(np.linalg.norm(points - [0, 0.15, thin], axis=1) < 0.011)
+    points[lost, 2] -= 2 * thin + 0.009  # out of the limb on the other side, or deep in it
+    points[lost[0], 2] += 0.012
+    found = settle(replace(sleeve, points=points), limb(thin))
+    settled = points + found.offsets
+    assert not found.left and settled[lost, 2].min() > 0.8 * thin
+    assert np.linalg.norm(found.offsets[sleeve.points[:, 2] < -0.01], axis=1).max() < 0.01
+
+
+def test_layers_keep_their_order():
+    """An outer layer 2 mm above an inner one that is inside moves out with it."""
+    inner, outer = (dented(tube(RADIUS + gap), depth=0.012 - gap) for gap in (0.006, 0.008))
+    both = Mesh("Coat", np.r_[inner.points, outer.points], np.r_[inner.faces, outer.faces + inner.vertex_count])
+    assert height_above(both.points).min() < -0.005
+    found = settle(both, limb())
+    lower, upper = np.split(height_above(both.points + found.offsets), 2)
+    assert not found.left and lower.min() > GAP - 2e-4 and (upper - lower).min() > 1e-3
+
+
+def test_a_corner_of_the_body_between_vertices_of_the_cloth_is_covered():
+    """A coarse roof over a spike: no vertex of it is near, and no sample need be."""
+    spike = np.array([[-0.1, 0, -0.1], [0.1, 0, -0.1], [0, 0, 0.1], [0, 0.05, 0.0]])
+    body = Mesh("Spike", spike, np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]]))
+    x, z = np.meshgrid(np.linspace(-0.2, 0.2, 9), np.linspace(-0.2, 0.2, 9))
+    corner = (np.arange(8)[:, None] * 9 + np.arange(8)).reshape(-1)
+    faces = np.r_[np.c_[corner, corner + 9, corner + 1], np.c_[corner + 1, corner + 9, corner + 10]]
+    roof = Mesh("Roof", np.c_[x.reshape(-1) + 0.017, np.full(81, 0.045), z.reshape(-1) + 0.008], faces)
+    found = settle(roof, body)
+    from ssilk_core.setup.surface import closest_on_surface
+
+    after = Mesh("Roof", roof.points + found.offsets, faces)
+    above = closest_on_surface(spike[3:], after)
+    height = np.einsum("k,kc->c", above.barycentric[0], after.points[above.corners[0]])[1] - spike[3, 1]
+    assert not found.left and height > 0.5 * GAP
