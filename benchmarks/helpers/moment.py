@@ -51,6 +51,7 @@ class Moment:
 
     def _met(self) -> None:
         self.body = self.posed()
+        self.sampled = self.objective.energy.cloth.positions(self.x)
         self.normal, self.offset = self.planes()
         self.first = self.decoded_first()
         path = self.path()
@@ -106,7 +107,7 @@ class Moment:
 
     def planes(self, *, surface: bool = True) -> tuple[Tensor, Tensor]:
         body = self.body if surface else replace(self.body, rings=None)
-        return self.objective.contacts.planes(self.x, body)
+        return self.objective.contacts.planes(self.sampled, body)
 
     def update(self) -> Callable[[], Tensors]:
         """Return what gives the parameters known gradients, in one copy, and moves them."""

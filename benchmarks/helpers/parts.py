@@ -105,12 +105,12 @@ def contact_parts(at: Moment) -> list[Part]:
     assert body is not None and posed.rings is not None
     influences = at.model.scene.character.bodies[0].skin.indices.shape[1]
     placing = (influences * BLEND + 2 * TRANSFORM + NORMALISE) * posed.points.shape[0] * at.count
-    pairs = x.shape[0] * at.count
+    pairs = at.sampled.shape[0] * at.count
     search = BRUTE_FORCE * posed.points.shape[0] * pairs
     triangles = float(posed.rings[:, 0].float().mean()) - 1  # a ring's first neighbour spans none
     return [
         Part(name="body posing", run=at.surface, reads=(at.character, body.points, body.normals), operations=placing),
-        Part(name="nearest body point", run=at.planes, reads=(x, posed.points, posed.normals),
+        Part(name="nearest body point", run=at.planes, reads=(at.sampled, posed.points, posed.normals),
              operations=search + TRIANGLE * triangles * pairs, captured=kernels.available(x.device)),
         Part(name="nearest body vertex alone", run=lambda: at.planes(surface=False), operations=search, phases=(),
              reads=(x, posed.points, posed.normals)),
@@ -126,8 +126,10 @@ def energy_parts(at: Moment) -> list[Part]:
         Part(name="stretch and bending", run=lambda: energy.elastic(x), reads=(x,), leaves=(x,), energy=True,
              operations=elastic),
         Part(name="gravity and collision",
-             run=lambda: energy.gravity_and_collision(x, root, gravity, at.normal, at.offset),
-             reads=(x, at.normal, at.offset), leaves=(x,), energy=True, operations=2 * POINTWISE * moved),
+             run=lambda: energy.gravity_and_collision(
+                 x, root, gravity, energy.cloth.positions(x), at.normal, at.offset),
+             reads=(x, at.sampled, at.normal, at.offset), leaves=(x,), energy=True,
+             operations=2 * POINTWISE * (moved + at.sampled.shape[0] * at.count)),
         Part(name="positions before", run=at.path, reads=(at.first, at.last), phases=(WINDOWS,)),
         Part(name="inertia and drag",
              run=lambda: energy.inertia_and_drag(x, at.last, at.before, shift, at.objective.dt),
@@ -148,8 +150,8 @@ def single_energy_parts(at: Moment) -> list[Part]:
         term("stretch", lambda: energy.stretch(x), STRETCH * len(energy.area), x),
         term("bending", lambda: energy.bending(x), BENDING * len(energy.rest_angle), x),
         term("gravity", lambda: energy.gravity(x, gravity), cloth, x),
-        term("collision", lambda: energy.collision_at((at.normal * x).sum(1) - at.offset), cloth, x, at.normal,
-             at.offset),
+        term("collision", lambda: energy.collision_at(
+            (at.normal * energy.cloth.positions(x)).sum(1) - at.offset), cloth, x, at.sampled, at.normal, at.offset),
         term("inertia", lambda: energy.inertia(moving, predicted, dt), cloth, moving, predicted),
         term("drag", lambda: energy.drag(moving, at.last, dt), cloth, moving, at.last),
     ]  # fmt: skip

@@ -9,6 +9,7 @@ from ..scene.garment import unusable
 from .base import SidebarPanel
 
 MEMBRANE = {"stvk": ("lame_mu", "lame_lambda"), "baraff_witkin": ("stretch", "shear")}  # values of each model
+CONTACT = {"surface": "contact", "vertex": "collision"}  # likewise
 
 
 class FabricPanel(SidebarPanel, bpy.types.Panel):
@@ -26,5 +27,6 @@ class FabricPanel(SidebarPanel, bpy.types.Panel):
         layout.use_property_split, layout.use_property_decorate = True, False  # a fabric is not animated
         for name in ("preset", "density", "stretch_model", *MEMBRANE[fabric.stretch_model]):
             layout.prop(fabric, name)
-        for name in ("bending", "drag", "collision", "margin"):
+        contact = CONTACT[fabric.contact_model]
+        for name in ("bending", "drag", "contact_model", contact, "margin", "thickness"):
             layout.prop(fabric, name)

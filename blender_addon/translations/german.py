@@ -22,7 +22,16 @@ WORDS = {
     "Preset": "Vorgabe",
     "Cloth to start from; sets all values": "Stoff, von dem ausgegangen wird; setzt alle Werte",
     "Default": "Standard",
-    "The paper's: light and soft": "Der des Artikels: leicht und weich",
+    "Light and soft": "Leicht und weich",
+    "The paper's energy of contact, which depends on the mesh": "Der Kontakt des Artikels, der vom Netz abhängt",
+    "Contact": "Kontakt",
+    "Contact Model": "Kontaktmodell",
+    "What the body pushes away": "Was der Körper wegdrückt",
+    "The body pushes each area of the cloth, whatever its mesh": "Der Körper drückt jede Fläche, gleich welches Netz",
+    "The body pushes each vertex, as in the paper; a coarse mesh resists less": (
+        "Der Körper drückt jeden Eckpunkt, wie im Artikel; ein grobes Netz hält weniger stand"
+    ),
+    "Thickness": "Dicke",
     "Silk": "Seide",
     "Light and very soft, 80 g/m²": "Leicht und sehr weich, 80 g/m²",
     "Cotton": "Baumwolle",

@@ -54,7 +54,6 @@ def train_trial(scene: Scene, fabric: Fabric, drive: ProceduralMotion, steps: in
         window=4,
         static_batch=windows,
         recombinations=0,
-        perturbations=0,
     )
     job = TrainJob(
         scene=scene, motions=[motion], held_out=[motion], model=replace(TRIAL_MODEL, fps=drive.fps), train=config,

@@ -47,9 +47,9 @@ def test_the_margin_is_shown_in_the_scenes_units(bpy, skirt):
     from blender_addon.fabric_properties import fabric_options
 
     fabric = skirt.ssilk.fabric
-    assert fabric.margin == pytest.approx(0.004)
+    assert fabric.margin == pytest.approx(0.008)
     bpy.context.scene.unit_settings.scale_length = 0.01
-    assert fabric.margin == pytest.approx(0.4)
+    assert fabric.margin == pytest.approx(0.8)
     fabric.margin = 0.5
     assert fabric_options(fabric) == ["--fabric", "default", "--material", "margin=0.005"]
 
@@ -81,3 +81,8 @@ def test_the_panel_shows_the_values_of_the_model(bpy, skirt):
     skirt.ssilk.fabric.stretch_model = "baraff_witkin"
     notes = drawn(FabricPanel, bpy.context)
     assert "shear" in notes and "lame_mu" not in notes
+    assert "contact" in notes and "collision" not in notes
+    skirt.ssilk.fabric.preset = "paper"
+    assert skirt.ssilk.fabric.contact_model == "vertex"
+    notes = drawn(FabricPanel, bpy.context)
+    assert "collision" in notes and "contact" not in notes

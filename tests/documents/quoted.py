@@ -51,8 +51,6 @@ PAPER = {
     "state_reuse": 0,
     "rotated_fraction": 1,
     "recombinations": 0,
-    "perturbations": 0,
-    "outlier_energy": 0,
     "noise_correlation": 0,
     "noise_probability": "not stated",
     "static_fraction": 0,
