@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Penetration and stretch of a garment in the frame that is shown, the skin that shows, what was pushed out; colours.
+"""Penetration, stretch, skin that shows and what Push Out moved, in the frame that is shown, as colours on meshes.
 
-All come a little at a time: to find what is nearest to 20,000 vertices takes a tenth of a second.
+Measuring comes a little at a time: to find what is nearest to 20,000 vertices takes a tenth of a second.
 """
 
 from __future__ import annotations
