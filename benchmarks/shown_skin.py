@@ -21,8 +21,7 @@ from helpers.subjects import Subject, arguments, clip_of, open_subject, parsed
 from refine import NetworkTake
 from torch import Tensor
 
-from ssilk_core.collision import CoveredSkin
-from ssilk_core.collision.covered_skin import ShownCounts
+from ssilk_core.collision import CoveredSkin, ShownCounts
 from ssilk_core.evaluation.splits import read_index
 from ssilk_core.kinematics import motion_transforms, skinning_matrices
 from ssilk_core.motion_bank import roll_states
