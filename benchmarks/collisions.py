@@ -134,7 +134,7 @@ def measure(subject: Subject, options: Any) -> dict[str, Any]:
             counts["LBS"].add(lbs, character)
     found = {how: count.figures() for how, count in counts.items()}
     quantiles = [float(np.quantile(rest, q)) for q in (0, 0.05, 0.5)]
-    closer = float(np.mean(rest < subject.file.fabric.margin))
+    closer = float(np.mean(rest < subject.file.fabric.contact_distance))
     return {**found, "clearance": quantiles, "within the margin at rest": closer}
 
 

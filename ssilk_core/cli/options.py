@@ -40,7 +40,12 @@ def add_scene(verb: argparse.ArgumentParser) -> None:
 
 def add_fabric(verb: argparse.ArgumentParser) -> None:
     """Add the options of the fabric."""
-    verb.add_argument("--fabric", choices=FABRICS, default="default", help="material (default: that of the paper)")
+    verb.add_argument(
+        "--fabric",
+        choices=FABRICS,
+        default="default",
+        help="material (default: default); 'paper' has the paper's contact",
+    )
     verb.add_argument(
         "--material",
         action="append",

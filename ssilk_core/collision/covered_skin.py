@@ -136,7 +136,7 @@ class CoveredSkin:
 
     @torch.no_grad()
     def shows(self, x: Tensor, character: Tensor) -> Tensor:
-        """Tell which covered points show, bool (P, N).
+        """Tell which covered points show, bool (P, N); all do in a frame where a position is not finite.
 
         Args:
             x: garment positions [m], shape (V, 3, N).
@@ -144,7 +144,8 @@ class CoveredSkin:
         """
         if self._skinning is None:
             return torch.zeros(0, x.shape[2], dtype=torch.bool, device=x.device)
-        return showing(self.points.hits(x, *self._skinning.surface(self._rest, self._normals, character)))
+        found = showing(self.points.hits(x, *self._skinning.surface(self._rest, self._normals, character)))
+        return found | ~x.isfinite().all(0).all(0)
 
     def figures(self, clips: Sequence[tuple[str, ShownCounts]]) -> ShownSkin | None:
         """Return the figures of clips by name; None where the garment covers nothing.

@@ -3,8 +3,7 @@
 
 An integral over the cloth is a sum over its vertices and over points inside its triangles, each with the area that it
 stands for. Finer meshes have more points with less area each, so that the sum depends on the garment and not on its
-mesh. Samples are at most `MAX_SPACING` apart: a vertex of the body that comes
-nothing passes between samples unnoticed, a vertex of the body neither.
+mesh. Samples are about `MAX_SPACING` apart, so that a vertex of the body does not pass between them unnoticed.
 """
 
 from __future__ import annotations
@@ -23,7 +22,6 @@ from ..operators import SparseOperator
 
 MAX_SPACING = 0.02  # [m] between the samples of a triangle, at rest
 MAX_DIVISIONS = 8  # of an edge: 64 samples in a large triangle
-VERTEX_SHARE = 0.25  # of a triangle's area; with its middle this integrates quadratic functions exactly
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +59,8 @@ def vertex_samples(vertex_count: int) -> ContactSamples:
 def contact_samples(mesh: Mesh, fabric: Fabric) -> ContactSamples:
     """Return the samples at which a garment of a fabric meets the body.
 
-    A triangle whose longest edge is n times `MAX_SPACING` is divided into n^2 equal ones, with a sample in the middle
-    of each. `VERTEX_SHARE` of its area goes to its corners.
+    Large triangles are divided into n^2 equal ones, with a sample in the middle of each. The corners stand for
+    1 / (1 + 3 n^2) of the area: so the rule integrates quadratic functions exactly for every n.
     """
     vertices = vertex_samples(mesh.vertex_count)
     if fabric.contact_model == "vertex":
@@ -73,13 +71,14 @@ def contact_samples(mesh: Mesh, fabric: Fabric) -> ContactSamples:
     longest = np.max([np.linalg.norm(side, axis=1) for side in (b - a, c - b, a - c)], axis=0)
     # The middles of equal triangles are apart by 1 / sqrt(3) of their edge.
     divisions = np.ceil(longest / np.sqrt(3) / MAX_SPACING).clip(1, MAX_DIVISIONS).astype(int)
-    corners, weights, areas = [vertices.corners], [vertices.weights], []
-    areas.append(VERTEX_SHARE * np.bincount(faces.reshape(-1), np.repeat(area / 3, 3), mesh.vertex_count))
+    at_corners = area / (1 + 3 * divisions**2)
+    corners, weights = [vertices.corners], [vertices.weights]
+    areas = [np.bincount(faces.reshape(-1), np.repeat(at_corners / 3, 3), mesh.vertex_count)]
     for n in np.unique(divisions):
         own, middles = divisions == n, subdivision_middles(n)
         corners.append(np.repeat(faces[own], len(middles), axis=0))
         weights.append(np.tile(middles, (own.sum(), 1)))
-        areas.append(np.repeat((1 - VERTEX_SHARE) * area[own] / len(middles), len(middles)))
+        areas.append(np.repeat((area - at_corners)[own] / len(middles), len(middles)))
     return ContactSamples(mesh.vertex_count, *(np.concatenate(parts) for parts in (corners, weights, areas)))
 
 

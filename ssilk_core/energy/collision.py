@@ -39,7 +39,7 @@ class ContactLaw:
     @classmethod
     def of(cls, fabric: Fabric) -> ContactLaw:
         """Return the law of a fabric, whose mesh lies in the middle of its thickness."""
-        start = fabric.margin + 0.5 * fabric.thickness
+        start = fabric.contact_distance
         if fabric.contact_model == "vertex":
             return cls(2 * fabric.collision, start, 0.0)
         return cls(fabric.contact, start, fabric.margin)
@@ -49,18 +49,18 @@ class ContactLaw:
         depth = self._depth(distance)
         soft = depth**3 / (6 * max(self.ramp, TINY))
         deep = 0.5 * depth * (depth - self.ramp) + self.ramp**2 / 6
-        return self.stiffness * torch.where(depth < self.ramp, soft, deep.where(depth > 0, 0))
+        return self.stiffness * torch.where(depth < self.ramp, soft, deep.where(depth != 0, 0))
 
     def pressure(self, distance: Tensor) -> Tensor:
         """Return minus the derivative of the energy [Pa] (paper: [N])."""
         depth = self._depth(distance)
         soft = depth**2 / (2 * max(self.ramp, TINY))
-        return self.stiffness * torch.where(depth < self.ramp, soft, (depth - 0.5 * self.ramp).where(depth > 0, 0))
+        return self.stiffness * torch.where(depth < self.ramp, soft, (depth - 0.5 * self.ramp).where(depth != 0, 0))
 
     def curvature(self, distance: Tensor) -> Tensor:
         """Return the second derivative of the energy [N/m3] (paper: [N/m])."""
         depth = self._depth(distance)
-        return self.stiffness * torch.where(depth < self.ramp, depth / max(self.ramp, TINY), (depth > 0).to(depth))
+        return self.stiffness * torch.where(depth < self.ramp, depth / max(self.ramp, TINY), (depth / depth).where(depth != 0, 0))
 
     def _depth(self, distance: Tensor) -> Tensor:
         return (self.start - distance).clamp_min(0)

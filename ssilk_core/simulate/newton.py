@@ -281,13 +281,15 @@ def line_search(
 
 
 def excess_collision(potential: IncrementalPotential, state: State, trial: State, moved: Tensor) -> Tensor:
-    """Return the collision energy in a trial minus its second-order prediction [J], of each vertex (V, N).
+    """Return by how much the collision energy in a trial exceeds its second-order prediction [J], (V, N).
 
-    That of a sample is distributed to its corners.
+    That of a sample is distributed to those of its corners that are free.
     """
     if state.body_distance is None:
         return torch.zeros_like(moved[:, 0])
     positions = potential.cloth.positions
     expected = potential.collision_at(state.body_distance.expected(positions(trial.x), positions(moved)))
-    excess = potential.collision(trial.x, trial.body_distance) - expected
-    return potential.cloth.to_vertices(excess[:, None])[:, 0]
+    excess = (potential.collision(trial.x, trial.body_distance) - expected).clamp_min(0)
+    found = torch.zeros_like(moved[:, 0])
+    found[potential.free] = potential.cloth.to_vertices(excess[:, None])[potential.free, 0]
+    return found

@@ -17,6 +17,7 @@ from .latent_regularization import latent_distortion
 from .windows import WindowSampler
 
 Terms = dict[str, Tensor]
+REGULARIZATION = "latent regularization"  # a term of latents, which has no frames
 
 
 class Objective:
@@ -121,21 +122,21 @@ class Objective:
         )
         if weight := sampler.config.latent_regularization:
             drawn, scale = torch.cat([rolled[-batch:], quiet]), sampler.config.latent_regularization_scale
-            dynamic["latent regularization"] = weight * latent_distortion(model, self.energy.mass, drawn, scale)
+            dynamic[REGULARIZATION] = weight * latent_distortion(model, self.energy.mass, drawn, scale)
         return dynamic, single, torch.stack(z[-2:]).detach()
 
 
 def total(terms: Terms, half: float = 0.0) -> Tensor:
     """Return the sum of all terms, averaged over frames [J].
 
-    Poses in which body parts lie inside one another have no good state. Their energies are a thousand times those of
+    Poses in which body parts lie inside one another have no good state. Their energies are hundreds of times those of
     others, and a network that is trained on the mean gives up the others for them. So each frame is divided by
-    1 + (stretch + collision) / half, without a gradient: every pose keeps its minimum.
+    1 + (stretch + collision) / half, without a gradient: every pose keeps the minimum of its energy.
 
     Args:
         half: stretch and collision at which a frame counts half [J]; zero for the plain mean.
     """
-    share = torch.ones(())
     if half:
         share = half / (half + (terms["stretch"] + terms["collision"]).detach())
-    return sum((value * share if value.shape == share.shape else value).mean() for value in terms.values())  # type: ignore[return-value]
+        terms = {name: value if name == REGULARIZATION else value * share for name, value in terms.items()}
+    return sum(value.mean() for value in terms.values())  # type: ignore[return-value]

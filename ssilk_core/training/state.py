@@ -25,7 +25,7 @@ from .validation import Score
 
 Tensors = dict[str, Tensor]
 
-FORMAT = 2  # of training states; settings had other names in format 1
+FORMAT = 3  # of training states; settings had other names in format 1, fabrics no contact on surfaces in format 2
 SAMPLER_PREFIX = "sampler."  # of the sampler's tensors; all others are parameters or optimiser state
 
 

@@ -43,6 +43,12 @@ def test_the_skin_meets_half_the_stiffness_times_the_margin():
     torch.testing.assert_close(law.energy(inner)[1], torch.tensor(2e5 * 0.01**2 / 6).double())
 
 
+@pytest.mark.parametrize("fabric", [SOFT, FABRICS["paper"]], ids=lambda fabric: fabric.name)
+def test_a_body_that_is_not_finite_is_not_taken_for_free_space(fabric):
+    law, nowhere = ContactLaw.of(fabric), torch.tensor([float("nan")])
+    assert all(value(nowhere).isnan() for value in (law.energy, law.pressure, law.curvature))
+
+
 @pytest.mark.parametrize("n", [1, 2, 5])
 def test_a_triangle_is_divided_into_equal_parts(n):
     middles = subdivision_middles(n)
@@ -53,8 +59,9 @@ def test_a_triangle_is_divided_into_equal_parts(n):
     assert n == 1 or np.ptp(apart.min(axis=1)) < 1e-12
 
 
-def test_samples_integrate_quadratic_functions_exactly_over_fine_meshes(toy_grid):
-    mesh = sheet(toy_grid, 31, 21)
+@pytest.mark.parametrize("rows, columns", [(31, 21), (5, 4), (2, 2)])
+def test_samples_integrate_quadratic_functions_exactly(toy_grid, rows, columns):
+    mesh = sheet(toy_grid, rows, columns)
     samples = contact_samples(mesh, SOFT)
     x, y, _ = samples.points(mesh.points).T
     x = x + 0.1

@@ -201,20 +201,20 @@ def contact_of_a_point(case: Case, point: np.ndarray, frame: int) -> tuple[float
 
 
 def collision(case: Case, x: np.ndarray, frame: int) -> tuple[float, np.ndarray]:
-    """A quarter of each triangle's area is at its corners, the rest in the middles of equal parts."""
+    """A part of each triangle's area is at its corners, the rest in the middles of equal parts."""
     total, gradient = 0.0, np.zeros_like(x)
     for face in case.mesh.faces:
         a, b, c = case.mesh.points[face]
         area = np.linalg.norm(np.cross(b - a, c - a)) / 2
         longest = max(np.linalg.norm(b - a), np.linalg.norm(c - b), np.linalg.norm(a - c))
         n = min(max(int(np.ceil(longest / np.sqrt(3) / MAX_SPACING)), 1), MAX_DIVISIONS)
-        parts = [(weights, area / 12) for weights in np.eye(3)]
+        inner = area * 3 * n**2 / (1 + 3 * n**2)
+        parts = [(weights, (area - inner) / 3) for weights in np.eye(3)]
         for i in range(n):
             for j in range(n - i):
                 thirds = [(1, 1)] if i + j == n - 1 else [(1, 1), (2, 2)]
                 parts += [
-                    (np.array([n - i - j - (s + t) / 3, i + s / 3, j + t / 3]) / n, 0.75 * area / n**2)
-                    for s, t in thirds
+                    (np.array([n - i - j - (s + t) / 3, i + s / 3, j + t / 3]) / n, inner / n**2) for s, t in thirds
                 ]
         for weights, share in parts:
             energy, slope = contact_of_a_point(case, weights @ x[face], frame)
