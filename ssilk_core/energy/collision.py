@@ -60,7 +60,9 @@ class ContactLaw:
     def curvature(self, distance: Tensor) -> Tensor:
         """Return the second derivative of the energy [N/m3] (paper: [N/m])."""
         depth = self._depth(distance)
-        return self.stiffness * torch.where(depth < self.ramp, depth / max(self.ramp, TINY), (depth / depth).where(depth != 0, 0))
+        return self.stiffness * torch.where(
+            depth < self.ramp, depth / max(self.ramp, TINY), (depth / depth).where(depth != 0, 0)
+        )
 
     def _depth(self, distance: Tensor) -> Tensor:
         return (self.start - distance).clamp_min(0)
