@@ -31,6 +31,7 @@ ITERATIONS = 30
 RESTING = 2e-4  # [m] movement of 99 % of the vertices in an iteration from which on the garment rests
 CALM = 6  # iterations after which steps are damped more and more, so that cloth in a crease comes to rest
 LAYER_DISTANCE = 0.012  # [m] within which layers are tied
+ACROSS = 0.7  # cosine between cloth's normal and the way to another layer, at least
 LEAST_FRICTION = 2e-3  # of contacts, relative to the penalty
 DAMPING = 0.4  # growth of the damping in each further iteration, relative to the stiffness of an edge
 TOUCHING = 1e-4  # [m] from its plane up to which a sample is taken to touch it at first
@@ -252,5 +253,9 @@ def _layer_ties(cloth: _Cloth, facing: Facing, free: Mask) -> Ints:
     around = links @ links @ links
     pairs = np.sort(near[pairs], axis=1)
     apart = np.asarray(around[pairs[:, 0], pairs[:, 1]]).reshape(-1) == 0
-    alike = np.einsum("tc,tc->t", facing.directions[pairs[:, 0]], facing.directions[pairs[:, 1]]) > 0.5
-    return pairs[apart & alike]
+    directions, between = facing.directions[pairs], cloth.points[pairs[:, 0]] - cloth.points[pairs[:, 1]]
+    alike = np.einsum("tc,tc->t", directions[:, 0], directions[:, 1]) > 0.5
+    # What lies beside a vertex is of its own layer, if that is fine.
+    height = np.abs(np.einsum("tc,tc->t", between, directions[:, 0]))
+    across = height > ACROSS * np.linalg.norm(between, axis=1)
+    return pairs[apart & alike & across]
