@@ -16,6 +16,7 @@ from .settle import DEEPEST, Settled, settle
 
 COLLISION_MARGIN = FABRICS["default"].margin  # [m]
 TOO_DEEP = f"leaves a garment that is more than {1000 * DEEPEST:g} mm deep as it is, because it is not fitted"
+NOT_SETTLED = "leaves this garment as it is, because settling found no shape that is less deep in the body"
 MAX_INSIDE_SHARE = 0.25  # share of vertices inside the body above which penetration is an error
 ALIGNMENT_SAMPLES = 400  # number of vertices that the alignment is measured with
 SCALES = (1.0, 0.01, 100.0, 0.1, 10.0, 0.001, 1000.0, 0.0254, 1 / 0.0254)
@@ -157,7 +158,7 @@ def penetration(mesh: Mesh, body: Mesh) -> Findings:
             f"{1000 * settled.before.depth:.1f} mm deep",
             why="this is the rest shape: elastic and collision forces oppose each other in every frame",
             fix="settle the garment out of the body in the bind pose, or make it wider; --fix "
-            + (describe_move(settled, "moves") if settled.moved else TOO_DEEP)
+            + (describe_move(settled, "moves") if settled.moved else _why_still(settled))
             + (f", and {format_count(len(settled.after.vertices), 'vertices')} stay inside" if settled.left else ""),
             fixable=not settled.left,
             elements="vertices",
@@ -197,7 +198,11 @@ def describe_left(settled: Settled, mesh: Mesh, character: Character) -> str:
     joints, count = np.unique(body.skin.indices[beneath, strongest], return_counts=True)
     where = format_joints(character.skeleton, joints[np.argsort(-count, kind="stable")], 3)
     deep = f"{format_count(len(left), 'vertices')} inside the body, up to {1000 * settled.after.depth:.1f} mm deep"
-    return f"left {deep}, at {where}" + ("" if settled.moved else f": {TOO_DEEP}")
+    return f"left {deep}, at {where}" + ("" if settled.moved else f": {_why_still(settled)}")
+
+
+def _why_still(settled: Settled) -> str:
+    return NOT_SETTLED if settled.failed else TOO_DEEP
 
 
 def signed_distance(points: Floats, body: Mesh) -> Floats:

@@ -6,10 +6,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from ssilk_core.assets import Floats, Ints, Mesh
 from ssilk_core.mesh.topology import edges
 from ssilk_core.preflight.cloth_samples import sample_cloth
+from ssilk_core.preflight.fit import penetration
 from ssilk_core.preflight.settle import GAP, _Cloth, _layer_ties, settle
 from ssilk_core.preflight.sides import find_facing
 
@@ -78,6 +80,22 @@ def test_a_dent_comes_out_smoothly_and_all_else_stays():
 def test_cloth_that_is_clear_of_the_body_is_left_alone():
     found = settle(tube(RADIUS + 0.006), limb())
     assert not found.offsets.any() and not found.left and found.before.depth == 0
+
+
+def test_cloth_deeper_than_40_mm_is_not_fitted_and_stays():
+    for depth, moves in ((0.038, True), (0.042, False)):
+        found = settle(dented(tube(RADIUS + 0.006, 24, 15), depth), limb())
+        assert abs(found.before.depth - depth) < 1e-3 and found.offsets.any() == moves == (not found.left)
+        assert not found.failed
+
+
+@pytest.mark.parametrize("end", [lambda points: points * [0.99, 1, 0.99], lambda points: points * np.nan])
+def test_what_settling_would_make_worse_stays(monkeypatch, end):
+    monkeypatch.setattr("ssilk_core.preflight.settle._Solve.run", lambda solve: end(solve.cloth.points))
+    cloth = dented(tube(RADIUS + 0.006))
+    found = settle(cloth, limb())
+    assert found.failed and found.left and not found.offsets.any() and found.after is found.before
+    assert "because settling found no shape" in next(penetration(cloth, limb())).fix
 
 
 def test_seams_stay_closed():
