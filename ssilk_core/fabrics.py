@@ -68,6 +68,11 @@ class Fabric:
         if not self.density > 0:
             fail(f"fabric '{self.name}'", "a density of zero", "it must be positive")
 
+    @property
+    def contact_distance(self) -> float:
+        """Distance between body and mesh at which contact begins [m]."""
+        return self.margin + 0.5 * self.thickness
+
 
 # Areal densities are typical mid-weight values of each cloth. Stiffness is scaled from the neutral default of NCS
 # and keeps the order of real cloths. Real membranes are stiffer by orders of magnitude, which affects the

@@ -14,7 +14,7 @@ from ..setup.surface import closest_on_surface
 from .finding import Finding, Findings, format_count, format_joints, index_tuple
 from .settle import DEEPEST, Settled, settle
 
-COLLISION_MARGIN = FABRICS["default"].margin  # [m]
+COLLISION_MARGIN = FABRICS["default"].contact_distance  # [m]
 TOO_DEEP = f"leaves a garment that is more than {1000 * DEEPEST:g} mm deep as it is, because it is not fitted"
 NOT_SETTLED = "leaves this garment as it is, because settling found no shape that is less deep in the body"
 MAX_INSIDE_SHARE = 0.25  # share of vertices inside the body above which penetration is an error
@@ -173,7 +173,6 @@ def penetration(mesh: Mesh, body: Mesh) -> Findings:
             found=f"the nearest of them is {1000 * signed[near].min():.1f} mm from the body; collisions start at "
             f"{1000 * COLLISION_MARGIN:g} mm",
             why="collisions push the cloth slightly outward there, even at rest",
-            fixable=settled.moved > 0 and not settled.left,
             elements="vertices",
             indices=index_tuple(near),
         )

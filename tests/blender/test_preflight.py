@@ -183,6 +183,8 @@ def test_cloth_in_the_body_is_pushed_out_with_its_shape_keys(ready, skirt):
     np.testing.assert_allclose(stored, shift, atol=1e-6)
     assert ready.ops.ssilk.show_heat(kind="PUSHED_OUT") == {"FINISHED"}
     assert skirt.ssilk.heat == "PUSHED_OUT" and "SSILK Heat" in skirt.data.color_attributes
+    ready.ops.ssilk.inspect()
+    assert "penetration" not in findings(ready) and not fixer(show(ready, "inside-margin"))
 
 
 def test_what_was_not_pushed_out_cannot_be_shown(ready, skirt):
