@@ -149,13 +149,13 @@ def penetration(mesh: Mesh, body: Mesh) -> Findings:
     settled = settle(mesh, body)
     inside = settled.before.vertices
     if len(inside):
+        what = f"{share:.1%} of all vertices, and points inside triangles," if share else "points inside triangles"
         yield Finding(
             severity="error" if share > MAX_INSIDE_SHARE else "warning",
             code="penetration",
             prim=mesh.path,
             count=len(inside),
-            found=f"{share:.1%} of all vertices, and points inside triangles, are inside the body, up to "
-            f"{1000 * settled.before.depth:.1f} mm deep",
+            found=f"{what} are inside the body, up to {1000 * settled.before.depth:.1f} mm deep",
             why="this is the rest shape: elastic and collision forces oppose each other in every frame",
             fix="settle the garment out of the body in the bind pose, or make it wider; --fix "
             + (describe_move(settled, "moves") if settled.moved else _why_still(settled))

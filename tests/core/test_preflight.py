@@ -244,6 +244,9 @@ def test_penetration_counts_and_measures():
     assert (deep.code, deep.severity, deep.fixable) == ("penetration", "warning", True)
     assert (deep.indices == tuple(range(32)) and "30." in deep.found) or "29." in deep.found
     assert only(fit.penetration(tube(0.1), body)).severity == "error"
+    box = trimesh.creation.box((0.28, 0.3, 0.28))  # only its corners are outside
+    through = next(fit.penetration(Mesh("box", box.vertices + [0, 1.1, 0], box.faces), body))
+    assert through.count == 8 and through.found.startswith("points inside triangles are inside the body")
 
 
 def test_signed_distance_against_a_sphere():
