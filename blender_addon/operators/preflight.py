@@ -27,7 +27,7 @@ from .reporting import ReportingOperator
 from .rig import RigOperator
 
 MOVED, LEFT = "moved ", "left "  # begin what `ssilk inspect --fix` says of settled cloth, and of what stays inside
-PUSHED = ("penetration", "inside-margin")
+PUSHED = "penetration"  # the finding that Push Out mends
 
 
 class InspectOperator(RigOperator):
@@ -179,8 +179,8 @@ class PushOut(InspectOperator, bpy.types.Operator):
 
 def fixer(item: FindingItem) -> str:
     """Return the operator that repairs a finding; empty where none does."""
-    if item.code in PUSHED:
-        return PushOut.bl_idname if item.code == PUSHED[0] or item.fixable else ""
+    if item.code == PUSHED:
+        return PushOut.bl_idname
     safe = item.fixable or item.code == "body-inside-out"
     return FixFinding.bl_idname if safe and (item.code in REPAIRS or item.code == SCALE) else ""
 

@@ -17,6 +17,7 @@ from .meshes import edited
 
 DISPLACEMENT = "SSILK Displacement"  # mesh attribute: how far vertices moved, in the mesh's own space
 MERGE = 2 * SAME_PLACE  # [m]; longer than the diagonal of a cell in which ssilk takes vertices for one
+ROUNDING = 1e-5  # [m] of coordinates on their way through float32 in USD
 Repair = Callable[[bmesh.types.BMesh, Sequence[int], float], None]
 
 
@@ -70,7 +71,8 @@ def move_points(thing: bpy.types.Object, points: np.ndarray) -> np.ndarray:
     mesh, inverse = thing.data, np.array(thing.matrix_world.inverted())
     target = points @ inverse[:3, :3].T + inverse[:3, 3]
     old = _coordinates(mesh.vertices)
-    offset = np.where(np.abs(target - old).max(axis=1, keepdims=True) > 1e-6, target - old, 0.0)
+    moved = np.linalg.norm((target - old) @ _metres(thing).T, axis=1, keepdims=True) > ROUNDING
+    offset = np.where(moved, target - old, 0.0)
     for items in [mesh.vertices, *(block.data for block in (mesh.shape_keys.key_blocks if mesh.shape_keys else ()))]:
         items.foreach_set("co", (_coordinates(items) + offset).astype(np.float32).reshape(-1))
     layer = mesh.attributes.get(DISPLACEMENT) or mesh.attributes.new(DISPLACEMENT, "FLOAT_VECTOR", "POINT")
@@ -90,8 +92,12 @@ def displacements(thing: bpy.types.Object) -> np.ndarray:
         raise SetupError(f"'{thing.name}' was not pushed out; there is nothing to show.")
     moved = np.empty(len(layer.data) * 3, dtype=np.float32)
     layer.data.foreach_get("vector", moved)
-    world = np.array(thing.matrix_world)[:3, :3] * bpy.context.scene.unit_settings.scale_length
-    return np.linalg.norm(moved.reshape(-1, 3) @ world.T, axis=1)
+    return np.linalg.norm(moved.reshape(-1, 3) @ _metres(thing).T, axis=1)
+
+
+def _metres(thing: bpy.types.Object) -> np.ndarray:
+    """Return the matrix from displacements in the mesh's own space to metres in the world, shape (3, 3)."""
+    return np.array(thing.matrix_world)[:3, :3] * bpy.context.scene.unit_settings.scale_length
 
 
 def _coordinates(items: bpy.types.bpy_prop_collection) -> np.ndarray:

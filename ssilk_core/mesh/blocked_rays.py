@@ -72,6 +72,8 @@ class BlockedRays:
     ) -> tuple[Ints, Floats]:
         """Return the result of `find`, from all triangles."""
         found, distances = np.full(len(starts), NO_TRIANGLE), np.full(len(starts), np.inf)
+        if not len(self.blocks):
+            return found, distances
         corners = points[self.faces[self.blocks]].reshape(len(self.blocks), -1, 3)
         centres = (corners.min(axis=1) + corners.max(axis=1)) / 2
         radii = np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1) * (1 + EDGE_SLACK)

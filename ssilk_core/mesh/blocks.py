@@ -13,6 +13,8 @@ def compact_blocks(points: Floats, size: int) -> Ints:
 
     The last block is padded with its last index.
     """
+    if not len(points):
+        return np.zeros((0, size), dtype=np.int32)
     blocks, parts = [], [np.arange(len(points))]
     while parts:
         part = parts.pop()

@@ -14,8 +14,9 @@ from ..setup.surface import closest_on_surface
 from .finding import Finding, Findings, format_count, format_joints, index_tuple
 from .settle import DEEPEST, Settled, settle
 
-COLLISION_MARGIN = FABRICS["default"].margin  # [m]
+COLLISION_MARGIN = FABRICS["default"].contact_distance  # [m]
 TOO_DEEP = f"leaves a garment that is more than {1000 * DEEPEST:g} mm deep as it is, because it is not fitted"
+NOT_SETTLED = "leaves this garment as it is, because settling found no shape that is less deep in the body"
 MAX_INSIDE_SHARE = 0.25  # share of vertices inside the body above which penetration is an error
 ALIGNMENT_SAMPLES = 400  # number of vertices that the alignment is measured with
 SCALES = (1.0, 0.01, 100.0, 0.1, 10.0, 0.001, 1000.0, 0.0254, 1 / 0.0254)
@@ -148,16 +149,16 @@ def penetration(mesh: Mesh, body: Mesh) -> Findings:
     settled = settle(mesh, body)
     inside = settled.before.vertices
     if len(inside):
+        what = f"{share:.1%} of all vertices, and points inside triangles," if share else "points inside triangles"
         yield Finding(
             severity="error" if share > MAX_INSIDE_SHARE else "warning",
             code="penetration",
             prim=mesh.path,
             count=len(inside),
-            found=f"{share:.1%} of all vertices, and points inside triangles, are inside the body, up to "
-            f"{1000 * settled.before.depth:.1f} mm deep",
+            found=f"{what} are inside the body, up to {1000 * settled.before.depth:.1f} mm deep",
             why="this is the rest shape: elastic and collision forces oppose each other in every frame",
             fix="settle the garment out of the body in the bind pose, or make it wider; --fix "
-            + (describe_move(settled, "moves") if settled.moved else TOO_DEEP)
+            + (describe_move(settled, "moves") if settled.moved else _why_still(settled))
             + (f", and {format_count(len(settled.after.vertices), 'vertices')} stay inside" if settled.left else ""),
             fixable=not settled.left,
             elements="vertices",
@@ -172,7 +173,6 @@ def penetration(mesh: Mesh, body: Mesh) -> Findings:
             found=f"the nearest of them is {1000 * signed[near].min():.1f} mm from the body; collisions start at "
             f"{1000 * COLLISION_MARGIN:g} mm",
             why="collisions push the cloth slightly outward there, even at rest",
-            fixable=settled.moved > 0 and not settled.left,
             elements="vertices",
             indices=index_tuple(near),
         )
@@ -197,7 +197,11 @@ def describe_left(settled: Settled, mesh: Mesh, character: Character) -> str:
     joints, count = np.unique(body.skin.indices[beneath, strongest], return_counts=True)
     where = format_joints(character.skeleton, joints[np.argsort(-count, kind="stable")], 3)
     deep = f"{format_count(len(left), 'vertices')} inside the body, up to {1000 * settled.after.depth:.1f} mm deep"
-    return f"left {deep}, at {where}" + ("" if settled.moved else f": {TOO_DEEP}")
+    return f"left {deep}, at {where}" + ("" if settled.moved else f": {_why_still(settled)}")
+
+
+def _why_still(settled: Settled) -> str:
+    return NOT_SETTLED if settled.failed else TOO_DEEP
 
 
 def signed_distance(points: Floats, body: Mesh) -> Floats:

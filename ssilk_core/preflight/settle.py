@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
 Mask = NDArray[np.bool_]
-GAP = 4e-3  # [m] that settled cloth keeps from the body; contact with the default fabric begins there
+GAP = 4e-3  # [m] that settled cloth keeps from the body
 DEEPEST = 0.04  # [m] from which a garment is not fitted to this body at all
 TOLERANCE = 4e-4  # [m] that a sample may lie nearer than it should; cloth is settled so much beyond the gap
 SLOPE = 10.0  # cloth takes part as far from a sample as this many times the way that the sample moves ...
@@ -31,6 +31,7 @@ ITERATIONS = 30
 RESTING = 2e-4  # [m] movement of 99 % of the vertices in an iteration from which on the garment rests
 CALM = 6  # iterations after which steps are damped more and more, so that cloth in a crease comes to rest
 LAYER_DISTANCE = 0.012  # [m] within which layers are tied
+ACROSS = 0.7  # cosine between cloth's normal and the way to another layer, at least
 LEAST_FRICTION = 2e-3  # of contacts, relative to the penalty
 DAMPING = 0.4  # growth of the damping in each further iteration, relative to the stiffness of an edge
 TOUCHING = 1e-4  # [m] from its plane up to which a sample is taken to touch it at first
@@ -59,11 +60,13 @@ class Settled:
     Attributes:
         offsets: how far the vertices move [m], shape (V, 3); exactly zero for those that stay.
         before, after: what lies in the body.
+        failed: whether no shape was found that is less deep in the body, so that the garment stays as it is.
     """
 
     offsets: Floats
     before: PartInside
     after: PartInside
+    failed: bool = False
 
     @property
     def left(self) -> bool:
@@ -89,10 +92,11 @@ class Settled:
 def settle(mesh: Mesh, body: Mesh, gap: float = GAP) -> Settled:
     """Settle a garment out of a body.
 
-    Every vertex, point inside a triangle, and vertex of the body beneath cloth comes to lie at least `gap` apart [m].
-    The change of shape (`ShapeEnergy`) is the least that this allows. Coincident vertices move together. Cloth far
-    from any that must move stays exactly as it is. So does all of it where nothing is inside, or where it lies deeper
-    than `DEEPEST`.
+    Every vertex, point inside a triangle, and vertex of the body beneath cloth comes to lie at least `gap` apart [m],
+    as far as `ITERATIONS` allow; `Settled.after` tells what is left. The change of shape (`ShapeEnergy`) is the least
+    that this allows. Coincident vertices move together. Cloth far from any that must move stays exactly as it is. So
+    does all of it where nothing is inside, where it lies deeper than `DEEPEST`, or where it would come to lie deeper
+    than before (`Settled.failed`).
     """
     return _Cloth(mesh, body).settled(gap)
 
@@ -111,11 +115,15 @@ class _Cloth:
         self.samples = sample_cloth(self.points, self.faces)
 
     def settled(self, gap: float) -> Settled:
-        before = self._part_inside(self.samples, self.points)
+        before, still = self._part_inside(self.samples, self.points), np.zeros((len(self.joined), 3))
         if before.depth > DEEPEST or not len(before.vertices):
-            return Settled(np.zeros((len(self.joined), 3)), before, before)
+            return Settled(still, before, before)
         points = _Solve(self, gap).run()
+        if not np.isfinite(points).all():
+            return Settled(still, before, before, failed=True)
         after = self._part_inside(sample_cloth(points, self.faces), points)  # stretched triangles need more samples
+        if after.depth > before.depth:
+            return Settled(still, before, before, failed=True)
         return Settled((points - self.points)[self.joined], before, after)
 
     def _part_inside(self, samples: ClothSamples, points: Floats) -> PartInside:
@@ -141,7 +149,7 @@ class _Solve:
         self.energy = ShapeEnergy(cloth.points, cloth.faces, _layer_ties(cloth, self.facing, self.free))
 
     def run(self) -> Floats:
-        """Return where the vertices come to rest [m], shape (V, 3)."""
+        """Return where the vertices come to rest [m], shape (V, 3); not finite if the equations have no solution."""
         points, step, brake = self.cloth.points, np.inf, 0.0
         for iteration in range(ITERATIONS):
             contacts = self._contacts(points)
@@ -149,6 +157,8 @@ class _Solve:
                 break
             friction, damping = max(LEAST_FRICTION, 0.1 * 0.5**iteration), max(brake, DAMPING * (iteration - CALM))
             new = self._step(points, contacts, friction, damping)
+            if not np.isfinite(new).all():
+                return new
             moved, points = np.linalg.norm(new - points, axis=1)[self.free], new
             brake = max(DAMPING, 4 * brake) if moved.max() > LONGEST_STEP else brake / 2
             step = np.quantile(moved, 0.99)
@@ -252,5 +262,9 @@ def _layer_ties(cloth: _Cloth, facing: Facing, free: Mask) -> Ints:
     around = links @ links @ links
     pairs = np.sort(near[pairs], axis=1)
     apart = np.asarray(around[pairs[:, 0], pairs[:, 1]]).reshape(-1) == 0
-    alike = np.einsum("tc,tc->t", facing.directions[pairs[:, 0]], facing.directions[pairs[:, 1]]) > 0.5
-    return pairs[apart & alike]
+    directions, between = facing.directions[pairs], cloth.points[pairs[:, 0]] - cloth.points[pairs[:, 1]]
+    alike = np.einsum("tc,tc->t", directions[:, 0], directions[:, 1]) > 0.5
+    # What lies beside a vertex is of its own layer, if that is fine.
+    height = np.abs(np.einsum("tc,tc->t", between, directions[:, 0]))
+    across = height > ACROSS * np.linalg.norm(between, axis=1)
+    return pairs[apart & alike & across]

@@ -11,6 +11,8 @@ from ssilk_core.assets import Mesh
 
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
+from mathutils import Matrix
+
 from blender_addon.scene.keys import curves_of
 
 from .conftest import activate, add_mesh
@@ -156,10 +158,15 @@ def test_fixes_keep_classes_weights_and_shape_keys(ready, skirt):
     assert skirt.vertex_groups["Hips"].weight(100) == 1
 
 
-def test_cloth_in_the_body_is_pushed_out_with_its_shape_keys(ready, skirt):
+@pytest.mark.parametrize("scale", [1, 0.01])
+def test_cloth_in_the_body_is_pushed_out_with_its_shape_keys(ready, skirt, scale):
+    skirt.data.transform(Matrix.Scale(1 / scale, 4))
+    skirt.scale = (scale,) * 3
+    ready.context.view_layer.update()
     skirt.shape_key_add(name="Basis")
-    skirt.shape_key_add(name="Wide").data[7].co.x += 0.1
-    waist = [vertex.index for vertex in skirt.data.vertices if vertex.co.z > 1.0]
+    skirt.shape_key_add(name="Wide").data[7].co.x += 0.1 / scale
+    height = scale * np.array([vertex.co.z for vertex in skirt.data.vertices])
+    waist = np.flatnonzero(height > 1.0).tolist()
     for block in (skirt.data.vertices, *(block.data for block in skirt.data.shape_keys.key_blocks)):
         for index in waist:
             block[index].co.x *= 0.148 / 0.165
@@ -172,17 +179,18 @@ def test_cloth_in_the_body_is_pushed_out_with_its_shape_keys(ready, skirt):
 
     assert fixer(item) == "ssilk.push_out"
     assert ready.ops.ssilk.push_out() == {"FINISHED"}
-    radius = [np.hypot(*skirt.data.vertices[index].co.xy) for index in waist]
+    radius = [scale * np.hypot(*skirt.data.vertices[index].co.xy) for index in waist]
     assert min(radius) > 0.15
     wide = skirt.data.shape_keys.key_blocks["Wide"]
-    assert np.isclose(wide.data[7].co.x - skirt.data.vertices[7].co.x, 0.1)
-    untouched = [vertex.index for vertex in skirt.data.vertices if vertex.co.z < 0.8]
-    assert all(skirt.data.vertices[index].co == before[index] for index in untouched)
+    assert np.isclose(wide.data[7].co.x - skirt.data.vertices[7].co.x, 0.1 / scale)
+    assert all(skirt.data.vertices[index].co == before[index] for index in np.flatnonzero(height < 0.8))
     shift = np.array([vertex.co - old for vertex, old in zip(skirt.data.vertices, before)])
     stored = np.array([item.vector for item in skirt.data.attributes["SSILK Displacement"].data])
-    np.testing.assert_allclose(stored, shift, atol=1e-6)
+    np.testing.assert_allclose(stored, shift, atol=1e-6 / scale)
     assert ready.ops.ssilk.show_heat(kind="PUSHED_OUT") == {"FINISHED"}
     assert skirt.ssilk.heat == "PUSHED_OUT" and "SSILK Heat" in skirt.data.color_attributes
+    ready.ops.ssilk.inspect()
+    assert "penetration" not in findings(ready) and not fixer(show(ready, "inside-margin"))
 
 
 def test_what_was_not_pushed_out_cannot_be_shown(ready, skirt):

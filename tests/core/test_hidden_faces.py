@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ssilk_core.assets import Mesh
-from ssilk_core.mesh.blocked_rays import NO_TRIANGLE, BlockedRays
+from ssilk_core.mesh.blocked_rays import BLOCK, NO_TRIANGLE, BlockedRays
 from ssilk_core.mesh.hidden_faces import APART, HiddenFaces
 
 RADIUS, GAP, LOW, HIGH = 0.12, 0.01, 0.5, 1.1
@@ -111,6 +111,14 @@ def _sheet(middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     points = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3) + middle
     a = (np.arange(39)[:, None] * 60 + np.arange(59)).reshape(-1)
     return points, np.concatenate([np.c_[a, a + 60, a + 1], np.c_[a + 60, a + 61, a + 1]])
+
+
+def test_no_triangles_block_no_rays():
+    rays = BlockedRays(np.zeros((0, 3)), np.zeros((0, 3), dtype=int))
+    assert rays.blocks.shape == (0, BLOCK)
+    ends = np.zeros(2), np.ones(2)
+    found, distances = rays.find(np.zeros((0, 3)), np.zeros((2, 3)), np.eye(3)[:2], *ends, np.full(2, NO_TRIANGLE))
+    assert (found == NO_TRIANGLE).all() and np.isinf(distances).all()
 
 
 def test_rays_are_blocked_as_trying_every_triangle_says():

@@ -231,6 +231,12 @@ def test_penetration_counts_and_measures():
     assert not list(fit.penetration(tube(0.17), body))
     near = only(fit.penetration(tube(0.1525), body))
     assert (near.code, near.severity, near.fixable) == ("inside-margin", "info", False)
+    assert "collisions start at 8.5 mm" in near.found  # a margin of 8 mm, to fabric of 1 mm
+    cloth = tube(0.157)
+    points = cloth.points.copy()
+    points[:32, [0, 2]] *= 0.145 / 0.157
+    deep, near = fit.penetration(Mesh(cloth.path, points, cloth.faces), body)
+    assert (deep.code, deep.fixable, near.code, near.fixable) == ("penetration", True, "inside-margin", False)
     cloth = tube(0.17)
     points = cloth.points.copy()
     points[:32, [0, 2]] *= 0.12 / 0.17
@@ -238,6 +244,9 @@ def test_penetration_counts_and_measures():
     assert (deep.code, deep.severity, deep.fixable) == ("penetration", "warning", True)
     assert (deep.indices == tuple(range(32)) and "30." in deep.found) or "29." in deep.found
     assert only(fit.penetration(tube(0.1), body)).severity == "error"
+    box = trimesh.creation.box((0.28, 0.3, 0.28))  # only its corners are outside
+    through = next(fit.penetration(Mesh("box", box.vertices + [0, 1.1, 0], box.faces), body))
+    assert through.count == 8 and through.found.startswith("points inside triangles are inside the body")
 
 
 def test_signed_distance_against_a_sphere():

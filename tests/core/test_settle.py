@@ -6,11 +6,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from ssilk_core.assets import Floats, Ints, Mesh
 from ssilk_core.mesh.topology import edges
 from ssilk_core.preflight.cloth_samples import sample_cloth
-from ssilk_core.preflight.settle import GAP, settle
+from ssilk_core.preflight.fit import penetration
+from ssilk_core.preflight.settle import GAP, _Cloth, _layer_ties, settle
+from ssilk_core.preflight.sides import find_facing
 
 RADIUS, COLUMNS, ROWS = 0.1, 32, 27
 
@@ -79,6 +82,22 @@ def test_cloth_that_is_clear_of_the_body_is_left_alone():
     assert not found.offsets.any() and not found.left and found.before.depth == 0
 
 
+def test_cloth_deeper_than_40_mm_is_not_fitted_and_stays():
+    for depth, moves in ((0.038, True), (0.042, False)):
+        found = settle(dented(tube(RADIUS + 0.006, 24, 15), depth), limb())
+        assert abs(found.before.depth - depth) < 1e-3 and found.offsets.any() == moves == (not found.left)
+        assert not found.failed
+
+
+@pytest.mark.parametrize("end", [lambda points: points * [0.99, 1, 0.99], lambda points: points * np.nan])
+def test_what_settling_would_make_worse_stays(monkeypatch, end):
+    monkeypatch.setattr("ssilk_core.preflight.settle._Solve.run", lambda solve: end(solve.cloth.points))
+    cloth = dented(tube(RADIUS + 0.006))
+    found = settle(cloth, limb())
+    assert found.failed and found.left and not found.offsets.any() and found.after is found.before
+    assert "because settling found no shape" in next(penetration(cloth, limb())).fix
+
+
 def test_seams_stay_closed():
     whole = dented(tube(RADIUS + 0.006))
     seam = np.arange(0, whole.vertex_count, COLUMNS)  # through the middle of the dent
@@ -114,6 +133,17 @@ def test_layers_keep_their_order():
     found = settle(both, limb())
     lower, upper = np.split(height_above(both.points + found.offsets), 2)
     assert not found.left and lower.min() > GAP - 2e-4 and (upper - lower).min() > 1e-3
+
+
+def test_a_fine_layer_is_not_tied_to_itself():
+    fine, above = (tube(radius, 56, 14, 0.04) for radius in (0.026, 0.028))  # edges of 3 mm
+    both = Mesh("Cuff", np.r_[fine.points, above.points], np.r_[fine.faces, above.faces + fine.vertex_count])
+    single, double = (_Cloth(mesh, limb(0.02)) for mesh in (fine, both))
+    everything = [np.ones(len(cloth.points), dtype=bool) for cloth in (single, double)]
+    facings = [find_facing(cloth.points, cloth.faces, cloth.surface) for cloth in (single, double)]
+    assert not len(_layer_ties(single, facings[0], everything[0]))
+    ties = np.hypot(*double.points[_layer_ties(double, facings[1], everything[1])][..., ::2].T)
+    assert len(ties.T) >= fine.vertex_count and np.allclose(np.ptp(ties, axis=0), 0.002)
 
 
 def test_a_corner_of_the_body_between_vertices_of_the_cloth_is_covered():
