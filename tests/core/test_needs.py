@@ -94,9 +94,11 @@ def test_only_what_is_not_pinned_meets_the_body(scene, toy_motion):
     objective = parts.stepper(TrainConfig(batch=2, window=4, static_batch=2), 0).objective
     character = parts.bank.character(torch.arange(5))
     x = parts.model.vertices(torch.zeros(5, 8), character).detach()
+    cloth = objective.energy.cloth
+    x = cloth.positions(x)
     normal, offset = objective._planes(x, character)
     expected = nearest_planes(x, parts.body.pose(character), None)
-    free = torch.tensor(classes != PINNED)
+    free = torch.tensor(cloth.samples.classes(classes) != PINNED)
     torch.testing.assert_close(normal[free], expected[0][free])
     torch.testing.assert_close(offset[free], expected[1][free])
     distance = (normal * x).sum(1) - offset

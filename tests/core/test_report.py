@@ -17,7 +17,7 @@ from ssilk_core.report.page import Section, facts, figure, flattened, page, tabl
 from ssilk_core.report.shots import joined
 from ssilk_core.report.terms import SHARE, SHOWN, TermsMeter, worst_frames
 
-CLOTH = Fabric("toy", density=0.2, margin=0.0, collision=7.0)
+CLOTH = Fabric("toy", density=0.2, contact_model="vertex", margin=0.0, thickness=0.0, collision=7.0)
 
 
 @pytest.fixture

@@ -380,6 +380,7 @@ def test_a_vertex_on_a_crease_does_not_keep_the_others_from_coming_to_rest(
     monkeypatch, potential: IncrementalPotential, scene: Scene
 ) -> None:
     x, inputs = moving(scene, 2)
+    potential = IncrementalPotential(scene, replace(potential.fabric, contact_model="vertex"), device=CPU)
     vertex = int(potential.free[len(potential.free) // 2])
     monkeypatch.setattr(potential, "body_distance", creased(potential, vertex, float(x[vertex, 0, 0])))
     options = SolverOptions(tolerance=1e-3)

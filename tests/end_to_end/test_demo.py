@@ -63,18 +63,12 @@ def rigged(garment: str, folder: Path) -> Scene:
 
 @pytest.mark.parametrize("garment", garments.GARMENTS)
 def test_shipped_models_fit_what_the_demo_builds(garment, tmp_path):
-    """The garment, its classes, its weights and its rig, to the rounding of a stage."""
+    """The garment and its classes, to the rounding of a stage; a model keeps the weights and the rig it came with."""
     built, model = rigged(garment, tmp_path), load_model(shipped.shipped_path(garment))
     mine, theirs = model.scene, replace(built, character=replace(built.character, bodies=()))
-    assert mine.joint_names == theirs.joint_names
-    for name in ("parents", "classes"):
-        np.testing.assert_array_equal(getattr(mine, name), getattr(theirs, name))
+    np.testing.assert_array_equal(mine.classes, theirs.classes)
     np.testing.assert_array_equal(mine.garment.mesh.faces, theirs.garment.mesh.faces)
     np.testing.assert_allclose(mine.garment.mesh.points, theirs.garment.mesh.points, atol=1e-5)
-    np.testing.assert_allclose(mine.bind_transforms, theirs.bind_transforms, atol=1e-5)
-    count = len(mine.joint_names)
-    np.testing.assert_allclose(mine.lbs_skin.dense(count), theirs.lbs_skin.dense(count), atol=1e-4)
-    np.testing.assert_allclose(mine.rig.skin.dense(count), theirs.rig.skin.dense(count), atol=1e-4)
 
 
 @pytest.mark.parametrize("garment", garments.GARMENTS)
