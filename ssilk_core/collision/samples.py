@@ -79,7 +79,7 @@ def contact_samples(mesh: Mesh, fabric: Fabric) -> ContactSamples:
         corners.append(np.repeat(faces[own], len(middles), axis=0))
         weights.append(np.tile(middles, (own.sum(), 1)))
         areas.append(np.repeat((area - at_corners)[own] / len(middles), len(middles)))
-    return ContactSamples(mesh.vertex_count, *(np.concatenate(parts) for parts in (corners, weights, areas)))
+    return ContactSamples(mesh.vertex_count, np.concatenate(corners), np.concatenate(weights), np.concatenate(areas))
 
 
 def subdivision_middles(n: int) -> Floats:
