@@ -32,6 +32,18 @@ WORDS = {
         "Der Körper drückt jeden Eckpunkt, wie im Artikel; ein grobes Netz hält weniger stand"
     ),
     "Thickness": "Dicke",
+    "Paper": "Artikel",
+    "Surface": "Fläche",
+    "Vertex": "Eckpunkt",
+    "Gap between cloth and body at which the body begins to push": (
+        "Abstand zwischen Stoff und Körper, ab dem der Körper drückt"
+    ),
+    "Gap at which the body begins to push, in m": "Abstand, ab dem der Körper drückt, in m",
+    "Thickness of the cloth, whose mesh lies in its middle": "Dicke des Stoffs, dessen Netz in seiner Mitte liegt",
+    "Thickness of the cloth, in m": "Dicke des Stoffs, in m",
+    "How hard the body pushes each area away at the skin, in N/m³": (
+        "Wie stark der Körper jede Fläche an der Haut wegdrückt, in N/m³"
+    ),
     "Silk": "Seide",
     "Light and very soft, 80 g/m²": "Leicht und sehr weich, 80 g/m²",
     "Cotton": "Baumwolle",
@@ -65,7 +77,6 @@ WORDS = {
     "Collision": "Kollision",
     "How hard the body pushes each vertex away, in N/m": "Wie stark der Körper jeden Punkt wegdrückt, in N/m",
     "Margin": "Abstand",
-    "Distance at which the body begins to push": "Abstand, ab dem der Körper drückt",
     "Air Drag": "Luftwiderstand",
     "Resistance of the air for each area and speed, in kg/(m² s); zero is a vacuum": (
         "Widerstand der Luft je Fläche und Geschwindigkeit, in kg/(m² s); null ist luftleer"
