@@ -38,9 +38,7 @@ WORDS = {
     "Gap between cloth and body at which the body begins to push": (
         "Abstand zwischen Stoff und Körper, ab dem der Körper drückt"
     ),
-    "Gap at which the body begins to push, in m": "Abstand, ab dem der Körper drückt, in m",
     "Thickness of the cloth, whose mesh lies in its middle": "Dicke des Stoffs, dessen Netz in seiner Mitte liegt",
-    "Thickness of the cloth, in m": "Dicke des Stoffs, in m",
     "How hard the body pushes each area away at the skin, in N/m³": (
         "Wie stark der Körper jede Fläche an der Haut wegdrückt, in N/m³"
     ),
