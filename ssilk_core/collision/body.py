@@ -9,10 +9,11 @@ from torch import Tensor
 
 from ..assets import Body, Ints, Mesh, SkinWeights
 from ..mesh import topology
+from ..mesh.blocks import compact_blocks
 from ..skinning import Skinning
 from .closest_point import triangle_patches
 from .distance import PosedBody
-from .nearest_vertex import BODY_GROUP, compact_blocks
+from .nearest_vertex import BODY_GROUP
 from .one_ring import triangle_rings
 
 

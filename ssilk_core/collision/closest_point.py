@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ..assets import Floats, Ints
-from .nearest_vertex import compact_blocks
+from ..mesh.blocks import compact_blocks
 from .one_ring import closest_in_triangle
 
 MAX_PAIRS = 1 << 25  # pairs of a vertex and a triangle in memory at once, on a CPU

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from ..assets import PINNED, TIGHT, Floats, Ints, Mesh, Scene
 from ..mesh import topology
+from ..mesh.blocks import compact_blocks
 from ..mesh.geodesic import edge_graph
 from .body import faces_among
 from .distance import (
@@ -29,7 +30,7 @@ from .distance import (
     signed_distance_to_planes,
     smoothed_planes,
 )
-from .nearest_vertex import GARMENT_BLOCK, compact_blocks
+from .nearest_vertex import GARMENT_BLOCK
 from .samples import ContactSamples
 from .smoothed_distance import SmoothedDistance
 

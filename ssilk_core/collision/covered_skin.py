@@ -114,7 +114,8 @@ class CoveredSkin:
     """
 
     def __init__(self, scene: Scene, *, count: int = SKIN_POINTS, device: torch.device) -> None:
-        body, skin = scene.character.merged_body().mesh, scene.character.merged_body().skin
+        merged = scene.character.merged_body()
+        body, skin = merged.mesh, merged.skin
         self.points = CoveredPoints(body, scene.garment.mesh, count=count, device=device)
         self.joint_names = scene.character.skeleton.joint_names
         corners, vertices = body.faces[self.points.faces], self.points.vertices

@@ -7,8 +7,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..mesh.blocks import compact_blocks as compact_blocks
-
 MAX_SCORES = 1 << 27  # in memory at once, in batched matrix products
 GARMENT_BLOCK, BODY_GROUP = 32, 8  # vertices of the garment and of the body that the kernel processes together
 

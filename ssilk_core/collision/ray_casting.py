@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ..assets import Mesh
-from .nearest_vertex import compact_blocks
+from ..mesh.blocks import compact_blocks
 
 RAY_PATCH = 8  # triangles with one bounding sphere
 MAX_RAY_PAIRS = 1 << 20, 1 << 26  # pairs of a ray and a patch, or a triangle, at once on a CPU and on a GPU: 1 GB

@@ -75,20 +75,11 @@ def contact_samples(mesh: Mesh, fabric: Fabric) -> ContactSamples:
     corners, weights = [vertices.corners], [vertices.weights]
     areas = [np.bincount(faces.reshape(-1), np.repeat(at_corners / 3, 3), mesh.vertex_count)]
     for n in np.unique(divisions):
-        own, middles = divisions == n, subdivision_middles(n)
+        own, middles = divisions == n, topology.subdivision_middles(n)
         corners.append(np.repeat(faces[own], len(middles), axis=0))
         weights.append(np.tile(middles, (own.sum(), 1)))
         areas.append(np.repeat((area - at_corners)[own] / len(middles), len(middles)))
     return ContactSamples(mesh.vertex_count, np.concatenate(corners), np.concatenate(weights), np.concatenate(areas))
-
-
-def subdivision_middles(n: int) -> Floats:
-    """Return the barycentric coordinates of the middles of n^2 equal triangles in one, shape (n^2, 3)."""
-    i, j = (index.reshape(-1) for index in np.mgrid[:n, :n])
-    upward = np.stack([i, j], axis=1)[i + j < n] + 1 / 3
-    downward = np.stack([i, j], axis=1)[i + j < n - 1] + 2 / 3
-    second = np.concatenate([upward, downward]) / n
-    return np.column_stack([1 - second.sum(axis=1), second])
 
 
 class SampledCloth:

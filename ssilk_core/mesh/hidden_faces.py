@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from ..assets import Floats, Ints, Mesh
 from .blocked_rays import NO_TRIANGLE, BlockedRays
-from .topology import vertex_normals
+from .topology import subdivision_middles, vertex_normals
 
 REACH, DEPTH = 0.08, 0.03  # [m] above and beneath the skin
 FAN = ((40.0, 4), (70.0, 12))  # tilts from the normal [degrees], and how many directions at each
@@ -192,21 +192,11 @@ def _points_on(mesh: Mesh, chosen: Ints, inside: bool) -> tuple[Ints, Floats, In
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     parts = np.maximum(1, np.ceil(longest / SPACING)).astype(int) if inside else np.zeros(0, dtype=int)
     for count in np.unique(parts):
-        weights, which = _middles(count), np.flatnonzero(parts == count)
+        weights, which = subdivision_middles(count), np.flatnonzero(parts == count)
         each = np.repeat(which, len(weights))
         found.append((faces[each], np.tile(weights, (len(which), 1)), chosen[each]))
     indices, weights, owners = (np.concatenate(part) for part in zip(*found))
     return indices, weights.astype(np.float32), owners
-
-
-def _middles(count: int) -> Floats:
-    """Return the middles of the count^2 equal parts of a triangle, in barycentric coordinates."""
-    i, j = (part.reshape(-1) for part in np.mgrid[:count, :count])
-    upward = i + j < count
-    downward = i + j < count - 1
-    u = np.concatenate([i[upward] + 1 / 3, i[downward] + 2 / 3]) / count
-    v = np.concatenate([j[upward] + 1 / 3, j[downward] + 2 / 3]) / count
-    return np.stack([1 - u - v, u, v], axis=1)
 
 
 def _fan() -> Floats:

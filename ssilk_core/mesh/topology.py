@@ -133,3 +133,18 @@ def _face_crosses(points: Floats, faces: Ints) -> Floats:
 def _unit(vectors: Floats) -> Floats:
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
+
+
+def subdivision_middles(n: int) -> Floats:
+    """Return the barycentric coordinates of the middles of n^2 equal triangles in one, shape (n^2, 3)."""
+    i, j = (index.reshape(-1) for index in np.mgrid[:n, :n])
+    upward = np.stack([i, j], axis=1)[i + j < n] + 1 / 3
+    downward = np.stack([i, j], axis=1)[i + j < n - 1] + 2 / 3
+    second = np.concatenate([upward, downward]) / n
+    return np.column_stack([1 - second.sum(axis=1), second])
+
+
+def is_inside_out(points: Floats, faces: Ints) -> bool:
+    """Return whether the normals of a closed mesh point inward: its faces enclose a negative volume."""
+    a, b, c = np.moveaxis((points - points.mean(axis=0))[faces], 1, 0)
+    return bool(np.einsum("fi,fi->", a, np.cross(b, c)) < 0)

@@ -9,8 +9,8 @@ import numpy as np
 
 from ..assets import Character, Floats, Mesh
 from ..fabrics import FABRICS
-from ..mesh.topology import edge_use, vertex_mask
-from ..setup.surface import closest_on_surface
+from ..mesh.topology import edge_use, is_inside_out, vertex_mask
+from ..setup.surface import closest_on_surface, is_enclosed
 from .finding import Finding, Findings, format_count, format_joints, index_tuple
 from .settle import DEEPEST, Settled, settle
 
@@ -126,8 +126,7 @@ def body_holes(body: Mesh) -> Findings:
 
 def body_inside_out(body: Mesh) -> Findings:
     """Yield an error if the body's normals point inward: its faces enclose a negative volume."""
-    a, b, c = np.moveaxis((body.points - body.points.mean(axis=0))[body.faces], 1, 0)
-    if np.einsum("fi,fi->", a, np.cross(b, c)) < 0:
+    if is_inside_out(body.points, body.faces):
         yield Finding(
             severity="error",
             code="body-inside-out",
@@ -205,8 +204,5 @@ def _why_still(settled: Settled) -> str:
 
 
 def signed_distance(points: Floats, body: Mesh) -> Floats:
-    """Return the distance to the body's surface [m], negative where the winding number exceeds 0.5, shape (V,)."""
-    import igl
-
-    winding = igl.fast_winding_number(body.points, body.faces, np.ascontiguousarray(points))
-    return np.where(np.abs(winding) > 0.5, -1.0, 1.0) * _distance(points, body)
+    """Return the distance to the body's surface [m], negative inside, shape (V,)."""
+    return np.where(is_enclosed(points, body), -1.0, 1.0) * _distance(points, body)

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..assets import Floats, Ints, Mesh
-from ..mesh.topology import components, edges, islands, smooth, vertex_areas, vertex_normals
-from ..setup.surface import closest_on_surface
+from ..mesh.topology import components, edges, is_inside_out, islands, smooth, vertex_areas, vertex_normals
+from ..setup.surface import closest_on_surface, is_enclosed
 from .winding import consistent_flips
 
 Mask = NDArray[np.bool_]
@@ -77,13 +77,8 @@ class OuterSurface:
         self.face_normals = directions[seen] if seen.any() else directions
 
     def inside(self, points: Floats) -> Mask:
-        """Return whether points (S, 3) lie in the body: their winding number exceeds 0.5, shape (S,)."""
-        import igl
-
-        if not len(points):
-            return np.zeros(0, dtype=bool)
-        winding = igl.fast_winding_number(self.whole.points, self.whole.faces, np.ascontiguousarray(points))
-        return np.abs(winding) > 0.5
+        """Return whether points (S, 3) lie in the body, shape (S,)."""
+        return is_enclosed(points, self.whole)
 
     def nearest(self, points: Floats) -> SurfaceSide:
         """Return the nearest points of the surface."""
@@ -163,8 +158,7 @@ def _share_of_island(part: Ints, points: Floats, faces: Ints) -> Floats:
 
 
 def _outward_faces(body: Mesh) -> Ints:
-    a, b, c = np.moveaxis((body.points - body.points.mean(axis=0))[body.faces], 1, 0)
-    return body.faces[:, ::-1] if np.einsum("fi,fi->", a, np.cross(b, c)) < 0 else body.faces
+    return body.faces[:, ::-1] if is_inside_out(body.points, body.faces) else body.faces
 
 
 def _closest(points: Floats, mesh: Mesh, shaded: Mesh | None = None) -> tuple[Floats, Floats, Floats]:

@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..assets import Floats, Ints, Mesh
 from ..mesh.topology import vertex_normals
@@ -50,3 +51,13 @@ def barycentric_coordinates(points: Floats, triangles: Floats) -> Floats:
         found /= found.sum(axis=1, keepdims=True)
     nearest = np.linalg.norm(triangles - points[:, None], axis=2).argmin(axis=1)
     return np.where(np.isfinite(found).all(axis=1, keepdims=True), found, np.eye(3)[nearest])
+
+
+def is_enclosed(points: Floats, mesh: Mesh) -> NDArray[np.bool_]:
+    """Return whether a closed mesh encloses points (S, 3): their winding number exceeds 0.5, shape (S,)."""
+    import igl
+
+    if not len(points):
+        return np.zeros(0, dtype=bool)
+    winding = igl.fast_winding_number(mesh.points, mesh.faces, np.ascontiguousarray(points))
+    return np.abs(winding) > 0.5

@@ -8,10 +8,11 @@ import pytest
 import torch
 
 from ssilk_core.assets import LOOSE, PINNED, TIGHT, Mesh
-from ssilk_core.collision.samples import MAX_SPACING, SampledCloth, contact_samples, subdivision_middles
+from ssilk_core.collision.samples import MAX_SPACING, SampledCloth, contact_samples
 from ssilk_core.energy import GarmentEnergy
 from ssilk_core.energy.collision import ContactLaw
 from ssilk_core.fabrics import FABRICS, Fabric
+from ssilk_core.mesh.topology import subdivision_middles
 
 CPU = torch.device("cpu")
 SOFT = Fabric("soft", contact=2e5, margin=0.01, thickness=0.002)

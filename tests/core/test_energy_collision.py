@@ -13,12 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from ssilk_core.assets import Body, Mesh, SkinWeights
 from ssilk_core.collision import CollisionBody, PosedBody, distance, nearest_planes, nearest_vertex, signed_distance
-from ssilk_core.collision.nearest_vertex import compact_blocks
 from ssilk_core.collision.one_ring import nearest_on_rings, triangle_rings
 from ssilk_core.energy import GarmentEnergy
 from ssilk_core.energy.collision import ContactLaw
 from ssilk_core.fabrics import FABRICS
 from ssilk_core.kinematics import skin_points
+from ssilk_core.mesh.blocks import compact_blocks
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"  # on a CPU kernels run in Triton's interpreter
 KERNELS = pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="kernels need Triton")
