@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from ..collision import CoveredSkin, ShownCounts
 
-SKIN_FRAMES = 512  # samples of a shot that are counted at most, spread evenly: rays take long on a CPU
+SKIN_FRAMES = 48  # samples of a shot that are counted at most, spread evenly: a count takes as long as two frames
 
 
 class SkinMeter:

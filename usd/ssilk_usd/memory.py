@@ -18,14 +18,19 @@ STACK = 8 << 20  # bytes of each thread that USD may start meanwhile
 
 def allowed_gib() -> float:
     """Return how many GiB reading may take: from the environment, else the default."""
-    text = os.environ.get(VARIABLE, str(USUAL))
+    return positive_setting(VARIABLE, USUAL, "GiB")
+
+
+def positive_setting(variable: str, usual: float, unit: str) -> float:
+    """Return a positive number from the environment, `usual` where it is not set; raise `SsilkError` for others."""
+    text = os.environ.get(variable, str(usual))
     try:
-        allowed = float(text)
+        number = float(text)
     except ValueError:
-        allowed = 0.0
-    if not 0 < allowed < 1e6:
-        fail(VARIABLE, f"'{text}'", "a number of GiB is needed", "correct it in the environment")
-    return allowed
+        number = 0.0
+    if not 0 < number < 1e6:
+        fail(variable, f"'{text}'", f"a number of {unit} is needed", "correct it in the environment")
+    return number
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from ssilk_core.kinematics import matrix_from_quaternion, quaternion_from_matrix
 
 from .read_skeleton import skeletons
 from .read_skin import match_joints
-from .read_spaces import joints_to_core, need_similarity
+from .read_spaces import joints_to_core, need_similarity, similarity_scale
 from .read_stage import (
     PRIMS,
     USD_SUFFIXES,
@@ -32,6 +32,7 @@ from .read_stage import (
 from .units import StageUnits
 
 _SCALE_TOLERANCE = 1e-3
+_FRAMES_AT_ONCE = 1024  # while reading: 4 MB for each array of matrices of 30 joints
 _MOST_FRAMES = 200_000  # close to two hours at 30 frames a second
 
 
@@ -87,20 +88,24 @@ def read_motion(source: StageLike, skeleton: Skeleton, *, prim: str | None = Non
     joints = tuple(str(name) for name in UsdSkel.Animation(animation).GetJointsAttr().Get() or ())
     match = _matched(joints, skeleton, where)
     codes, fps = _time_codes(stage, animation, placed)
-    rotations, translations = read_samples(animation, codes, len(joints), where)
     placements = np.stack([world_matrix(placed, code) for code in codes]) if placed else np.eye(4)[None]
     if placed:
         need_similarity(placed, placements)
-    local = joints_to_core(
-        rigid(matrix_from_quaternion(rotations), translations)[:, match],
-        skeleton.parents,
-        placements,
-        StageUnits.of(stage),
-    )
-    local[:, match < 0] = skeleton.rest_transforms[match < 0]
-    _check_lengths(local[:, match >= 0], skeleton.rest_transforms[match >= 0], skeleton.parents[match >= 0], where)
+    scale = similarity_scale(placements)
+    rotations, translations = (np.empty((len(codes), skeleton.joint_count, width)) for width in (4, 3))
+    for first in range(0, len(codes), _FRAMES_AT_ONCE):
+        part = slice(first, first + _FRAMES_AT_ONCE)
+        turned, moved = read_samples(animation, codes[part], len(joints), where)
+        authored = rigid(matrix_from_quaternion(turned), moved)[:, match]
+        placement = placements[part] if placed else placements
+        local = joints_to_core(authored, skeleton.parents, placement, StageUnits.of(stage), scale)
+        local[:, match < 0] = skeleton.rest_transforms[match < 0]
+        if not first:
+            kept = match >= 0
+            _check_lengths(local[:, kept], skeleton.rest_transforms[kept], skeleton.parents[kept], where)
+        rotations[part], translations[part] = quaternion_from_matrix(local[..., :3, :3]), local[..., :3, 3]
     start = float(codes[0] * fps / stage.GetTimeCodesPerSecond())
-    return Motion(where, fps, quaternion_from_matrix(local[..., :3, :3]), local[..., :3, 3], start)
+    return Motion(where, fps, rotations, translations, start)
 
 
 def find_animation(stage: Usd.Stage, prim: str | None, root: str | None) -> tuple[Usd.Prim, Usd.Prim | None]:

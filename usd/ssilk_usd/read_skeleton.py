@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdSkel
 
@@ -122,7 +124,7 @@ def _source(root: Usd.Prim, prim: Usd.Prim) -> SkelSource:
 
 def _parents(joints: tuple[str, ...], where: str) -> Ints:
     """Return parent indices by UsdSkel's rule: the parent is the nearest ancestor path that is a joint."""
-    repeated = next((name for name in joints if joints.count(name) > 1), None)
+    repeated = next((name for name, count in Counter(joints).items() if count > 1), None)
     if repeated is not None:
         fail(where, f"joint '{repeated}' is listed twice", "each joint needs its own path", "rename one")
     broken = next((name for name in joints if not Sdf.Path.IsValidPathString(name)), None)

@@ -113,7 +113,9 @@ class SkelSource:
         return np.stack([side, stage_up, np.cross(side, stage_up)]).T @ np.stack([side, up, np.cross(side, up)])
 
 
-def joints_to_core(local: Floats, parents: Ints, placement: Floats, units: StageUnits) -> Floats:
+def joints_to_core(
+    local: Floats, parents: Ints, placement: Floats, units: StageUnits, scale: float | None = None
+) -> Floats:
     """Return joint-to-parent transforms in metres, y up, with the placement applied to the roots.
 
     Args:
@@ -121,8 +123,9 @@ def joints_to_core(local: Floats, parents: Ints, placement: Floats, units: Stage
         parents: index of each joint's parent, -1 for roots, shape (J,).
         placement: skeleton space to world, similarities, shape (4, 4) or (..., 4, 4).
         units: units of the stage.
+        scale: uniform scale of all placements; by default that of the first.
     """
-    scale = similarity_scale(placement) * units.meters_per_unit
+    scale = (similarity_scale(placement) if scale is None else scale) * units.meters_per_unit
     result = np.array(local, dtype=np.float64)
     result[..., :3, 3] *= scale
     roots = np.flatnonzero(np.asarray(parents) < 0)

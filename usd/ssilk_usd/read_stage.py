@@ -16,10 +16,12 @@ from ssilk_core.assets import Floats
 from ssilk_core.errors import fail
 from ssilk_core.files import sha256
 
+from . import memory, trial
 from .garment_api import register_schema
-from .memory import VARIABLE, allowed_gib, bounded_memory
+from .memory import allowed_gib, bounded_memory
 from .names import LAYER_SUFFIXES
 from .specs import free_when_closed
+from .trial import allowed_seconds, tried
 
 Reader = TypeVar("Reader", bound=Callable[..., Any])
 StageLike: TypeAlias = str | Path | Usd.Stage
@@ -28,27 +30,42 @@ EARLIEST = Usd.TimeCode.EarliestTime()
 # Readers traverse instance proxies, because a referenced character may be instanceable.
 PRIMS = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
 register_schema()  # before the first stage is opened, because USD reads its schema list only once
-_ALLOWED = f"a complete .usd, .usda, .usdc or .usdz file is needed, with arrays of at most {{:g}} GiB ({VARIABLE})"
 _MISSING = (Pcp.ErrorInvalidAssetPath, Pcp.ErrorInvalidSublayerPath, Pcp.ErrorUnresolvedPrimPath)
 
 
 def needs_whole_files(read: Reader) -> Reader:
-    """Decorate a reader, whose first argument is its source, so that a damaged file raises one `SsilkError`."""
+    """Decorate a reader, whose first argument is its source, so that a damaged file raises one `SsilkError`.
+
+    It is read twice: first where a crash or a hang harms nobody (`trial`).
+    """
 
     @wraps(read)
     def reader(source: StageLike, *args: Any, **options: Any) -> Any:
-        try:
+        def bounded() -> Any:
             with bounded_memory():
                 return read(source, *args, **options)
-        except MemoryError:
-            where = stage_name(source) if isinstance(source, Usd.Stage) else str(source)
-            fail(where, "it declares arrays that do not fit into memory", _ALLOWED.format(allowed_gib()))
-        except (Tf.ErrorException, UnicodeDecodeError) as error:
-            where = stage_name(source) if isinstance(source, Usd.Stage) else str(source)
-            reason = usd_reason(error) if isinstance(error, Tf.ErrorException) else "it holds text that is not UTF-8"
-            fail(where, f"it cannot be read as USD ({reason})", _ALLOWED.format(allowed_gib()))
+
+        where = stage_name(source) if isinstance(source, Usd.Stage) else str(source)
+        with tried(bounded) as ending:
+            if ending:
+                fail(where, ending, _allowed())
+            try:
+                return bounded()
+            except MemoryError:
+                fail(where, "it declares arrays that do not fit into memory", _allowed())
+            except (Tf.ErrorException, UnicodeDecodeError) as error:
+                usd = isinstance(error, Tf.ErrorException)
+                reason = usd_reason(error) if usd else "it holds text that is not UTF-8"
+                fail(where, f"it cannot be read as USD ({reason})", _allowed())
 
     return cast(Reader, reader)
+
+
+def _allowed() -> str:
+    return (
+        "a complete .usd, .usda, .usdc or .usdz file is needed, which can be read with arrays of at most "
+        f"{allowed_gib():g} GiB ({memory.VARIABLE}) and in {allowed_seconds():g} s ({trial.VARIABLE})"
+    )
 
 
 def usd_reason(error: Tf.ErrorException) -> str:
