@@ -16,12 +16,13 @@ from contextvars import ContextVar
 
 from .memory import HOST, positive_setting
 
-VARIABLE, USUAL = "SSILK_READ_SECONDS", 30.0
+VARIABLE, USUAL = "SSILK_READ_SECONDS", 30.0  # of computing, so that busy machines refuse nothing
+WAITING = 4  # times as long may pass in all
 _within = ContextVar("_within", default=False)
 
 
 def allowed_seconds() -> float:
-    """Return how many seconds reading may take: from the environment, else the default."""
+    """Return how many seconds of computing reading may take: from the environment, else the default."""
     return positive_setting(VARIABLE, USUAL, "seconds")
 
 
@@ -55,13 +56,13 @@ def _ending(read: Callable[[], object], seconds: float) -> str:
     if not os.WIFSIGNALED(status):
         return ""
     number = os.WTERMSIG(status)
-    if number == signal.SIGALRM:
-        return f"reading it takes more than {seconds:g} s"
+    if number in (signal.SIGPROF, signal.SIGALRM):
+        return f"reading it takes more than {seconds if number == signal.SIGPROF else WAITING * seconds:g} s"
     return f"reading it ends the process by signal {number} ({signal.Signals(number).name})"
 
 
 def _read_and_exit(read: Callable[[], object], seconds: float) -> None:
-    """Read, without a word and within `seconds`; end this process."""
+    """Read, without a word and within `seconds` of computing; end this process."""
     with suppress(BaseException):  # the caller reads again, and meets it where it can be told
         import resource
 
@@ -69,8 +70,9 @@ def _read_and_exit(read: Callable[[], object], seconds: float) -> None:
         os.dup2(silence, 1)
         os.dup2(silence, 2)
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        for number in (signal.SIGALRM, signal.SIGINT, signal.SIGTERM):
+        for number in (signal.SIGPROF, signal.SIGALRM, signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_DFL)
-        signal.setitimer(signal.ITIMER_REAL, seconds)
+        signal.setitimer(signal.ITIMER_PROF, seconds)
+        signal.setitimer(signal.ITIMER_REAL, WAITING * seconds)
         read()
     os._exit(0)
