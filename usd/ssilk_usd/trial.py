@@ -64,8 +64,10 @@ def _ending(read: Callable[[], object], seconds: float) -> str:
 def _read_and_exit(read: Callable[[], object], seconds: float) -> None:
     """Read, without a word and within `seconds` of computing; end this process."""
     with suppress(BaseException):  # the caller reads again, and meets it where it can be told
+        import faulthandler
         import resource
 
+        faulthandler.disable()
         silence = os.open(os.devnull, os.O_WRONLY)
         os.dup2(silence, 1)
         os.dup2(silence, 2)
