@@ -58,7 +58,11 @@ class Fuzzer:
     def __init__(self, folder: Path, kind: str, source: Path, character: Path) -> None:
         self.content, self.path = source.read_bytes(), folder / f"damaged{source.suffix}"
         skeleton = read_character(character).skeleton
-        readers = {"character": read_character, "motion": lambda path: read_motion(path, skeleton), "model": load_model}
+        readers = {
+            "character": read_character,
+            "motion": lambda path: read_motion(path, skeleton),
+            "model": load_model,
+        }
         self.read, self.ends, self.longest = readers[kind], Counter(), 0.0
 
     def step(self, draw: random.Random) -> None:
