@@ -3,7 +3,8 @@
 
 Nothing is unpickled. Tensors are named "scene.*" (the garment, its rig and the skeleton) or "model.*" (the
 parameters). Each has the narrowest type that holds it. The header has one JSON document under "ssilk". Quantised
-matrices are 16-bit integers, with their scales in "scale.model.*".
+matrices are 16-bit integers, with their scales in "scale.model.*". A checksum covers everything. Models of earlier
+versions, the shipped ones among them, have none and are read without a warning, on which nobody could act.
 """
 
 from __future__ import annotations
@@ -24,12 +25,13 @@ from .fabrics import FABRIC_OF_VERTICES, Fabric
 from .files import replacing
 from .packing import dequantize, narrowest, quantize
 from .parameters import Shapes, parameter_shapes
-from .tensors import read_tensors
+from .tensors import pack_tensors, read_tensors
 
 if TYPE_CHECKING:
     from .model.network import GarmentModel
 
 FORMAT = 4
+HEADER_NAME = "ssilk"  # of the JSON document in the metadata
 # Settings that format 3 stores under other names. Formats before 3 hold networks of another architecture.
 RENAMED_SINCE_3 = {
     "config": {"bound": "latent_bound", "push": "max_latent_step"},
@@ -93,11 +95,10 @@ def save_model(path: str | Path, model: ModelFile, *, pack: bool = False) -> Non
         pack: store parameter matrices in 16 bits and skinning weights in single precision, which halves the size
             of the file. `benchmarks/precision.py` measures the effect on the result.
     """
-    from safetensors.numpy import save
-
     arrays = {name: narrowest(np.ascontiguousarray(value)) for name, value in _tensors(model).items()}
+    words = {HEADER_NAME: json.dumps(_document(model))}
     with replacing(path) as temporary:
-        temporary.write_bytes(save(_packed(arrays) if pack else arrays, {"ssilk": json.dumps(_document(model))}))
+        temporary.write_bytes(pack_tensors(_packed(arrays) if pack else arrays, words))
 
 
 def _tensors(model: ModelFile) -> dict[str, Any]:
@@ -184,14 +185,14 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     if not path.is_file():
         fail(str(path), "there is no such model file", "a file written by 'ssilk train' is needed")
     try:
-        tensors, words = read_tensors(path)
+        tensors, words = read_tensors(path, HEADER_NAME)
     except ValueError as error:
         first = str(error).partition("\n")[0]
         raise SsilkError(
             f"{path}: this is not a safetensors file, or it is truncated or damaged ({first}); train again or fetch "
             "the file again."
         ) from error
-    header = words.get("ssilk", "")
+    header = words.get(HEADER_NAME, "")
     if not header:
         fail(str(path), "a safetensors file without SSILK's header", "a file written by 'ssilk train' is needed")
     try:

@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read safetensors files with only numpy, for environments without the library; the content is not trusted.
+"""Safetensors files with a checksum, read with only numpy and not trusted; writing needs the library.
 
 A file has the length of the header (8 bytes, little endian), the header (JSON with the type, shape and byte range of
-each tensor), and the tensors without gaps [huggingface.co/docs/safetensors].
+each tensor), and the tensors without gaps [huggingface.co/docs/safetensors]. Its metadata holds the SHA-256 of header
+and tensors, with zeros in place of this checksum. Files of earlier versions have none, and are read without a word.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,7 @@ TYPES = {
     "BOOL": "?", "U8": "u1", "I8": "i1", "U16": "<u2", "I16": "<i2", "U32": "<u4", "I32": "<i4", "U64": "<u8",
     "I64": "<i8", "F16": "<f2", "F32": "<f4", "F64": "<f8",
 }  # fmt: skip
+CHECKSUM, NO_CHECKSUM = "sha256", "0" * 64  # its name in the metadata, and what stands there while it is computed
 Tensors = dict[str, NDArray]
 
 
@@ -40,8 +43,28 @@ class Place:
         return np.frombuffer(bytearray(data), self.kind).reshape(self.shape)
 
 
-def read_tensors(path: Path) -> tuple[Tensors, dict[str, str]]:
+def pack_tensors(tensors: Mapping[str, NDArray], words: Mapping[str, str]) -> bytes:
+    """Return the content of a file with these tensors, this metadata and their checksum."""
+    from safetensors.numpy import save
+
+    written = save(dict(tensors), dict(words))
+    size = int.from_bytes(written[:8], "little")
+    header, data = json.loads(written[8 : 8 + size]), memoryview(written)[8 + size :]
+    header["__metadata__"] = {**words, CHECKSUM: NO_CHECKSUM}
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)  # tensors begin at a multiple of eight bytes
+    digest = hashlib.sha256(text)
+    digest.update(data)
+    text = text.replace(NO_CHECKSUM.encode(), digest.hexdigest().encode())
+    return b"".join((len(text).to_bytes(8, "little"), text, data))
+
+
+def read_tensors(path: Path, word: str = "") -> tuple[Tensors, dict[str, str]]:
     """Return the tensors of a file by name, and the text metadata in its header.
+
+    Args:
+        word: the only name that the metadata may have, besides the checksum: a damaged name of the checksum would
+            otherwise hide it. Any by default.
 
     Raises:
         ValueError: the file is not a safetensors file, is damaged, or has a type that numpy lacks.
@@ -50,13 +73,25 @@ def read_tensors(path: Path) -> tuple[Tensors, dict[str, str]]:
         size = int.from_bytes(stream.read(8).ljust(8, b"\0"), "little")
         if not 0 < size <= HEADER_LIMIT:
             raise ValueError("its header has an invalid length")
-        header = _header(stream.read(size))
+        text = stream.read(size)
+        header = _header(text)
         words, left = header.pop("__metadata__", {}), path.stat().st_size - 8 - size
         if not isinstance(words, dict):
             raise ValueError("its metadata is not a table of text")
+        stated = str(words.pop(CHECKSUM, ""))
+        if word and words.keys() - {word}:
+            raise ValueError(f"its metadata has the unknown name {min(words.keys() - {word})[:40]!r}")
+        digest = hashlib.sha256(text.replace(stated.encode(), NO_CHECKSUM.encode(), 1) if stated else text)
         places = sorted(_entries(header), key=lambda place: (place.start, place.stop))
         _need_filled(places, left)
-        return {place.name: place.read(stream.read(place.stop - place.start)) for place in places}, words
+        tensors = {}
+        for place in places:
+            data = stream.read(place.stop - place.start)
+            digest.update(data)
+            tensors[place.name] = place.read(data)
+    if stated and stated != digest.hexdigest():
+        raise ValueError("its content does not match its checksum")
+    return tensors, words
 
 
 def _need_filled(places: list[Place], size: int) -> None:

@@ -15,6 +15,7 @@ from torch import Tensor
 from ..assets import Motion
 from ..files import replacing
 from ..motion_bank import MAX_JOINT_SPEED, MotionBank, usable_spans
+from ..tensors import pack_tensors
 from .skipped_steps import SkippedSteps
 from .state import learned_tensors
 from .step import Stepper
@@ -85,8 +86,6 @@ def save_fault(path: Path, stepper: Stepper, motions: Sequence[Motion], found: s
     Tensors "window.*" are the inputs of the step. The header holds under "ssilk_fault" what was found, the iteration
     after the step, and the motion and frame at which each slot of the window begins.
     """
-    from safetensors.torch import save
-
     skipped, bank = stepper.skipped, stepper.objective.bank
     still = int(skipped.iteration) < stepper.config.static_iterations
     window = {name: value.cpu() for name, value in skipped.window.items() if (name in STATIC_INPUTS) == still}
@@ -94,8 +93,9 @@ def save_fault(path: Path, stepper: Stepper, motions: Sequence[Motion], found: s
     places = [] if frames is None else locate_frames(frames, bank, motions, stepper.model.config.fps)
     document = {"found": found, "iteration": int(skipped.iteration) + 1, "places": places}
     tensors = learned_tensors(stepper) | {f"window.{name}": value.contiguous() for name, value in window.items()}
+    arrays = {name: value.numpy() for name, value in tensors.items()}
     with replacing(path) as temporary:
-        temporary.write_bytes(save(tensors, {"ssilk_fault": json.dumps(document)}))
+        temporary.write_bytes(pack_tensors(arrays, {"ssilk_fault": json.dumps(document)}))
 
 
 def locate_frames(frames: Tensor, bank: MotionBank, motions: Sequence[Motion], fps: float) -> list[dict[str, Any]]:

@@ -8,6 +8,7 @@ import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
+from math import inf, isfinite
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from ..assets import Scene
 from ..config import TrainConfig
 from ..errors import SsilkError, fail
 from ..files import replacing
+from ..tensors import pack_tensors, read_tensors
 from .curve import CurvePoint
 from .step import Stepper
 from .validation import Score
@@ -26,6 +28,7 @@ from .validation import Score
 Tensors = dict[str, Tensor]
 
 FORMAT = 3  # of training states; settings had other names in format 1, fabrics no contact on surfaces in format 2
+HEADER_NAME = "ssilk_state"  # of the JSON document in the metadata
 SAMPLER_PREFIX = "sampler."  # of the sampler's tensors; all others are parameters or optimiser state
 
 
@@ -97,13 +100,12 @@ def state_path(model: str | Path) -> Path:
 
 def save_state(path: Path, stepper: Stepper, samplers: Sequence[Tensors], state: RunState) -> None:
     """Write all that the next iteration depends on; `samplers` has the sampler's state of each process."""
-    from safetensors.torch import save
-
     tensors = learned_tensors(stepper)
     for rank, sampler in enumerate(samplers):
         tensors |= {f"{SAMPLER_PREFIX}{rank}.{name}": value for name, value in sampler.items()}
+    arrays = {name: value.numpy() for name, value in tensors.items()}
     with replacing(path) as temporary:
-        temporary.write_bytes(save(tensors, {"ssilk_state": json.dumps(_document(state))}))
+        temporary.write_bytes(pack_tensors(arrays, {HEADER_NAME: json.dumps(_document(state))}))
 
 
 def load_state(path: Path, asked: dict[str, Any]) -> tuple[RunState, Tensors]:
@@ -112,8 +114,6 @@ def load_state(path: Path, asked: dict[str, Any]) -> tuple[RunState, Tensors]:
     Raises:
         SsilkError: there is no state, it is damaged, or it belongs to a run with other inputs.
     """
-    from safetensors import safe_open
-
     if not path.is_file():
         fail(
             str(path),
@@ -122,10 +122,12 @@ def load_state(path: Path, asked: dict[str, Any]) -> tuple[RunState, Tensors]:
             "train without --resume",
         )
     with _name_damage(path):
-        with safe_open(path, "pt") as stream:
-            state = _state_of(path, json.loads((stream.metadata() or {})["ssilk_state"]))
-            tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
+        arrays, words = read_tensors(path, HEADER_NAME)
+        state = _state_of(path, json.loads(words[HEADER_NAME]))
         _need_same(path, asked, state.asked)
+        _need_possible(state)
+        tensors = {name: torch.from_numpy(value) for name, value in arrays.items()}
+        _need_finite(tensors)
     return state, tensors
 
 
@@ -197,15 +199,45 @@ def _state_of(path: Path, document: dict[str, Any]) -> RunState:
 @contextmanager
 def _name_damage(path: Path) -> Iterator[None]:
     """Turn the errors that a damaged file causes into one sentence."""
-    from safetensors import SafetensorError
-
     try:
         yield
-    except (SafetensorError, ValueError, TypeError, KeyError, RuntimeError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, RuntimeError, OverflowError) as error:
         reason = str(error).rpartition("\n")[2].strip().rstrip(".")
         raise SsilkError(
             f"{path}: the training state is damaged ({reason}); delete it and train without --resume."
         ) from error
+
+
+def _need_possible(state: RunState) -> None:
+    """Raise `ValueError` unless a run can have reached this state; files of earlier versions have no checksum."""
+    asked, scored = state.asked["train"], [each for each in (state.best, *state.curve) if each]
+    last = state.planned or asked["iterations"]
+    _need_counts("planned", 0, inf, [state.planned])
+    _need_counts("iteration", 0, last, [state.iteration])
+    _need_counts("undone", 0, 2 * last, [state.skipped])  # a run that diverges goes back once
+    _need_counts("an earlier iteration", 0, state.iteration, [each.iteration for each in (*scored, *state.lowered)])
+    for name in ("batch", "pretraining_batch"):
+        _need_counts(name, 1, asked[name], [getattr(each, name) for each in state.lowered])
+    times = [state.seconds, *(point.seconds for point in state.curve)]
+    paces = [each.pace for each in state.lowered]
+    if not (all(0 <= time < inf for time in times) and all(0 < pace <= 1 for pace in paces)):
+        raise ValueError("a duration or a pace is out of range")
+    if not all(isfinite(each.score.total) for each in scored):
+        raise ValueError("a score is not finite")
+
+
+def _need_counts(name: str, least: int, most: float, values: Sequence[int]) -> None:
+    """Raise `ValueError` unless all values are integers in a range."""
+    for value in values:
+        if not (type(value) is int and least <= value <= most):
+            raise ValueError(f"{name} is {str(value)[:40]}, beyond {least} to {most}")
+
+
+def _need_finite(tensors: Tensors) -> None:
+    """Raise `ValueError` unless all that was learned is finite; the sampler's tensors may hold anything."""
+    for name, value in tensors.items():
+        if not (name.startswith(SAMPLER_PREFIX) or value.isfinite().all()):
+            raise ValueError(f"tensor '{name}' holds NaN or infinity")
 
 
 def _need_same(path: Path, asked: dict[str, Any], before: dict[str, Any]) -> None:

@@ -84,6 +84,24 @@ def test_saving_twice_gives_the_same_bytes(path, model, tmp_path):
     assert other.read_bytes() == path.read_bytes()
 
 
+def test_a_byte_that_changed_anywhere_is_found(path):
+    whole = path.read_bytes()
+    load_model(path)
+    for place in np.linspace(8, len(whole) - 1, 150).astype(int):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+        with pytest.raises(SsilkError, match="damaged"):
+            load_model(path)
+
+
+def test_a_model_of_an_earlier_version_has_no_checksum_and_is_read(path):
+    assert (
+        "sha256"
+        in json.loads(path.read_bytes()[8 : 8 + int.from_bytes(path.read_bytes()[:8], "little")])["__metadata__"]
+    )
+    rewrite(path, lambda tensors, document: None)
+    assert load_model(path).provenance["seed"] == 3
+
+
 @pytest.mark.parametrize("shapes, proxies", [(0, 2), (4, 0)])
 def test_models_without_shapes_or_proxies_round_trip(toy_scene, toy_model, tmp_path, shapes, proxies):
     model = toy_model(toy_scene(proxies=proxies), shapes=shapes)

@@ -2,6 +2,7 @@
 """Whole training runs on the toy scene: learning, stopping, resuming, running out of memory, diverging."""
 
 import json
+import math
 import os
 import signal
 import threading
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors import safe_open
+from safetensors.torch import save_file
 
 from ssilk_core.checkpoint import load_model
 from ssilk_core.collision import CollisionBody, CoveredSkin
@@ -191,6 +193,54 @@ def test_damaged_or_missing_states_are_refused(job, uninterrupted):
         state_path(missing.output).write_bytes(whole[:size])
         with pytest.raises(SsilkError, match=r"the training state is damaged .*delete it"):
             train(missing, silent)
+
+
+def test_a_byte_that_changed_anywhere_in_a_state_is_found(job, uninterrupted):
+    damaged, whole = job("flipped", resume=True), state_path(uninterrupted.output).read_bytes()
+    for place in np.linspace(8, len(whole) - 1, 60).astype(int):
+        changed = bytes([whole[place] ^ 1])
+        state_path(damaged.output).write_bytes(whole[:place] + changed + whole[place + 1 :])
+        with pytest.raises(SsilkError, match=r"the training state is damaged .*delete it"):
+            load_state(state_path(damaged.output), damaged.identity() | {"processes": 1})
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"iteration": 10**9}, "iteration is 1000000000, beyond 0 to 14"),
+        ({"iteration": -5}, "iteration is -5"),
+        ({"iteration": 2.5}, "iteration is 2.5"),
+        ({"planned": -1}, "planned is -1"),
+        ({"undone": 10**30}, "undone is 1000"),
+        ({"seconds": math.nan}, "a duration"),
+        ({"best": None, "lowered": [{"iteration": 3, "batch": 10**6, "pretraining_batch": 1}]}, "batch is 1000000"),
+        ({"lowered": 3}, "not iterable"),
+        (None, "holds NaN"),
+    ],
+)
+def test_a_state_without_checksum_that_no_run_can_have_reached_is_refused(job, uninterrupted, change, says):
+    resumed = job("impossible", resume=True)
+    with safe_open(state_path(uninterrupted.output), "pt") as stream:
+        tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
+        document = json.loads(stream.metadata()["ssilk_state"])
+    if change is None:
+        name = next(name for name in tensors if name.startswith("adam.") and tensors[name].ndim)
+        tensors[name].view(torch.uint8).fill_(255)
+    save_file(tensors, state_path(resumed.output), {"ssilk_state": json.dumps(document | (change or {}))})
+    before = state_path(resumed.output).read_bytes()
+    with pytest.raises(SsilkError, match=f"the training state is damaged .*{says}") as error:
+        train(resumed, silent)
+    assert "\n" not in str(error.value) and error.value.exit_code == 2
+    assert state_path(resumed.output).read_bytes() == before and not resumed.output.exists()
+
+
+def test_a_state_of_an_earlier_version_has_no_checksum_and_is_resumed(job, uninterrupted):
+    resumed = job("before", resume=True)
+    with safe_open(state_path(uninterrupted.output), "pt") as stream:
+        tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
+        words = {"ssilk_state": stream.metadata()["ssilk_state"]}
+    save_file(tensors, state_path(resumed.output), words)
+    assert train(resumed, silent).finished
 
 
 def test_the_best_model_is_kept(job, monkeypatch):
