@@ -17,6 +17,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pxr import Sdf, Usd, UsdGeom, Vt
+from safetensors import safe_open
+from safetensors.numpy import load_file, save_file
 from ssilk_usd.memory import bounded_memory
 from ssilk_usd.read_character import read_character
 from ssilk_usd.read_motion import read_motion
@@ -38,6 +40,10 @@ def files(toy, tmp_path_factory):
     toy.copy(folder)
     for name in ("rigged", "clip"):
         Sdf.Layer.FindOrOpen(str(folder / f"{name}.usda")).Export(str(folder / f"{name}.usdc"))
+    model = folder / "model.safetensors"
+    with safe_open(model, "numpy") as stream:  # without its checksum, which would refuse any change at once
+        words = {"ssilk": stream.metadata()["ssilk"]}
+    save_file(load_file(model), model, words)
     return folder
 
 
