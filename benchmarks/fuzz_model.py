@@ -4,7 +4,6 @@
     pip install atheris
     python benchmarks/fuzz_model.py CORPUS model.safetensors -max_total_time=600
 
-
 CORPUS is a folder that the fuzzer keeps what reached new code in; the model is what it starts from, without its
 checksum, which would refuse any change at once. The options are those of libFuzzer. What it finds belongs into
 tests/end_to_end/test_hostile.py.
