@@ -131,6 +131,11 @@ class BakeRollout:
         return decode(self.model, self.motion, pose)
 
     def warn(self, report: Reporter) -> None:
-        """Report at which frames the rollout was lost."""
+        """Report where the motion jumps, and at which frames the rollout was lost."""
+        from ..preflight.motion import joint_jumps, root_jumps
+
+        skeleton = self.deformer.scene.character.skeleton
+        for found in (*root_jumps(self.source), *joint_jumps(self.source, skeleton)):
+            report(Message(f"{found.prim}: {found.found}; {found.why}; {found.fix}", "warning"))
         for span in self.recovered:
             report(Message(f"frames {span}: the rollout was lost, and the garment is put to rest", "warning"))

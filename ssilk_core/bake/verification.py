@@ -73,7 +73,8 @@ def verify_file(rollout: BakeRollout, path: Path, report: Reporter) -> Verificat
     if not found.passed:
         raise VerificationError(
             f"{path}: vertex {found.vertex} at time code {found.time:g} is {found.worst:.3g} m from where the "
-            f"decoder has it; at most {found.bound:.3g} m is allowed."
+            f"decoder has it; at most {found.bound:.3g} m is allowed, wherever it is; bake it again, closer to the "
+            "origin if it is many kilometres away."
         )
     return Verification(frames=len(times), largest_error_m=found.worst, allowed_error_m=found.bound)
 

@@ -105,6 +105,8 @@ def _on_motions(inputs: PreflightInput) -> Findings:
     for clip in inputs.motions:
         yield from motion.root_jumps(clip)
     for clip in inputs.motions:
+        yield from motion.joint_jumps(clip, skeleton)
+    for clip in inputs.motions:
         yield from motion.joint_snaps(clip, skeleton)
     for clip in inputs.motions:
         yield from motion.short_motion(clip, preset.model.fps, preset.train.window)

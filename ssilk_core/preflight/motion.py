@@ -51,6 +51,26 @@ def root_jumps(motion: Motion) -> Findings:
         )
 
 
+def joint_jumps(motion: Motion, skeleton: Skeleton) -> Findings:
+    """Yield the frames at which a joint leaps away from its parent."""
+    steps = np.linalg.norm(np.diff(motion.translations, axis=0), axis=-1) * (np.asarray(skeleton.parents) >= 0)
+    frames = np.flatnonzero((steps * motion.fps > CUT_SPEED).any(axis=1))
+    if len(frames):
+        joint = int(steps.max(axis=0).argmax())
+        yield Finding(
+            severity="warning",
+            code="joint-jumps",
+            prim=motion.path,
+            count=len(frames),
+            found=f"{format_joints(skeleton, [joint])} moves {steps.max():.2g} m from its parent in one frame "
+            f"(first to frame {frames[0] + 1} of {motion.frame_count})",
+            why=f"a step faster than {CUT_SPEED:g} m/s within a body is no movement, and the cloth does not restart",
+            fix="repair the translation curves, or leave the clip out",
+            elements="frames",
+            indices=index_tuple(frames + 1),
+        )
+
+
 def joint_snaps(motion: Motion, skeleton: Skeleton) -> Findings:
     """Yield the frames at which a joint flips."""
     angles = _angles(motion.rotations[1:], motion.rotations[:-1])

@@ -336,6 +336,16 @@ def test_root_jumps():
     assert found.indices == (40,) and "2 m" in found.found
 
 
+def test_joint_jumps():
+    assert not list(motion.joint_jumps(turning(), SKELETON))
+    moved = turning().translations.copy()
+    moved[40:, 0] += 2.0  # the root: another finding
+    assert not list(motion.joint_jumps(replace(turning(), translations=moved), SKELETON))
+    moved[30:, 2, 1] += 1000.0
+    found = only(motion.joint_jumps(replace(turning(), translations=moved), SKELETON))
+    assert found.indices == (30,) and "Tail moves 1e+03 m" in found.found
+
+
 def test_joint_snaps():
     flipped = turning().rotations.copy()
     flipped[30:, 2] = [0, 0, 1, 0]

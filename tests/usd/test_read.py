@@ -677,6 +677,10 @@ BAD_MOTIONS = {
     "no rotations": (broken(lambda s: s.GetPrimAtPath(WALK).RemoveProperty("rotations")), "has no rotations"),
     "units": (broken(lambda s: UsdGeom.SetStageMetersPerUnit(s, 0.01)), "0.01 times as long"),
     "stray sample": (clip(JOINTS, {0: 0, 1e9: 0}), "time code 0 to 1e\\+09"),
+    "far": (
+        broken(lambda s: s.GetPrimAtPath(WALK).GetAttribute("translations").Set([(0, 1e30, 0)] * 5, 3)),
+        "m from the origin at time code 3; at most 100000 m",
+    ),
     "growing": (
         author(Usd.Stage.CreateInMemory(), Recipe(placements=[turned("y", 0, 1 + i) for i in range(FRAMES)])),
         "animate scale",

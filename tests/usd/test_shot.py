@@ -11,7 +11,7 @@ import pytest
 import ssilk_usd.shot as shot_module
 from pxr import Sdf, Usd, UsdGeom, UsdSkel
 from ssilk_usd.author import prim_names, sorted_influences
-from ssilk_usd.check import check_shot, compare_points
+from ssilk_usd.check import allowed_error, check_shot, compare_points
 from ssilk_usd.play import Shot
 from ssilk_usd.read_character import read_character
 from ssilk_usd.read_garment import read_garment
@@ -170,6 +170,11 @@ def test_a_character_far_away_loses_only_float32_precision(tmp_path, units):
     assert np.abs(expected).max() > 80
     assert comparison.bound == pytest.approx(1e-5 + 4 * 2**-23 * np.abs(expected).max(), rel=0.1)
     assert comparison.passed
+
+
+@pytest.mark.parametrize("away", [1e5, 1e9, 1e30])
+def test_no_distance_allows_more_than_some_millimetres(away):
+    assert allowed_error(np.full((4, 3), away)) == allowed_error(np.full((4, 3), 10_000.0)) < 5e-3
 
 
 def test_usd_bakes_the_same_points(tmp_path):

@@ -21,6 +21,7 @@ from .play import Shot, frame_times
 from .read_stage import PRIMS, apply, open_stage, world_matrix
 
 TOLERANCE = 1e-5  # [m]
+WORLD = 10_000.0  # [m] from the origin; what rounding is allowed does not grow beyond
 EPSILON = float(np.finfo(np.float32).eps)
 _SEVERITIES = {
     UsdValidation.ValidationErrorType.Error: "error",
@@ -152,9 +153,12 @@ def allowed_error(points: Floats, tolerance: float = TOLERANCE) -> float:
     """Return `tolerance` [m] plus what float32 rounds off: four units in the last place of the largest coordinate.
 
     Far from the origin float32 itself is coarser than any tolerance: 100 m away its spacing is 7.6e-6 m. A vertex
-    is rounded when joints are stored, when each influence is added, and when it is stored.
+    is rounded when joints are stored, when each influence is added, and when it is stored. An allowance in proportion
+    to the points alone would allow any error to points that are themselves wrong, so that it proves nothing. Game
+    worlds reach some kilometres; therefore it ends at `WORLD`, at 4.8 mm; further out, a shot has to be as
+    close as it is there.
     """
-    return tolerance + 4 * EPSILON * float(np.abs(points[np.isfinite(points)]).max(initial=0.0))
+    return tolerance + 4 * EPSILON * min(float(np.abs(points[np.isfinite(points)]).max(initial=0.0)), WORLD)
 
 
 def compare_points(

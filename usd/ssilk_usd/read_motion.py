@@ -33,6 +33,7 @@ from .units import StageUnits
 
 _SCALE_TOLERANCE = 1e-3
 _FRAMES_AT_ONCE = 1024  # while reading: 4 MB for each array of matrices of 30 joints
+_FARTHEST = 100_000.0  # [m] that a joint may be from its parent, or a root from the origin: damage lies beyond
 _MOST_FRAMES = 200_000  # close to two hours at 30 frames a second
 
 
@@ -104,6 +105,7 @@ def read_motion(source: StageLike, skeleton: Skeleton, *, prim: str | None = Non
             kept = match >= 0
             _check_lengths(local[:, kept], skeleton.rest_transforms[kept], skeleton.parents[kept], where)
         rotations[part], translations[part] = quaternion_from_matrix(local[..., :3, :3]), local[..., :3, 3]
+    _check_places(translations, skeleton, codes, where)
     start = float(codes[0] * fps / stage.GetTimeCodesPerSecond())
     return Motion(where, fps, rotations, translations, start)
 
@@ -224,4 +226,20 @@ def _check_lengths(local: Floats, rest: Floats, parents: Ints, where: str) -> No
             f"bones are {ratio:.3g} times as long as the skeleton's",
             "both must agree in metres",
             "set metersPerUnit of the motion's file to its units",
+        )
+
+
+def _check_places(translations: Floats, skeleton: Skeleton, codes: Floats, where: str) -> None:
+    """Raise `SsilkError` if a joint leaves any sensible world; `translations` [m] are local, shape (F, J, 3)."""
+    far = np.abs(translations).max(axis=-1)
+    beyond = ~(far <= _FARTHEST)
+    if beyond.any():
+        frame, joint = np.argwhere(beyond)[0]
+        name = skeleton.joint_names[joint].rpartition("/")[2]
+        apart = "the origin" if skeleton.parents[joint] < 0 else "its parent"
+        fail(
+            where,
+            f"joint {name} is {far[frame, joint]:.3g} m from {apart} at time code {codes[frame]:g}",
+            f"at most {_FARTHEST:g} m are allowed",
+            "repair the animation, or set metersPerUnit of its file",
         )

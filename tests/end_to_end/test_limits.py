@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numbers, names and places beyond what makes sense: one sentence and a documented exit code."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+
+import pytest
+from pxr import Gf, Usd, UsdSkel
+
+from ssilk_core.cli import main
+
+BAKE = "bake model.safetensors --stage rigged.usda"
+
+
+@pytest.fixture
+def copy(toy, tmp_path, monkeypatch) -> Path:
+    """A copy of the toy world, in which commands run."""
+    monkeypatch.chdir(tmp_path)
+    return toy.copy(tmp_path)
+
+
+def run(command: str) -> int:
+    return main(shlex.split(command))
+
+
+def said(capsys: pytest.CaptureFixture[str], level: str = "warning") -> str:
+    """Return what the events of a command with --json say, of one level, one line for each."""
+    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    return "\n".join(event.get("error") or event["text"] for event in events if event.get("level", "error") == level
+                     and ("error" in event or "text" in event))  # fmt: skip
+
+
+# Places
+
+
+def moved(toy, path: Path, away: float, joint: int = 0, from_frame: int = 0) -> Path:
+    """Write a short clip with a joint moved along x from a frame on."""
+    stage = Usd.Stage.Open(str(toy.write_clip(path, frames=8)))
+    attribute = UsdSkel.Animation(stage.GetPrimAtPath("/Clip")).GetTranslationsAttr()
+    for time in attribute.GetTimeSamples():
+        values = list(attribute.Get(time))
+        values[joint] += Gf.Vec3f(away if time >= from_frame else 0, 0, 0)
+        attribute.Set(values, time)
+    stage.GetRootLayer().Save()
+    return path
+
+
+@pytest.mark.parametrize(("away", "joint"), [(1e30, 0), (1e6, 0), (2e5, 1)])
+def test_a_motion_beyond_any_world_is_refused(copy, toy, capsys, away, joint):
+    moved(toy, copy / "far.usda", away, joint, from_frame=4)
+    assert run(f"{BAKE} --motion far.usda -o far.usdc --json") == 2
+    assert "at time code 4; at most 100000 m are allowed" in said(capsys, "error")
+    assert not (copy / "far.usdc").exists()
+
+
+def test_a_shot_that_is_millimetres_off_far_from_the_origin_is_not_kept(copy, toy, capsys):
+    moved(toy, copy / "far.usda", 9e4)
+    assert run(f"{BAKE} --motion far.usda -o far.usdc --json") == 3
+    assert "at most 0.00478 m is allowed" in said(capsys, "error") and not (copy / "far.usdc").exists()
+
+
+@pytest.mark.parametrize(("joint", "says"), [(0, "the root jumps, by up to 5e+02 m"), (1, "Spine moves 5e+02 m")])
+def test_jumps_are_warned_of(copy, toy, capsys, joint, says):
+    moved(toy, copy / "jump.usda", 500.0, joint, from_frame=4)
+    assert run(f"{BAKE} --motion jump.usda -o jump.usdc --json") == 0
+    assert says in said(capsys)
