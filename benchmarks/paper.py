@@ -25,7 +25,7 @@ from pathlib import Path
 from helpers.paper_jobs import GARMENTS, PYTHON, TABLES, Job, Plan, jobs, without_models
 from helpers.reports import table
 
-from ssilk_core.errors import SsilkError
+from ssilk_core.errors import EXIT_OK, EXIT_WORSE, SsilkError
 from ssilk_core.training.signals import stop_on_signals
 from ssilk_core.wardrobe.queue import CommandTask, End, Queue
 
@@ -80,7 +80,7 @@ class Backlog:
         """Say how a job ended."""
         job = self.running.pop(name)
         told = f"{end.seconds:.0f} s (predicted {job.seconds:.0f})"
-        if end.code or not job.is_done:
+        if end.code not in (EXIT_OK, EXIT_WORSE) or not job.is_done:
             self.failed.append(name)
             last = (self._log(job).read_text().strip().splitlines() or ["no output"])[-1]
             told = f"FAILED with code {end.code} after {told}: {last}"

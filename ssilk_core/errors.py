@@ -10,6 +10,7 @@ EXIT_INTERNAL = 1
 EXIT_BAD_INPUT = 2
 EXIT_VERIFICATION = 3
 EXIT_TASKS = 4
+EXIT_WORSE = 5  # a model was trained and is worse than linear blend skinning
 EXIT_INTERRUPTED = 130
 
 

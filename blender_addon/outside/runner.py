@@ -22,7 +22,7 @@ LOOK = 0.25  # seconds between two looks at the queue, the training and the wish
 BEAT = 2.0  # seconds after which the state is written though nothing was heard: Blender sees that somebody is there
 MOST_POINTS = 300  # of the curve
 UNLOCKED = 5.0  # seconds that a new place in the queue may be unlocked before it counts as left behind
-INTERRUPTED = 130  # exit code of ssilk
+WORSE, INTERRUPTED = 5, 130  # exit codes of ssilk: the model is worse than linear blend skinning; stopped
 
 # On Windows an interrupt reaches a whole group, so that the training needs one of its own.
 if sys.platform == "win32":
@@ -192,8 +192,8 @@ def main(folder, queue_folder):
             return
         record.write(state="running")
         code = train(folder, record, read(folder / ORDER)["command"])
-    if code in (0, INTERRUPTED):
-        record.write(state="stopped" if code else "done", seconds_left=None)
+    if code in (0, WORSE, INTERRUPTED):
+        record.write(state="stopped" if code == INTERRUPTED else "done", seconds_left=None)
     else:
         record.write(state="failed", error=record.fields.get("error") or last_words(folder))
 

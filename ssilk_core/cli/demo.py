@@ -11,7 +11,7 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..errors import EXIT_OK
+from ..errors import EXIT_OK, EXIT_WORSE
 from ..events import Message, Reporter, Result
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     for command in commands:
         report(Message("\n$ ssilk " + shlex.join(command)))
         code = main([*command, "--json"] if options.json else command)
-        if code != EXIT_OK:
+        if code not in (EXIT_OK, EXIT_WORSE):  # a draft that is worse than none is filmed, too
             return code
     shown = ["shipped"] if options.pretrained else ["shipped", PRESET]
     report(Result("demo", {f"{name} film": str(options.output / f"{name}.mp4") for name in shown}))

@@ -2,7 +2,8 @@
 """Train a garment on motions and write a model.
 
 Where the stage lacks weights, classes or a proxy rig, they are made as 'ssilk rig' makes them by default.
-Ctrl-C stops the training and keeps the best model and the state. --resume continues from there.
+Ctrl-C stops the training and keeps the best model and the state. --resume continues from there. A model that is worse
+than linear blend skinning on the validation motions is kept and warned of, and the exit code is 5.
 """
 
 from __future__ import annotations
@@ -12,9 +13,10 @@ from math import inf
 from pathlib import Path
 
 from ..config import PRESETS, ModelConfig, TrainConfig, apply_overrides, preset_named
-from ..errors import EXIT_INTERRUPTED, EXIT_OK, fail
+from ..errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_WORSE, fail
 from ..events import Message, Reporter, Result, silent
 from ..fabrics import Fabric
+from ..wardrobe.training import WORSE_FIGURE
 from . import options as shared
 
 
@@ -59,10 +61,11 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
-    """Train; return 0 when finished, 130 when interrupted."""
+    """Train; return 0 when finished, 5 when the model is worse than linear blend skinning, 130 when interrupted."""
     from ..training.parallel import join_process_group
     from ..training.run import train
     from ..training.signals import stop_on_signals
+    from ..training.verdict import is_worse, lower_by, worse_message
 
     if options.output.suffix != ".safetensors":
         fail(str(options.output), "not a name for a model", "it ends in .safetensors")
@@ -72,7 +75,10 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     with join_process_group(options.device) as (group, device), stop_on_signals() as stop:
         report = report if group.is_first else silent
         trained = train(training_job(options, device, report), report, stop, group)
-    share, shown = 1 - trained.score.total / trained.lbs.total, trained.score.shown_skin
+    share, shown = lower_by(trained.score, trained.lbs), trained.score.shown_skin
+    worse = is_worse(trained.score, trained.lbs)
+    if worse:
+        report(worse_message(str(options.output), trained.score, trained.lbs))
     report(
         Result(
             "train",
@@ -82,6 +88,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
                 "total [J]": round(trained.score.total, 5),
                 "linear blend skinning [J]": round(trained.lbs.total, 5),
                 ("lower by" if share >= 0 else "higher by"): f"{abs(share):.1%}",
+                **({WORSE_FIGURE: True} if worse else {}),
                 "collisions": f"{trained.score.collisions:.2%}",
                 **(shown.summary() if shown else {}),
                 **{f"{k} [J]": round(v, 5) for k, v in trained.score.terms.items()},
@@ -91,7 +98,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     if not trained.finished:
         report(Message(f"stopped at iteration {trained.iterations}; --resume continues from there."))
         return EXIT_INTERRUPTED
-    return EXIT_OK
+    return EXIT_WORSE if worse and group.size == 1 else EXIT_OK  # torchrun takes other codes for a crash
 
 
 def training_job(options: argparse.Namespace, device: str, report: Reporter):  # type: ignore[no-untyped-def]  # its type is heavy

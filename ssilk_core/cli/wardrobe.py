@@ -25,7 +25,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from ..errors import SsilkError, fail
+from ..errors import EXIT_OK, EXIT_WORSE, SsilkError, fail
 from ..events import Failed, GarmentEvent, Message, Reporter, Result, Started, TaskEvent
 from ..files import need_writable, sha256
 from ..wardrobe.listing import WardrobeEntry, read_list
@@ -50,7 +50,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
-    """Train all; return 0, 130 when interrupted, or the exit code of a garment that failed."""
+    """Train all; return 0, 130 when interrupted, the code of one that failed, or 5 where one is worse than none."""
     if not (options.jobs is None or options.jobs > 0):
         fail("--jobs", f"{options.jobs} trainings at a time", "1 is the least")
     device, slots = _slots(options.device, options.jobs)
@@ -66,7 +66,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         report(Result("wardrobe", {"garments": rows}))
     else:
         print(table(rows), *(f"{t.entry.name}: {t.error}" for t in trainings if t.state == "failed"), sep="\n")
-    return max(training.code for training in trainings)
+    return max((training.code for training in trainings), key=lambda code: (code not in (EXIT_OK, EXIT_WORSE), code))
 
 
 def _train(

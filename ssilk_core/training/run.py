@@ -346,7 +346,7 @@ class TrainingRun:
         self.saved, self._saved_at = self.state.iteration, time.monotonic()
 
     def _write_model(self, score: Score) -> None:
-        self.files.save_model(self.stepper.ema_model, self.state, score)
+        self.files.save_model(self.stepper.ema_model, self.state, score, self.lbs)
         self.report(Checkpoint(str(self.job.output), self.state.iteration, True))
 
     @contextmanager

@@ -21,6 +21,7 @@ from .parallel import SINGLE_PROCESS, ProcessGroup
 from .state import RunState, copy_to_cpu, json_round_trip, save_state, state_path
 from .step import Stepper
 from .validation import Score
+from .verdict import is_worse
 
 
 class RunFiles:
@@ -49,17 +50,17 @@ class RunFiles:
         if self.group.is_first:
             write_curve(self.curve, state.curve, lbs)
 
-    def save_model(self, model: GarmentModel, state: RunState, score: Score) -> None:
+    def save_model(self, model: GarmentModel, state: RunState, score: Score, lbs: Score) -> None:
         """Write a model with its provenance."""
         if self.group.is_first:
-            save_model(self.model, model_file(model, self.job.fabric, self.provenance(state, score)))
+            save_model(self.model, model_file(model, self.job.fabric, self.provenance(state, score, lbs)))
 
     def save_fault(self, stepper: Stepper, found: str) -> None:
         """Write the inputs of the last skipped step."""
         if self.group.is_first:
             save_fault(self.fault, stepper, self.job.training_motions(), found)
 
-    def provenance(self, state: RunState, score: Score) -> dict[str, Any]:
+    def provenance(self, state: RunState, score: Score, lbs: Score) -> dict[str, Any]:
         """Return the provenance of a model: inputs, settings, versions and validation."""
         return json_round_trip(
             {
@@ -73,5 +74,7 @@ class RunFiles:
                 "python": platform.python_version(),
                 "device": device_name(self.device),
                 "validation": summary(score),
+                "lbs": summary(lbs),
+                "worse_than_lbs": is_worse(score, lbs),
             }
         )

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 # A rollout closer than this to the quasi-static state of each pose has learned no dynamics.
 NO_DYNAMICS = 2e-3  # [m]
+# A total that is higher than linear blend skinning's by less than this share of it differs by rounding.
+WORSE = 1e-3
 ADVICE = "nothing dynamic is being learned: train longer, or check that the motions move"
 
 
@@ -23,6 +25,26 @@ def curve_lbs(curve: Mapping[str, Any]) -> Mapping[str, float]:
     return found
 
 
+def lower_by(score: Score, lbs: Score) -> float:
+    """Return how much lower a total is than linear blend skinning's, as a share of it; negative if higher."""
+    return 1 - score.total / lbs.total if lbs.total else 0.0
+
+
+def is_worse(score: Score, lbs: Score) -> bool:
+    """Return whether a model is worse than none: its total is above that of linear blend skinning."""
+    return lower_by(score, lbs) < -WORSE
+
+
+def worse_message(model: str, score: Score, lbs: Score) -> Message:
+    """Return the warning about a model that is worse than none."""
+    return Message(
+        f"{model}: the model is worse than none: its validation total of {score.total:.4g} J is "
+        f"{-lower_by(score, lbs):.0%} above linear blend skinning's {lbs.total:.4g} J; train longer, or bake with "
+        "--lbs",
+        "warning",
+    )
+
+
 def non_finite_terms(score: Score) -> list[str]:
     """Return the names of the terms that are not finite."""
     return [name for name, value in score.terms.items() if not isfinite(value)]
@@ -30,11 +52,11 @@ def non_finite_terms(score: Score) -> list[str]:
 
 def validation_message(iteration: int, score: Score, lbs: Score, moves: bool) -> Message:
     """Compare a score with that of linear blend skinning; warn if a garment that `moves` has learned no dynamics."""
-    share = 1 - score.total / lbs.total
+    share = lower_by(score, lbs)
     terms = ", ".join(f"{name} {value:.4g}" for name, value in score.terms.items())
     text = (
         f"validation at {iteration}: total {score.total:.4g} J, "
-        f"{share:.1%} under linear blend skinning's {lbs.total:.4g} J "
+        f"{abs(share):.1%} {'under' if share >= 0 else 'above'} linear blend skinning's {lbs.total:.4g} J "
         f"({terms}), collisions {score.collisions:.2%}, motion of its own {score.dynamics * 1000:.0f} mm"
         f"{f', {score.shown_skin}' if score.shown_skin else ''}"
     )

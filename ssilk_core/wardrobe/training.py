@@ -7,12 +7,13 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from ..errors import EXIT_INTERNAL, EXIT_INTERRUPTED, EXIT_OK, fail
+from ..errors import EXIT_INTERNAL, EXIT_INTERRUPTED, EXIT_OK, EXIT_WORSE, fail
 from ..files import sha256
 from ..work_record import WorkRecord, read_record, write_record
 from .listing import WardrobeEntry
 from .queue import CommandTask, End
 
+WORSE_FIGURE = "worse than linear blend skinning"  # among the figures of a training, where that is so
 COLUMNS = ("garment", "iterations", "total [J]", "lower by", "collisions", "skin shows", "time", "state")
 
 
@@ -44,6 +45,8 @@ class GarmentTraining:
             )
         self.seconds = float(detail.get("seconds", 0.0))
         self.figures, self.error = self.record.detail["result"] if finished else {}, ""
+        if finished and WORSE_FIGURE in self.figures:
+            self.code = EXIT_WORSE
         self.plan = (
             "finished before; skipped" if finished
             else "resumes where it stopped" if self.resumed
@@ -68,7 +71,9 @@ class GarmentTraining:
     def end(self, end: End) -> None:
         """Record the end of the training."""
         self.code = end.code if end.code >= 0 else EXIT_INTERNAL
-        self.state = {EXIT_OK: "finished", EXIT_INTERRUPTED: "stopped"}.get(end.code, "failed")
+        self.state = {EXIT_OK: "finished", EXIT_WORSE: "finished", EXIT_INTERRUPTED: "stopped"}.get(
+            end.code, "failed"
+        )
         self.figures = {} if end.result is None else end.result.detail
         self.seconds += end.seconds
         model = self._file(".safetensors")

@@ -74,6 +74,13 @@ def test_state_is_what_the_training_said(folder):
     assert [done for done, _ in state.curve] == [1, 2, 3, 4]
 
 
+def test_a_training_whose_model_is_worse_than_none_is_done_and_says_so(folder):
+    warns = "say(event='message', text='worse than none', level='warning'); sys.exit(5)"
+    jobs.begin(sys.executable, folder, ["-c", SAYS + warns])
+    state = until(folder, "done")
+    assert (state.text, state.error, state.checkpoint) == ("worse than none", "", 4)
+
+
 def test_a_curve_goes_on_where_a_job_is_resumed(folder):
     jobs.begin(sys.executable, folder, ["-c", SAYS])
     until(folder, "done")

@@ -38,6 +38,7 @@ from ssilk_core.training.signals import stop_on_signals
 from ssilk_core.training.state import RunState, learned_tensors, load_state, state_path
 from ssilk_core.training.step import EAGER_STEPS, Stepper, learning_rate
 from ssilk_core.training.validation import Score, Validator
+from ssilk_core.training.verdict import is_worse, worse_message
 from ssilk_core.training.windows import WindowSampler
 
 SHORT = TrainConfig(
@@ -255,6 +256,22 @@ def test_the_best_model_is_kept(job, monkeypatch):
     assert [event.done for event in events if isinstance(event, Checkpoint)] == [4, 8]
     assert trained.score.total == 1.0
     assert load_model(kept.output).provenance["iteration"] == 8
+
+
+@pytest.mark.parametrize("factor", [1.0, 3.8])
+def test_a_model_says_whether_it_is_worse_than_none(job, monkeypatch, factor):
+    lbs_score = validation.Validator.lbs_score
+    monkeypatch.setattr(
+        validation.Validator,
+        "score",
+        lambda self, model: replace(lbs_score(self), terms={"all": factor * lbs_score(self).total}),
+    )
+    trained = train(judged := job(f"worse {factor}", replace(SHORT, iterations=2, static_fraction=0.0)), silent)
+    provenance = load_model(judged.output).provenance
+    assert provenance["worse_than_lbs"] is is_worse(trained.score, trained.lbs) is (factor > 1)
+    assert provenance["lbs"]["total"] == trained.lbs.total
+    told = worse_message("cape", trained.score, trained.lbs)
+    assert factor == 1.0 or (told.level == "warning" and "280% above linear blend skinning's" in told.text)
 
 
 def test_events_say_what_is_trained_and_how_it_goes(job):

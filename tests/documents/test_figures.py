@@ -11,6 +11,8 @@ import re
 import shlex
 
 import pytest
+from ssilk_usd.check import TOLERANCE, WORLD
+from ssilk_usd.read_motion import FARTHEST
 
 from benchmarks.helpers.paper_schemes import PAPER_SCHEMES
 from ssilk_core.bake.skin import SKIN_FRAMES
@@ -33,7 +35,7 @@ CONSTANTS: dict[str, tuple[str, ...]] = {
     "a licence": (r"(Apache|GPL)-\d\.\d(-or-later)?", r"\bCC0\b"),
     "the number of a heading or of a step": (r"^(#+ )?\d+\. ", r"\(step \d\)"),
     "an exit code": (
-        r"^\| (0|1|2|3|4|130) \|",
+        r"^\| (0|1|2|3|4|5|130) \|",
         r"exit code 2 \(3 when a",
         r"\b4 when some tasks",
         r"\b130 when\s+interrupted",
@@ -44,6 +46,11 @@ CONSTANTS: dict[str, tuple[str, ...]] = {
         rf"within {1000 * COVER_REACH:.0f} mm above",
         rf"within {1000 * SHOW_DEPTH:.0f} mm beneath",
         rf"at most {SKIN_FRAMES} samples",
+    ),
+    "part of what a vertex may be off": (
+        rf"by {1e6 * TOLERANCE:.0f} µm, plus",
+        rf"growing\s+{WORLD / 1000:.0f} km away",
+        rf"more than {FARTHEST / 1000:.0f} km away",
     ),
     "an example of a message": (r"\*12 of 900 vertices",),
     "the shape of a tensor": (r"the shape \(\w+(, \w+)*\)",),

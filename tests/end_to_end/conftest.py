@@ -16,6 +16,7 @@ import trimesh
 from pxr import Gf, Usd, UsdGeom, UsdSkel, Vt
 
 from ssilk_core.cli import main
+from ssilk_core.errors import EXIT_WORSE
 
 JOINTS = ("Hips", "Hips/Spine", "Hips/Spine/Head")
 HEIGHTS = (0.8, 1.2, 1.5)  # of the joints [m]
@@ -104,7 +105,10 @@ def run(command: str, *more: str) -> int:
 
 @pytest.fixture(scope="session")
 def toy(tmp_path_factory: pytest.TempPathFactory) -> Toy:
-    """hero.usda, clip.usda, rigged.usda, model.safetensors (with its state) and shot.usda in one folder."""
+    """hero.usda, clip.usda, rigged.usda, model.safetensors (with its state) and shot.usda in one folder.
+
+    After six iterations the model is worse than linear blend skinning.
+    """
     torch.set_num_threads(1)
     folder = tmp_path_factory.mktemp("toy")
     write_hero(folder / "hero.usda")
@@ -112,6 +116,6 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> Toy:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         assert run("rig hero.usda --garment Skirt --proxies 4 -o rigged.usda") == 0
-        assert run("train rigged.usda --motions clip.usda -o model.safetensors", *TRAINING) == 0
+        assert run("train rigged.usda --motions clip.usda -o model.safetensors", *TRAINING) == EXIT_WORSE
         assert run("bake model.safetensors --stage rigged.usda --motion clip.usda -o shot.usda") == 0
     return Toy(folder, TRAINING, write_clip)

@@ -22,6 +22,7 @@ from safetensors.torch import load_file
 
 from ssilk_core.checkpoint import load_model
 from ssilk_core.cli import main
+from ssilk_core.errors import EXIT_WORSE
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="processes are forked, and killed by a signal")
 
@@ -77,7 +78,7 @@ def whole(command, tmp_path_factory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder := tmp_path_factory.mktemp("whole"))
         torch.set_num_threads(1)
-        assert main(command) == 0
+        assert main(command) == EXIT_WORSE
     return folder
 
 
@@ -126,7 +127,7 @@ def test_killed_wherever_a_file_gets_its_name(forks, command, whole, tmp_path, m
         process.join(60)
         codes.append(process.exitcode)
         check_files()
-    assert codes == [-signal.SIGKILL] * (len(places) - 1) + [0]
+    assert codes == [-signal.SIGKILL] * (len(places) - 1) + [EXIT_WORSE]
     check_equal(whole)
 
 
@@ -145,5 +146,5 @@ def test_killed_at_any_time(forks, command, whole, tmp_path, monkeypatch):
         process.join(60)
         check_files()
         began.append(len(json.loads(CURVE.read_text())["points"]) if CURVE.exists() else 0)
-    assert process.exitcode == 0 and began == sorted(began) and began[0] < began[-2] < 24
+    assert process.exitcode == EXIT_WORSE and began == sorted(began) and began[0] < began[-2] < 24
     check_equal(whole)

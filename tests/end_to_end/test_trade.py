@@ -11,6 +11,7 @@ import pytest
 
 from ssilk_core.cli import main
 from ssilk_core.cost import Time
+from ssilk_core.errors import EXIT_WORSE
 
 TRADE = "trade model.safetensors --stage rigged.usda --motions motions"
 
@@ -84,7 +85,7 @@ def test_garments_are_not_mixed(world, capsys):
             "train rigged.usda --garment Skirt --motions clip.usda -o other.safetensors --preset draft --set "
             "iterations=2 --set latent=4 --set widths=8 --set shapes=2 --set fps=24 --set valid_frames=8"
         )
-        == 0
+        == EXIT_WORSE
     )
     capsys.readouterr()
     assert run(TRADE.replace("trade model", "trade other.safetensors model")) == 2

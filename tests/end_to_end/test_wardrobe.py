@@ -24,7 +24,7 @@ from ssilk_core.events import GarmentEvent, JsonReporter, Message, Progress, Tas
 from ssilk_core.wardrobe.listing import WardrobeEntry, read_list
 from ssilk_core.wardrobe.panel import ProgressTable, table
 from ssilk_core.wardrobe.queue import CommandTask, End, Queue
-from ssilk_core.wardrobe.training import GarmentTraining
+from ssilk_core.wardrobe.training import WORSE_FIGURE, GarmentTraining
 
 LIST = """
 [defaults]
@@ -213,7 +213,7 @@ def test_a_second_interrupt_ends_all_at_once(tmp_path):
 
 
 def test_what_is_finished_is_skipped_unless_something_else_is_asked(tmp_path):
-    entry, done = WardrobeEntry("cape", ("stage.usda",)), {"iterations": 5, "higher by": "3.0%"}
+    entry, done = WardrobeEntry("cape", ("stage.usda",)), {"iterations": 5, "higher by": "3.0%", WORSE_FIGURE: True}
     first = GarmentTraining(entry, tmp_path, "request")
     assert (first.state, first.resumed, first.code) == ("waiting", False, 130)
     begun = first.begin(tmp_path, "cpu")
@@ -226,9 +226,9 @@ def test_what_is_finished_is_skipped_unless_something_else_is_asked(tmp_path):
     assert (again.state, again.code) == ("stopped", 130)
     (tmp_path / "cape.safetensors").touch()
     last = GarmentTraining(entry, tmp_path, "request")
-    last.end(End(0, 3.0, read_event(json.dumps({"event": "result", "task": "train", "detail": done}))))
+    last.end(End(5, 3.0, read_event(json.dumps({"event": "result", "task": "train", "detail": done}))))
     kept = GarmentTraining(entry, tmp_path, "request")
-    assert (kept.state, kept.code, kept.plan) == ("finished", 0, "finished before; skipped")
+    assert (kept.state, kept.code, kept.plan) == ("finished", 5, "finished before; skipped")
     assert kept.row() == {
         "garment": "cape", "iterations": 5, "total [J]": None, "lower by": "-3.0%", "collisions": None,
         "skin shows": None, "time": 5.0, "state": "finished",

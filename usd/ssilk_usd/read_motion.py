@@ -33,7 +33,7 @@ from .units import StageUnits
 
 _SCALE_TOLERANCE = 1e-3
 _FRAMES_AT_ONCE = 1024  # while reading: 4 MB for each array of matrices of 30 joints
-_FARTHEST = 100_000.0  # [m] that a joint may be from its parent, or a root from the origin: damage lies beyond
+FARTHEST = 100_000.0  # [m] that a joint may be from its parent, or a root from the origin: damage lies beyond
 _MOST_FRAMES = 200_000  # close to two hours at 30 frames a second
 
 
@@ -232,7 +232,7 @@ def _check_lengths(local: Floats, rest: Floats, parents: Ints, where: str) -> No
 def _check_places(translations: Floats, skeleton: Skeleton, codes: Floats, where: str) -> None:
     """Raise `SsilkError` if a joint leaves any sensible world; `translations` [m] are local, shape (F, J, 3)."""
     far = np.abs(translations).max(axis=-1)
-    beyond = ~(far <= _FARTHEST)
+    beyond = ~(far <= FARTHEST)
     if beyond.any():
         frame, joint = np.argwhere(beyond)[0]
         name = skeleton.joint_names[joint].rpartition("/")[2]
@@ -240,6 +240,6 @@ def _check_places(translations: Floats, skeleton: Skeleton, codes: Floats, where
         fail(
             where,
             f"joint {name} is {far[frame, joint]:.3g} m from {apart} at time code {codes[frame]:g}",
-            f"at most {_FARTHEST:g} m are allowed",
+            f"at most {FARTHEST:g} m are allowed",
             "repair the animation, or set metersPerUnit of its file",
         )
