@@ -229,6 +229,9 @@ def _need_header(document: dict[str, Any]) -> None:
     _need_types(document["fabric"], vars(Fabric("")))
     for words in (document["joint_names"], document["proxy_names"], document["paths"].values()):
         _need_types(dict(enumerate(words)), dict.fromkeys(range(len(words)), ""))
+    seed = document["provenance"].get("seed", 0)
+    if type(seed) is not int or not -(2**63) <= seed < 2**63:  # shots store it in 64 bits
+        raise TypeError(f"the seed {str(seed)[:40]!r} is not a whole number of 64 bits")
     widths = document["config"].get("widths", [])
     _need_types(dict(enumerate(widths)), dict.fromkeys(range(len(widths)), 0))
 

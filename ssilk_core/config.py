@@ -10,6 +10,7 @@ from .errors import fail
 from .schemes import need_scheme
 
 CLOSEST_POINTS = ("triangles", "vertices")
+MAX_SIZE = 65_536  # of a part of the network; larger ones fit into no machine
 NO_BOUND = 1e9  # upper limit of settings without a limit of their own
 
 # Constants of `model.integrators.SpringVerlet`, shared with the numpy runtime and explained there.
@@ -58,10 +59,12 @@ class ModelConfig:
     def __post_init__(self) -> None:
         object.__setattr__(self, "widths", tuple(self.widths))
         need_scheme(self.scheme)
-        if not min(self.widths) > 0:
-            fail("model", f"widths = {self.widths}", "each must be at least 1")
-        _need_between(self, 1, NO_BOUND, "latent", "fps")
-        _need_between(self, 0, NO_BOUND, "shapes", "activations", "latent_bound", "max_latent_step")
+        if not 1 <= min(self.widths) <= max(self.widths) <= MAX_SIZE:
+            fail("model", f"widths = {self.widths}", f"each must be at least 1 and at most {MAX_SIZE}")
+        _need_between(self, 1, MAX_SIZE, "latent")
+        _need_between(self, 1, NO_BOUND, "fps")
+        _need_between(self, 0, MAX_SIZE, "shapes", "activations")
+        _need_between(self, 0, NO_BOUND, "latent_bound", "max_latent_step")
         _need_between(self, 1e-6, 1, "stiffness")
 
     @property

@@ -11,12 +11,12 @@ from ..checkpoint import ModelFile, load_model
 from ..devices import select_device
 from ..errors import fail
 from ..files import sha256
-from ..kinematics import lbs_deformer, resample
+from ..kinematics import MAX_FPS, MIN_FPS, lbs_deformer, resample
 from ..quality import SizeReduction
 from ..reduction import Reducer
 from ..targets import Target, cap_influences
 from .character import on_character
-from .request import BakeRequest
+from .request import ALLOWED_FPS, BakeRequest
 from .rollout import BakeRollout
 
 if TYPE_CHECKING:
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from ssilk_usd.units import StageUnits
 
     from ..model.network import GarmentModel
-
-MAX_FPS = 10_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,8 +146,8 @@ def _network_like(like: GarmentModel, file: ModelFile, request: BakeRequest) -> 
 
 
 def _at_fps(motion: Motion, fps: float) -> Motion:
-    if not 0 < fps <= MAX_FPS:
-        fail("--fps", f"{fps:g} frames per second", f"a positive rate of at most {MAX_FPS} is needed")
+    if not MIN_FPS <= fps <= MAX_FPS:
+        fail("--fps", f"{fps:g} frames per second", ALLOWED_FPS)
     return replace(resample(motion, fps), start=motion.start * fps / motion.fps)
 
 

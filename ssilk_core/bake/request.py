@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 from ..errors import fail
+from ..kinematics import MAX_FPS, MIN_FPS
 from ..reduction import ModelSize
 from ..targets import TARGETS, Target
 from .plain import from_plain
@@ -16,6 +17,8 @@ INPUTS = ("model", "stage", "motion")  # the files that a shot is baked from
 REFINED_OUTPUTS = ("points", "joints")
 MAX_SAMPLES_PER_FRAME = 64
 MAX_PRE_ROLL = 600.0  # [s]
+MAX_REFINE = 10_000
+ALLOWED_FPS = f"a positive rate from {MIN_FPS:g} to {MAX_FPS} is needed"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,10 +75,10 @@ class BakeRequest:
             fail("--samples-per-frame", found, f"1 to {MAX_SAMPLES_PER_FRAME} are allowed")
         if not 0 <= self.pre_roll <= MAX_PRE_ROLL:
             fail("--pre-roll", f"{self.pre_roll:g} seconds", f"0 to {MAX_PRE_ROLL:g} are allowed")
-        if self.fps is not None and not 0 < self.fps < float("inf"):
-            fail("--fps", f"{self.fps:g} frames per second", "a positive rate is needed")
-        if self.refine < 0 or int(self.refine) != self.refine:
-            fail("--refine", f"{self.refine:g} iterations", "1 to 10000 are allowed, or 0 for none")
+        if self.fps is not None and not MIN_FPS <= self.fps <= MAX_FPS:
+            fail("--fps", f"{self.fps:g} frames per second", ALLOWED_FPS)
+        if not 0 <= self.refine <= MAX_REFINE or int(self.refine) != self.refine:
+            fail("--refine", f"{self.refine:g} iterations", f"1 to {MAX_REFINE} are allowed, or 0 for none")
         if self.refined_output not in REFINED_OUTPUTS:
             fail("--refined-output", f"'{self.refined_output}'", f"it is one of {', '.join(REFINED_OUTPUTS)}")
         if self.lbs and self.keep:

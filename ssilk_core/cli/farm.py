@@ -18,7 +18,7 @@ from ..bake import BakeTask, LayerFolder, plan_layers
 from ..errors import EXIT_OK, EXIT_TASKS, fail
 from ..events import Failed, GarmentEvent, Progress, Reporter, Result, Started
 from ..farm.openjd import TEMPLATE, BundleOptions, write_bundle
-from .options import add_bake, layer_options, requests_of
+from .options import NumberRange, add_bake, layer_options, requests_of
 
 if TYPE_CHECKING:
     from ..farm.cluster import TaskOutcome
@@ -35,9 +35,13 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     group = verb.add_argument_group("job bundle")
     defaults = BundleOptions()
     group.add_argument(
-        "--memory", type=int, default=defaults.memory, metavar="MIB", help="that a host needs (default %(default)s)"
+        "--memory",
+        type=NumberRange(1, 2**31 - 1, int),
+        default=defaults.memory,
+        metavar="MIB",
+        help="that a host needs (default %(default)s)",
     )
-    group.add_argument("--timeout", type=int, default=defaults.timeout, metavar="SECONDS",
+    group.add_argument("--timeout", type=NumberRange(1, 2**31 - 1, int), default=defaults.timeout, metavar="SECONDS",
                        help="after which a chunk of shots is cancelled (default %(default)s)")  # fmt: skip
 
 

@@ -4,15 +4,19 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import dataclass
+from math import nan
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..bake import BakeRequest
+from ..bake.request import MAX_PRE_ROLL, MAX_REFINE, MAX_SAMPLES_PER_FRAME
 from ..config import apply_overrides
 from ..errors import fail
 from ..events import Reporter
 from ..fabrics import FABRICS, Fabric, fabric_named
 from ..files import need_not_input, need_writable
+from ..kinematics import MAX_FPS, MIN_FPS
 from ..quality import QUALITIES
 from ..targets import TARGETS
 
@@ -60,6 +64,31 @@ def fabric(options: argparse.Namespace) -> Fabric:
     return apply_overrides(fabric_named(options.fabric), options.material)
 
 
+@dataclass(frozen=True)
+class NumberRange:
+    """The type of an option that takes a finite number from `low` to `high`."""
+
+    low: float
+    high: float
+    kind: type[int] | type[float] = float
+
+    def __call__(self, text: str) -> float:
+        """Return the number that a text spells; raise `ArgumentTypeError` where it is none of these."""
+        try:
+            value = self.kind(text)
+        except ValueError:
+            value = nan
+        if not self.low <= value <= self.high:
+            whole = "whole " if self.kind is int else ""
+            raise argparse.ArgumentTypeError(
+                f"'{text[:40]}' is not a {whole}number from {self.low:g} to {self.high:g}"
+            )
+        return value
+
+
+RATE = NumberRange(MIN_FPS, MAX_FPS)  # frames in a second
+
+
 def add_bake(verb: argparse.ArgumentParser) -> None:
     """Add the options that say what is baked, over what, and for whom."""
     verb.add_argument("model", nargs="+", metavar="MODEL[:/ROOT]",
@@ -70,12 +99,12 @@ def add_bake(verb: argparse.ArgumentParser) -> None:
                       help="USD files with motions; PRIM is the SkelAnimation, where there are several")  # fmt: skip
     about = "; ".join(f"{name}: {target.about}" for name, target in TARGETS.items())
     verb.add_argument("--target", choices=TARGETS, default="usd", help=f"who receives it (default usd). {about}")
-    verb.add_argument("--fps", type=float, help="frames per second of the shot (default: the motion's)")
-    verb.add_argument("--samples-per-frame", type=int, default=1, metavar="N",
+    verb.add_argument("--fps", type=RATE, help="frames per second of the shot (default: the motion's)")
+    verb.add_argument("--samples-per-frame", type=NumberRange(1, MAX_SAMPLES_PER_FRAME, int), default=1, metavar="N",
                       help="samples in each frame, for motion blur (default 1)")  # fmt: skip
     verb.add_argument(
         "--pre-roll",
-        type=float,
+        type=NumberRange(0, MAX_PRE_ROLL),
         default=0.0,
         metavar="SECONDS",
         help="run-up to the first pose and after each cut, so that the garment has settled (default 0)",
@@ -89,7 +118,7 @@ def _add_output(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--points", action="store_true", help="write point caches as well (folders)")
     verb.add_argument(
         "--refine",
-        type=int,
+        type=NumberRange(0, MAX_REFINE, int),
         default=0,
         metavar="N",
         help="iterations of the simulator's solver in each frame, from the network's state (default 0)",

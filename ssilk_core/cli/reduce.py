@@ -33,7 +33,9 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("model", type=Path, help="model written by 'ssilk train'")
     verb.add_argument("-o", "--output", type=Path, required=True, help="model to write (.safetensors)")
     for name, what in zip(NUMBERS, ("blendshapes", "proxy joints", "joints that move one vertex")):
-        verb.add_argument(f"--{name}", type=int, metavar="N", help=f"{what} to keep (default: all)")
+        verb.add_argument(
+            f"--{name}", type=shared.NumberRange(0, 10**6, int), metavar="N", help=f"{what} to keep (default: all)"
+        )
     shared.add_level(verb, "6MB for the file")
     verb.add_argument("--motions", type=Path, nargs="+", default=[], metavar="PATH",
                       help="motion files or folders to keep exact (default: the training's)")  # fmt: skip

@@ -27,14 +27,17 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     shared.add_scene(verb)
     verb.add_argument("-o", "--output", type=Path, required=True, help="stage to write (.usdc, .usd or .usda)")
     verb.add_argument(
-        "--tight-distance", type=float, default=ClassOptions.tight_distance, metavar="METRES",
+        "--tight-distance", type=shared.NumberRange(0, 1000), default=ClassOptions.tight_distance, metavar="METRES",
         help="cloth farther than this from the body is loose (default %(default)s)",
     )  # fmt: skip
     verb.add_argument(
-        "--proxies", type=int, default=RigOptions.proxies, help="proxy joints on the loose part (default %(default)s)"
+        "--proxies",
+        type=shared.NumberRange(0, 1000, int),
+        default=RigOptions.proxies,
+        help="proxy joints on the loose part (default %(default)s)",
     )
     verb.add_argument(
-        "--roots", type=int, default=RigOptions.roots_per_cluster, metavar="N",
+        "--roots", type=shared.NumberRange(1, 1000, int), default=RigOptions.roots_per_cluster, metavar="N",
         help="proxies of each connected loose part that hang from the character itself (default %(default)s)",
     )  # fmt: skip
     verb.add_argument(

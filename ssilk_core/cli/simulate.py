@@ -42,13 +42,20 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         help="shot to write (.usdc, .usd or .usda), or a folder where there are several motions",
     )  # fmt: skip
     shared.add_fabric(verb)
-    verb.add_argument("--fps", type=float, default=30.0, help="frames per second (default 30, as models are trained)")
-    verb.add_argument("--tolerance", type=float, default=1e-2, metavar="G",
+    verb.add_argument(
+        "--fps", type=shared.RATE, default=30.0, help="frames per second (default 30, as models are trained)"
+    )
+    verb.add_argument("--tolerance", type=shared.NumberRange(1e-9, 1e3), default=1e-2, metavar="G",
                       help="largest residual acceleration of a vertex, in units of g (default 0.01)")  # fmt: skip
-    verb.add_argument("--iterations", type=int, default=100, metavar="N",
+    verb.add_argument("--iterations", type=shared.NumberRange(1, 10**6, int), default=100, metavar="N",
                       help="most iterations of the solver in each frame (default 100)")  # fmt: skip
-    verb.add_argument("--batch", type=int, default=64, help="motions that advance together (default 64)")
-    verb.add_argument("--sequence", type=int, metavar="FRAMES",
+    verb.add_argument(
+        "--batch",
+        type=shared.NumberRange(1, 10**6, int),
+        default=64,
+        help="motions that advance together (default 64)",
+    )
+    verb.add_argument("--sequence", type=shared.NumberRange(1, 10**6, int), metavar="FRAMES",
                       help="restart from rest after so many frames (paper: 512; default: never)")  # fmt: skip
     verb.add_argument("--no-body", action="store_true", help="leave the body meshes out")
     verb.add_argument("--device", default="cpu", help="where it runs (default cpu)")

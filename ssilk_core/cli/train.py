@@ -9,7 +9,6 @@ than linear blend skinning on the validation motions is kept and warned of, and 
 from __future__ import annotations
 
 import argparse
-from math import inf
 from pathlib import Path
 
 from ..config import PRESETS, ModelConfig, TrainConfig, apply_overrides, preset_named
@@ -42,7 +41,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     )
     verb.add_argument(
         "--minutes",
-        type=float,
+        type=shared.NumberRange(1e-3, 1e6),
         metavar="M",
         help="wall time after the setup, in place of the preset's iterations: a few steps are timed, and the "
         "schedule is scaled to the number that fits; one seed gives one model only for one such number",
@@ -70,8 +69,6 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     if options.output.suffix != ".safetensors":
         fail(str(options.output), "not a name for a model", "it ends in .safetensors")
     shared.check_output(options.output)
-    if not (options.minutes is None or 0 < options.minutes < inf):
-        fail("--minutes", f"{options.minutes}", "a positive number is needed")
     with join_process_group(options.device) as (group, device), stop_on_signals() as stop:
         report = report if group.is_first else silent
         trained = train(training_job(options, device, report), report, stop, group)

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 from pathlib import Path
 
 from ..errors import EXIT_OK, fail
 from ..events import Reporter, Result
-from .options import check_output
+from .options import RATE, NumberRange, check_output
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -20,9 +21,13 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("shots", type=Path, nargs="+", metavar="SHOT", help="shots of one length and rate")
     verb.add_argument("-o", "--output", type=Path, required=True, help="film (.mp4) or contact sheet (.png)")
     verb.add_argument("--label", action="append", default=[], help="caption of a shot (repeatable)")
-    verb.add_argument("--fps", type=float, default=30.0, help="most frames per second of a film (default 30)")
-    verb.add_argument("--columns", type=int, default=6, help="moments that the sheet shows (default 6)")
-    verb.add_argument("--azimuth", type=float, default=None, help="side from which the camera looks [degrees]")
+    verb.add_argument("--fps", type=RATE, default=30.0, help="most frames per second of a film (default 30)")
+    verb.add_argument(
+        "--columns", type=NumberRange(1, 100, int), default=6, help="moments that the sheet shows (default 6)"
+    )
+    verb.add_argument(
+        "--azimuth", type=NumberRange(-3600, 3600), default=None, help="side from which the camera looks [degrees]"
+    )
     verb.add_argument("--size", metavar="WxH", help="pixels of one panel")
 
 
@@ -57,10 +62,10 @@ def _look(options: argparse.Namespace, film: bool):  # type: ignore[no-untyped-d
     from ..view.shots import Look
 
     width, height = (480, 640) if film else (320, 440)
-    if options.size:
+    if options.size is not None:
         parts = options.size.lower().split("x")
-        if not (len(parts) == 2 and all(part.isdecimal() for part in parts)):
-            fail(f"--size {options.size}", "not a size", "WIDTHxHEIGHT in pixels is needed")
+        if not (len(parts) == 2 and all(re.fullmatch(r"[0-9]{1,9}", part) for part in parts)):
+            fail(f"--size {options.size[:40]}", "not a size", "WIDTHxHEIGHT in pixels is needed")
         width, height = int(parts[0]), int(parts[1])
     azimuth = Look.azimuth if options.azimuth is None else options.azimuth
     return Look(width=width, height=height, azimuth=azimuth, workers=os.cpu_count() or 1)

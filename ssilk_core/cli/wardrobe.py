@@ -43,7 +43,11 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "-o", "--output", type=Path, required=True, metavar="FOLDER", help="folder for models, states and logs"
     )
-    verb.add_argument("--jobs", type=int, help="trainings at a time (default: one for each GPU; one without GPUs)")
+    verb.add_argument(
+        "--jobs",
+        type=shared.NumberRange(1, 1000, int),
+        help="trainings at a time (default: one for each GPU; one without GPUs)",
+    )
     verb.add_argument(
         "--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to train (default auto)"
     )
@@ -51,8 +55,6 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Train all; return 0, 130 when interrupted, the code of one that failed, or 5 where one is worse than none."""
-    if not (options.jobs is None or options.jobs > 0):
-        fail("--jobs", f"{options.jobs} trainings at a time", "1 is the least")
     device, slots = _slots(options.device, options.jobs)
     need_writable(options.output / "log")
     entries = read_list(options.list)

@@ -89,7 +89,7 @@ def numbers(text: str, count: int) -> list[int]:
     found: list[int] = []
     for part in text.split(","):
         first, dash, last = part.partition("-")
-        if not (first.strip().isdecimal() and (not dash or last.strip().isdecimal())):
+        if not re.fullmatch(r"\s*\d{1,9}\s*(-\s*\d{1,9}\s*)?", part):
             fail(where, f"'{text}'", allowed)
         span = range(int(first), int(last if dash else first) + 1)
         if not (len(span) and span[-1] < count):

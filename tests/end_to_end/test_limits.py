@@ -3,14 +3,20 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from pxr import Gf, Usd, UsdSkel
 
-from ssilk_core.cli import main
+from ssilk_core.checkpoint import load_model, save_model
+from ssilk_core.cli import main, parser
+from ssilk_core.cli.options import NumberRange
+from ssilk_core.errors import SsilkError
+from ssilk_core.farm.job import numbers
 
 BAKE = "bake model.safetensors --stage rigged.usda"
 
@@ -31,6 +37,46 @@ def said(capsys: pytest.CaptureFixture[str], level: str = "warning") -> str:
     events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     return "\n".join(event.get("error") or event["text"] for event in events if event.get("level", "error") == level
                      and ("error" in event or "text" in event))  # fmt: skip
+
+
+# Numbers
+
+
+def numeric_options() -> list[tuple[str, str]]:
+    """Return the verb and the name of every option that takes a number."""
+    (verbs,) = (action for action in parser()._actions if isinstance(action, argparse._SubParsersAction))
+    taken = [(name, action) for name, verb in verbs.choices.items() for action in verb._actions]
+    assert not [action for _, action in taken if action.type in (int, float)], "these take any number"
+    return [(verb, action.option_strings[-1]) for verb, action in taken if isinstance(action.type, NumberRange)]
+
+
+@pytest.mark.parametrize(("verb", "option"), numeric_options())
+def test_no_option_takes_a_number_without_bounds(verb, option, capsys):
+    for value in ("-1e4", "nan", "inf", "-inf", "1e300", "1" + "0" * 30, "9" * 5000, "x", "", "1,5", "0x10"):
+        assert main([verb, "--json", f"{option}={value}"]) == 2
+        (event,) = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+        assert event["event"] == "failed" and f"{option}: '" in event["error"] and len(event["error"]) < 250
+
+
+@pytest.mark.parametrize("text", ["9" * 5000, "0-" + "9" * 5000, "-1", "1-", "nan", "", "0,,1"])
+def test_any_numbers_of_tasks_are_read_or_refused(text):
+    with pytest.raises(SsilkError, match="--tasks"):
+        numbers(text, 3)
+
+
+@pytest.mark.parametrize("seed", ["x", 10**30, None, 1.5])
+def test_a_model_with_an_impossible_seed_is_refused(toy, tmp_path, seed):
+    file = load_model(toy.folder / "model.safetensors")
+    save_model(tmp_path / "m.safetensors", replace(file, provenance={**file.provenance, "seed": seed}))
+    with pytest.raises(SsilkError, match=r"the seed .* is not a whole number of 64 bits"):
+        load_model(tmp_path / "m.safetensors")
+
+
+@pytest.mark.parametrize("rate", [1e-9, 1e300])
+def test_a_motion_of_an_impossible_rate_is_refused(copy, toy, capsys, rate):
+    toy.write_clip(copy / "slow.usda", frames=3, fps=rate)
+    assert run(f"{BAKE} --motion slow.usda -o slow.usdc --json") == 2
+    assert "it must be from 0.01" in said(capsys, "error")
 
 
 # Places

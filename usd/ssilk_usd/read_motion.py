@@ -11,7 +11,7 @@ from pxr import Usd, UsdGeom, UsdSkel
 
 from ssilk_core.assets import Floats, Ints, Motion, Skeleton
 from ssilk_core.errors import fail
-from ssilk_core.kinematics import matrix_from_quaternion, quaternion_from_matrix, rigid
+from ssilk_core.kinematics import MAX_FPS, MIN_FPS, matrix_from_quaternion, quaternion_from_matrix, rigid
 
 from .read_skeleton import skeletons
 from .read_skin import match_joints
@@ -34,6 +34,7 @@ from .units import StageUnits
 _SCALE_TOLERANCE = 1e-3
 _FRAMES_AT_ONCE = 1024  # while reading: 4 MB for each array of matrices of 30 joints
 FARTHEST = 100_000.0  # [m] that a joint may be from its parent, or a root from the origin: damage lies beyond
+_MOST_TIME_CODES = 1e9  # in a second; some programs count in ticks
 _MOST_FRAMES = 200_000  # close to two hours at 30 frames a second
 
 
@@ -160,8 +161,10 @@ def _time_codes(stage: Usd.Stage, animation: Usd.Prim, placed: Usd.Prim | None) 
     """Return the time codes of the frames and their rate [1/s]."""
     second = stage.GetTimeCodesPerSecond()
     fps = stage.GetFramesPerSecond() if stage.HasAuthoredMetadata("framesPerSecond") else second
-    if not (fps > 0 and second > 0):
-        fail(stage.GetRootLayer().identifier, f"a rate of {fps} frames", "it must be positive")
+    for rate, what, most in ((fps, "frames", MAX_FPS), (second, "time codes", _MOST_TIME_CODES)):
+        if not MIN_FPS <= rate <= most:
+            where = stage.GetRootLayer().identifier
+            fail(where, f"a rate of {rate:g} {what}", f"it must be from {MIN_FPS:g} to {most:g} in a second")
     samples = [
         time for name in ("rotations", "translations") for time in animation.GetAttribute(name).GetTimeSamples()
     ]
