@@ -20,17 +20,29 @@ def shot_metadata(rollout: BakeRollout, output: Path, skin: Mapping[str, object]
         skin: figures of the covered skin that shows.
     """
     refined = {"refined": rollout.refinement.summary.to_metadata()} if rollout.refinement else {}
-    beside = _beside(rollout.request, output)
-    return {**rollout.provenance, "beside": beside, "recovered": rollout.recovered, "shown_skin": skin, **refined}
+    request = rollout.request.relocated(lambda path: _from_folder(path, output.absolute().parent)).to_metadata()
+    return {
+        **rollout.provenance, "request": request, "recovered": rollout.recovered, "shown_skin": skin, **refined
+    }  # fmt: skip
 
 
-def _beside(request: BakeRequest, output: Path) -> dict[str, str]:
-    """Return the inputs' paths relative to the output's folder: they hold when everything moves together."""
-    folder = output.absolute().parent
+def _from_folder(location: str, folder: Path) -> str:
+    """Return the path of an input from a shot's folder; its name alone where they share nothing but the root.
+
+    So nothing tells where a studio keeps its files, and the same files give the same bytes wherever they lie.
+    """
+    path = Path(location).absolute()
     try:
-        return {name: os.path.relpath(path, folder) for name, path in request.inputs.items()}
+        shared = Path(os.path.commonpath([path, folder]))
     except ValueError:  # on another drive
-        return {}
+        return _name(location)
+    return os.path.relpath(path, folder) if shared != Path(shared.anchor) else _name(location)
+
+
+def _name(location: str) -> str:
+    """Return the name of a location's file, with the prim that it names."""
+    file, mark, prim = location.partition(":/")
+    return Path(file).name + mark + prim
 
 
 @dataclass(frozen=True)
@@ -68,22 +80,27 @@ def read_origin(shot: Path, elsewhere: Mapping[str, str | os.PathLike[str] | Non
     except (TypeError, ValueError) as error:
         fail(str(shot), f"the file does not say how it was baked as this version does ({error})", allowed,
              "bake it again")  # fmt: skip
-    beside = provenance.get("beside")
-    folder = shot.parent
+    beside = provenance.get("beside")  # earlier versions stored paths as they were given, and these here
     found: dict[str, str] = {}
     for name, path in stored.inputs.items():
-        then = Path(path)
-        near = folder / str(beside[name]) if isinstance(beside, Mapping) and name in beside else then
-        found[name] = str(elsewhere.get(name) or _existing(shot, name, then, near))
+        near = str(beside[name]) if isinstance(beside, Mapping) and name in beside else path
+        found[name] = str(elsewhere.get(name) or _existing(shot, name, near, Path(path)))
     hashes = {name: provenance.get(f"{name}_sha256") for name in ("model", "motion")}
     return ShotOrigin(replace(stored, model=found["model"], stage=found["stage"], motion=found["motion"]), hashes)
 
 
-def _existing(shot: Path, name: str, then: Path, near: Path) -> Path:
-    """Return the place of an input where there is a file."""
+def _existing(shot: Path, name: str, near: str, then: Path) -> Path:
+    """Return the place of an input where there is a file.
+
+    It is looked for where it lay as seen from the shot, then in the same place as seen from the working folder and
+    from each folder above the shot, because some inputs may have stayed where they were.
+    """
     from ssilk_usd.read_stage import split_location
 
-    there = next((path for path in (then, near) if Path(split_location(str(path))[0]).exists()), None)
+    parts = Path(near).parts
+    tail = Path(*parts[next((at for at, part in enumerate(parts) if part != ".."), 0) :])
+    places = [shot.parent / near, then, Path(tail), *(above / tail for above in shot.absolute().parents)]
+    there = next((path for path in places if Path(split_location(str(path))[0]).is_file()), None)
     if there is None:
-        fail(str(shot), f"the {name} that it was baked from is not at {then}", f"--{name} gives its present path")
+        fail(str(shot), f"the {name} that it was baked from is not at {near}", f"--{name} gives its present path")
     return there

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, UsdValidation
 from ssilk_usd.garment_api import SCHEMA, read_garment_record
 from ssilk_usd.play import Shot
 
@@ -137,6 +137,15 @@ def test_variants_switch_what_deforms_the_garment(copy):
     centred = rest - rest.mean(axis=1, keepdims=True)
     np.testing.assert_allclose(centred, np.broadcast_to(centred[0], centred.shape), atol=1e-6)
     assert np.abs(full - full.mean(axis=1, keepdims=True) - centred).max() > 1e-3
+
+
+@pytest.mark.parametrize("choice", ["skel", "rest", "points"])
+def test_each_variant_is_valid(copy, choice):
+    stage = Usd.Stage.Open(str(anim()))
+    stage.GetDefaultPrim().GetVariantSet("deformation").SetVariantSelection(choice)
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    found = UsdValidation.ValidationContext(validators).Validate(stage)
+    assert [error.GetMessage() for error in found if error.GetType() == UsdValidation.ValidationErrorType.Error] == []
 
 
 def test_a_new_bake_replaces_the_animation_alone_and_artists_layers_hold(copy, toy):

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from pxr import Gf, Usd, UsdSkel
+from pxr import Gf, Sdf, Usd, UsdSkel
 
 from ssilk_core.checkpoint import load_model, save_model
 from ssilk_core.cli import main, parser
@@ -113,3 +113,24 @@ def test_jumps_are_warned_of(copy, toy, capsys, joint, says):
     moved(toy, copy / "jump.usda", 500.0, joint, from_frame=4)
     assert run(f"{BAKE} --motion jump.usda -o jump.usdc --json") == 0
     assert says in said(capsys)
+
+
+# Paths and names
+
+
+def test_the_same_inputs_give_the_same_bytes_wherever_they_lie(toy, tmp_path, monkeypatch):
+    """Given by absolute paths; no layer names a folder above."""
+    for name in ("here", "a studio/elsewhere"):
+        folder = tmp_path / name
+        toy.copy(folder)
+        toy.write_clip(folder / "walk.usda", frames=3)
+        inputs = f"'{folder}/model.safetensors' --stage '{folder}/rigged.usda' --motion '{folder}/walk.usda'"
+        assert run(f"bake {inputs} --points -o '{folder}/layers'") == 0
+    one, other = tmp_path / "here/layers", tmp_path / "a studio/elsewhere/layers"
+    files = sorted(path.relative_to(one) for path in one.rglob("*") if path.is_file())
+    assert len(files) == 6
+    for file in files:
+        assert (one / file).read_bytes() == (other / file).read_bytes(), file
+        if file.suffix == ".usdc":
+            assert str(tmp_path) not in Sdf.Layer.FindOrOpen(str(one / file)).ExportToString()
+    assert run(f"verify '{other}/shots/walk/model/anim.usdc'") == 0

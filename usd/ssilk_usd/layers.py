@@ -227,7 +227,7 @@ def _define_points(stage: Usd.Stage, asset: Asset, layout: Layout) -> None:
     with _variant(root, DEFORMATION, "points"):
         root.GetPayloads().AddPayload(f"./{layout.points.name}", asset.root)
         mesh = stage.OverridePrim(asset.garment)
-        mesh.RemoveAppliedSchema("SkelBindingAPI")
+        # The schema stays applied, since its properties come with the asset; without a skeleton nothing is skinned.
         UsdSkel.BindingAPI(mesh).CreateSkeletonRel().SetTargets([])
     root.GetVariantSet(DEFORMATION).SetVariantSelection("skel")
 
