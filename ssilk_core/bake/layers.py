@@ -23,7 +23,7 @@ from .request import BakeRequest
 from .result import BakeResult
 from .rollout import BakeRollout
 from .skin import SkinMeter
-from .task import BakeTask, plan_layers
+from .task import BakeTask, has_possible_names, need_possible_names, plan_layers
 from .verification import verify_file
 from .write import result_of
 
@@ -99,6 +99,7 @@ class LayerFolder:
         Raises:
             SsilkError: an input is missing or cannot be read.
         """
+        need_possible_names(task)
         return current_record(self._home(task), key_of(task)) is not None
 
     def bake(self, task: BakeTask, *, again: bool = False, report: Reporter = silent) -> BakeResult:
@@ -108,6 +109,7 @@ class LayerFolder:
             SsilkError: an input is missing or bad, or a file cannot be written.
             VerificationError: the written layer is not what was computed; it is not kept.
         """
+        need_possible_names(task)
         layout, key, home = self.layout(task), key_of(task), self._home(task)
         if not again and (record := current_record(home, key)):
             return replace(record.result, current=True)
@@ -154,7 +156,7 @@ class LayerFolder:
 
     def remove_unfinished(self, tasks: Sequence[BakeTask]) -> None:
         """Remove what killed processes left half written of tasks that nobody works on any more."""
-        layouts = [self.layout(task) for task in tasks]
+        layouts = [self.layout(task) for task in tasks if has_possible_names(task)]
         shared = {path for layout in layouts for path in (layout.asset, layout.geometry, layout.stage)}
         for path in shared.union(*(_own_files(layout) for layout in layouts)):
             remove_unfinished(path)

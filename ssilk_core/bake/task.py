@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -13,6 +14,8 @@ from ..checkpoint import load_model
 from ..errors import fail
 from ..targets import check_influences
 from .request import BakeRequest, need_body
+
+LONGEST_NAME = 255  # [bytes] of a file or folder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,6 +82,22 @@ def plan_layers(
     ]
     _need_unique([task.name for task in tasks], "MODEL", "tasks")
     return tasks
+
+
+def has_possible_names(task: BakeTask) -> bool:
+    """Return whether file systems take the names of a task's folders."""
+    return max(len(os.fsencode(name)) for name in (task.garment, task.shot)) <= LONGEST_NAME
+
+
+def need_possible_names(task: BakeTask) -> None:
+    """Raise `SsilkError` where the name of a task's folder is longer than file systems take."""
+    if not has_possible_names(task):
+        fail(
+            f"{task.name[:60]}...",
+            f"a name of {max(len(task.garment), len(task.shot))} characters",
+            f"folders are named by it, and file systems take {LONGEST_NAME}",
+            "rename the model or the motion",
+        )
 
 
 def _need_for_layers(requests: Sequence[BakeRequest], include_body: bool) -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from .job import NAME, write_job
 TEMPLATE, VALUES, ASSETS = "template.json", "parameter_values.json", "asset_references.json"
 CHUNK, CHUNK_SECONDS = 10, 300  # tasks of a chunk at first, and how long one should take; both are parameters
 NOTICE = 30  # seconds that a worker has to stop
+CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")  # what may end or change a line
 _STOP = {"mode": "NOTIFY_THEN_TERMINATE", "notifyPeriodInSeconds": NOTICE}
 
 
@@ -155,8 +157,13 @@ class OpenJdReporter:
                 self._say(f"openjd_status: {task} {name}")
             case Failed() | GarmentEvent(_, Failed()):
                 self._say(f"openjd_fail: {describe(event)}")
-            case Message() | Result() | GarmentEvent():
-                self._say(describe(event))
+            case GarmentEvent(name, Result(_, detail)):
+                self._say(f"{name}: " + ", ".join(f"{key} {value}" for key, value in detail.items()))
+            case Result(_, detail):
+                self._say(", ".join(f"{key} {value}" for key, value in detail.items()))
+            case Message() | GarmentEvent():
+                text = describe(event)
+                self._say(f" {text}" if text.startswith("openjd_") else text)  # a name is no command
 
     def _progress(self, percent: float) -> None:
         if int(percent) > self.percent:  # sessions log each line
@@ -164,4 +171,6 @@ class OpenJdReporter:
             self._say(f"openjd_progress: {percent:.1f}")
 
     def _say(self, text: str) -> None:
+        """Print one line: a line break in a file's name would begin another, which sessions might obey."""
+        text = CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
         print(text, file=self.stream, flush=True)

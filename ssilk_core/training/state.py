@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -242,6 +243,7 @@ def _need_finite(tensors: Tensors) -> None:
 
 def _need_same(path: Path, asked: dict[str, Any], before: dict[str, Any]) -> None:
     differing: list[str] = []
+    asked, before = _located(asked, asked), _located(before, asked)
     for key, value in asked.items():
         old = before.get(key)
         if isinstance(value, dict) and isinstance(old, dict):
@@ -255,6 +257,24 @@ def _need_same(path: Path, asked: dict[str, Any], before: dict[str, Any]) -> Non
             "a resumed run repeats the same command",
             "use the same options or train without --resume",
         )
+
+
+def _located(identity: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
+    """Return the inputs of a run with each file as `now` writes its path: what is in a file counts, not its place."""
+    left, places = dict(now.get("inputs", {})), {}
+    for path, digest in identity.get("inputs", {}).items():
+        same = [other for other, found in left.items() if found == digest]
+        alike = [other for other in same or left if Path(other).name == Path(path).name]
+        places[os.path.normpath(path)] = chosen = path if path in left else next(iter((*alike, *same)), path)
+        left.pop(chosen, None)
+
+    def located(location: str) -> str:
+        file, mark, prim = location.partition(":/")
+        return os.path.normpath(places.get(os.path.normpath(file), file)) + mark + prim
+
+    parts = {name: identity[name] for name in ("inputs", "motions", "held out") if name in identity}
+    moved = {name: {located(key): value for key, value in part.items()} for name, part in parts.items()}
+    return {**identity, **moved, "garment": located(identity.get("garment", ""))}
 
 
 def scene_digest(scene: Scene) -> str:

@@ -35,7 +35,7 @@ from ssilk_core.training.objective import Objective
 from ssilk_core.training.run import train
 from ssilk_core.training.run_files import RunFiles
 from ssilk_core.training.signals import stop_on_signals
-from ssilk_core.training.state import RunState, learned_tensors, load_state, state_path
+from ssilk_core.training.state import RunState, _need_same, json_round_trip, learned_tensors, load_state, state_path
 from ssilk_core.training.step import EAGER_STEPS, Stepper, learning_rate
 from ssilk_core.training.validation import Score, Validator
 from ssilk_core.training.verdict import is_worse, worse_message
@@ -183,6 +183,22 @@ def test_a_run_is_not_resumed_on_another_animation_of_the_same_files(uninterrupt
     first, *others = getattr(uninterrupted, changed)
     with pytest.raises(SsilkError, match=rf"started with another .*{name}.*a resumed run repeats the same command"):
         train(replace(uninterrupted, resume=True, **{changed: [change(first), *others]}), silent)
+
+
+def test_a_run_is_resumed_however_its_paths_are_written(job, uninterrupted):
+    first, *others = uninterrupted.motions
+    inputs = {"shots/a.usd": "123", "stage.usd": "abc", "copy/stage.usd": "abc"}
+    written = replace(uninterrupted, motions=[replace(first, path="shots/a.usd:/Walk"), *others], inputs=inputs)
+    before = json_round_trip(written.identity())
+    elsewhere = {"/proj/link/a.usd": "123", "/proj/./stage.usd": "abc", "/proj/copy/stage.usd": "abc"}
+    again = replace(written, motions=[replace(first, path="/proj/link/./a.usd:/Walk"), *others], inputs=elsewhere)
+    _need_same(Path("state"), again.identity(), before)
+    for wrong in (
+        replace(again, inputs=elsewhere | {"/proj/link/a.usd": "124"}),
+        replace(again, motions=[replace(first, path="/proj/link/a.usd:/Run"), *others]),
+    ):
+        with pytest.raises(SsilkError, match=r"a\.usd"):
+            _need_same(Path("state"), wrong.identity(), before)
 
 
 def test_damaged_or_missing_states_are_refused(job, uninterrupted):

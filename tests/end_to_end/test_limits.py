@@ -134,3 +134,16 @@ def test_the_same_inputs_give_the_same_bytes_wherever_they_lie(toy, tmp_path, mo
         if file.suffix == ".usdc":
             assert str(tmp_path) not in Sdf.Layer.FindOrOpen(str(one / file)).ExportToString()
     assert run(f"verify '{other}/shots/walk/model/anim.usdc'") == 0
+
+
+def test_a_name_that_is_too_long_fails_its_task_alone(copy, capsys):
+    assert run("farm model.safetensors --stage rigged.usda --motion clip.usda --bundle job") == 0
+    job = json.loads(Path("job/job.json").read_text())
+    job["tasks"] = [job["tasks"][0] | {"shot": "long" * 70}, *job["tasks"]]
+    Path("job/job.json").write_text(json.dumps(job))
+    capsys.readouterr()
+    assert run("task job/job.json -o out --openjd") == 4
+    (failed,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("openjd_fail")]
+    assert "a name of 280 characters" in failed
+    assert run("task job/job.json -o out --check --json") == 3
+    assert "1 of 2 tasks are not done" in said(capsys, "error") and Path("out/shots/clip/shot.usda").is_file()

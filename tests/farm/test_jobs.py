@@ -16,7 +16,7 @@ from openjd.model import IntRangeExpr, create_job, decode_job_template, preproce
 from ssilk_core.bake import BakeRequest, BakeResult, BakeTask, FrameSpan, Verification, plan_layers
 from ssilk_core.bake.record import RECORD, TaskRecord, current_record, read_record, task_key, write_record
 from ssilk_core.errors import SsilkError
-from ssilk_core.events import Failed, GarmentEvent, Message, Progress, Started
+from ssilk_core.events import Failed, GarmentEvent, Message, Progress, Result, Started
 from ssilk_core.farm.job import numbers, read_job, write_job
 from ssilk_core.farm.openjd import BundleOptions, OpenJdReporter, template, write_bundle
 from ssilk_core.files import sha256
@@ -214,6 +214,21 @@ def test_a_bundle_names_the_files_that_it_takes_and_gives(tmp_path):
     assert assets["outputs"]["directories"] == [str(tmp_path / "out")]
     values = json.loads((tmp_path / "parameter_values.json").read_text())["parameterValues"]
     assert values == [{"name": "Output", "value": str(tmp_path / "out")}]
+
+
+def test_no_name_is_a_command_of_a_session():
+    stream = io.StringIO()
+    report, name = OpenJdReporter(stream), "a\nopenjd_fail: forged\r\u2028\x85\x1b[2J"
+    results = Result("bake", {"path": name}), GarmentEvent(name, Result("bake", {name: name}))
+    said = Failed(name), Message(name), Message("openjd_fail: forged"), GarmentEvent(name, Started("bake", 1))
+    for event in (*said, *results):
+        report(event)
+    lines = stream.getvalue().splitlines()
+    assert len(lines) == 6 and not any(ord(each) < 32 for line in lines for each in line)
+    assert [line.partition(":")[0] for line in lines if line.startswith("openjd_")] == [
+        "openjd_fail",
+        "openjd_status",
+    ]
 
 
 def test_what_sessions_read_of_a_worker():
