@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 from ..bake import BakeTask, LayerFolder, plan_layers
 from ..errors import EXIT_OK, EXIT_TASKS, fail
 from ..events import Failed, GarmentEvent, Progress, Reporter, Result, Started
+from ..farm.job import pinned
 from ..farm.openjd import TEMPLATE, BundleOptions, write_bundle
 from .options import add_bake, layer_options, requests_of
 
@@ -43,11 +44,12 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Write the bundle, or run the tasks."""
+    if not (options.bundle or options.output):
+        fail("--cluster", "no folder for the layers", "-o names one")
     tasks = [_absolute(task) for task in plan_layers(requests_of(options), **layer_options(options))]
+    tasks = pinned(tasks, report)
     if options.bundle:
         return _write(tasks, options, report)
-    if not options.output:
-        fail("--cluster", "no folder for the layers", "-o names one")
     return _run(tasks, options, report)
 
 

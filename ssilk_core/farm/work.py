@@ -46,7 +46,8 @@ def check_tasks(tasks: Sequence[BakeTask], folder: Path, report: Reporter) -> No
     """
     layers = LayerFolder(folder)
     layers.remove_unfinished(tasks)
-    done = [task for task in tasks if _is_done(layers, task, report)]
+    faults: set[str] = set()
+    done = [task for task in tasks if _is_done(layers, task, faults, report)]
     layers.write_stages(done, report)
     missing = sorted(task.name for task in set(tasks).difference(done))
     if missing:
@@ -57,9 +58,12 @@ def check_tasks(tasks: Sequence[BakeTask], folder: Path, report: Reporter) -> No
     report(Result("check", {"tasks": len(tasks), "output": str(folder)}))
 
 
-def _is_done(layers: LayerFolder, task: BakeTask, report: Reporter) -> bool:
+def _is_done(layers: LayerFolder, task: BakeTask, faults: set[str], report: Reporter) -> bool:
+    """Return whether a task is done; report each fault of an input once, however many tasks have it."""
     try:
         return layers.is_done(task)
-    except SsilkError as error:  # an input that cannot be read
-        report(Message(f"{task.name}: {error}", "warning"))
+    except SsilkError as error:
+        if str(error) not in faults:
+            faults.add(str(error))
+            report(Message(f"{task.name}: {error}", "warning"))
         return False

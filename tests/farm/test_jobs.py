@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from openjd.model import IntRangeExpr, create_job, decode_job_template, preprocess_job_parameters
 
 from ssilk_core.bake import BakeRequest, BakeResult, BakeTask, FrameSpan, Verification, plan_layers
+from ssilk_core.bake.inputs import InputHashes
 from ssilk_core.bake.record import RECORD, TaskRecord, current_record, read_record, task_key, write_record
 from ssilk_core.errors import SsilkError
 from ssilk_core.events import Failed, GarmentEvent, Message, Progress, Started
@@ -24,7 +25,7 @@ from ssilk_core.reduction import ModelSize
 
 REQUEST = BakeRequest(model="/m/cape.safetensors", stage="/s/hero.usd", motion="/s/walk.usd")
 TASK = BakeTask(garment="cape", shot="walk", request=REQUEST)
-CONTENTS = dict.fromkeys(REQUEST.inputs, "0")
+CONTENTS = InputHashes(model="0", stage="0", motion="0")
 SETTINGS = settings(max_examples=200, deadline=None, derandomize=True, database=None,
                     suppress_health_check=[HealthCheck.function_scoped_fixture])  # fmt: skip
 
@@ -87,7 +88,7 @@ def test_a_key_is_of_all_that_decides_what_is_written():
     others += [task_key(replace(TASK, **{name: value}), CONTENTS) for name, value in (
         ("include_body", False), ("points", True), ("garment", "hat"), ("shot", "run"),
     )]  # fmt: skip
-    others += [task_key(TASK, {**CONTENTS, name: "1"}) for name in CONTENTS]
+    others += [task_key(TASK, replace(CONTENTS, **{name: "1"})) for name in REQUEST.inputs]
     assert len({key, *others}) == len(others) + 1
     moved = replace(TASK, request=replace(REQUEST, model="/elsewhere/cape.safetensors"))
     assert task_key(moved, CONTENTS) == key
