@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import TypeVar
 
 from ..errors import SsilkError, fail
@@ -110,11 +110,15 @@ def read_unchanged(contents: Callable[[], InputContents], read: Callable[[], T])
 
 
 class InputFiles:
-    """The inputs of many tasks as they are now, each file read again only where it may have changed."""
+    """The inputs of many tasks as they are now, each file read again only where it may have changed.
 
-    def __init__(self) -> None:
+    Args:
+        known: what inputs held before, by their locations: where they still do, USD need not open them.
+    """
+
+    def __init__(self, known: Mapping[str, InputContents] = MappingProxyType({})) -> None:
         self._hashed = FileHashes().sha256
-        self._known: dict[tuple[str, str], InputContents] = {}
+        self._known = dict(known)
 
     def hashes(self, request: BakeRequest) -> InputHashes:
         """Return what the inputs of a request hold; raise `SsilkError` where one cannot be read."""
@@ -129,11 +133,15 @@ class InputFiles:
         Raises:
             SsilkError: it cannot be read.
         """
-        known = self._known.get((name, path))
+        return self.contents(name, path).digest
+
+    def contents(self, name: str, path: str) -> InputContents:
+        """Return what an input holds; arguments and errors are those of `digest`."""
+        known = self._known.get(path)
         if known is None or not self.still_there(known):
-            find = partial(model_contents if name == "model" else stage_contents, path)
-            known = self._known[name, path] = find(self._hashed)
-        return known.digest
+            find = model_contents if name == "model" else stage_contents
+            known = self._known[path] = find(path, self._hashed)
+        return known
 
     def still_there(self, contents: InputContents) -> bool:
         """Return whether the files of an input hold the same as before."""

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,7 @@ from ..files import FileHashes, remove_unfinished_in, replacing, sha256
 from ..targets import check_influences
 from ..work_record import is_file
 from .hiding import covered_polygons
-from .inputs import InputFiles, need_pinned
+from .inputs import InputFiles, InputHashes, need_pinned
 from .load import LoadedGarment, load_garment
 from .origin import shot_metadata
 from .record import RECORD, TaskRecord, current_record, read_record, task_key, write_record
@@ -78,9 +78,9 @@ class LayerFolder:
     once.
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: str | os.PathLike[str], inputs: InputFiles | None = None) -> None:
         self.path = Path(path)
-        self.inputs = InputFiles()
+        self.inputs = inputs or InputFiles()
         self._files = FileHashes()
         self._loaded: LoadedGarment | None = None
         self._written: tuple[object, WrittenAsset] | None = None
@@ -108,7 +108,11 @@ class LayerFolder:
         found = self.inputs.hashes(task.request)
         if task.pinned:
             need_pinned(task.request, task.pinned, found)
-        return current_record(self._home(task), task_key(task, found), self._files.sha256) is not None
+        return self.is_written(task, found)
+
+    def is_written(self, task: BakeTask, contents: InputHashes) -> bool:
+        """Return whether a task is done with inputs that hold this, and its files are as they were written."""
+        return current_record(self._home(task), task_key(task, contents), self._files.sha256) is not None
 
     def bake(self, task: BakeTask, *, again: bool = False, report: Reporter = silent) -> BakeResult:
         """Bake one garment in one shot, unless that is done already.
@@ -158,10 +162,13 @@ class LayerFolder:
         shots: dict[str, list[Layout]] = {}
         for layout in layouts:
             shots.setdefault(layout.shot, []).append(layout)
+        known: dict[str, set[str]] = {}
+        for layout in layouts:
+            known.setdefault(layout.garment, set()).add(layout.shot)
         for garments in shots.values():
             write_stage(garments)
         for layout in {layout.garment: layout for layout in layouts}.values():
-            outdated = list(_outdated_shots(layout))
+            outdated = list(_outdated_shots(layout, known[layout.garment]))
             if outdated:
                 report(Message(
                     f"{layout.asset}: {len(outdated)} shots were baked with the asset as it was before "
@@ -230,9 +237,13 @@ def _write_layer(
     return result_of(skin, layout.animation, summary, verification, hidden), digests
 
 
-def _outdated_shots(layout: Layout) -> Iterator[str]:
-    """Yield the shots whose record has another asset of this garment than is there now."""
+def _outdated_shots(layout: Layout, current: Container[str]) -> Iterator[str]:
+    """Yield the shots, besides the `current` ones, whose record has another asset of this garment than is there."""
+    digest = sha256(layout.geometry) if layout.geometry.is_file() else None
     for path in sorted(layout.folder.glob(f"shots/*/{layout.garment}/{RECORD}")):
+        shot = path.parent.parent.name
+        if digest is None or shot in current:
+            continue
         record, name = read_record(path.parent), os.path.relpath(layout.geometry, path.parent)
-        if record and layout.geometry.is_file() and record.files.get(name) != sha256(layout.geometry):
-            yield path.parent.parent.name
+        if record and record.files.get(name) != digest:
+            yield shot

@@ -37,5 +37,5 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     if options.check:
         check_tasks(read_job(options.job, options.path_mapping), options.output, report)
         return EXIT_OK
-    failed = bake_tasks(read_job(options.job, options.path_mapping, options.tasks), options.output, report)
+    failed = bake_tasks(read_job(options.job, options.path_mapping, options.tasks).tasks, options.output, report)
     return EXIT_TASKS if failed else EXIT_OK

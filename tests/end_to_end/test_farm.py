@@ -127,7 +127,7 @@ def test_a_chunk_writes_its_asset_once_while_it_stays_as_it_was(farm, monkeypatc
 
     monkeypatch.setattr(layers_of_usd, "write_asset", counted)
     assert task() == 0 and written == ["a"]
-    folder, job = LayerFolder("out"), read_job(Path("bundle/job.json"))
+    folder, job = LayerFolder("out"), read_job("bundle/job.json").tasks
     folder.bake(job[0], again=True)
     whole = sha256("out/assets/model/geometry.usdc")
     Path("out/assets/model/geometry.usdc").write_bytes(b"")
@@ -188,7 +188,7 @@ def test_the_last_step_removes_what_killed_workers_left(farm):
 def test_workers_that_bake_the_same_task_at_once_all_succeed(farm, monkeypatch):
     """A second worker begins each task, and ends it, while the first has written half of it: twice within."""
     assert run("task bundle/job.json -o quiet") == 0
-    (tasks, write, depth) = read_job("bundle/job.json"), layers_of_usd.write_animation, []
+    (tasks, write, depth) = read_job("bundle/job.json").tasks, layers_of_usd.write_animation, []
 
     def interrupted(layout, *args, **options):
         options["path"].write_text("half")
@@ -213,7 +213,7 @@ def other_model(path: Path) -> Path:
 
 
 def test_a_model_that_is_published_while_a_chunk_runs_is_refused(farm, capsys):
-    folder, (first, second, _) = LayerFolder("out"), read_job("bundle/job.json")
+    folder, (first, second, _) = LayerFolder("out"), read_job("bundle/job.json").tasks
     folder.bake(first)
     shutil.copy("model.safetensors", "old.safetensors")
     other_model(farm / "new.safetensors").replace("model.safetensors")
@@ -231,7 +231,7 @@ def test_a_model_that_is_published_while_a_chunk_runs_is_refused(farm, capsys):
 
 def test_what_is_baked_without_a_job_is_what_its_key_says(farm):
     """The model is replaced between two shots of one process: each is baked as a process does that sees it alone."""
-    folder, tasks = LayerFolder("out"), [replace(task, pinned=None) for task in read_job("bundle/job.json")]
+    folder, tasks = LayerFolder("out"), [replace(task, pinned=None) for task in read_job("bundle/job.json").tasks]
     folder.bake(tasks[0])
     other_model(farm / "new.safetensors").replace("model.safetensors")
     folder.bake(tasks[1])
@@ -243,7 +243,7 @@ def test_what_is_baked_without_a_job_is_what_its_key_says(farm):
 @pytest.mark.parametrize(("changes", "says"), [(1, None), (99, "it changes while it is read")])
 def test_a_motion_that_changes_while_it_is_read_is_read_again(farm, toy, monkeypatch, changes, says):
     """Its key is of the bytes that were used, or there is none."""
-    tasks, read, left = [replace(task, pinned=None) for task in read_job("bundle/job.json")], [], [changes]
+    tasks, read, left = [replace(task, pinned=None) for task in read_job("bundle/job.json").tasks], [], [changes]
     original = read_visibility.read_hidden
 
     def replaced_before(source, motion, **options):
