@@ -48,12 +48,11 @@ class Worker:
 
     def __init__(self, words: Sequence[str], folder: Path, log: Path, delay: float) -> None:
         self.folder, self.log = folder, log
-        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        self.process = subprocess.Popen([sys.executable, "-c", WORK, *words], **quiet)
+        self.process = _quiet([sys.executable, "-c", WORK, *words])
         os.waitid(os.P_PID, self.process.pid, os.WSTOPPED | os.WNOWAIT)
         inject = f"inject={CALLS}:delay_enter={round(delay * 1e6)}"
         tracing = ["strace", "-f", "-y", "-qq", "-e", f"trace={CALLS}", "-e", inject, "-o", str(log)]
-        self.tracer = subprocess.Popen([*tracing, "-p", str(self.process.pid)], **quiet)
+        self.tracer = _quiet([*tracing, "-p", str(self.process.pid)])
         while not re.search(r"TracerPid:\t[1-9]", Path(f"/proc/{self.process.pid}/status").read_text()):
             time.sleep(0.01)
 
@@ -73,6 +72,10 @@ class Worker:
         return sum(str(self.folder) in line for line in lines), len(lines)
 
 
+def _quiet(words: Sequence[str]) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
 def main() -> None:
     """Measure and write the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -90,13 +93,14 @@ def main() -> None:
 
 def _measured(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     _write_shots(options, folder)
-    runs, out = {}, folder / "layers_1"
+    runs: dict[str, Any] = {}
+    out = folder / "layers_1"
     for count in options.workers:
         out = folder / f"layers_{count}"
         share = options.shots // count
         chunks = [f"{first}-{first + share - 1}" for first in range(0, share * count, share)]
-        words = [["task", str(folder / "job.json"), "-o", str(out), "--tasks", chunk] for chunk in chunks]
-        runs[f"bake, workers: {count}"] = _run(words, folder, options.delay)
+        commands = [["task", str(folder / "job.json"), "-o", str(out), "--tasks", chunk] for chunk in chunks]
+        runs[f"bake, workers: {count}"] = _run(commands, folder, options.delay)
     words = ["task", str(folder / "job.json"), "-o", str(out)]
     runs["bake again"] = _run([words], folder, options.delay)
     runs["check"] = _run([[*words, "--check"]], folder, options.delay)
