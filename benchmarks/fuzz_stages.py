@@ -16,6 +16,7 @@ import struct
 import sys
 import time
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 from helpers.reports import table, write_results
@@ -58,12 +59,13 @@ class Fuzzer:
     def __init__(self, folder: Path, kind: str, source: Path, character: Path) -> None:
         self.content, self.path = source.read_bytes(), folder / f"damaged{source.suffix}"
         skeleton = read_character(character).skeleton
-        readers = {
+        readers: dict[str, Callable[[Path], object]] = {
             "character": read_character,
             "motion": lambda path: read_motion(path, skeleton),
             "model": load_model,
         }
-        self.read, self.ends, self.longest = readers[kind], Counter(), 0.0
+        self.read, self.longest = readers[kind], 0.0
+        self.ends: Counter[str] = Counter()
 
     def step(self, draw: random.Random) -> None:
         """Read one more."""

@@ -4,18 +4,24 @@
 from __future__ import annotations
 
 import filecmp
-import glob
 import hashlib
 import os
+import re
+import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 
 from .errors import SsilkError, fail
 
 WRITABLE = "choose an output folder that exists and that you may write to"
-UNFINISHED = ".{}.partial-"  # start of temporary names; the braces stand for the stem of the target
+UNFINISHED = ".{}.partial-{}-"  # start of temporary names: the stem of the target, and who writes
+_WRITER = re.compile(r"\.partial-(?P<host>[0-9a-f]+)\.(?P<process>\d+)\.(?P<began>\d+)-")
+STEM = 64  # characters of a target's stem in temporary names, which may have 255 in all
+ABANDONED = 24 * 3600.0  # seconds without a change after which a temporary file's writer has ended, wherever it ran
 
 
 @contextmanager
@@ -33,7 +39,7 @@ def replacing(target: str | Path, *, keep_same: bool = False) -> Iterator[Path]:
     target = Path(target)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        prefix = UNFINISHED.format(target.stem)
+        prefix = UNFINISHED.format(target.stem[:STEM], _writer())
         handle, name = tempfile.mkstemp(prefix=prefix, suffix=target.suffix, dir=target.parent)
         os.close(handle)
     except OSError as error:
@@ -59,15 +65,72 @@ def replacing(target: str | Path, *, keep_same: bool = False) -> Iterator[Path]:
 
 
 def remove_unfinished(target: str | Path) -> None:
-    """Remove temporary files that killed processes left beside `target`.
-
-    No other process may write `target` at the same time.
-    """
+    """Remove temporary files beside `target` whose writers have ended; others may write `target` meanwhile."""
     target = Path(target)
-    name = glob.escape(UNFINISHED.format(target.stem))
-    for prefix in (name, f".{name}"):  # the second: a writer that itself replaces its file
-        for path in target.parent.glob(f"{prefix}*{glob.escape(target.suffix)}"):
+    stem = re.escape(UNFINISHED.format(target.stem[:STEM], "").removesuffix("-"))
+    _remove(target.parent, re.compile(rf"\.?{stem}.*{re.escape(target.suffix)}", re.DOTALL))
+
+
+def remove_unfinished_in(folder: str | Path) -> None:
+    """Remove the temporary files in a folder whose writers have ended."""
+    _remove(Path(folder), re.compile(r"\..*\.partial-.*", re.DOTALL))
+
+
+def _remove(folder: Path, names: re.Pattern[str]) -> None:
+    try:
+        found = [path for path in folder.iterdir() if names.match(path.name)]
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    for path in found:
+        if _has_ended(path):
             path.unlink(missing_ok=True)
+
+
+def _has_ended(temporary: Path) -> bool:
+    """Return whether the writer of a temporary file has ended: seen here, or because the file stays as it is."""
+    writer = _WRITER.search(temporary.name)
+    if writer and writer["host"] == _host():
+        return not _is_running(int(writer["process"]), int(writer["began"]))
+    try:
+        return time.time() - temporary.stat().st_mtime > ABANDONED
+    except FileNotFoundError:
+        return True
+
+
+def _writer() -> str:
+    """Return this process, as no other is called: a number that is given again comes with another start."""
+    return f"{_host() or '0'}.{os.getpid()}.{_began(os.getpid()) or 0}"
+
+
+@lru_cache(maxsize=1)
+def _host() -> str:
+    """Return where processes have their numbers from: a start of this machine, and a container; "" if unknown."""
+    if not sys.platform.startswith("linux"):
+        return ""
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text()
+        return hashlib.sha256(f"{boot} {os.readlink('/proc/self/ns/pid')}".encode()).hexdigest()[:12]
+    except OSError:
+        return ""
+
+
+def _is_running(process: int, began: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # another user's, which /proc may hide
+        pass
+    return _began(process) in (began, None)
+
+
+def _began(process: int) -> int | None:
+    """Return when a process began, in ticks since the machine did; 0 if it has ended, None if that cannot be seen."""
+    try:
+        state, *rest = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return None
+    return 0 if state in "ZX" else int(rest[18])
 
 
 def need_writable(target: str | Path) -> None:
@@ -102,3 +165,23 @@ def sha256(path: str | Path) -> str:
         while block := stream.read(1 << 20):
             digest.update(block)
     return digest.hexdigest()
+
+
+class FileHashes:
+    """SHA-256 of files, which are read again only where they may have changed.
+
+    A file counts as the same while its device, inode, size, and times of modification and of change are the same.
+    Programs cannot set the time of change. What stays unseen is a file that is rewritten in place, with the same
+    size, within one tick of its file system's clock (some milliseconds) after it was read.
+    """
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[int, ...], str] = {}
+
+    def sha256(self, path: str | Path) -> str:
+        """Return the SHA-256 of a file's bytes as hexadecimal text; raise `OSError` where it cannot be read."""
+        found = os.stat(path)  # before the bytes: where they change meanwhile, they are read again next time
+        state = (found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns)
+        if state not in self._known:
+            self._known[state] = sha256(path)
+        return self._known[state]

@@ -5,13 +5,15 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from .errors import fail
 from .files import replacing, sha256
+
+Hash = Callable[[Path], str]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,13 +30,21 @@ class WorkRecord:
     files: Mapping[str, str] = field(default_factory=dict)
     detail: Mapping[str, Any] = field(default_factory=dict)
 
-    def is_done(self, folder: Path) -> bool:
-        """Return whether the work is finished and its files in `folder` are as it wrote them."""
-        return bool(self.files) and all(_is_file(folder / name, digest) for name, digest in self.files.items())
+    def is_done(self, folder: Path, hashed: Hash = sha256) -> bool:
+        """Return whether the work is finished and its files in `folder` are as it wrote them.
+
+        Args:
+            hashed: gives the SHA-256 of a file.
+        """
+        return bool(self.files) and all(is_file(folder / name, digest, hashed) for name, digest in self.files.items())
 
 
-def _is_file(path: Path, digest: str) -> bool:
-    return path.is_file() and sha256(path) == digest
+def is_file(path: Path, digest: str, hashed: Hash = sha256) -> bool:
+    """Return whether there is a file with these contents."""
+    try:
+        return hashed(path) == digest
+    except OSError:
+        return False
 
 
 def request_key(asked: object, contents: Iterable[tuple[str, str]]) -> str:

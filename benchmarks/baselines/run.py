@@ -141,7 +141,9 @@ class BaselineRun:
         state.skipped = int(self.stepper.skipped.count)
         if state.best is None or score.total < state.best.score.total:
             state.best = Best(state.iteration, score)
-            save_baseline(base.output, self.stepper.ema_model, base.fabric, self.files.provenance(state, score))
+            save_baseline(
+                base.output, self.stepper.ema_model, base.fabric, self.files.provenance(state, score, self.lbs)
+            )
             self.report(Checkpoint(str(base.output), state.iteration, True))
         self.files.save_state(self.stepper, state)
         self.files.save_curve(state, self.lbs)

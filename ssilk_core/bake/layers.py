@@ -4,17 +4,17 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import fail
 from ..events import Message, Reporter, Result, Started, silent
-from ..files import remove_unfinished, replacing, sha256
+from ..files import FileHashes, remove_unfinished_in, replacing, sha256
 from ..targets import check_influences
+from ..work_record import is_file
 from .hiding import covered_polygons
+from .inputs import InputFiles, InputHashes, need_pinned
 from .load import LoadedGarment, load_garment
 from .origin import shot_metadata
 from .record import RECORD, TaskRecord, current_record, read_record, task_key, write_record
@@ -29,7 +29,7 @@ from .write import result_of
 
 if TYPE_CHECKING:
     from ssilk_usd.author import Asset
-    from ssilk_usd.layers import Layout
+    from ssilk_usd.layers import Layout, WrittenAsset
 
 
 def bake_layers(
@@ -78,10 +78,12 @@ class LayerFolder:
     once.
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: str | os.PathLike[str], inputs: InputFiles | None = None) -> None:
         self.path = Path(path)
-        self._load = lru_cache(maxsize=1)(load_garment)
-        self._written: tuple[object, Asset] | None = None
+        self.inputs = inputs or InputFiles()
+        self._files = FileHashes()
+        self._loaded: LoadedGarment | None = None
+        self._written: tuple[object, WrittenAsset] | None = None
 
     def layout(self, task: BakeTask) -> Layout:
         """Return where the files of a task lie."""
@@ -91,51 +93,68 @@ class LayerFolder:
 
     def garment(self, task: BakeTask) -> LoadedGarment:
         """Return the garment of a task, ready for any motion; raise `SsilkError` as `load_garment`."""
-        return self._load(replace(task.request, motion=""))
+        request, kept = replace(task.request, motion=""), self._loaded
+        held = kept is not None and all(map(self.inputs.still_there, (kept.model_held, kept.stage_held)))
+        if kept is None or kept.request != request or not held:
+            kept = self._loaded = load_garment(request)
+        return kept
 
     def is_done(self, task: BakeTask) -> bool:
         """Return whether a task is done with its inputs as they are now, and its files are as they were written.
 
         Raises:
-            SsilkError: an input is missing or cannot be read.
+            SsilkError: an input is missing, cannot be read, or is not what the task's job was submitted with.
         """
         need_possible_names(task)
-        return current_record(self._home(task), key_of(task)) is not None
+        found = self.inputs.hashes(task.request)
+        if task.pinned:
+            need_pinned(task.request, task.pinned, found)
+        return self.is_written(task, found)
+
+    def is_written(self, task: BakeTask, contents: InputHashes) -> bool:
+        """Return whether a task is done with inputs that hold this, and its files are as they were written."""
+        return current_record(self._home(task), task_key(task, contents), self._files.sha256) is not None
 
     def bake(self, task: BakeTask, *, again: bool = False, report: Reporter = silent) -> BakeResult:
         """Bake one garment in one shot, unless that is done already.
 
+        Any number of processes may bake the same task at the same time: each writes the same files. The record's key
+        is of what the inputs held while they were read.
+
         Raises:
-            SsilkError: an input is missing or bad, or a file cannot be written.
+            SsilkError: an input is missing or bad, or not what the task's job was submitted with, or a file cannot be
+                written.
             VerificationError: the written layer is not what was computed; it is not kept.
         """
         need_possible_names(task)
-        layout, key, home = self.layout(task), key_of(task), self._home(task)
-        if not again and (record := current_record(home, key)):
+        layout, home = self.layout(task), self._home(task)
+        wanted = task.pinned or self.inputs.hashes(task.request)
+        if not again and (record := current_record(home, task_key(task, wanted), self._files.sha256)):
             return replace(record.result, current=True)
-        for path in _own_files(layout):
-            remove_unfinished(path)
         rollout = self.garment(task).over(task.request.motion)
+        if task.pinned:
+            need_pinned(task.request, task.pinned, rollout.inputs)
         check_influences(rollout.influences, task.request.target, task.request.model)
         asset = self._asset(task, layout, report)
-        result = _write_layer(layout, asset, rollout, task, report)
-        files = [layout.animation, layout.asset, layout.geometry, *([layout.points] if task.points else [])]
-        written = {os.path.relpath(path, home): sha256(path) for path in files}
-        write_record(home, TaskRecord(key=key, files=written, result=result))
+        result, files = _write_layer(layout, asset.asset, rollout, task, report)
+        written = {os.path.relpath(path, home): digest for path, digest in (files | dict(asset.digests)).items()}
+        write_record(home, TaskRecord(key=task_key(task, rollout.inputs), files=written, result=result))
         return result
 
     def _home(self, task: BakeTask) -> Path:
         """Return the folder of the files that a task alone writes."""
         return self.layout(task).animation.parent
 
-    def _asset(self, task: BakeTask, layout: Layout, report: Reporter) -> Asset:
+    def _asset(self, task: BakeTask, layout: Layout, report: Reporter) -> WrittenAsset:
         """Return the asset of a task, written unless the last task left the same."""
         garment = self.garment(task)
         asked = (garment, task.include_body, layout.asset)
-        if self._written is None or self._written[0] != (asked, _digests(layout)):
-            asset = _write_asset(layout, garment, task, report)
-            self._written = ((asked, _digests(layout)), asset)
+        if self._written is None or self._written[0] != asked or not self._is_there(self._written[1]):
+            self._written = (asked, _write_asset(layout, garment, task, report))
         return self._written[1]
+
+    def _is_there(self, asset: WrittenAsset) -> bool:
+        return all(is_file(path, digest, self._files.sha256) for path, digest in asset.digests)
 
     def write_stages(self, tasks: Sequence[BakeTask], report: Reporter = silent) -> None:
         """Write the stage of each shot of tasks that are done; warn of shots baked with an older asset."""
@@ -145,47 +164,27 @@ class LayerFolder:
         shots: dict[str, list[Layout]] = {}
         for layout in layouts:
             shots.setdefault(layout.shot, []).append(layout)
+        known: dict[str, set[str]] = {}
+        for layout in layouts:
+            known.setdefault(layout.garment, set()).add(layout.shot)
         for garments in shots.values():
             write_stage(garments)
         for layout in {layout.garment: layout for layout in layouts}.values():
-            outdated = list(_outdated_shots(layout))
+            outdated = list(_outdated_shots(layout, known[layout.garment]))
             if outdated:
                 report(Message(
                     f"{layout.asset}: {len(outdated)} shots were baked with the asset as it was before "
                     f"({', '.join(outdated[:3])}); bake them again", "warning"))  # fmt: skip
 
     def remove_unfinished(self, tasks: Sequence[BakeTask]) -> None:
-        """Remove what killed processes left half written of tasks that nobody works on any more."""
+        """Remove what processes that have ended left half written."""
         layouts = [self.layout(task) for task in tasks if has_possible_names(task)]
-        shared = {path for layout in layouts for path in (layout.asset, layout.geometry, layout.stage)}
-        for path in shared.union(*(_own_files(layout) for layout in layouts)):
-            remove_unfinished(path)
+        paths = (path for each in layouts for path in (each.asset, each.stage, each.animation))
+        for folder in dict.fromkeys(path.parent for path in paths):
+            remove_unfinished_in(folder)
 
 
-def key_of(task: BakeTask) -> str:
-    """Return the key of a task, from what its inputs hold now.
-
-    Raises:
-        SsilkError: an input is missing or cannot be read.
-    """
-    from ssilk_usd.read_stage import content_hash, split_location
-
-    request = task.request
-    if not Path(request.model).is_file():
-        fail(request.model, "there is no such model file", "a file of 'ssilk train' is needed")
-    contents = {
-        "model": sha256(request.model),
-        "stage": content_hash(request.stage),
-        "motion": content_hash(split_location(request.motion)[0]),
-    }
-    return task_key(task, contents)
-
-
-def _digests(layout: Layout) -> list[str]:
-    return [sha256(path) for path in (layout.asset, layout.geometry) if path.is_file()]
-
-
-def _write_asset(layout: Layout, garment: LoadedGarment, task: BakeTask, report: Reporter) -> Asset:
+def _write_asset(layout: Layout, garment: LoadedGarment, task: BakeTask, report: Reporter) -> WrittenAsset:
     """Write the asset of a task where it is not there already; warn of changes that layers above may rely on."""
     from ssilk_usd import layers
 
@@ -194,11 +193,13 @@ def _write_asset(layout: Layout, garment: LoadedGarment, task: BakeTask, report:
     )
     for change in written.changes:
         report(Message(f"{layout.asset}: {change}; check the layers that override it", "warning"))
-    return written.asset
+    return written
 
 
-def _write_layer(layout: Layout, asset: Asset, rollout: BakeRollout, task: BakeTask, report: Reporter) -> BakeResult:
-    """Write and verify what moves."""
+def _write_layer(
+    layout: Layout, asset: Asset, rollout: BakeRollout, task: BakeTask, report: Reporter
+) -> tuple[BakeResult, dict[Path, str]]:
+    """Write and verify what moves; return the result, and SHA-256 of what was written, by its path."""
     from ssilk_usd import layers
 
     rollout = refined(rollout, report)
@@ -213,8 +214,11 @@ def _write_layer(layout: Layout, asset: Asset, rollout: BakeRollout, task: BakeT
         "samples_per_frame": task.request.samples_per_frame,
         "lean": task.request.receiver.lean,
     }
+    digests: dict[Path, str] = {}
     if task.points:
-        layers.write_points(layout, asset, rollout.points(), rollout.deformer, rollout.motion, **common)
+        digests[layout.points] = layers.write_points(
+            layout, asset, rollout.points(), rollout.deformer, rollout.motion, **common
+        )
     with replacing(layout.animation) as unverified:
         summary = layers.write_animation(
             layout,
@@ -230,18 +234,18 @@ def _write_layer(layout: Layout, asset: Asset, rollout: BakeRollout, task: BakeT
             points=task.points,
         )
         verification = verify_file(rollout, unverified, report) if task.verify else None
+        digests[layout.animation] = sha256(unverified)  # not later: another process may replace the file
     rollout.warn(report)
-    return result_of(skin, layout.animation, summary, verification, hidden)
+    return result_of(skin, layout.animation, summary, verification, hidden), digests
 
 
-def _own_files(layout: Layout) -> tuple[Path, ...]:
-    """Return the files that one task alone writes."""
-    return (layout.animation, layout.points, layout.animation.with_name(RECORD))
-
-
-def _outdated_shots(layout: Layout) -> Iterator[str]:
-    """Yield the shots whose record has another asset of this garment than is there now."""
+def _outdated_shots(layout: Layout, current: Container[str]) -> Iterator[str]:
+    """Yield the shots, besides the `current` ones, whose record has another asset of this garment than is there."""
+    digest = sha256(layout.geometry) if layout.geometry.is_file() else None
     for path in sorted(layout.folder.glob(f"shots/*/{layout.garment}/{RECORD}")):
+        shot = path.parent.parent.name
+        if digest is None or shot in current:
+            continue
         record, name = read_record(path.parent), os.path.relpath(layout.geometry, path.parent)
-        if record and layout.geometry.is_file() and record.files.get(name) != sha256(layout.geometry):
-            yield path.parent.parent.name
+        if record and record.files.get(name) != digest:
+            yield shot

@@ -4,18 +4,19 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
-from ..assets import Deformer, Motion
+from ..assets import Deformer, Motion, Scene
 from ..checkpoint import ModelFile, load_model
 from ..devices import select_device
 from ..errors import fail
-from ..files import sha256
 from ..kinematics import MAX_FPS, MIN_FPS, lbs_deformer, resample
 from ..quality import SizeReduction
 from ..reduction import Reducer
 from ..targets import Target, cap_influences
 from .character import on_character
+from .inputs import InputContents, InputHashes, model_contents, read_unchanged, stage_contents
 from .request import ALLOWED_FPS, BakeRequest
 from .rollout import BakeRollout
 
@@ -35,6 +36,7 @@ class LoadedGarment:
         model: the network; None under linear blend skinning.
         deformer: the garment as its target takes it.
         units: units and up axis of what is written.
+        model_held, stage_held: what model and stage held while they were read.
         provenance: where the model comes from, as a shot stores it.
         record: how the model was made, as its mesh stores it.
     """
@@ -44,6 +46,8 @@ class LoadedGarment:
     model: GarmentModel | None
     deformer: Deformer
     units: StageUnits
+    model_held: InputContents
+    stage_held: InputContents
     provenance: dict[str, object]
     record: GarmentRecord
 
@@ -53,21 +57,16 @@ class LoadedGarment:
         Raises:
             SsilkError: the file is missing or does not fit.
         """
-        from ssilk_usd.read_motion import read_motion
-        from ssilk_usd.read_stage import split_location
-        from ssilk_usd.read_visibility import read_hidden
-
         request = replace(self.request, motion=motion)
-        source = read_motion(motion, self.file.scene.character.skeleton, root=request.root)
-        at_fps = source if request.fps is None else _at_fps(source, request.fps)
-        samples = request.samples_per_frame
-        sampled = at_fps if samples == 1 else _at_fps(source, at_fps.fps * samples)
+        (source, sampled, hidden), held = read_unchanged(
+            partial(stage_contents, motion), partial(self._read, request)
+        )
         kept, reduction = self._cut(source) if request.keep else (self, None)
         provenance = {
             **self.provenance,
             **({"reduced": reduction.to_metadata()} if reduction else {}),
             "request": request.to_metadata(),
-            "motion_sha256": sha256(split_location(motion)[0]),
+            "motion_sha256": held.first,
         }
         return BakeRollout(
             request=request,
@@ -75,13 +74,25 @@ class LoadedGarment:
             deformer=kept.deformer,
             motion=sampled,
             source=source,
-            hidden=read_hidden(motion, sampled, root=request.root),
+            hidden=hidden,
             units=self.units,
+            inputs=InputHashes(model=self.model_held.digest, stage=self.stage_held.digest, motion=held.digest),
             provenance=provenance,
             record=self.record,
             fabric=self.file.fabric,
             reduction=reduction,
         )
+
+    def _read(self, request: BakeRequest) -> tuple[Motion, Motion, list[tuple[int, bool]]]:
+        """Return a motion as it was read, at the shot's samples, and when its character is hidden."""
+        from ssilk_usd.read_motion import read_motion
+        from ssilk_usd.read_visibility import read_hidden
+
+        source = read_motion(request.motion, self.file.scene.character.skeleton, root=request.root)
+        at_fps = source if request.fps is None else _at_fps(source, request.fps)
+        samples = request.samples_per_frame
+        sampled = at_fps if samples == 1 else _at_fps(source, at_fps.fps * samples)
+        return source, sampled, read_hidden(request.motion, sampled, root=request.root)
 
     def _cut(self, motion: Motion) -> tuple[LoadedGarment, SizeReduction]:
         """Return the garment cut to the size that the request keeps, so as to be best for this motion."""
@@ -98,26 +109,34 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
     Raises:
         SsilkError: a file is missing or does not fit the others.
     """
-    from ssilk_usd.read_stage import open_stage
-
     from ..checkpoint import network
 
     device = select_device(request.device)
-    file = load_model(request.model)
-    stage = open_stage(request.stage)
-    scene = on_character(file, stage, request.root)
+    file, model_held = read_unchanged(partial(model_contents, request.model), partial(load_model, request.model))
+    (scene, units), stage_held = read_unchanged(
+        partial(stage_contents, request.stage), partial(_on_stage, file, request)
+    )
     model = None if request.lbs else network(file, scene).to(device)
     deformer = lbs_deformer(scene) if model is None else model.deformer()
-    model_hash = sha256(request.model)
     return LoadedGarment(
         request=request,
         file=file,
         model=model,
         deformer=cap_influences(deformer, request.receiver),
-        units=_units(stage, request.receiver),
-        provenance={"model_sha256": model_hash, "training": file.provenance.get("ssilk", "")},
-        record=_record(file, model_hash),
+        units=units,
+        model_held=model_held,
+        stage_held=stage_held,
+        provenance={"model_sha256": model_held.digest, "training": file.provenance.get("ssilk", "")},
+        record=_record(file, model_held.digest),
     )
+
+
+def _on_stage(file: ModelFile, request: BakeRequest) -> tuple[Scene, StageUnits]:
+    """Return a model's scene with the character of a stage, and the units of what is written."""
+    from ssilk_usd.read_stage import open_stage
+
+    stage = open_stage(request.stage)
+    return on_character(file, stage, request.root), _units(stage, request.receiver)
 
 
 def load_rollout(request: BakeRequest) -> BakeRollout:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
+from functools import cache
 from types import UnionType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
@@ -20,12 +21,17 @@ def from_plain(kind: type[T], document: object) -> T:
     """
     if not isinstance(document, Mapping):
         raise TypeError(f"{str(document)[:40]!r} has no fields")
-    types = get_type_hints(kind)
+    types = _types(kind)  # type: ignore[arg-type]
     known = {item.name for item in fields(kind)}  # type: ignore[arg-type]
     unknown = sorted(str(name) for name in document.keys() - known)
     if unknown:
         raise TypeError(f"{unknown[0]!r} is no field")
     return kind(**{name: _value(types[name], name, value) for name, value in document.items()})
+
+
+@cache
+def _types(kind: type) -> dict[str, Any]:
+    return get_type_hints(kind)
 
 
 def _value(kind: Any, name: str, value: object) -> Any:

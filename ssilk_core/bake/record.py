@@ -9,7 +9,9 @@ from pathlib import Path
 
 from .. import __version__, work_record
 from ..errors import SsilkError
-from ..work_record import WorkRecord, request_key
+from ..files import sha256
+from ..work_record import Hash, WorkRecord, request_key
+from .inputs import InputHashes
 from .plain import from_plain
 from .request import INPUTS
 from .result import BakeResult
@@ -33,16 +35,17 @@ class TaskRecord:
     result: BakeResult
 
 
-def task_key(task: BakeTask, contents: Mapping[str, str]) -> str:
+def task_key(task: BakeTask, contents: InputHashes) -> str:
     """Return a hash of all that decides what a task writes: where its inputs lie makes no difference.
 
     Args:
-        contents: hashes of what is in each of the request's `INPUTS`.
+        contents: what the request's inputs hold.
     """
     options = asdict(task)
+    del options["pinned"]
     for name in INPUTS:
         del options["request"][name]
-    return request_key({"ssilk": __version__, "options": options}, [(name, contents[name]) for name in INPUTS])
+    return request_key({"ssilk": __version__, "options": options}, [*asdict(contents).items()])
 
 
 def write_record(folder: Path, record: TaskRecord) -> None:
@@ -68,9 +71,13 @@ def read_record(folder: Path) -> TaskRecord | None:
         return None
 
 
-def current_record(folder: Path, key: str) -> TaskRecord | None:
-    """Return the record of a task that is done: it has this key, and the files are as they were written."""
+def current_record(folder: Path, key: str, hashed: Hash = sha256) -> TaskRecord | None:
+    """Return the record of a task that is done: it has this key, and the files are as they were written.
+
+    Args:
+        hashed: gives the SHA-256 of a file.
+    """
     record = read_record(folder)
     if record is None or record.key != key:
         return None
-    return record if WorkRecord(key=key, files=record.files).is_done(folder) else None
+    return record if WorkRecord(key=key, files=record.files).is_done(folder, hashed) else None

@@ -12,6 +12,7 @@ from ..events import Message, Progress, Reporter, silent
 from ..fabrics import Fabric
 from ..kinematics import deform, lbs_poses
 from ..quality import SizeReduction
+from .inputs import InputHashes
 from .request import BakeRequest
 from .result import FrameSpan, RefinementSummary
 
@@ -49,6 +50,7 @@ class BakeRollout:
         motion: the character's motion at the shot's samples; `source` is the motion as it was read.
         hidden: at which frames of the motion the garment becomes hidden (True) or visible (False).
         units: units and up axis of the shot.
+        inputs: what the request's inputs held while they were read.
         provenance: where all of this comes from, as a shot stores it.
         record: how the garment's model was made.
         reduction: what was kept of the model, where less than all.
@@ -64,6 +66,7 @@ class BakeRollout:
     source: Motion
     hidden: list[tuple[int, bool]]
     units: StageUnits
+    inputs: InputHashes
     provenance: dict[str, object]
     record: GarmentRecord
     fabric: Fabric

@@ -13,6 +13,7 @@ from pathlib import Path
 from ..checkpoint import load_model
 from ..errors import fail
 from ..targets import check_influences
+from .inputs import InputHashes
 from .request import BakeRequest, need_body
 
 LONGEST_NAME = 255  # [bytes] of a file or folder
@@ -29,6 +30,7 @@ class BakeTask:
         include_body: write the character's body meshes into the asset as well.
         points: write a point cache as well.
         verify: re-skin the written layer and compare it.
+        pinned: what its inputs have to hold, as they did when its job was submitted; None for whatever they hold.
     """
 
     garment: str
@@ -37,6 +39,7 @@ class BakeTask:
     include_body: bool = True
     points: bool = False
     verify: bool = True
+    pinned: InputHashes | None = None
 
     @property
     def name(self) -> str:

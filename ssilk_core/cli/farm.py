@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 from ..bake import BakeTask, LayerFolder, plan_layers
 from ..errors import EXIT_OK, EXIT_TASKS, fail
 from ..events import Failed, GarmentEvent, Progress, Reporter, Result, Started
+from ..farm.job import FarmJob, submitted
 from ..farm.openjd import TEMPLATE, BundleOptions, write_bundle
 from .options import NumberRange, add_bake, layer_options, requests_of
 
@@ -47,12 +48,13 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Write the bundle, or run the tasks."""
-    tasks = [_absolute(task) for task in plan_layers(requests_of(options), **layer_options(options))]
-    if options.bundle:
-        return _write(tasks, options, report)
-    if not options.output:
+    if not (options.bundle or options.output):
         fail("--cluster", "no folder for the layers", "-o names one")
-    return _run(tasks, options, report)
+    tasks = [_absolute(task) for task in plan_layers(requests_of(options), **layer_options(options))]
+    job = submitted(tasks, report)
+    if options.bundle:
+        return _write(job, options, report)
+    return _run(job.tasks, options, report)
 
 
 def _absolute(task: BakeTask) -> BakeTask:
@@ -60,13 +62,13 @@ def _absolute(task: BakeTask) -> BakeTask:
     return replace(task, request=task.request.relocated(lambda path: str(Path(path).absolute())))
 
 
-def _write(tasks: Sequence[BakeTask], options: argparse.Namespace, report: Reporter) -> int:
+def _write(job: FarmJob, options: argparse.Namespace, report: Reporter) -> int:
     fixed = BundleOptions(memory=options.memory, timeout=options.timeout)
-    write_bundle(options.bundle, tasks, options.output, fixed)
+    write_bundle(options.bundle, job, options.output, fixed)
     output = f" -p Output={options.output.absolute()}" if options.output else ""
     detail = {
         "bundle": str(options.bundle),
-        "tasks": len(tasks),
+        "tasks": len(job.tasks),
         "on this machine": f"openjd run {options.bundle / TEMPLATE}{output}",
         "on Deadline Cloud": f"deadline bundle submit {options.bundle}",
     }

@@ -205,7 +205,7 @@ class _Caches:
 
 def _provenance(options: argparse.Namespace, motion: Path) -> dict[str, str | float]:
     """Return everything that decides what a shot's file holds."""
-    from ssilk_usd.read_stage import content_hash, split_location
+    from ..bake.inputs import stage_contents
 
     garment, _ = shared.wardrobe(options)
     names, lists = ("fabric", "fps", "tolerance", "iterations", "no_body"), ("material", "body")
@@ -214,8 +214,7 @@ def _provenance(options: argparse.Namespace, motion: Path) -> dict[str, str | fl
         "motion": str(motion),
         "garment": str(options.garment or ""),
         "root": options.root or "",
-        "contents": " ".join(content_hash(str(path))
-                             for path in (options.stage, garment, split_location(str(motion))[0])),
+        "contents": " ".join(stage_contents(str(path)).digest for path in (options.stage, garment, motion)),
         "sequence": options.sequence or 0,
         **{name: getattr(options, name) for name in names},
         **{name: ", ".join(getattr(options, name)) for name in lists},

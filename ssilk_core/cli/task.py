@@ -13,7 +13,7 @@ from pathlib import Path
 
 from ..errors import EXIT_OK, EXIT_TASKS
 from ..events import Reporter
-from ..farm.job import numbers, read_job
+from ..farm.job import read_job
 from ..farm.openjd import OpenJdReporter
 from ..farm.work import bake_tasks, check_tasks
 
@@ -34,10 +34,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     """Bake or check."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # farms cancel by it: stop as on Ctrl-C
     report = OpenJdReporter() if options.openjd else report
-    tasks = read_job(options.job, options.path_mapping)
     if options.check:
-        check_tasks(tasks, options.output, report)
+        check_tasks(read_job(options.job, options.path_mapping), options.output, report)
         return EXIT_OK
-    chosen = [tasks[number] for number in numbers(options.tasks or f"0-{len(tasks) - 1}", len(tasks))]
-    failed = bake_tasks(chosen, options.output, report)
+    failed = bake_tasks(read_job(options.job, options.path_mapping, options.tasks).tasks, options.output, report)
     return EXIT_TASKS if failed else EXIT_OK

@@ -6,15 +6,21 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
 from ..bake import BakeResult, BakeTask, LayerFolder
 from ..errors import SsilkError, fail
+from .watchdog import ended_together
 
 BakeFunction = Callable[[BakeTask, Path], BakeResult]
 RETRIES = 10  # of a task whose worker died
+STARTS = 5  # of a cluster on this machine, which may end before its tasks do
+WINDOW = 1000  # tasks that the cluster knows of at once: waiting takes a time that grows with their number
 
 
 @dataclass(frozen=True)
@@ -45,32 +51,69 @@ def run_on_cluster(
 
     Raises:
         SsilkError: there is no such cluster, or a task needs a GPU and this machine has none.
+
+    A cluster of this machine that ends before its tasks do is started again, a few times; all of its processes end
+    with this one.
     """
+    left, starts = list(tasks), 1 if address else STARTS
+    for _ in range(starts):
+        lost: list[BakeTask] = []
+        with ended_together() if address is None else nullcontext(), _connected(address, cores):
+            yield from _outcomes(left, folder.absolute(), bake, lost, here=address is None)
+        left = lost
+        if not left:
+            return
+    ended = f"the cluster ended {starts} times" if starts > 1 else "this machine's part of the cluster ended"
+    for task in left:
+        yield TaskOutcome(task, error=f"{ended}; run the same command again, finished tasks stay.")
+
+
+@contextmanager
+def _connected(address: str | None, cores: int | None) -> Iterator[None]:
+    """Be part of a cluster meanwhile; raise `SsilkError` where there is none."""
     os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", ".")  # or Ray writes to standard output, among events
     import ray
-    from ray.exceptions import RayError
 
     try:
         ray.init(address, num_cpus=cores, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
     except (ConnectionError, RuntimeError, ValueError) as error:
         fail("--cluster", f"no cluster at {address} ({str(error).splitlines()[0]})", "start one with 'ray start'")
     try:
-        if address is None and any(task.request.needs_gpu for task in tasks):
-            _need_gpu(ray.cluster_resources())
-        worker = ray.remote(num_cpus=1, max_retries=RETRIES)(_outcome)
-        pending = {
-            worker.options(num_gpus=int(task.request.needs_gpu)).remote(bake, task, folder.absolute()): task
-            for task in tasks
-        }
-        while pending:
-            (done, *_), _ = ray.wait(list(pending))
-            task = pending.pop(done)
-            try:
-                yield ray.get(done)
-            except RayError as error:
-                yield TaskOutcome(task, error=f"its workers died ({str(error).splitlines()[0]})")
+        yield
     finally:
         ray.shutdown()
+
+
+def _outcomes(
+    tasks: Sequence[BakeTask], folder: Path, bake: BakeFunction, lost: list[BakeTask], *, here: bool
+) -> Iterator[TaskOutcome]:
+    """Yield the outcome of each task as it ends; where the cluster ends, add the tasks without one to `lost`.
+
+    Args:
+        here: the cluster is this machine alone.
+    """
+    import ray
+    from ray.exceptions import LocalRayletDiedError, NodeDiedError, RayError
+
+    if here and any(task.request.needs_gpu for task in tasks):
+        _need_gpu(ray.cluster_resources())
+    worker = ray.remote(num_cpus=1, max_retries=RETRIES)(_outcome)
+    waiting, pending = iter(tasks), dict[Any, BakeTask]()
+    while True:
+        for task in islice(waiting, WINDOW - len(pending)):
+            options = worker.options(num_gpus=int(task.request.needs_gpu))
+            pending[options.remote(bake, task, folder)] = task
+        if not pending:
+            return
+        (done, *_), _ = ray.wait(list(pending))
+        task = pending.pop(done)
+        try:
+            yield ray.get(done)
+        except RayError as error:
+            if isinstance(error, LocalRayletDiedError) or (here and isinstance(error, NodeDiedError)):
+                lost += [task, *pending.values(), *waiting]
+                return
+            yield TaskOutcome(task, error=f"its workers died ({str(error).splitlines()[0]})")
 
 
 def _need_gpu(resources: Mapping[str, float]) -> None:

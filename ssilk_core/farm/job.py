@@ -5,43 +5,106 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any
+from typing import Any, NoReturn
 
 from .. import __version__
-from ..bake import BakeTask
+from ..bake import BakeRequest, BakeTask
+from ..bake.inputs import InputContents, InputFiles, InputHashes
 from ..bake.plain import from_plain
+from ..bake.request import INPUTS
 from ..errors import SsilkError, fail
+from ..events import Message, Reporter
 from ..files import replacing
 
 NAME = "job.json"
 
 
-def write_job(path: str | Path, tasks: Sequence[BakeTask]) -> None:
-    """Write the tasks of a job; raise `SsilkError` where that is not possible."""
-    document = {"ssilk": __version__, "tasks": [asdict(task) for task in tasks]}
+@dataclass(frozen=True)
+class FarmJob:
+    """Tasks, and what their inputs held when they were submitted, by the inputs' locations."""
+
+    tasks: tuple[BakeTask, ...]
+    inputs: Mapping[str, InputContents]
+
+
+def submitted(tasks: Sequence[BakeTask], report: Reporter) -> FarmJob:
+    """Return tasks pinned to what their inputs hold now, so that nobody bakes other files that come in their place.
+
+    A task with an input that cannot be read stays as it is, with a warning: it fails alone, unless somebody repairs
+    the input.
+    """
+    files = InputFiles()
+    found: dict[str, InputContents] = {}
+    for name, path in dict.fromkeys(item for task in tasks for item in task.request.inputs.items()):
+        try:
+            found[path] = files.contents(name, path)
+        except SsilkError as error:
+            report(Message(str(error), "warning"))
+    return FarmJob(tuple(_pinned(task, found) for task in tasks), found)
+
+
+def write_job(path: str | Path, job: FarmJob) -> None:
+    """Write a job, a line for each task; raise `SsilkError` where that is not possible."""
+    lines = ",\n".join(json.dumps(_entry(task)) for task in job.tasks)
+    inputs = {path: dict(held.files) for path, held in job.inputs.items()}
+    head = json.dumps({"ssilk": __version__, "inputs": inputs}, indent=1).removesuffix("\n}")
     with replacing(path, keep_same=True) as temporary:
-        temporary.write_text(json.dumps(document, indent=1) + "\n")
+        temporary.write_text(f'{head},\n "tasks": [\n{lines}\n]}}\n')
 
 
-def read_job(path: str | Path, mapping: str | Path | None = None) -> list[BakeTask]:
-    """Return the tasks of a job.
+def _entry(task: BakeTask) -> dict[str, Any]:
+    """Return what differs from the defaults: a job of 50,000 tasks is read by each chunk."""
+    stated = {**_stated(task), "request": _stated(task.request)}
+    stated.pop("pinned", None)
+    return stated
+
+
+def _stated(values: BakeTask | BakeRequest) -> dict[str, Any]:
+    return {item.name: value for item in fields(values) if (value := getattr(values, item.name)) != item.default}
+
+
+def read_job(path: str | Path, mapping: str | Path | None = None, chosen: str | None = None) -> FarmJob:
+    """Return a job, or some of its tasks.
 
     Args:
         mapping: a file with Open Job Description's rules for where another machine's paths lie on this one.
+        chosen: numbers of the tasks, such as "0-9,12"; None for all.
 
     Raises:
-        SsilkError: a file is missing or damaged.
+        SsilkError: a file is missing or damaged, or there are no such tasks.
     """
     document = _json(Path(path), "a file written by 'ssilk farm' is needed")
     rules = _json(Path(mapping), "path mapping rules are needed").get("path_mapping_rules", []) if mapping else []
+    entries = document.get("tasks")
+    if not isinstance(entries, list):
+        _no_job(path, "it is no job (it has no tasks)")
+    wanted = range(len(entries)) if chosen is None else numbers(chosen, len(entries))
     try:
-        tasks = [_checked(from_plain(BakeTask, entry)) for entry in document["tasks"]]
-        return [_mapped(task, rules) for task in tasks]
+        tasks = [_mapped(_checked(from_plain(BakeTask, entries[number])), rules) for number in wanted]
+        held = document.get("inputs", {})
+        inputs = {_found(path, rules): _contents(files, rules) for path, files in held.items()}
+        return FarmJob(tuple(_pinned(task, inputs) for task in tasks), inputs)
     except (KeyError, TypeError, AttributeError, SsilkError) as error:
-        fail(str(path), f"it is no job ({type(error).__name__}: {error})", "a file written by 'ssilk farm' is needed")
+        return _no_job(path, f"it is no job ({type(error).__name__}: {error})")
+
+
+def _no_job(path: str | Path, found: str) -> NoReturn:
+    fail(str(path), found, "a file written by 'ssilk farm' is needed")
+
+
+def _contents(files: Mapping[str, str], rules: Sequence[dict[str, str]]) -> InputContents:
+    if not files or not all(isinstance(digest, str) for digest in files.values()):
+        raise TypeError(f"{str(files)[:40]!r} are no files with their hashes")
+    return InputContents(tuple((_found(path, rules), digest) for path, digest in files.items()))
+
+
+def _pinned(task: BakeTask, inputs: Mapping[str, InputContents]) -> BakeTask:
+    """Return a task with what its inputs held when the job was submitted, where that is known."""
+    found = {name: inputs[path].digest for name, path in task.request.inputs.items() if path in inputs}
+    return replace(task, pinned=InputHashes(**found)) if len(found) == len(INPUTS) else task
 
 
 def _json(path: Path, allowed: str) -> dict[str, Any]:

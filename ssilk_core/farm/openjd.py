@@ -15,7 +15,7 @@ from ..bake import BakeTask
 from ..errors import fail
 from ..events import Event, Failed, GarmentEvent, Message, Progress, Result, Started, describe
 from ..files import replacing
-from .job import NAME, write_job
+from .job import NAME, FarmJob, write_job
 
 TEMPLATE, VALUES, ASSETS = "template.json", "parameter_values.json", "asset_references.json"
 CHUNK, CHUNK_SECONDS = 10, 300  # tasks of a chunk at first, and how long one should take; both are parameters
@@ -45,13 +45,14 @@ class BundleOptions:
                 fail(f"--{name}", str(value), "a positive number is needed")
 
 
-def write_bundle(folder: Path, tasks: Sequence[BakeTask], output: Path | None, options: BundleOptions) -> None:
+def write_bundle(folder: Path, job: FarmJob, output: Path | None, options: BundleOptions) -> None:
     """Write a job bundle: template, job, parameter values and the files that go in and come out.
 
     Raises:
         SsilkError: it cannot be written.
     """
-    write_job(folder / NAME, tasks)
+    tasks = job.tasks
+    write_job(folder / NAME, job)
     _write(folder / TEMPLATE, template(tasks, options))
     values = [] if output is None else [{"name": "Output", "value": str(output.absolute())}]
     _write(folder / VALUES, {"parameterValues": values})

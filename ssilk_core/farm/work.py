@@ -4,11 +4,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from ..bake import BakeTask, LayerFolder
+from ..bake.inputs import InputFiles, InputHashes, need_pinned
 from ..errors import SsilkError, VerificationError
 from ..events import Event, Failed, GarmentEvent, Message, Progress, Reporter, Result, Started
+from .job import FarmJob
+
+READERS = 16  # threads that read files for a check
 
 
 def bake_tasks(tasks: Sequence[BakeTask], folder: Path, report: Reporter) -> list[BakeTask]:
@@ -38,15 +43,20 @@ def _part(report: Reporter, index: int, count: int) -> Reporter:
     return part
 
 
-def check_tasks(tasks: Sequence[BakeTask], folder: Path, report: Reporter) -> None:
+def check_tasks(job: FarmJob, folder: Path, report: Reporter) -> None:
     """Remove what killed workers left half written, and write the stage of each shot.
 
     Raises:
-        VerificationError: a task is not done, or its files are not as they were written.
+        VerificationError: a task is not done, an input is not what the job was submitted with, or files are not as
+            they were written.
     """
-    layers = LayerFolder(folder)
+    layers, tasks = LayerFolder(folder, InputFiles(job.inputs)), job.tasks
     layers.remove_unfinished(tasks)
-    done = [task for task in tasks if _is_done(layers, task, report)]
+    with ThreadPoolExecutor(READERS) as readers:  # most of the time goes into waiting for a file system
+        list(readers.map(layers.inputs.still_there, job.inputs.values()))
+        wanted = _as_submitted(layers.inputs, tasks, report)
+        written = readers.map(layers.is_written, wanted, wanted.values())
+        done = [task for task, there in zip(wanted, written) if there]
     layers.write_stages(done, report)
     missing = sorted(task.name for task in set(tasks).difference(done))
     if missing:
@@ -57,9 +67,29 @@ def check_tasks(tasks: Sequence[BakeTask], folder: Path, report: Reporter) -> No
     report(Result("check", {"tasks": len(tasks), "output": str(folder)}))
 
 
-def _is_done(layers: LayerFolder, task: BakeTask, report: Reporter) -> bool:
-    try:
-        return layers.is_done(task)
-    except SsilkError as error:  # an input that cannot be read
-        report(Message(f"{task.name}: {error}", "warning"))
-        return False
+def _as_submitted(inputs: InputFiles, tasks: Sequence[BakeTask], report: Reporter) -> dict[BakeTask, InputHashes]:
+    """Return the tasks whose inputs are as they were submitted, and what they hold; report each fault once.
+
+    Not in threads: USD opens inputs of which it is not known what files they consist of.
+    """
+    found: dict[BakeTask, InputHashes] = {}
+    faults: set[str] = set()
+    digests: dict[str, str] = {}
+    for name, path in dict.fromkeys(item for task in tasks for item in task.request.inputs.items()):
+        try:
+            digests[path] = inputs.digest(name, path)
+        except SsilkError as error:
+            report(Message(str(error), "warning"))
+    for task in tasks:
+        if not all(path in digests for path in task.request.inputs.values()):
+            continue
+        hashes = InputHashes(**{name: digests[path] for name, path in task.request.inputs.items()})
+        try:
+            if task.pinned:
+                need_pinned(task.request, task.pinned, hashes)
+            found[task] = hashes
+        except SsilkError as error:
+            if str(error) not in faults:
+                faults.add(str(error))
+                report(Message(str(error), "warning"))
+    return found

@@ -273,7 +273,9 @@ def _located(identity: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
         return os.path.normpath(places.get(os.path.normpath(file), file)) + mark + prim
 
     parts = {name: identity[name] for name in ("inputs", "motions", "held out") if name in identity}
-    moved = {name: {located(key): value for key, value in part.items()} for name, part in parts.items()}
+    moved: dict[str, Any] = {
+        name: {located(key): value for key, value in part.items()} for name, part in parts.items()
+    }
     return {**identity, **moved, "garment": located(identity.get("garment", ""))}
 
 

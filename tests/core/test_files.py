@@ -4,13 +4,17 @@
 import errno
 import hashlib
 import os
+import re
 import stat
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
+from ssilk_core import files
 from ssilk_core.errors import SsilkError, VerificationError
-from ssilk_core.files import need_writable, remove_unfinished, replacing, sha256
+from ssilk_core.files import need_writable, remove_unfinished, remove_unfinished_in, replacing, sha256
 
 
 def test_a_file_appears_when_it_is_whole(tmp_path):
@@ -50,17 +54,56 @@ def test_bytes_reach_the_disk_before_the_name_does(tmp_path, monkeypatch):
     assert seen == [5, target]
 
 
+def killed_while_writing(*targets: Path) -> None:
+    """Leave half of each target under its temporary name, as a process does that is killed."""
+    words = (
+        "import os, sys; from ssilk_core.files import replacing; held = [replacing(path) for path in sys.argv[1:]]; "
+        "[each.__enter__().write_text('half') for each in held]; os.kill(os.getpid(), 9)"
+    )
+    subprocess.run([sys.executable, "-c", words, *map(str, targets)])
+
+
+def hidden(folder: Path) -> set[str]:
+    return {path.name.split(".partial-")[0] for path in folder.iterdir() if path.name.startswith(".")}
+
+
 def test_what_killed_processes_left_of_a_file_is_removed_and_nothing_else(tmp_path):
     targets = [tmp_path / name for name in ("mo[d]el.safetensors", "mo[d]el.resume.safetensors", "d.safetensors")]
-    unfinished = [replacing(target) for target in targets]  # held until the test ends: no writer comes to its own
-    for target, writing in zip(targets, unfinished):
-        writing.__enter__().write_text("half")
+    killed_while_writing(*targets)
+    for target in targets:
         target.write_text("older")
     remove_unfinished(targets[0])
-    left = [path.name for path in tmp_path.iterdir() if path.name.startswith(".")]
-    assert len(left) == 2 and not any(name.startswith(".mo[d]el.partial-") for name in left)
+    assert hidden(tmp_path) == {".mo[d]el.resume", ".d"}
+    remove_unfinished_in(tmp_path)
+    assert not hidden(tmp_path)
     assert all(target.read_text() == "older" for target in targets)
     remove_unfinished(tmp_path / "none" / "model.safetensors")
+
+
+def test_what_others_are_writing_stays_until_it_is_a_day_old(tmp_path):
+    with replacing(tmp_path / "ours.bin") as ours:
+        elsewhere = ours.with_name(re.sub("partial-[^.]*", "partial-abc", ours.name))  # on another machine
+        elsewhere.touch()
+        for remove in (lambda: remove_unfinished(tmp_path / "ours.bin"), lambda: remove_unfinished_in(tmp_path)):
+            remove()
+            assert ours.exists() and elsewhere.exists()
+        for path in (ours, elsewhere):
+            os.utime(path, (0, 0))
+        remove_unfinished_in(tmp_path)
+        assert ours.exists() and not elsewhere.exists()
+
+
+def test_files_are_hashed_again_only_where_they_may_have_changed(tmp_path, monkeypatch):
+    read, path, hashes = [], tmp_path / "a", files.FileHashes()
+    monkeypatch.setattr(files, "sha256", lambda path: (read.append(path), sha256(path))[1])
+    path.write_text("one")
+    first = [hashes.sha256(path), hashes.sha256(tmp_path / "." / ".." / tmp_path.name / "a")]
+    assert first == [sha256(path)] * 2 and len(read) == 1
+    stamp = path.stat().st_mtime_ns
+    (tmp_path / "b").write_text("two")
+    os.utime(tmp_path / "b", ns=(stamp, stamp))
+    (tmp_path / "b").replace(path)  # published with the same name, size and time of modification
+    assert hashes.sha256(path) == sha256(path) != first[0]
 
 
 def test_a_full_disk_is_one_sentence(tmp_path):

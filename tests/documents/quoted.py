@@ -14,7 +14,7 @@ from ssilk_usd import memory
 from ssilk_core import checkpoint
 from ssilk_core.config import PRESETS
 from ssilk_core.fabrics import Fabric
-from ssilk_core.farm.openjd import CHUNK_SECONDS
+from ssilk_core.farm.openjd import CHUNK, CHUNK_SECONDS
 from ssilk_core.mesh import hidden_faces
 
 from .measured import default, digits, fixed, micro, milli, percent, result, row, series
@@ -115,11 +115,54 @@ def farm() -> Text:
             f"memory after {count} bakes in one process [MiB]", fixed(soak[f"memory after {count} bakes [MiB]"])
         )
     yield f"file handles stay at {soak['file handles, least and most'].partition(',')[0]}"
+    yield from shared_disk()
     yield f"at most {memory.USUAL:g} GiB more"
     yield row(
         "`SSILK_READ_GIB`",
         f"the most memory that reading a file may take [GiB], {memory.USUAL:g} where it is not set",
     )
+
+
+CORES = 2  # of the machine that shared_disk.json is from
+
+
+def shared_disk() -> Text:
+    """What a job of 10,000 shots of five garments asks of one disk, from what one garment in some shots asks."""
+    found = result("shared_disk")
+    shots, runs, sizes = found["shots"], found["runs"], found["bytes"]
+    own = {count: runs[f"bake, workers: {count}"]["operations in the folder"] for count in (1, 2, 4)}
+    chunk = own[2] - own[1]
+    task = (own[1] - chunk) / shots
+    yield row("operations of a chunk", fixed(chunk))
+    yield row("operations of each of its tasks", fixed(task))
+    yield row(
+        "operations of a task that is done already", fixed(runs["bake again"]["operations in the folder"] / shots)
+    )
+    yield row("operations of the last step, for each task", fixed(runs["check"]["operations in the folder"] / shots))
+    yield f"{fixed(own[1] + 3 * chunk)} operations for 4 workers, and {fixed(own[4])} were counted"
+    delay = found["delay of a file operation [s]"]
+    yield f"waits {1000 * delay:g} ms"
+    for count in (1, 2, 4):
+        run = runs[f"bake, workers: {count}"]
+        waited = delay * run["operations of the busiest worker"]
+        computed = run["seconds of computing, start included"] / min(count, CORES)
+        yield row(count, own[count], fixed(waited), fixed(waited + computed), fixed(run["seconds"]))
+    tasks = found["large job"]["tasks"]
+    chunks = tasks / CHUNK
+    yield f"{tasks:,} tasks in {chunks:,.0f} chunks of {CHUNK}"
+    operations = chunks * chunk + tasks * task
+    yield row("operations of all bakes, millions", fixed(operations, 1, 1e6))
+    yield row("of these by each of 1,000 workers", f"{operations / 1000:,.0f}")
+    yield row("minutes that each worker waits, at 1 ms", fixed(operations / 1000 / 1000 / 60, 1))
+    yield row("minutes that each worker waits, at 10 ms", fixed(operations / 1000 / 100 / 60, 1))
+    shared = sizes["model"] + sizes["stage"] + sizes["asset"] + found["large job"]["bytes"]
+    yield row("read by a chunk: model, stage, asset and job [MB]", fixed(shared, 0, 1e6))
+    yield row("read by all chunks, where no host keeps any of it [GB]", fixed(chunks * shared, 0, 1e9))
+    yield row("the file of the job [MB]", fixed(found["large job"]["bytes"], 0, 1e6))
+    yield row("reading it for one chunk [s]", fixed(found["large job"]["seconds to read ten"], 2))
+    last = tasks * runs["check"]["operations in the folder"] / shots
+    yield row("operations of the last step, millions", fixed(last, 1, 1e6))
+    yield row("minutes that the last step waits, at 1 ms, at most", fixed(last / 1000 / 60, 0))
 
 
 # docs/pipeline.md

@@ -14,17 +14,18 @@ from hypothesis import strategies as st
 from openjd.model import IntRangeExpr, create_job, decode_job_template, preprocess_job_parameters
 
 from ssilk_core.bake import BakeRequest, BakeResult, BakeTask, FrameSpan, Verification, plan_layers
+from ssilk_core.bake.inputs import InputHashes
 from ssilk_core.bake.record import RECORD, TaskRecord, current_record, read_record, task_key, write_record
 from ssilk_core.errors import SsilkError
 from ssilk_core.events import Failed, GarmentEvent, Message, Progress, Result, Started
-from ssilk_core.farm.job import numbers, read_job, write_job
+from ssilk_core.farm.job import FarmJob, numbers, read_job, write_job
 from ssilk_core.farm.openjd import BundleOptions, OpenJdReporter, template, write_bundle
 from ssilk_core.files import sha256
 from ssilk_core.reduction import ModelSize
 
 REQUEST = BakeRequest(model="/m/cape.safetensors", stage="/s/hero.usd", motion="/s/walk.usd")
 TASK = BakeTask(garment="cape", shot="walk", request=REQUEST)
-CONTENTS = dict.fromkeys(REQUEST.inputs, "0")
+CONTENTS = InputHashes(model="0", stage="0", motion="0")
 SETTINGS = settings(max_examples=200, deadline=None, derandomize=True, database=None,
                     suppress_health_check=[HealthCheck.function_scoped_fixture])  # fmt: skip
 
@@ -87,7 +88,7 @@ def test_a_key_is_of_all_that_decides_what_is_written():
     others += [task_key(replace(TASK, **{name: value}), CONTENTS) for name, value in (
         ("include_body", False), ("points", True), ("garment", "hat"), ("shot", "run"),
     )]  # fmt: skip
-    others += [task_key(TASK, {**CONTENTS, name: "1"}) for name in CONTENTS]
+    others += [task_key(TASK, replace(CONTENTS, **{name: "1"})) for name in REQUEST.inputs]
     assert len({key, *others}) == len(others) + 1
     moved = replace(TASK, request=replace(REQUEST, model="/elsewhere/cape.safetensors"))
     assert task_key(moved, CONTENTS) == key
@@ -129,11 +130,11 @@ def test_a_damaged_record_means_that_the_task_is_done_again(tmp_path, text):
 
 def test_a_job_reads_as_it_was_written_and_where_its_inputs_lie_now(tmp_path):
     other = replace(REQUEST, motion="/s/run.usd:/Clip", fps=24.0)
-    write_job(tmp_path / "job.json", [TASK, replace(TASK, shot="run", request=other)])
-    assert read_job(tmp_path / "job.json")[0] == TASK
+    write_job(tmp_path / "job.json", FarmJob((TASK, replace(TASK, shot="run", request=other)), {}))
+    assert read_job(tmp_path / "job.json").tasks[0] == TASK
     rules = [{"source_path_format": "POSIX", "source_path": "/s", "destination_path": "/farm/7"}]
     (tmp_path / "rules.json").write_text(json.dumps({"version": "pathmapping-1.0", "path_mapping_rules": rules}))
-    mapped = read_job(tmp_path / "job.json", tmp_path / "rules.json")[1].request
+    mapped = read_job(tmp_path / "job.json", tmp_path / "rules.json").tasks[1].request
     assert (mapped.model, mapped.stage, mapped.motion) == (
         "/m/cape.safetensors", "/farm/7/hero.usd", "/farm/7/run.usd:/Clip")  # fmt: skip
 
@@ -144,7 +145,7 @@ def test_a_job_reads_as_it_was_written_and_where_its_inputs_lie_now(tmp_path):
     {"request": {"lbs": 1}}, {"request": {"pre_roll": 601}}, {"points": 1}, {"request": 3},
 ])  # fmt: skip
 def test_a_job_cannot_name_files_elsewhere_or_values_of_other_types(tmp_path, change):
-    write_job(tmp_path / "job.json", [TASK])
+    write_job(tmp_path / "job.json", FarmJob((TASK,), {}))
     document = json.loads((tmp_path / "job.json").read_text())
     nested = change.get("request")
     if isinstance(nested, dict):
@@ -171,7 +172,7 @@ def test_any_json_is_a_job_or_one_sentence(tmp_path, document):
     path = tmp_path / "job.json"
     path.write_text(json.dumps(document))
     try:
-        assert all(isinstance(task, BakeTask) for task in read_job(path))
+        assert all(isinstance(task, BakeTask) for task in read_job(path).tasks)
     except SsilkError as error:
         assert str(error).startswith(str(path)) and str(error).endswith(".")
 
@@ -208,7 +209,7 @@ def test_hosts_and_chunks_need_something(name):
 
 
 def test_a_bundle_names_the_files_that_it_takes_and_gives(tmp_path):
-    write_bundle(tmp_path, [TASK], tmp_path / "out", BundleOptions())
+    write_bundle(tmp_path, FarmJob((TASK,), {}), tmp_path / "out", BundleOptions())
     assets = json.loads((tmp_path / "asset_references.json").read_text())["assetReferences"]
     assert assets["inputs"]["filenames"] == ["/m/cape.safetensors", "/s/hero.usd", "/s/walk.usd"]
     assert assets["outputs"]["directories"] == [str(tmp_path / "out")]

@@ -22,7 +22,7 @@ from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from ssilk_core.assets import Deformer, Floats, GarmentPose, Motion
 from ssilk_core.errors import SsilkError
-from ssilk_core.files import replacing
+from ssilk_core.files import replacing, sha256
 
 from .author import Asset, define_asset, extent_array
 from .body_faces import HiddenPolygons, hide_polygons
@@ -70,10 +70,17 @@ class Layout:
 
 @dataclass(frozen=True)
 class WrittenAsset:
-    """An asset on disk: the paths of its prims, and changes that may break stronger layers."""
+    """An asset on disk.
+
+    Attributes:
+        asset: the paths of its prims.
+        changes: that may break stronger layers.
+        digests: path and SHA-256 of each file.
+    """
 
     asset: Asset
     changes: tuple[str, ...]
+    digests: tuple[tuple[Path, str], ...]
 
 
 def write_asset(
@@ -97,13 +104,16 @@ def write_asset(
         save(stage.GetRootLayer(), layout.geometry)
         box = _extent(stage, asset)
         del stage
+        geometry = sha256(temporary)
     with replacing(layout.asset, keep_same=True) as temporary:
         stage = new_stage(temporary, units)
         _define_component(stage, asset, layout, box)
         free_when_closed(stage.GetUsedLayers())
         save(stage.GetRootLayer(), layout.asset)
         del stage
-    return WrittenAsset(asset, unknown if before is None else asset_facts(layout.asset).changes_since(before))
+        component = sha256(temporary)
+    changes = unknown if before is None else asset_facts(layout.asset).changes_since(before)
+    return WrittenAsset(asset, changes, ((layout.geometry, geometry), (layout.asset, component)))
 
 
 def _facts_before(layout: Layout) -> tuple[AssetFacts | None, tuple[str, ...]]:
@@ -243,8 +253,12 @@ def write_points(
     start: float = 0.0,
     samples_per_frame: int = 1,
     lean: bool = True,
-) -> None:
-    """Write the garment's points at each sample of a shot, [m] in world space, shape (V, 3), as a point cache."""
+) -> str:
+    """Write the garment's points at each sample of a shot, [m] in world space, shape (V, 3), as a point cache.
+
+    Returns:
+        SHA-256 of the file.
+    """
     span = TimeSpan.of(motion, start, samples_per_frame)
     paths = root_path(deformer, motion) if lean else np.zeros((motion.frame_count, 3))
     with replacing(layout.points) as temporary:
@@ -263,6 +277,7 @@ def write_points(
                 save(layer, layout.points)
         save(layer, layout.points)
         del layer  # the file is closed before it is renamed
+        return sha256(temporary)
 
 
 def write_stage(garments: Sequence[Layout]) -> None:

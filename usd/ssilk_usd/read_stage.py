@@ -3,18 +3,16 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterator
 from functools import wraps
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar, cast
 
 import numpy as np
-from pxr import Pcp, Tf, Usd, UsdGeom, UsdUtils
+from pxr import Ar, Pcp, Tf, Usd, UsdGeom, UsdUtils
 
 from ssilk_core.assets import Floats
 from ssilk_core.errors import fail
-from ssilk_core.files import sha256
 
 from . import memory, trial
 from .garment_api import register_schema
@@ -110,15 +108,17 @@ def _composition_errors(stage: Usd.Stage) -> list[Any]:
     return found
 
 
-def content_hash(source: str | Path) -> str:
-    """Return a SHA-256 of the contents of a stage's root layer and all files that it uses, whatever their paths.
+def used_files(source: StageLike) -> list[str]:
+    """Return the files of a stage's root layer and of everything that it uses, the root first.
 
     Raises:
         SsilkError: as `open_stage`.
     """
     stage = open_stage(source)
-    paths = {layer.realPath for layer in stage.GetUsedLayers() if layer.realPath} | set(_clips(stage))
-    return hashlib.sha256("".join(sorted(map(sha256, paths))).encode()).hexdigest()
+    root = stage.GetRootLayer().realPath
+    paths = [root, *(layer.realPath for layer in stage.GetUsedLayers() if layer.realPath), *_clips(stage)]
+    whole, *used = (Ar.SplitPackageRelativePathOuter(path)[0] for path in paths)  # of a package, its file
+    return [whole, *sorted(set(used) - {whole})]
 
 
 def _clips(stage: Usd.Stage) -> Iterator[str]:
