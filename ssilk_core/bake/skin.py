@@ -92,7 +92,7 @@ class SkinMeter:
             for values in (matrices[0, :, :3].copy(), points - origin)
         )
         time = int(self.rollout.start + sample / self.rollout.request.samples_per_frame)
-        self._counts.append(ShownCounts.of(self._skin.shows(x, character), [time]))
+        self._counts.append(ShownCounts.of(self._skin.states(x, character), [time]))
 
 
 @lru_cache(maxsize=1)

@@ -17,7 +17,7 @@ from ..view.player import ShotPlayer
 from ..view.render import Image, render
 from ..view.shots import shot_surfaces
 from .page import Section, figure, table
-from .terms import SHARE, SHOWN, UNITS, TermsMeter, worst_frames
+from .terms import BARE, SHARE, SHOWN, UNITS, TermsMeter, worst_frames
 
 PICTURES, SKIN_PICTURES = 4, 2  # worst frames to show: of the energy, and of the skin that shows
 APART = 0.5  # the least time between them [s]
@@ -74,9 +74,9 @@ def _sections(player: ShotPlayer, garment: ShotGarment, meter: TermsMeter) -> li
         if values[SHOWN][frame] > 0 and frame not in worst
     ]
     times, marks = np.arange(len(values["total"])) / player.fps, dict(zip(worst, LETTERS))
-    shown = [name for name in UNITS if meter.body or name not in ("collision", SHARE, SHOWN)]
-    if meter.covered is None and SHOWN in shown:
-        shown.remove(SHOWN)
+    shown = [name for name in UNITS if meter.body or name not in ("collision", SHARE)]
+    if meter.covered is None:
+        shown = [name for name in shown if name not in (SHOWN, BARE)]
     panels = [
         ChartPanel(
             title=name, x="time [s]", y=UNITS[name], curves={"": (times, values[name])},

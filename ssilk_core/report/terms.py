@@ -10,7 +10,7 @@ import numpy as np
 
 from ..assets import Floats, Mesh
 from ..collision import CoveredPoints, PosedBody, ShownCounts, signed_distance
-from ..collision.covered_skin import showing, shown_skin
+from ..collision.covered_skin import shown_skin
 from ..collision.one_ring import triangle_rings
 from ..constants import GRAVITY
 from ..energy import TERMS, GarmentEnergy
@@ -18,8 +18,8 @@ from ..fabrics import Fabric
 from ..mesh.topology import vertex_normals
 from ..shown_skin import ShownSkin
 
-SHARE, SHOWN = "inside the body", "covered skin that shows"
-UNITS = {"total": "J", **dict.fromkeys(TERMS, "J"), SHARE: "%", SHOWN: "%"}
+SHARE, SHOWN, BARE = "inside the body", "covered skin that shows", "covered skin that is bare"
+UNITS = {"total": "J", **dict.fromkeys(TERMS, "J"), SHARE: "%", SHOWN: "%", BARE: "%"}
 
 
 @dataclass(eq=False)
@@ -34,8 +34,8 @@ class TermsMeter:
         garment: the mesh at rest.
         body: all body meshes at rest as one, or None.
         fps: frames per second.
-        values: by name, one for each frame: energies [J], the share of vertices inside the body, and that of the
-            covered skin that shows [%].
+        values: by name, one for each frame: energies [J], the share of vertices inside the body, and those of the
+            covered skin that shows and that is bare [%].
     """
 
     garment: Mesh
@@ -46,7 +46,7 @@ class TermsMeter:
 
     def __post_init__(self) -> None:
         self.energy = GarmentEnergy(self.garment, self.fabric)
-        self.shows: list = []
+        self.skin: list[ShownCounts] = []
         self.past: deque = deque(maxlen=2)
         import torch
 
@@ -77,9 +77,7 @@ class TermsMeter:
 
     def shown_skin(self, name: str) -> ShownSkin | None:
         """Return the share of the covered skin that shows in the shot `name`; None where nothing is covered."""
-        import torch
-
-        return shown_skin([(name, ShownCounts.of(torch.cat(self.shows, dim=1)))]) if self.covered else None
+        return shown_skin([(name, ShownCounts.joined(self.skin))]) if self.covered else None
 
     def _height(self, points: Floats, body: Floats | None) -> float:
         """Return the garment's weight times its height above the middle of the body, or above y = 0 [J]."""
@@ -97,16 +95,17 @@ class TermsMeter:
         import torch
 
         if body is None or self.body is None:
-            return {"collision": 0.0, SHARE: 0.0, SHOWN: 0.0}
+            return {"collision": 0.0, SHARE: 0.0, SHOWN: 0.0, BARE: 0.0}
         normals = vertex_normals(body, self.body.faces)
         at, towards = (torch.as_tensor(values, dtype=torch.float32)[:, :, None] for values in (body, normals))
         distance = signed_distance(self.energy.cloth.positions(x), PosedBody(at, towards, self.rings))
         inside = 100 * float((distance[: len(x)] < 0).double().mean())
-        found = {"collision": float(self.energy.collision_at(distance)), SHARE: inside, SHOWN: 0.0}
+        found = {"collision": float(self.energy.collision_at(distance)), SHARE: inside, SHOWN: 0.0, BARE: 0.0}
         if self.covered:
             vertices = self.covered.vertices
-            self.shows.append(showing(self.covered.hits(x, at[vertices], towards[vertices])))
-            found[SHOWN] = 100 * float(self.shows[-1].double().mean())
+            states = self.covered.states(x, at[vertices], towards[vertices])
+            self.skin.append(ShownCounts.of(states, [len(self.skin)]))
+            found |= {SHOWN: 100 * float(self.skin[-1].shares), BARE: 100 * float(self.skin[-1].bare)}
         return found
 
 

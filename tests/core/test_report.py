@@ -15,7 +15,7 @@ from ssilk_core.fabrics import Fabric
 from ssilk_core.report.figures import learning_of, section_of
 from ssilk_core.report.page import Section, facts, figure, flattened, page, table
 from ssilk_core.report.shots import joined
-from ssilk_core.report.terms import SHARE, SHOWN, TermsMeter, worst_frames
+from ssilk_core.report.terms import BARE, SHARE, SHOWN, TermsMeter, worst_frames
 
 CLOTH = Fabric("toy", density=0.2, contact_model="vertex", margin=0.0, thickness=0.0, collision=7.0)
 
@@ -56,20 +56,25 @@ def test_what_is_inside_the_body_is_counted_and_costs_its_depth(sheet):
 
 
 def test_skin_that_shows_through_a_sheet_is_a_cap_of_the_ball(toy_grid):
-    """A wide sheet in front of a ball, then 20 mm behind its foremost point: a cap of height 20 mm shows."""
+    """A wide sheet in front of a ball, then 20 mm behind its foremost point: a cap of height 20 mm shows.
+
+    When it is lifted off by 50 mm, nothing shows and a rim is bare.
+    """
     points, faces = toy_grid(40, 40, height=1.0, width=1.0)
     cover = Mesh("/cover", points + [0, 0.5, -0.31], faces)
     body = ball()
     meter = TermsMeter(cover, body, CLOTH, 30.0)
-    for depth in (0.0, 0.03):
+    for depth in (0.0, 0.03, -0.05):
         meter.add(cover.points + [0, 0, depth], body.points)
     found = meter.shown_skin("shot")
     # A ray along the normal at an angle a from the axis meets the plane at d / cos(a) from the centre.
-    first, second = 1 - 0.31 / 0.38, 1 - 0.28 / 0.3
+    first, second, third = 1 - 0.31 / 0.38, 1 - 0.28 / 0.3, 1 - 0.36 / 0.38
     assert found.covered == pytest.approx(8000 * first / 2, rel=0.02)
-    assert meter.values[SHOWN] == [0, pytest.approx(100 * second / first, rel=0.03)]
+    assert meter.values[SHOWN] == [0, pytest.approx(100 * second / first, rel=0.03), 0]
+    assert meter.values[BARE] == [0, 0, pytest.approx(100 * (1 - third / first), rel=0.03)]
     assert (found.clip, found.frame, found.regions) == ("shot", 1, {})
-    assert 100 * found.worst == meter.values[SHOWN][1] and found.mean == found.worst / 2
+    assert 100 * found.worst == meter.values[SHOWN][1] and found.mean == found.worst / 3
+    assert 100 * found.worst_bare == meter.values[BARE][2] and found.bare == found.worst_bare / 3
 
 
 def test_bodies_are_joined_in_their_order():
