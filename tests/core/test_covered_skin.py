@@ -127,9 +127,15 @@ def test_a_garment_that_covers_nothing_has_no_figure(scene):
     assert skin.figures([("clip", ShownCounts.of(states))]) is None
 
 
-@pytest.mark.parametrize("limit", [64, 1 << 20])
+@pytest.mark.parametrize("limit", [400, 1 << 20])  # two rays at once; all of several frames
 def test_rays_meet_what_a_slow_search_finds(monkeypatch, limit):
     monkeypatch.setattr(ray_casting, "MAX_RAY_PAIRS", (limit, limit))
+    compared, search = [], ray_casting._reachable
+    monkeypatch.setattr(
+        ray_casting,
+        "_reachable",
+        lambda start, *rest: compared.append(len(start) * start.shape[1] * rest[1].shape[1]) or search(start, *rest),
+    )
     random = np.random.default_rng(1)
     sheet = trimesh.creation.icosphere(subdivisions=3, radius=0.3)
     x = sheet.vertices[:, :, None] + random.normal(0, 0.02, (len(sheet.vertices), 3, 3)) + [[[0.0, 1.0, 5.0]]]
@@ -141,6 +147,7 @@ def test_rays_meet_what_a_slow_search_finds(monkeypatch, limit):
     caster = RayCaster(Mesh("/sheet", sheet.vertices, sheet.faces), device=DEVICE)
     asked = (torch.as_tensor(values, dtype=torch.float32, device=DEVICE) for values in (points, directions, x))
     found = caster.cast(*asked, above=0.08, beneath=0.03)
+    assert max(compared) <= max(limit, len(caster.patches))
     for frame in range(3):
         distance = distances_by_solving(points[..., frame], directions[..., frame], x[sheet.faces, :, frame])
         above, beneath = ((distance >= low) & (distance <= high) for low, high in ((0, 0.08), (-0.03, 0)))
