@@ -36,10 +36,10 @@ def rewrite_mesh(mesh: UsdGeom.Mesh, repair: MeshRepair, offsets: Floats) -> Non
     """
     if repair.reshapes:
         _reshape(mesh, repair)
-    move_points(mesh, offsets)
+    offset_points(mesh, offsets)
 
 
-def move_points(mesh: UsdGeom.Mesh, offsets: Floats) -> None:
+def offset_points(mesh: UsdGeom.Mesh, offsets: Floats) -> None:
     """Move the points of a mesh by offsets in its own space and units, shape (V, 3), and its extent with them."""
     _change(mesh.GetPointsAttr(), lambda rows: (rows + offsets).astype(rows.dtype))
     if mesh.GetExtentAttr().HasAuthoredValue():
