@@ -33,6 +33,7 @@ CALM = 6  # iterations after which steps are damped more and more, so that cloth
 LAYER_DISTANCE = 0.012  # [m] within which layers are tied
 ACROSS = 0.7  # cosine between cloth's normal and the way to another layer, at least
 LEAST_FRICTION = 2e-3  # of contacts, relative to the penalty
+LEAST_DAMPING = 1e-6  # relative to the stiffness of an edge: free cloth that touches nothing stays where it is
 DAMPING = 0.4  # growth of the damping in each further iteration, relative to the stiffness of an edge
 TOUCHING = 1e-4  # [m] from its plane up to which a sample is taken to touch it at first
 ACTIVE_SETS = 4  # changes of the active set in an iteration, at most
@@ -101,6 +102,11 @@ def settle(mesh: Mesh, body: Mesh, gap: float = GAP) -> Settled:
     return _Cloth(mesh, body).settled(gap)
 
 
+def part_inside(mesh: Mesh, body: Mesh) -> PartInside:
+    """Return the part of a garment that lies in a body, which `settle` would take out."""
+    return _Cloth(mesh, body).inside_now()
+
+
 class _Cloth:
     """The garment with coincident vertices joined, and the body's surface."""
 
@@ -114,8 +120,12 @@ class _Cloth:
         self.surface = OuterSurface(body)
         self.samples = sample_cloth(self.points, self.faces)
 
+    def inside_now(self) -> PartInside:
+        """Return the part that lies in the body where the garment is."""
+        return self._part_inside(self.samples, self.points)
+
     def settled(self, gap: float) -> Settled:
-        before, still = self._part_inside(self.samples, self.points), np.zeros((len(self.joined), 3))
+        before, still = self.inside_now(), np.zeros((len(self.joined), 3))
         if before.depth > DEEPEST or not len(before.vertices):
             return Settled(still, before, before)
         points = _Solve(self, gap).run()
@@ -155,7 +165,8 @@ class _Solve:
             contacts = self._contacts(points)
             if step < RESTING and contacts.heights(points).min(initial=np.inf) > self.gap - TOLERANCE:
                 break
-            friction, damping = max(LEAST_FRICTION, 0.1 * 0.5**iteration), max(brake, DAMPING * (iteration - CALM))
+            friction = max(LEAST_FRICTION, 0.1 * 0.5**iteration)
+            damping = max(brake, DAMPING * (iteration - CALM), LEAST_DAMPING)
             new = self._step(points, contacts, friction, damping)
             if not np.isfinite(new).all():
                 return new

@@ -11,8 +11,8 @@ import pytest
 from ssilk_core.assets import Floats, Ints, Mesh
 from ssilk_core.mesh.topology import edges
 from ssilk_core.preflight.cloth_samples import sample_cloth
-from ssilk_core.preflight.fit import penetration
-from ssilk_core.preflight.settle import GAP, _Cloth, _layer_ties, settle
+from ssilk_core.preflight.fit import _why_still, penetration
+from ssilk_core.preflight.settle import GAP, _Cloth, _layer_ties, _Solve, part_inside, settle
 from ssilk_core.preflight.sides import find_facing
 
 RADIUS, COLUMNS, ROWS = 0.1, 32, 27
@@ -95,7 +95,26 @@ def test_what_settling_would_make_worse_stays(monkeypatch, end):
     cloth = dented(tube(RADIUS + 0.006))
     found = settle(cloth, limb())
     assert found.failed and found.left and not found.offsets.any() and found.after is found.before
-    assert "because settling found no shape" in next(penetration(cloth, limb())).fix
+    assert "because settling found no shape" in _why_still(found)
+
+
+def test_an_inspection_words_its_finding_without_settling(monkeypatch):
+    monkeypatch.setattr("ssilk_core.preflight.settle._Solve.run", lambda solve: pytest.fail("settled"))
+    cloth = dented(tube(RADIUS + 0.006))
+    found = next(penetration(cloth, limb()))
+    inside = part_inside(cloth, limb())
+    assert found.fixable and found.fix.endswith("--fix settles it") and found.count == len(inside.vertices) > 0
+    assert f"up to {1000 * inside.depth:.1f} mm deep" in found.found
+
+
+def test_free_cloth_that_touches_nothing_stays_where_it_is():
+    dent = dented(tube(RADIUS + 0.006, 16, 9))
+    cloth = _Cloth(replace(dent, points=np.r_[dent.points, [[1.0, 0, 0]]]), limb())  # with a vertex of no triangle
+    solve = _Solve(cloth, GAP)
+    solve.free[:] = True  # the equations alone are singular
+    nothing = solve.planes.near(np.zeros(len(solve.taking_part), dtype=bool), GAP)
+    solve._contacts = lambda points: nothing
+    np.testing.assert_allclose(solve.run(), cloth.points, atol=1e-6)
 
 
 def test_seams_stay_closed():
