@@ -33,7 +33,6 @@ CALM = 6  # iterations after which steps are damped more and more, so that cloth
 LAYER_DISTANCE = 0.012  # [m] within which layers are tied
 ACROSS = 0.7  # cosine between cloth's normal and the way to another layer, at least
 LEAST_FRICTION = 2e-3  # of contacts, relative to the penalty
-LEAST_DAMPING = 1e-6  # relative to the stiffness of an edge: free cloth that touches nothing stays where it is
 DAMPING = 0.4  # growth of the damping in each further iteration, relative to the stiffness of an edge
 TOUCHING = 1e-4  # [m] from its plane up to which a sample is taken to touch it at first
 ACTIVE_SETS = 4  # changes of the active set in an iteration, at most
@@ -165,8 +164,7 @@ class _Solve:
             contacts = self._contacts(points)
             if step < RESTING and contacts.heights(points).min(initial=np.inf) > self.gap - TOLERANCE:
                 break
-            friction = max(LEAST_FRICTION, 0.1 * 0.5**iteration)
-            damping = max(brake, DAMPING * (iteration - CALM), LEAST_DAMPING)
+            friction, damping = max(LEAST_FRICTION, 0.1 * 0.5**iteration), max(brake, DAMPING * (iteration - CALM))
             new = self._step(points, contacts, friction, damping)
             if not np.isfinite(new).all():
                 return new
@@ -205,9 +203,14 @@ class _Solve:
             system = sparse.kron(inner + sliding, sparse.identity(3)) + PENALTY * (pushed.T @ pushed)
             right = (load + sliding @ points[free]).reshape(-1) + PENALTY * (pushed.T @ (target - held_part)[active])
             right += PENALTY * friction * (pushed.T @ (target - now)[active])
-            factor = splu(
-                system.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-            )
+            try:
+                factor = splu(
+                    system.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+                )
+            except RuntimeError as error:
+                if "singular" not in str(error):
+                    raise
+                return np.full_like(points, np.nan)  # as where a solution overflows: the garment stays as it is
             solution = factor.solve(right)
             before, active = active, along @ solution + held_part < target
             if np.array_equal(before, active):
