@@ -17,7 +17,7 @@ class ShownSkin:
         covered: points that the garment covers.
         mean, worst: mean share over frames, and that of the worst frame.
         bare, worst_bare: the same of skin with no cloth within reach; None where an earlier version counted.
-        clip, frame: the worst frame; of several equal ones the first.
+        clip, frame: the worst frame, of several equal ones the first; of a shot its time code.
         regions: share of what shows, of all frames together, at the joints that move most of it, largest first.
     """
 
@@ -26,7 +26,7 @@ class ShownSkin:
     mean: float
     worst: float
     clip: str
-    frame: int
+    frame: float
     regions: dict[str, float]
     bare: float | None = None
     worst_bare: float | None = None
@@ -40,7 +40,7 @@ class ShownSkin:
         """Return figures for people."""
         return {
             "covered skin that shows": f"{self.mean:.3%}",
-            "in the worst frame": f"{self.worst:.2%}, {self.clip} at {self.frame}",
+            "in the worst frame": f"{self.worst:.2%}, {self.clip} at {self.frame:g}",
             **({"most at": self.where} if self.where else {}),
             **({} if self.bare is None else {"bare": f"{self.bare:.2%}"}),
             **({} if self.worst_bare is None else {"bare in its worst frame": f"{self.worst_bare:.2%}"}),
@@ -53,6 +53,6 @@ class ShownSkin:
         return {**known, **rounded, "regions": {joint: round(share, 4) for joint, share in self.regions.items()}}
 
     def __str__(self) -> str:
-        worst = f"{self.clip}, frame {self.frame}" + (f"; most at {self.where}" if self.where else "")
+        worst = f"{self.clip}, frame {self.frame:g}" + (f"; most at {self.where}" if self.where else "")
         bare = "" if self.bare is None else f", {self.bare:.2%} is bare ({self.worst_bare:.2%} at most)"
         return f"{self.mean:.3%} of the covered skin shows, {self.worst:.2%} in the worst frame ({worst}){bare}"

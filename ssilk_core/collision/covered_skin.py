@@ -44,7 +44,7 @@ class ShownCounts:
     Attributes:
         shares, bare: shares of the covered points that show, and that are bare, in each frame, both of shape (N,).
         points: frames in which each covered point shows, shape (P,).
-        frames: numbers of the frames in the clip, shape (N,).
+        frames: numbers of the frames in the clip, or their time codes, shape (N,).
     """
 
     shares: Tensor
@@ -53,10 +53,10 @@ class ShownCounts:
     frames: Tensor
 
     @classmethod
-    def of(cls, states: SkinStates, frames: Sequence[int] | None = None) -> ShownCounts:
+    def of(cls, states: SkinStates, frames: Sequence[float] | None = None) -> ShownCounts:
         """Return the counts of a clip, from the states (P, N) in `frames`, by default the first N."""
         shares, bare = (found.double().mean(0).cpu() for found in (states.shows, states.bare))
-        numbers = torch.arange(len(shares)) if frames is None else torch.tensor(frames)
+        numbers = torch.arange(len(shares)) if frames is None else torch.from_numpy(np.asarray(frames))
         return cls(shares, bare, states.shows.sum(1).cpu(), numbers)
 
     @classmethod
@@ -194,7 +194,7 @@ def shown_skin(
         bare=float(together.bare.mean()),
         worst_bare=float(together.bare.max()),
         clip=clip,
-        frame=int(worst.frames[worst.shares.argmax()]),
+        frame=worst.frames[worst.shares.argmax()].item(),
         regions=regions(together.points),
     )
 

@@ -73,7 +73,7 @@ def _energies(f: Figures) -> list[str]:
 
 def _shown_skin(f: ShownSkin) -> list[str]:
     bare = " / ".join(_percent(share) for share in (f.bare, f.worst_bare) if share is not None)
-    return [str(f.covered), _percent(f.mean, 3), _percent(f.worst), f.clip, str(f.frame), f.where, bare]
+    return [str(f.covered), _percent(f.mean, 3), _percent(f.worst), f.clip, f"{f.frame:g}", f.where, bare]
 
 
 def _motion(f: Figures) -> list[str]:

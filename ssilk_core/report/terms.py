@@ -36,6 +36,7 @@ class TermsMeter:
         fps: frames per second.
         values: by name, one for each frame: energies [J], the share of vertices inside the body, and those of the
             covered skin that shows and that is bare [%].
+        finite: whether the garment of each frame is.
     """
 
     garment: Mesh
@@ -46,6 +47,7 @@ class TermsMeter:
 
     def __post_init__(self) -> None:
         self.energy = GarmentEnergy(self.garment, self.fabric)
+        self.finite: list[bool] = []
         self.skin: list[ShownCounts] = []
         self.past: deque = deque(maxlen=2)
         import torch
@@ -57,11 +59,15 @@ class TermsMeter:
             self.rings = torch.as_tensor(triangle_rings(self.body.faces, self.body.vertex_count))
         self.rest = self._height(self.garment.points, None if self.body is None else self.body.points)
 
-    def add(self, points: Floats, body: Floats | None) -> None:
-        """Take a frame: points of the garment (V, 3) and of the body (B, 3) [m]."""
+    def add(self, points: Floats, body: Floats | None, time: float) -> None:
+        """Take the frame of a time code: points of the garment (V, 3) and of the body (B, 3) [m].
+
+        Where the garment is not finite, all covered skin shows and the energies are not finite.
+        """
         import torch
 
-        origin = points.mean(axis=0)
+        self.finite.append(bool(np.isfinite(points).all()))
+        origin = points.mean(axis=0) if self.finite[-1] else np.zeros(3)
         x = torch.as_tensor(points - origin, dtype=torch.float32)[:, :, None]
         stretch, bending = self.energy.elastic(x)
         found = {
@@ -69,7 +75,7 @@ class TermsMeter:
             "bending": float(bending),
             "gravity": self._height(points, body) - self.rest,
             "inertia": self._inertia(points),
-            **self._collision(x, None if body is None else body - origin),
+            **self._collision(x, None if body is None else body - origin, time),
         }
         total = sum(value for name, value in found.items() if UNITS[name] == "J")
         for name, value in {"total": total, **found}.items():
@@ -91,7 +97,7 @@ class TermsMeter:
         self.past.append(points)
         return float(self.energy.mass.numpy() @ squared) * self.fps**2 / 2
 
-    def _collision(self, x, body: Floats | None) -> dict[str, float]:  # type: ignore[no-untyped-def]  # torch is heavy
+    def _collision(self, x, body: Floats | None, time: float) -> dict[str, float]:  # type: ignore[no-untyped-def]  # torch is heavy
         import torch
 
         if body is None or self.body is None:
@@ -104,16 +110,16 @@ class TermsMeter:
         if self.covered:
             vertices = self.covered.vertices
             states = self.covered.states(x, at[vertices], towards[vertices])
-            self.skin.append(ShownCounts.of(states, [len(self.skin)]))
+            self.skin.append(ShownCounts.of(states, [time]))
             found |= {SHOWN: 100 * float(self.skin[-1].shares), BARE: 100 * float(self.skin[-1].bare)}
         return found
 
 
 def worst_frames(values: Floats, count: int, apart: int) -> list[int]:
-    """Return up to `count` frames with the largest values, the worst first, at least `apart` frames apart."""
+    """Return up to `count` frames with the largest finite values, the worst first, at least `apart` frames apart."""
     found: list[int] = []
     for frame in np.argsort(-np.asarray(values), kind="stable").tolist():
-        if len(found) == count:
+        if len(found) == count or not np.isfinite(values[frame]):
             break
         if all(abs(frame - other) >= apart for other in found):
             found.append(frame)
