@@ -32,11 +32,12 @@ from ssilk_core.assets import (
     SkinWeights,
 )
 from ssilk_core.collision import CollisionBody
+from ssilk_core.collision.samples import contact_samples
 from ssilk_core.config import ModelConfig, TrainConfig
 from ssilk_core.energy import GarmentEnergy
 from ssilk_core.fabrics import Fabric
 from ssilk_core.kinematics import local_transforms, rigid
-from ssilk_core.memory import step_memory
+from ssilk_core.memory import decoded_frames, step_memory
 from ssilk_core.model.network import GarmentModel
 from ssilk_core.motion_bank import build_bank
 from ssilk_core.training.objective import Objective
@@ -114,14 +115,19 @@ def stepper(whole: Scene, config: TrainConfig, device: torch.device) -> Stepper:
 def measure(vertices: int, body_vertices: int, frames: int, surface: str, device: torch.device) -> dict[str, int]:
     """Return the measured and the predicted peak of a step that decodes `frames` at once [bytes]."""
     whole = scene(vertices, body_vertices)
-    config = TrainConfig(batch=frames // WINDOW, window=WINDOW, pretraining_batch=frames, closest_point=surface)
+    config = TrainConfig(
+        batch=frames // (2 * WINDOW), static_batch=frames // 2, window=WINDOW, pretraining_batch=frames,
+        closest_point=surface,
+    )  # fmt: skip
+    assert decoded_frames(config, config.batch) == frames
     steps = stepper(whole, config, device)
     peak = Peak(device)
     for iteration in (0, config.static_iterations):
         steps.run(iteration)
         steps.run(iteration + 1)  # beside the optimiser's moments, which the first step makes
     body = whole.character.bodies[0].mesh.vertex_count
-    predicted = step_memory(whole, ModelConfig(), frames, body)
+    samples = len(contact_samples(whole.garment.mesh, Fabric("default")).area)
+    predicted = step_memory(whole, ModelConfig(), frames, body, samples)
     return {"measured": peak.bytes(), "predicted": predicted}
 
 

@@ -28,33 +28,43 @@ from ssilk_core.motion_bank import roll_states
 from ssilk_core.simulate import SimulationOptions, simulate
 
 SPLITS = ("valid", "test", "flips")
-HEADER = ("garment", "split", "method", "frames", "shows, mean [%]", "worst frame [%]", "in", "stretch [J]")
+HEADER = (
+    "garment",
+    "split",
+    "method",
+    "frames",
+    "shows, mean [%]",
+    "worst frame [%]",
+    "in",
+    "bare [%]",
+    "stretch [J]",
+)
 CHUNK = 256  # frames in memory at once
 ITERATIONS = 4
 
 
 def whole_clip(
     subject: Subject, skin: CoveredSkin, options: Namespace, clip: str
-) -> Iterator[tuple[str, Tensor, Tensor]]:
-    """Yield method, shares of skin that shows and stretch energies of every frame of a clip."""
+) -> Iterator[tuple[str, ShownCounts, Tensor]]:
+    """Yield method, the skin that shows and stretch energies of every frame of a clip."""
     validator = subject.validator(clip_of(options, clip, subject))
     (span,) = validator.clips
     states = roll_states(subject.model, validator.bank, [span], validator.down)[0]
     for method in ("network", "linear blend skinning"):
-        shares, stretch = [], []
+        counts, stretch = [], []
         for start in range(0, len(span), CHUNK):
             frames = torch.arange(span[start], span[min(start + CHUNK, len(span)) - 1] + 1, device=subject.device)
             character = validator.bank.character(frames)
             at = subject.model.vertices(states[start : start + CHUNK], character)
             x = at if method == "network" else validator.lbs_vertices(character)
-            shares.append(ShownCounts.of(skin.shows(x, character)).shares)
+            counts.append(ShownCounts.of(skin.states(x, character)))
             stretch.append(subject.energy.stretch(x).cpu())
-        yield method, torch.cat(shares), torch.cat(stretch)
+        yield method, ShownCounts.joined(counts), torch.cat(stretch)
 
 
 def solved(
     subject: Subject, skin: CoveredSkin, options: Namespace, clip: str
-) -> Iterator[tuple[str, Tensor, Tensor]]:
+) -> Iterator[tuple[str, ShownCounts, Tensor]]:
     """Yield the same of the first frames of a clip: the network, refined, and the simulator."""
     take = NetworkTake.of(subject, clip_of(options, clip, subject), options.frames)
     dressed, motion = subject.dressed, take.motion
@@ -66,16 +76,17 @@ def solved(
     character = torch.tensor(matrices[:, :, :3].transpose(1, 2, 3, 0), dtype=torch.float32, device=subject.device)
     for method, points in (("network", take.points), (f"refine {ITERATIONS}", refined), ("simulator", simulated)):
         x = torch.tensor(points.transpose(1, 2, 0), dtype=torch.float32, device=subject.device)
-        yield method, ShownCounts.of(skin.shows(x, character)).shares, subject.energy.stretch(x).cpu()
+        yield method, ShownCounts.of(skin.states(x, character)), subject.energy.stretch(x).cpu()
 
 
-def figures(found: list[tuple[str, Tensor, Tensor]]) -> dict[str, Any]:
-    """Return the figures of one method over clips, each with its name, shares and energies."""
-    shares, stretch = torch.cat([each[1] for each in found]), torch.cat([each[2] for each in found])
-    worst = max(found, key=lambda each: float(each[1].max()))
+def figures(found: list[tuple[str, ShownCounts, Tensor]]) -> dict[str, Any]:
+    """Return the figures of one method over clips, each with its name, skin and energies."""
+    counts, stretch = ShownCounts.joined([each[1] for each in found]), torch.cat([each[2] for each in found])
+    worst = max(found, key=lambda each: float(each[1].shares.max()))
     return {
-        "frames": len(shares), "mean": float(shares.mean()), "worst": float(shares.max()), "in": worst[0],
-        "stretch": float(stretch.mean()), "clips": {name: float(own.mean()) for name, own, _ in found},
+        "frames": len(stretch), "mean": float(counts.shares.mean()), "worst": float(counts.shares.max()),
+        "in": worst[0], "bare": float(counts.bare.mean()),
+        "stretch": float(stretch.mean()), "clips": {name: float(own.shares.mean()) for name, own, _ in found},
     }  # fmt: skip
 
 
@@ -89,7 +100,7 @@ def measure(subject: Subject, options: Namespace) -> dict[str, Any]:
     if options.refined:
         runs.append((f"first {options.frames} frames", options.refined, solved))
     for split, clips, run in runs:
-        methods: dict[str, list[tuple[str, Tensor, Tensor]]] = {}
+        methods: dict[str, list[tuple[str, ShownCounts, Tensor]]] = {}
         for clip in clips:
             for method, shares, stretch in run(subject, skin, options, clip):
                 methods.setdefault(method, []).append((clip, shares, stretch))
@@ -101,7 +112,7 @@ def rows(garment: str, found: dict[str, Any]) -> list[list[str]]:
     """Return the lines of a garment."""
     return [
         [garment, split, method, str(at["frames"]), f"{at['mean']:.3%}", f"{at['worst']:.2%}", at["in"],
-         f"{at['stretch']:.3f}"]
+         f"{at['bare']:.2%}", f"{at['stretch']:.3f}"]
         for split, methods in found.items() if isinstance(methods, dict) for method, at in methods.items()
     ]  # fmt: skip
 

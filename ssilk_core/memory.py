@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Callable
 from math import ceil
 from pathlib import Path
@@ -15,6 +16,7 @@ from .errors import fail
 
 PLANNED_SHARE = 0.8  # of the free memory
 DEFAULT_FREE_MEMORY = 8 << 30  # bytes, where the system offers no portable way to ask
+MAX_SEARCHED = 1 << 25  # pairs of a sample and a triangle of the body at once, as `collision.closest_point` takes
 MEMINFO = Path("/proc/meminfo")
 CONTAINER = Path("/sys/fs/cgroup")
 # Limit, usage, statistics and the name of reclaimable cache in them, for versions 2 and 1 of control groups.
@@ -50,16 +52,20 @@ def _numbers(path: Path) -> dict[str, str]:
     return {words[0]: words[1] for line in path.read_text().splitlines() if len(words := line.split()) > 1}
 
 
-def step_memory(scene: Scene, config: ModelConfig, frames: int, body_vertices: int) -> int:
+def step_memory(scene: Scene, config: ModelConfig, frames: int, body_vertices: int, samples: int) -> int:
     """Predict the bytes that one training step holds at its peak, for `frames` decoded at once.
 
-    Counts float32 numbers for each frame and vertex, body vertex, joint and unit of the network, and one table of
-    squared distances; the constants were fitted to measured peaks, on the safe side (benchmarks/memory.py).
+    Counts float32 numbers for each frame and vertex, contact sample, body vertex, joint and unit of the network, one
+    table of squared distances, and the search for the closest triangles on a CPU. The constants were fitted to
+    measured peaks, on the safe side (benchmarks/memory.py).
+
+    Args:
+        samples: at which the garment meets the body (`collision.samples`), its vertices among them.
     """
-    vertices = scene.garment.mesh.vertex_count
-    numbers = 225 * vertices + 22 * body_vertices + 60 * len(scene.joint_names)
+    numbers = 200 * scene.garment.mesh.vertex_count + 25 * samples + 22 * body_vertices + 60 * len(scene.joint_names)
     network = 12 * sum(config.widths) + 20 * config.latent
-    return 4 * frames * (numbers + network) + 4 * vertices * body_vertices + (40 << 20)
+    pairs = min(MAX_SEARCHED, 2 * frames * samples * body_vertices)  # a closed mesh has twice as many faces
+    return 4 * frames * (numbers + network) + 4 * samples * body_vertices + 8 * pairs + (40 << 20)
 
 
 def decoded_frames(config: TrainConfig, batch: int) -> int:
@@ -73,21 +79,25 @@ def _frames_of_a_window(config: TrainConfig) -> float:
 
 
 def fitting_batch(
-    scene: Scene, model: ModelConfig, config: TrainConfig, body_vertices: int, available: int
+    scene: Scene, model: ModelConfig, config: TrainConfig, body_vertices: int, samples: int, available: int
 ) -> tuple[int, int]:
     """Return the largest batch and pretraining batch, up to the configured ones, that fit into `available` bytes."""
-    per_frame = step_memory(scene, model, 1, body_vertices) - step_memory(scene, model, 0, body_vertices)
-    frames = int(max(1, (PLANNED_SHARE * available - step_memory(scene, model, 0, body_vertices)) // per_frame))
+
+    def needed(frames: int) -> int:
+        return step_memory(scene, model, frames, body_vertices, samples)
+
+    most = decoded_frames(config, config.batch)
+    frames = bisect_right(range(most + 1), PLANNED_SHARE * available, key=needed) - 1
     return max(1, min(config.batch, int(frames / _frames_of_a_window(config)))), max(
         1, min(config.pretraining_batch, frames)
     )
 
 
 def check_one_window_fits(
-    scene: Scene, model: ModelConfig, config: TrainConfig, body_vertices: int, available: int
+    scene: Scene, model: ModelConfig, config: TrainConfig, body_vertices: int, samples: int, available: int
 ) -> None:
     """Raise `SsilkError` unless a step on a single window fits into `available` bytes."""
-    needed = step_memory(scene, model, ceil(_frames_of_a_window(config)), body_vertices)
+    needed = step_memory(scene, model, ceil(_frames_of_a_window(config)), body_vertices, samples)
     if not needed <= available:
         fail(
             scene.garment.mesh.path,

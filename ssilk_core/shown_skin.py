@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The share of covered skin that shows, as figures; `collision.covered_skin` measures it."""
+"""The shares of covered skin that show and that are bare, as figures; `collision.covered_skin` measures it."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ COVER_REACH, SHOW_DEPTH = 0.08, 0.03  # [m]: how far cloth above covers a point,
 
 @dataclass(frozen=True, kw_only=True)
 class ShownSkin:
-    """The share of covered skin that shows, over frames.
+    """The share of covered skin that shows, over frames, and beside it the share that is bare.
 
     Attributes:
         frames: that were counted.
         covered: points that the garment covers.
         mean, worst: mean share over frames, and that of the worst frame.
-        clip, frame: the worst frame; of several equal ones the first.
+        bare, worst_bare: the same of skin with no cloth within reach; None where an earlier version counted.
+        clip, frame: the worst frame, of several equal ones the first; of a shot its time code.
         regions: share of what shows, of all frames together, at the joints that move most of it, largest first.
     """
 
@@ -25,8 +26,10 @@ class ShownSkin:
     mean: float
     worst: float
     clip: str
-    frame: int
+    frame: float
     regions: dict[str, float]
+    bare: float | None = None
+    worst_bare: float | None = None
 
     @property
     def where(self) -> str:
@@ -37,15 +40,19 @@ class ShownSkin:
         """Return figures for people."""
         return {
             "covered skin that shows": f"{self.mean:.3%}",
-            "in the worst frame": f"{self.worst:.2%}, {self.clip} at {self.frame}",
+            "in the worst frame": f"{self.worst:.2%}, {self.clip} at {self.frame:g}",
             **({"most at": self.where} if self.where else {}),
+            **({} if self.bare is None else {"bare": f"{self.bare:.2%}"}),
+            **({} if self.worst_bare is None else {"bare in its worst frame": f"{self.worst_bare:.2%}"}),
         }
 
     def to_metadata(self) -> dict[str, object]:
         """Return figures of four digits, as a shot stores them."""
-        rounded = {name: float(f"{getattr(self, name):.4g}") for name in ("mean", "worst")}
-        return {**vars(self), **rounded, "regions": {joint: round(share, 4) for joint, share in self.regions.items()}}
+        known = {name: value for name, value in vars(self).items() if value is not None}
+        rounded = {name: float(f"{value:.4g}") for name, value in known.items() if isinstance(value, float)}
+        return {**known, **rounded, "regions": {joint: round(share, 4) for joint, share in self.regions.items()}}
 
     def __str__(self) -> str:
-        worst = f"{self.clip}, frame {self.frame}" + (f"; most at {self.where}" if self.where else "")
-        return f"{self.mean:.3%} of the covered skin shows, {self.worst:.2%} in the worst frame ({worst})"
+        worst = f"{self.clip}, frame {self.frame:g}" + (f"; most at {self.where}" if self.where else "")
+        bare = "" if self.bare is None else f", {self.bare:.2%} is bare ({self.worst_bare:.2%} at most)"
+        return f"{self.mean:.3%} of the covered skin shows, {self.worst:.2%} in the worst frame ({worst}){bare}"

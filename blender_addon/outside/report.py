@@ -50,6 +50,8 @@ def findings(state: JobState, curve: Mapping[str, Any], *, moves: bool) -> list[
         found.append(
             (f"{shown['mean']:.2%} of the covered skin shows, {shown['worst']:.2%} in the worst frame", False)
         )
+        if shown.get("bare") is not None:
+            found.append((f"{shown['bare']:.2%} of it is bare: no cloth is near", False))
     if moves:
         found.append(dynamics(score["dynamics"]))
     if state.checkpoint is not None:

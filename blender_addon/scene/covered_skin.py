@@ -14,7 +14,7 @@ from ssilk_core.mesh.hidden_faces import HiddenFaces, hidden_polygons
 from ..errors import SetupError
 from .garment import armature_of, bodies_of
 from .gather import gather
-from .masks import mask, mask_name, show
+from .masks import mask, show
 from .meshes import need_same_vertices, world_points
 from .units import scene_units
 
@@ -65,7 +65,7 @@ class CoveredSkinSearch:
             owners = np.repeat(np.arange(len(chosen)), mesh.polygon_counts)
             hidden += len(np.unique(owners[inside[mesh.indices_of_corners]]))
             if inside.any():
-                mask(body, mask_name(garment), np.flatnonzero(inside))
+                mask(body, garment, np.flatnonzero(inside))
         return hidden, sum(len(mesh.polygon_counts) for mesh in self.meshes)
 
 

@@ -25,6 +25,7 @@ from .repairs import displacements
 from .shapes import mixed_points, rest_points
 
 ATTRIBUTE = "SSILK Heat"
+ACTIVE_BEFORE = "ssilk_active_color"  # custom property of a coloured mesh: its active colour attribute before
 PENETRATION, STRETCH, SKIN, PUSHED_OUT = "PENETRATION", "STRETCH", "SKIN", "PUSHED_OUT"
 CHUNK = 1000  # vertices at a time
 
@@ -139,9 +140,11 @@ def hide(garment: bpy.types.Object) -> None:
     """Remove the colours of a garment, and those that it gave its bodies."""
     kind, garment.ssilk.heat = garment.ssilk.heat, ""
     for thing in (garment, *(_coloured(garment, kind) if kind == SKIN else ())):
-        colors = thing.data.color_attributes
+        colors, before = thing.data.color_attributes, thing.data.pop(ACTIVE_BEFORE, "")
         if ATTRIBUTE in colors:
             colors.remove(colors[ATTRIBUTE])
+        if before in colors:
+            colors.active_color = colors[before]
 
 
 def _coloured(garment: bpy.types.Object, kind: str) -> list[bpy.types.Object]:
@@ -162,7 +165,10 @@ def _paint(garment: bpy.types.Object, measured: HeatMap, red: float) -> None:
     colors = heat.colors_of(measured.values, red).astype(np.float32)
     for thing in _coloured(garment, measured.kind):
         mesh, count = thing.data, len(thing.data.vertices)
-        layer = mesh.color_attributes.get(ATTRIBUTE) or mesh.color_attributes.new(ATTRIBUTE, "FLOAT_COLOR", "POINT")
+        layer = mesh.color_attributes.get(ATTRIBUTE)
+        if layer is None:
+            mesh[ACTIVE_BEFORE] = mesh.color_attributes.active_color_name
+            layer = mesh.color_attributes.new(ATTRIBUTE, "FLOAT_COLOR", "POINT")
         layer.data.foreach_set("color_srgb", colors[:count].reshape(-1))
         mesh.color_attributes.active_color = layer
         mesh.update()

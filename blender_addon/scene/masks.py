@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Mask modifiers that hide the skin under garments, each on a vertex group of the same name."""
+"""Mask modifiers that hide the skin under garments, each on a vertex group of the same name.
+
+A custom property of the body, of that name too, points to the garment, which may be renamed.
+"""
 
 from __future__ import annotations
 
@@ -16,24 +19,34 @@ LONGEST_NAME = 63  # bytes in UTF-8
 WHOLE = 0.99  # weight above which a vertex is hidden, so that subdivision hides nothing between
 
 
-def mask_name(garment: bpy.types.Object) -> str:
-    """Return the name of the vertex group and of the modifier that hide the skin under a garment."""
+def _name(garment: bpy.types.Object) -> str:
+    """Return the name of the vertex group and of the modifier that are to hide the skin under a garment."""
     return f"{PREFIX}{garment.name}".encode()[:LONGEST_NAME].decode(errors="ignore")
 
 
 def masked(garment: bpy.types.Object) -> list[bpy.types.Object]:
     """Return the objects whose skin is hidden under a garment."""
-    name = mask_name(garment)
-    return [thing for thing in bpy.data.objects if thing.type == "MESH" and name in thing.modifiers]
+    return [thing for thing in bpy.data.objects if thing.type == "MESH" and _masks_under(garment, thing)]
+
+
+def _masks_under(garment: bpy.types.Object, thing: bpy.types.Object) -> list[str]:
+    """Return the names of the modifiers that hide skin of an object under a garment."""
+    names = [modifier.name for modifier in thing.modifiers if modifier.type == "MASK"]
+    # Earlier versions told garments by name alone.
+    return [name for name in names if (thing[name] == garment if name in thing else name == _name(garment))]
 
 
 def show(garment: bpy.types.Object) -> int:
     """Show all skin under a garment again; return on how many bodies it was hidden."""
-    name, things = mask_name(garment), masked(garment)
+    things = masked(garment)
     for thing in things:
-        thing.modifiers.remove(thing.modifiers[name])
-        if name in thing.vertex_groups:
-            thing.vertex_groups.remove(thing.vertex_groups[name])
+        for name in _masks_under(garment, thing):
+            group = thing.vertex_groups.get(thing.modifiers[name].vertex_group)
+            thing.modifiers.remove(thing.modifiers[name])
+            if group:
+                thing.vertex_groups.remove(group)
+            if name in thing:
+                del thing[name]
     return len(things)
 
 
@@ -67,8 +80,9 @@ def _masks_of(thing: bpy.types.Object) -> list[str]:
     ]
 
 
-def mask(body: bpy.types.Object, name: str, vertices: np.ndarray) -> None:
-    """Hide vertices of a body."""
-    body.vertex_groups.new(name=name).add(vertices.tolist(), 1.0, "REPLACE")
-    modifier = body.modifiers.new(name, "MASK")
-    modifier.vertex_group, modifier.invert_vertex_group, modifier.threshold = name, True, WHOLE
+def mask(body: bpy.types.Object, garment: bpy.types.Object, vertices: np.ndarray) -> None:
+    """Hide vertices of a body under a garment."""
+    group, modifier = body.vertex_groups.new(name=_name(garment)), body.modifiers.new(_name(garment), "MASK")
+    group.add(vertices.tolist(), 1.0, "REPLACE")
+    modifier.vertex_group, modifier.invert_vertex_group, modifier.threshold = group.name, True, WHOLE
+    body[modifier.name] = garment

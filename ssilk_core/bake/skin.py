@@ -91,8 +91,8 @@ class SkinMeter:
             torch.as_tensor(values, dtype=torch.float32, device=device)[..., None]
             for values in (matrices[0, :, :3].copy(), points - origin)
         )
-        time = int(self.rollout.start + sample / self.rollout.request.samples_per_frame)
-        self._counts.append(ShownCounts.of(self._skin.shows(x, character), [time]))
+        time = self.rollout.start + sample / self.rollout.request.samples_per_frame
+        self._counts.append(ShownCounts.of(self._skin.states(x, character), [time]))
 
 
 @lru_cache(maxsize=1)

@@ -6,7 +6,7 @@ Positions have the shape (V, 3, N): vertices, coordinates, frames.
 
 from .body import CollisionBody
 from .contacts import Contacts
-from .covered_skin import CoveredPoints, CoveredSkin, ShownCounts
+from .covered_skin import CoveredPoints, CoveredSkin, ShownCounts, SkinStates
 from .distance import (
     Patches,
     PosedBody,
@@ -30,6 +30,7 @@ __all__ = [
     "RayHits",
     "ReachableBody",
     "ShownCounts",
+    "SkinStates",
     "SmoothedDistance",
     "nearest_planes",
     "reachable_body",

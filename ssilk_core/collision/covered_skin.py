@@ -3,7 +3,8 @@
 
 Points are spread evenly over the body. A point is covered when cloth lies within `COVER_REACH` above it, along its
 normal, in the bind pose. A covered point shows when cloth lies within `SHOW_DEPTH` beneath it and none within
-`COVER_REACH` above it. The share of vertices inside the body counts cloth; this share counts what is seen.
+`COVER_REACH` above it. The share of vertices inside the body counts cloth; this share counts what is seen. A covered
+point is bare when neither is within reach: cloth that was thrown off, or swings away as a skirt may, shows nothing.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from ..assets import Floats, Ints, Mesh, Scene, SkinWeights
 from ..mesh import topology
 from ..shown_skin import COVER_REACH, SHOW_DEPTH, ShownSkin
 from ..skinning import Skinning
-from .ray_casting import RayCaster, RayHits
+from .ray_casting import RayCaster
 
 SKIN_POINTS = 8000
 NAMED_REGIONS = 3
@@ -29,30 +30,41 @@ PLASTIC = 1.32471795724474602596  # root of x^3 = x + 1; its powers make the mos
 
 
 @dataclass(frozen=True, eq=False)
+class SkinStates:
+    """Which covered points show, and which are bare, both bool (P, N)."""
+
+    shows: Tensor
+    bare: Tensor
+
+
+@dataclass(frozen=True, eq=False)
 class ShownCounts:
     """How much of the covered skin shows in frames of one clip; on the CPU.
 
     Attributes:
-        shares: share of the covered points that show in each frame, shape (N,).
+        shares, bare: shares of the covered points that show, and that are bare, in each frame, both of shape (N,).
         points: frames in which each covered point shows, shape (P,).
-        frames: numbers of the frames in the clip, shape (N,).
+        frames: numbers of the frames in the clip, or their time codes, shape (N,).
     """
 
     shares: Tensor
+    bare: Tensor
     points: Tensor
     frames: Tensor
 
     @classmethod
-    def of(cls, shows: Tensor, frames: Sequence[int] | None = None) -> ShownCounts:
-        """Return the counts of a clip, from what shows (P, N) in `frames`, by default the first N."""
-        numbers = torch.arange(shows.shape[1]) if frames is None else torch.tensor(frames)
-        return cls(shows.double().mean(0).cpu(), shows.sum(1).cpu(), numbers)
+    def of(cls, states: SkinStates, frames: Sequence[float] | None = None) -> ShownCounts:
+        """Return the counts of a clip, from the states (P, N) in `frames`, by default the first N."""
+        shares, bare = (found.double().mean(0).cpu() for found in (states.shows, states.bare))
+        numbers = torch.arange(len(shares)) if frames is None else torch.from_numpy(np.asarray(frames))
+        return cls(shares, bare, states.shows.sum(1).cpu(), numbers)
 
     @classmethod
     def joined(cls, parts: Sequence[ShownCounts]) -> ShownCounts:
         """Return the counts of several parts together."""
         return cls(
             torch.cat([part.shares for part in parts]),
+            torch.cat([part.bare for part in parts]),
             torch.stack([part.points for part in parts]).sum(0),
             torch.cat([part.frames for part in parts]),
         )
@@ -89,19 +101,16 @@ class CoveredPoints:
         points, normals = ((values[self._corners] * self._weights).sum(1) for values in (points, normals))
         return points, normals / normals.norm(dim=1, keepdim=True).clamp_min(1e-8)
 
-    def hits(self, x: Tensor, points: Tensor, normals: Tensor) -> RayHits:
-        """Tell above and beneath which points cloth lies.
+    def states(self, x: Tensor, points: Tensor, normals: Tensor) -> SkinStates:
+        """Tell which points show, and which are bare; all show in a frame where the cloth is not finite.
 
         Args:
             x: vertices of the cloth [m], shape (V, 3, N).
             points, normals: of the body at `vertices`, in the same frames [m], both (C, 3, N).
         """
-        return self._caster.cast(*self.place(points, normals), x, above=COVER_REACH, beneath=SHOW_DEPTH)
-
-
-def showing(hits: RayHits) -> Tensor:
-    """Tell which points show, bool (P, N)."""
-    return hits.beneath & ~hits.above
+        hits = self._caster.cast(*self.place(points, normals), x, above=COVER_REACH, beneath=SHOW_DEPTH)
+        finite = x.isfinite().all(0).all(0)
+        return SkinStates((hits.beneath & ~hits.above) | ~finite, ~(hits.beneath | hits.above) & finite)
 
 
 class CoveredSkin:
@@ -136,17 +145,16 @@ class CoveredSkin:
         return len(self.points)
 
     @torch.no_grad()
-    def shows(self, x: Tensor, character: Tensor) -> Tensor:
-        """Tell which covered points show, bool (P, N); all do in a frame where a position is not finite.
+    def states(self, x: Tensor, character: Tensor) -> SkinStates:
+        """Tell which covered points show, and which are bare; all show in a frame where the cloth is not finite.
 
         Args:
             x: garment positions [m], shape (V, 3, N).
             character: skinning matrices of the character's joints in the same frames, shape (J, 3, 4, N).
         """
         if self._skinning is None:
-            return torch.zeros(0, x.shape[2], dtype=torch.bool, device=x.device)
-        found = showing(self.points.hits(x, *self._skinning.surface(self._rest, self._normals, character)))
-        return found | ~x.isfinite().all(0).all(0)
+            return SkinStates(*torch.zeros(2, 0, x.shape[2], dtype=torch.bool, device=x.device))
+        return self.points.states(x, *self._skinning.surface(self._rest, self._normals, character))
 
     def figures(self, clips: Sequence[tuple[str, ShownCounts]]) -> ShownSkin | None:
         """Return the figures of clips by name; None where the garment covers nothing.
@@ -183,8 +191,10 @@ def shown_skin(
         covered=len(together.points),
         mean=float(together.shares.mean()),
         worst=float(worst.shares.max()),
+        bare=float(together.bare.mean()),
+        worst_bare=float(together.bare.max()),
         clip=clip,
-        frame=int(worst.frames[worst.shares.argmax()]),
+        frame=worst.frames[worst.shares.argmax()].item(),
         regions=regions(together.points),
     )
 

@@ -51,7 +51,8 @@ class RayCaster:
         """
         shape, limit = (len(points), x.shape[2]), MAX_RAY_PAIRS[x.is_cuda]
         hits = RayHits(*(torch.zeros(shape, dtype=torch.bool, device=x.device) for _ in range(2)))
-        frames = max(1, limit // max(1, len(points) * len(self.patches)))
+        patches = max(1, len(self.patches))
+        frames, rays = max(1, limit // max(1, len(points) * patches)), max(1, limit // patches)
         for chosen in torch.arange(x.shape[2], device=x.device).split(frames):
             # Products lose fewer digits about the middle of the cloth.
             middle = x[..., chosen].mean(0)
@@ -60,18 +61,30 @@ class RayCaster:
                 for values in (points[..., chosen] - middle, directions[..., chosen], x[..., chosen] - middle)
             )
             triangles = vertices[:, self.patches]  # (n, patches, triangles, corners, 3)
-            pairs = _reachable(start, direction, triangles.flatten(2, 3), above, beneath)
-            for frame, ray, patch in (part.unbind(1) for part in pairs.split(limit // RAY_PATCH)):
-                rays = start[frame, ray][:, None], direction[frame, ray][:, None]
-                distance = ray_distances(*rays, triangles[frame, patch])
-                upward = ((distance >= 0) & (distance <= above)).any(1)
-                downward = ((distance < 0) & (distance >= -beneath)).any(1)
-                hits.above[ray[upward], chosen[frame[upward]]] = True
-                hits.beneath[ray[downward], chosen[frame[downward]]] = True
+            spheres = _bounding_spheres(triangles.flatten(2, 3))
+            for first in range(0, len(points), rays):
+                part = slice(first, first + rays)
+                pairs = _reachable(start[:, part], direction[:, part], *spheres, above, beneath)
+                pairs[:, 1] += first
+                for frame, ray, patch in (some.unbind(1) for some in pairs.split(max(1, limit // RAY_PATCH))):
+                    lines = start[frame, ray][:, None], direction[frame, ray][:, None]
+                    distance = ray_distances(*lines, triangles[frame, patch])
+                    upward = ((distance >= 0) & (distance <= above)).any(1)
+                    downward = ((distance < 0) & (distance >= -beneath)).any(1)
+                    hits.above[ray[upward], chosen[frame[upward]]] = True
+                    hits.beneath[ray[downward], chosen[frame[downward]]] = True
         return hits
 
 
-def _reachable(start: Tensor, direction: Tensor, corners: Tensor, above: float, beneath: float) -> Tensor:
+def _bounding_spheres(corners: Tensor) -> tuple[Tensor, Tensor]:
+    """Return centres (n, patches, 3) and radii (n, patches, 1) of corners (n, patches, C, 3)."""
+    centre = corners.mean(2)
+    return centre, (corners - centre[:, :, None]).norm(dim=-1).amax(-1, keepdim=True) + SPHERE_SLACK
+
+
+def _reachable(
+    start: Tensor, direction: Tensor, centre: Tensor, radius: Tensor, above: float, beneath: float
+) -> Tensor:
     """Return frames, rays and patches of all pairs that can meet, shape (M, 3).
 
     A ray can meet a patch if the patch's sphere, of centre c and radius r, meets the line, and its centre projects
@@ -79,10 +92,8 @@ def _reachable(start: Tensor, direction: Tensor, corners: Tensor, above: float, 
     |q|^2 - (q . d)^2 <= r^2 and |q . d| <= r + h, where h is half the ray's length.
 
     Args:
-        start, direction: shape (n, P, 3); corners: of the triangles of each patch, shape (n, patches, C, 3).
+        start, direction: shape (n, P, 3); centre, radius: of the patches' spheres, as `_bounding_spheres` returns.
     """
-    centre = corners.mean(2)
-    radius = (corners - centre[:, :, None]).norm(dim=-1).amax(-1, keepdim=True) + SPHERE_SLACK
     middle, one = start + direction * ((above - beneath) / 2), torch.ones_like(start[..., :1])
     squares = (middle * middle).sum(-1, keepdim=True)
     power = (centre * centre).sum(-1, keepdim=True) - radius * radius

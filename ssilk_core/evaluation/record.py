@@ -48,8 +48,8 @@ def recorded(
         x = path[..., -len(frames) :]
         stretch = principal_stretches(dressed.columns(x))[0]
         stretches += stretch_histogram(stretch)
-        shows = dressed.covered.shows(x, take_set.character(take, frames))
-        shown.append(ShownCounts.of(shows, range(first + frames.start, first + frames.stop)))
+        states = dressed.covered.states(x, take_set.character(take, frames))
+        shown.append(ShownCounts.of(states, range(first + frames.start, first + frames.stop)))
         values = {
             **frame_energies(dressed, take_set, take, frames, path),
             **_moving(dressed, path, len(frames)),

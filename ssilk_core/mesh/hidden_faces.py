@@ -4,12 +4,13 @@
 A point of the skin is covered in a frame when nothing outside sees it, or when whoever does would see cloth if the
 skin were not there:
 
-- Along its normal there is cloth within `REACH` above it; or other skin, as in an armpit; or cloth within `DEPTH`
-  beneath it and no skin before. In the last case skin shows through the cloth, which is what hiding is for.
-- So it is in a fan of directions tilted from the normal: cloth not higher than `REACH` above the point, or the body,
-  blocks a ray. Of the flat ones `FLAT_FREE` may be free. Where cloth touches the skin, or skin shows through, the
-  line of a ray may also meet cloth within `DEPTH` beneath the skin, or leave a round limb before. Flat rays do not
-  count where cloth is less than `SHALLOW` beneath: `APART` keeps openings further away than they look.
+- Along its normal there is cloth within `COVER_REACH` above it; or other skin, as in an armpit; or cloth within
+  `SHOW_DEPTH` beneath it and no skin before. In the last case skin shows through the cloth, which is what hiding is
+  for.
+- So it is in a fan of directions tilted from the normal: cloth not higher than `COVER_REACH` above the point, or the
+  body, blocks a ray. Of the flat ones `FLAT_FREE` may be free. Where cloth touches the skin, or skin shows through,
+  the line of a ray may also meet cloth within `SHOW_DEPTH` beneath the skin, or leave a round limb before. Flat rays
+  do not count where cloth is less than `SHALLOW` beneath: `APART` keeps openings further away than they look.
 - At least one of these rays meets cloth: a mouth is no covered skin.
 
 A triangle is covered when points all over it are, in all frames. What is hidden keeps a distance of `APART`, and of
@@ -24,10 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..assets import Floats, Ints, Mesh
+from ..shown_skin import COVER_REACH, SHOW_DEPTH
 from .blocked_rays import NO_TRIANGLE, BlockedRays
 from .topology import subdivision_middles, vertex_normals
 
-REACH, DEPTH = 0.08, 0.03  # [m] above and beneath the skin
 FAN = ((40.0, 4), (70.0, 12))  # tilts from the normal [degrees], and how many directions at each
 SPACING = 0.02  # [m]; points on a triangle are at most so far apart
 APART = 0.03  # [m]
@@ -123,7 +124,7 @@ class HiddenFaces:
         It is infinite where neither is within reach, and NaN where other skin faces the point instead.
         """
         starts, up = self._at(body), _unit(self._at(normals))
-        low, high = _all(-DEPTH, starts), _all(REACH, starts)
+        low, high = _all(-SHOW_DEPTH, starts), _all(COVER_REACH, starts)
         self._above, heights = self._cloth_rays.find(cloth, starts, up, low, high, self._above)
         self._settle_beneath(heights, body, cloth, starts, up)
         open_ = np.flatnonzero(np.isinf(heights))
@@ -137,7 +138,7 @@ class HiddenFaces:
         beneath = np.flatnonzero(heights < 0)
         starts, up, depths, guesses = starts[beneath], up[beneath], -heights[beneath], self._above[beneath]
         nothing, unknown = _all(0, beneath), np.full(len(beneath), NO_TRIANGLE)
-        again, above = self._cloth_rays.find(cloth, starts, up, nothing, nothing + REACH, guesses)
+        again, above = self._cloth_rays.find(cloth, starts, up, nothing, nothing + COVER_REACH, guesses)
         skin, _ = self._body_rays.find(body, starts, -up, nothing + LEAVING, depths, unknown)
         self._above[beneath] = np.where(np.isfinite(above), again, guesses)
         heights[beneath] = np.where(np.isfinite(above), above, np.where(skin == NO_TRIANGLE, -depths, np.inf))
@@ -150,8 +151,8 @@ class HiddenFaces:
         rays = np.einsum("dx,pxy->pdy", self._fan, np.stack([east, np.cross(up, east), up], axis=1))
         upright = np.isfinite(rays).all(axis=(1, 2))
         touched = heights < TOUCHING
-        lifted, high = points + LIFT * up, _all(REACH, points)[:, None] / self._fan[:, 2]
-        low = -DEPTH * touched[:, None] / self._fan[:, 2]
+        lifted, high = points + LIFT * up, _all(COVER_REACH, points)[:, None] / self._fan[:, 2]
+        low = -SHOW_DEPTH * touched[:, None] / self._fan[:, 2]
         around = np.where(self._around == NO_TRIANGLE, self._above[:, None], self._around)
         found, by_body = np.full(around.shape, NO_TRIANGLE), self._by_body & (self._around != NO_TRIANGLE)
         shows = np.broadcast_to(touched[:, None], by_body.shape)
@@ -160,7 +161,7 @@ class HiddenFaces:
             (self._body_rays, body, lifted, by_body, True, 0 * low, high),  # first what blocked a ray before
             (self._cloth_rays, cloth, points, np.ones_like(by_body), False, low, high),
             (self._body_rays, body, lifted, ~by_body, True, 0 * low, high),
-            (self._body_rays, body, points, shows, True, leaves - DEPTH / self._fan[:, 2], leaves),
+            (self._body_rays, body, points, shows, True, leaves - SHOW_DEPTH / self._fan[:, 2], leaves),
         )
         flat = self._fan[:, 2] < STEEP
         shallow = (heights < 0) & (heights > -SHALLOW)

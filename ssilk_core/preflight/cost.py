@@ -33,13 +33,16 @@ def training_cost(scene: Scene, motions: Sequence[Motion], preset: Preset) -> Fi
 
 def memory(scene: Scene, preset: Preset, body_vertices: int) -> Findings:
     """Yield the memory and time that a preset takes when the garment can touch `body_vertices` vertices."""
+    from ..collision.samples import contact_samples
     from ..devices import select_device
+    from ..fabrics import FABRICS
     from ..memory import decoded_frames, fitting_batch, free_memory, step_memory
 
     model, train, device = preset.model, preset.train, select_device("auto")
     free = free_memory(device)
-    needed = step_memory(scene, model, decoded_frames(train, train.batch), body_vertices)
-    batch, pretraining_batch = fitting_batch(scene, model, train, body_vertices, free)
+    samples = len(contact_samples(scene.garment.mesh, FABRICS["default"]).area)
+    needed = step_memory(scene, model, decoded_frames(train, train.batch), body_vertices, samples)
+    batch, pretraining_batch = fitting_batch(scene, model, train, body_vertices, samples, free)
     lowered = (batch, pretraining_batch) != (train.batch, train.pretraining_batch)
     note = (
         f"; the batch is reduced from {train.batch} to {batch} windows "

@@ -12,7 +12,7 @@ from ..fabrics import FABRICS
 from ..mesh.topology import edge_use, is_inside_out, vertex_mask
 from ..setup.surface import closest_on_surface, is_enclosed
 from .finding import Finding, Findings, format_count, format_joints, index_tuple
-from .settle import DEEPEST, Settled, settle
+from .settle import DEEPEST, Settled, part_inside
 
 COLLISION_MARGIN = FABRICS["default"].contact_distance  # [m]
 TOO_DEEP = f"leaves a garment that is more than {1000 * DEEPEST:g} mm deep as it is, because it is not fitted"
@@ -145,8 +145,8 @@ def penetration(mesh: Mesh, body: Mesh) -> Findings:
     used = vertex_mask(mesh.faces, mesh.vertex_count)
     share = float(np.mean(signed[used] < 0))
     near = np.flatnonzero(used & (signed >= 0) & (signed < COLLISION_MARGIN))
-    settled = settle(mesh, body)
-    inside = settled.before.vertices
+    part = part_inside(mesh, body)
+    inside, fitted = part.vertices, part.depth <= DEEPEST
     if len(inside):
         what = f"{share:.1%} of all vertices, and points inside triangles," if share else "points inside triangles"
         yield Finding(
@@ -154,12 +154,11 @@ def penetration(mesh: Mesh, body: Mesh) -> Findings:
             code="penetration",
             prim=mesh.path,
             count=len(inside),
-            found=f"{what} are inside the body, up to {1000 * settled.before.depth:.1f} mm deep",
+            found=f"{what} are inside the body, up to {1000 * part.depth:.1f} mm deep",
             why="this is the rest shape: elastic and collision forces oppose each other in every frame",
             fix="settle the garment out of the body in the bind pose, or make it wider; --fix "
-            + (describe_move(settled, "moves") if settled.moved else _why_still(settled))
-            + (f", and {format_count(len(settled.after.vertices), 'vertices')} stay inside" if settled.left else ""),
-            fixable=not settled.left,
+            + ("settles it" if fitted else TOO_DEEP),
+            fixable=fitted,
             elements="vertices",
             indices=index_tuple(inside),
         )

@@ -101,6 +101,11 @@ def settle(mesh: Mesh, body: Mesh, gap: float = GAP) -> Settled:
     return _Cloth(mesh, body).settled(gap)
 
 
+def part_inside(mesh: Mesh, body: Mesh) -> PartInside:
+    """Return the part of a garment that lies in a body, which `settle` would take out."""
+    return _Cloth(mesh, body).inside_now()
+
+
 class _Cloth:
     """The garment with coincident vertices joined, and the body's surface."""
 
@@ -114,8 +119,12 @@ class _Cloth:
         self.surface = OuterSurface(body)
         self.samples = sample_cloth(self.points, self.faces)
 
+    def inside_now(self) -> PartInside:
+        """Return the part that lies in the body where the garment is."""
+        return self._part_inside(self.samples, self.points)
+
     def settled(self, gap: float) -> Settled:
-        before, still = self._part_inside(self.samples, self.points), np.zeros((len(self.joined), 3))
+        before, still = self.inside_now(), np.zeros((len(self.joined), 3))
         if before.depth > DEEPEST or not len(before.vertices):
             return Settled(still, before, before)
         points = _Solve(self, gap).run()
@@ -194,9 +203,14 @@ class _Solve:
             system = sparse.kron(inner + sliding, sparse.identity(3)) + PENALTY * (pushed.T @ pushed)
             right = (load + sliding @ points[free]).reshape(-1) + PENALTY * (pushed.T @ (target - held_part)[active])
             right += PENALTY * friction * (pushed.T @ (target - now)[active])
-            factor = splu(
-                system.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-            )
+            try:
+                factor = splu(
+                    system.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+                )
+            except RuntimeError as error:
+                if "singular" not in str(error):
+                    raise
+                return np.full_like(points, np.nan)  # as where a solution overflows: the garment stays as it is
             solution = factor.solve(right)
             before, active = active, along @ solution + held_part < target
             if np.array_equal(before, active):

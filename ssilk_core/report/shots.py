@@ -17,7 +17,7 @@ from ..view.player import ShotPlayer
 from ..view.render import Image, render
 from ..view.shots import shot_surfaces
 from .page import Section, figure, table
-from .terms import SHARE, SHOWN, UNITS, TermsMeter, worst_frames
+from .terms import BARE, SHARE, SHOWN, UNITS, TermsMeter, worst_frames
 
 PICTURES, SKIN_PICTURES = 4, 2  # worst frames to show: of the energy, and of the skin that shows
 APART = 0.5  # the least time between them [s]
@@ -49,7 +49,7 @@ def shot_sections(
         points = player.points(time)
         body = np.concatenate([points[index] for index in bodies]) if bodies else None
         for each, meter in zip(garments, meters):
-            meter.add(points[each.index], body)
+            meter.add(points[each.index], body, time)
         report(Progress(number + 1, len(player.frame_times)))
     return [part for each, meter in zip(garments, meters) for part in _sections(player, each, meter)]
 
@@ -70,13 +70,13 @@ def _sections(player: ShotPlayer, garment: ShotGarment, meter: TermsMeter) -> li
     worst = worst_frames(bad, PICTURES, apart)
     worst += [
         frame
-        for frame in worst_frames(values[SHOWN], SKIN_PICTURES, apart)
+        for frame in worst_frames(np.where(meter.finite, values[SHOWN], np.nan), SKIN_PICTURES, apart)
         if values[SHOWN][frame] > 0 and frame not in worst
     ]
     times, marks = np.arange(len(values["total"])) / player.fps, dict(zip(worst, LETTERS))
-    shown = [name for name in UNITS if meter.body or name not in ("collision", SHARE, SHOWN)]
-    if meter.covered is None and SHOWN in shown:
-        shown.remove(SHOWN)
+    shown = [name for name in UNITS if meter.body or name not in ("collision", SHARE)]
+    if meter.covered is None:
+        shown = [name for name in shown if name not in (SHOWN, BARE)]
     panels = [
         ChartPanel(
             title=name, x="time [s]", y=UNITS[name], curves={"": (times, values[name])},
@@ -93,21 +93,30 @@ def _sections(player: ShotPlayer, garment: ShotGarment, meter: TermsMeter) -> li
 
     pictures = "".join(
         figure(
-            picture(player, frame), f"{letter}: {times[frame]:.2f} s, {bad[frame]:.4g} J without gravity{skin(frame)}"
+            picture(player, frame),
+            f"{letter}: frame {player.frame_times[frame]:g}, at {times[frame]:.2f} s, "
+            f"{bad[frame]:.4g} J without gravity{skin(frame)}",
         )
         for frame, letter in marks.items()
     )
     found = meter.shown_skin(name)
     charts += table(("", "mean", "median", "95 %", "most"), rows)
+    lost = [time for time, finite in zip(player.frame_times, meter.finite) if not finite]
+    if lost:
+        said = f"The garment is not finite in {len(lost)} of {len(times)} frames, first in frame {lost[0]:g}."
+        charts += f'<p class="note">{said} Energies leave these frames out; all covered skin counts as shown.</p>'
+    figures = {"shown_skin": asdict(found)} if found else {}
     return [
-        Section(f"{name}: energies over time", charts, {name: {"shown_skin": asdict(found)}} if found else {}),
+        Section(f"{name}: energies over time", charts, {name: {**figures, "non-finite frames": len(lost)}}),
         Section(f"{name}: its worst frames", f'<div class="pictures">{pictures}</div>'),
     ]
 
 
 def _spread(values: Floats) -> list[str]:
-    figures = values.mean(), np.median(values), np.quantile(values, 0.95), values.max()
-    return [f"{value:.4g}" for value in figures]
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return ["–"] * 4
+    return [f"{value:.4g}" for value in (values.mean(), np.median(values), np.quantile(values, 0.95), values.max())]
 
 
 def picture(player: ShotPlayer, frame: int) -> Image:

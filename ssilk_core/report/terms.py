@@ -10,7 +10,7 @@ import numpy as np
 
 from ..assets import Floats, Mesh
 from ..collision import CoveredPoints, PosedBody, ShownCounts, signed_distance
-from ..collision.covered_skin import showing, shown_skin
+from ..collision.covered_skin import shown_skin
 from ..collision.one_ring import triangle_rings
 from ..constants import GRAVITY
 from ..energy import TERMS, GarmentEnergy
@@ -18,8 +18,8 @@ from ..fabrics import Fabric
 from ..mesh.topology import vertex_normals
 from ..shown_skin import ShownSkin
 
-SHARE, SHOWN = "inside the body", "covered skin that shows"
-UNITS = {"total": "J", **dict.fromkeys(TERMS, "J"), SHARE: "%", SHOWN: "%"}
+SHARE, SHOWN, BARE = "inside the body", "covered skin that shows", "covered skin that is bare"
+UNITS = {"total": "J", **dict.fromkeys(TERMS, "J"), SHARE: "%", SHOWN: "%", BARE: "%"}
 
 
 @dataclass(eq=False)
@@ -34,8 +34,9 @@ class TermsMeter:
         garment: the mesh at rest.
         body: all body meshes at rest as one, or None.
         fps: frames per second.
-        values: by name, one for each frame: energies [J], the share of vertices inside the body, and that of the
-            covered skin that shows [%].
+        values: by name, one for each frame: energies [J], the share of vertices inside the body, and those of the
+            covered skin that shows and that is bare [%].
+        finite: whether the garment of each frame is.
     """
 
     garment: Mesh
@@ -46,7 +47,8 @@ class TermsMeter:
 
     def __post_init__(self) -> None:
         self.energy = GarmentEnergy(self.garment, self.fabric)
-        self.shows: list = []
+        self.finite: list[bool] = []
+        self.skin: list[ShownCounts] = []
         self.past: deque = deque(maxlen=2)
         import torch
 
@@ -57,11 +59,15 @@ class TermsMeter:
             self.rings = torch.as_tensor(triangle_rings(self.body.faces, self.body.vertex_count))
         self.rest = self._height(self.garment.points, None if self.body is None else self.body.points)
 
-    def add(self, points: Floats, body: Floats | None) -> None:
-        """Take a frame: points of the garment (V, 3) and of the body (B, 3) [m]."""
+    def add(self, points: Floats, body: Floats | None, time: float) -> None:
+        """Take the frame of a time code: points of the garment (V, 3) and of the body (B, 3) [m].
+
+        Where the garment is not finite, all covered skin shows and the energies are not finite.
+        """
         import torch
 
-        origin = points.mean(axis=0)
+        self.finite.append(bool(np.isfinite(points).all()))
+        origin = points.mean(axis=0) if self.finite[-1] else np.zeros(3)
         x = torch.as_tensor(points - origin, dtype=torch.float32)[:, :, None]
         stretch, bending = self.energy.elastic(x)
         found = {
@@ -69,7 +75,7 @@ class TermsMeter:
             "bending": float(bending),
             "gravity": self._height(points, body) - self.rest,
             "inertia": self._inertia(points),
-            **self._collision(x, None if body is None else body - origin),
+            **self._collision(x, None if body is None else body - origin, time),
         }
         total = sum(value for name, value in found.items() if UNITS[name] == "J")
         for name, value in {"total": total, **found}.items():
@@ -77,9 +83,7 @@ class TermsMeter:
 
     def shown_skin(self, name: str) -> ShownSkin | None:
         """Return the share of the covered skin that shows in the shot `name`; None where nothing is covered."""
-        import torch
-
-        return shown_skin([(name, ShownCounts.of(torch.cat(self.shows, dim=1)))]) if self.covered else None
+        return shown_skin([(name, ShownCounts.joined(self.skin))]) if self.covered else None
 
     def _height(self, points: Floats, body: Floats | None) -> float:
         """Return the garment's weight times its height above the middle of the body, or above y = 0 [J]."""
@@ -93,28 +97,29 @@ class TermsMeter:
         self.past.append(points)
         return float(self.energy.mass.numpy() @ squared) * self.fps**2 / 2
 
-    def _collision(self, x, body: Floats | None) -> dict[str, float]:  # type: ignore[no-untyped-def]  # torch is heavy
+    def _collision(self, x, body: Floats | None, time: float) -> dict[str, float]:  # type: ignore[no-untyped-def]  # torch is heavy
         import torch
 
         if body is None or self.body is None:
-            return {"collision": 0.0, SHARE: 0.0, SHOWN: 0.0}
+            return {"collision": 0.0, SHARE: 0.0, SHOWN: 0.0, BARE: 0.0}
         normals = vertex_normals(body, self.body.faces)
         at, towards = (torch.as_tensor(values, dtype=torch.float32)[:, :, None] for values in (body, normals))
         distance = signed_distance(self.energy.cloth.positions(x), PosedBody(at, towards, self.rings))
         inside = 100 * float((distance[: len(x)] < 0).double().mean())
-        found = {"collision": float(self.energy.collision_at(distance)), SHARE: inside, SHOWN: 0.0}
+        found = {"collision": float(self.energy.collision_at(distance)), SHARE: inside, SHOWN: 0.0, BARE: 0.0}
         if self.covered:
             vertices = self.covered.vertices
-            self.shows.append(showing(self.covered.hits(x, at[vertices], towards[vertices])))
-            found[SHOWN] = 100 * float(self.shows[-1].double().mean())
+            states = self.covered.states(x, at[vertices], towards[vertices])
+            self.skin.append(ShownCounts.of(states, [time]))
+            found |= {SHOWN: 100 * float(self.skin[-1].shares), BARE: 100 * float(self.skin[-1].bare)}
         return found
 
 
 def worst_frames(values: Floats, count: int, apart: int) -> list[int]:
-    """Return up to `count` frames with the largest values, the worst first, at least `apart` frames apart."""
+    """Return up to `count` frames with the largest finite values, the worst first, at least `apart` frames apart."""
     found: list[int] = []
     for frame in np.argsort(-np.asarray(values), kind="stable").tolist():
-        if len(found) == count:
+        if len(found) == count or not np.isfinite(values[frame]):
             break
         if all(abs(frame - other) >= apart for other in found):
             found.append(frame)

@@ -10,7 +10,7 @@ from .collision_cost import CollisionCost
 from .point import SECONDS, TradePoint, front
 
 HEADER = ("model", "swept", "variant", "size", "ms a frame", "95 %", "PyTorch", "memory [MB]", "model [MB]",
-          f"{SECONDS} s shot [MB]", "total [J]", "excess [J]", "inside", "skin shows", "worst",
+          f"{SECONDS} s shot [MB]", "total [J]", "excess [J]", "inside", "skin shows", "worst", "bare",
           "RMS [mm]", "velocity [mm/s]", "best at")  # fmt: skip
 MARKS = {"milliseconds": "time", "shot_bytes": "shot", "model_bytes": "model"}
 
@@ -48,6 +48,7 @@ def _cells(p: TradePoint, best: list[str]) -> list[str]:
         f"{p.collisions:.2%}",
         f"{p.shown_skin.mean:.3%}" if p.shown_skin else "",
         f"{p.shown_skin.worst:.2%}" if p.shown_skin else "",
+        f"{p.shown_skin.bare:.2%}" if p.shown_skin and p.shown_skin.bare is not None else "",
         f"{1000 * p.position:.3g}",
         f"{1000 * p.velocity:.3g}",
         ", ".join(best),

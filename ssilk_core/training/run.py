@@ -145,9 +145,9 @@ class TrainingRun:
         job, config, group, free = self.job, self.job.train, self.group, free_memory(self.device)
         if self.device.type == "cpu":
             free //= group.size
-        check_one_window_fits(job.scene, job.model, config, self.parts.reached, free)
+        check_one_window_fits(job.scene, job.model, config, *self._contact_sizes(), free)
         fitting = group.gather(
-            fitting_batch(job.scene, job.model, group.local_config(config), self.parts.reached, free)
+            fitting_batch(job.scene, job.model, group.local_config(config), *self._contact_sizes(), free)
         )
         batch, pretraining_batch = (group.size * min(counts) for counts in zip(*fitting))
         if (batch, pretraining_batch) != (config.batch, config.pretraining_batch):
@@ -158,7 +158,11 @@ class TrainingRun:
         """Predict the memory of a step in this process [bytes]."""
         own = self.group.local_config(self.config)
         frames = decoded_frames(own, own.batch)
-        return step_memory(self.job.scene, self.job.model, frames, self.parts.reached)
+        return step_memory(self.job.scene, self.job.model, frames, *self._contact_sizes())
+
+    def _contact_sizes(self) -> tuple[int, int]:
+        """Return the vertices of the body that the garment can touch, and the samples at which it meets them."""
+        return self.parts.reached, len(self.parts.energy.cloth.samples.area)
 
     def _reduce_batch(self, found: str, batch: int, pretraining_batch: int) -> None:
         before, lowered = self.config, self.state.lowered

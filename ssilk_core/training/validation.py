@@ -126,7 +126,7 @@ class Validator:
             if model is not None and latents is not None:
                 x = model.vertices(latents[frames], character)
             numbers = [self.first[number] + frame for frame in chosen]
-            counts[number] = ShownCounts.of(self.covered.shows(x, character), numbers)
+            counts[number] = ShownCounts.of(self.covered.states(x, character), numbers)
         joined = {number: found for part in self.group.gather(counts) for number, found in part.items()}
         return self.covered.figures([(self.names[number], joined[number]) for number in sorted(joined)])
 

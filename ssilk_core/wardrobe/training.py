@@ -14,7 +14,7 @@ from .listing import WardrobeEntry
 from .queue import CommandTask, End
 
 WORSE_FIGURE = "worse than linear blend skinning"  # among the figures of a training, where that is so
-COLUMNS = ("garment", "iterations", "total [J]", "lower by", "collisions", "skin shows", "time", "state")
+COLUMNS = ("garment", "iterations", "total [J]", "lower by", "collisions", "skin shows", "bare", "time", "state")
 
 
 class GarmentTraining:
@@ -92,5 +92,6 @@ class GarmentTraining:
             lower,
             found.get("collisions"),
             found.get("covered skin that shows"),
+            found.get("bare"),
         ]
         return dict(zip(COLUMNS, [self.entry.name, *figures, round(self.seconds, 1), self.state]))

@@ -167,6 +167,19 @@ def test_heat_is_shown_follows_frames_and_goes(bpy, dressed):
     assert "SSILK Heat" not in dressed.data.color_attributes and not dressed.ssilk.heat
 
 
+@pytest.mark.parametrize("kind", ["SKIN", "PENETRATION"])
+def test_the_active_colour_attribute_is_what_it_was_when_heat_goes(bpy, dressed, kind):
+    mesh = (bpy.data.objects["Pillar"] if kind == "SKIN" else dressed).data
+    for name in ("Freckles", "Paint", "Rouge"):
+        mesh.color_attributes.new(name, "FLOAT_COLOR", "POINT")
+    mesh.color_attributes.active_color = mesh.color_attributes["Paint"]
+    for _ in range(2):  # the second time over the first
+        assert bpy.ops.ssilk.show_heat(kind=kind) == {"FINISHED"}
+    assert mesh.color_attributes.active_color_name == "SSILK Heat"
+    assert bpy.ops.ssilk.hide_heat() == {"FINISHED"}
+    assert mesh.color_attributes.active_color_name == "Paint" and "ssilk_active_color" not in mesh
+
+
 def test_skin_that_shows_is_coloured_on_the_body(bpy, dressed):
     """A sleeve 20 mm off the pillar covers it over its length; a shape key takes its upper half 20 mm inside."""
     pillar = bpy.data.objects["Pillar"]

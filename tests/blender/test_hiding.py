@@ -54,6 +54,32 @@ def test_covered_skin_is_hidden_shown_and_hidden_anew(bpy, skirt, pillar):
     assert not bpy.ops.ssilk.show_covered.poll()
 
 
+def test_skin_under_a_renamed_garment_is_found_again(bpy, skirt, pillar):
+    whole = shown_faces(bpy, pillar)
+    assert bpy.ops.ssilk.hide_covered() == {"FINISHED"}
+    hidden = whole - shown_faces(bpy, pillar)
+    skirt.name = "Kilt"
+    assert bpy.ops.ssilk.hide_covered() == {"FINISHED"}  # in place of what was hidden under the old name
+    assert [modifier.name for modifier in pillar.modifiers] == ["Armature", "SSILK Under Kilt"]
+    assert whole - shown_faces(bpy, pillar) == hidden
+    skirt.name = "Skirt"
+    other = skirt.copy()
+    bpy.context.scene.collection.objects.link(other)
+    other.name = "Kilt"
+    activate(bpy, other)
+    assert not bpy.ops.ssilk.show_covered.poll()  # a namesake hides nothing
+    activate(bpy, skirt)
+    assert bpy.ops.ssilk.show_covered() == {"FINISHED"}
+    assert shown_faces(bpy, pillar) == whole and not [key for key in pillar.keys() if "Under" in key]  # noqa: SIM118
+
+
+def test_skin_hidden_by_an_earlier_version_is_shown_by_its_name(bpy, skirt, pillar):
+    whole = shown_faces(bpy, pillar)
+    assert bpy.ops.ssilk.hide_covered() == {"FINISHED"}
+    del pillar[NAME]
+    assert bpy.ops.ssilk.show_covered() == {"FINISHED"} and shown_faces(bpy, pillar) == whole
+
+
 def test_hiding_is_one_step_to_undo(bpy, skirt, pillar):
     bpy.ops.ed.undo_push(message="before")
     assert bpy.ops.ssilk.hide_covered() == {"FINISHED"}

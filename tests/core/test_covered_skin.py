@@ -9,7 +9,7 @@ import torch
 import trimesh
 
 from ssilk_core.assets import Body, Garment, Mesh, ProxyRig, Scene, SkinWeights
-from ssilk_core.collision import CoveredSkin, RayCaster, ShownCounts, ray_casting
+from ssilk_core.collision import CoveredSkin, RayCaster, ShownCounts, SkinStates, ray_casting
 from ssilk_core.collision.covered_skin import spread_points
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -61,17 +61,35 @@ def test_a_cap_of_a_shell_covers_or_shows_its_share_of_the_sphere(scene):
     sunk = np.where(points[:, 2:] > CAP * (RADIUS + GAP), (RADIUS - 0.01) / (RADIUS + GAP), 1.0) * points
     deep = np.where(points[:, 2:] > CAP * (RADIUS + GAP), (RADIUS - 0.05) / (RADIUS + GAP), 1.0) * points
     x = torch.cat([posed(points), posed(sunk), posed(deep)], dim=-1)
-    shows = skin.shows(x, still(3))
+    states = skin.states(x, still(3))
+    shows = states.shows
     shares = shows.double().mean(0).tolist()
     assert shares[0] == 0
     assert shares[1] == pytest.approx(cap, abs=6e-3)
     assert shares[2] < 0.2 * cap  # beyond the reach, but for the slope at its border
-    counts = ShownCounts.of(shows)
-    found = skin.figures([("calm", ShownCounts.of(shows[:, :1])), ("rough", counts)])
+    counts = ShownCounts.of(states)
+    calm = SkinStates(shows[:, :1], states.bare[:, :1])
+    found = skin.figures([("calm", ShownCounts.of(calm)), ("rough", counts)])
     assert (found.covered, found.clip, found.frame) == (8000, "rough", 1)
     assert found.worst == shares[1] and found.mean == pytest.approx(sum(shares) / 4)
     assert found.regions == {"Spine": 1.0}
     assert int(counts.points.sum()) == int(shows.sum())
+    bare = states.bare.double().mean(0).tolist()
+    assert bare[:2] == [0, 0] and bare[2] == pytest.approx(cap, rel=0.2)
+    assert found.worst_bare == bare[2] and found.bare == pytest.approx(bare[2] / 4)
+
+
+def test_cloth_that_is_thrown_off_leaves_skin_bare_and_shows_nothing(scene):
+    whole = shell_of(scene)
+    skin, points = CoveredSkin(whole, device=DEVICE), whole.garment.mesh.points
+    thrown = posed(points) + torch.tensor([0.0, 3.0, 0.0], device=DEVICE)[None, :, None]
+    found = skin.figures([("flip", ShownCounts.of(skin.states(torch.cat([posed(points), thrown], -1), still(2))))])
+    assert (found.mean, found.worst, found.bare, found.worst_bare) == (0, 0, 0.5, 1)
+    assert str(found).endswith("50.00% is bare (100.00% at most)") and found.summary()["bare"] == "50.00%"
+    lost = skin.states(torch.full_like(thrown, torch.nan), still(1))
+    assert lost.shows.all() and not lost.bare.any()  # what is nowhere is no garment that was lifted
+    earlier = type(found)(**{name: value for name, value in vars(found).items() if "bare" not in name})
+    assert "bare" not in f"{earlier} {earlier.summary()} {earlier.to_metadata()}"
 
 
 def test_points_move_with_the_skin(scene):
@@ -81,11 +99,11 @@ def test_points_move_with_the_skin(scene):
     turn = still(1)
     turn[:, :, :3, 0] = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], device=DEVICE)
     turn[:, :, 3, 0] = torch.tensor([0.1, 0.2, 0.3], device=DEVICE)
-    shows = skin.shows(posed(sunk), still(1))
+    shows = skin.states(posed(sunk), still(1)).shows
     moved = np.stack([0.1 - sunk[:, 1], 0.2 + sunk[:, 0], 0.3 + sunk[:, 2]], axis=1)
     assert 0.1 < shows.double().mean() < 0.5
-    assert (skin.shows(posed(moved), turn) != shows).double().mean() < 1e-3  # but for rounding
-    assert not torch.equal(skin.shows(posed(sunk), turn), shows)
+    assert (skin.states(posed(moved), turn).shows != shows).double().mean() < 1e-3  # but for rounding
+    assert not torch.equal(skin.states(posed(sunk), turn).shows, shows)
 
 
 def test_points_are_spread_evenly(scene):
@@ -104,14 +122,20 @@ def test_a_garment_that_covers_nothing_has_no_figure(scene):
     mesh = far.garment.mesh
     far = replace(far, garment=replace(far.garment, mesh=replace(mesh, points=mesh.points + [2, 0, 0])))
     skin = CoveredSkin(far, device=DEVICE)
-    shows = skin.shows(posed(mesh.points), still(1))
-    assert shows.shape == (0, 1)
-    assert skin.figures([("clip", ShownCounts.of(shows))]) is None
+    states = skin.states(posed(mesh.points), still(1))
+    assert states.shows.shape == (0, 1)
+    assert skin.figures([("clip", ShownCounts.of(states))]) is None
 
 
-@pytest.mark.parametrize("limit", [64, 1 << 20])
+@pytest.mark.parametrize("limit", [400, 1 << 20])  # two rays at once; all of several frames
 def test_rays_meet_what_a_slow_search_finds(monkeypatch, limit):
     monkeypatch.setattr(ray_casting, "MAX_RAY_PAIRS", (limit, limit))
+    compared, search = [], ray_casting._reachable
+    monkeypatch.setattr(
+        ray_casting,
+        "_reachable",
+        lambda start, *rest: compared.append(len(start) * start.shape[1] * rest[1].shape[1]) or search(start, *rest),
+    )
     random = np.random.default_rng(1)
     sheet = trimesh.creation.icosphere(subdivisions=3, radius=0.3)
     x = sheet.vertices[:, :, None] + random.normal(0, 0.02, (len(sheet.vertices), 3, 3)) + [[[0.0, 1.0, 5.0]]]
@@ -123,6 +147,7 @@ def test_rays_meet_what_a_slow_search_finds(monkeypatch, limit):
     caster = RayCaster(Mesh("/sheet", sheet.vertices, sheet.faces), device=DEVICE)
     asked = (torch.as_tensor(values, dtype=torch.float32, device=DEVICE) for values in (points, directions, x))
     found = caster.cast(*asked, above=0.08, beneath=0.03)
+    assert max(compared) <= max(limit, len(caster.patches))
     for frame in range(3):
         distance = distances_by_solving(points[..., frame], directions[..., frame], x[sheet.faces, :, frame])
         above, beneath = ((distance >= low) & (distance <= high) for low, high in ((0, 0.08), (-0.03, 0)))

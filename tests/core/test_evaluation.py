@@ -178,9 +178,10 @@ def test_skin_that_shows_is_counted_where_cloth_sinks_into_the_body(dressed, mot
     records = {take: recorded(dressed, take_set, method, take) for take, method in enumerate((lbs, into))}
     found = Tally(records, {0: "sway", 1: "sway"}).shown_skin(dressed.covered)
     calm = [
-        dressed.covered.shows(lbs.vertices(take, range(20)), take_set.character(take, range(20))) for take in (0, 1)
+        dressed.covered.states(lbs.vertices(take, range(20)), take_set.character(take, range(20))).shows
+        for take in (0, 1)
     ]
-    bad = dressed.covered.shows(into.vertices(1, range(7, 8)), take_set.character(1, range(7, 8)))
+    bad = dressed.covered.states(into.vertices(1, range(7, 8)), take_set.character(1, range(7, 8))).shows
     assert (found.frames, found.covered, found.clip, found.frame) == (40, len(dressed.covered), "sway", 27)
     assert found.worst == pytest.approx(float(bad.double().mean())) and found.worst > 0.02
     calm[1][:, 7] = bad[:, 0]

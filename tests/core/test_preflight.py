@@ -406,7 +406,7 @@ def test_memory_says_when_the_batch_is_lowered(monkeypatch):
     scene = dressed(tube())
     assert next(cost.memory(scene, PRESETS["draft"], 100)).severity == "info"
     monkeypatch.setattr(
-        memory, "free_memory", lambda device: memory.step_memory(scene, PRESETS["draft"].model, 20, 100)
+        memory, "free_memory", lambda device: memory.step_memory(scene, PRESETS["draft"].model, 20, 100, 900)
     )
     assert next(cost.memory(scene, PRESETS["draft"], 100)).severity == "warning"
 

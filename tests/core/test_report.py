@@ -3,6 +3,7 @@
 
 import json
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,8 +15,8 @@ from ssilk_core.errors import SsilkError
 from ssilk_core.fabrics import Fabric
 from ssilk_core.report.figures import learning_of, section_of
 from ssilk_core.report.page import Section, facts, figure, flattened, page, table
-from ssilk_core.report.shots import joined
-from ssilk_core.report.terms import SHARE, SHOWN, TermsMeter, worst_frames
+from ssilk_core.report.shots import ShotGarment, joined, shot_sections
+from ssilk_core.report.terms import BARE, SHARE, SHOWN, TermsMeter, worst_frames
 
 CLOTH = Fabric("toy", density=0.2, contact_model="vertex", margin=0.0, thickness=0.0, collision=7.0)
 
@@ -26,15 +27,15 @@ def sheet(toy_grid) -> Mesh:
     return Mesh("/sheet", points, faces)
 
 
-def ball(radius: float = 0.3) -> Mesh:
-    sphere = trimesh.creation.icosphere(subdivisions=4, radius=radius)
+def ball(radius: float = 0.3, subdivisions: int = 4) -> Mesh:
+    sphere = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
     return Mesh("/ball", np.asarray(sphere.vertices), np.asarray(sphere.faces))
 
 
 def test_a_sheet_that_falls_freely_has_the_energies_of_one(sheet):
     meter, times = TermsMeter(sheet, None, CLOTH, 50.0), np.arange(6) / 50
     for time in times:
-        meter.add(sheet.points - [0, 4.9 * time**2, 0], None)
+        meter.add(sheet.points - [0, 4.9 * time**2, 0], None, 0.0)
     mass = 0.2 * 0.55 * 0.2
     np.testing.assert_allclose(meter.values["stretch"], 0, atol=1e-6)
     np.testing.assert_allclose(meter.values["gravity"], -mass * 9.81 * 4.9 * times**2, atol=1e-9)
@@ -48,7 +49,7 @@ def test_what_is_inside_the_body_is_counted_and_costs_its_depth(sheet):
     body, far = ball(), np.array([4000.0, 0, -9000])
     meter = TermsMeter(sheet, body, CLOTH, 30.0)
     points = sheet.points + [0, 0.275, 0]  # its middle in the ball's
-    meter.add(points + far, body.points + far)
+    meter.add(points + far, body.points + far, 1.0)
     depth = 0.3 - np.linalg.norm(points, axis=1)
     assert meter.values[SHARE] == [pytest.approx(100 * np.mean(depth > 0), abs=2)]
     assert meter.values["collision"][0] == pytest.approx(7.0 * (depth.clip(0) ** 2).sum(), rel=0.03)
@@ -56,20 +57,49 @@ def test_what_is_inside_the_body_is_counted_and_costs_its_depth(sheet):
 
 
 def test_skin_that_shows_through_a_sheet_is_a_cap_of_the_ball(toy_grid):
-    """A wide sheet in front of a ball, then 20 mm behind its foremost point: a cap of height 20 mm shows."""
+    """A wide sheet in front of a ball, then 20 mm behind its foremost point: a cap of height 20 mm shows.
+
+    When it is lifted off by 50 mm, nothing shows and a rim is bare.
+    """
     points, faces = toy_grid(40, 40, height=1.0, width=1.0)
     cover = Mesh("/cover", points + [0, 0.5, -0.31], faces)
     body = ball()
     meter = TermsMeter(cover, body, CLOTH, 30.0)
-    for depth in (0.0, 0.03):
-        meter.add(cover.points + [0, 0, depth], body.points)
+    for time, depth in ((1001.0, 0.0), (1001.5, 0.03), (1002.0, -0.05)):
+        meter.add(cover.points + [0, 0, depth], body.points, time)
     found = meter.shown_skin("shot")
     # A ray along the normal at an angle a from the axis meets the plane at d / cos(a) from the centre.
-    first, second = 1 - 0.31 / 0.38, 1 - 0.28 / 0.3
+    first, second, third = 1 - 0.31 / 0.38, 1 - 0.28 / 0.3, 1 - 0.36 / 0.38
     assert found.covered == pytest.approx(8000 * first / 2, rel=0.02)
-    assert meter.values[SHOWN] == [0, pytest.approx(100 * second / first, rel=0.03)]
-    assert (found.clip, found.frame, found.regions) == ("shot", 1, {})
-    assert 100 * found.worst == meter.values[SHOWN][1] and found.mean == found.worst / 2
+    assert meter.values[SHOWN] == [0, pytest.approx(100 * second / first, rel=0.03), 0]
+    assert meter.values[BARE] == [0, 0, pytest.approx(100 * (1 - third / first), rel=0.03)]
+    assert (found.clip, found.frame, found.regions) == ("shot", 1001.5, {})
+    assert 100 * found.worst == meter.values[SHOWN][1] and found.mean == found.worst / 3
+    assert 100 * found.worst_bare == meter.values[BARE][2] and found.bare == found.worst_bare / 3
+
+
+def test_frames_that_are_not_finite_are_counted_and_named_by_their_time_code(toy_grid, monkeypatch):
+    monkeypatch.setattr("ssilk_core.report.shots.WIDTH", 60)
+    monkeypatch.setattr("ssilk_core.report.shots.HEIGHT", 80)
+    points, faces = toy_grid(12, 12, height=0.3, width=0.3)
+    cover, body = Mesh("/cover", points + [0, 0.15, -0.31], faces), ball(subdivisions=2)
+
+    class Lost:
+        fps, frame_times = 30.0, [1001.0, 1002.0, 1003.0, 1004.0, 1005.0, 1006.0]
+        meshes = (
+            SimpleNamespace(name="Cover", faces=faces, is_garment=True),
+            SimpleNamespace(name="Ball", faces=body.faces, is_garment=False),
+        )
+
+        def points(self, time: float) -> list[np.ndarray]:
+            lost = np.nan if time in (1002, 1006) else 0.02 * (time == 1005)
+            return [cover.points + [0, 0, lost], body.points]
+
+    energies, worst = shot_sections(Lost(), [ShotGarment(0, cover, CLOTH)], {1: body})
+    assert "not finite in 2 of 6 frames, first in frame 1002." in energies.body and "nan" not in energies.body
+    figures = energies.figures["Cover"]
+    assert figures["non-finite frames"] == 2 and figures["shown_skin"]["frame"] == 1002
+    assert "A: frame 1005, at 0.13 s, " in worst.body and "frame 1002" not in worst.body
 
 
 def test_bodies_are_joined_in_their_order():

@@ -11,8 +11,8 @@ import pytest
 from ssilk_core.assets import Floats, Ints, Mesh
 from ssilk_core.mesh.topology import edges
 from ssilk_core.preflight.cloth_samples import sample_cloth
-from ssilk_core.preflight.fit import penetration
-from ssilk_core.preflight.settle import GAP, _Cloth, _layer_ties, settle
+from ssilk_core.preflight.fit import _why_still, penetration
+from ssilk_core.preflight.settle import GAP, _Cloth, _layer_ties, part_inside, settle
 from ssilk_core.preflight.sides import find_facing
 
 RADIUS, COLUMNS, ROWS = 0.1, 32, 27
@@ -95,7 +95,25 @@ def test_what_settling_would_make_worse_stays(monkeypatch, end):
     cloth = dented(tube(RADIUS + 0.006))
     found = settle(cloth, limb())
     assert found.failed and found.left and not found.offsets.any() and found.after is found.before
-    assert "because settling found no shape" in next(penetration(cloth, limb())).fix
+    assert "because settling found no shape" in _why_still(found)
+
+
+def test_an_inspection_words_its_finding_without_settling(monkeypatch):
+    monkeypatch.setattr("ssilk_core.preflight.settle._Solve.run", lambda solve: pytest.fail("settled"))
+    cloth = dented(tube(RADIUS + 0.006))
+    found = next(penetration(cloth, limb()))
+    inside = part_inside(cloth, limb())
+    assert found.fixable and found.fix.endswith("--fix settles it") and found.count == len(inside.vertices) > 0
+    assert f"up to {1000 * inside.depth:.1f} mm deep" in found.found
+
+
+def test_a_garment_whose_equations_are_singular_stays(monkeypatch):
+    def singular(*asked: object, **options: object) -> None:
+        raise RuntimeError("Factor is exactly singular")
+
+    monkeypatch.setattr("scipy.sparse.linalg.splu", singular)
+    found = settle(dented(tube(RADIUS + 0.006)), limb())
+    assert found.failed and found.left and not found.offsets.any()
 
 
 def test_seams_stay_closed():

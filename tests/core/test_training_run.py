@@ -713,7 +713,8 @@ def test_a_validation_counts_the_skin_that_shows_in_frames_spread_over_all_clips
     found = validator.score(model).shown_skin
     picked = torch.tensor([5, 15, 25, 35, 45])
     character = bank.character(picked)
-    shows = CoveredSkin(scene, device=torch.device("cpu")).shows(validator.lbs_vertices(character) + into, character)
+    skin = CoveredSkin(scene, device=torch.device("cpu"))
+    shows = skin.states(validator.lbs_vertices(character) + into, character).shows
     shares = shows.double().mean(0)
     assert found.mean == pytest.approx(float(shares.mean())) and found.worst == pytest.approx(float(shares.max()))
     names = [("a", 5), ("a", 15), ("b", 12), ("b", 22), ("b", 32)]

@@ -13,7 +13,7 @@ from ssilk_usd import memory
 
 from ssilk_core import checkpoint
 from ssilk_core.config import PRESETS
-from ssilk_core.fabrics import Fabric
+from ssilk_core.fabrics import FABRICS, Fabric
 from ssilk_core.farm.openjd import CHUNK, CHUNK_SECONDS
 from ssilk_core.mesh import hidden_faces
 
@@ -79,7 +79,12 @@ def training() -> Text:
         )  # fmt: skip
     for setting, paper in PAPER.items():
         yield f"| `{setting}` | {default(setting):g} | {paper} |"
-    yield f"| `drag` (material) [kg/(m² s)] | {Fabric('default').drag:g} |"
+    cloth, papers = Fabric("default"), FABRICS["paper"]
+    yield f"| `drag` (material) [kg/(m² s)] | {cloth.drag:g} |"
+    yield f"| `contact_model` (material) | {cloth.contact_model} | {papers.contact_model} |"
+    yield f"| `contact` (material) [N/m³] | {cloth.contact:g} | none |"
+    yield f"| `margin` (material) [mm] | {1000 * cloth.margin:g} | {1000 * papers.margin:g} |"
+    yield f"| `thickness` (material) [mm] | {1000 * cloth.thickness:g} | none |"
     yield f"{default('fps'):g} times a second"
     yield f"`final` takes {PRESETS['final'].train.ema_decay:g}"
     yield default_step()
@@ -188,7 +193,7 @@ def pipeline() -> Text:
 
 def hidden_skin() -> Text:
     (low, few), (high, many) = hidden_faces.FAN
-    names = ("REACH", "DEPTH", "TOUCHING", "APART", "SPACING", "SHALLOW")
+    names = ("COVER_REACH", "SHOW_DEPTH", "TOUCHING", "APART", "SPACING", "SHALLOW")
     lengths = (getattr(hidden_faces, name) for name in names)
     reach, depth, touching, apart, spacing, shallow = (f"{1000 * length:.0f} mm" for length in lengths)
     yield f"points at most {spacing} apart"

@@ -119,3 +119,11 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> Toy:
         assert run("train rigged.usda --motions clip.usda -o model.safetensors", *TRAINING) == EXIT_WORSE
         assert run("bake model.safetensors --stage rigged.usda --motion clip.usda -o shot.usda") == 0
     return Toy(folder, TRAINING, write_clip)
+
+
+@pytest.fixture
+def copy(world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the module's `world`, the current folder."""
+    shutil.copytree(world, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path

@@ -60,13 +60,6 @@ def author_pillar(prim: Usd.Prim, columns: int = 24, rows: int = 60) -> None:
     coordinates.Set(Vt.Vec2fArray.FromNumpy(np.stack([corners, -corners], axis=1).astype(np.float32)))
 
 
-@pytest.fixture
-def copy(world, tmp_path, monkeypatch):
-    shutil.copytree(world, tmp_path, dirs_exist_ok=True)
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 def bake(words: str) -> int:
     return main(shlex.split(f"{BAKE} {words}"))
 

@@ -231,7 +231,7 @@ def test_what_is_finished_is_skipped_unless_something_else_is_asked(tmp_path):
     assert (kept.state, kept.code, kept.plan) == ("finished", 5, "finished before; skipped")
     assert kept.row() == {
         "garment": "cape", "iterations": 5, "total [J]": None, "lower by": "-3.0%", "collisions": None,
-        "skin shows": None, "time": 5.0, "state": "finished",
+        "skin shows": None, "bare": None, "time": 5.0, "state": "finished",
     }  # fmt: skip
     model = tmp_path / "cape.safetensors"
     model.write_bytes(b"another model")

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Usd, UsdGeom
+from pxr import Sdf, Usd, UsdGeom, Vt
 from ssilk_usd.facts import animated, stage_facts
 from ssilk_usd.read_garment import read_garment
 from ssilk_usd.read_motion import read_motion
 from ssilk_usd.repair import repair_lock, write_repaired, write_with_units
+from ssilk_usd.repair_mesh import offset_points
 from ssilk_usd.units import StageUnits
 
 from ssilk_core.assets import Skeleton
@@ -215,3 +216,18 @@ def SkelAnimation "Walk"
 """)
     joints, times = animated(read_motion(path, SKELETON), SKELETON)
     assert joints.tolist() == [1] and times.tolist() == [0, 0.5, 2]
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_normals_of_another_shape_are_dropped_and_those_of_unmoved_points_kept(moves):
+    stage = Usd.Stage.CreateInMemory()
+    mesh = UsdGeom.Mesh.Define(stage, "/Cloth")
+    mesh.CreatePointsAttr([(0, 0, 0), (1, 0, 0), (0, 1, 0)])
+    up = Vt.Vec3fArray([(0, 0, 1)])
+    mesh.CreateNormalsAttr(up)
+    primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("normals", Sdf.ValueTypeNames.Normal3fArray, "vertex")
+    primvar.Set(up)
+    primvar.SetIndices(Vt.IntArray([0, 0, 0]))
+    offset_points(mesh, np.array([[0, 0, moves], [0, 0, 0], [0, 0, 0]], dtype=float))
+    assert (mesh.GetNormalsAttr().Get() is None) == moves == (primvar.ComputeFlattened() is None)
+    assert mesh.GetPointsAttr().Get()[0][2] == moves

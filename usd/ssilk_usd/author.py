@@ -49,14 +49,14 @@ def define_asset(
     *,
     name: str | None = None,
     record: GarmentRecord | None = None,
-    hidden: HiddenPolygons | None = None,
+    hidden_polygons: HiddenPolygons | None = None,
 ) -> Asset:
     """Define SkelRoot, Skeleton, SkelAnimation, the garment's mesh with its blendshapes, and body meshes.
 
     Args:
         name: of the SkelRoot (default: the character's).
         record: how the garment was made, kept on its mesh.
-        hidden: polygons of the bodies to hide.
+        hidden_polygons: polygons of the bodies to hide.
 
     Raises:
         SsilkError: the joint paths spell another hierarchy than the parents.
@@ -78,8 +78,8 @@ def define_asset(
     _define_blendshapes(garment, shape_names, deformer.shapes[shapes], units)
     for path, body in zip(paths[3:], bodies):
         bind_skin(define_mesh(stage, path, body.mesh, units), body.skin, skeleton)
-    if hidden is not None:
-        hide_polygons(stage, root.GetPath(), paths[3:], [body.mesh for body in bodies], hidden)
+    if hidden_polygons is not None:
+        hide_polygons(stage, root.GetPath(), paths[3:], [body.mesh for body in bodies], hidden_polygons)
     return Asset(root.GetPath(), paths[2], paths[1], bodies, tuple(paths[3:]), shapes)
 
 

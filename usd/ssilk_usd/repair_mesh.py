@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 # Skinning and the tool's own data stay on points; vertices only merge where these agree.
 _ON_POINTS = ("skel:", "ssilk:")
+NORMALS = ("normals", "primvars:normals", "primvars:normals:indices")
 _VERTEX = (UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying)
 Change = Callable[[np.ndarray], np.ndarray]
 
@@ -36,11 +37,17 @@ def rewrite_mesh(mesh: UsdGeom.Mesh, repair: MeshRepair, offsets: Floats) -> Non
     """
     if repair.reshapes:
         _reshape(mesh, repair)
-    move_points(mesh, offsets)
+    offset_points(mesh, offsets)
 
 
-def move_points(mesh: UsdGeom.Mesh, offsets: Floats) -> None:
-    """Move the points of a mesh by offsets in its own space and units, shape (V, 3), and its extent with them."""
+def offset_points(mesh: UsdGeom.Mesh, offsets: Floats) -> None:
+    """Move the points of a mesh by offsets in its own space and units, shape (V, 3), and its extent with them.
+
+    Authored normals would be those of another shape. They are blocked, so that readers compute their own.
+    """
+    for attribute in map(mesh.GetPrim().GetAttribute, NORMALS if offsets.any() else ()):
+        if attribute.HasAuthoredValue():
+            attribute.Block()
     _change(mesh.GetPointsAttr(), lambda rows: (rows + offsets).astype(rows.dtype))
     if mesh.GetExtentAttr().HasAuthoredValue():
         extent = np.array(UsdGeom.PointBased.ComputeExtent(mesh.GetPointsAttr().Get(EARLIEST)))

@@ -46,7 +46,7 @@ from .read_stage import (
     split_location,
     value,
 )
-from .repair_mesh import move_points
+from .repair_mesh import offset_points
 from .units import StageUnits
 
 
@@ -216,7 +216,7 @@ def _place_garment(
     to_core = garment_to_core(old, skel)
     to_bind = np.linalg.inv(skel.bind_to_core) @ to_core
     if moved is not None:
-        move_points(UsdGeom.Mesh(old), moved @ np.linalg.inv(to_core[:3, :3]).T)
+        offset_points(UsdGeom.Mesh(old), moved @ np.linalg.inv(to_core[:3, :3]).T)
     if not old.GetPath().HasPrefix(skel.root.GetPath()):
         old = _move(stage, old, _free_path(skel, old.GetName()))
     return UsdGeom.Mesh(old), to_bind

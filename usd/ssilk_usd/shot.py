@@ -81,7 +81,7 @@ def write_shot(
         layer = Sdf.Layer.CreateNew(str(temporary))
         stage = Usd.Stage.Open(layer, None)
         hiding = hidden_polygons if include_body else None
-        asset = define_asset(stage, deformer, bodies, units, record=record, hidden=hiding)
+        asset = define_asset(stage, deformer, bodies, units, record=record, hidden_polygons=hiding)
         span = TimeSpan.of(motion, start, samples_per_frame)
         set_metadata(stage, span, units)
         set_visibility(stage, asset.root, span, hidden)
