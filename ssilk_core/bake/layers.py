@@ -17,11 +17,12 @@ from ..targets import check_influences
 from .hiding import covered_polygons
 from .load import LoadedGarment, load_garment
 from .origin import shot_metadata
-from .record import RECORD, TaskRecord, current_record, read_record, task_key, write_record
+from .record import RECORD, TaskRecord, current_record, inputs_of, read_record, task_key, write_record
 from .refinement import refined
 from .request import BakeRequest
 from .result import BakeResult
 from .rollout import BakeRollout
+from .shots import write_shot_stage
 from .skin import SkinMeter
 from .task import BakeTask, plan_layers
 from .verification import verify_file
@@ -47,7 +48,7 @@ def bake_layers(
 
     Args:
         folder: made where it is not there; its layout is in docs/pipeline.md.
-        include_body: write each character's body meshes with the first of its garments.
+        include_body: write each character's body meshes; a shot shows those of one of its garments.
         points: write point caches as well.
         verify: re-skin each layer by UsdSkel and compare it with the decoder's own vertices.
         again: bake what is there and current, too.
@@ -64,10 +65,12 @@ def bake_layers(
     tasks = plan_layers(requests, include_body=include_body, points=points, verify=verify)
     layers, results = LayerFolder(folder), []
     report(Started("bake", len(tasks), {"output": str(folder)}))
-    for task in tasks:
-        results.append(layers.bake(task, again=again, report=report))
-        report(Result("bake", results[-1].figures("layer")))
-    layers.write_stages(tasks, report)
+    try:
+        for task in tasks:
+            results.append(layers.bake(task, again=again, report=report))
+            report(Result("bake", results[-1].figures("layer")))
+    finally:  # what is finished is in its shot, whatever stops the rest
+        layers.write_stages(tasks[: len(results)], report)
     return results
 
 
@@ -108,7 +111,8 @@ class LayerFolder:
             SsilkError: an input is missing or bad, or a file cannot be written.
             VerificationError: the written layer is not what was computed; it is not kept.
         """
-        layout, key, home = self.layout(task), key_of(task), self._home(task)
+        layout, contents, home = self.layout(task), contents_of(task), self._home(task)
+        key = task_key(task, contents)
         if not again and (record := current_record(home, key)):
             return replace(record.result, current=True)
         for path in _own_files(layout):
@@ -119,7 +123,8 @@ class LayerFolder:
         result = _write_layer(layout, asset, rollout, task, report)
         files = [layout.animation, layout.asset, layout.geometry, *([layout.points] if task.points else [])]
         written = {os.path.relpath(path, home): sha256(path) for path in files}
-        write_record(home, TaskRecord(key=key, files=written, result=result))
+        inputs = inputs_of(task.request, contents, self.path)
+        write_record(home, TaskRecord(key=key, files=written, result=result, inputs=inputs, root=task.request.root))
         return result
 
     def _home(self, task: BakeTask) -> Path:
@@ -136,15 +141,10 @@ class LayerFolder:
         return self._written[1]
 
     def write_stages(self, tasks: Sequence[BakeTask], report: Reporter = silent) -> None:
-        """Write the stage of each shot of tasks that are done; warn of shots baked with an older asset."""
-        from ssilk_usd.layers import write_stage
-
+        """Write the stage of each shot of tasks, with all that is baked for it; warn of shots with an older asset."""
         layouts = [self.layout(task) for task in tasks]
-        shots: dict[str, list[Layout]] = {}
-        for layout in layouts:
-            shots.setdefault(layout.shot, []).append(layout)
-        for garments in shots.values():
-            write_stage(garments)
+        for shot in dict.fromkeys(task.shot for task in tasks):
+            write_shot_stage(self.path, shot, report)
         for layout in {layout.garment: layout for layout in layouts}.values():
             outdated = list(_outdated_shots(layout))
             if outdated:
@@ -166,17 +166,25 @@ def key_of(task: BakeTask) -> str:
     Raises:
         SsilkError: an input is missing or cannot be read.
     """
+    return task_key(task, contents_of(task))
+
+
+def contents_of(task: BakeTask) -> dict[str, str]:
+    """Return a hash of what each input of a task holds now.
+
+    Raises:
+        SsilkError: an input is missing or cannot be read.
+    """
     from ssilk_usd.read_stage import content_hash, split_location
 
     request = task.request
     if not Path(request.model).is_file():
         fail(request.model, "there is no such model file", "a file of 'ssilk train' is needed")
-    contents = {
+    return {
         "model": sha256(request.model),
         "stage": content_hash(request.stage),
         "motion": content_hash(split_location(request.motion)[0]),
     }
-    return task_key(task, contents)
 
 
 def _digests(layout: Layout) -> list[str]:
@@ -200,10 +208,7 @@ def _write_layer(layout: Layout, asset: Asset, rollout: BakeRollout, task: BakeT
     from ssilk_usd import layers
 
     rollout = refined(rollout, report)
-    hidden = covered_polygons(rollout, report) if task.request.hide_covered and task.include_body else None
-    if task.request.hide_covered and not task.include_body:
-        text = f"{task.name}: the body comes with another garment; faces that this one covers are not hidden"
-        report(Message(text, "warning"))
+    hidden = covered_polygons(rollout, report) if task.request.hide_covered else None
     skin = SkinMeter(rollout)
     common: dict[str, Any] = {
         "units": rollout.units,

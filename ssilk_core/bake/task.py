@@ -46,7 +46,8 @@ def plan_layers(
     """Return a task for each request; tasks of one garment follow each other.
 
     Garments are named after their models, with the SkelRoot in front where one is named, and shots after their
-    motions. A character's body comes with the first of its garments.
+    motions.
+    Each asset has the body of its character, whichever garments are baked with it; a shot shows one of them.
 
     Args:
         points: write point caches as well; refined points are always written.
@@ -61,15 +62,12 @@ def plan_layers(
     shots = {request.motion: _shot_name(request) for request in requests}
     _need_unique(list(garments.values()), "MODEL", "garments")
     _need_unique(list(shots.values()), "--motion", "shots")
-    first: dict[str | None, str] = {}
-    for (_, root), garment in garments.items():
-        first.setdefault(root, garment)
     tasks = [
         BakeTask(
             garment=garment,
             shot=shots[request.motion],
             request=request,
-            include_body=include_body and first[request.root] == garment,
+            include_body=include_body,
             points=points or request.writes_points,
             verify=verify,
         )

@@ -34,14 +34,13 @@ def requests(models: list[tuple[str, str | None]], motions: list[str]) -> list[B
     return [replace(REQUEST, model=model, root=root, motion=motion) for motion in motions for model, root in models]
 
 
-def test_tasks_of_one_model_follow_each_other_and_a_character_has_one_body():
+def test_tasks_of_one_model_follow_each_other():
     models = [("/m/cape.safetensors", "/World/Anna"), ("/m/hat.safetensors", "/World/Anna"),
               ("/m/cape.safetensors", "/World/Bert")]  # fmt: skip
     tasks = plan_layers(requests(models, ["a/01 walk.usd", "b/run.usd:/Clips/Fast"]))
     assert [task.name for task in tasks] == [
         f"{shot}/{garment}" for garment in ("Anna_cape", "Anna_hat", "Bert_cape") for shot in ("01_walk", "run_Fast")
     ]
-    assert [task.include_body for task in tasks] == [True, True, False, False, True, True]
 
 
 @pytest.mark.parametrize(("models", "motions", "says"), [
