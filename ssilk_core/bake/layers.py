@@ -16,6 +16,7 @@ from ..files import remove_unfinished, replacing, sha256
 from ..targets import check_influences
 from .hiding import covered_polygons
 from .load import LoadedGarment, load_garment
+from .names_used import UsedNames
 from .origin import shot_metadata
 from .record import RECORD, TaskRecord, current_record, inputs_of, read_record, task_key, write_record
 from .refinement import refined
@@ -41,6 +42,7 @@ def bake_layers(
     points: bool = False,
     verify: bool = True,
     again: bool = False,
+    replace_names: bool = False,
     report: Reporter = silent,
 ) -> list[BakeResult]:
     """Bake garments over motions as layers: an asset for each garment, a small layer for each garment in each shot,
@@ -52,18 +54,22 @@ def bake_layers(
         points: write point caches as well.
         verify: re-skin each layer by UsdSkel and compare it with the decoder's own vertices.
         again: bake what is there and current, too.
+        replace_names: bake even where the name of a garment or a shot was used for another input before.
         report: takes events.
 
     Returns:
         A result for each request, those of one garment together.
 
     Raises:
-        SsilkError: an input is missing or does not fit, two garments or two shots would have one name, or a file
-            cannot be written; what was finished before stays.
+        SsilkError: an input is missing or does not fit, two garments or two shots would have one name, a name was
+            used for another input, or a file cannot be written; what was finished before stays.
         VerificationError: a layer is not what was computed; it is not kept.
     """
-    tasks = plan_layers(requests, include_body=include_body, points=points, verify=verify)
+    tasks = plan_layers(
+        requests, include_body=include_body, points=points, verify=verify, replace_names=replace_names
+    )
     layers, results = LayerFolder(folder), []
+    layers.need_names(tasks)
     report(Started("bake", len(tasks), {"output": str(folder)}))
     try:
         for task in tasks:
@@ -104,6 +110,13 @@ class LayerFolder:
         """
         return current_record(self._home(task), key_of(task)) is not None
 
+    def need_names(self, tasks: Iterable[BakeTask]) -> None:
+        """Raise `SsilkError` where a name was used for another input, unless its task says so."""
+        names = UsedNames(self.path)
+        for task in tasks:
+            if not task.replace:
+                names.check(task)
+
     def bake(self, task: BakeTask, *, again: bool = False, report: Reporter = silent) -> BakeResult:
         """Bake one garment in one shot, unless that is done already.
 
@@ -115,6 +128,7 @@ class LayerFolder:
         key = task_key(task, contents)
         if not again and (record := current_record(home, key)):
             return replace(record.result, current=True)
+        self.need_names([task])
         for path in _own_files(layout):
             remove_unfinished(path)
         rollout = self.garment(task).over(task.request.motion)

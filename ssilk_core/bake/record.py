@@ -59,6 +59,7 @@ def task_key(task: BakeTask, contents: Mapping[str, str]) -> str:
         contents: hashes of what is in each of the request's `INPUTS`.
     """
     options = asdict(task)
+    del options["replace"]
     for name in INPUTS:
         del options["request"][name]
     return request_key({"ssilk": __version__, "options": options}, [(name, contents[name]) for name in INPUTS])

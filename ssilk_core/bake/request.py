@@ -22,8 +22,8 @@ MAX_PRE_ROLL = 600.0  # [s]
 class BakeRequest:
     """One garment over one motion: all that decides how the garment moves.
 
-    Fields are named as the options of 'ssilk bake', which has none for `feedback` and names `root` in MODEL:/ROOT. A
-    shot stores its request, so that it can be verified later.
+    Fields are named as the options of 'ssilk bake', which has none for `feedback`, names `root` in MODEL:/ROOT, and
+    names `garment` and `shot` by patterns or in a list. A shot stores its request, so that it can be verified later.
 
     Attributes:
         model: file written by 'ssilk train'.
@@ -41,6 +41,7 @@ class BakeRequest:
         hide_covered: hide the body's faces that the garment covers in every frame (see `mesh.hidden_faces`).
         keep: what is kept of the model, cut to be best for this motion; None for all.
         device: where the network runs.
+        garment, shot: names in a folder of layers; None for those of the model and the motion.
 
     Raises:
         SsilkError: an unknown target or refined output, or a number out of range.
@@ -61,6 +62,8 @@ class BakeRequest:
     hide_covered: bool = False
     keep: ModelSize | None = None
     device: str = "cpu"
+    garment: str | None = None
+    shot: str | None = None
 
     def __post_init__(self) -> None:
         for name in INPUTS:  # a pathlib.Path is as good, but USD's metadata stores text

@@ -44,6 +44,8 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Write the bundle, or run the tasks."""
     tasks = [_absolute(task) for task in plan_layers(requests_of(options), **layer_options(options))]
+    if options.output:
+        LayerFolder(options.output).need_names(tasks)
     if options.bundle:
         return _write(tasks, options, report)
     if not options.output:

@@ -293,7 +293,7 @@ def test_names_that_would_collide_are_refused(copy, capsys):
     shutil.copy("walk.usda", "more/walk.usda")
     capsys.readouterr()
     assert bake("--motion walk.usda more/walk.usda -o other") == 2
-    assert "2 shots are named 'walk'" in capsys.readouterr().err and not Path("other").exists()
+    assert "would both be the shot 'walk'" in capsys.readouterr().err and not Path("other").exists()
 
 
 def test_hidden_spans_are_kept(copy):

@@ -119,3 +119,68 @@ def test_a_record_names_inputs_without_saying_where_the_studio_keeps_them(copy):
         "model": "../overalls.safetensors", "stage": "../rigged.usda", "motion": "../walk.usda",
     }  # fmt: skip
     assert str(copy) not in text
+
+
+def two_sequences(toy) -> None:
+    """Two shots whose files have one name."""
+    for name, frames in (("s010", 5), ("s020", 4)):
+        Path(name).mkdir()
+        toy.write_clip(Path(name, "anim.usda"), frames=frames)
+
+
+def test_shots_whose_files_have_one_name_are_refused_in_one_command_and_in_two(copy, toy, capsys):
+    two_sequences(toy)
+    assert bake("shirt.safetensors", "--motion s010/anim.usda s020/anim.usda -o new") == 2
+    said = capsys.readouterr().err
+    assert "'s010/anim.usda' and 's020/anim.usda' would both be the shot 'anim'" in said and "--shot-name" in said
+    assert bake("shirt.safetensors", "--motion s010/anim.usda -o new") == 0
+    before = Path("new/shots/anim/shirt/anim.usdc").read_bytes()
+    for model in ("shirt", "overalls"):  # beside what is there, too, it would be another shot's
+        assert bake(f"{model}.safetensors", "--motion s020/anim.usda -o new") == 2
+        said = capsys.readouterr().err
+        assert "the shot 'anim' was baked from '../s010/anim.usda', not from 's020/anim.usda'" in said
+        assert "--replace" in said and Path("new/shots/anim/shirt/anim.usdc").read_bytes() == before
+    toy.write_clip(Path("s010/anim.usda"), frames=6)  # the same input, changed
+    assert bake("shirt.safetensors", "--motion s010/anim.usda -o new") == 0
+    assert Path("new/shots/anim/shirt/anim.usdc").read_bytes() != before
+    assert bake("shirt.safetensors", "--motion s020/anim.usda -o new --replace") == 0
+    assert Usd.Stage.Open("new/shots/anim/shot.usda").GetEndTimeCode() == 3
+
+
+@pytest.mark.parametrize("words", [
+    "--motion s010/anim.usda s020/anim.usda --shot-name '{parent}_{stem}'", "--shots lists/shots.json",
+])  # fmt: skip
+def test_shots_are_named_by_a_pattern_or_in_a_list(copy, toy, words):
+    two_sequences(toy)
+    Path("lists").mkdir()
+    named = {f"{name}_anim": f"../{name}/anim.usda" for name in ("s010", "s020")}
+    Path("lists/shots.json").write_text(json.dumps(named))
+    assert bake("shirt.safetensors", f"{words} --garment-name worn -o new") == 0
+    assert {path.parent.name for path in Path("new/shots").glob("*/shot.usda")} == {"s010_anim", "s020_anim"}
+    assert Usd.Stage.Open("new/shots/s020_anim/worn/anim.usdc").GetDefaultPrim().GetName() == "worn"
+
+
+def test_another_model_of_one_name_is_refused(copy, capsys):
+    Path("other").mkdir()
+    reduced = "reduce overalls.safetensors --shapes 2 --motions walk.usda -o other/overalls.safetensors"
+    assert main(shlex.split(reduced)) == 0
+    assert bake("overalls.safetensors other/overalls.safetensors", "--motion run.usda -o layers") == 2
+    assert "would both be the garment 'overalls'" in capsys.readouterr().err
+    assert bake("other/overalls.safetensors", "--motion run.usda -o layers") == 2  # its asset is that of all shots
+    said = capsys.readouterr().err
+    assert "the garment 'overalls' was baked from '../overalls.safetensors', not from 'other/overalls" in said
+    assert bake("other/overalls.safetensors", "--motion walk.usda -o layers --garment-name '{parent}'") == 0
+    assert garments() == ["other", "overalls"]
+    shutil.copy("overalls.safetensors", "other/overalls.safetensors")
+    assert bake("other/overalls.safetensors", "--motion run.usda -o layers") == 0  # it has only moved
+
+
+@pytest.mark.parametrize(("text", "says"), [
+    ("[]", "it names no shots"), ("{", "it cannot be read"), ('{"a": 3}', "the shot 'a' has '3' for a motion"),
+    ('{"a": "walk.usda", "a": "run.usda"}', "'a' is there twice"),
+    ('{"a.b": "walk.usda", "a b": "run.usda"}', "would both be the shot 'a_b'"),
+])  # fmt: skip
+def test_a_list_of_shots_that_names_none_is_refused(copy, capsys, text, says):
+    Path("shots.json").write_text(text)
+    assert bake("shirt.safetensors", "--shots shots.json -o new") == 2
+    assert says in capsys.readouterr().err and not Path("new").exists()
