@@ -100,7 +100,7 @@ class LayerFolder:
 
     def garment(self, task: BakeTask) -> LoadedGarment:
         """Return the garment of a task, ready for any motion; raise `SsilkError` as `load_garment`."""
-        return self._load(replace(task.request, motion=""))
+        return self._load(replace(task.request, motion="", range=None, handles=0))
 
     def is_done(self, task: BakeTask) -> bool:
         """Return whether a task is done with its inputs as they are now, and its files are as they were written.
@@ -131,7 +131,9 @@ class LayerFolder:
         self.need_names([task])
         for path in _own_files(layout):
             remove_unfinished(path)
-        rollout = self.garment(task).over(task.request.motion)
+        request = task.request
+        rollout = self.garment(task).over(request.motion, range=request.range, handles=request.handles)
+        rollout.tell(report)
         check_influences(rollout.influences, task.request.target, task.request.model)
         asset = self._asset(task, layout, report)
         result = _write_layer(layout, asset, rollout, task, report)

@@ -21,12 +21,14 @@ from .rollout import BakeRollout
 
 if TYPE_CHECKING:
     from pxr import Usd
+    from ssilk_usd.frame_range import FrameRange
     from ssilk_usd.garment_api import GarmentRecord
     from ssilk_usd.units import StageUnits
 
     from ..model.network import GarmentModel
 
 MAX_FPS = 10_000
+LEAD = 1.0  # [s] of a motion before its shot that are rolled out, so that the garment is on its way when it begins
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,21 +51,27 @@ class LoadedGarment:
     provenance: dict[str, object]
     record: GarmentRecord
 
-    def over(self, motion: str) -> BakeRollout:
-        """Return the garment over a motion, "file[:/Prim/Path]".
+    def over(self, motion: str, *, range: str | None = None, handles: int = 0) -> BakeRollout:
+        """Return the garment over a motion, "file[:/Prim/Path]"; range and handles are those of a request.
 
         Raises:
-            SsilkError: the file is missing or does not fit.
+            SsilkError: the file is missing, does not fit, or lacks the range.
         """
+        from ssilk_usd.frame_range import read_frame_range
         from ssilk_usd.read_motion import read_motion
         from ssilk_usd.read_stage import split_location
         from ssilk_usd.read_visibility import read_hidden
 
-        request = replace(self.request, motion=motion)
-        source = read_motion(motion, self.file.scene.character.skeleton, root=request.root)
+        request = replace(self.request, motion=motion, range=range, handles=handles)
+        frames = read_frame_range(motion, request.time_range, handles, root=request.root)
+        lead = _lead(frames, request) if frames else 0
+        within = (frames.played[0] - lead * frames.step, frames.played[1]) if frames else None
+        source = read_motion(motion, self.file.scene.character.skeleton, root=request.root, within=within)
         at_fps = source if request.fps is None else _at_fps(source, request.fps)
         samples = request.samples_per_frame
-        sampled = at_fps if samples == 1 else _at_fps(source, at_fps.fps * samples)
+        every = at_fps if samples == 1 else _at_fps(source, at_fps.fps * samples)
+        skipped = round(lead * every.fps / source.fps)
+        sampled = every.clip(skipped, every.frame_count) if skipped else every
         kept, reduction = self._cut(source) if request.keep else (self, None)
         provenance = {
             **self.provenance,
@@ -77,6 +85,8 @@ class LoadedGarment:
             deformer=kept.deformer,
             motion=sampled,
             source=source,
+            lead=skipped,
+            frames=frames,
             hidden=read_hidden(motion, sampled, root=request.root),
             units=self.units,
             provenance=provenance,
@@ -128,7 +138,7 @@ def load_rollout(request: BakeRequest) -> BakeRollout:
     Raises:
         SsilkError: a file is missing or does not fit the others.
     """
-    return load_garment(request).over(request.motion)
+    return load_garment(request).over(request.motion, range=request.range, handles=request.handles)
 
 
 def with_model(rollout: BakeRollout, file: ModelFile) -> BakeRollout:
@@ -145,6 +155,13 @@ def _network_like(like: GarmentModel, file: ModelFile, request: BakeRequest) -> 
     model = network(file, replace(file.scene, character=like.scene.character))
     model.to(select_device(request.device))
     return model, cap_influences(model.deformer(), request.receiver)
+
+
+def _lead(frames: FrameRange, request: BakeRequest) -> int:
+    """Return how many frames of the motion before the shot are rolled out: they make whole samples of the shot."""
+    rate = (request.fps or frames.fps) * request.samples_per_frame / frames.fps
+    most = min(frames.earlier, round(max(LEAD, request.pre_roll) * frames.fps))
+    return next((count for count in range(most, 0, -1) if abs(count * rate - round(count * rate)) < 1e-6), 0)
 
 
 def _at_fps(motion: Motion, fps: float) -> Motion:

@@ -9,10 +9,12 @@ import os
 import re
 import unicodedata
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from ..errors import fail
+from .plain import from_plain
 
 FIELDS = "{stem}, {prim}, {parent}, {parent2}, {parent3}, ... are names of its file, prim and folders"
 LONGEST = 100  # characters of a name; file systems take 255 bytes
@@ -60,16 +62,26 @@ def prim_name(text: str) -> str:
     return re.sub(r"^(?=\d)", "_", file_name(text).replace("-", "_"))
 
 
-def read_shots(path: Path) -> dict[str, str]:
-    """Return the motions of a list of shots, "file[:/Prim]", by the names of the shots.
+@dataclass(frozen=True)
+class ListedShot:
+    """A shot: its motion, "file[:/Prim]", and its range as a request takes it."""
+
+    motion: str
+    range: str | None = None
+
+
+def read_shots(path: Path) -> dict[str, ListedShot]:
+    """Return the shots of a list by their names.
 
     Args:
-        path: of a JSON file such as {"s010": "s010/anim.usdc"}, where paths are relative to the file.
+        path: of a JSON file such as {"s010": "s010/anim.usdc"}, where paths are relative to the file. An entry may
+            also be {"motion": "s010/anim.usdc", "range": "1021-1100"}.
 
     Raises:
         SsilkError: it cannot be read, or holds anything else.
     """
-    allowed = 'a list of shots is JSON such as {"s010": "s010/anim.usdc", "s020": "s020/anim.usdc:/Anim"}'
+    allowed = ('a list of shots is JSON such as {"s010": "s010/anim.usdc", "s020": {"motion": "s020/anim.usdc", '
+               '"range": "1001-1100"}}')  # fmt: skip
     if not path.is_file():
         fail(str(path), "there is no such file", allowed)
     try:
@@ -78,7 +90,7 @@ def read_shots(path: Path) -> dict[str, str]:
         fail(str(path), f"it cannot be read ({error})", allowed)
     if not (isinstance(document, Mapping) and document):
         fail(str(path), "it names no shots", allowed)
-    return {str(name): _motion(path, str(name), entry, allowed) for name, entry in document.items()}
+    return {str(name): _listed(path, str(name), entry, allowed) for name, entry in document.items()}
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -91,7 +103,11 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return document
 
 
-def _motion(path: Path, name: str, entry: object, allowed: str) -> str:
-    if not (name.strip() and isinstance(entry, str) and entry):
-        fail(str(path), f"the shot '{name}' has {str(entry)[:40]!r} for a motion", allowed)
-    return str(path.parent / entry)
+def _listed(path: Path, name: str, entry: object, allowed: str) -> ListedShot:
+    try:
+        shot = from_plain(ListedShot, {"motion": entry} if isinstance(entry, str) else entry)
+    except TypeError as error:
+        fail(str(path), f"in the shot '{name}', {error}", allowed)
+    if not (name.strip() and shot.motion):
+        fail(str(path), f"the shot '{name}' has '{shot.motion}' for a motion", allowed)
+    return replace(shot, motion=str(path.parent / shot.motion))

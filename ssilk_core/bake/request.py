@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from math import inf
 
 from ..errors import fail
 from ..reduction import ModelSize
@@ -16,6 +18,8 @@ INPUTS = ("model", "stage", "motion")  # the files that a shot is baked from
 REFINED_OUTPUTS = ("points", "joints")
 MAX_SAMPLES_PER_FRAME = 64
 MAX_PRE_ROLL = 600.0  # [s]
+MAX_HANDLES = 10_000
+_NUMBER = r"-?[0-9]{1,9}(?:\.[0-9]{1,9})?"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +36,8 @@ class BakeRequest:
         root: SkelRoot of the character, where the stage has several.
         fps: frames per second of the shot [1/s]; None for the motion's.
         samples_per_frame: samples in each frame, for motion blur.
+        range: "FIRST-LAST" in time codes of the motion's stage, or "all" samples; None for the range of the stage.
+        handles: frames before and after the range that are baked as well, where the motion has samples.
         pre_roll: run-up to the first pose and after each cut [s].
         target: who receives the shot, a name in `ssilk_core.targets.TARGETS`.
         lbs: bake linear blend skinning instead of the network.
@@ -53,6 +59,8 @@ class BakeRequest:
     root: str | None = None
     fps: float | None = None
     samples_per_frame: int = 1
+    range: str | None = None
+    handles: int = 0
     pre_roll: float = 0.0
     target: str = "usd"
     lbs: bool = False
@@ -73,6 +81,10 @@ class BakeRequest:
         if not 1 <= self.samples_per_frame <= MAX_SAMPLES_PER_FRAME:
             found = f"{self.samples_per_frame} samples in each frame"
             fail("--samples-per-frame", found, f"1 to {MAX_SAMPLES_PER_FRAME} are allowed")
+        if not 0 <= self.handles <= MAX_HANDLES:
+            fail("--handles", f"{self.handles} frames", f"0 to {MAX_HANDLES} are allowed")
+        if self.time_range and not self.time_range[0] <= self.time_range[1]:
+            fail(f"--range {self.range}", "it ends before it begins", "FIRST-LAST is needed, such as 1001-1100")
         if not 0 <= self.pre_roll <= MAX_PRE_ROLL:
             fail("--pre-roll", f"{self.pre_roll:g} seconds", f"0 to {MAX_PRE_ROLL:g} are allowed")
         if self.fps is not None and not 0 < self.fps < float("inf"):
@@ -90,6 +102,19 @@ class BakeRequest:
                 "they can be written as points",
                 "use --refined-output points",
             )
+
+    @property
+    def time_range(self) -> tuple[float, float] | None:
+        """First and last time code of the range, infinite for all samples; None for that of the stage."""
+        if self.range is None:
+            return None
+        if self.range == "all":
+            return -inf, inf
+        found = re.fullmatch(rf"({_NUMBER})-({_NUMBER})", self.range)
+        if not found:
+            allowed = "first and last time code are needed, such as 1001-1100, or 'all'"
+            fail("--range", f"'{self.range}'", allowed)
+        return float(found[1]), float(found[2])
 
     @property
     def inputs(self) -> dict[str, str]:

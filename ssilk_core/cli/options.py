@@ -79,6 +79,15 @@ def add_bake(verb: argparse.ArgumentParser) -> None:
     about = "; ".join(f"{name}: {target.about}" for name, target in TARGETS.items())
     verb.add_argument("--target", choices=TARGETS, default="usd", help=f"who receives it (default usd). {about}")
     verb.add_argument("--fps", type=float, help="frames per second of the shot (default: the motion's)")
+    verb.add_argument(
+        "--range",
+        metavar="FIRST-LAST",
+        help="frames to bake, as time codes of the motion, such as 1001-1100, or 'all' that have samples (default: "
+        "the range of the motion's stage, or all)",
+    )
+    verb.add_argument("--handles", type=int, default=0, metavar="N",
+                      help="frames before and after the range that are baked as well, where there are samples "
+                           "(default 0)")  # fmt: skip
     verb.add_argument("--samples-per-frame", type=int, default=1, metavar="N",
                       help="samples in each frame, for motion blur (default 1)")  # fmt: skip
     verb.add_argument(
@@ -143,21 +152,24 @@ def requests_of(options: argparse.Namespace) -> list[BakeRequest]:
     """Return a request for each model over each motion, as the options of `add_bake` say."""
     from ssilk_usd.read_stage import split_location
 
-    shots: list[tuple[str | None, str]]
+    shots: list[tuple[str | None, naming.ListedShot]]
     if options.shots:
         if options.shot_name:
             fail("--shot-name", "a pattern and a list of shots", "the list names them", "leave one of them out")
         shots = list(naming.read_shots(options.shots).items())
     else:
-        shots = [(_name(options.shot_name, motion, "--shot-name"), motion) for motion in options.motion]
+        listed = map(naming.ListedShot, options.motion)
+        shots = [(_name(options.shot_name, shot.motion, "--shot-name"), shot) for shot in listed]
     worn = [(split_location(model), _name(options.garment_name, model, "--garment-name")) for model in options.model]
     return [
         BakeRequest(
             model=model,
             stage=options.stage,
-            motion=motion,
+            motion=shot.motion,
             root=root,
             fps=options.fps,
+            range=shot.range or options.range,
+            handles=options.handles,
             samples_per_frame=options.samples_per_frame,
             pre_roll=options.pre_roll,
             target=options.target,
@@ -167,10 +179,10 @@ def requests_of(options: argparse.Namespace) -> list[BakeRequest]:
             hide_covered=options.hide_covered,
             device=options.device,
             garment=garment,
-            shot=shot,
+            shot=name,
         )
         for (model, root), garment in worn
-        for shot, motion in shots
+        for name, shot in shots
     ]
 
 

@@ -176,7 +176,7 @@ def test_another_model_of_one_name_is_refused(copy, capsys):
 
 
 @pytest.mark.parametrize(("text", "says"), [
-    ("[]", "it names no shots"), ("{", "it cannot be read"), ('{"a": 3}', "the shot 'a' has '3' for a motion"),
+    ("[]", "it names no shots"), ("{", "it cannot be read"), ('{"a": 3}', "in the shot 'a', '3' has no fields"),
     ('{"a": "walk.usda", "a": "run.usda"}', "'a' is there twice"),
     ('{"a.b": "walk.usda", "a b": "run.usda"}', "would both be the shot 'a_b'"),
 ])  # fmt: skip
