@@ -16,12 +16,14 @@ from ..work_record import is_file
 from .hiding import covered_polygons
 from .inputs import InputFiles, InputHashes, need_pinned
 from .load import LoadedGarment, load_garment
+from .names_used import UsedNames
 from .origin import shot_metadata
-from .record import RECORD, TaskRecord, current_record, read_record, task_key, write_record
+from .record import RECORD, TaskRecord, current_record, inputs_of, read_record, task_key, write_record
 from .refinement import refined
 from .request import BakeRequest
 from .result import BakeResult
 from .rollout import BakeRollout
+from .shots import write_shot_stage
 from .skin import SkinMeter
 from .task import BakeTask, has_possible_names, need_possible_names, plan_layers
 from .verification import verify_file
@@ -40,6 +42,7 @@ def bake_layers(
     points: bool = False,
     verify: bool = True,
     again: bool = False,
+    replace_names: bool = False,
     report: Reporter = silent,
 ) -> list[BakeResult]:
     """Bake garments over motions as layers: an asset for each garment, a small layer for each garment in each shot,
@@ -47,27 +50,33 @@ def bake_layers(
 
     Args:
         folder: made where it is not there; its layout is in docs/pipeline.md.
-        include_body: write each character's body meshes with the first of its garments.
+        include_body: write each character's body meshes; a shot shows those of one of its garments.
         points: write point caches as well.
         verify: re-skin each layer by UsdSkel and compare it with the decoder's own vertices.
         again: bake what is there and current, too.
+        replace_names: bake even where the name of a garment or a shot was used for another input before.
         report: takes events.
 
     Returns:
         A result for each request, those of one garment together.
 
     Raises:
-        SsilkError: an input is missing or does not fit, two garments or two shots would have one name, or a file
-            cannot be written; what was finished before stays.
+        SsilkError: an input is missing or does not fit, two garments or two shots would have one name, a name was
+            used for another input, or a file cannot be written; what was finished before stays.
         VerificationError: a layer is not what was computed; it is not kept.
     """
-    tasks = plan_layers(requests, include_body=include_body, points=points, verify=verify)
+    tasks = plan_layers(
+        requests, include_body=include_body, points=points, verify=verify, replace_names=replace_names
+    )
     layers, results = LayerFolder(folder), []
+    layers.need_names(tasks)
     report(Started("bake", len(tasks), {"output": str(folder)}))
-    for task in tasks:
-        results.append(layers.bake(task, again=again, report=report))
-        report(Result("bake", results[-1].figures("layer")))
-    layers.write_stages(tasks, report)
+    try:
+        for task in tasks:
+            results.append(layers.bake(task, again=again, report=report))
+            report(Result("bake", results[-1].figures("layer")))
+    finally:  # what is finished is in its shot, whatever stops the rest
+        layers.write_stages(tasks[: len(results)], report)
     return results
 
 
@@ -93,7 +102,7 @@ class LayerFolder:
 
     def garment(self, task: BakeTask) -> LoadedGarment:
         """Return the garment of a task, ready for any motion; raise `SsilkError` as `load_garment`."""
-        request, kept = replace(task.request, motion=""), self._loaded
+        request, kept = replace(task.request, motion="", range=None, handles=0), self._loaded
         held = kept is not None and all(map(self.inputs.still_there, (kept.model_held, kept.stage_held)))
         if kept is None or kept.request != request or not held:
             kept = self._loaded = load_garment(request)
@@ -115,6 +124,13 @@ class LayerFolder:
         """Return whether a task is done with inputs that hold this, and its files are as they were written."""
         return current_record(self._home(task), task_key(task, contents), self._files.sha256) is not None
 
+    def need_names(self, tasks: Iterable[BakeTask]) -> None:
+        """Raise `SsilkError` where a name was used for another input, unless its task says so."""
+        names = UsedNames(self.path)
+        for task in tasks:
+            if not task.replace:
+                names.check(task)
+
     def bake(self, task: BakeTask, *, again: bool = False, report: Reporter = silent) -> BakeResult:
         """Bake one garment in one shot, unless that is done already.
 
@@ -131,14 +147,18 @@ class LayerFolder:
         wanted = task.pinned or self.inputs.hashes(task.request)
         if not again and (record := current_record(home, task_key(task, wanted), self._files.sha256)):
             return replace(record.result, current=True)
-        rollout = self.garment(task).over(task.request.motion)
+        self.need_names([task])
+        request = task.request
+        rollout = self.garment(task).over(request.motion, range=request.range, handles=request.handles)
         if task.pinned:
-            need_pinned(task.request, task.pinned, rollout.inputs)
-        check_influences(rollout.influences, task.request.target, task.request.model)
+            need_pinned(request, task.pinned, rollout.inputs)
+        rollout.tell(report)
+        check_influences(rollout.influences, request.target, request.model)
         asset = self._asset(task, layout, report)
         result, files = _write_layer(layout, asset.asset, rollout, task, report)
         written = {os.path.relpath(path, home): digest for path, digest in (files | dict(asset.digests)).items()}
-        write_record(home, TaskRecord(key=task_key(task, rollout.inputs), files=written, result=result))
+        key, inputs = task_key(task, rollout.inputs), inputs_of(request, rollout.inputs, self.path)
+        write_record(home, TaskRecord(key=key, files=written, result=result, inputs=inputs, root=request.root))
         return result
 
     def _home(self, task: BakeTask) -> Path:
@@ -157,18 +177,13 @@ class LayerFolder:
         return all(is_file(path, digest, self._files.sha256) for path, digest in asset.digests)
 
     def write_stages(self, tasks: Sequence[BakeTask], report: Reporter = silent) -> None:
-        """Write the stage of each shot of tasks that are done; warn of shots baked with an older asset."""
-        from ssilk_usd.layers import write_stage
-
+        """Write the stage of each shot of tasks, with all that is baked for it; warn of shots with an older asset."""
         layouts = [self.layout(task) for task in tasks]
-        shots: dict[str, list[Layout]] = {}
-        for layout in layouts:
-            shots.setdefault(layout.shot, []).append(layout)
         known: dict[str, set[str]] = {}
         for layout in layouts:
             known.setdefault(layout.garment, set()).add(layout.shot)
-        for garments in shots.values():
-            write_stage(garments)
+        for shot in dict.fromkeys(task.shot for task in tasks):
+            write_shot_stage(self.path, shot, report)
         for layout in {layout.garment: layout for layout in layouts}.values():
             outdated = list(_outdated_shots(layout, known[layout.garment]))
             if outdated:
@@ -203,10 +218,7 @@ def _write_layer(
     from ssilk_usd import layers
 
     rollout = refined(rollout, report)
-    hidden = covered_polygons(rollout, report) if task.request.hide_covered and task.include_body else None
-    if task.request.hide_covered and not task.include_body:
-        text = f"{task.name}: the body comes with another garment; faces that this one covers are not hidden"
-        report(Message(text, "warning"))
+    hidden = covered_polygons(rollout, report) if task.request.hide_covered else None
     skin = SkinMeter(rollout)
     common: dict[str, Any] = {
         "units": rollout.units,

@@ -22,10 +22,25 @@ from .rollout import BakeRollout
 
 if TYPE_CHECKING:
     from pxr import Usd
+    from ssilk_usd.frame_range import FrameRange
     from ssilk_usd.garment_api import GarmentRecord
     from ssilk_usd.units import StageUnits
 
     from ..model.network import GarmentModel
+
+LEAD = 1.0  # [s] of a motion before its shot that are rolled out, so that the garment is on its way when it begins
+
+
+@dataclass(frozen=True, eq=False)
+class _ReadMotion:
+    """A motion as it was read, its part at the shot's samples, how many samples come before, and which frames these
+    are; and at which of them the character becomes hidden (True) or visible (False)."""
+
+    source: Motion
+    sampled: Motion
+    lead: int
+    frames: FrameRange | None
+    hidden: list[tuple[int, bool]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,16 +66,15 @@ class LoadedGarment:
     provenance: dict[str, object]
     record: GarmentRecord
 
-    def over(self, motion: str) -> BakeRollout:
-        """Return the garment over a motion, "file[:/Prim/Path]".
+    def over(self, motion: str, *, range: str | None = None, handles: int = 0) -> BakeRollout:
+        """Return the garment over a motion, "file[:/Prim/Path]"; range and handles are those of a request.
 
         Raises:
-            SsilkError: the file is missing or does not fit.
+            SsilkError: the file is missing, does not fit, or lacks the range.
         """
-        request = replace(self.request, motion=motion)
-        (source, sampled, hidden), held = read_unchanged(
-            partial(stage_contents, motion), partial(self._read, request)
-        )
+        request = replace(self.request, motion=motion, range=range, handles=handles)
+        read, held = read_unchanged(partial(stage_contents, motion), partial(self._read, request))
+        source = read.source
         kept, reduction = self._cut(source) if request.keep else (self, None)
         provenance = {
             **self.provenance,
@@ -72,9 +86,11 @@ class LoadedGarment:
             request=request,
             model=kept.model,
             deformer=kept.deformer,
-            motion=sampled,
+            motion=read.sampled,
             source=source,
-            hidden=hidden,
+            lead=read.lead,
+            frames=read.frames,
+            hidden=read.hidden,
             units=self.units,
             inputs=InputHashes(model=self.model_held.digest, stage=self.stage_held.digest, motion=held.digest),
             provenance=provenance,
@@ -83,16 +99,22 @@ class LoadedGarment:
             reduction=reduction,
         )
 
-    def _read(self, request: BakeRequest) -> tuple[Motion, Motion, list[tuple[int, bool]]]:
-        """Return a motion as it was read, at the shot's samples, and when its character is hidden."""
+    def _read(self, request: BakeRequest) -> _ReadMotion:
+        from ssilk_usd.frame_range import read_frame_range
         from ssilk_usd.read_motion import read_motion
         from ssilk_usd.read_visibility import read_hidden
 
-        source = read_motion(request.motion, self.file.scene.character.skeleton, root=request.root)
+        frames = read_frame_range(request.motion, request.time_range, request.handles, root=request.root)
+        lead = _lead(frames, request) if frames else 0
+        within = (frames.played[0] - lead * frames.step, frames.played[1]) if frames else None
+        source = read_motion(request.motion, self.file.scene.character.skeleton, root=request.root, within=within)
         at_fps = source if request.fps is None else _at_fps(source, request.fps)
         samples = request.samples_per_frame
-        sampled = at_fps if samples == 1 else _at_fps(source, at_fps.fps * samples)
-        return source, sampled, read_hidden(request.motion, sampled, root=request.root)
+        every = at_fps if samples == 1 else _at_fps(source, at_fps.fps * samples)
+        skipped = round(lead * every.fps / source.fps)
+        sampled = every.clip(skipped, every.frame_count) if skipped else every
+        hidden = read_hidden(request.motion, sampled, root=request.root)
+        return _ReadMotion(source, sampled, skipped, frames, hidden)
 
     def _cut(self, motion: Motion) -> tuple[LoadedGarment, SizeReduction]:
         """Return the garment cut to the size that the request keeps, so as to be best for this motion."""
@@ -145,7 +167,7 @@ def load_rollout(request: BakeRequest) -> BakeRollout:
     Raises:
         SsilkError: a file is missing or does not fit the others.
     """
-    return load_garment(request).over(request.motion)
+    return load_garment(request).over(request.motion, range=request.range, handles=request.handles)
 
 
 def with_model(rollout: BakeRollout, file: ModelFile) -> BakeRollout:
@@ -162,6 +184,13 @@ def _network_like(like: GarmentModel, file: ModelFile, request: BakeRequest) -> 
     model = network(file, replace(file.scene, character=like.scene.character))
     model.to(select_device(request.device))
     return model, cap_influences(model.deformer(), request.receiver)
+
+
+def _lead(frames: FrameRange, request: BakeRequest) -> int:
+    """Return how many frames of the motion before the shot are rolled out: they make whole samples of the shot."""
+    rate = (request.fps or frames.fps) * request.samples_per_frame / frames.fps
+    most = min(frames.earlier, round(max(LEAD, request.pre_roll) * frames.fps))
+    return next((count for count in range(most, 0, -1) if abs(count * rate - round(count * rate)) < 1e-6), 0)
 
 
 def _at_fps(motion: Motion, fps: float) -> Motion:

@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from math import inf
 
 from ..errors import fail
 from ..kinematics import MAX_FPS, MIN_FPS
@@ -19,14 +21,16 @@ MAX_SAMPLES_PER_FRAME = 64
 MAX_PRE_ROLL = 600.0  # [s]
 MAX_REFINE = 10_000
 ALLOWED_FPS = f"a positive rate from {MIN_FPS:g} to {MAX_FPS} is needed"
+MAX_HANDLES = 10_000
+_NUMBER = r"-?[0-9]{1,9}(?:\.[0-9]{1,9})?"
 
 
 @dataclass(frozen=True, kw_only=True)
 class BakeRequest:
     """One garment over one motion: all that decides how the garment moves.
 
-    Fields are named as the options of 'ssilk bake', which has none for `feedback` and names `root` in MODEL:/ROOT. A
-    shot stores its request, so that it can be verified later.
+    Fields are named as the options of 'ssilk bake', which has none for `feedback`, names `root` in MODEL:/ROOT, and
+    names `garment` and `shot` by patterns or in a list. A shot stores its request, so that it can be verified later.
 
     Attributes:
         model: file written by 'ssilk train'.
@@ -35,6 +39,8 @@ class BakeRequest:
         root: SkelRoot of the character, where the stage has several.
         fps: frames per second of the shot [1/s]; None for the motion's.
         samples_per_frame: samples in each frame, for motion blur.
+        range: "FIRST-LAST" in time codes of the motion's stage, or "all" samples; None for the range of the stage.
+        handles: frames before and after the range that are baked as well, where the motion has samples.
         pre_roll: run-up to the first pose and after each cut [s].
         target: who receives the shot, a name in `ssilk_core.targets.TARGETS`.
         lbs: bake linear blend skinning instead of the network.
@@ -44,6 +50,7 @@ class BakeRequest:
         hide_covered: hide the body's faces that the garment covers in every frame (see `mesh.hidden_faces`).
         keep: what is kept of the model, cut to be best for this motion; None for all.
         device: where the network runs.
+        garment, shot: names in a folder of layers; None for those of the model and the motion.
 
     Raises:
         SsilkError: an unknown target or refined output, or a number out of range.
@@ -55,6 +62,8 @@ class BakeRequest:
     root: str | None = None
     fps: float | None = None
     samples_per_frame: int = 1
+    range: str | None = None
+    handles: int = 0
     pre_roll: float = 0.0
     target: str = "usd"
     lbs: bool = False
@@ -64,6 +73,8 @@ class BakeRequest:
     hide_covered: bool = False
     keep: ModelSize | None = None
     device: str = "cpu"
+    garment: str | None = None
+    shot: str | None = None
 
     def __post_init__(self) -> None:
         for name in INPUTS:  # a pathlib.Path is as good, but USD's metadata stores text
@@ -73,6 +84,10 @@ class BakeRequest:
         if not 1 <= self.samples_per_frame <= MAX_SAMPLES_PER_FRAME:
             found = f"{self.samples_per_frame} samples in each frame"
             fail("--samples-per-frame", found, f"1 to {MAX_SAMPLES_PER_FRAME} are allowed")
+        if not 0 <= self.handles <= MAX_HANDLES:
+            fail("--handles", f"{self.handles} frames", f"0 to {MAX_HANDLES} are allowed")
+        if self.time_range and not self.time_range[0] <= self.time_range[1]:
+            fail(f"--range {self.range}", "it ends before it begins", "FIRST-LAST is needed, such as 1001-1100")
         if not 0 <= self.pre_roll <= MAX_PRE_ROLL:
             fail("--pre-roll", f"{self.pre_roll:g} seconds", f"0 to {MAX_PRE_ROLL:g} are allowed")
         if self.fps is not None and not MIN_FPS <= self.fps <= MAX_FPS:
@@ -90,6 +105,19 @@ class BakeRequest:
                 "they can be written as points",
                 "use --refined-output points",
             )
+
+    @property
+    def time_range(self) -> tuple[float, float] | None:
+        """First and last time code of the range, infinite for all samples; None for that of the stage."""
+        if self.range is None:
+            return None
+        if self.range == "all":
+            return -inf, inf
+        found = re.fullmatch(rf"({_NUMBER})-({_NUMBER})", self.range)
+        if not found:
+            allowed = "first and last time code are needed, such as 1001-1100, or 'all'"
+            fail("--range", f"'{self.range}'", allowed)
+        return float(found[1]), float(found[2])
 
     @property
     def inputs(self) -> dict[str, str]:

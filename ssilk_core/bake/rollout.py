@@ -17,6 +17,7 @@ from .request import BakeRequest
 from .result import FrameSpan, RefinementSummary
 
 if TYPE_CHECKING:
+    from ssilk_usd.frame_range import FrameRange
     from ssilk_usd.garment_api import GarmentRecord
     from ssilk_usd.units import StageUnits
 
@@ -48,6 +49,8 @@ class BakeRollout:
         model: the network; None under linear blend skinning.
         deformer: the garment as its target takes it.
         motion: the character's motion at the shot's samples; `source` is the motion as it was read.
+        lead: samples of `source` before the shot.
+        frames: which frames of the motion the shot plays; None for a pose without samples.
         hidden: at which frames of the motion the garment becomes hidden (True) or visible (False).
         units: units and up axis of the shot.
         inputs: what the request's inputs held while they were read.
@@ -70,6 +73,8 @@ class BakeRollout:
     provenance: dict[str, object]
     record: GarmentRecord
     fabric: Fabric
+    lead: int = 0
+    frames: FrameRange | None = None
     reduction: SizeReduction | None = None
     refinement: Refinement | None = None
     recovered: list[FrameSpan] = field(default_factory=list)
@@ -100,10 +105,16 @@ class BakeRollout:
 
         self.recovered.clear()
         rate, pre_roll = self.motion.fps, self.request.pre_roll
-        yield from garment_poses(self.model, self.source, rate, CHUNK, self._note, pre_roll=pre_roll)
+        poses = garment_poses(self.model, self.source, rate, CHUNK, self._note, pre_roll=pre_roll)
+        for pose in poses:
+            skipped = max(self.lead - pose.start, 0)
+            if skipped < pose.frame_count:
+                start = pose.start + skipped - self.lead
+                yield GarmentPose(start, pose.rotations[skipped:], pose.weights[skipped:])
 
     def _note(self, frames: range) -> None:
-        self.recovered.append(FrameSpan(frames[0], frames[-1]))
+        if frames[-1] >= self.lead:
+            self.recovered.append(FrameSpan(max(frames[0] - self.lead, 0), frames[-1] - self.lead))
 
     def vertices(self, report: Reporter = silent) -> Iterator[Floats]:
         """Yield the decoder's garment vertices in the world [m], shape (V, 3), of each of the shot's poses."""
@@ -132,6 +143,16 @@ class BakeRollout:
         from ..rollout import decode
 
         return decode(self.model, self.motion, pose)
+
+    def tell(self, report: Reporter) -> None:
+        """Report which frames of the motion are played, unless it is all of them."""
+        if self.frames is None:
+            return
+        name = self.request.motion
+        if self.frames.left_out:
+            report(Message(f"{name}: {self.frames.left_out}", "warning"))
+        if self.frames.chosen or self.request.handles:
+            report(Message(f"{name}: {self.frames}"))
 
     def warn(self, report: Reporter) -> None:
         """Report where the motion jumps, and at which frames the rollout was lost."""

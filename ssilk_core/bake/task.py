@@ -4,16 +4,15 @@
 from __future__ import annotations
 
 import os
-import re
-from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ..checkpoint import load_model
 from ..errors import fail
 from ..targets import check_influences
 from .inputs import InputHashes
+from .naming import file_name, prim_name
 from .request import BakeRequest, need_body
 
 LONGEST_NAME = 255  # [bytes] of a file or folder
@@ -31,6 +30,7 @@ class BakeTask:
         points: write a point cache as well.
         verify: re-skin the written layer and compare it.
         pinned: what its inputs have to hold, as they did when its job was submitted; None for whatever they hold.
+        replace: bake even where one of the names was used for another input.
     """
 
     garment: str
@@ -40,6 +40,7 @@ class BakeTask:
     points: bool = False
     verify: bool = True
     pinned: InputHashes | None = None
+    replace: bool = False
 
     @property
     def name(self) -> str:
@@ -47,15 +48,22 @@ class BakeTask:
 
 
 def plan_layers(
-    requests: Iterable[BakeRequest], *, include_body: bool = True, points: bool = False, verify: bool = True
+    requests: Iterable[BakeRequest],
+    *,
+    include_body: bool = True,
+    points: bool = False,
+    verify: bool = True,
+    replace_names: bool = False,
 ) -> list[BakeTask]:
     """Return a task for each request; tasks of one garment follow each other.
 
-    Garments are named after their models, with the SkelRoot in front where one is named, and shots after their
-    motions. A character's body comes with the first of its garments.
+    Garments and shots that a request does not name are named after their models, with the SkelRoot in front where one
+    is named, and after their motions. Each asset has the body of its character, whichever garments are baked with it;
+    a shot shows one of them.
 
     Args:
         points: write point caches as well; refined points are always written.
+        replace_names: bake even where a name was used for another input before.
 
     Raises:
         SsilkError: two garments or two shots would have one name, or a request is not for layers: its target takes
@@ -63,28 +71,27 @@ def plan_layers(
     """
     requests = list(requests)
     _need_for_layers(requests, include_body)
-    garments = {(request.model, request.root): _garment_name(request) for request in requests}
-    shots = {request.motion: _shot_name(request) for request in requests}
-    _need_unique(list(garments.values()), "MODEL", "garments")
-    _need_unique(list(shots.values()), "--motion", "shots")
-    first: dict[str | None, str] = {}
-    for (_, root), garment in garments.items():
-        first.setdefault(root, garment)
     tasks = [
         BakeTask(
-            garment=garment,
-            shot=shots[request.motion],
-            request=request,
-            include_body=include_body and first[request.root] == garment,
+            garment=_garment_name(request),
+            shot=_shot_name(request),
+            request=replace(request, garment=None, shot=None),
+            include_body=include_body,
             points=points or request.writes_points,
             verify=verify,
+            replace=replace_names,
         )
-        for worn, garment in garments.items()
         for request in requests
-        if (request.model, request.root) == worn
     ]
-    _need_unique([task.name for task in tasks], "MODEL", "tasks")
-    return tasks
+    _need_unique([(task.garment, _worn(task.request)) for task in tasks], "MODEL", "garment", "--garment-name")
+    _need_unique([(task.shot, task.request.motion) for task in tasks], "--motion", "shot", "--shot-name or --shots")
+    order = list(dict.fromkeys(task.garment for task in tasks))
+    seen: set[str] = set()
+    for task in tasks:
+        if task.name in seen:
+            fail(task.request.model, f"'{task.name}' is to be baked twice", "a garment is baked once in a shot")
+        seen.add(task.name)
+    return sorted(tasks, key=lambda task: order.index(task.garment))
 
 
 def has_possible_names(task: BakeTask) -> bool:
@@ -127,16 +134,11 @@ def _need_for_layers(requests: Sequence[BakeRequest], include_body: bool) -> Non
 
 def _garment_name(request: BakeRequest) -> str:
     stem = _stem(request.model)
-    return identifier(f"{_leaf(request.root)}_{stem}" if request.root else stem)
+    return prim_name(request.garment or (f"{_leaf(request.root)}_{stem}" if request.root else stem))
 
 
 def _shot_name(request: BakeRequest) -> str:
-    return re.sub(r"[^\w-]", "_", _stem(request.motion), flags=re.ASCII)
-
-
-def identifier(text: str) -> str:
-    """Return text as the name of a prim, and of a folder."""
-    return re.sub(r"^(?=\d|$)", "_", re.sub(r"\W", "_", text, flags=re.ASCII))
+    return file_name(request.shot or _stem(request.motion))
 
 
 def _stem(location: str) -> str:
@@ -148,12 +150,22 @@ def _leaf(path: str) -> str:
     return path.rstrip("/").rpartition("/")[2]
 
 
-def _need_unique(names: Sequence[str], where: str, what: str) -> None:
-    name, times = Counter(names).most_common(1)[0] if names else ("", 1)
-    if times != 1:
-        fail(
-            where,
-            f"{times} {what} are named '{name}'",
-            "files and folders are named by them",
-            "rename one of the files",
-        )
+def _worn(request: BakeRequest) -> str:
+    return f"{request.model}:{request.root}" if request.root else request.model
+
+
+def _need_unique(named: Iterable[tuple[str, str]], where: str, kind: str, option: str) -> None:
+    """Raise `SsilkError` where two inputs have one name, or names that not every file system tells apart."""
+    first: dict[str, tuple[str, str]] = {}
+    for name, location in named:
+        other, before = first.setdefault(name.casefold(), (name, location))
+        if before != location:
+            both = (
+                f"the {kind} '{name}'" if other == name else f"the {kind}s '{other}' and '{name}', one on some disks"
+            )
+            fail(
+                where,
+                f"'{before}' and '{location}' would both be {both}",
+                "files and folders are named by them",
+                f"name them with {option}, such as {{parent}}_{{stem}}",
+            )

@@ -55,6 +55,7 @@ def bake(
         request, quality=quality, budget=budget, suffix=path.suffix, include_body=include_body, report=report
     )
     report(Started("bake", rollout.motion.frame_count, {"output": str(path)}))
+    rollout.tell(report)
     rollout = refined(rollout, report)
     hidden = covered_polygons(rollout, report) if request.hide_covered else None
     skin = SkinMeter(rollout)

@@ -9,8 +9,8 @@ from math import nan
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..bake import BakeRequest
-from ..bake.request import MAX_PRE_ROLL, MAX_REFINE, MAX_SAMPLES_PER_FRAME
+from ..bake import BakeRequest, naming
+from ..bake.request import MAX_HANDLES, MAX_PRE_ROLL, MAX_REFINE, MAX_SAMPLES_PER_FRAME
 from ..config import apply_overrides
 from ..errors import fail
 from ..events import Reporter
@@ -95,11 +95,28 @@ def add_bake(verb: argparse.ArgumentParser) -> None:
                       help="models written by 'ssilk train'; ROOT is the SkelRoot that wears it, where the stage has "
                            "several")  # fmt: skip
     verb.add_argument("--stage", type=Path, required=True, help="USD file with the characters")
-    verb.add_argument("--motion", nargs="+", required=True, metavar="SHOT[:/PRIM]",
-                      help="USD files with motions; PRIM is the SkelAnimation, where there are several")  # fmt: skip
+    motions = verb.add_mutually_exclusive_group(required=True)
+    motions.add_argument(
+        "--motion",
+        nargs="+",
+        metavar="SHOT[:/PRIM]",
+        help="USD files with motions; PRIM is the SkelAnimation, where there are several",
+    )
+    motions.add_argument("--shots", type=Path, metavar="LIST",
+                         help='JSON file of named shots, {"s010": "s010/anim.usdc", ...}; paths are relative to '
+                              "it")  # fmt: skip
     about = "; ".join(f"{name}: {target.about}" for name, target in TARGETS.items())
     verb.add_argument("--target", choices=TARGETS, default="usd", help=f"who receives it (default usd). {about}")
     verb.add_argument("--fps", type=RATE, help="frames per second of the shot (default: the motion's)")
+    verb.add_argument(
+        "--range",
+        metavar="FIRST-LAST",
+        help="frames to bake, as time codes of the motion, such as 1001-1100, or 'all' that have samples (default: "
+        "the range of the motion's stage, or all)",
+    )
+    verb.add_argument("--handles", type=NumberRange(0, MAX_HANDLES, int), default=0, metavar="N",
+                      help="frames before and after the range that are baked as well, where there are samples "
+                           "(default 0)")  # fmt: skip
     verb.add_argument("--samples-per-frame", type=NumberRange(1, MAX_SAMPLES_PER_FRAME, int), default=1, metavar="N",
                       help="samples in each frame, for motion blur (default 1)")  # fmt: skip
     verb.add_argument(
@@ -109,7 +126,20 @@ def add_bake(verb: argparse.ArgumentParser) -> None:
         metavar="SECONDS",
         help="run-up to the first pose and after each cut, so that the garment has settled (default 0)",
     )
+    _add_names(verb)
     _add_output(verb)
+
+
+def _add_names(verb: argparse.ArgumentParser) -> None:
+    """Add the options that say how garments and shots are named in a folder."""
+    names = verb.add_argument_group("names in a folder of layers", f"In a pattern, {naming.FIELDS}.")
+    names.add_argument("--shot-name", metavar="PATTERN",
+                       help="such as s010 for one motion, or '{parent2}_{stem}' (default: the file's, and the prim's "
+                            "where one is named)")  # fmt: skip
+    names.add_argument("--garment-name", metavar="PATTERN",
+                       help="such as cape, or '{parent}' (default: the model's, with ROOT in front)")  # fmt: skip
+    names.add_argument("--replace", action="store_true",
+                       help="bake even where a name was used for another input before")  # fmt: skip
 
 
 def _add_output(verb: argparse.ArgumentParser) -> None:
@@ -151,14 +181,24 @@ def requests_of(options: argparse.Namespace) -> list[BakeRequest]:
     """Return a request for each model over each motion, as the options of `add_bake` say."""
     from ssilk_usd.read_stage import split_location
 
-    named = [split_location(model) for model in options.model]
+    shots: list[tuple[str | None, naming.ListedShot]]
+    if options.shots:
+        if options.shot_name:
+            fail("--shot-name", "a pattern and a list of shots", "the list names them", "leave one of them out")
+        shots = list(naming.read_shots(options.shots).items())
+    else:
+        listed = map(naming.ListedShot, options.motion)
+        shots = [(_name(options.shot_name, shot.motion, "--shot-name"), shot) for shot in listed]
+    worn = [(split_location(model), _name(options.garment_name, model, "--garment-name")) for model in options.model]
     return [
         BakeRequest(
             model=model,
             stage=options.stage,
-            motion=motion,
+            motion=shot.motion,
             root=root,
             fps=options.fps,
+            range=shot.range or options.range,
+            handles=options.handles,
             samples_per_frame=options.samples_per_frame,
             pre_roll=options.pre_roll,
             target=options.target,
@@ -167,15 +207,26 @@ def requests_of(options: argparse.Namespace) -> list[BakeRequest]:
             refined_output=options.refined_output,
             hide_covered=options.hide_covered,
             device=options.device,
+            garment=garment,
+            shot=name,
         )
-        for model, root in named
-        for motion in options.motion
+        for (model, root), garment in worn
+        for name, shot in shots
     ]
+
+
+def _name(pattern: str | None, location: str, option: str) -> str | None:
+    return naming.pattern_name(pattern, location, option) if pattern else None
 
 
 def layer_options(options: argparse.Namespace) -> dict[str, bool]:
     """Return what `plan_layers` takes beside requests, as the options of `add_bake` say."""
-    return {"include_body": not options.no_body, "points": options.points, "verify": not options.no_verify}
+    return {
+        "include_body": not options.no_body,
+        "points": options.points,
+        "verify": not options.no_verify,
+        "replace_names": options.replace,
+    }
 
 
 def is_folder(output: Path) -> bool:

@@ -161,7 +161,7 @@ class Bench:
         @lru_cache(4)
         def rollout(fps: float) -> BakeRollout:
             return load_rollout(
-                BakeRequest(model=str(path), stage=stage, motion=motion, fps=fps, root=self.options.root)
+                BakeRequest(model=str(path), stage=stage, motion=motion, range="all", fps=fps, root=self.options.root)
             )
 
         return lambda file, fps: shot_bytes(with_model(rollout(fps), file), ".usdc", include_body=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,9 +13,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from openjd.model import IntRangeExpr, create_job, decode_job_template, preprocess_job_parameters
+from pxr import Tf
 
 from ssilk_core.bake import BakeRequest, BakeResult, BakeTask, FrameSpan, Verification, plan_layers
 from ssilk_core.bake.inputs import InputHashes
+from ssilk_core.bake.naming import file_name, pattern_name, prim_name
 from ssilk_core.bake.record import RECORD, TaskRecord, current_record, read_record, task_key, write_record
 from ssilk_core.errors import SsilkError
 from ssilk_core.events import Failed, GarmentEvent, Message, Progress, Result, Started
@@ -35,24 +38,46 @@ def requests(models: list[tuple[str, str | None]], motions: list[str]) -> list[B
     return [replace(REQUEST, model=model, root=root, motion=motion) for motion in motions for model, root in models]
 
 
-def test_tasks_of_one_model_follow_each_other_and_a_character_has_one_body():
+def test_tasks_of_one_model_follow_each_other():
     models = [("/m/cape.safetensors", "/World/Anna"), ("/m/hat.safetensors", "/World/Anna"),
               ("/m/cape.safetensors", "/World/Bert")]  # fmt: skip
     tasks = plan_layers(requests(models, ["a/01 walk.usd", "b/run.usd:/Clips/Fast"]))
     assert [task.name for task in tasks] == [
         f"{shot}/{garment}" for garment in ("Anna_cape", "Anna_hat", "Bert_cape") for shot in ("01_walk", "run_Fast")
     ]
-    assert [task.include_body for task in tasks] == [True, True, False, False, True, True]
 
 
 @pytest.mark.parametrize(("models", "motions", "says"), [
-    (["a/x.safetensors", "b/x.safetensors"], ["w.usd"], "2 garments are named 'x'"),
-    (["x.safetensors"], ["a/w.usd", "b/w.usda"], "2 shots are named 'w'"),
-    (["x.safetensors", "x.safetensors"], ["w.usd"], "tasks are named 'w/x'"),
+    (["a/x.safetensors", "b/x.safetensors"], ["w.usd"], "'a/x.safetensors' and 'b/x.safetensors' would both"),
+    (["x.safetensors"], ["a/w.usd", "b/w.usda"], "'a/w.usd' and 'b/w.usda' would both be the shot 'w'"),
+    (["x.safetensors"], ["a/w.usd", "b/W.usda"], "would both be the shots 'w' and 'W', one on some disks"),
+    (["x.safetensors", "x.safetensors"], ["w.usd"], "'w/x' is to be baked twice"),
 ])  # fmt: skip
 def test_no_two_tasks_write_the_same_file(models, motions, says):
     with pytest.raises(SsilkError, match=says):
         plan_layers(requests([(model, None) for model in models], motions))
+
+
+def test_names_of_other_letters_stay_apart():
+    tasks = plan_layers(requests([("/m/cape.safetensors", None)], ["衣.usd", "空.usd", "e\u0301.usd", "walk 2.usd"]))
+    names = [task.shot for task in tasks]
+    assert len(set(names)) == 4 and names[3] == "walk_2" and re.fullmatch(r"e_[0-9a-f]{8}", names[2])
+    assert file_name("\u00e9") == names[2]  # the same letter, as other file systems store it
+    assert all(re.fullmatch(r"[\w-]+", name, re.ASCII) for name in names)
+    assert Tf.IsValidIdentifier(prim_name("1-衣")) and len(file_name("x" * 300)) < 120
+
+
+@pytest.mark.parametrize(("pattern", "expected"), [
+    ("{parent2}_{stem}", "show_01 walk"), ("s010", "s010"), ("{parent}-{prim}", "s-Fast"),
+])  # fmt: skip
+def test_patterns_over_paths(pattern, expected):
+    assert pattern_name(pattern, "/show/s/01 walk.usd:/Clips/Fast", "--shot-name") == expected
+
+
+@pytest.mark.parametrize("pattern", ["{stem.__class__}", "{parent9}", "{}", "{prim}"])
+def test_patterns_that_a_path_does_not_have(pattern):
+    with pytest.raises(SsilkError, match=re.escape(f"--shot-name {pattern}: '/show/walk.usd' has no {pattern}")):
+        pattern_name(pattern, "/show/walk.usd", "--shot-name")
 
 
 @pytest.mark.parametrize(("change", "says"), [

@@ -13,7 +13,7 @@ Artists put layers of their own above these: nothing here is edited in place, an
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,7 +21,7 @@ import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from ssilk_core.assets import Deformer, Floats, GarmentPose, Motion
-from ssilk_core.errors import SsilkError
+from ssilk_core.errors import SsilkError, fail
 from ssilk_core.files import replacing, sha256
 
 from .author import Asset, define_asset, extent_array
@@ -29,6 +29,7 @@ from .body_faces import HiddenPolygons, hide_polygons
 from .export import new_stage, save
 from .garment_api import GarmentRecord
 from .layers_facts import AssetFacts, asset_facts
+from .read_mesh import is_garment
 from .read_stage import open_stage
 from .samples import PATH_OP, Samples, kept_joints, root_path
 from .shot import ShotSummary, TimeSpan, set_metadata, set_visibility, summary, write_samples
@@ -280,23 +281,91 @@ def write_points(
         return sha256(temporary)
 
 
-def write_stage(garments: Sequence[Layout]) -> None:
-    """Write the stage of a shot, which references each garment and spans all frames; keep an identical file."""
-    layout = garments[0]
-    stages = [open_stage(garment.animation) for garment in garments]
-    layers = [stage.GetRootLayer() for stage in stages]
-    first = layers[0].pseudoRoot
+@dataclass(frozen=True)
+class WrittenStage:
+    """The stage of a shot: garments that are left out because they cannot be read, and why; garments whose body is
+    not shown, with the garment whose body is."""
+
+    unreadable: Mapping[str, str]
+    bodies: Mapping[str, str]
+
+
+def write_stage(garments: Mapping[Layout, Hashable]) -> WrittenStage:
+    """Write the stage of a shot, which references each garment and spans all frames; keep an identical file.
+
+    Args:
+        garments: the garments of one shot, and who wears each: the body of a character is shown with the first of
+            its garments that has one.
+            If none can be read, no stage is written.
+
+    Raises:
+        SsilkError: the garments have different units or axes, or the file cannot be written.
+    """
+    stages, unreadable = _opened(garments)
+    shown: dict[Hashable, str] = {}
+    others: dict[str, str] = {}
+    if not stages:
+        return WrittenStage(unreadable, others)
+    layout, units = next(iter(stages)), _common_units(stages)
+    first = stages[layout].GetRootLayer()
+    spans = [_span(stage.GetRootLayer(), first.timeCodesPerSecond) for stage in stages.values()]
     with replacing(layout.stage, keep_same=True) as temporary:
-        stage = new_stage(temporary, StageUnits.of(stages[0]))
+        stage = new_stage(temporary, units)
         shot = UsdGeom.Xform.Define(stage, "/Shot").GetPrim()
         stage.SetDefaultPrim(shot)
         Usd.ModelAPI(shot).SetKind(Kind.Tokens.assembly)
         for name in ("timeCodesPerSecond", "framesPerSecond"):
-            stage.SetMetadata(name, first.GetInfo(name))
-        stage.SetStartTimeCode(min(layer.startTimeCode for layer in layers))
-        stage.SetEndTimeCode(max(layer.endTimeCode for layer in layers))
-        for garment in garments:
+            stage.SetMetadata(name, first.pseudoRoot.GetInfo(name))
+        stage.SetStartTimeCode(min(start for start, _ in spans))
+        stage.SetEndTimeCode(max(end for _, end in spans))
+        for garment, opened in stages.items():
             prim = stage.DefinePrim(shot.GetPath().AppendChild(garment.garment))
             prim.GetReferences().AddReference(os.path.relpath(garment.animation, layout.stage.parent))
+            bodies = _body_names(opened)
+            if bodies and shown.setdefault(garments[garment], garment.garment) != garment.garment:
+                others[garment.garment] = shown[garments[garment]]
+                for name in bodies:
+                    stage.OverridePrim(prim.GetPath().AppendChild(name)).SetActive(False)
+        free_when_closed(stage.GetUsedLayers())
         save(stage.GetRootLayer(), layout.stage)
-        del stage, shot
+        del stage, shot, prim
+    return WrittenStage(unreadable, others)
+
+
+def _opened(garments: Iterable[Layout]) -> tuple[dict[Layout, Usd.Stage], dict[str, str]]:
+    """Return the stages of garments that can be read, and why others cannot."""
+    stages, unreadable = {}, {}
+    for garment in garments:
+        try:
+            stages[garment] = open_stage(garment.animation)
+        except SsilkError as error:
+            unreadable[garment.garment] = str(error)
+    return stages, unreadable
+
+
+def _common_units(stages: Mapping[Layout, Usd.Stage]) -> StageUnits:
+    """Return the units of the garments of a shot, which references do not convert."""
+    found = {garment: StageUnits.of(stage) for garment, stage in stages.items()}
+    one = next(iter(found))
+    for other, units in found.items():
+        if units != found[one]:
+            fail(
+                str(one.stage),
+                f"'{one.garment}' is in units of {found[one].meters_per_unit:g} m with {found[one].up_axis} up, "
+                f"'{other.garment}' in units of {units.meters_per_unit:g} m with {units.up_axis} up",
+                "the garments of a shot share units and axis",
+                "bake them for one target, or into separate folders",
+            )
+    return found[one]
+
+
+def _span(layer: Sdf.Layer, rate: float) -> tuple[float, float]:
+    """Return the first and last time code of a layer, as a stage of another rate plays them."""
+    scale = rate / layer.timeCodesPerSecond
+    return layer.startTimeCode * scale, layer.endTimeCode * scale
+
+
+def _body_names(stage: Usd.Stage) -> list[str]:
+    """Return the names of the body meshes that come with a garment."""
+    prims = stage.GetDefaultPrim().GetChildren()
+    return [prim.GetName() for prim in prims if prim.IsA(UsdGeom.Mesh) and not is_garment(prim)]

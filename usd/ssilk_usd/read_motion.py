@@ -64,18 +64,26 @@ def _listed_folders(paths: Iterable[str | Path]) -> list[Path]:
 
 
 @needs_whole_files
-def read_motion(source: StageLike, skeleton: Skeleton, *, prim: str | None = None, root: str | None = None) -> Motion:
+def read_motion(
+    source: StageLike,
+    skeleton: Skeleton,
+    *,
+    prim: str | None = None,
+    root: str | None = None,
+    within: tuple[float, float] | None = None,
+) -> Motion:
     """Read a motion at its own rate: framesPerSecond if authored, else timeCodesPerSecond.
 
-    Frames run from the first to the last authored sample; USD interpolates between samples. On a character, the
-    root joints include the xforms above the skeleton, animated or not. Joints are matched by path, then by unique
-    leaf name. Joints that the animation lacks stay in the rest pose.
+    Frames run from the first to the last authored sample, whatever range the stage says; USD interpolates between
+    samples. On a character, the root joints include the xforms above the skeleton, animated or not. Joints are
+    matched by path, then by unique leaf name. Joints that the animation lacks stay in the rest pose.
 
     Args:
         source: a file with a SkelAnimation, as "file[:/Prim/Path]", or a stage with an animated character.
         skeleton: skeleton whose joints the motion is for.
         prim: the SkelAnimation, by path or name, if there are several.
         root: the character, by path or name, if several are animated.
+        within: time codes of the first and the last frame, in place of all samples.
 
     Raises:
         SsilkError: there is no animation or several, it is for another skeleton or has scales, or the data is
@@ -89,7 +97,7 @@ def read_motion(source: StageLike, skeleton: Skeleton, *, prim: str | None = Non
     where = location(animation)
     joints = tuple(str(name) for name in UsdSkel.Animation(animation).GetJointsAttr().Get() or ())
     match = _matched(joints, skeleton, where)
-    codes, fps = _time_codes(stage, animation, placed)
+    codes, fps = _time_codes(stage, animation, placed, within)
     placements = np.stack([world_matrix(placed, code) for code in codes]) if placed else np.eye(4)[None]
     if placed:
         need_similarity(placed, placements)
@@ -157,25 +165,16 @@ def _matched(joints: tuple[str, ...], skeleton: Skeleton, where: str) -> Ints:
     return match
 
 
-def _time_codes(stage: Usd.Stage, animation: Usd.Prim, placed: Usd.Prim | None) -> tuple[Floats, float]:
+def _time_codes(
+    stage: Usd.Stage, animation: Usd.Prim, placed: Usd.Prim | None, within: tuple[float, float] | None
+) -> tuple[Floats, float]:
     """Return the time codes of the frames and their rate [1/s]."""
-    second = stage.GetTimeCodesPerSecond()
-    fps = stage.GetFramesPerSecond() if stage.HasAuthoredMetadata("framesPerSecond") else second
-    for rate, what, most in ((fps, "frames", MAX_FPS), (second, "time codes", _MOST_TIME_CODES)):
-        if not MIN_FPS <= rate <= most:
-            where = stage.GetRootLayer().identifier
-            fail(where, f"a rate of {rate:g} {what}", f"it must be from {MIN_FPS:g} to {most:g} in a second")
-    samples = [
-        time for name in ("rotations", "translations") for time in animation.GetAttribute(name).GetTimeSamples()
-    ]
-    above = placed
-    while above and not above.IsPseudoRoot():
-        samples += UsdGeom.Xformable(above).GetTimeSamples() if above.IsA(UsdGeom.Xformable) else []
-        above = above.GetParent()
-    if not samples:
+    fps, second = frame_rate(stage)
+    span = within or sampled_span(animation, placed)
+    if span is None:
         return np.zeros(1), fps
     step = second / fps
-    first, last = min(samples), max(samples)
+    first, last = span
     if last - first >= step * _MOST_FRAMES:
         fail(
             location(animation),
@@ -184,6 +183,29 @@ def _time_codes(stage: Usd.Stage, animation: Usd.Prim, placed: Usd.Prim | None) 
             "remove stray samples",
         )
     return first + step * np.arange(int((last - first) / step + 1e-6) + 1), fps
+
+
+def frame_rate(stage: Usd.Stage) -> tuple[float, float]:
+    """Return the frames and the time codes of a second; raise `SsilkError` where they are out of range."""
+    second = stage.GetTimeCodesPerSecond()
+    fps = stage.GetFramesPerSecond() if stage.HasAuthoredMetadata("framesPerSecond") else second
+    for rate, what, most in ((fps, "frames", MAX_FPS), (second, "time codes", _MOST_TIME_CODES)):
+        if not MIN_FPS <= rate <= most:
+            where = stage.GetRootLayer().identifier
+            fail(where, f"a rate of {rate:g} {what}", f"it must be from {MIN_FPS:g} to {most:g} in a second")
+    return fps, second
+
+
+def sampled_span(animation: Usd.Prim, placed: Usd.Prim | None) -> tuple[float, float] | None:
+    """Return the time codes of the first and last sample of a motion and its placement; None where there is none."""
+    samples = [
+        time for name in ("rotations", "translations") for time in animation.GetAttribute(name).GetTimeSamples()
+    ]
+    above = placed
+    while above and not above.IsPseudoRoot():
+        samples += UsdGeom.Xformable(above).GetTimeSamples() if above.IsA(UsdGeom.Xformable) else []
+        above = above.GetParent()
+    return (min(samples), max(samples)) if samples else None
 
 
 def read_samples(animation: Usd.Prim, codes: Floats, count: int, where: str) -> tuple[Floats, Floats]:

@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What becomes of a shot that several commands bake for, and of names that several inputs would have."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import shutil
+from pathlib import Path
+
+import pytest
+from pxr import Usd
+from ssilk_usd import layers as layers_of_usd
+from ssilk_usd.play import Shot
+
+from ssilk_core.bake import shots as gathering
+from ssilk_core.cli import main
+
+
+@pytest.fixture(scope="module")
+def world(toy, tmp_path_factory):
+    """The toy world with a model of two names, and one baked over a clip of 6 frames into `layers`."""
+    folder = tmp_path_factory.mktemp("shots")
+    toy.copy(folder)
+    shutil.move(folder / "model.safetensors", folder / "overalls.safetensors")
+    shutil.copy(folder / "overalls.safetensors", folder / "shirt.safetensors")
+    for name in ("walk", "run"):
+        toy.write_clip(folder / f"{name}.usda", frames=6)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        assert bake("overalls.safetensors", "--motion walk.usda -o layers") == 0
+    return folder
+
+
+@pytest.fixture
+def copy(world, tmp_path, monkeypatch):
+    shutil.copytree(world, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def bake(models: str, words: str) -> int:
+    return main(shlex.split(f"bake {models} --stage rigged.usda --no-verify {words}"))
+
+
+def garments(shot: str = "walk") -> list[str]:
+    stage = Usd.Stage.Open(f"layers/shots/{shot}/shot.usda")
+    return [prim.GetName() for prim in stage.GetDefaultPrim().GetChildren()]
+
+
+def test_a_second_bake_joins_the_first_and_the_character_keeps_one_body(copy):
+    assert bake("shirt.safetensors", "--motion walk.usda -o layers") == 0
+    shot = Shot("layers/shots/walk/shot.usda")
+    assert [mesh.path for mesh in shot.meshes if mesh.is_garment] == ["/Shot/overalls/Skirt", "/Shot/shirt/Skirt"]
+    assert [mesh.path for mesh in shot.meshes if not mesh.is_garment] == ["/Shot/overalls/Body"]
+    together = Path("layers/shots/walk/shot.usda").read_bytes()
+    shutil.rmtree("layers")
+    for model in ("shirt", "overalls"):
+        assert bake(f"{model}.safetensors", "--motion walk.usda -o layers") == 0
+    assert Path("layers/shots/walk/shot.usda").read_bytes() == together  # in any order
+
+
+def test_what_another_process_finishes_while_a_stage_is_written_is_not_lost(copy, monkeypatch):
+    """The other one finishes, stage and all, between our look at the folder and the rename of our stage."""
+    write, other = layers_of_usd.write_stage, []
+
+    def late(garments):
+        if not other:
+            other.append(garments)
+            assert bake("shirt.safetensors", "--motion walk.usda -o layers") == 0
+        return write(garments)
+
+    monkeypatch.setattr(layers_of_usd, "write_stage", late)
+    gathering.write_shot_stage(Path("layers"), "walk")
+    assert len(other) == 1 and garments() == ["overalls", "shirt"]
+
+
+def test_garments_are_taken_out(copy, capsys):
+    assert bake("shirt.safetensors overalls.safetensors", "--motion walk.usda run.usda -o layers") == 0
+    assert main(shlex.split("remove layers walk/overalls")) == 0
+    assert garments("walk") == ["shirt"] and garments("run") == ["overalls", "shirt"]
+    paths = [mesh.path for mesh in Shot("layers/shots/walk/shot.usda").meshes]
+    assert paths == ["/Shot/shirt/Skirt", "/Shot/shirt/Body"]  # the body does not go with the overalls
+    assert not Path("layers/shots/walk/overalls").exists() and Path("layers/assets/overalls/asset.usda").is_file()
+    assert main(shlex.split("remove layers walk/overalls")) == 2
+    assert "no garment is baked as 'walk/overalls'; there are run/overalls" in capsys.readouterr().err
+    assert main(shlex.split("remove layers '*/shirt' run/overalls")) == 0
+    assert not list(Path("layers/shots").iterdir())
+
+
+def test_a_garment_that_cannot_be_read_is_left_out_and_told(copy, capsys):
+    assert bake("shirt.safetensors", "--motion walk.usda -o layers") == 0
+    Path("layers/shots/walk/overalls/anim.usdc").write_bytes(b"half")
+    capsys.readouterr()
+    assert bake("shirt.safetensors", "--motion walk.usda -o layers") == 0
+    assert garments() == ["shirt"] and "walk/overalls/anim.usdc" in capsys.readouterr().err
+
+
+def test_a_shot_of_several_rates_spans_them_all(copy, toy):
+    toy.write_clip(copy / "walk.usda", frames=21, fps=60.0)
+    assert bake("shirt.safetensors", "--motion walk.usda -o layers") == 0
+    stage = Usd.Stage.Open("layers/shots/walk/shot.usda")
+    assert (stage.GetTimeCodesPerSecond(), stage.GetEndTimeCode()) == (30.0, 10.0)
+    samples = stage.GetPrimAtPath("/Shot/shirt/Animation").GetAttribute("rotations").GetTimeSamples()
+    assert samples[-1] == pytest.approx(10.0)
+
+
+def test_garments_of_several_units_are_refused(copy, capsys):
+    before = Path("layers/shots/walk/shot.usda").read_bytes()
+    assert bake("shirt.safetensors", "--motion walk.usda -o layers --target blender") == 2
+    assert "'overalls' is in units of 1 m with Y up, 'shirt' in units of 1 m with Z up" in capsys.readouterr().err
+    assert Path("layers/shots/walk/shot.usda").read_bytes() == before
+
+
+def test_a_record_names_inputs_without_saying_where_the_studio_keeps_them(copy):
+    text = Path("layers/shots/walk/overalls/bake.json").read_text()
+    inputs = json.loads(text)["detail"]["inputs"]
+    assert {name: each["path"] for name, each in inputs.items()} == {
+        "model": "../overalls.safetensors", "stage": "../rigged.usda", "motion": "../walk.usda",
+    }  # fmt: skip
+    assert str(copy) not in text
+
+
+def two_sequences(toy) -> None:
+    """Two shots whose files have one name."""
+    for name, frames in (("s010", 5), ("s020", 4)):
+        Path(name).mkdir()
+        toy.write_clip(Path(name, "anim.usda"), frames=frames)
+
+
+def test_shots_whose_files_have_one_name_are_refused_in_one_command_and_in_two(copy, toy, capsys):
+    two_sequences(toy)
+    assert bake("shirt.safetensors", "--motion s010/anim.usda s020/anim.usda -o new") == 2
+    said = capsys.readouterr().err
+    assert "'s010/anim.usda' and 's020/anim.usda' would both be the shot 'anim'" in said and "--shot-name" in said
+    assert bake("shirt.safetensors", "--motion s010/anim.usda -o new") == 0
+    before = Path("new/shots/anim/shirt/anim.usdc").read_bytes()
+    for model in ("shirt", "overalls"):  # beside what is there, too, it would be another shot's
+        assert bake(f"{model}.safetensors", "--motion s020/anim.usda -o new") == 2
+        said = capsys.readouterr().err
+        assert "the shot 'anim' was baked from '../s010/anim.usda', not from 's020/anim.usda'" in said
+        assert "--replace" in said and Path("new/shots/anim/shirt/anim.usdc").read_bytes() == before
+    toy.write_clip(Path("s010/anim.usda"), frames=6)  # the same input, changed
+    assert bake("shirt.safetensors", "--motion s010/anim.usda -o new") == 0
+    assert Path("new/shots/anim/shirt/anim.usdc").read_bytes() != before
+    assert bake("shirt.safetensors", "--motion s020/anim.usda -o new --replace") == 0
+    assert Usd.Stage.Open("new/shots/anim/shot.usda").GetEndTimeCode() == 3
+
+
+@pytest.mark.parametrize("words", [
+    "--motion s010/anim.usda s020/anim.usda --shot-name '{parent}_{stem}'", "--shots lists/shots.json",
+])  # fmt: skip
+def test_shots_are_named_by_a_pattern_or_in_a_list(copy, toy, words):
+    two_sequences(toy)
+    Path("lists").mkdir()
+    named = {f"{name}_anim": f"../{name}/anim.usda" for name in ("s010", "s020")}
+    Path("lists/shots.json").write_text(json.dumps(named))
+    assert bake("shirt.safetensors", f"{words} --garment-name worn -o new") == 0
+    assert {path.parent.name for path in Path("new/shots").glob("*/shot.usda")} == {"s010_anim", "s020_anim"}
+    assert Usd.Stage.Open("new/shots/s020_anim/worn/anim.usdc").GetDefaultPrim().GetName() == "worn"
+
+
+def test_another_model_of_one_name_is_refused(copy, capsys):
+    Path("other").mkdir()
+    reduced = "reduce overalls.safetensors --shapes 2 --motions walk.usda -o other/overalls.safetensors"
+    assert main(shlex.split(reduced)) == 0
+    assert bake("overalls.safetensors other/overalls.safetensors", "--motion run.usda -o layers") == 2
+    assert "would both be the garment 'overalls'" in capsys.readouterr().err
+    assert bake("other/overalls.safetensors", "--motion run.usda -o layers") == 2  # its asset is that of all shots
+    said = capsys.readouterr().err
+    assert "the garment 'overalls' was baked from '../overalls.safetensors', not from 'other/overalls" in said
+    assert bake("other/overalls.safetensors", "--motion walk.usda -o layers --garment-name '{parent}'") == 0
+    assert garments() == ["other", "overalls"]
+    shutil.copy("overalls.safetensors", "other/overalls.safetensors")
+    assert bake("other/overalls.safetensors", "--motion run.usda -o layers") == 0  # it has only moved
+
+
+@pytest.mark.parametrize(("text", "says"), [
+    ("[]", "it names no shots"), ("{", "it cannot be read"), ('{"a": 3}', "in the shot 'a', '3' has no fields"),
+    ('{"a": "walk.usda", "a": "run.usda"}', "'a' is there twice"),
+    ('{"a.b": "walk.usda", "a b": "run.usda"}', "would both be the shot 'a_b'"),
+])  # fmt: skip
+def test_a_list_of_shots_that_names_none_is_refused(copy, capsys, text, says):
+    Path("shots.json").write_text(text)
+    assert bake("shirt.safetensors", "--shots shots.json -o new") == 2
+    assert says in capsys.readouterr().err and not Path("new").exists()
