@@ -113,7 +113,10 @@ class LayerFolder:
 
     def is_written(self, task: BakeTask, contents: InputHashes) -> bool:
         """Return whether a task is done with inputs that hold this, and its files are as they were written."""
-        return current_record(self._home(task), task_key(task, contents), self._files.sha256) is not None
+        return (
+            has_possible_names(task)
+            and current_record(self._home(task), task_key(task, contents), self._files.sha256) is not None
+        )
 
     def bake(self, task: BakeTask, *, again: bool = False, report: Reporter = silent) -> BakeResult:
         """Bake one garment in one shot, unless that is done already.
