@@ -122,7 +122,10 @@ class LayerFolder:
 
     def is_written(self, task: BakeTask, contents: InputHashes) -> bool:
         """Return whether a task is done with inputs that hold this, and its files are as they were written."""
-        return current_record(self._home(task), task_key(task, contents), self._files.sha256) is not None
+        return (
+            has_possible_names(task)
+            and current_record(self._home(task), task_key(task, contents), self._files.sha256) is not None
+        )
 
     def need_names(self, tasks: Iterable[BakeTask]) -> None:
         """Raise `SsilkError` where a name was used for another input, unless its task says so."""

@@ -101,7 +101,7 @@ def test_samples_within_frames_are_refined_too(there):
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        (["--refine", "-1"], "-1 iterations; 1 to 10000"),
+        (["--refine", "-1"], "a whole number from 0 to 10000"),
         (["--refine", "2", "--lbs", "--refined-output", "joints"], "use --refined-output points"),
         (["--refine", "2", "--budget", "1MB"], "a budget for points"),
     ],

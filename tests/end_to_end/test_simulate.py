@@ -108,7 +108,7 @@ def test_what_an_interrupted_simulation_finished_is_not_done_again(stage, monkey
         ("--motion brief.usda short.usda -o one.usdc", "one file for 2 motions"),
         ("--motion brief.usda ./brief.usda -o caches", "several files are called brief"),
         ("--motion brief.usda -o one.usdc --fps -3", "a number from 0.01 to 10000"),
-        ("--motion brief.usda -o one.usdc --tolerance 0", "tolerance = 0"),
+        ("--motion brief.usda -o one.usdc --tolerance 0", "a number from 1e-09 to 1000"),
         ("--motion nowhere.usda -o one.usdc", "there is no such file"),
         ("--motion brief.usda -o brief.usda", "output is also an input"),
     ],
