@@ -93,7 +93,7 @@ def test_a_range_of_the_stage_that_is_not_sampled(world, capsys, stage, span, te
     ("--range 15-25", "--range 15-25: walk.usda has samples from time code 0 to 19; a range lies within them"),
     ("--range=-3-5", "--range -3-5: walk.usda has samples"), ("--range 9-3", "it ends before it begins"),
     ("--range 9", "'9'; first and last time code are needed"), ("--range a-b", "'a-b'"),
-    ("--handles -1", "--handles: -1 frames"),
+    ("--handles -1", "--handles: '-1' is not a whole number from 0 to 10000"),
 ])  # fmt: skip
 def test_what_is_asked_for_and_does_not_exist_is_refused(world, capsys, words, text):
     assert bake(f"--motion walk.usda {words} -o shot.usdc") == 2
