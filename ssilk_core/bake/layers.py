@@ -185,8 +185,11 @@ class LayerFolder:
         known: dict[str, set[str]] = {}
         for layout in layouts:
             known.setdefault(layout.garment, set()).add(layout.shot)
-        for shot in dict.fromkeys(task.shot for task in tasks):
-            write_shot_stage(self.path, shot, report)
+        needed: dict[str, set[str]] = {}
+        for layout in layouts:
+            needed.setdefault(layout.shot, set()).add(layout.garment)
+        for shot, garments in needed.items():
+            write_shot_stage(self.path, shot, report, needed=garments)
         for layout in {layout.garment: layout for layout in layouts}.values():
             outdated = list(_outdated_shots(layout, known[layout.garment]))
             if outdated:

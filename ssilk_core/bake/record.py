@@ -78,14 +78,23 @@ def inputs_of(request: BakeRequest, contents: InputHashes, folder: Path) -> dict
 
 
 def portable(location: str, folder: Path) -> str:
-    """Return "file[:/Prim]" relative to a folder, with forward slashes, so that both can move together."""
+    """Return "file[:/Prim]" relative to a folder, with forward slashes, so that both can move together.
+
+    Where the two share nothing but the root, a hash tells the file from others of its name, and nothing tells where a
+    studio keeps it.
+    """
     from ssilk_usd.read_stage import split_location
 
     file, prim = split_location(location)
+    place, home = os.path.abspath(file), os.path.abspath(folder)
     try:
-        path = Path(os.path.relpath(file, folder)).as_posix()
-    except ValueError:  # on another drive: told from others of its name, without saying where it lies
-        path = f"{hashlib.sha256(os.path.abspath(file).encode()).hexdigest()[:8]}/{Path(file).name}"
+        shared = Path(os.path.commonpath([place, home]))
+    except ValueError:  # on another drive
+        shared = Path(Path(place).anchor)
+    if shared == Path(shared.anchor):
+        path = f"{hashlib.sha256(place.encode()).hexdigest()[:8]}/{Path(place).name}"
+    else:
+        path = Path(os.path.relpath(place, home)).as_posix()
     return f"{path}:{prim}" if prim else path
 
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,11 +17,17 @@ if TYPE_CHECKING:
     from ssilk_usd.layers import Layout
 
 
-def write_shot_stage(folder: Path, shot: str, report: Reporter = silent) -> None:
-    """Write the stage of a shot from the garments that are on disk now; warn of those that cannot be read.
+def write_shot_stage(
+    folder: Path, shot: str, report: Reporter = silent, *, needed: Container[str] = frozenset()
+) -> None:
+    """Write the stage of a shot from the garments that are on disk now; warn of others that cannot be read.
+
+    Args:
+        needed: garments that have to be in it.
 
     Raises:
-        SsilkError: the garments have different units or axes, or the file cannot be written.
+        SsilkError: a needed garment cannot be read, the garments have different units or axes, or the file cannot be
+            written.
     """
     from ssilk_usd.layers import Layout, write_stage
 
@@ -33,8 +39,8 @@ def write_shot_stage(folder: Path, shot: str, report: Reporter = silent) -> None
     while True:
         found = _finished(folder, shot)
         layouts = {Layout(folder, name, shot): record.wearer for name, record in found.items() if record}
-        written = write_stage(layouts)
-        if len(written.unreadable) == len(layouts):
+        written = write_stage(layouts, needed)
+        if not layouts:
             Layout(folder, "", shot).stage.unlink(missing_ok=True)
         if _finished(folder, shot) == found:
             break

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 import shutil
 from pathlib import Path
@@ -13,8 +14,11 @@ from pxr import Usd
 from ssilk_usd import layers as layers_of_usd
 from ssilk_usd.play import Shot
 
+from ssilk_core.bake import BakeRequest, LayerFolder, plan_layers
 from ssilk_core.bake import shots as gathering
+from ssilk_core.bake.record import portable
 from ssilk_core.cli import main
+from ssilk_core.errors import SsilkError
 
 
 @pytest.fixture(scope="module")
@@ -64,11 +68,11 @@ def test_what_another_process_finishes_while_a_stage_is_written_is_not_lost(copy
     """The other one finishes, stage and all, between our look at the folder and the rename of our stage."""
     write, other = layers_of_usd.write_stage, []
 
-    def late(garments):
+    def late(garments, needed=()):
         if not other:
             other.append(garments)
             assert bake("shirt.safetensors", "--motion walk.usda -o layers") == 0
-        return write(garments)
+        return write(garments, needed)
 
     monkeypatch.setattr(layers_of_usd, "write_stage", late)
     gathering.write_shot_stage(Path("layers"), "walk")
@@ -94,6 +98,22 @@ def test_a_garment_that_cannot_be_read_is_left_out_and_told(copy, capsys):
     capsys.readouterr()
     assert bake("shirt.safetensors", "--motion walk.usda -o layers") == 0
     assert garments() == ["shirt"] and "walk/overalls/anim.usdc" in capsys.readouterr().err
+
+
+def test_a_stage_is_not_written_without_what_was_just_baked(copy):
+    request = BakeRequest(model="overalls.safetensors", stage="rigged.usda", motion="walk.usda")
+    before = Path("layers/shots/walk/shot.usda").read_bytes()
+    Path("layers/shots/walk/overalls/anim.usdc").write_bytes(b"half")
+    with pytest.raises(SsilkError, match=r"overalls/anim\.usdc"):
+        LayerFolder("layers").write_stages(plan_layers([request]))
+    assert Path("layers/shots/walk/shot.usda").read_bytes() == before
+
+
+def test_a_record_does_not_say_where_a_studio_keeps_what_lies_apart():
+    near, far = Path("/show/a/layers"), "/studio/s010/anim.usd:/Clip"
+    assert portable("/show/s010/anim.usd:/Clip", near) == "../../s010/anim.usd:/Clip"
+    assert re.fullmatch(r"[0-9a-f]{8}/anim\.usd:/Clip", portable(far, near))
+    assert portable(far, near) != portable(far.replace("s010", "s020"), near)
 
 
 def test_a_shot_of_several_rates_spans_them_all(copy, toy):

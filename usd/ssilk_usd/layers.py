@@ -13,7 +13,7 @@ Artists put layers of their own above these: nothing here is edited in place, an
 from __future__ import annotations
 
 import os
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Container, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -290,18 +290,19 @@ class WrittenStage:
     bodies: Mapping[str, str]
 
 
-def write_stage(garments: Mapping[Layout, Hashable]) -> WrittenStage:
+def write_stage(garments: Mapping[Layout, Hashable], needed: Container[str] = frozenset()) -> WrittenStage:
     """Write the stage of a shot, which references each garment and spans all frames; keep an identical file.
 
     Args:
         garments: the garments of one shot, and who wears each: the body of a character is shown with the first of
-            its garments that has one.
-            If none can be read, no stage is written.
+            its garments that has one. If none can be read, no stage is written.
+        needed: names of garments that have to be in it; others are left out where they cannot be read.
 
     Raises:
-        SsilkError: the garments have different units or axes, or the file cannot be written.
+        SsilkError: a needed garment cannot be read, the garments have different units or axes, or the file cannot be
+            written.
     """
-    stages, unreadable = _opened(garments)
+    stages, unreadable = _opened(garments, needed)
     shown: dict[Hashable, str] = {}
     others: dict[str, str] = {}
     if not stages:
@@ -332,13 +333,15 @@ def write_stage(garments: Mapping[Layout, Hashable]) -> WrittenStage:
     return WrittenStage(unreadable, others)
 
 
-def _opened(garments: Iterable[Layout]) -> tuple[dict[Layout, Usd.Stage], dict[str, str]]:
+def _opened(garments: Iterable[Layout], needed: Container[str]) -> tuple[dict[Layout, Usd.Stage], dict[str, str]]:
     """Return the stages of garments that can be read, and why others cannot."""
     stages, unreadable = {}, {}
     for garment in garments:
         try:
             stages[garment] = open_stage(garment.animation)
         except SsilkError as error:
+            if garment.garment in needed:
+                raise
             unreadable[garment.garment] = str(error)
     return stages, unreadable
 
