@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from functools import wraps
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar, cast
@@ -39,16 +40,15 @@ def needs_whole_files(read: Reader) -> Reader:
 
     @wraps(read)
     def reader(source: StageLike, *args: Any, **options: Any) -> Any:
-        def bounded() -> Any:
-            with bounded_memory():
-                return read(source, *args, **options)
-
         where = stage_name(source) if isinstance(source, Usd.Stage) else str(source)
-        with tried(bounded) as ending:
+        silent = {name: value for name, value in options.items() if name != "report"}
+        in_memory = isinstance(source, Usd.Stage) and not source.GetRootLayer().realPath
+        with nullcontext("") if in_memory else tried(reader, where, *args, **silent) as ending:
             if ending:
                 fail(where, ending, _allowed())
             try:
-                return bounded()
+                with bounded_memory():
+                    return read(source, *args, **options)
             except MemoryError:
                 fail(where, "it declares arrays that do not fit into memory", _allowed())
             except (Tf.ErrorException, UnicodeDecodeError) as error:
