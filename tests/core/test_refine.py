@@ -38,7 +38,7 @@ def refined(scene, motion, points, **options):
 
 def test_no_frame_gains_energy_with_more_iterations(scene, rollout) -> None:
     motion, points = rollout
-    found = [refined(scene, motion, points, iterations=n)[1] for n in (1, 2, 4, 8, 16)]
+    found = [refined(scene, motion, points, iterations=n)[1] for n in (1, 3, 9)]
     for few, more in pairwise(found):
         assert all(a.before == pytest.approx(b.before, abs=1e-12) for a, b in zip(few, more))
         assert all(b.after <= a.after + 1e-12 for a, b in zip(few, more))
@@ -72,7 +72,7 @@ def test_without_feedback_a_stretch_by_itself_comes_out_alike(scene, rollout) ->
 
 
 def test_with_feedback_it_becomes_the_simulator(scene, rollout) -> None:
-    motion, points = rollout
+    motion, points = rollout[0].clip(0, 4), rollout[1][:4]
     solver = SolverOptions(tolerance=1e-5, iterations=300)
     options = SimulationOptions(solver=solver, quasi_static_solver=replace(solver, tolerance=1e-5))
     (expected,) = simulate(scene, CLOTH, [motion], options)

@@ -25,7 +25,7 @@ def world(toy, tmp_path, monkeypatch):
     """A folder with the toy's files and three motions, as the working folder."""
     monkeypatch.chdir(toy.copy(tmp_path))
     (tmp_path / "motions").mkdir()
-    for name, frames in (("long", 40), ("short", 24), ("other", 40)):
+    for name, frames in (("long", 14), ("short", 10), ("other", 14)):
         toy.write_clip(tmp_path / "motions" / f"{name}.usda", frames)
     return tmp_path
 
