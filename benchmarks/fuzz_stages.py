@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Damage stages, motions and models at random, and read them: any bytes are read, or refused with one sentence.
 
-    python benchmarks/fuzz_stages.py FOLDER character:STAGE motion:FILE model:MODEL --minutes 60
+    python benchmarks/fuzz_stages.py FOLDER character:STAGE scene:RIGGED motion:FILE model:MODEL --minutes 60
 
 The files are damaged again and again, in FOLDER, where one that ends this process stays. The readers read USD first
 in a process of its own; what ended that process is counted, for it would have ended this one.
@@ -22,6 +22,7 @@ from pathlib import Path
 from helpers.reports import table, write_results
 from ssilk_usd.read_character import read_character
 from ssilk_usd.read_motion import read_motion
+from ssilk_usd.read_scene import read_scene
 
 from ssilk_core.checkpoint import load_model
 from ssilk_core.errors import SsilkError
@@ -61,6 +62,7 @@ class Fuzzer:
         skeleton = read_character(character).skeleton
         readers: dict[str, Callable[[Path], object]] = {
             "character": read_character,
+            "scene": read_scene,
             "motion": lambda path: read_motion(path, skeleton),
             "model": load_model,
         }

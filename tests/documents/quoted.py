@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from ssilk_usd import memory
+from ssilk_usd import memory, trial
 
 from ssilk_core import checkpoint
 from ssilk_core.config import PRESETS
@@ -121,10 +121,14 @@ def farm() -> Text:
         )
     yield f"file handles stay at {soak['file handles, least and most'].partition(',')[0]}"
     yield from shared_disk()
-    yield f"at most {memory.USUAL:g} GiB more"
+    yield f"Reading may take {trial.USUAL:g} s of computing, and {memory.USUAL:g} GiB more"
     yield row(
         "`SSILK_READ_GIB`",
         f"the most memory that reading a file may take [GiB], {memory.USUAL:g} where it is not set",
+    )
+    yield row(
+        "`SSILK_READ_SECONDS`",
+        f"the longest that reading a file may compute [s], {trial.USUAL:g} where it is not set",
     )
 
 
