@@ -103,6 +103,15 @@ def _started() -> subprocess.Popen[bytes]:
     )
 
 
+def stop() -> None:
+    """End the server, if there is one; the next trial starts another."""
+    global _server
+    with _lock:
+        if _server and _server[0] == os.getpid():
+            _server[1].communicate()
+        _server = None
+
+
 def serve() -> None:
     """Answer requests on standard input until it ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that asks
