@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import shlex
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -101,6 +101,14 @@ def write_clip(path: Path, frames: int = 40, fps: float = 30.0, joints: Sequence
 
 def run(command: str, *more: str) -> int:
     return main([*shlex.split(command), *more])
+
+
+@pytest.fixture(autouse=True, scope="session")
+def few_contacts() -> Iterator[None]:
+    """Cloth touches the body at vertices and at few points between: what is tested here are commands and files."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ssilk_core.collision.samples.MAX_SPACING", 0.1)
+        yield
 
 
 @pytest.fixture(scope="session")
