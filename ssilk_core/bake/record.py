@@ -112,14 +112,17 @@ def _portable(result: BakeResult) -> dict[str, object]:
 
 
 def read_record(folder: Path) -> TaskRecord | None:
-    """Return the record of a folder; None where none can be read, so that its task is done again."""
+    """Return the record of a folder; None where none can be read, so that its task is done again.
+
+    Records of older bakes name neither inputs nor SkelRoot.
+    """
     try:
         found = work_record.read_record(folder / RECORD)
         if found is None:
             return None
         detail = {**found.detail, "path": folder / found.detail["path"]}
-        inputs = {str(name): from_plain(RecordedInput, each) for name, each in detail.pop("inputs").items()}
-        root = detail.pop("root")
+        inputs = {str(name): from_plain(RecordedInput, each) for name, each in detail.pop("inputs", {}).items()}
+        root = detail.pop("root", None)
         result = from_plain(BakeResult, detail)
         return TaskRecord(key=found.key, files=found.files, result=result, inputs=inputs, root=root)
     except (SsilkError, ValueError, TypeError, KeyError, AttributeError):

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Container, Sequence
+from collections.abc import Container, Hashable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -38,21 +38,40 @@ def write_shot_stage(
     # killed between the rename and the second look, the next bake of the shot, or the check of a job, puts it right.
     while True:
         found = _finished(folder, shot)
-        layouts = {Layout(folder, name, shot): record.wearer for name, record in found.items() if record}
+        layouts = {Layout(folder, name, shot): wearer for name, wearer in _wearers(found).items()}
         written = write_stage(layouts, needed)
         if not layouts:
             Layout(folder, "", shot).stage.unlink(missing_ok=True)
         if _finished(folder, shot) == found:
             break
-    damaged = [f"{folder / 'shots' / shot / name / RECORD}: it is damaged"
-               for name, record in found.items() if not record]  # fmt: skip
-    for text in (*written.unreadable.values(), *damaged):
+    for text in written.unreadable.values():
         left = "the shot is without this garment, until it is baked again or taken out with 'ssilk remove'"
         report(Message(f"{text.rstrip('.')}; {left}", "warning"))
+    for name in [name for name, record in found.items() if not record and name not in written.unreadable]:
+        place = folder / "shots" / shot / name / RECORD
+        kept = "the garment stays in the shot, but nothing tells what it was baked from"
+        report(Message(f"{place}: it is damaged; {kept}; bake it again with --replace", "warning"))
     for name, other in written.bodies.items():
         if (record := found[name]) and record.result.hidden_faces is not None:
             text = f"{shot}/{name}: the body comes with '{other}'; faces that this one covers are not hidden"
             report(Message(text, "warning"))
+
+
+def _wearers(found: Mapping[str, TaskRecord | None]) -> dict[str, Hashable]:
+    """Return who wears each garment of a shot.
+
+    A record that is damaged or older names no motion. All garments of a shot share one, unless somebody replaced it,
+    so such a garment is taken to be of the first character that is known.
+    """
+    known = [record.wearer for record in found.values() if record and record.wearer[0]]
+
+    def wearer(record: TaskRecord | None) -> Hashable:
+        if record and record.wearer[0]:
+            return record.wearer
+        same = [one for one in known if record is None or one[1] == record.root]
+        return same[0] if same else (None, record.root if record else None)
+
+    return {name: wearer(record) for name, record in found.items()}
 
 
 def _finished(folder: Path, shot: str) -> dict[str, TaskRecord | None]:

@@ -100,6 +100,25 @@ def test_a_garment_that_cannot_be_read_is_left_out_and_told(copy, capsys):
     assert garments() == ["shirt"] and "walk/overalls/anim.usdc" in capsys.readouterr().err
 
 
+RECORD_OF_OVERALLS = Path("layers/shots/walk/overalls/bake.json")
+
+
+def of_an_older_bake(path: Path) -> str:
+    """Return a record as bakes wrote it that recorded neither inputs nor SkelRoot."""
+    record = json.loads(path.read_text())
+    del record["detail"]["inputs"], record["detail"]["root"]
+    return json.dumps(record)
+
+
+@pytest.mark.parametrize("damaged", [False, True])
+def test_a_garment_with_an_older_or_damaged_record_stays_in_its_shot(copy, capsys, damaged):
+    RECORD_OF_OVERALLS.write_text("{" if damaged else of_an_older_bake(RECORD_OF_OVERALLS))
+    assert bake("shirt.safetensors", "--motion walk.usda -o layers") == 0
+    assert ("bake.json: it is damaged; the garment stays" in capsys.readouterr().err) == damaged
+    paths = [mesh.path for mesh in Shot("layers/shots/walk/shot.usda").meshes]
+    assert paths == ["/Shot/overalls/Skirt", "/Shot/overalls/Body", "/Shot/shirt/Skirt"]  # one body
+
+
 def test_a_stage_is_not_written_without_what_was_just_baked(copy):
     request = BakeRequest(model="overalls.safetensors", stage="rigged.usda", motion="walk.usda")
     before = Path("layers/shots/walk/shot.usda").read_bytes()
