@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..errors import SsilkError
 from ..events import Message, Reporter, Result, Started, silent
 from ..files import FileHashes, remove_unfinished_in, replacing, sha256
 from ..targets import check_influences
@@ -75,8 +76,13 @@ def bake_layers(
         for task in tasks:
             results.append(layers.bake(task, again=again, report=report))
             report(Result("bake", results[-1].figures("layer")))
-    finally:  # what is finished is in its shot, whatever stops the rest
-        layers.write_stages(tasks[: len(results)], report)
+    except BaseException:  # what is finished is in its shot, whatever stops the rest, which is what is told
+        try:
+            layers.write_stages(tasks[: len(results)], report)
+        except SsilkError as error:
+            report(Message(str(error), "warning"))
+        raise
+    layers.write_stages(tasks, report)
     return results
 
 
@@ -180,7 +186,11 @@ class LayerFolder:
         return all(is_file(path, digest, self._files.sha256) for path, digest in asset.digests)
 
     def write_stages(self, tasks: Sequence[BakeTask], report: Reporter = silent) -> None:
-        """Write the stage of each shot of tasks, with all that is baked for it; warn of shots with an older asset."""
+        """Write the stage of each shot of tasks, with all that is baked for it; warn of shots with an older asset.
+
+        Raises:
+            SsilkError: as `write_shot_stage` does; the stages of all other shots are written before.
+        """
         layouts = [self.layout(task) for task in tasks]
         known: dict[str, set[str]] = {}
         for layout in layouts:
@@ -188,14 +198,20 @@ class LayerFolder:
         needed: dict[str, set[str]] = {}
         for layout in layouts:
             needed.setdefault(layout.shot, set()).add(layout.garment)
+        errors: list[SsilkError] = []
         for shot, garments in needed.items():
-            write_shot_stage(self.path, shot, report, needed=garments)
+            try:
+                write_shot_stage(self.path, shot, report, needed=garments)
+            except SsilkError as error:
+                errors.append(error)
         for layout in {layout.garment: layout for layout in layouts}.values():
             outdated = list(_outdated_shots(layout, known[layout.garment]))
             if outdated:
                 report(Message(
                     f"{layout.asset}: {len(outdated)} shots were baked with the asset as it was before "
                     f"({', '.join(outdated[:3])}); bake them again", "warning"))  # fmt: skip
+        if errors:
+            raise _as_one(errors, len(needed))
 
     def remove_unfinished(self, tasks: Sequence[BakeTask]) -> None:
         """Remove what processes that have ended left half written."""
@@ -203,6 +219,13 @@ class LayerFolder:
         paths = (path for each in layouts for path in (each.asset, each.stage, each.animation))
         for folder in dict.fromkeys(path.parent for path in paths):
             remove_unfinished_in(folder)
+
+
+def _as_one(errors: Sequence[SsilkError], shots: int) -> SsilkError:
+    """Return the error of shots whose stages could not be written."""
+    if len(errors) == 1:
+        return errors[0]
+    return SsilkError(f"{len(errors)} of {shots} shots have no current stage; the first: {errors[0]}")
 
 
 def _write_asset(layout: Layout, garment: LoadedGarment, task: BakeTask, report: Reporter) -> WrittenAsset:

@@ -47,8 +47,8 @@ def check_tasks(job: FarmJob, folder: Path, report: Reporter) -> None:
     """Remove what killed workers left half written, and write the stage of each shot.
 
     Raises:
-        VerificationError: a task is not done, an input is not what the job was submitted with, or files are not as
-            they were written.
+        VerificationError: a task is not done, an input is not what the job was submitted with, files are not as they
+            were written, or the stage of a shot cannot be written.
     """
     layers, tasks = LayerFolder(folder, InputFiles(job.inputs)), job.tasks
     layers.remove_unfinished(tasks)
@@ -57,13 +57,21 @@ def check_tasks(job: FarmJob, folder: Path, report: Reporter) -> None:
         wanted = _as_submitted(layers.inputs, tasks, report)
         written = readers.map(layers.is_written, wanted, wanted.values())
         done = [task for task, there in zip(wanted, written) if there]
-    layers.write_stages(done, report)
+    fault = ""
+    try:
+        layers.write_stages(done, report)
+    except SsilkError as error:
+        fault = str(error)
     missing = sorted(task.name for task in set(tasks).difference(done))
     if missing:
+        if fault:
+            report(Message(fault, "warning"))
         raise VerificationError(
             f"{folder}: {len(missing)} of {len(tasks)} tasks are not done, or their files are not as they were "
             f"written ({', '.join(missing[:5])}); run them again."
         )
+    if fault:
+        raise VerificationError(fault)
     report(Result("check", {"tasks": len(tasks), "output": str(folder)}))
 
 

@@ -151,6 +151,25 @@ def test_garments_of_several_units_are_refused(copy, capsys):
     assert Path("layers/shots/walk/shot.usda").read_bytes() == before
 
 
+def test_a_shot_that_cannot_be_written_stops_no_other_and_hides_no_error(copy, capsys):
+    assert bake("shirt.safetensors", "--motion walk.usda run.usda -o layers --target blender") == 2
+    assert "'overalls' is in units of 1 m with Y up" in capsys.readouterr().err
+    assert garments("run") == ["shirt"]
+    shutil.rmtree("layers/shots/run")
+    Path("run.usda").write_text("#usda 1.0")
+    assert bake("shirt.safetensors", "--motion walk.usda run.usda -o layers --target blender") == 2
+    said = capsys.readouterr().err.splitlines()
+    assert "run.usda" in said[-1] and [line for line in said[:-1] if "with Y up" in line]
+
+
+def test_a_check_tells_a_shot_that_cannot_be_written_after_all_others_are(copy, capsys):
+    assert main(shlex.split("farm shirt.safetensors --stage rigged.usda --no-verify --target blender "
+                            "--motion walk.usda run.usda --bundle job")) == 0  # fmt: skip
+    assert main(shlex.split("task job/job.json -o layers --tasks 0-1")) == 0
+    assert main(shlex.split("task job/job.json -o layers --check")) == 3
+    assert "with Y up" in capsys.readouterr().err and garments("run") == ["shirt"]
+
+
 def test_a_record_names_inputs_without_saying_where_the_studio_keeps_them(copy):
     text = Path("layers/shots/walk/overalls/bake.json").read_text()
     inputs = json.loads(text)["detail"]["inputs"]
