@@ -17,7 +17,7 @@ from ..work_record import is_file
 from .hiding import covered_polygons
 from .inputs import InputFiles, InputHashes, need_pinned
 from .load import LoadedGarment, load_garment
-from .names_used import UsedNames
+from .names_used import GarmentUse, UsedNames, write_use
 from .origin import shot_metadata
 from .record import RECORD, TaskRecord, current_record, inputs_of, read_record, task_key, write_record
 from .refinement import refined
@@ -97,6 +97,7 @@ class LayerFolder:
         self.path = Path(path)
         self.inputs = inputs or InputFiles()
         self._files = FileHashes()
+        self._checked: set[BakeTask] = set()  # tasks of which the names are known to be free
         self._loaded: LoadedGarment | None = None
         self._written: tuple[object, WrittenAsset] | None = None
 
@@ -137,8 +138,9 @@ class LayerFolder:
         """Raise `SsilkError` where a name was used for another input, unless its task says so."""
         names = UsedNames(self.path)
         for task in tasks:
-            if not task.replace:
+            if not task.replace and task not in self._checked:
                 names.check(task)
+                self._checked.add(task)
 
     def bake(self, task: BakeTask, *, again: bool = False, report: Reporter = silent) -> BakeResult:
         """Bake one garment in one shot, unless that is done already.
@@ -163,10 +165,11 @@ class LayerFolder:
             need_pinned(request, task.pinned, rollout.inputs)
         rollout.tell(report)
         check_influences(rollout.influences, request.target, request.model)
+        key, inputs = task_key(task, rollout.inputs), inputs_of(request, rollout.inputs, self.path)
+        write_use(self.path, task.garment, GarmentUse(inputs["model"], request.root))  # no asset is without it
         asset = self._asset(task, layout, report)
         result, files = _write_layer(layout, asset.asset, rollout, task, report)
         written = {os.path.relpath(path, home): digest for path, digest in (files | dict(asset.digests)).items()}
-        key, inputs = task_key(task, rollout.inputs), inputs_of(request, rollout.inputs, self.path)
         write_record(home, TaskRecord(key=key, files=written, result=result, inputs=inputs, root=request.root))
         return result
 

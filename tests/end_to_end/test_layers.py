@@ -74,7 +74,7 @@ def garment_points(path: Path | Usd.Stage, times: list[float] | None = None) -> 
 def test_an_asset_that_stays_and_a_small_layer_for_each_shot(world):
     folder = world / "layers"
     assert set(hashes(folder)) == {
-        "assets/skirt/asset.usda", "assets/skirt/geometry.usdc",
+        "assets/skirt/asset.usda", "assets/skirt/geometry.usdc", "assets/skirt/used.json",
         *(f"shots/{shot}/shot.usda" for shot in ("walk", "run")),
         *(f"shots/{shot}/skirt/{name}" for shot in ("walk", "run") for name in SHOT_FILES),
     }  # fmt: skip

@@ -7,6 +7,7 @@ import json
 import re
 import shlex
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -231,6 +232,38 @@ def test_another_model_of_one_name_is_refused(copy, capsys):
     assert garments() == ["other", "overalls"]
     shutil.copy("overalls.safetensors", "other/overalls.safetensors")
     assert bake("other/overalls.safetensors", "--motion run.usda -o layers") == 0  # it has only moved
+
+
+@pytest.mark.parametrize("damaged", [False, True])
+def test_a_name_whose_record_does_not_tell_its_input_is_not_replaced_unasked(copy, capsys, damaged):
+    RECORD_OF_OVERALLS.write_text("{" if damaged else of_an_older_bake(RECORD_OF_OVERALLS))
+    Path("layers/assets/overalls/used.json").unlink()
+    for motion in ("walk", "run"):  # the layer, and the asset that it shares
+        assert bake("overalls.safetensors", f"--motion {motion}.usda --points -o layers") == 2
+        (said,) = capsys.readouterr().err.splitlines()
+        assert "overalls/bake.json: it does not tell what" in said and "--replace" in said
+    assert bake("overalls.safetensors", "--motion walk.usda --points -o layers --replace") == 0
+    assert bake("overalls.safetensors", "--motion run.usda -o layers") == 0
+
+
+def test_a_task_does_not_look_for_its_garment_in_all_shots(copy, monkeypatch):
+    searched, glob = [], Path.glob
+
+    def noted(path, pattern):
+        searched.append(pattern)
+        return glob(path, pattern)
+
+    monkeypatch.setattr(Path, "glob", noted)
+    for model in ("overalls", "shirt"):
+        request = BakeRequest(model=f"{model}.safetensors", stage="rigged.usda", motion="run.usda")
+        LayerFolder("layers").bake(*plan_layers([request], verify=False))
+    assert searched and not [pattern for pattern in searched if pattern.startswith("shots/*")]
+    Path("layers/assets/overalls/used.json").unlink()  # as older bakes left it
+    shutil.rmtree("layers/shots/run/overalls")
+    Path("other.safetensors").write_bytes(b"other")
+    other = replace(request, model="other.safetensors", garment="overalls")
+    with pytest.raises(SsilkError, match=r"was baked from '\.\./overalls\.safetensors'"):
+        LayerFolder("layers").need_names(plan_layers([other]))
 
 
 @pytest.mark.parametrize(("text", "says"), [

@@ -3,6 +3,7 @@
 
     FOLDER/assets/cape/asset.usda        component; payload and variants
     FOLDER/assets/cape/geometry.usdc     the payload: meshes, skeleton, blendshapes
+    FOLDER/assets/cape/used.json         what the name is used for; `ssilk_core.bake.names_used` writes it
     FOLDER/shots/walk/cape/anim.usdc     what moves; opens by itself
     FOLDER/shots/walk/cape/points.usdc   a point cache, where one is asked for
     FOLDER/shots/walk/shot.usda          every garment of the shot
