@@ -17,7 +17,7 @@ from ..work_record import is_file
 from .hiding import covered_polygons
 from .inputs import InputFiles, InputHashes, need_pinned
 from .load import LoadedGarment, load_garment
-from .names_used import GarmentUse, UsedNames, write_use
+from .names_used import GarmentUse, UsedNames, need_distinct_case, write_use
 from .origin import shot_metadata
 from .record import RECORD, TaskRecord, current_record, inputs_of, read_record, task_key, write_record
 from .refinement import refined
@@ -135,6 +135,16 @@ class LayerFolder:
         )
 
     def need_names(self, tasks: Iterable[BakeTask]) -> None:
+        """Raise `SsilkError` where a name differs from one in the folder by case alone, or was used for another
+        input, unless its task says so.
+
+        It lists the folders of all shots and assets, so it is for a whole command; `bake` lists none.
+        """
+        tasks = list(tasks)
+        need_distinct_case(self.path, tasks)
+        self._need_inputs(tasks)
+
+    def _need_inputs(self, tasks: Iterable[BakeTask]) -> None:
         """Raise `SsilkError` where a name was used for another input, unless its task says so."""
         names = UsedNames(self.path)
         for task in tasks:
@@ -158,7 +168,7 @@ class LayerFolder:
         wanted = task.pinned or self.inputs.hashes(task.request)
         if not again and (record := current_record(home, task_key(task, wanted), self._files.sha256)):
             return replace(record.result, current=True)
-        self.need_names([task])
+        self._need_inputs([task])
         request = task.request
         rollout = self.garment(task).over(request.motion, range=request.range, handles=request.handles)
         if task.pinned:
@@ -201,10 +211,14 @@ class LayerFolder:
         needed: dict[str, set[str]] = {}
         for layout in layouts:
             needed.setdefault(layout.shot, set()).add(layout.garment)
+        replaced: dict[str, list[str]] = {}
+        for task in tasks:
+            if task.replace:
+                replaced.setdefault(task.shot, []).append(task.garment)
         errors: list[SsilkError] = []
         for shot, garments in needed.items():
             try:
-                write_shot_stage(self.path, shot, report, needed=garments)
+                write_shot_stage(self.path, shot, report, needed=garments, replaced=replaced.get(shot, ()))
             except SsilkError as error:
                 errors.append(error)
         for layout in {layout.garment: layout for layout in layouts}.values():

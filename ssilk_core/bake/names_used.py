@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import NoReturn
@@ -53,6 +53,28 @@ def read_use(folder: Path, garment: str) -> GarmentUse | None:
 
 def _place(folder: Path, garment: str) -> Path:
     return folder / "assets" / garment / USED
+
+
+def need_distinct_case(folder: Path, tasks: Iterable[BakeTask]) -> None:
+    """Raise `SsilkError` where a shot or garment differs from one in a folder of layers by upper and lower case alone.
+
+    Not every file system tells them apart.
+    """
+    tasks = list(tasks)
+    for kind, home, names in (
+        ("shot", folder / "shots", dict.fromkeys(task.shot for task in tasks)),
+        ("garment", folder / "assets", dict.fromkeys(task.garment for task in tasks)),
+    ):
+        there = set(os.listdir(home)) if home.is_dir() else set()
+        alike = {name.casefold(): name for name in sorted(there)}
+        for name in names:
+            if name not in there and (other := alike.get(name.casefold())):
+                fail(
+                    str(home),
+                    f"there is a {kind} '{other}', one with '{name}' on some disks",
+                    "files and folders are named by them",
+                    f"name this {kind} '{other}', or otherwise, with --{kind}-name",
+                )
 
 
 class UsedNames:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Container, Hashable, Mapping, Sequence
+from collections.abc import Collection, Container, Hashable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,12 +18,19 @@ if TYPE_CHECKING:
 
 
 def write_shot_stage(
-    folder: Path, shot: str, report: Reporter = silent, *, needed: Container[str] = frozenset()
+    folder: Path,
+    shot: str,
+    report: Reporter = silent,
+    *,
+    needed: Container[str] = frozenset(),
+    replaced: Collection[str] = (),
 ) -> None:
     """Write the stage of a shot from the garments that are on disk now; warn of others that cannot be read.
 
     Args:
         needed: garments that have to be in it.
+        replaced: garments whose motion may be another than that of the shot before; others of their characters that
+            follow another motion are told.
 
     Raises:
         SsilkError: a needed garment cannot be read, the garments have different units or axes, or the file cannot be
@@ -51,6 +58,10 @@ def write_shot_stage(
         place = folder / "shots" / shot / name / RECORD
         kept = "the garment stays in the shot, but nothing tells what it was baked from"
         report(Message(f"{place}: it is damaged; {kept}; bake it again with --replace", "warning"))
+    if behind := _behind(found, replaced):
+        text = f"{', '.join(behind)} follow another motion than {', '.join(replaced)}, with a body of their own"
+        todo = "bake them again with this motion and --replace, or take them out with 'ssilk remove'"
+        report(Message(f"{folder / 'shots' / shot}: {text}; {todo}", "warning"))
     for name, other in written.bodies.items():
         if (record := found[name]) and record.result.hidden_faces is not None:
             text = f"{shot}/{name}: the body comes with '{other}'; faces that this one covers are not hidden"
@@ -72,6 +83,22 @@ def _wearers(found: Mapping[str, TaskRecord | None]) -> dict[str, Hashable]:
         return same[0] if same else (None, record.root if record else None)
 
     return {name: wearer(record) for name, record in found.items()}
+
+
+def _behind(found: Mapping[str, TaskRecord | None], replaced: Collection[str]) -> list[str]:
+    """Return the garments with another motion than a `replaced` one, and with its stage and SkelRoot."""
+    ours = [record for name in replaced if (record := found.get(name))]
+
+    def is_behind(other: TaskRecord) -> bool:
+        return any(
+            other.wearer != one.wearer
+            and other.root == one.root
+            and other.inputs.get("stage") == one.inputs.get("stage")
+            for one in ours
+            if "motion" in other.inputs
+        )
+
+    return [name for name, record in found.items() if name not in replaced and record and is_behind(record)]
 
 
 def _finished(folder: Path, shot: str) -> dict[str, TaskRecord | None]:

@@ -234,6 +234,24 @@ def test_another_model_of_one_name_is_refused(copy, capsys):
     assert bake("other/overalls.safetensors", "--motion run.usda -o layers") == 0  # it has only moved
 
 
+def test_garments_that_a_replaced_motion_leaves_behind_are_named(copy, toy, capsys):
+    two_sequences(toy)
+    assert bake("shirt.safetensors", "--motion s010/anim.usda --shot-name walk -o layers --replace") == 0
+    assert "overalls follow another motion than shirt" in capsys.readouterr().err
+    assert bake("overalls.safetensors", "--motion s010/anim.usda --shot-name walk -o layers --replace") == 0
+    assert "another motion" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("words", "kind"), [
+    ("--motion walk.usda --shot-name WALK", "shot 'walk'"),
+    ("--motion run.usda --garment-name Overalls", "garment 'overalls'"),
+])  # fmt: skip
+def test_names_that_differ_from_those_on_disk_by_case_alone_are_refused(copy, capsys, words, kind):
+    assert bake("overalls.safetensors", f"{words} -o layers --replace") == 2
+    (said,) = capsys.readouterr().err.splitlines()
+    assert f"there is a {kind}, one with" in said and len(list(Path("layers/shots").iterdir())) == 1
+
+
 @pytest.mark.parametrize("damaged", [False, True])
 def test_a_name_whose_record_does_not_tell_its_input_is_not_replaced_unasked(copy, capsys, damaged):
     RECORD_OF_OVERALLS.write_text("{" if damaged else of_an_older_bake(RECORD_OF_OVERALLS))
