@@ -56,7 +56,7 @@ def _place(folder: Path, garment: str) -> Path:
 
 
 def need_distinct_case(folder: Path, tasks: Iterable[BakeTask]) -> None:
-    """Raise `SsilkError` where a shot or garment differs from one in a folder of layers by upper and lower case alone.
+    """Raise `SsilkError` where a shot or garment differs from one in a folder of layers by its case alone.
 
     Not every file system tells them apart.
     """
