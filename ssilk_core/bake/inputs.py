@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import hashlib
+import json
+import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +22,7 @@ TRIES = 3  # of reading files that change meanwhile
 
 @dataclass(frozen=True, kw_only=True)
 class InputHashes:
-    """SHA-256 of what each input of a request holds (see `InputContents.digest`)."""
+    """SHA-256 of what each input of a request holds (see `InputContents.digest`); empty if it could not be read."""
 
     model: str
     stage: str
@@ -44,9 +46,12 @@ class InputContents:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of all files, wherever they lie; of the file where it is one."""
-        digests = sorted(digest for _, digest in self.files)
-        return digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest()
+        """SHA-256 of all files and of where they lie beside each other; of the file where it is one."""
+        if len(self.files) == 1:
+            return self.first
+        home = os.path.dirname(os.path.abspath(self.files[0][0]))
+        parts = sorted((_beside(path, home), digest) for path, digest in self.files)
+        return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
     def still_there(self, hashed: Callable[[str], str] = sha256) -> bool:
         """Return whether the files hold the same as before."""
@@ -54,6 +59,16 @@ class InputContents:
             return all(hashed(path) == digest for path, digest in self.files)
         except OSError:
             return False
+
+
+def _beside(path: str, folder: str) -> str:
+    """Return a path relative to a folder; its name alone where the two share nothing, as on other machines."""
+    path = os.path.abspath(path)
+    try:
+        shared = os.path.commonpath([path, folder])
+    except ValueError:  # other drives
+        return os.path.basename(path)
+    return Path(os.path.relpath(path, folder)).as_posix() if Path(shared).name else os.path.basename(path)
 
 
 def model_contents(model: str, hashed: Callable[[str], str] = sha256) -> InputContents:
@@ -151,6 +166,13 @@ class InputFiles:
 def need_pinned(request: BakeRequest, pinned: InputHashes, found: InputHashes) -> None:
     """Raise `SsilkError` where an input is not what a job was submitted with."""
     for name in INPUTS:
+        if not getattr(pinned, name):
+            fail(
+                getattr(request, name),
+                f"the {name} could not be read when the job was submitted",
+                "a job bakes what its inputs held then",
+                "submit the job again",
+            )
         if getattr(pinned, name) != getattr(found, name):
             fail(
                 getattr(request, name),

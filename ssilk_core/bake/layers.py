@@ -170,14 +170,15 @@ class LayerFolder:
             return replace(record.result, current=True)
         self._need_inputs([task])
         request = task.request
-        rollout = self.garment(task).over(request.motion, range=request.range, handles=request.handles)
+        garment = self.garment(task)
+        rollout = garment.over(request.motion, range=request.range, handles=request.handles)
         if task.pinned:
             need_pinned(request, task.pinned, rollout.inputs)
         rollout.tell(report)
         check_influences(rollout.influences, request.target, request.model)
         key, inputs = task_key(task, rollout.inputs), inputs_of(request, rollout.inputs, self.path)
         write_use(self.path, task.garment, GarmentUse(inputs["model"], request.root))  # no asset is without it
-        asset = self._asset(task, layout, report)
+        asset = self._asset(task, garment, layout, report)
         result, files = _write_layer(layout, asset.asset, rollout, task, report)
         written = {os.path.relpath(path, home): digest for path, digest in (files | dict(asset.digests)).items()}
         write_record(home, TaskRecord(key=key, files=written, result=result, inputs=inputs, root=request.root))
@@ -187,9 +188,8 @@ class LayerFolder:
         """Return the folder of the files that a task alone writes."""
         return self.layout(task).animation.parent
 
-    def _asset(self, task: BakeTask, layout: Layout, report: Reporter) -> WrittenAsset:
+    def _asset(self, task: BakeTask, garment: LoadedGarment, layout: Layout, report: Reporter) -> WrittenAsset:
         """Return the asset of a task, written unless the last task left the same."""
-        garment = self.garment(task)
         asked = (garment, task.include_body, layout.asset)
         if self._written is None or self._written[0] != asked or not self._is_there(self._written[1]):
             self._written = (asked, _write_asset(layout, garment, task, report))

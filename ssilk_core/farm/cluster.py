@@ -76,8 +76,9 @@ def _connected(address: str | None, cores: int | None) -> Iterator[None]:
 
     try:
         ray.init(address, num_cpus=cores, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
-    except (ConnectionError, RuntimeError, ValueError) as error:
-        fail("--cluster", f"no cluster at {address} ({str(error).splitlines()[0]})", "start one with 'ray start'")
+    except Exception as error:  # Ray says nowhere which ones there are
+        where = f"at {address}" if address else "on this machine"
+        fail("--cluster", f"no cluster {where} ({_first_line(error)})", "start one with 'ray start'")
     try:
         yield
     finally:
@@ -113,7 +114,11 @@ def _outcomes(
             if isinstance(error, LocalRayletDiedError) or (here and isinstance(error, NodeDiedError)):
                 lost += [task, *pending.values(), *waiting]
                 return
-            yield TaskOutcome(task, error=f"its workers died ({str(error).splitlines()[0]})")
+            yield TaskOutcome(task, error=f"its workers died ({_first_line(error)})")
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).splitlines()), type(error).__name__)
 
 
 def _need_gpu(resources: Mapping[str, float]) -> None:

@@ -14,7 +14,6 @@ from .. import __version__
 from ..bake import BakeRequest, BakeTask
 from ..bake.inputs import InputContents, InputFiles, InputHashes
 from ..bake.plain import from_plain
-from ..bake.request import INPUTS
 from ..errors import SsilkError, fail
 from ..events import Message, Reporter
 from ..files import replacing
@@ -33,8 +32,7 @@ class FarmJob:
 def submitted(tasks: Sequence[BakeTask], report: Reporter) -> FarmJob:
     """Return tasks pinned to what their inputs hold now, so that nobody bakes other files that come in their place.
 
-    A task with an input that cannot be read stays as it is, with a warning: it fails alone, unless somebody repairs
-    the input.
+    A task with an input that cannot be read is kept, with a warning: it fails alone until the job is submitted again.
     """
     files = InputFiles()
     found: dict[str, InputContents] = {}
@@ -102,9 +100,9 @@ def _contents(files: Mapping[str, str], rules: Sequence[dict[str, str]]) -> Inpu
 
 
 def _pinned(task: BakeTask, inputs: Mapping[str, InputContents]) -> BakeTask:
-    """Return a task with what its inputs held when the job was submitted, where that is known."""
-    found = {name: inputs[path].digest for name, path in task.request.inputs.items() if path in inputs}
-    return replace(task, pinned=InputHashes(**found)) if len(found) == len(INPUTS) else task
+    """Return a task with what its inputs held when the job was submitted; a job without inputs pins nothing."""
+    held = {name: inputs[path].digest if path in inputs else "" for name, path in task.request.inputs.items()}
+    return replace(task, pinned=InputHashes(**held)) if inputs else task
 
 
 def _json(path: Path, allowed: str) -> dict[str, Any]:

@@ -121,7 +121,7 @@ def farm() -> Text:
         )
     yield f"file handles stay at {soak['file handles, least and most'].partition(',')[0]}"
     yield from shared_disk()
-    yield f"Reading may take {trial.USUAL:g} s of computing, and {memory.USUAL:g} GiB more"
+    yield f"Reading may take {trial.USUAL:g} s of computing, or of waiting without any, and {memory.USUAL:g} GiB more"
     yield row(
         "`SSILK_READ_GIB`",
         f"the most memory that reading a file may take [GiB], {memory.USUAL:g} where it is not set",

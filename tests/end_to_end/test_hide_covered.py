@@ -172,4 +172,4 @@ def test_cloth_that_covers_nothing_hides_nothing_and_no_body_is_refused(copy, ca
 def test_farms_take_the_option_along(copy):
     words = BAKE.replace("bake ", "farm ", 1)
     assert main(shlex.split(f"{words} --bundle bundle")) == 0
-    assert [task.request.hide_covered for task in read_job("bundle/job.json")] == [True]
+    assert [task.request.hide_covered for task in read_job("bundle/job.json").tasks] == [True]

@@ -22,6 +22,7 @@ from safetensors.torch import load_file
 
 from ssilk_core.checkpoint import load_model
 from ssilk_core.cli import main
+from ssilk_core.collision.samples import MAX_SPACING
 from ssilk_core.errors import EXIT_WORSE
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="processes are forked, and killed by a signal")
@@ -64,6 +65,14 @@ def forks():
         ]
     )
     return forks
+
+
+@pytest.fixture(autouse=True, scope="module")
+def all_contacts():
+    """Other processes compute them all, and are compared with this one."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ssilk_core.collision.samples.MAX_SPACING", MAX_SPACING)
+        yield
 
 
 @pytest.fixture(scope="module")

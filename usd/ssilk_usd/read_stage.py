@@ -32,31 +32,45 @@ register_schema()  # before the first stage is opened, because USD reads its sch
 _MISSING = (Pcp.ErrorInvalidAssetPath, Pcp.ErrorInvalidSublayerPath, Pcp.ErrorUnresolvedPrimPath)
 
 
-def needs_whole_files(read: Reader) -> Reader:
-    """Decorate a reader, whose first argument is its source, so that a damaged file raises one `SsilkError`.
-
-    It is read twice: first where a crash or a hang harms nobody (`trial`).
-    """
+def explains_damage(read: Reader) -> Reader:
+    """Decorate a function, whose first argument is its source, so that a damaged file raises one `SsilkError`."""
 
     @wraps(read)
     def reader(source: StageLike, *args: Any, **options: Any) -> Any:
-        where = stage_name(source) if isinstance(source, Usd.Stage) else str(source)
-        silent = {name: value for name, value in options.items() if name != "report"}
-        in_memory = isinstance(source, Usd.Stage) and not source.GetRootLayer().realPath
-        with nullcontext("") if in_memory else tried(reader, where, *args, **silent) as ending:
-            if ending:
-                fail(where, ending, _allowed())
-            try:
-                with bounded_memory():
-                    return read(source, *args, **options)
-            except MemoryError:
-                fail(where, "it declares arrays that do not fit into memory", _allowed())
-            except (Tf.ErrorException, UnicodeDecodeError) as error:
-                usd = isinstance(error, Tf.ErrorException)
-                reason = usd_reason(error) if usd else "it holds text that is not UTF-8"
-                fail(where, f"it cannot be read as USD ({reason})", _allowed())
+        try:
+            with bounded_memory():
+                return read(source, *args, **options)
+        except MemoryError:
+            fail(_named(source), "it declares arrays that do not fit into memory", _allowed())
+        except (Tf.ErrorException, UnicodeDecodeError) as error:
+            usd = isinstance(error, Tf.ErrorException)
+            reason = usd_reason(error) if usd else "it holds text that is not UTF-8"
+            fail(_named(source), f"it cannot be read as USD ({reason})", _allowed())
 
     return cast(Reader, reader)
+
+
+def needs_whole_files(read: Reader) -> Reader:
+    """Decorate a reader as `explains_damage` does; what would crash or hang raises one `SsilkError` as well.
+
+    It is called twice: first where a crash or a hang harms nobody (`trial`).
+    """
+    explained = explains_damage(read)
+
+    @wraps(read)
+    def reader(source: StageLike, *args: Any, **options: Any) -> Any:
+        silent = {name: value for name, value in options.items() if name != "report"}
+        in_memory = isinstance(source, Usd.Stage) and not source.GetRootLayer().realPath
+        with nullcontext("") if in_memory else tried(reader, _named(source), *args, **silent) as ending:
+            if ending:
+                fail(_named(source), ending, _allowed())
+            return explained(source, *args, **options)
+
+    return cast(Reader, reader)
+
+
+def _named(source: StageLike) -> str:
+    return stage_name(source) if isinstance(source, Usd.Stage) else str(source)
 
 
 def _allowed() -> str:

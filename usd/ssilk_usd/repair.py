@@ -11,7 +11,7 @@ from pxr import Usd, UsdGeom
 
 from .export import export
 from .read_garment import find_garment, fitted_skeleton, garment_to_core
-from .read_stage import needs_whole_files, open_stage, value
+from .read_stage import explains_damage, open_stage, value
 from .repair_mesh import rewrite_mesh
 from .units import StageUnits
 
@@ -36,7 +36,7 @@ def repair_lock(source: str | Path, garment: str | None = None) -> str:
     return " and ".join(held)
 
 
-@needs_whole_files
+@explains_damage
 def write_with_units(source: str | Path, out: str | Path, units: StageUnits) -> None:
     """Write a flattened copy of a file with authored units.
 
@@ -50,7 +50,7 @@ def write_with_units(source: str | Path, out: str | Path, units: StageUnits) -> 
     export(layer, out)
 
 
-@needs_whole_files
+@explains_damage
 def write_repaired(
     source: str | Path, out: str | Path, repair: MeshRepair, *, garment: str | None = None, root: str | None = None
 ) -> None:

@@ -10,29 +10,37 @@ from __future__ import annotations
 
 import os
 import pickle
+import select
 import signal
+import struct
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from importlib import import_module
+from pathlib import Path
 from typing import Any
+
+from ssilk_core.errors import fail
 
 from . import memory
 from .memory import HOST, allowed_gib, positive_setting
 
-VARIABLE, USUAL = "SSILK_READ_SECONDS", 30.0  # of computing, so that busy machines refuse nothing
-WAITING = 4  # times as long may pass in all
+VARIABLE, USUAL = "SSILK_READ_SECONDS", 30.0
 _READERS = ("read_motion", "read_scene", "read_shot", "read_visibility", "repair", "frame_range")
 _SERVE = f"from ssilk_usd import {', '.join(_READERS)}, trial; trial.serve()"
+_HEADER = struct.Struct("<Qd")  # of a request: its size [bytes], and for how long it may compute [s]
+_LOOK = 1.0  # [s] between looks at whether a process still computes
 _within = ContextVar("_within", default=False)
 _lock = threading.Lock()
 _server: tuple[int, subprocess.Popen[bytes]] | None = None  # of the process with this number
 
 
 def allowed_seconds() -> float:
-    """Return how many seconds of computing reading may take: from the environment, else the default."""
+    """Return for how many seconds reading may compute: from the environment, else the default."""
     return positive_setting(VARIABLE, USUAL, "seconds")
 
 
@@ -44,7 +52,7 @@ def tried(read: Callable[..., object], *args: Any, **options: Any) -> Iterator[s
     and inside Blender, which reads what the artist opened.
 
     Args:
-        read: a function of a module, by which the other process finds it.
+        read: a function of a module, by whose name the other process finds it.
         args, options: values that can be pickled.
     """
     if _within.get() or not sys.platform.startswith("linux") or HOST in sys.modules:
@@ -61,46 +69,60 @@ def ending(read: Callable[..., object], *args: Any, **options: Any) -> str:
     """Call a function in a process of its own; return what ended that, or "" where the function returned or raised.
 
     Arguments are those of `tried`.
+
+    Raises:
+        SsilkError: the server does not answer.
     """
     seconds = allowed_seconds()
-    request = seconds, allowed_gib(), os.getcwd(), read, args, options
+    call = read.__module__, read.__qualname__, args, options
+    content = pickle.dumps((seconds, allowed_gib(), os.getcwd(), *call))
     with _lock:
-        status = _asked(pickle.dumps(request))
+        status = _asked(_HEADER.pack(len(content), seconds) + content)
     if not os.WIFSIGNALED(status):
         return ""
     number = os.WTERMSIG(status)
     if number in (signal.SIGPROF, signal.SIGALRM):
-        return f"reading it takes more than {seconds if number == signal.SIGPROF else WAITING * seconds:g} s"
+        return f"reading it {'takes' if number == signal.SIGPROF else 'waits'} more than {seconds:g} s"
     return f"reading it ends the process by signal {number} ({signal.Signals(number).name})"
 
 
 def _asked(request: bytes) -> int:
     """Return the status in which the process of a trial ended, as `os.waitpid` returns it."""
+    for _ in range(2):  # somebody may have killed the server
+        answer = b""
+        server = _running()
+        assert server.stdin and server.stdout
+        try:
+            server.stdin.write(request)
+            server.stdin.flush()
+            answer = server.stdout.readline()
+        except BrokenPipeError:
+            continue
+        finally:
+            if not answer:  # Ctrl-C, too: the next answer would be one to this request
+                server.kill()
+                server.wait()
+        if answer:
+            return int(answer)
+    return fail("reading", "the process that reads first was killed twice", "it must live on", "is memory short?")
+
+
+def _running() -> subprocess.Popen[bytes]:
+    """Return this process's server, started where there is none."""
     global _server
     if _server is None or _server[0] != os.getpid() or _server[1].poll() is not None:
-        _server = os.getpid(), _started()
-    server = _server[1]
-    assert server.stdin and server.stdout
-    answer = b""
-    try:
-        server.stdin.write(len(request).to_bytes(8, "little") + request)
-        server.stdin.flush()
-        answer = server.stdout.readline()
-    finally:
-        if not answer:  # Ctrl-C, or it was killed: the next answer would be one to this request
-            server.kill()
-            server.wait()
-    return int(answer or signal.SIGKILL)
-
-
-def _started() -> subprocess.Popen[bytes]:
-    paths = os.pathsep.join(filter(None, sys.path))
-    return subprocess.Popen(
-        [sys.executable, "-c", _SERVE],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        env={**os.environ, "PYTHONPATH": paths},
-    )
+        paths = os.pathsep.join(filter(None, sys.path))
+        # -P: modules that lie in the working folder are none of ours.
+        _server = (
+            os.getpid(),
+            subprocess.Popen(
+                [sys.executable, "-P", "-c", _SERVE],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                env={**os.environ, "PYTHONPATH": paths},
+            ),
+        )
+    return _server[1]
 
 
 def stop() -> None:
@@ -114,17 +136,32 @@ def stop() -> None:
 
 def serve() -> None:
     """Answer requests on standard input until it ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that asks
+    for number in (signal.SIGINT, signal.SIGTERM):  # they are for the process that asks
+        signal.signal(number, signal.SIG_IGN)
     source, answers = sys.stdin.buffer, os.dup(1)
     silence = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):  # what USD prints is raised where it is read again
         os.dup2(silence, stream)
-    while size := source.read(8):
-        request = source.read(int.from_bytes(size, "little"))
+    while header := source.read(_HEADER.size):
+        size, seconds = _HEADER.unpack(header)
+        request = source.read(size)
         child = os.fork()
         if child == 0:
             _read_and_exit(request)
-        os.write(answers, b"%d\n" % os.waitpid(child, 0)[1])
+        os.write(answers, b"%d\n" % _ended(child, seconds))
+
+
+def _ended(child: int, seconds: float) -> int:
+    """Wait for a process, and end it once it has not computed for some seconds; return its status."""
+    handle, used, since = os.pidfd_open(child), -1, time.monotonic()
+    while not select.select([handle], [], [], _LOOK)[0]:
+        now = sum(map(int, Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()[11:13]))
+        if now > used:
+            used, since = now, time.monotonic()
+        elif time.monotonic() - since > seconds:
+            os.kill(child, signal.SIGALRM)
+    os.close(handle)
+    return os.waitpid(child, 0)[1]
 
 
 def _read_and_exit(request: bytes) -> None:
@@ -133,12 +170,11 @@ def _read_and_exit(request: bytes) -> None:
         import resource
 
         # From the process that started this one; what lies in files is never unpickled.
-        seconds, gib, folder, read, args, options = pickle.loads(request)
+        seconds, gib, folder, module, name, args, options = pickle.loads(request)
         os.chdir(folder)
         os.environ[memory.VARIABLE] = str(gib)
         _within.set(True)
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        signal.setitimer(signal.ITIMER_PROF, seconds)
-        signal.setitimer(signal.ITIMER_REAL, WAITING * seconds)
-        read(*args, **options)
+        signal.setitimer(signal.ITIMER_PROF, seconds)  # of computing, so that busy machines refuse nothing
+        getattr(import_module(module), name)(*args, **options)
     os._exit(0)
