@@ -7,11 +7,13 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
-from ..assets import Deformer, Motion, Scene
+import numpy as np
+
+from ..assets import Deformer, Floats, Motion, Scene
 from ..checkpoint import ModelFile, load_model
 from ..devices import select_device
 from ..errors import fail
-from ..kinematics import MAX_FPS, MIN_FPS, lbs_deformer, resample
+from ..kinematics import MAX_FPS, MIN_FPS, lbs_deformer, sample_motion
 from ..quality import SizeReduction
 from ..reduction import Reducer
 from ..targets import Target, cap_influences
@@ -33,8 +35,8 @@ LEAD = 1.0  # [s] of a motion before its shot that are rolled out, so that the g
 
 @dataclass(frozen=True, eq=False)
 class _ReadMotion:
-    """A motion as it was read, its part at the shot's samples, how many samples come before, and which frames these
-    are; and at which of them the character becomes hidden (True) or visible (False)."""
+    """A motion as it was read, the shot's samples of it, how many come before them, and which frames these are;
+    and at which of them the character becomes hidden (True) or visible (False)."""
 
     source: Motion
     sampled: Motion
@@ -104,17 +106,27 @@ class LoadedGarment:
         from ssilk_usd.read_motion import read_motion
         from ssilk_usd.read_visibility import read_hidden
 
-        frames = read_frame_range(request.motion, request.time_range, request.handles, root=request.root)
-        lead = _lead(frames, request) if frames else 0
-        within = (frames.played[0] - lead * frames.step, frames.played[1]) if frames else None
-        source = read_motion(request.motion, self.file.scene.character.skeleton, root=request.root, within=within)
-        at_fps = source if request.fps is None else _at_fps(source, request.fps)
-        samples = request.samples_per_frame
-        every = at_fps if samples == 1 else _at_fps(source, at_fps.fps * samples)
-        skipped = round(lead * every.fps / source.fps)
-        sampled = every.clip(skipped, every.frame_count) if skipped else every
-        hidden = read_hidden(request.motion, sampled, root=request.root)
-        return _ReadMotion(source, sampled, skipped, frames, hidden)
+        character, root, samples = self.file.scene.character, request.root, request.samples_per_frame
+        frames = read_frame_range(request.motion, request.time_range, request.handles, root=root, rate=request.fps)
+        if frames is None:
+            source = read_motion(request.motion, character.skeleton, root=root)
+            sampled, begun, handles = _sampled(source, (request.fps or source.fps) * samples, np.zeros(1)), 0, 0
+        else:
+            fps = (request.fps or frames.fps) * samples
+            rate, handles = fps / frames.fps, frames.before * samples
+            wanted = handles + round(
+                max(LEAD, request.pre_roll) * fps
+            )  # samples before the range, on the shot's grid
+            begun = max(min(_floor(frames.earlier * rate), wanted), handles)
+            earlier = min(_ceil(begun / rate), frames.earlier)
+            last = min(_floor(frames.count * rate) + frames.after * samples, _floor(frames.later * rate))
+            later = max(min(_ceil(last / rate), frames.later), frames.count)
+            within = (frames.first - earlier * frames.step, frames.first + later * frames.step)
+            source = read_motion(request.motion, character.skeleton, root=root, within=within)
+            sampled = _sampled(source, fps, earlier + np.arange(-handles, last + 1) / rate)
+            sampled = replace(sampled, start=frames.first / frames.step * fps / frames.fps - handles)
+        hidden = read_hidden(request.motion, sampled, root=root)
+        return _ReadMotion(source, sampled, begun - handles, frames, hidden)
 
     def _cut(self, motion: Motion) -> tuple[LoadedGarment, SizeReduction]:
         """Return the garment cut to the size that the request keeps, so as to be best for this motion."""
@@ -186,17 +198,22 @@ def _network_like(like: GarmentModel, file: ModelFile, request: BakeRequest) -> 
     return model, cap_influences(model.deformer(), request.receiver)
 
 
-def _lead(frames: FrameRange, request: BakeRequest) -> int:
-    """Return how many frames of the motion before the shot are rolled out: they make whole samples of the shot."""
-    rate = (request.fps or frames.fps) * request.samples_per_frame / frames.fps
-    most = min(frames.earlier, round(max(LEAD, request.pre_roll) * frames.fps))
-    return next((count for count in range(most, 0, -1) if abs(count * rate - round(count * rate)) < 1e-6), 0)
-
-
-def _at_fps(motion: Motion, fps: float) -> Motion:
+def _sampled(motion: Motion, fps: float, position: Floats) -> Motion:
+    """Return a motion at fractional frames `position`, shape (N,), which are those of a rate [1/s]."""
     if not MIN_FPS <= fps <= MAX_FPS:
         fail("--fps", f"{fps:g} frames per second", ALLOWED_FPS)
-    return replace(resample(motion, fps), start=motion.start * fps / motion.fps)
+    near = np.round(position)
+    whole = np.abs(position - near) < 1e-6
+    position = np.where(whole, near, position).clip(0, motion.frame_count - 1)
+    return Motion(motion.path, fps, *sample_motion(motion, position))
+
+
+def _floor(samples: float) -> int:
+    return int(np.floor(samples + 1e-6))
+
+
+def _ceil(frames: float) -> int:
+    return int(np.ceil(frames - 1e-6))
 
 
 def _units(stage: Usd.Stage, target: Target) -> StageUnits:

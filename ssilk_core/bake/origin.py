@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ..errors import fail
+from ..files import sha256
+from .record import RECORD
 from .request import BakeRequest
 from .rollout import BakeRollout
 
@@ -81,26 +83,48 @@ def read_origin(shot: Path, elsewhere: Mapping[str, str | os.PathLike[str] | Non
         fail(str(shot), f"the file does not say how it was baked as this version does ({error})", allowed,
              "bake it again")  # fmt: skip
     beside = provenance.get("beside")  # earlier versions stored paths as they were given, and these here
+    hashes = {name: provenance.get(f"{name}_sha256") for name in ("model", "motion")}
     found: dict[str, str] = {}
     for name, path in stored.inputs.items():
         near = str(beside[name]) if isinstance(beside, Mapping) and name in beside else path
-        found[name] = str(elsewhere.get(name) or _existing(shot, name, near, Path(path)))
-    hashes = {name: provenance.get(f"{name}_sha256") for name in ("model", "motion")}
+        found[name] = str(elsewhere.get(name) or _existing(shot, name, near, Path(path), hashes.get(name)))
     return ShotOrigin(replace(stored, model=found["model"], stage=found["stage"], motion=found["motion"]), hashes)
 
 
-def _existing(shot: Path, name: str, near: str, then: Path) -> Path:
+def _existing(shot: Path, name: str, near: str, then: Path, held: object) -> Path:
     """Return the place of an input where there is a file.
 
     It is looked for where it lay as seen from the shot, then in the same place as seen from the working folder and
-    from each folder above the shot, because some inputs may have stayed where they were.
-    """
-    from ssilk_usd.read_stage import split_location
+    from each folder above the shot, because some inputs may have stayed where they were. Of several files the first
+    that holds what the input held is taken. What bakes wrote is no input.
 
+    Args:
+        held: SHA-256 of the input when the shot was baked, where the shot says it.
+    """
     parts = Path(near).parts
     tail = Path(*parts[next((at for at, part in enumerate(parts) if part != ".."), 0) :])
     places = [shot.parent / near, then, Path(tail), *(above / tail for above in shot.absolute().parents)]
-    there = next((path for path in places if Path(split_location(str(path))[0]).is_file()), None)
-    if there is None:
+    there = [path for path in places if _file(path).is_file() and not _is_baked(_file(path), shot)]
+    if not there:
         fail(str(shot), f"the {name} that it was baked from is not at {near}", f"--{name} gives its present path")
-    return there
+    if len({_file(path).resolve() for path in there}) == 1:
+        return there[0]
+    return next((path for path in there if sha256(_file(path)) == held), there[0])
+
+
+def _file(place: Path) -> Path:
+    """Return the file of a place, which may name a prim in it."""
+    from ssilk_usd.read_stage import split_location
+
+    return Path(split_location(str(place))[0])
+
+
+def _is_baked(file: Path, shot: Path) -> bool:
+    """Return whether a file is the shot itself, or of the layers that bakes wrote for garments and shots.
+
+    Layers may be written into a folder that holds inputs too, so it is not the folder that tells.
+    """
+    of_garment = (file.parent / RECORD).is_file()
+    of_shot = file.name == "shot.usda" and any(file.parent.glob(f"*/{RECORD}"))
+    of_asset = file.name in ("asset.usda", "geometry.usdc") and file.parent.parent.name == "assets"
+    return file.samefile(shot) or of_garment or of_shot or of_asset

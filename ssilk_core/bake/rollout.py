@@ -7,10 +7,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from ..assets import Deformer, Floats, GarmentPose, Motion
 from ..events import Message, Progress, Reporter, silent
 from ..fabrics import Fabric
-from ..kinematics import deform, lbs_poses
+from ..kinematics import deform, lbs_poses, slerp, split_at_cuts
 from ..quality import SizeReduction
 from .inputs import InputHashes
 from .request import BakeRequest
@@ -49,7 +51,7 @@ class BakeRollout:
         model: the network; None under linear blend skinning.
         deformer: the garment as its target takes it.
         motion: the character's motion at the shot's samples; `source` is the motion as it was read.
-        lead: samples of `source` before the shot.
+        lead: samples before the shot that are rolled out, at its rate.
         frames: which frames of the motion the shot plays; None for a pose without samples.
         hidden: at which frames of the motion the garment becomes hidden (True) or visible (False).
         units: units and up axis of the shot.
@@ -105,16 +107,23 @@ class BakeRollout:
 
         self.recovered.clear()
         rate, pre_roll = self.motion.fps, self.request.pre_roll
-        poses = garment_poses(self.model, self.source, rate, CHUNK, self._note, pre_roll=pre_roll)
-        for pose in poses:
-            skipped = max(self.lead - pose.start, 0)
-            if skipped < pose.frame_count:
-                start = pose.start + skipped - self.lead
-                yield GarmentPose(start, pose.rotations[skipped:], pose.weights[skipped:])
+        driver = _from_fraction(self.source, self._source_frame(-self.lead))
+        stop = self.lead + self.motion.frame_count
+        for pose in garment_poses(self.model, driver, rate, CHUNK, self._note, pre_roll=pre_roll):
+            shown = slice(max(self.lead - pose.start, 0), max(stop - pose.start, 0))
+            rotations, weights = pose.rotations[shown], pose.weights[shown]
+            if len(rotations):
+                yield GarmentPose(pose.start + shown.start - self.lead, rotations, weights)
+
+    def _source_frame(self, sample: int) -> float:
+        """Return the frame of `source` at a sample of the shot, a fraction where the grids differ."""
+        frame = (self.motion.start + sample) * self.source.fps / self.motion.fps - self.source.start
+        return float(round(frame)) if abs(frame - round(frame)) < 1e-6 else frame
 
     def _note(self, frames: range) -> None:
-        if frames[-1] >= self.lead:
-            self.recovered.append(FrameSpan(max(frames[0] - self.lead, 0), frames[-1] - self.lead))
+        first, last = max(frames[0] - self.lead, 0), min(frames[-1] - self.lead, self.motion.frame_count - 1)
+        if first <= last:
+            self.recovered.append(FrameSpan(first, last))
 
     def vertices(self, report: Reporter = silent) -> Iterator[Floats]:
         """Yield the decoder's garment vertices in the world [m], shape (V, 3), of each of the shot's poses."""
@@ -159,7 +168,34 @@ class BakeRollout:
         from ..preflight.motion import joint_jumps, root_jumps
 
         skeleton = self.deformer.scene.character.skeleton
-        for found in (*root_jumps(self.source), *joint_jumps(self.source, skeleton)):
-            report(Message(f"{found.prim}: {found.found}; {found.why}; {found.fix}", "warning"))
+        first, last = self._source_frame(0), self._source_frame(self.motion.frame_count - 1)
+        shown = self.source.clip(int(first), int(np.ceil(last)) + 1)
+        for found in (*root_jumps(shown), *joint_jumps(shown, skeleton)):
+            code = (shown.start + found.indices[0]) * self.motion.fps / shown.fps / self.request.samples_per_frame
+            text = f"{found.found.partition(' (first to frame')[0]} (first to time code {code:.9g})"
+            report(Message(f"{found.prim}: {text}; {found.why}; {found.fix}", "warning"))
         for span in self.recovered:
             report(Message(f"frames {span}: the rollout was lost, and the garment is put to rest", "warning"))
+
+
+def _from_fraction(motion: Motion, first: float) -> Motion:
+    """Return a motion with as many frames from a fractional one on, at its own rate.
+
+    Nothing is interpolated across a cut: the frame before it becomes one of those after it, and their first step is
+    continued back to it, as the last step of all is continued on.
+    """
+    whole = int(first)
+    motion = motion.clip(whole, motion.frame_count)
+    if first == whole:
+        return motion
+    frames = np.arange(motion.frame_count)
+    ends = np.cumsum([span.frame_count for span in split_at_cuts(motion)])
+    own = np.searchsorted(ends, np.minimum(frames + 1, frames[-1]), side="right")
+    begin, end = np.array([0, *ends[:-1]])[own], ends[own] - 1
+    low = np.clip(frames, begin, np.maximum(end - 1, begin))
+    high = np.minimum(low + 1, end)
+    part = (frames + first - whole - low)[:, None]
+    rotations = slerp(motion.rotations[low], motion.rotations[high], part)
+    step = motion.translations[high] - motion.translations[low]
+    translations = motion.translations[low] + part[..., None] * step
+    return Motion(motion.path, motion.fps, rotations, translations, motion.start + first - whole)

@@ -6,13 +6,18 @@ from __future__ import annotations
 import json
 import shlex
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Sdf, Usd
+from pxr import Gf, Sdf, Usd
 from ssilk_usd.play import Shot
 
+from ssilk_core.bake import origin
+from ssilk_core.bake.load import load_rollout
+from ssilk_core.bake.request import BakeRequest
+from ssilk_core.bake.rollout import _from_fraction
 from ssilk_core.cli import main
 
 
@@ -111,3 +116,72 @@ def test_shots_of_a_list_have_ranges_of_their_own(world):
     assert bake("--shots shots.json --no-verify -o out") == 0
     layers = [Sdf.Layer.FindOrOpen(f"out/shots/{name}/shot.usda") for name in "abc"]
     assert [(layer.startTimeCode, layer.endTimeCode) for layer in layers] == [(0, 4), (5, 9), (8, 13)]
+
+
+def at_sixty(toy, first: float, last: float) -> None:
+    toy.write_clip(Path("walk.usda"), frames=120, fps=60)
+    says(first, last)
+
+
+@pytest.mark.parametrize("fps", [23.976, 24000 / 1001, 29.97, 59.94])
+def test_a_shot_of_any_rate_has_a_run_up(world, toy, fps):
+    """Its first pose is close to that of the bake of all samples, and its frames are those of the motion."""
+    at_sixty(toy, 70, 100)
+    request = BakeRequest(model="model.safetensors", stage="rigged.usda", motion="walk.usda", fps=fps)
+    shot, whole = load_rollout(request), load_rollout(replace(request, fps=None, range="all"))
+    without = replace(shot, source=shot.source.clip(shot.source.frame_count - 31, shot.source.frame_count), lead=0)
+    expected, run_up, at_rest = (
+        list(rollout.vertices())[at] for rollout, at in ((whole, 70), (shot, 0), (without, 0))
+    )
+    assert shot.lead == round(fps) and shot.start == 70 * fps / 60
+    np.testing.assert_allclose(shot.motion.translations[0], whole.motion.translations[70], atol=1e-9)
+    assert np.abs(run_up - expected).max() < 0.2 * np.abs(at_rest - expected).max()
+    assert [pose.start for pose in shot.poses()] == [0] and shot.motion.frame_count == int(30 * fps / 60) + 1
+
+
+def test_nothing_is_interpolated_across_a_cut_where_the_grids_of_motion_and_shot_differ(world, toy):
+    at_sixty(toy, 70, 100)
+    request = BakeRequest(model="model.safetensors", stage="rigged.usda", motion="walk.usda", fps=23.976)
+    source = load_rollout(request).source
+    moved = source.translations.copy()
+    moved[:, 0, 0] = 0.9 * np.arange(len(moved)) + 100 * (np.arange(len(moved)) > 40)  # at 54 m/s
+    driver = _from_fraction(replace(source, translations=moved), 0.25).translations[:, 0, 0]
+    later = np.arange(len(moved)) + 0.25
+    np.testing.assert_allclose(driver, 0.9 * later + 100 * (later > 40), atol=1e-9)
+
+
+@pytest.mark.parametrize(("words", "span"), [("", (28, 38)), ("--handles 8", (20, 46)), ("--handles 40", (0, 47))])
+def test_handles_are_frames_of_the_shot_on_its_grid(world, toy, words, span):
+    at_sixty(toy, 70, 95)
+    assert bake(f"--motion walk.usda --fps 24 --no-body {words} -o shot.usdc") == 0
+    times = Sdf.Layer.FindOrOpen("shot.usdc").ListTimeSamplesForPath("/Hero/Animation.rotations")
+    assert times == list(range(span[0], span[1] + 1))
+
+
+@pytest.mark.parametrize(("jump", "told"), [(20, ""), (50, "(first to time code 25)"), (80, "")])
+def test_jumps_within_the_shot_are_told_by_its_time_codes(world, toy, capsys, jump, told):
+    at_sixty(toy, 40, 60)
+    layer = Sdf.Layer.FindOrOpen("walk.usda")
+    for time in range(jump, 120):
+        moved = layer.QueryTimeSample("/Clip.translations", time)
+        moved[0] += Gf.Vec3f(9, 0, 0)
+        layer.SetTimeSample("/Clip.translations", time, moved)
+    layer.Save()
+    assert bake("--motion walk.usda --fps 30 --lbs --no-verify --no-body -o shot.usdc") == 0
+    text = capsys.readouterr().err
+    assert ("the root jumps" in text) == bool(told) and told in text and "first to frame" not in text
+
+
+def test_a_shot_and_files_of_other_contents_are_not_taken_for_the_motion(world, monkeypatch, capsys):
+    """Inputs on another root are known by their names alone, and this motion has the name of the shot's own layer."""
+    monkeypatch.setattr(origin, "_from_folder", lambda path, folder: Path(path).name)
+    Sdf.Layer.FindOrOpen("walk.usda").Export("anim.usdc")
+    assert bake("--motion anim.usdc --shot-name s010 --no-verify -o far/layers") == 0
+    Sdf.Layer.FindOrOpen("clip.usda").Export("far/anim.usdc")
+    (world / "elsewhere").mkdir()
+    monkeypatch.chdir(world / "elsewhere")
+    shot = "../far/layers/shots/s010/model/anim.usdc"
+    assert main(["verify", shot]) == 0 and "has changed" not in capsys.readouterr().err
+    for name in ("anim.usdc", "far/anim.usdc"):
+        (world / name).unlink()
+    assert main(["verify", shot]) == 2 and "--motion gives its present path" in capsys.readouterr().err

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pxr import Usd
@@ -23,8 +23,8 @@ class FrameRange:
     Attributes:
         first, last: of the range, without handles.
         fps: frames per second of the motion [1/s].
-        step: from one frame to the next.
-        before, after: frames of handles.
+        step: from one frame of the motion to the next.
+        before, after: frames of handles, at the rate of the shot.
         sampled: first and last sample of the motion.
         chosen: what the range comes from, for messages; empty where it is all that is sampled.
         left_out: why the range that the stage says is not played as it is; empty where it is.
@@ -41,14 +41,19 @@ class FrameRange:
     left_out: str = ""
 
     @property
-    def played(self) -> tuple[float, float]:
-        """Time codes of the first and the last frame of the shot, handles included."""
-        return self.first - self.before * self.step, self.last + self.after * self.step
+    def count(self) -> int:
+        """Frames of the motion from the first to the last of the range."""
+        return _whole(self.last - self.first, self.step)
 
     @property
     def earlier(self) -> int:
-        """Frames that are sampled before the shot."""
-        return int((self.played[0] - self.sampled[0]) / self.step + _TOLERANCE)
+        """Frames that are sampled before the range."""
+        return _whole(self.first - self.sampled[0], self.step)
+
+    @property
+    def later(self) -> int:
+        """Frames that are sampled after the first of the range."""
+        return _whole(self.sampled[1] - self.first, self.step)
 
     def __str__(self) -> str:
         with_handles = f", with handles of {self.before} frames before and {self.after} after"
@@ -59,7 +64,12 @@ class FrameRange:
 
 @needs_whole_files
 def read_frame_range(
-    source: str, asked: tuple[float, float] | None = None, handles: int = 0, *, root: str | None = None
+    source: str,
+    asked: tuple[float, float] | None = None,
+    handles: int = 0,
+    *,
+    root: str | None = None,
+    rate: float | None = None,
 ) -> FrameRange | None:
     """Return the frames of a motion that a shot plays; None for a pose without samples.
 
@@ -68,8 +78,9 @@ def read_frame_range(
     Args:
         source: "file[:/Prim/Path]", as for `read_motion`.
         asked: first and last time code, of the motion's stage; infinite ones for all samples.
-        handles: frames before and after the range that are played as well, where they are sampled.
+        handles: frames of the shot before and after the range that are played as well, where they are sampled.
         root: the character, if several are animated.
+        rate: frames per second of the shot; None for those of the motion.
 
     Raises:
         SsilkError: the range asked for is not sampled; also as `read_motion`.
@@ -84,11 +95,17 @@ def read_frame_range(
         return None
     step = second / fps
     (first, last), chosen, left_out = _range(stage, source, asked, found, step)
-    last = first + step * np.floor((last - first) / step + _TOLERANCE)
-    before, after = (
-        min(handles, int(max(space, 0.0) / step + _TOLERANCE)) for space in (first - found[0], found[1] - last)
-    )
-    return FrameRange(first, float(last), fps, step, before, after, found, chosen, left_out)
+    last = first + step * _whole(last - first, step)
+    found_range = FrameRange(first, last, fps, step, 0, 0, found, chosen, left_out)
+    shown = fps / (rate or fps)  # frames of the motion from one frame of the shot to the next
+    before = min(handles, _whole(found_range.earlier, shown))
+    after = min(handles, _whole(found_range.later, shown) - _whole(found_range.count, shown))
+    return replace(found_range, before=before, after=after)
+
+
+def _whole(length: float, step: float) -> int:
+    """Return how many whole steps there are in a length; none in a negative one."""
+    return max(int(length / step + _TOLERANCE), 0)
 
 
 def _range(
