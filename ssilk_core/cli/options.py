@@ -112,7 +112,7 @@ def add_bake(verb: argparse.ArgumentParser) -> None:
         "--range",
         metavar="FIRST-LAST",
         help="frames to bake, as time codes of the motion, such as 1001-1100, or 'all' that have samples (default: "
-        "the range of the motion's stage, or all)",
+        "the range of the motion's stage, or all); --range=-3-5 where FIRST is negative",
     )
     verb.add_argument("--handles", type=NumberRange(0, MAX_HANDLES, int), default=0, metavar="N",
                       help="frames before and after the range that are baked as well, where there are samples "
