@@ -37,7 +37,7 @@ for words in (
     [*bake, "-o", "usd"], *([*bake, "--target", target, "-o", output] for target, output in (
         ("blender", "blender"), ("blender", "file.usdc"), ("arkit", "package.usdz"))),
 ):
-    assert main(words) == 0, words
+    assert main(words) in (0, 5), words  # 5: so few iterations do no good
 for path in sys.argv[2:]:
     shot = Shot(path)
     np.save(path + ".npy", np.stack([shot.garment_points(time) for time in shot.frame_times]))

@@ -18,6 +18,7 @@ INPUTS = {"model": "cape.safetensors", "stage": "hero.usdc", "motion": "walk.usd
 CHANGED = BakeRequest(
     **INPUTS, root="/Hero", fps=24.0, samples_per_frame=2, pre_roll=0.5, target="game8", refine=3, feedback=True,
     refined_output="joints", hide_covered=True, keep=ModelSize(shapes=8, joints=4, influences=2), device="cuda",
+    garment="cape", shot="walk", range="1001-1100", handles=8,
 )  # fmt: skip
 
 

@@ -578,10 +578,10 @@ def test_a_model_that_was_not_written_any_more_is_in_the_state(job, monkeypatch)
     )
     killed, write = job("killed"), RunFiles.save_model
 
-    def second(self: RunFiles, model: GarmentModel, state: RunState, score: Score) -> None:
+    def second(self: RunFiles, model: GarmentModel, state: RunState, score: Score, lbs: Score) -> None:
         if state.iteration == 10:
             raise InterruptedError
-        write(self, model, state, score)
+        write(self, model, state, score, lbs)
 
     with monkeypatch.context() as patch, pytest.raises(InterruptedError):
         patch.setattr(RunFiles, "save_model", second)

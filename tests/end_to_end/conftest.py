@@ -103,7 +103,7 @@ def run(command: str, *more: str) -> int:
     return main([*shlex.split(command), *more])
 
 
-@pytest.fixture(autouse=True, scope="session")
+@pytest.fixture(autouse=True, scope="module")
 def few_contacts() -> Iterator[None]:
     """Cloth touches the body at vertices and at few points between: what is tested here are commands and files."""
     with pytest.MonkeyPatch.context() as patch:

@@ -23,8 +23,9 @@ from safetensors.torch import load_file
 from ssilk_core.checkpoint import load_model
 from ssilk_core.cli import main
 from ssilk_core.collision.samples import MAX_SPACING
-from ssilk_core.errors import EXIT_WORSE
+from ssilk_core.errors import EXIT_OK, EXIT_WORSE
 
+TRAINED = (EXIT_OK, EXIT_WORSE)  # so few iterations may do no good
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="processes are forked, and killed by a signal")
 
 # Files are written after every step, and steps are so large that some models are the best so far and some are not.
@@ -87,7 +88,7 @@ def whole(command, tmp_path_factory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder := tmp_path_factory.mktemp("whole"))
         torch.set_num_threads(1)
-        assert main(command) == EXIT_WORSE
+        assert main(command) in TRAINED
     return folder
 
 
@@ -136,7 +137,7 @@ def test_killed_wherever_a_file_gets_its_name(forks, command, whole, tmp_path, m
         process.join(60)
         codes.append(process.exitcode)
         check_files()
-    assert codes == [-signal.SIGKILL] * (len(places) - 1) + [EXIT_WORSE]
+    assert codes == [-signal.SIGKILL] * (len(places) - 1) + [codes[-1]] and codes[-1] in TRAINED
     check_equal(whole)
 
 
@@ -155,5 +156,5 @@ def test_killed_at_any_time(forks, command, whole, tmp_path, monkeypatch):
         process.join(60)
         check_files()
         began.append(len(json.loads(CURVE.read_text())["points"]) if CURVE.exists() else 0)
-    assert process.exitcode == EXIT_WORSE and began == sorted(began) and began[0] < began[-2] < 24
+    assert process.exitcode in TRAINED and began == sorted(began) and began[0] < began[-2] < 24
     check_equal(whole)
