@@ -121,6 +121,12 @@ def farm() -> Text:
         )
     yield f"file handles stay at {soak['file handles, least and most'].partition(',')[0]}"
     yield from shared_disk()
+    fuzzed = result("fuzz_stages")
+    readers = fuzzed["readers"].values()
+    yield f"In {fuzzed['minutes']:.0f} minutes `benchmarks/fuzz_stages.py` damaged and read"
+    yield f"{sum(reader['all'] for reader in readers):,} stages, motions and models"
+    yield f"at most {fuzzed['memory added at most [MiB]']:,.0f} MiB of memory"
+    yield f"The longest took {max(reader['longest [s]'] for reader in readers):.0f} s"
     yield f"Reading may take {trial.USUAL:g} s of computing, or of waiting without any, and {memory.USUAL:g} GiB more"
     yield row(
         "`SSILK_READ_GIB`",
