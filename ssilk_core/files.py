@@ -167,6 +167,16 @@ def sha256(path: str | Path) -> str:
     return digest.hexdigest()
 
 
+def relative_path(path: str | Path, folder: str | Path) -> str | None:
+    """Return a path as seen from a folder, with forward slashes; None where they share nothing but the root."""
+    place, home = os.path.abspath(path), os.path.abspath(folder)
+    try:
+        shared = Path(os.path.commonpath([place, home]))
+    except ValueError:  # on another drive
+        return None
+    return None if shared == Path(shared.anchor) else Path(os.path.relpath(place, home)).as_posix()
+
+
 class FileHashes:
     """SHA-256 of files, which are read again only where they may have changed.
 

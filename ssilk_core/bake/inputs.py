@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ from types import MappingProxyType
 from typing import TypeVar
 
 from ..errors import SsilkError, fail
-from ..files import FileHashes, sha256
+from ..files import FileHashes, relative_path, sha256
 from .request import INPUTS, BakeRequest
 
 T = TypeVar("T")
@@ -49,8 +48,9 @@ class InputContents:
         """SHA-256 of all files and of where they lie beside each other; of the file where it is one."""
         if len(self.files) == 1:
             return self.first
-        home = os.path.dirname(os.path.abspath(self.files[0][0]))
-        parts = sorted((_beside(path, home), digest) for path, digest in self.files)
+        home = Path(self.files[0][0]).parent
+        # By its name alone where the two share nothing, as on other machines.
+        parts = sorted((relative_path(path, home) or Path(path).name, digest) for path, digest in self.files)
         return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
     def still_there(self, hashed: Callable[[str], str] = sha256) -> bool:
@@ -59,16 +59,6 @@ class InputContents:
             return all(hashed(path) == digest for path, digest in self.files)
         except OSError:
             return False
-
-
-def _beside(path: str, folder: str) -> str:
-    """Return a path relative to a folder; its name alone where the two share nothing, as on other machines."""
-    path = os.path.abspath(path)
-    try:
-        shared = os.path.commonpath([path, folder])
-    except ValueError:  # other drives
-        return os.path.basename(path)
-    return Path(os.path.relpath(path, folder)).as_posix() if Path(shared).name else os.path.basename(path)
 
 
 def model_contents(model: str, hashed: Callable[[str], str] = sha256) -> InputContents:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ..errors import fail
-from ..files import sha256
+from ..files import relative_path, sha256
 from .record import RECORD
 from .request import BakeRequest
 from .rollout import BakeRollout
@@ -33,12 +33,7 @@ def _from_folder(location: str, folder: Path) -> str:
 
     So nothing tells where a studio keeps its files, and the same files give the same bytes wherever they lie.
     """
-    path = Path(location).absolute()
-    try:
-        shared = Path(os.path.commonpath([path, folder]))
-    except ValueError:  # on another drive
-        return _name(location)
-    return os.path.relpath(path, folder) if shared != Path(shared.anchor) else _name(location)
+    return relative_path(location, folder) or _name(location)
 
 
 def _name(location: str) -> str:

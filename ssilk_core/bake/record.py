@@ -11,7 +11,7 @@ from pathlib import Path
 
 from .. import __version__, work_record
 from ..errors import SsilkError
-from ..files import sha256
+from ..files import relative_path, sha256
 from ..work_record import Hash, WorkRecord, request_key
 from .inputs import InputHashes
 from .plain import from_plain
@@ -86,15 +86,9 @@ def portable(location: str, folder: Path) -> str:
     from ssilk_usd.read_stage import split_location
 
     file, prim = split_location(location)
-    place, home = os.path.abspath(file), os.path.abspath(folder)
-    try:
-        shared = Path(os.path.commonpath([place, home]))
-    except ValueError:  # on another drive
-        shared = Path(Path(place).anchor)
-    if shared == Path(shared.anchor):
-        path = f"{hashlib.sha256(place.encode()).hexdigest()[:8]}/{Path(place).name}"
-    else:
-        path = Path(os.path.relpath(place, home)).as_posix()
+    path = relative_path(file, folder)
+    if path is None:
+        path = f"{hashlib.sha256(os.path.abspath(file).encode()).hexdigest()[:8]}/{Path(file).name}"
     return f"{path}:{prim}" if prim else path
 
 
