@@ -123,8 +123,8 @@ class TrainConfig:
     state_reuse: float = 0.97
     rotated_fraction: float = 0.5
     recombinations: int = 3
-    perturbations: int = 0
-    outlier_energy: float = 0.0
+    perturbations: int = 1
+    outlier_energy: float = 0.1
     static_batch: int = 256
     noise_probability: float = 0.03
     noise: float = 0.1

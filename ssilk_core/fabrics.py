@@ -11,7 +11,7 @@ from .errors import fail
 STRETCH_MODELS = ("stvk", "baraff_witkin")
 CONTACT_MODELS = ("surface", "vertex")
 # What files state of a fabric from before contact acted on surfaces: nothing of these.
-FABRIC_OF_VERTICES: dict[str, Any] = {"contact_model": "vertex", "thickness": 0.0}
+FABRIC_OF_VERTICES: dict[str, Any] = {"contact_model": "vertex", "thickness": 0.0, "tether": 0.0}
 
 
 @dataclass(frozen=True)
@@ -25,10 +25,13 @@ class Fabric:
         stretch, shear: stiffness along and across the threads [N/m]; used by "baraff_witkin".
         bending: dihedral stiffness [N m] (per radian squared).
         contact_model: "surface" (`energy.collision`) or "vertex", the paper's penalty, which depends on the mesh.
-        contact: stiffness of contact at the skin, for each area [N/m3]; used by "surface".
+        contact, loose_contact: stiffness of contact at the skin, for each area of tight and pinned cloth, and of
+            loose cloth [N/m3]; used by "surface". Tight cloth is under tension, loose cloth only under its weight.
         collision: penalty stiffness for each vertex [N/m, per vertex]; used by "vertex".
         margin: gap between the fabric and the body at which contact begins [m].
         thickness: of the fabric, whose mesh lies in its middle [m].
+        tether: stiffness, for each area, that holds tight cloth where linear blend skinning puts it [N/m3]. It acts
+            as static friction does: without it, tight cloth slides to where the body is thin.
         drag: air drag per area and velocity [kg/(m2 s)], relative to air that moves with the character's root.
             The default stops light cloth from swinging within about half a second. Zero is the paper's vacuum.
     """
@@ -43,9 +46,11 @@ class Fabric:
     bending: float = 1e-5
     contact_model: str = "surface"
     contact: float = 1e6
+    loose_contact: float = 2e5
     collision: float = 10.0
     margin: float = 8e-3
     thickness: float = 1e-3
+    tether: float = 1e3
     drag: float = 0.3
 
     def __post_init__(self) -> None:
@@ -82,7 +87,7 @@ FABRICS: dict[str, Fabric] = {
     for fabric in (
         Fabric("default"),
         # The contact of the paper's tables.
-        Fabric("paper", contact_model="vertex", margin=4e-3, thickness=0.0),
+        Fabric("paper", contact_model="vertex", margin=4e-3, thickness=0.0, tether=0.0),
         Fabric(
             "silk",
             density=0.08,

@@ -87,13 +87,19 @@ class SampledCloth:
 
     Attributes:
         samples: as they were given.
-        area: of each sample, shape (S, 1).
+        area: of each sample, times the share of the full stiffness of contact that it has, shape (S, 1).
+
+    Args:
+        stiffness: that share, shape (S,); one by default.
     """
 
-    def __init__(self, samples: ContactSamples, device: torch.device, dtype: torch.dtype) -> None:
+    def __init__(
+        self, samples: ContactSamples, device: torch.device, dtype: torch.dtype, stiffness: Floats | None = None
+    ) -> None:
         count = len(samples.area)
         self.samples = samples
-        self.area = torch.as_tensor(samples.area, dtype=dtype, device=device)[:, None]
+        area = samples.area if stiffness is None else samples.area * stiffness
+        self.area = torch.as_tensor(area, dtype=dtype, device=device)[:, None]
         rows = np.repeat(np.arange(count), 3)
         used = samples.weights.reshape(-1) > 0
         entries = rows[used], samples.corners.reshape(-1)[used], samples.weights.reshape(-1)[used]

@@ -28,7 +28,7 @@ def energy_terms(
     The share counts vertices inside any part of the body, also where the energy lets them touch only one part.
 
     Args:
-        x, lbs: positions (V, 3, N); gravity is that of `x` minus that of `lbs`.
+        x, lbs: positions (V, 3, N); gravity is that of `x` minus that of `lbs`, and tethers end at `lbs`.
         joined: up to two earlier frames, then `x`. Inertia is zero where two earlier frames are missing.
         down: direction of gravity, shape (3,).
     """
@@ -40,5 +40,6 @@ def energy_terms(
         "gravity": energy.gravity(x - lbs, GRAVITY * down[:, None]),
         "inertia": torch.cat([inertia.new_zeros(x.shape[-1] - len(inertia)), inertia]),
         "collision": energy.collision_at(contact_distance),
+        "tether": energy.tether(x, lbs[energy.tethered]),
         "collisions": (body_distance[: len(x)] < 0).double().mean(0),
     }

@@ -8,20 +8,23 @@ import torch
 from torch import Tensor
 
 from .. import kernels
-from ..assets import Floats, Ints, Mesh
+from ..assets import LOOSE, TIGHT, Floats, Ints, Mesh
 from ..collision import PosedBody, signed_distance, signed_distance_to_planes
-from ..collision.samples import SampledCloth, contact_samples
+from ..collision.samples import ContactSamples, SampledCloth, contact_samples
 from ..fabrics import Fabric
 from ..kernels.corners import elastic_tables
 from ..mesh import topology
 from ..mesh.topology import SLIVER
 from ..operators import difference_operator
 from .bending import bending_energy, dihedral_angles
-from .collision import ContactLaw
+from .collision import TINY, ContactLaw
 from .stretch import column_weights, deformation_gradient_operator, stretch_density, stretched_areas
 
-TERMS = ("stretch", "bending", "gravity", "inertia", "collision")
-"""The paper's terms. Drag is part of training but not of totals, so that these compare with the paper's."""
+TERMS = ("stretch", "bending", "gravity", "inertia", "collision", "tether")
+"""The paper's terms, and the tether, which its fabric does without.
+
+Drag is part of training but not of totals, so that these compare with the paper's.
+"""
 STATIC_TERMS = tuple(term for term in TERMS if term != "inertia")
 """Those that a pose at rest has."""
 
@@ -32,10 +35,21 @@ class GarmentEnergy:
     Attributes:
         mass: lumped vertex masses [kg], shape (V,).
         cloth: the samples of the cloth, at which it meets the body.
+        tethered: indices of the vertices that a tether holds, shape (T,).
+        tether_stiffness: of each of these [N/m], shape (T,).
+
+    Args:
+        classes: of the vertices, shape (V,). Without them contact has its full stiffness and there are no tethers.
     """
 
     def __init__(
-        self, mesh: Mesh, fabric: Fabric, *, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
+        self,
+        mesh: Mesh,
+        fabric: Fabric,
+        classes: Ints | None = None,
+        *,
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float32,
     ) -> None:
         device = torch.device(device)
 
@@ -46,8 +60,14 @@ class GarmentEnergy:
         hinges = topology.hinges(mesh.faces) if fabric.bending else np.zeros((0, 4), dtype=np.int64)
         self.fabric = fabric
         self.area = tensor(areas)[:, None]
-        self.mass = tensor(fabric.density * topology.vertex_areas(mesh.points, mesh.faces))
-        self.cloth = SampledCloth(contact_samples(mesh, fabric), device, dtype)
+        vertex_areas = topology.vertex_areas(mesh.points, mesh.faces)
+        self.mass = tensor(fabric.density * vertex_areas)
+        held = fabric.tether > 0 and classes is not None
+        tethered = np.flatnonzero(classes == TIGHT) if held else np.zeros(0, dtype=np.int64)
+        self.tethered = torch.as_tensor(tethered, device=device)
+        self.tether_stiffness = tensor(fabric.tether * vertex_areas[tethered])
+        samples = contact_samples(mesh, fabric)
+        self.cloth = SampledCloth(samples, device, dtype, _contact_stiffness(samples, fabric, classes))
         self.law = ContactLaw.of(fabric)
         self._gradient = deformation_gradient_operator(mesh, device, dtype)
         heads = hinges[:, [1, 2, 3]].T.reshape(-1)
@@ -82,6 +102,10 @@ class GarmentEnergy:
         """
         weight = self.fabric.drag / self.fabric.density * self.mass
         return weight @ ((x - advected.detach()) ** 2).sum(1) / (2 * dt)
+
+    def tether(self, x: Tensor, skinned: Tensor) -> Tensor:
+        """Return sum k/2 |x - skinned|^2 over the tethered vertices; `skinned` (T, 3, N) has no gradient."""
+        return self.tether_stiffness @ ((x.index_select(0, self.tethered) - skinned.detach()) ** 2).sum(1) / 2
 
     def collision(self, x: Tensor, body: PosedBody) -> Tensor:
         return self.collision_at(signed_distance(self.cloth.positions(x), body))
@@ -135,6 +159,14 @@ class GarmentEnergy:
 
         weights = 1 / (dt * dt), self.fabric.drag / self.fabric.density / dt
         return inertia_and_drag_kernel(x, self.mass, last, before, shift, *weights)
+
+
+def _contact_stiffness(samples: ContactSamples, fabric: Fabric, classes: Ints | None) -> Floats | None:
+    """Return each sample's share of the full stiffness of contact, shape (S,); None for one everywhere."""
+    if classes is None or fabric.contact_model == "vertex":
+        return None
+    loose = samples.classes(classes) == LOOSE
+    return np.where(loose, fabric.loose_contact / max(fabric.contact, TINY), 1.0)
 
 
 def _hinge_shapes(mesh: Mesh, hinges: Ints) -> Floats:

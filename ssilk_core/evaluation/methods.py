@@ -76,7 +76,7 @@ class EvaluationScene:
     ) -> None:
         mesh = scene.garment.mesh
         self.scene, self.fabric, self.fps, self.device, self.exact = scene, fabric, fps, device, exact
-        self.energy = GarmentEnergy(mesh, fabric, device=device)
+        self.energy = GarmentEnergy(mesh, fabric, scene.classes, device=device)
         self.columns = deformation_gradient_operator(mesh, device, torch.float32)
         skeleton = scene.character.skeleton
         self.body = CollisionBody(scene.character.merged_body(), skeleton.joint_count, device=device)

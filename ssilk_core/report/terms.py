@@ -18,8 +18,9 @@ from ..fabrics import Fabric
 from ..mesh.topology import vertex_normals
 from ..shown_skin import ShownSkin
 
+SHOT_TERMS = tuple(term for term in TERMS if term != "tether")
 SHARE, SHOWN, BARE = "inside the body", "covered skin that shows", "covered skin that is bare"
-UNITS = {"total": "J", **dict.fromkeys(TERMS, "J"), SHARE: "%", SHOWN: "%", BARE: "%"}
+UNITS = {"total": "J", **dict.fromkeys(SHOT_TERMS, "J"), SHARE: "%", SHOWN: "%", BARE: "%"}
 
 
 @dataclass(eq=False)
@@ -27,8 +28,8 @@ class TermsMeter:
     """Measures the energies of a shot's frames, given in order.
 
     The energy of gravity counts heights above the middle of the body, relative to the garment at rest. A shot does
-    not say which cloth is tight, so all cloth collides with the whole body here. In training tight cloth collides
-    only with the patch under it.
+    not say which cloth is tight: all cloth collides with the whole body here, as stiffly as tight cloth, and none is
+    tethered. In training tight cloth collides only with the patch under it.
 
     Attributes:
         garment: the mesh at rest.

@@ -3,7 +3,8 @@
 
 Implicit Euler with time step dt is the minimum of
 
-    stretch + bending + gravity + collision + m/(2 dt^2) |x - (2 x' - x'')|^2 + drag a/(2 dt) |x - advected|^2
+    stretch + bending + gravity + collision + tether
+    + m/(2 dt^2) |x - (2 x' - x'')|^2 + drag a/(2 dt) |x - advected|^2
 
 (`energy.GarmentEnergy`); a quasi-static state has none of the last two terms. The distance to the body is that to the
 whole surface that a vertex can touch. Training uses only the triangles around the nearest vertex. The distance is
@@ -40,6 +41,7 @@ class StepInputs:
         predicted: 2 x' - x'' [m], shape (V, 3, N), or None for a quasi-static state.
         advected: x' moved with the air [m], shape (V, 3, N), or None likewise.
         dt: time step [s]. For a quasi-static state it only damps the solver's steps.
+        skinned: the garment under linear blend skinning [m], where tethers hold it, shape (V, 3, N); None without.
     """
 
     body: PosedBody | None
@@ -47,12 +49,15 @@ class StepInputs:
     predicted: Tensor | None = None
     advected: Tensor | None = None
     dt: float = 0.1
+    skinned: Tensor | None = None
 
     def select(self, frames: Tensor) -> StepInputs:
         """Return the inputs of the frames with indices (M,)."""
         body = self.body and self.body.select(frames)
-        predicted, advected = (v if v is None else v[..., frames] for v in (self.predicted, self.advected))
-        return StepInputs(body, self.gravity[..., frames], predicted, advected, self.dt)
+        predicted, advected, skinned = (
+            v if v is None else v[..., frames] for v in (self.predicted, self.advected, self.skinned)
+        )
+        return StepInputs(body, self.gravity[..., frames], predicted, advected, self.dt, skinned)
 
 
 class IncrementalPotential:
@@ -70,10 +75,12 @@ class IncrementalPotential:
         self, scene: Scene, fabric: Fabric, *, device: torch.device, dtype: torch.dtype = torch.float64
     ) -> None:
         mesh = scene.garment.mesh
-        energy = GarmentEnergy(mesh, fabric, device=device, dtype=dtype)
+        energy = GarmentEnergy(mesh, fabric, scene.classes, device=device, dtype=dtype)
         hinges = topology.hinges(mesh.faces) if fabric.bending else np.zeros((0, 4), dtype=np.int64)
         self.fabric, self.dtype = fabric, dtype
         self.mass: Tensor = energy.mass[:, None]
+        self.tether = torch.zeros_like(self.mass)
+        self.tether[energy.tethered, 0] = energy.tether_stiffness
         self.size = float(np.linalg.norm(np.ptp(mesh.points, axis=0)))
         self.cloth, self.law = energy.cloth, energy.law
         self.contacts = Contacts(scene, self.cloth.samples, device=device)
@@ -156,8 +163,10 @@ class IncrementalPotential:
         return ((force * force).sum(1) / mass).sum(0).div(mass.sum()).sqrt() / GRAVITY
 
     def _anchors(self, inputs: StepInputs) -> list[tuple[Tensor, Tensor]]:
-        """Return stiffness [N/m] (V, 1) and target (V, 3, N) of inertia and drag, where present."""
+        """Return stiffness [N/m] (V, 1) and target (V, 3, N) of the tether, inertia and drag, where present."""
         found = []
+        if inputs.skinned is not None and self.fabric.tether:
+            found.append((self.tether, inputs.skinned))
         if inputs.predicted is not None:
             found.append((self.mass / inputs.dt**2, inputs.predicted))
         if inputs.advected is not None and self.fabric.drag:

@@ -167,10 +167,10 @@ class Simulator:
         """Return the inputs of a step after `past`, or of a quasi-static state without it, relative to the roots."""
         gravity = self.gravity.expand(3, poses.root.shape[-1])
         if past is None:
-            return StepInputs(poses.body, gravity)
+            return StepInputs(poses.body, gravity, skinned=poses.lbs)
         shift = poses.root - past.root
         predicted = past.follow_lbs(poses) if past.before is None else past.local + (past.last - past.before - shift)
-        return StepInputs(poses.body, gravity, predicted.to(past.lbs.dtype), past.local, self.dt)
+        return StepInputs(poses.body, gravity, predicted.to(past.lbs.dtype), past.local, self.dt, poses.lbs)
 
     def _step(self, poses: PosedCharacters, past: StepHistory) -> Solution:
         """Return the states one step later."""

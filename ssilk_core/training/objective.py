@@ -7,12 +7,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..assets import SkinWeights
 from ..collision import CollisionBody, Contacts
 from ..collision.contacts import no_planes
 from ..constants import GRAVITY
 from ..energy import GarmentEnergy
 from ..model.network import GarmentModel
 from ..motion_bank import MotionBank
+from ..skinning import Skinning
 from .latent_regularization import latent_distortion
 from .windows import WindowSampler
 
@@ -46,6 +48,12 @@ class Objective:
             self.contacts = Contacts(
                 model.scene, energy.cloth.samples, vertices=body.vertices, pinned=False, device=device
             )
+        self.skin = None
+        if len(tethered := energy.tethered.cpu().numpy()):
+            skin = model.scene.lbs_skin
+            rows = SkinWeights(skin.path, skin.indices[tethered], skin.weights[tethered])
+            self.skin = Skinning(rows).to(device)
+            self.tethered_rest = model.decoder.rest[energy.tethered]
         self.dt = 1 / model.config.fps
         size = float(np.linalg.norm(np.ptp(model.scene.garment.mesh.points, axis=0)))
         self.scale = GRAVITY * float(energy.mass.sum()) * size
@@ -58,7 +66,10 @@ class Objective:
         gravity, collision = energy.gravity_and_collision(
             x, root, GRAVITY * direction.T, sampled, *self._planes(sampled.detach(), character)
         )
-        return {"stretch": stretch, "bending": bending, "gravity": gravity, "collision": collision}
+        terms = {"stretch": stretch, "bending": bending, "gravity": gravity, "collision": collision}
+        if self.skin:
+            terms["tether"] = energy.tether(x, self.skin(self.tethered_rest, None, self.skin.weights, character))
+        return terms
 
     def _planes(self, x: Tensor, character: Tensor) -> tuple[Tensor, Tensor]:
         """Return the plane that each sample x (S, 3, N) can touch: normals (S, 3, N) and offsets (S, N)."""

@@ -75,7 +75,7 @@ def build_parts(job: TrainJob, device: torch.device, group: ProcessGroup = SINGL
     model = GarmentModel(scene, job.model, joints, job.train.seed).to(device)
     bank = build_bank(motions, skeleton, joints, fps, device, max_joint_speed=MAX_JOINT_SPEED)
     held = build_bank(job.held_out, skeleton, joints, fps, device)
-    energy = GarmentEnergy(scene.garment.mesh, job.fabric, device=device)
+    energy = GarmentEnergy(scene.garment.mesh, job.fabric, scene.classes, device=device)
     body, count = scene.character.merged_body(), skeleton.joint_count
     touched = CollisionBody(body, count, vertices=reach.vertices, device=device) if len(reach.vertices) else None
     # Validation uses the whole body, to detect collisions with parts that training leaves out.

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from ssilk_core.assets import Mesh
+from ssilk_core.assets import LOOSE, TIGHT, Mesh
 from ssilk_core.collision import PosedBody
 from ssilk_core.collision.samples import MAX_DIVISIONS, MAX_SPACING
 from ssilk_core.energy import GarmentEnergy
@@ -17,15 +17,16 @@ from ssilk_core.fabrics import Fabric
 DT, FRAMES = 1 / 30, 3
 STVK = Fabric("stvk", bending=2e-3, collision=30.0, margin=0.02)
 WOVEN = Fabric("woven", stretch_model="baraff_witkin", density=0.3, drag=0.7)
-TERMS = ("stvk", "woven", "bending", "gravity", "inertia", "drag", "collision")
+TERMS = ("stvk", "woven", "bending", "gravity", "inertia", "drag", "collision", "tether")
 Twin = Callable[["Case", np.ndarray, int], tuple[float, np.ndarray]]
 
 
 @dataclass(frozen=True)
 class Case:
-    """A crumpled sheet in motion near a body: positions (V, 3, N) and (B, 3, N)."""
+    """A crumpled sheet, half tight and half loose, in motion near a body: positions (V, 3, N) and (B, 3, N)."""
 
     mesh: Mesh
+    classes: np.ndarray
     x: np.ndarray
     last: np.ndarray
     predicted: np.ndarray
@@ -36,7 +37,7 @@ class Case:
     def energy_of(self, term: str, x: torch.Tensor) -> torch.Tensor:
         """The fast path of a term, in the precision of `x`."""
         fabric = WOVEN if term in ("woven", "drag") else STVK
-        energy = GarmentEnergy(self.mesh, fabric, dtype=x.dtype)
+        energy = GarmentEnergy(self.mesh, fabric, self.classes, dtype=x.dtype)
         last, predicted, down, points, normals = (
             torch.tensor(v, dtype=x.dtype) for v in (self.last, self.predicted, self.down, self.points, self.normals)
         )
@@ -48,6 +49,7 @@ class Case:
             "inertia": lambda: energy.inertia(x, predicted, DT),
             "drag": lambda: energy.drag(x, last, DT),
             "collision": lambda: energy.collision(x, PosedBody(points, normals)),
+            "tether": lambda: energy.tether(x, predicted[energy.tethered]),
         }
         return calls[term]()
 
@@ -61,6 +63,7 @@ def build(points: np.ndarray, faces: np.ndarray, seed: int) -> Case:
     normals = rng.normal(size=(60, 3, FRAMES))
     return Case(
         Mesh("/crumpled", rest, faces),
+        np.where(points[:, 0] > 0, LOOSE, TIGHT),
         x,
         last,
         last + noise[2],
@@ -218,12 +221,21 @@ def collision(case: Case, x: np.ndarray, frame: int) -> tuple[float, np.ndarray]
                 ]
         for weights, share in parts:
             energy, slope = contact_of_a_point(case, weights @ x[face], frame)
+            if weights @ (case.classes[face] == LOOSE) >= 0.5:
+                share *= STVK.loose_contact / STVK.contact
             total += share * energy
             gradient[face] += share * weights[:, None] * slope
     return total, gradient
 
 
-TWINS: dict[str, Twin] = dict(zip(TERMS, (stvk, woven, bending, gravity, inertia, drag, collision)))
+def tether(case: Case, x: np.ndarray, frame: int) -> tuple[float, np.ndarray]:
+    tight = (case.classes == TIGHT)[:, None]
+    weight = tight * STVK.tether * masses(case.mesh, 1.0)[:, None]
+    offset = x - case.predicted[..., frame]
+    return float(np.sum(weight * offset**2) / 2), weight * offset
+
+
+TWINS: dict[str, Twin] = dict(zip(TERMS, (stvk, woven, bending, gravity, inertia, drag, collision, tether)))
 
 
 def fast(case: Case, term: str, dtype: torch.dtype) -> tuple[np.ndarray, np.ndarray]:

@@ -48,7 +48,9 @@ def moving(scene: Scene, frames: int = 2) -> tuple[torch.Tensor, StepInputs]:
     """A crumpled strip on its way, touching the ball."""
     x = crumpled(scene, frames) + torch.tensor([0.0, 0.0, 0.03], dtype=torch.float64)[:, None]
     past, air = crumpled(scene, frames, 0.01), crumpled(scene, frames, 0.02)
-    return x, StepInputs(body_of(scene, frames), DOWN.expand(3, frames), past, air, 1 / 30)
+    return x, StepInputs(
+        body_of(scene, frames), DOWN.expand(3, frames), past, air, 1 / 30, crumpled(scene, frames, 0.006)
+    )
 
 
 @pytest.fixture(params=FABRICS)
@@ -58,7 +60,7 @@ def potential(request: pytest.FixtureRequest, scene: Scene) -> IncrementalPotent
 
 def test_the_energy_is_that_of_training(potential: IncrementalPotential, scene: Scene) -> None:
     x, inputs = moving(scene)
-    energy = GarmentEnergy(scene.garment.mesh, potential.fabric, dtype=torch.float64)
+    energy = GarmentEnergy(scene.garment.mesh, potential.fabric, scene.classes, dtype=torch.float64)
     body = PosedBody(inputs.body.points.double(), inputs.body.normals.double(), inputs.body.rings)
     terms = {
         "stretch": energy.stretch(x),
@@ -67,6 +69,7 @@ def test_the_energy_is_that_of_training(potential: IncrementalPotential, scene: 
         "inertia": energy.inertia(x, inputs.predicted, inputs.dt),
         "drag": energy.drag(x, inputs.advected, inputs.dt),
         "collision": energy.collision(x, body),
+        "tether": energy.tether(x, inputs.skinned[energy.tethered]),
     }
     assert terms.keys() == {*TERMS, "drag"}, "a new term is part of the simulator too"
     numbers = {name: value for name, value in vars(potential.fabric).items() if isinstance(value, float)}
@@ -197,6 +200,7 @@ def test_the_assembled_hessian_is_the_gauss_newton_hessian(potential: Incrementa
     )[:, :, :, 0] * (2 * potential.hinges.stiffness[:, :, None]).sqrt()  # fmt: skip
     expected += torch.einsum("hia,hjb->iajb", slopes, slopes)
     inertia = potential.mass[:, 0] * (900 + potential.fabric.drag / potential.fabric.density * 30)
+    inertia = inertia + potential.tether[:, 0]
     contact = potential.cloth.area * potential.law.curvature(body_distance.distance(potential.cloth.positions(x)))
     corners, shares = (
         torch.as_tensor(part) for part in (potential.cloth.samples.corners, potential.cloth.samples.weights)
@@ -380,7 +384,7 @@ def test_a_vertex_on_a_crease_does_not_keep_the_others_from_coming_to_rest(
     monkeypatch, potential: IncrementalPotential, scene: Scene
 ) -> None:
     x, inputs = moving(scene, 2)
-    potential = IncrementalPotential(scene, replace(potential.fabric, contact_model="vertex"), device=CPU)
+    potential = IncrementalPotential(scene, replace(potential.fabric, contact_model="vertex", tether=0.0), device=CPU)
     vertex = int(potential.free[len(potential.free) // 2])
     monkeypatch.setattr(potential, "body_distance", creased(potential, vertex, float(x[vertex, 0, 0])))
     options = SolverOptions(tolerance=1e-3)
