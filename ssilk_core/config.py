@@ -201,6 +201,7 @@ PRESETS = {
                 state_reuse=0.7,
                 static_batch=8,
                 recombinations=0,
+                perturbations=0,
                 rotated_fraction=0.3,
                 learning_rate=6e-4,
                 final_learning_rate=1e-4,
