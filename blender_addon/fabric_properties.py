@@ -96,11 +96,17 @@ class FabricSettings(bpy.types.PropertyGroup):
     contact: _number(
         "contact", "Contact", "How hard the body pushes each area away at the skin, in N/m³", precision=0
     )
+    loose_contact: _number(
+        "loose_contact", "Loose Contact", "The same of loose cloth; a soft one slides off hands", precision=0
+    )
     collision: _number("collision", "Collision", "How hard the body pushes each vertex away, in N/m")
     margin_meters: _meters("margin", "Gap at which the body begins to push, in m")
     margin: _length("margin", "Margin", "Gap between cloth and body at which the body begins to push")
     thickness_meters: _meters("thickness", "Thickness of the cloth, in m")
     thickness: _length("thickness", "Thickness", "Thickness of the cloth, whose mesh lies in its middle")
+    tether: _number(
+        "tether", "Tether", "How firmly tight cloth stays over its skin, in N/m³; zero lets it slide", precision=0
+    )
     drag: _number("drag", "Air Drag", "Resistance of the air for each area and speed, in kg/(m² s); zero is a vacuum")
 
 

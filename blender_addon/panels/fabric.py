@@ -9,7 +9,7 @@ from ..scene.garment import unusable
 from .base import SidebarPanel
 
 MEMBRANE = {"stvk": ("lame_mu", "lame_lambda"), "baraff_witkin": ("stretch", "shear")}  # values of each model
-CONTACT = {"surface": "contact", "vertex": "collision"}  # likewise
+CONTACT = {"surface": ("contact", "loose_contact"), "vertex": ("collision",)}  # likewise
 
 
 class FabricPanel(SidebarPanel, bpy.types.Panel):
@@ -28,5 +28,5 @@ class FabricPanel(SidebarPanel, bpy.types.Panel):
         for name in ("preset", "density", "stretch_model", *MEMBRANE[fabric.stretch_model]):
             layout.prop(fabric, name)
         contact = CONTACT[fabric.contact_model]
-        for name in ("bending", "drag", "contact_model", contact, "margin", "thickness"):
+        for name in ("bending", "drag", "contact_model", *contact, "margin", "thickness", "tether"):
             layout.prop(fabric, name)

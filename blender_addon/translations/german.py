@@ -31,6 +31,12 @@ WORDS = {
     "The body pushes each vertex, as in the paper; a coarse mesh resists less": (
         "Der Körper drückt jeden Eckpunkt, wie im Artikel; ein grobes Netz hält weniger stand"
     ),
+    "Loose Contact": "Kontakt des Losen",
+    "The same of loose cloth; a soft one slides off hands": "Ebenso bei losem Stoff; weich gleitet er von Händen ab",
+    "Tether": "Halt",
+    "How firmly tight cloth stays over its skin, in N/m³; zero lets it slide": (
+        "Wie fest enger Stoff über seiner Haut bleibt, in N/m³; null lässt ihn gleiten"
+    ),
     "Thickness": "Dicke",
     "Paper": "Artikel",
     "Surface": "Fläche",

@@ -128,7 +128,7 @@ def build_model(scene: Scene, seed: int = 3, scale: float = 0.3, **options: obje
 def build_objective(scene: Scene, model: GarmentModel, *motions: Motion, surface: bool = True) -> Objective:
     """What a training run puts together, of one fabric with every term switched on."""
     cpu, skeleton = torch.device("cpu"), scene.character.skeleton
-    energy = GarmentEnergy(scene.garment.mesh, Fabric("toy", bending=1e-4, margin=0.02))
+    energy = GarmentEnergy(scene.garment.mesh, Fabric("toy", bending=1e-4, margin=0.02), scene.classes)
     body = CollisionBody(scene.character.merged_body(), skeleton.joint_count, device=cpu)
     bank = build_bank(motions, skeleton, model.joints, model.config.fps, cpu)
     return Objective(model, energy, body, bank, surface)

@@ -12,11 +12,12 @@ from ssilk_core.collision import signed_distance_to_planes
 from ssilk_core.config import TrainConfig
 from ssilk_core.constants import GRAVITY
 from ssilk_core.schemes import SCHEMES
+from ssilk_core.skinning import Skinning
 from ssilk_core.training.objective import Objective, total
 from ssilk_core.training.step import Stepper
 from ssilk_core.training.windows import WindowSampler
 
-CONFIG = TrainConfig(batch=3, window=6, static_batch=6, rotated_fraction=0.5, noise=0.2)
+CONFIG = TrainConfig(batch=3, window=6, static_batch=6, rotated_fraction=0.5, noise=0.2, outlier_energy=0)
 
 
 @pytest.fixture
@@ -47,6 +48,8 @@ def at_frame(objective: Objective, z: torch.Tensor, frame: torch.Tensor, down: t
             signed_distance_to_planes(sampled, *objective.contacts.planes(sampled, objective.body.pose(character)))
         ),
     }
+    skin, rest = Skinning(objective.model.scene.lbs_skin), objective.model.decoder.rest
+    terms["tether"] = energy.tether(x, skin(rest, None, skin.weights, character)[energy.tethered])
     return x, terms
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from ssilk_core.assets import LOOSE, PINNED, Garment, Mesh, Motion, ProxyRig, Scene, SkinWeights
+from ssilk_core.assets import LOOSE, PINNED, TIGHT, Garment, Mesh, Motion, ProxyRig, Scene, SkinWeights
 from ssilk_core.errors import SsilkError
 from ssilk_core.fabrics import Fabric
 from ssilk_core.kinematics import (
@@ -85,6 +85,18 @@ def test_a_strip_hangs_as_a_column_under_its_own_weight(scene, toy_grid) -> None
     assert stretch.max() > 1.1
     lowest = -float(found.x[:, 1].min())
     assert lowest == pytest.approx(stretch.mean() * length, rel=3e-3)
+
+
+def test_tethered_cloth_sags_by_its_weight_over_the_stiffness(scene: Scene, toy_grid) -> None:
+    points, faces = toy_grid(7, 7, height=0.3, width=0.3)
+    cloth = dressed(scene, points, faces, np.zeros(len(points), dtype=bool))
+    tight = replace(cloth, garment=replace(cloth.garment, classes=np.full(len(points), TIGHT)))
+    potential = IncrementalPotential(tight, replace(CALM, tether=500.0), device=CPU)
+    down = torch.tensor([[0.0], [-G], [0.0]], dtype=torch.float64)
+    inputs = StepInputs(None, down, skinned=tensor(points))
+    found = minimise_from(potential, tensor(points), inputs, EXACT)
+    sag = CALM.density * G / 500.0
+    torch.testing.assert_close(found.x, tensor(points - [0, sag, 0]), rtol=0, atol=1e-8)
 
 
 @pytest.mark.parametrize("model", ["stvk", "baraff_witkin"])

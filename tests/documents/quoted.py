@@ -51,6 +51,8 @@ PAPER = {
     "state_reuse": 0,
     "rotated_fraction": 1,
     "recombinations": 0,
+    "perturbations": 0,
+    "outlier_energy": 0,
     "noise_correlation": 0,
     "noise_probability": "not stated",
     "static_fraction": 0,
@@ -83,6 +85,8 @@ def training() -> Text:
     yield f"| `drag` (material) [kg/(m² s)] | {cloth.drag:g} |"
     yield f"| `contact_model` (material) | {cloth.contact_model} | {papers.contact_model} |"
     yield f"| `contact` (material) [N/m³] | {cloth.contact:g} | none |"
+    yield f"| `loose_contact` (material) [N/m³] | {cloth.loose_contact:g} | none |"
+    yield f"| `tether` (material) [N/m³] | {cloth.tether:g} | {papers.tether:g} |"
     yield f"| `margin` (material) [mm] | {1000 * cloth.margin:g} | {1000 * papers.margin:g} |"
     yield f"| `thickness` (material) [mm] | {1000 * cloth.thickness:g} | none |"
     yield f"{default('fps'):g} times a second"
