@@ -73,7 +73,7 @@ def read_run(text: str) -> Run:
     points = document["points"]
     if not points:
         fail(str(path), "the curve has no point yet", "one validation at least is needed", "train longer")
-    values = {key: np.array([point["validation"][key] for point in points]) for key in PANELS}
+    values = {key: np.array([point["validation"].get(key, 0.0) for point in points]) for key in PANELS}
     iterations, seconds = (np.array([point[key] for point in points]) for key in ("iteration", "seconds"))
     return Run(name or Path(model).stem, iterations, seconds, values, curve_lbs(document)["total"])
 

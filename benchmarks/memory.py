@@ -103,7 +103,7 @@ def stepper(whole: Scene, config: TrainConfig, device: torch.device) -> Stepper:
     joints = np.arange(JOINTS)
     bank = build_bank([Motion("/motion", model.fps, turns, places)], bones, joints, model.fps, device)
     network = GarmentModel(whole, model, joints).to(device)
-    energy = GarmentEnergy(whole.garment.mesh, Fabric("default"), device=device)
+    energy = GarmentEnergy(whole.garment.mesh, Fabric("default"), whole.classes, device=device)
     body = CollisionBody(whole.character.merged_body(), JOINTS, device=device)
     generator = torch.Generator(device).manual_seed(0)
     sampler = WindowSampler(bank, config, model.latent, generator)

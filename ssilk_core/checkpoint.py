@@ -21,7 +21,7 @@ from . import __version__
 from .assets import Character, Garment, Mesh, ProxyRig, Scene, Skeleton, SkinWeights
 from .config import ModelConfig
 from .errors import SsilkError, fail
-from .fabrics import FABRIC_OF_VERTICES, Fabric
+from .fabrics import Fabric, fabric_of_file
 from .files import replacing
 from .packing import dequantize, narrowest, quantize
 from .parameters import Shapes, parameter_shapes
@@ -257,7 +257,7 @@ def _model_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Model
     return ModelFile(
         scene,
         ModelConfig(**document["config"]),
-        Fabric(**(FABRIC_OF_VERTICES | document["fabric"])),
+        fabric_of_file(document["fabric"]),
         joints.astype(np.int64),
         _parameters(tensors, scene.garment.mesh.path),
         document["provenance"],

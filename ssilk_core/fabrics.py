@@ -10,8 +10,6 @@ from .errors import fail
 
 STRETCH_MODELS = ("stvk", "baraff_witkin")
 CONTACT_MODELS = ("surface", "vertex")
-# What files state of a fabric from before contact acted on surfaces: nothing of these.
-FABRIC_OF_VERTICES: dict[str, Any] = {"contact_model": "vertex", "thickness": 0.0, "tether": 0.0}
 
 
 @dataclass(frozen=True)
@@ -30,8 +28,8 @@ class Fabric:
         collision: penalty stiffness for each vertex [N/m, per vertex]; used by "vertex".
         margin: gap between the fabric and the body at which contact begins [m].
         thickness: of the fabric, whose mesh lies in its middle [m].
-        tether: stiffness, for each area, that holds tight cloth where linear blend skinning puts it [N/m3]. It acts
-            as static friction does: without it, tight cloth slides to where the body is thin.
+        tether: stiffness, for each area, that holds tight cloth where linear blend skinning puts it [N/m3]. It stands
+            in for friction, without which tight cloth slides to where the body is thin.
         drag: air drag per area and velocity [kg/(m2 s)], relative to air that moves with the character's root.
             The default stops light cloth from swinging within about half a second. Zero is the paper's vacuum.
     """
@@ -147,3 +145,11 @@ def fabric_named(name: str) -> Fabric:
     if name not in FABRICS:
         fail(f"fabric '{name}'", "no such preset", f"it is one of {', '.join(FABRICS)}")
     return FABRICS[name]
+
+
+def fabric_of_file(values: dict[str, Any]) -> Fabric:
+    """Return the fabric that a file states; what older files do not state did not act then."""
+    absent = {"contact_model": "vertex", "thickness": 0.0, "tether": 0.0}
+    if "contact" in values:
+        absent = {"tether": 0.0, "loose_contact": values["contact"]}
+    return Fabric(**(absent | values))

@@ -106,5 +106,5 @@ class BaselineStepper(Stepper):
         """Train everything on one window of every slot."""
         terms = self.objective.rolled(self.sampler)
         means = {name: value.mean() for name, value in terms.items()}
-        self._descend(total(terms), means, self.sampler.window())
+        self._descend(total(terms, self._half), means, self.sampler.window())
         self.sampler.advance(self.sampler.latents)

@@ -170,7 +170,7 @@ def stepper(size: Size, device: torch.device) -> Stepper:
     motions = [motion(skeleton, model.fps, seed) for seed in range(CLIPS)]
     bank = build_bank(motions, skeleton, joints, model.fps, device)
     network = GarmentModel(whole, model, joints).to(device)
-    energy = GarmentEnergy(whole.garment.mesh, Fabric("default"), device=device)
+    energy = GarmentEnergy(whole.garment.mesh, Fabric("default"), whole.classes, device=device)
     body = CollisionBody(whole.character.merged_body(), JOINTS, device=device)
     sampler = WindowSampler(bank, config, model.latent, torch.Generator(device).manual_seed(0))
     return Stepper(network, Objective(network, energy, body, bank), sampler, config)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import EXIT_OK, fail
 from ..events import Reporter, Result, Started
-from ..fabrics import FABRIC_OF_VERTICES, Fabric
+from ..fabrics import Fabric, fabric_of_file
 from ..files import replacing
 from .options import check_output
 
@@ -108,8 +108,7 @@ def _fabric(record: GarmentRecord | None) -> Fabric:
         return Fabric("default")
     known = {item.name for item in fields(Fabric)}
     numbers: dict[str, Any] = {name: value for name, value in record.parameters.items() if name in known}
-    contact: dict[str, Any] = {} if "contact" in numbers else FABRIC_OF_VERTICES
-    return Fabric(record.fabric, **(contact | numbers))
+    return fabric_of_file({"name": record.fabric, **numbers})
 
 
 def _model(options: argparse.Namespace, report: Reporter) -> list[Section]:

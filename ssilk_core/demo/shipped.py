@@ -12,7 +12,7 @@ from ..checkpoint import ModelFile, load_model
 from ..errors import fail
 
 FOLDER = Path(__file__).with_name("models")
-TOLERANCE = 0.01  # [m] between the garment of a model, which `rig` may have settled, and the one that is built here
+TOLERANCE = 0.01  # [m] between the garment of a model, which was settled, and the one that is built here
 
 
 def shipped_path(garment: str) -> Path:

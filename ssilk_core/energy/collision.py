@@ -38,11 +38,11 @@ class ContactLaw:
 
     @classmethod
     def of(cls, fabric: Fabric) -> ContactLaw:
-        """Return the law of a fabric, whose mesh lies in the middle of its thickness."""
+        """Return the law of a fabric where it is stiffest; its mesh lies in the middle of its thickness."""
         start = fabric.contact_distance
         if fabric.contact_model == "vertex":
             return cls(2 * fabric.collision, start, 0.0)
-        return cls(fabric.contact, start, fabric.margin)
+        return cls(max(fabric.contact, fabric.loose_contact), start, fabric.margin)
 
     def energy(self, distance: Tensor) -> Tensor:
         """Return the energy for each area [J/m2] (paper: [J]) at distances of the mesh [m], of the same shape."""

@@ -17,7 +17,7 @@ from ..mesh import topology
 from ..mesh.topology import SLIVER
 from ..operators import difference_operator
 from .bending import bending_energy, dihedral_angles
-from .collision import TINY, ContactLaw
+from .collision import ContactLaw
 from .stretch import column_weights, deformation_gradient_operator, stretch_density, stretched_areas
 
 TERMS = ("stretch", "bending", "gravity", "inertia", "collision", "tether")
@@ -163,10 +163,10 @@ class GarmentEnergy:
 
 def _contact_stiffness(samples: ContactSamples, fabric: Fabric, classes: Ints | None) -> Floats | None:
     """Return each sample's share of the full stiffness of contact, shape (S,); None for one everywhere."""
-    if classes is None or fabric.contact_model == "vertex":
+    most = max(fabric.contact, fabric.loose_contact)
+    if classes is None or fabric.contact_model == "vertex" or not most:
         return None
-    loose = samples.classes(classes) == LOOSE
-    return np.where(loose, fabric.loose_contact / max(fabric.contact, TINY), 1.0)
+    return np.where(samples.classes(classes) == LOOSE, fabric.loose_contact, fabric.contact) / most
 
 
 def _hinge_shapes(mesh: Mesh, hinges: Ints) -> Floats:

@@ -53,7 +53,8 @@ class Objective:
             skin = model.scene.lbs_skin
             rows = SkinWeights(skin.path, skin.indices[tethered], skin.weights[tethered])
             self.skin = Skinning(rows).to(device)
-            self.tethered_rest = model.decoder.rest[energy.tethered]
+            rest = model.scene.garment.mesh.points[tethered]
+            self.tethered_rest = torch.tensor(rest, dtype=torch.float32, device=device)
         self.dt = 1 / model.config.fps
         size = float(np.linalg.norm(np.ptp(model.scene.garment.mesh.points, axis=0)))
         self.scale = GRAVITY * float(energy.mass.sum()) * size

@@ -60,7 +60,7 @@ def network(scene: Scene, method: str, *, spread: float = 0.0) -> Baseline:
 
 
 def objective_of(scene: Scene, method: str, *motions: Motion, spread: float = 1e-3, **options) -> BaselineObjective:
-    energy = GarmentEnergy(scene.garment.mesh, FABRIC)
+    energy = GarmentEnergy(scene.garment.mesh, FABRIC, scene.classes)
     body = CollisionBody(scene.character.merged_body(), 3, device=CPU)
     model, bank = network(scene, method, spread=spread), bank_of(scene, *motions)
     return BaselineObjective(model, energy, body, bank, True, **{"judged": 2, **options})

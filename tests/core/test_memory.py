@@ -38,7 +38,7 @@ def test_what_a_step_keeps_of_its_contact_samples_is_counted(scene):
     """A coarse mesh has several samples for each vertex; the gradient keeps their positions, planes and distances."""
     frames, kept, counts = 8, [], []
     for fabric in (FABRICS["paper"], FABRICS["default"]):
-        energy, storages = GarmentEnergy(scene.garment.mesh, fabric), {}
+        energy, storages = GarmentEnergy(scene.garment.mesh, fabric, scene.classes), {}
 
         def keep(found: torch.Tensor, storages: dict[int, int] = storages) -> torch.Tensor:
             storages[found.untyped_storage().data_ptr()] = found.untyped_storage().nbytes()
