@@ -149,7 +149,7 @@ def fabric_named(name: str) -> Fabric:
 
 def fabric_of_file(values: dict[str, Any]) -> Fabric:
     """Return the fabric that a file states; what older files do not state did not act then."""
-    absent = {"contact_model": "vertex", "thickness": 0.0, "tether": 0.0}
+    absent: dict[str, Any] = {"contact_model": "vertex", "thickness": 0.0, "tether": 0.0}
     if "contact" in values:
         absent = {"tether": 0.0, "loose_contact": values["contact"]}
     return Fabric(**(absent | values))

@@ -26,6 +26,7 @@ from ssilk_core.fabrics import Fabric
 from ssilk_core.kinematics import matrix_from_quaternion, motion_transforms, quaternion_from_matrix
 from ssilk_core.model.network import GarmentModel
 from ssilk_core.motion_bank import build_bank
+from ssilk_core.skinning import Skinning
 from ssilk_core.training.curve import curve_path
 from ssilk_core.training.job import TrainJob
 from ssilk_core.training.objective import total
@@ -193,6 +194,9 @@ def test_the_terms_of_a_window_are_those_of_its_frames(scene, motions, method, j
         x = model.vertices(states, character)
         sampled = energy.cloth.positions(x)
         root = objective.bank.root[frames].T
+        rest_points = torch.tensor(np.array(scene.garment.mesh.points), dtype=torch.float32)
+        skin = Skinning(scene.lbs_skin)
+        lbs = skin(rest_points, None, skin.weights, character)
         direct = {
             "stretch": energy.stretch(x),
             "bending": energy.bending(x),
@@ -204,6 +208,7 @@ def test_the_terms_of_a_window_are_those_of_its_frames(scene, motions, method, j
             ),
             "inertia": energy.inertia(x[..., 2:], 2 * x[..., 1:-1] - x[..., :-2], 1 / 30),
             "drag": energy.drag(x[..., 2:], x[..., 1:-1] + root[:, 2:] - root[:, 1:-1], 1 / 30),
+            "tether": energy.tether(x, lbs[energy.tethered]),
         }
         assert terms.keys() == direct.keys()
         for name, values in direct.items():
