@@ -3,11 +3,11 @@
 
     python benchmarks/disturbed_farm.py --shots 500
 
-'ssilk farm --cluster' bakes the shipped cape in short shots. At random times a worker, the command itself (the driver)
-or the raylet is killed, the motions of some shots are replaced by others, or the model is. Whoever runs the farm gives
-the same command again, until it ends well and nothing was published since. Then all shots must be there once, with
-what the inputs hold now, and so must have been every shot that was said to be done on the way: the hashes of its files
-are those of an undisturbed bake of the same inputs. Each shot is then re-skinned, as by 'ssilk verify'. Linux only.
+'ssilk farm --cluster' bakes the shipped cape in short shots. At random times a worker, the command itself (the
+driver) or the raylet is killed, or the motions of some shots or the model are replaced. The operator gives the same
+command again, until it ends well and nothing was published since. Then all shots must be there once, with what the
+inputs hold now. So must have been every shot that was done on the way: the hashes of its files are those of an
+undisturbed bake of the same inputs. Each shot is then re-skinned, as by 'ssilk verify'. Linux only.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -43,7 +43,7 @@ from ssilk_core.bake.record import current_record, read_record, task_key
 from ssilk_core.checkpoint import load_model, save_model
 from ssilk_core.demo.motions import demo_shot
 from ssilk_core.demo.shipped import shipped_path
-from ssilk_core.errors import EXIT_INTERNAL, EXIT_OK, EXIT_TASKS, SsilkError
+from ssilk_core.errors import EXIT_OK, EXIT_TASKS, SsilkError
 from ssilk_core.events import Event, Message
 from ssilk_core.files import sha256
 
@@ -91,7 +91,10 @@ class Show:
 
     def key(self, shot: int, versions: Versions) -> str:
         """Return the key that the record of a shot ought to have."""
-        paths = (self.library / f"model_{versions.model}.safetensors", self.library / f"motion_{versions.motion}.usdc")
+        paths = (
+            self.library / f"model_{versions.model}.safetensors",
+            self.library / f"motion_{versions.motion}.usdc",
+        )
         model, motion = map(_digest, paths)
         return task_key(self.tasks[shot], InputHashes(model=model, stage=_digest(self.stage), motion=motion))
 
@@ -260,13 +263,12 @@ def _operate(show: Show, disturber: Disturber) -> tuple[dict[tuple[int, str], Ma
         published = disturber.published
         code, failures, result = _command(show, disturber)
         said.update(_kind(text) for text in failures)
-        said["commands that Ray ended because its raylet was killed while they started"] += code == EXIT_INTERNAL
         for shot, key, files in show.done():
             if seen.setdefault((shot, key), files) != files:
                 raise RuntimeError(f"two bakes of {show.tasks[shot].name} under one key have other files")
         print(f"command {number}: exit code {code}, {dict(result)}, {len(failures)} failed, {len(disturber.left)} "
               f"disturbances left", file=sys.stderr)  # fmt: skip
-        if code not in (EXIT_OK, EXIT_INTERNAL, EXIT_TASKS, -signal.SIGKILL):
+        if code not in (EXIT_OK, EXIT_TASKS, -signal.SIGKILL):
             raise RuntimeError(f"exit code {code}: {failures[-1:]}")
         if code == EXIT_OK and not disturber.left and published == disturber.published:
             _, _, again = _command(show, disturber)
