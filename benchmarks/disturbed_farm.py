@@ -170,7 +170,8 @@ class Disturber(threading.Thread):
         driver = self.driver
         if driver is None or driver.poll() is not None:
             return False
-        found = {"worker": workers, "raylet": raylets, "driver": lambda pid: [pid]}[kind](driver.pid)
+        busy = workers(driver.pid)
+        found = {"worker": busy, "raylet": raylets(driver.pid), "driver": [driver.pid] if busy else []}[kind]
         if not found:
             return False
         try:
