@@ -51,6 +51,7 @@ SHAPE_SCALES = (1.0, 0.9, 1.1)  # of the blendshapes, one for each version of th
 MOTIONS = 20  # versions of a motion, of which each shot begins with another
 AT_ONCE = 0.02  # share of the shots whose motions are published together
 COMMANDS = 200  # that are given at most
+WHILE_STARTING = 0.2  # how often a cluster is disturbed that bakes nothing yet, where it could be
 SECONDS = 1800.0  # after which a command counts as hung
 
 
@@ -171,8 +172,8 @@ class Disturber(threading.Thread):
         if driver is None or driver.poll() is not None:
             return False
         busy = workers(driver.pid)
-        found = {"worker": busy, "raylet": raylets(driver.pid), "driver": [driver.pid] if busy else []}[kind]
-        if not found:
+        found = {"worker": busy, "raylet": raylets(driver.pid), "driver": [driver.pid]}[kind]
+        if not found or (not busy and self.random.random() > WHILE_STARTING):
             return False
         try:
             os.kill(self.random.choice(found), signal.SIGKILL)
