@@ -105,7 +105,7 @@ def _apart(
     except EOFError:
         pass
     except BaseException:
-        process.terminate()
+        process.kill()  # Ray sees to the rest of it
         raise
     finally:
         process.join()
