@@ -27,6 +27,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from helpers.processes import resident, workers
 from helpers.reports import table, write_results
 from ssilk_usd.read_character import read_character
 from ssilk_usd.read_motion import read_motion
@@ -65,34 +66,6 @@ class Killer:
             if self.kill and busy:
                 os.kill(choice.choice(busy), signal.SIGKILL)
                 self.killed += 1
-
-
-def workers(ancestor: int) -> list[int]:
-    """Return the processes below `ancestor` that bake at the moment."""
-    parents, names = {}, {}
-    for path in Path("/proc").glob("[0-9]*"):
-        try:
-            parents[int(path.name)] = int((path / "stat").read_text().rpartition(")")[2].split()[1])
-            names[int(path.name)] = (path / "cmdline").read_bytes()
-        except OSError:  # it ended meanwhile
-            continue
-    return [
-        pid for pid, name in names.items() if name.startswith(b"ray::_outcome") and _below(pid, ancestor, parents)
-    ]
-
-
-def _below(pid: int, ancestor: int, parents: dict[int, int]) -> bool:
-    while pid > 1 and pid != ancestor:
-        pid = parents.get(pid, 0)
-    return pid == ancestor
-
-
-def resident(pid: int) -> float:
-    """Return the memory of a process [MiB]; 0 where it has ended."""
-    try:
-        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
-    except OSError:
-        return 0.0
 
 
 def main() -> None:

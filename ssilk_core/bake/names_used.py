@@ -51,6 +51,11 @@ def read_use(folder: Path, garment: str) -> GarmentUse | None:
         return None
 
 
+def forget_use(folder: Path, garment: str) -> None:
+    """Free the name of a garment that is in no shot any more."""
+    _place(folder, garment).unlink(missing_ok=True)
+
+
 def _place(folder: Path, garment: str) -> Path:
     return folder / "assets" / garment / USED
 

@@ -8,7 +8,7 @@ import json
 import os
 import re
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -43,6 +43,17 @@ def pattern_name(pattern: str, location: str, option: str) -> str:
     return _FIELD.sub(value, pattern)
 
 
+def location_stem(location: str) -> str:
+    """Return the name of "file[:/Prim]" where none is given: the file's stem, and the prim's name."""
+    file, _, prim = location.partition(":/")
+    return Path(file).stem + (f"_{prim_leaf(prim)}" if prim else "")
+
+
+def prim_leaf(path: str) -> str:
+    """Return the last name of a prim's path."""
+    return path.rstrip("/").rpartition("/")[2]
+
+
 def file_name(text: str) -> str:
     """Return a name as that of a folder: of ASCII letters, digits, "_" and "-".
 
@@ -60,6 +71,23 @@ def file_name(text: str) -> str:
 def prim_name(text: str) -> str:
     """Return a name as that of a prim and of its folder: as `file_name`, without "-", and no digit in front."""
     return re.sub(r"^(?=\d)", "_", file_name(text).replace("-", "_"))
+
+
+def need_unique(named: Iterable[tuple[str, str]], where: str, kind: str, option: str) -> None:
+    """Raise `SsilkError` where two inputs have one name, or names that not every file system tells apart."""
+    first: dict[str, tuple[str, str]] = {}
+    for name, location in named:
+        other, before = first.setdefault(name.casefold(), (name, location))
+        if before != location:
+            both = (
+                f"the {kind} '{name}'" if other == name else f"the {kind}s '{other}' and '{name}', one on some disks"
+            )
+            fail(
+                where,
+                f"'{before}' and '{location}' would both be {both}",
+                "files and folders are named by them",
+                f"name them with {option}, such as {{parent}}_{{stem}}",
+            )
 
 
 @dataclass(frozen=True)

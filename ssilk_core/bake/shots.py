@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from ..errors import fail
 from ..events import Message, Reporter, silent
+from .names_used import forget_use
 from .record import RECORD, TaskRecord, read_record
 
 if TYPE_CHECKING:
@@ -110,7 +111,9 @@ def _finished(folder: Path, shot: str) -> dict[str, TaskRecord | None]:
 
 
 def remove_layers(folder: Path, names: Sequence[str], report: Reporter = silent) -> list[str]:
-    """Take garments out of shots: remove their layers, and write the stages of the shots again. Assets stay.
+    """Take garments out of shots: remove their layers, and write the stages of the shots again.
+
+    Assets stay. The name of a garment that is in no shot any more is free for another model.
 
     Args:
         folder: of the layers.
@@ -144,6 +147,9 @@ def remove_layers(folder: Path, names: Sequence[str], report: Reporter = silent)
     for home in (*homes, *sorted({home.parent for home in homes})):
         if not any(home.iterdir()):
             home.rmdir()
+    left = {path.parent.name for path in _layers(folder)}
+    for garment in {layout.garment for layout in chosen.values()} - left:
+        forget_use(folder, garment)
     return list(chosen)
 
 

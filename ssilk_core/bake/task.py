@@ -6,13 +6,12 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 from ..checkpoint import load_model
 from ..errors import fail
 from ..targets import check_influences
 from .inputs import InputHashes
-from .naming import file_name, prim_name
+from .naming import file_name, location_stem, need_unique, prim_leaf, prim_name
 from .request import BakeRequest, need_body
 
 LONGEST_NAME = 255  # [bytes] of a file or folder
@@ -83,8 +82,8 @@ def plan_layers(
         )
         for request in requests
     ]
-    _need_unique([(task.garment, _worn(task.request)) for task in tasks], "MODEL", "garment", "--garment-name")
-    _need_unique([(task.shot, task.request.motion) for task in tasks], "--motion", "shot", "--shot-name or --shots")
+    need_unique([(task.garment, _worn(task.request)) for task in tasks], "MODEL", "garment", "--garment-name")
+    need_unique([(task.shot, task.request.motion) for task in tasks], "--motion", "shot", "--shot-name or --shots")
     order = list(dict.fromkeys(task.garment for task in tasks))
     seen: set[str] = set()
     for task in tasks:
@@ -133,39 +132,13 @@ def _need_for_layers(requests: Sequence[BakeRequest], include_body: bool) -> Non
 
 
 def _garment_name(request: BakeRequest) -> str:
-    stem = _stem(request.model)
-    return prim_name(request.garment or (f"{_leaf(request.root)}_{stem}" if request.root else stem))
+    stem = location_stem(request.model)
+    return prim_name(request.garment or (f"{prim_leaf(request.root)}_{stem}" if request.root else stem))
 
 
 def _shot_name(request: BakeRequest) -> str:
-    return file_name(request.shot or _stem(request.motion))
-
-
-def _stem(location: str) -> str:
-    file, _, prim = location.partition(":/")
-    return Path(file).stem + (f"_{_leaf(prim)}" if prim else "")
-
-
-def _leaf(path: str) -> str:
-    return path.rstrip("/").rpartition("/")[2]
+    return file_name(request.shot or location_stem(request.motion))
 
 
 def _worn(request: BakeRequest) -> str:
     return f"{request.model}:{request.root}" if request.root else request.model
-
-
-def _need_unique(named: Iterable[tuple[str, str]], where: str, kind: str, option: str) -> None:
-    """Raise `SsilkError` where two inputs have one name, or names that not every file system tells apart."""
-    first: dict[str, tuple[str, str]] = {}
-    for name, location in named:
-        other, before = first.setdefault(name.casefold(), (name, location))
-        if before != location:
-            both = (
-                f"the {kind} '{name}'" if other == name else f"the {kind}s '{other}' and '{name}', one on some disks"
-            )
-            fail(
-                where,
-                f"'{before}' and '{location}' would both be {both}",
-                "files and folders are named by them",
-                f"name them with {option}, such as {{parent}}_{{stem}}",
-            )

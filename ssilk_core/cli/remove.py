@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Take garments out of the shots of a folder of layers, and write the stages of these shots again.
 
-The garment's layers in the shot are removed. Its asset stays, for other shots.
+The garment's layers in the shot are removed. Its asset stays, for other shots. The name of a garment that is in no
+shot any more is free for another model.
 """
 
 from __future__ import annotations

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..bake import naming
 from ..errors import EXIT_OK, fail
 from ..events import Progress, Reporter, Result, Started
 from ..fabrics import Fabric
@@ -41,6 +42,9 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         "-o", "--output", type=Path, required=True,
         help="shot to write (.usdc, .usd or .usda), or a folder where there are several motions",
     )  # fmt: skip
+    verb.add_argument("--shot-name", metavar="PATTERN",
+                      help="name of each file in a folder, such as '{parent}_{stem}' (default: the motion file's, "
+                           f"and the prim's where one is named); {naming.FIELDS}")  # fmt: skip
     shared.add_fabric(verb)
     verb.add_argument(
         "--fps", type=shared.RATE, default=30.0, help="frames per second (default 30, as models are trained)"
@@ -69,7 +73,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     from ..simulate import SimulationOptions
     from ..simulate.newton import SolverOptions
 
-    outputs = _outputs(options.output, options.motion)
+    outputs = _outputs(options.output, list(map(str, options.motion)), options.shot_name)
     for output in outputs:
         shared.check_output(output, options.stage, *motion_files(options.motion))
     device = select_device(options.device)
@@ -110,9 +114,9 @@ class _Shot:
         return self.output.is_file() and read_provenance(self.output).get("simulated") == self.provenance
 
 
-def _outputs(output: Path, motions: Sequence[Path]) -> list[Path]:
+def _outputs(output: Path, motions: Sequence[str], pattern: str | None) -> list[Path]:
     """Return the file that each motion's shot is written to."""
-    from ssilk_usd.read_stage import LAYER_SUFFIXES, split_location
+    from ssilk_usd.read_stage import LAYER_SUFFIXES
 
     if output.suffix in LAYER_SUFFIXES:
         if len(motions) != 1:
@@ -120,16 +124,17 @@ def _outputs(output: Path, motions: Sequence[Path]) -> list[Path]:
                 str(output), f"one file for {len(motions)} motions", "each shot is a file of its own", "name a folder"
             )
         return [output]
-    names = [Path(split_location(str(motion))[0]).stem for motion in motions]
-    same = sorted({name for name in names if names.count(name) > 1})
-    if same:
-        fail(
-            "--motion",
-            f"several files are called {', '.join(same)}",
-            "shots are named after their motions",
-            "simulate them into separate folders",
-        )
+    for motion in motions:
+        if motions.count(motion) > 1:
+            fail("--motion", f"'{motion}' is named twice", "a shot is simulated once")
+    names = [_name(motion, pattern) for motion in motions]
+    naming.need_unique(zip(names, motions, strict=True), "--motion", "shot", "--shot-name")
     return [output / f"{name}.usdc" for name in names]
+
+
+def _name(motion: str, pattern: str | None) -> str:
+    given = naming.pattern_name(pattern, motion, "--shot-name") if pattern else naming.location_stem(motion)
+    return naming.file_name(given)
 
 
 def _written(

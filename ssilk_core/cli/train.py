@@ -3,7 +3,8 @@
 
 Where the stage lacks weights, classes or a proxy rig, they are made as 'ssilk rig' makes them by default.
 Ctrl-C stops the training and keeps the best model and the state. --resume continues from there. A model that is worse
-than linear blend skinning on the validation motions is kept and warned of, and the exit code is 5.
+than linear blend skinning on the validation motions is kept and warned of, and the exit code is 5. torchrun ends with
+its own code 1 then, and names this one.
 """
 
 from __future__ import annotations
@@ -95,7 +96,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     if not trained.finished:
         report(Message(f"stopped at iteration {trained.iterations}; --resume continues from there."))
         return EXIT_INTERRUPTED
-    return EXIT_WORSE if worse and group.size == 1 else EXIT_OK  # torchrun takes other codes for a crash
+    return EXIT_WORSE if worse else EXIT_OK
 
 
 def training_job(options: argparse.Namespace, device: str, report: Reporter):  # type: ignore[no-untyped-def]  # its type is heavy

@@ -5,22 +5,31 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
+import sys
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice
+from multiprocessing import get_context, parent_process
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 from ..bake import BakeResult, BakeTask, LayerFolder
-from ..errors import SsilkError, fail
+from ..errors import EXIT_INTERRUPTED, SsilkError, fail
 from .watchdog import ended_together
 
 BakeFunction = Callable[[BakeTask, Path], BakeResult]
 RETRIES = 10  # of a task whose worker died
 STARTS = 5  # of a cluster on this machine, which may end before its tasks do
 WINDOW = 1000  # tasks that the cluster knows of at once: waiting takes a time that grows with their number
+
+
+class NoClusterError(SsilkError):
+    """There is no cluster where one was sought, or none could be started."""
 
 
 @dataclass(frozen=True)
@@ -50,22 +59,82 @@ def run_on_cluster(
         cores: of this machine, for a cluster that is started here; None for all.
 
     Raises:
-        SsilkError: there is no such cluster, or a task needs a GPU and this machine has none.
+        SsilkError: a task needs a GPU and this machine has none, or, as `NoClusterError`, there is no such cluster.
 
-    A cluster of this machine that ends before its tasks do is started again, a few times; all of its processes end
-    with this one.
+    A cluster of this machine that ends before its tasks do is started again, a few times, and so is one that does not
+    start, once; all of its processes end with this one.
     """
-    left, starts = list(tasks), 1 if address else STARTS
-    for _ in range(starts):
-        lost: list[BakeTask] = []
-        with ended_together() if address is None else nullcontext(), _connected(address, cores):
-            yield from _outcomes(left, folder.absolute(), bake, lost, here=address is None)
-        left = lost
+    left, starts = dict.fromkeys(tasks), 1 if address else STARTS
+    started = True
+    for number in range(1, starts + 1):
+        try:
+            with ended_together() if address is None else nullcontext():
+                for outcome in _apart([*left], folder.absolute(), bake, address, cores):
+                    del left[outcome.task]
+                    yield outcome
+            started = True
+        except NoClusterError:  # Ray says the same where its raylet is killed meanwhile
+            if not started or number == starts:
+                raise
+            started = False
         if not left:
             return
     ended = f"the cluster ended {starts} times" if starts > 1 else "this machine's part of the cluster ended"
     for task in left:
         yield TaskOutcome(task, error=f"{ended}; run the same command again, finished tasks stay.")
+
+
+def _apart(
+    tasks: Sequence[BakeTask], folder: Path, bake: BakeFunction, address: str | None, cores: int | None
+) -> Iterator[TaskOutcome]:
+    """Yield the outcome of each task as it ends, from a process of its own; fewer where that ends before them.
+
+    Ray ends the process that uses it where a raylet is lost while they connect.
+    """
+    context: Any = get_context("fork" if sys.platform == "linux" else "spawn")
+    outcomes, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_drive, args=(sender, tasks, folder, bake, address, cores))
+    process.start()
+    sender.close()  # so that the end of the process is the end of the outcomes
+    try:
+        while True:
+            said = outcomes.recv()
+            if isinstance(said, SsilkError):
+                raise said
+            yield said
+    except EOFError:
+        pass
+    except BaseException:
+        process.kill()  # Ray sees to the rest of it
+        raise
+    finally:
+        process.join()
+
+
+def _drive(
+    sender: Connection[TaskOutcome | SsilkError, None],
+    tasks: Sequence[BakeTask],
+    folder: Path,
+    bake: BakeFunction,
+    address: str | None,
+    cores: int | None,
+) -> None:
+    """Send outcomes, or the error that there is no cluster; end when the process that receives them does."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # which a terminal sends to both
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    try:
+        with _connected(address, cores):
+            for outcome in _outcomes(tasks, folder, bake, here=address is None):
+                sender.send(outcome)
+    except SsilkError as error:
+        sender.send(error)
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(EXIT_INTERRUPTED)
 
 
 @contextmanager
@@ -78,17 +147,17 @@ def _connected(address: str | None, cores: int | None) -> Iterator[None]:
         ray.init(address, num_cpus=cores, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
     except Exception as error:  # Ray says nowhere which ones there are
         where = f"at {address}" if address else "on this machine"
-        fail("--cluster", f"no cluster {where} ({_first_line(error)})", "start one with 'ray start'")
+        raise NoClusterError(
+            f"--cluster: no cluster {where} ({_first_line(error)}); start one with 'ray start'."
+        ) from error
     try:
         yield
     finally:
         ray.shutdown()
 
 
-def _outcomes(
-    tasks: Sequence[BakeTask], folder: Path, bake: BakeFunction, lost: list[BakeTask], *, here: bool
-) -> Iterator[TaskOutcome]:
-    """Yield the outcome of each task as it ends; where the cluster ends, add the tasks without one to `lost`.
+def _outcomes(tasks: Sequence[BakeTask], folder: Path, bake: BakeFunction, *, here: bool) -> Iterator[TaskOutcome]:
+    """Yield the outcome of each task as it ends, until the cluster ends.
 
     Args:
         here: the cluster is this machine alone.
@@ -112,7 +181,6 @@ def _outcomes(
             yield ray.get(done)
         except RayError as error:
             if isinstance(error, LocalRayletDiedError) or (here and isinstance(error, NodeDiedError)):
-                lost += [task, *pending.values(), *waiting]
                 return
             yield TaskOutcome(task, error=f"its workers died ({_first_line(error)})")
 

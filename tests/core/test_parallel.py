@@ -12,22 +12,27 @@ import socket
 import subprocess
 import sys
 import threading
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 from safetensors.torch import load_file
 
+from ssilk_core import cli
 from ssilk_core.checkpoint import load_model
 from ssilk_core.config import ModelConfig, TrainConfig
-from ssilk_core.errors import SsilkError
+from ssilk_core.errors import EXIT_OK, EXIT_WORSE, SsilkError
 from ssilk_core.events import silent
 from ssilk_core.fabrics import Fabric
+from ssilk_core.training import parallel
 from ssilk_core.training.job import TrainJob
 from ssilk_core.training.parallel import TORCHRUN_VARIABLES, ProcessGroup, join_process_group
 from ssilk_core.training.run import TrainingRun, train
 from ssilk_core.training.state import state_path
+from ssilk_core.training.validation import Score
 
 SHORT = TrainConfig(
     iterations=24, static_fraction=0.3, pretraining_batch=8, batch=4, window=5, static_batch=8,
@@ -244,6 +249,19 @@ def test_torchrun_gives_out_the_devices(monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     with pytest.raises(SsilkError, match=r"process 2: 1 GPUs are visible; .*--nproc-per-node 1"):
         join_process_group("auto").__enter__()
+
+
+@pytest.mark.parametrize("rank", [0, 1])
+@pytest.mark.parametrize(("total", "code"), [(2.0, EXIT_WORSE), (0.5, EXIT_OK)])
+def test_each_process_of_a_group_tells_that_a_model_is_worse_than_none(tmp_path, monkeypatch, rank, total, code):
+    trained = SimpleNamespace(
+        score=Score({"stretch": total}, 0.0), lbs=Score({"stretch": 1.0}, 0.0), iterations=1, finished=True
+    )
+    monkeypatch.setattr(parallel, "join_process_group", lambda device: nullcontext((ProcessGroup(rank, 2), "cpu")))
+    monkeypatch.setattr("ssilk_core.training.run.train", lambda *_: trained)
+    monkeypatch.setattr("ssilk_core.cli.train.training_job", lambda *_: None)
+    words = ["train", "stage.usda", "--motions", "clip.usda", "-o", str(tmp_path / "model.safetensors")]
+    assert cli.main(words) == code
 
 
 if __name__ == "__main__":

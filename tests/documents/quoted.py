@@ -115,6 +115,8 @@ def farm() -> Text:
     }  # fmt: skip
     for text, key in cluster.items():
         yield row(text, result("farm")["cluster"][key])
+    for what, value in result("disturbed_farm").items():
+        yield row(what, value)
     for count, cores in {1: "1 core", 2: "2 cores", 4: "4 cores"}.items():
         rate = result("farm_cores")["cores"][f"shots per second, cores: {count}"]
         yield row(f"shots of 60 frames a second on {cores}", fixed(rate, 1))

@@ -18,6 +18,7 @@ from ssilk_usd.play import Shot
 from ssilk_core.bake import BakeRequest, LayerFolder, plan_layers
 from ssilk_core.bake import shots as gathering
 from ssilk_core.bake.record import portable
+from ssilk_core.checkpoint import load_model, save_model
 from ssilk_core.cli import main
 from ssilk_core.errors import SsilkError
 
@@ -91,6 +92,16 @@ def test_garments_are_taken_out(copy, capsys):
     assert "no garment is baked as 'walk/overalls'; there are run/overalls" in capsys.readouterr().err
     assert main(shlex.split("remove layers '*/shirt' run/overalls")) == 0
     assert not list(Path("layers/shots").iterdir())
+
+
+def test_a_name_is_free_once_its_garment_is_in_no_shot(copy, capsys):
+    assert bake("overalls.safetensors", "--motion run.usda -o layers") == 0
+    other = "--motion run.usda --garment-name overalls -o layers"
+    save_model("shirt.safetensors", replace(load_model("shirt.safetensors"), provenance={}))
+    assert main(shlex.split("remove layers walk/overalls")) == 0
+    assert bake("shirt.safetensors", other) == 2 and "was baked from" in capsys.readouterr().err
+    assert main(shlex.split("remove layers run/overalls")) == 0
+    assert bake("shirt.safetensors", other) == 0
 
 
 def test_a_garment_that_cannot_be_read_is_left_out_and_told(copy, capsys):

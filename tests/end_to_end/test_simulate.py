@@ -8,7 +8,8 @@ import pytest
 from pxr import Usd, UsdGeom, UsdSkel
 from ssilk_usd.play import Shot
 
-from ssilk_core.cli import main
+from ssilk_core.bake import BakeRequest, plan_layers
+from ssilk_core.cli import main, simulate
 from ssilk_core.simulate import Simulator
 
 
@@ -59,6 +60,21 @@ def test_several_motions_become_files_of_their_own(stage):
         )
 
 
+def test_shots_are_named_as_those_of_a_bake(stage):
+    """By a pattern, and so that names in other alphabets and prims of one file stay apart."""
+    motions = ["s010/anim.usdc", "衣/anim.usdc", "clips.usdc:/Walk", "clips.usdc:/Run"]
+    named = {
+        path.name
+        for path in simulate._outputs(stage / "caches", [*motions[1:], "s010/衣.usdc", "s010/空.usdc"], None)
+    }
+    requests = [
+        BakeRequest(model="m", stage="s", motion=motion) for motion in (*motions[1:], "s010/衣.usdc", "s010/空.usdc")
+    ]
+    assert named == {f"{task.shot}.usdc" for task in plan_layers(requests)} and len(named) == 5
+    patterned = simulate._outputs(stage / "caches", motions[:2], "{parent}_{stem}")
+    assert patterned[0].name == "s010_anim.usdc" and patterned[1] != patterned[0]
+
+
 def test_an_interruption_leaves_nothing_half_written(stage, monkeypatch):
     advanced = Simulator.frames
 
@@ -99,7 +115,8 @@ def test_what_an_interrupted_simulation_finished_is_not_done_again(stage, monkey
     ("words", "complaint"),
     [
         ("--motion brief.usda short.usda -o one.usdc", "one file for 2 motions"),
-        ("--motion brief.usda ./brief.usda -o caches", "several files are called brief"),
+        ("--motion brief.usda other/brief.usda -o caches", "'brief.usda' and 'other/brief.usda' would both be the"),
+        ("--motion brief.usda brief.usda -o caches", "'brief.usda' is named twice"),
         ("--motion brief.usda -o one.usdc --fps -3", "a number from 0.01 to 10000"),
         ("--motion brief.usda -o one.usdc --tolerance 0", "a number from 1e-09 to 1000"),
         ("--motion nowhere.usda -o one.usdc", "there is no such file"),
