@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ssilk_core.errors import fail
 
-VARIABLE, USUAL = "SSILK_READ_GIB", 1.0  # GiB; a character of a million vertices takes 0.6
+VARIABLE, USUAL = "SSILK_READ_GIB", 0.75  # GiB; a character of a million vertices takes 0.6
 HOST = "bpy"  # Blender's own module
 STACK = 8 << 20  # bytes of each thread that USD may start meanwhile
 
