@@ -12,6 +12,7 @@ import torch
 
 from ssilk_core.checkpoint import model_file
 from ssilk_core.cost import ShotBytes, model_bytes
+from ssilk_core.energy import TERMS
 from ssilk_core.errors import SsilkError
 from ssilk_core.evaluation.methods import EvaluationScene, Network, build_take_set
 from ssilk_core.evaluation.record import recorded
@@ -94,10 +95,7 @@ def test_the_whole_model_is_what_the_network_in_pytorch_is(meter, bench, model, 
     reducer, dressed, take_set = bench
     network = Network(model, take_set)
     records = [recorded(dressed, take_set, network, take) for take in range(2)]
-    total = sum(
-        torch.cat([r.values[name] for r in records])
-        for name in ("stretch", "bending", "gravity", "inertia", "collision")
-    )
+    total = sum(torch.cat([r.values[name] for r in records]) for name in TERMS)
     whole = points["as trained"]
     assert whole.total == pytest.approx(float(total.mean()), rel=1e-3)
     assert whole.position == whole.velocity == whole.excess == 0

@@ -265,6 +265,7 @@ def test_a_motion_that_changes_while_it_is_read_is_read_again(farm, toy, monkeyp
 
 def test_a_cancelled_worker_stops_in_time_and_leaves_nothing_half_written(farm, toy):
     toy.write_clip(farm / "a.usda", frames=1200)
+    assert run(f"{WORDS} --bundle bundle") == 0  # the job holds a hash of the clip
     worker = started("--tasks 0 --openjd")
     assert worker.stdout is not None
     for line in worker.stdout:
