@@ -114,9 +114,8 @@ class LoadedGarment:
         else:
             fps = (request.fps or frames.fps) * samples
             rate, handles = fps / frames.fps, frames.before * samples
-            wanted = handles + round(
-                max(LEAD, request.pre_roll) * fps
-            )  # samples before the range, on the shot's grid
+            # Samples before the range, on the shot's grid.
+            wanted = handles + round(max(LEAD, request.pre_roll) * fps)
             begun = max(min(_floor(frames.earlier * rate), wanted), handles)
             earlier = min(_ceil(begun / rate), frames.earlier)
             last = min(_floor(frames.count * rate) + frames.after * samples, _floor(frames.later * rate))

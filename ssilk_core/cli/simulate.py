@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -124,8 +125,8 @@ def _outputs(output: Path, motions: Sequence[str], pattern: str | None) -> list[
                 str(output), f"one file for {len(motions)} motions", "each shot is a file of its own", "name a folder"
             )
         return [output]
-    for motion in motions:
-        if motions.count(motion) > 1:
+    for motion, count in Counter(motions).items():
+        if count > 1:
             fail("--motion", f"'{motion}' is named twice", "a shot is simulated once")
     names = [_name(motion, pattern) for motion in motions]
     naming.need_unique(zip(names, motions, strict=True), "--motion", "shot", "--shot-name")

@@ -67,8 +67,9 @@ class GarmentEnergy:
         self.tethered = torch.as_tensor(tethered, device=device)
         self.tether_stiffness = tensor(fabric.tether * vertex_areas[tethered])
         samples = contact_samples(mesh, fabric)
-        self.cloth = SampledCloth(samples, device, dtype, _contact_stiffness(samples, fabric, classes))
         self.law = ContactLaw.of(fabric)
+        shares = _stiffness_shares(samples, fabric, self.law, classes)
+        self.cloth = SampledCloth(samples, device, dtype, shares)
         self._gradient = deformation_gradient_operator(mesh, device, dtype)
         heads = hinges[:, [1, 2, 3]].T.reshape(-1)
         self._hinge = difference_operator(heads, np.tile(hinges[:, 0], 3), mesh.vertex_count, device, dtype)
@@ -161,12 +162,13 @@ class GarmentEnergy:
         return inertia_and_drag_kernel(x, self.mass, last, before, shift, *weights)
 
 
-def _contact_stiffness(samples: ContactSamples, fabric: Fabric, classes: Ints | None) -> Floats | None:
-    """Return each sample's share of the full stiffness of contact, shape (S,); None for one everywhere."""
-    most = max(fabric.contact, fabric.loose_contact)
-    if classes is None or fabric.contact_model == "vertex" or not most:
+def _stiffness_shares(
+    samples: ContactSamples, fabric: Fabric, law: ContactLaw, classes: Ints | None
+) -> Floats | None:
+    """Return each sample's share of the law's stiffness, shape (S,); None for one everywhere."""
+    if classes is None or fabric.contact_model == "vertex" or not law.stiffness:
         return None
-    return np.where(samples.classes(classes) == LOOSE, fabric.loose_contact, fabric.contact) / most
+    return np.where(samples.classes(classes) == LOOSE, fabric.loose_contact, fabric.contact) / law.stiffness
 
 
 def _hinge_shapes(mesh: Mesh, hinges: Ints) -> Floats:

@@ -63,13 +63,9 @@ def test_several_motions_become_files_of_their_own(stage):
 def test_shots_are_named_as_those_of_a_bake(stage):
     """By a pattern, and so that names in other alphabets and prims of one file stay apart."""
     motions = ["s010/anim.usdc", "衣/anim.usdc", "clips.usdc:/Walk", "clips.usdc:/Run"]
-    named = {
-        path.name
-        for path in simulate._outputs(stage / "caches", [*motions[1:], "s010/衣.usdc", "s010/空.usdc"], None)
-    }
-    requests = [
-        BakeRequest(model="m", stage="s", motion=motion) for motion in (*motions[1:], "s010/衣.usdc", "s010/空.usdc")
-    ]
+    unnamed = [*motions[1:], "s010/衣.usdc", "s010/空.usdc"]
+    named = {path.name for path in simulate._outputs(stage / "caches", unnamed, None)}
+    requests = [BakeRequest(model="m", stage="s", motion=motion) for motion in unnamed]
     assert named == {f"{task.shot}.usdc" for task in plan_layers(requests)} and len(named) == 5
     patterned = simulate._outputs(stage / "caches", motions[:2], "{parent}_{stem}")
     assert patterned[0].name == "s010_anim.usdc" and patterned[1] != patterned[0]
