@@ -92,6 +92,8 @@ class TrainConfig:
         perturbations: number of extra motions for each motion with joints turned at random.
         outlier_energy: stretch and collision at which a frame counts half in the loss, relative to the garment's
             weight times its size; zero for the plain mean over frames, as in the paper (`training.objective.total`).
+        newton_weight: weight of the distance to a Newton step beside the energy (`training.newton_distance`); zero
+            for the energy alone, as in the paper.
         static_batch: single poses in each step of dynamic training, to which P is still fitted.
         noise_probability: probability per frame of noise on a reused state. A new window always starts with noise.
         noise: standard deviation of the noise on the first two latents of a window.
@@ -125,6 +127,7 @@ class TrainConfig:
     recombinations: int = 3
     perturbations: int = 1
     outlier_energy: float = 0.1
+    newton_weight: float = 0.0
     static_batch: int = 256
     noise_probability: float = 0.03
     noise: float = 0.1
@@ -165,6 +168,7 @@ class TrainConfig:
             "skin_learning_rate_scale",
             "shape_learning_rate_scale",
             "outlier_energy",
+            "newton_weight",
         )
         _need_between(self, 0, NO_BOUND, "latent_regularization")
         _need_between(self, 1e-9, NO_BOUND, "latent_regularization_scale")

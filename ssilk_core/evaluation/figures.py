@@ -35,6 +35,31 @@ class ReferenceErrors:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SolverErrors:
+    """A method compared with the solver that starts from the method's own states.
+
+    Attributes:
+        windows, steps: how many windows were simulated, and single steps solved.
+        step_energy: energy of a step above its minimum, from the method's own past [J].
+        step_distance: RMS distance over mass and steps to that minimum [m].
+        position_error: RMS distance over mass and windows to a simulation from the method's own first two states,
+            after the frames of `solver_errors.AFTER` [m].
+        median_position_error: the same of the median window [m].
+        velocity_error, lbs_velocity_error: RMS difference of velocities in these windows, and that of linear blend
+            skinning [m/s].
+    """
+
+    windows: int
+    steps: int
+    step_energy: float
+    step_distance: float
+    position_error: tuple[float, ...]
+    median_position_error: tuple[float, ...]
+    velocity_error: float
+    lbs_velocity_error: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class PoseNovelty:
     """How far poses are from the nearest training poses, and what that costs.
 
@@ -134,7 +159,8 @@ class Figures:
         static_distance: RMS distance to the method's own static state of each pose [m].
         jerk: RMS jerk over mass and frames [m/s3]; `jerk_ratio`: relative to that of linear blend skinning.
         stretch_quantiles: 50, 95 and 99 % quantiles and the maximum of the larger principal stretch.
-        reference, pose_novelty, settling, minimum, loop_drift: what else was measured, where the method has it.
+        reference, solver, pose_novelty, settling, minimum, loop_drift: what else was measured, where the method has
+            it.
     """
 
     clips: int
@@ -151,6 +177,7 @@ class Figures:
     stretch_quantiles: tuple[float, ...]
     shown_skin: ShownSkin | None = None
     reference: ReferenceErrors | None = None
+    solver: SolverErrors | None = None
     pose_novelty: PoseNovelty | None = None
     settling: Settling | None = None
     minimum: MinimumErrors | None = None

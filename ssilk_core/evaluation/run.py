@@ -16,7 +16,7 @@ from ..assets import Motion
 from ..errors import fail
 from ..events import Progress, Reporter, silent
 from ..motion_bank import MotionBank, build_bank
-from .figures import Figures, LoopDrift, MinimumErrors, Settling
+from .figures import Figures, LoopDrift, MinimumErrors, Settling, SolverErrors
 from .methods import (
     CachedPoints,
     EvaluatedMethod,
@@ -41,6 +41,7 @@ from .probes import (
     stopped_takes,
 )
 from .record import recorded
+from .solver_errors import solver_errors, windows_of
 from .takes import takes_of
 from .tally import Tally, figures, pose_novelty, reference_errors, takes_in
 
@@ -58,7 +59,8 @@ class EvaluationOptions:
         stops: stops in each clip after which poses are held; none for zero.
         hold: how long they are held [s].
         minimum: whether the simulator minimises the energy of held poses.
-        simulate: whether it plays the stops as well, to see how it settles; both take long on a CPU.
+        simulate: whether it plays the stops as well, to see how it settles.
+        solver: whether it simulates from the methods' own states. These three take long on a CPU.
         loop: frames that the first seconds of each clip loop for, at least; none for zero.
     """
 
@@ -67,6 +69,7 @@ class EvaluationOptions:
     hold: float = 3.0
     minimum: bool = False
     simulate: bool = False
+    solver: bool = False
     loop: int = 2000
 
     def __post_init__(self) -> None:
@@ -184,7 +187,8 @@ class _Run:
     def method_rows(self, method: EvaluatedMethod) -> Iterator[ResultRow]:
         """Yield the figures of a method."""
         take_set = build_take_set(self.takes, self.dressed, method.joints)
-        tally = self._tally(take_set, method.on(take_set), list(self.clips))
+        played = method.on(take_set)
+        tally = self._tally(take_set, played, list(self.clips))
         distances, loops = self._distances(take_set, method.joints), self._loops(method)
         stopped = self._stopped(method.joints, method.on)
         for row in self.rows(tally, method.name):
@@ -194,8 +198,14 @@ class _Run:
                 **self._rested(stopped, row.split),
                 pose_novelty=pose_novelty(tally.only(takes_in(self.clips, names)), distances) if distances else None,
                 loop_drift=joined_loop_drift([loop for clip, loop in loops if clip in names]),
+                solver=self._solver_errors(take_set, played, takes_in(self.clips, names)),
             )
             yield replace(row, figures=found)
+
+    def _solver_errors(self, take_set: TakeSet, method: Method, takes: Sequence[int]) -> SolverErrors | None:
+        """Return how far a method is from the solver on some takes; None unless asked for, or for short takes."""
+        windows = windows_of(self.dressed, take_set, takes) if self.options.solver else []
+        return solver_errors(self.dressed, take_set, method, windows) if windows else None
 
     def _distances(self, take_set: TakeSet, joints: np.ndarray) -> dict[int, Tensor]:
         """Return the distances of each take's poses from the training's [rad], (N,); empty if those are not known."""

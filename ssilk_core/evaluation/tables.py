@@ -9,8 +9,9 @@ from typing import Any
 
 from ..energy import TERMS
 from ..shown_skin import ShownSkin
-from .figures import Figures, LoopDrift, MinimumErrors, PoseNovelty, ReferenceErrors, Settling
+from .figures import Figures, LoopDrift, MinimumErrors, PoseNovelty, ReferenceErrors, Settling, SolverErrors
 from .run import ResultRow
+from .solver_errors import AFTER
 
 
 def aligned(header: Sequence[str], rows: Sequence[Sequence[str]], words: int) -> str:
@@ -53,6 +54,9 @@ MOTION = ("kinetic energy [J]", "RMS distance to static state [mm]", "RMS jerk [
 REFERENCE = ("frames", "L_tot excess over simulator [J]", "simulator L_tot [J]",
              "gravity excess over simulator [% m g L]", "RMS position error [mm]", "RMS velocity error [m/s]",
              "RMS acceleration error [m/s2]", "RMS jerk / simulator")  # fmt: skip
+SOLVER = ("windows", "energy of a step over its minimum [mJ]", "RMS distance to it [mm]",
+          *(f"RMS distance after {count} frames [mm] (median)" for count in AFTER), "RMS velocity error [m/s]",
+          "of LBS [m/s]")  # fmt: skip
 SETTLING = ("stops", "kinetic energy at stop [J]", "kinetic energy at end [J]", "settled stops [%]",
             "median settling time [s]", "RMS distance to static state [mm]", "its maximum [mm]",
             "static energy excess over static state [J]", "gravity excess over static state [% m g L]")  # fmt: skip
@@ -86,6 +90,13 @@ def _reference(f: ReferenceErrors) -> list[str]:
     return [str(f.frames), f"{f.total_excess:.4g}", f"{f.reference_total:.4g}", _signed(f.gravity_excess),
             _millimetres(f.position_error), f"{f.velocity_error:.3f}", f"{f.acceleration_error:.2f}",
             f"{f.jerk_ratio:.2f}"]  # fmt: skip
+
+
+def _solver(f: SolverErrors) -> list[str]:
+    each = zip(f.position_error, f.median_position_error)
+    distances = [f"{_millimetres(rms)} ({_millimetres(median)})" for rms, median in each]
+    return [str(f.windows), f"{1000 * f.step_energy:.1f}", _millimetres(f.step_distance), *distances,
+            f"{f.velocity_error:.3f}", f"{f.lbs_velocity_error:.3f}"]  # fmt: skip
 
 
 def _settling(f: Settling) -> list[str]:
@@ -126,6 +137,7 @@ KINDS: tuple[tuple[Callable[[Figures], Any], Sequence[str], Callable[[Any], list
     (lambda figures: figures, ENERGIES, _energies),
     (lambda figures: figures.shown_skin, SHOWN_SKIN, _shown_skin),
     (lambda figures: figures.reference, REFERENCE, _reference),
+    (lambda figures: figures.solver, SOLVER, _solver),
     (lambda figures: figures, MOTION, _motion),
     (lambda figures: figures.settling, SETTLING, _settling),
     (lambda figures: figures.minimum, MINIMUM, _minimum),

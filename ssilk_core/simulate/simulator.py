@@ -153,7 +153,7 @@ class Simulator:
             running = [span for span in spans if span.motion.frame_count > step]
             poses = self.poser.poses_at(running, step)
             past = past and past.first(len(running))
-            solution = self._step(poses, past) if past else self.quasi_static(poses, poses.lbs)
+            solution = self.step(poses, past) if past else self.quasi_static(poses, poses.lbs)
             world = solution.x.double() + poses.root
             past = StepHistory(world, past.last if past else None, poses.root, poses.lbs)
             if step % self.options.substeps == 0:
@@ -172,8 +172,8 @@ class Simulator:
         predicted = past.follow_lbs(poses) if past.before is None else past.local + (past.last - past.before - shift)
         return StepInputs(poses.body, gravity, predicted.to(past.lbs.dtype), past.local, self.dt, poses.lbs)
 
-    def _step(self, poses: PosedCharacters, past: StepHistory) -> Solution:
-        """Return the states one step later."""
+    def step(self, poses: PosedCharacters, past: StepHistory) -> Solution:
+        """Return the states one step after `past`, relative to the roots."""
         inputs = self.inputs(poses, past)
         assert inputs.predicted is not None
         starts = [inputs.predicted, past.local, past.follow_lbs(poses)]

@@ -16,6 +16,7 @@ from ..model.network import GarmentModel
 from ..motion_bank import MotionBank
 from ..skinning import Skinning
 from .latent_regularization import latent_distortion
+from .newton_distance import NewtonDistance
 from .windows import WindowSampler
 
 Terms = dict[str, Tensor]
@@ -31,6 +32,7 @@ class Objective:
     Args:
         body: the part of the body that the garment can touch, None for nothing. Pinned vertices do not collide,
             because training cannot move them.
+        newton_weight: see `NewtonDistance`; zero for the energy alone.
     """
 
     def __init__(
@@ -40,6 +42,7 @@ class Objective:
         body: CollisionBody | None,
         bank: MotionBank,
         surface: bool = True,
+        newton_weight: float = 0.0,
     ) -> None:
         self.model, self.energy, self.bank = model, energy, bank
         self.surface = surface
@@ -56,6 +59,7 @@ class Objective:
             rest = model.scene.garment.mesh.points[tethered]
             self.tethered_rest = torch.tensor(rest, dtype=torch.float32, device=device)
         self.dt = 1 / model.config.fps
+        self.newton = NewtonDistance(model.scene, energy, self.dt, newton_weight) if newton_weight else None
         size = float(np.linalg.norm(np.ptp(model.scene.garment.mesh.points, axis=0)))
         self.scale = GRAVITY * float(energy.mass.sum()) * size
 
@@ -64,9 +68,10 @@ class Objective:
         energy, root = self.energy, character[0, :, 3]  # heights over the root keep the value of gravity small
         stretch, bending = energy.elastic(x)
         sampled = energy.cloth.positions(x)
-        gravity, collision = energy.gravity_and_collision(
-            x, root, GRAVITY * direction.T, sampled, *self._planes(sampled.detach(), character)
-        )
+        planes = self._planes(sampled.detach(), character)
+        gravity, collision = energy.gravity_and_collision(x, root, GRAVITY * direction.T, sampled, *planes)
+        if self.newton:
+            self.newton.planes = planes
         terms = {"stretch": stretch, "bending": bending, "gravity": gravity, "collision": collision}
         if self.skin:
             terms["tether"] = energy.tether(x, self.skin(self.tethered_rest, None, self.skin.weights, character))
@@ -82,7 +87,12 @@ class Objective:
         """Return the terms of the initialiser's quasi-static states on single poses (Section 3.1)."""
         z = self.model.initial(self.bank.static_descriptor(frames, direction))
         character = self.bank.character(frames)
-        return self.quasi_static_terms(self.model.vertices(z, character), direction, character)
+        return self.quasi_static_terms(self._vertices(z, character, 0), direction, character)
+
+    def _vertices(self, z: Tensor, character: Tensor, moving: int) -> Tensor:
+        """Decode latents (N, latent), of which so many have inertia, to positions (V, 3, N)."""
+        x = self.model.vertices(z, character)
+        return self.newton.attach(x, moving) if self.newton else x
 
     def window(
         self, sampler: WindowSampler, noise: Tensor, frames: Tensor, direction: Tensor
@@ -122,7 +132,7 @@ class Objective:
             past = model.vertices(torch.cat(z[:2]), bank.character(times[: 2 * batch]))
         # One decoder call for the windows from the third frame on and the single poses.
         character = bank.character(torch.cat([times[2 * batch :], frames]))
-        x = model.vertices(torch.cat([rolled, quiet]), character)
+        x = self._vertices(torch.cat([rolled, quiet]), character, (length - 2) * batch)
         terms = self.quasi_static_terms(x, torch.cat([down[2 * batch :], direction]), character)
         count = (length - 2) * batch
         dynamic = {name: value[:count] for name, value in terms.items()}

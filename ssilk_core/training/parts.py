@@ -58,7 +58,8 @@ class TrainingParts:
         group, own = self.group, self.group.local_config(config)
         generator = torch.Generator(self.device).manual_seed(group.seed(seed))
         sampler = WindowSampler(self.bank, own, self.model.config.latent, generator)
-        objective = Objective(self.model, self.energy, self.body, self.bank, config.closest_point == "triangles")
+        surface = config.closest_point == "triangles"
+        objective = Objective(self.model, self.energy, self.body, self.bank, surface, config.newton_weight)
         return Stepper(self.model, objective, sampler, own, group.average if group.size > 1 else None)
 
 

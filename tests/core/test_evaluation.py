@@ -44,6 +44,7 @@ from ssilk_core.evaluation.probes import (
 )
 from ssilk_core.evaluation.record import recorded
 from ssilk_core.evaluation.run import SIMULATOR, EvaluationClips, EvaluationOptions, ResultRow, evaluate
+from ssilk_core.evaluation.solver_errors import solver_errors, windows_of
 from ssilk_core.evaluation.splits import chosen, read_index, splits_of
 from ssilk_core.evaluation.tables import aligned, tables
 from ssilk_core.evaluation.takes import Take, back_and_forth, stopped, takes_of
@@ -444,3 +445,29 @@ def test_no_take_is_refused(dressed, motion):
 def test_tables_are_aligned():
     text = aligned(["name", "value"], [["1_a", "1.5"], ["longer", "-20"]], 1)
     assert text == "| name   | value |\n| ------ | ----: |\n| 1_a    |   1.5 |\n| longer |   -20 |\n"
+
+
+def test_a_simulation_is_where_the_solver_goes_from_its_own_states(scene, dressed, toy_motion):
+    take_set = build_take_set(takes_of("sway", toy_motion(scene, 9), FPS), dressed, JOINTS)
+    simulated = Simulated(dressed, take_set)
+    (window, *_) = windows_of(dressed, take_set, [0])
+    found = solver_errors(dressed, take_set, simulated, [window])
+    assert found.windows == 1
+    assert found.step_energy < 1e-6
+    assert found.step_distance < 1e-4
+    assert found.position_error[0] < 1e-3
+    assert math.isnan(found.position_error[1])  # the take has nine frames
+    moved = solver_errors(dressed, take_set, LinearBlendSkinning(dressed, take_set), [window])
+    assert moved.step_distance > 10 * found.step_distance
+    assert moved.velocity_error > 10 * found.velocity_error
+
+
+def test_windows_begin_with_a_take_and_with_its_most_violent_second(dressed, scene, toy_motion):
+    calm = toy_motion(scene, 150, speed=0.05)
+    fast = toy_motion(scene, 40, speed=3.0)
+    rotations = np.concatenate([calm.rotations[:70], fast.rotations, calm.rotations[110:]])
+    translations = np.concatenate([calm.translations[:70], fast.translations, calm.translations[110:]])
+    take = Take("", 0, replace(calm, rotations=rotations, translations=translations))
+    windows = windows_of(dressed, build_take_set([take], dressed, JOINTS), [0])
+    assert windows[0] == (0, range(62))
+    assert 65 <= windows[1][1].start <= 85
