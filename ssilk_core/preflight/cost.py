@@ -13,10 +13,10 @@ from ..events import format_seconds
 from ..kinematics import quaternion_from_matrix
 from .finding import Finding, Findings, format_joints, index_tuple
 
-# Seconds per vertex and frame in a complete optimiser step, measured on a garment of 2,700 vertices: "draft",
-# 64 frames, takes 0.2 s on two CPU threads; "preview", 1,280 frames, takes 3.7 ms on one H100. Only measured devices
-# are listed.
-SECONDS_PER_VERTEX = {"cpu": 0.2 / (2700 * 64), "cuda": 0.0037 / (2700 * 1280)}
+# Seconds per contact sample and frame in a complete optimiser step: five garments of 7,300 to 10,000 samples on two
+# CPU threads ("draft"), four on an H200 that trained two at once ("preview"). Only measured devices are listed.
+SECONDS_PER_SAMPLE = {"cpu": 1.05e-6, "cuda": 0.9e-9}
+LONG = 3600.0  # [s], a training that is warned of
 
 
 def training_cost(scene: Scene, motions: Sequence[Motion], preset: Preset) -> Findings:
@@ -57,26 +57,38 @@ def memory(scene: Scene, preset: Preset, body_vertices: int) -> Findings:
         why="training progresses more slowly per step with smaller batches" if lowered else "",
         fix="free memory, or choose another device or a smaller preset" if lowered else "",
     )
-    seconds = training_seconds(scene.garment.mesh.vertex_count, train, device.type)
+    seconds = training_seconds(samples, train, device.type)
     found = f"preset '{preset.name}' takes about {format_seconds(seconds)} on {device}" if seconds else (
         f"the time that preset '{preset.name}' takes is unknown: training has not been measured on {device}"
     )  # fmt: skip
     why = (
-        "scaled by vertices and frames from a garment of 2,700 vertices on two CPU threads or one H100; "
+        "scaled by contact samples and frames from garments on two CPU threads or a shared H200; "
         "the actual time may differ by half"
     )
-    yield Finding(severity="info", code="time", prim=scene.garment.mesh.path, found=found, why=why if seconds else "")
+    long = seconds is not None and seconds > LONG
+    yield Finding(
+        severity="warning" if long else "info",
+        code="time",
+        prim=scene.garment.mesh.path,
+        found=found,
+        why=why if seconds else "",
+        fix="take a smaller preset, give minutes instead of iterations, or train on a GPU" if long else "",
+    )
 
 
-def training_seconds(vertices: int, train: TrainConfig, device: str) -> float | None:
-    """Return the estimated duration of a training [s]; None for a device that has not been measured."""
-    if device not in SECONDS_PER_VERTEX:
+def training_seconds(samples: int, train: TrainConfig, device: str) -> float | None:
+    """Return the estimated duration of a training [s]; None for a device that has not been measured.
+
+    Args:
+        samples: at which the garment meets the body (`collision.samples`).
+    """
+    if device not in SECONDS_PER_SAMPLE:
         return None
     trained = (
         train.batch * (train.window - 2) + train.static_batch
     )  # frames of a step, without the two given ones of each window
     proper = (train.iterations - train.static_iterations) * trained
-    return SECONDS_PER_VERTEX[device] * vertices * (train.static_iterations * train.pretraining_batch + proper)
+    return SECONDS_PER_SAMPLE[device] * samples * (train.static_iterations * train.pretraining_batch + proper)
 
 
 def irrelevant_joints(scene: Scene, colliding: np.ndarray) -> Findings:

@@ -1,10 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training for a given wall time: scale the schedule to the iterations that fit."""
+"""Training for a given wall time: the schedule follows the clock.
+
+A few timed steps give the first plan. The speed is measured again while training runs, and the plan follows it: on a
+machine that slows down there are fewer iterations, and the learning rate is low in the end all the same.
+"""
 
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -12,48 +16,77 @@ from ..config import TrainConfig
 from ..errors import fail
 from .step import EAGER_STEPS, Stepper
 
-PLANNED_SHARE = 0.9  # of the remaining time; the rest is a reserve in case the machine slows down
+PLANNED_SHARE = 0.98  # of the remaining time
+VALIDATION_SHARE = 0.1  # of the time that validations may take at most
 TIMED_STEPS = 3  # in each phase
 MIN_ITERATIONS = 20  # fewer do not train a usable model
 MAX_EMA_DECAY = 0.99999
+SMOOTHING = 0.3  # weight of a new measurement of the speed
 
 
-def scale_schedule(config: TrainConfig, iterations: int) -> TrainConfig:
-    """Return the schedule stretched to so many iterations, with the same number of validations."""
+@dataclass(frozen=True)
+class Pace:
+    """Duration of a step of static and of dynamic training [s]."""
+
+    static: float
+    dynamic: float
+
+    def updated(self, measured: float, is_static: bool) -> Pace:
+        """Return the pace after a step of one phase took `measured` seconds; the other phase slows down as much."""
+        known = self.static if is_static else self.dynamic
+        factor = 1 + SMOOTHING * (measured / known - 1)
+        return Pace(factor * self.static, factor * self.dynamic)
+
+
+def scale_schedule(config: TrainConfig, iterations: int, static: int = 0, validations: int = 0) -> TrainConfig:
+    """Return the schedule stretched to so many iterations.
+
+    Args:
+        static: iterations of static training, where these are over; zero for the schedule's share.
+        validations: how many there are; zero for as many as in the schedule.
+    """
     factor = iterations / config.iterations
+    every = config.validate_every * factor
+    if validations:
+        every = (1 - config.static_fraction) * iterations / validations
     return replace(
         config,
         iterations=iterations,
+        static_fraction=(static + 0.5) / iterations if static else config.static_fraction,
         learning_rate_warmup=round(config.learning_rate_warmup * factor),
-        validate_every=max(1, round(config.validate_every * factor)),
+        validate_every=max(1, round(every)),
         ema_decay=min(MAX_EMA_DECAY, config.ema_decay ** (1 / factor)),
     )
 
 
-def fitting_iterations(stepper: Stepper, config: TrainConfig, seconds: float, scoring: float, where: str) -> int:
-    """Return how many iterations of a schedule fit into the remaining time.
+def affordable_validations(config: TrainConfig, seconds: float, scoring: float) -> int:
+    """Return how many validations a run of so many seconds has, each of `scoring` seconds; at least one."""
+    asked = int((1 - config.static_fraction) * config.iterations / config.validate_every) + 1
+    return max(1, min(asked, int(VALIDATION_SHARE * seconds / scoring))) if scoring > 0 else asked
 
-    Args:
-        stepper: of the same schedule; a few steps are timed, after which it must not be used.
-        seconds: remaining time [s].
-        scoring: duration of a validation [s].
-        where: name of the run for messages.
 
-    Raises:
-        SsilkError: fewer than `MIN_ITERATIONS` fit.
-    """
-    validations = int((1 - config.static_fraction) * config.iterations / config.validate_every) + 1
-    static, dynamic = (_seconds(stepper, iteration) for iteration in (0, config.static_iterations))
-    left = PLANNED_SHARE * seconds - validations * scoring
-    count = int(left / (config.static_fraction * static + (1 - config.static_fraction) * dynamic))
-    if not count >= MIN_ITERATIONS:
+def timed_pace(stepper: Stepper, config: TrainConfig) -> Pace:
+    """Time a few steps of each phase; the stepper must not be used afterwards."""
+    return Pace(*(_seconds(stepper, iteration) for iteration in (0, config.static_iterations)))
+
+
+def fitting_iterations(pace: Pace, config: TrainConfig, seconds: float, done: int = 0) -> int:
+    """Return the iterations of a schedule of which `done` are over, where the others take at most so many seconds."""
+    left, share = PLANNED_SHARE * seconds, config.static_fraction
+    if done >= config.static_iterations:
+        return done + int(left / pace.dynamic)
+    return int((left + done * pace.static) / (share * pace.static + (1 - share) * pace.dynamic))
+
+
+def check_enough(iterations: int, where: str) -> None:
+    """Raise `SsilkError` for a run, named `where`, that would be too short."""
+    if not iterations >= MIN_ITERATIONS:
         fail(
             where,
-            f"{max(0, count)} iterations fit into the remaining minutes on this device",
+            f"{max(0, iterations)} iterations fit into the remaining minutes on this device",
             f"at least {MIN_ITERATIONS} are needed",
             "give more minutes, or use a smaller preset",
         )
-    return count
 
 
 def _seconds(stepper: Stepper, iteration: int) -> float:

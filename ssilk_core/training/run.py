@@ -22,7 +22,7 @@ from ..events import Checkpoint, Message, Progress, Reporter, Started
 from ..kinematics import split_at_cuts
 from ..memory import check_one_window_fits, decoded_frames, fits_in_memory, fitting_batch, free_memory, step_memory
 from ..motion_bank import MAX_JOINT_SPEED
-from .budget import fitting_iterations, scale_schedule
+from .budget import Pace, affordable_validations, check_enough, fitting_iterations, scale_schedule, timed_pace
 from .curve import CurvePoint, append_point
 from .divergence import CHECK_INTERVAL, DIVERGENCE_WINDOW, DivergenceMonitor
 from .job import TrainJob
@@ -34,6 +34,7 @@ from .validation import Score
 from .verdict import non_finite_terms, validation_message
 
 SAVE_INTERVAL = 60.0  # [s] between saved states
+PACE_INTERVAL = 5.0  # [s] between measurements of the speed on a processor
 RECOVERY_PACE = 0.25  # factor on learning rates after divergence
 
 
@@ -76,8 +77,12 @@ class TrainingRun:
         if not job.resume:
             self._fit_batch()
         self.lbs, self.validation_seconds = self._score_lbs()
-        if job.minutes and job.is_trainable and not job.resume:
-            self._plan(60 * job.minutes)
+        self.pace: Pace | None = None
+        if job.minutes and job.is_trainable:
+            if job.resume:
+                self._continue_plan()
+            else:
+                self._plan(60 * job.minutes)
         self._build_stepper()
         self._announce()
         self.files.remove_unfinished()
@@ -86,13 +91,16 @@ class TrainingRun:
         else:
             self._resume(tensors)
         self.files.save_curve(self.state, self.lbs)
-        self._since = self._saved_at = time.monotonic()
+        self._since = self._saved_at = self._measured_at = time.monotonic()
+        self._timed = self.state.iteration, self.state.seconds
 
     @property
     def config(self) -> TrainConfig:
         """The schedule in use: as requested, scaled to the minutes of the job, with reduced settings."""
         asked, state = self.job.train, self.state
-        config = scale_schedule(asked, state.planned) if state.planned else asked
+        config = asked
+        if state.planned:
+            config = scale_schedule(asked, state.planned, state.static, state.validations)
         return state.lowered[-1].apply_to(config) if state.lowered else config
 
     def _score_lbs(self) -> tuple[Score, float]:
@@ -102,16 +110,54 @@ class TrainingRun:
 
     def _plan(self, seconds: float) -> None:
         """Choose the number of iterations by timing a few steps; the model is restored afterwards."""
-        model, left = self.parts.model, seconds - (time.monotonic() - self._began)
+        model, config = self.parts.model, self.config
         before = {name: value.clone() for name, value in model.state_dict().items()}
-        stepper = self.parts.stepper(self.config, self.job.train.seed)
-        self.state.planned = fitting_iterations(
-            stepper, self.config, left, self.validation_seconds, str(self.job.output)
-        )
+        stepper = self.parts.stepper(config, self.job.train.seed)
+        self.pace = timed_pace(stepper, config)
         del stepper
         self._empty_memory()
         model.load_state_dict(before)
-        self.report(Message(f"{self.state.planned} iterations are planned for {seconds / 60:g} minutes"))
+        self.state.validations = affordable_validations(config, seconds, self.validation_seconds)
+        planned = fitting_iterations(self.pace, config, self._training_time_left())
+        check_enough(planned, str(self.job.output))
+        self.state.planned = planned
+        self.report(Message(f"about {planned} iterations are planned for {seconds / 60:g} minutes"))
+
+    def _continue_plan(self) -> None:
+        """Plan the rest of a resumed run at its mean speed; without time left it is done."""
+        state = self.state
+        if not (state.planned and state.seconds and state.iteration):
+            return
+        each = state.seconds / state.iteration
+        self.pace = Pace(each, each)
+        if state.iteration < state.planned or self._training_time_left() > 0:
+            self._follow_clock()
+
+    def _training_time_left(self) -> float:
+        """Return the time left for steps [s], after the validations that are still to come."""
+        to_come = max(0, self.state.validations - len(self.state.curve) - 1)  # the last is left out of `time_left`
+        return max(0.0, self.time_left - to_come * self.validation_seconds)
+
+    def _follow_clock(self) -> None:
+        """Plan as many iterations as fit into the time that is left."""
+        assert self.pace
+        state, config = self.state, self.config
+        if state.iteration >= config.static_iterations:
+            state.static = config.static_iterations
+        found = fitting_iterations(self.pace, config, self._training_time_left(), state.iteration)
+        state.planned = max(found, state.iteration, 1)
+
+    def _measure_pace(self) -> None:
+        """Measure the speed since the last check, and plan again."""
+        if self.pace is None:
+            return
+        iteration, seconds = self.state.iteration, self.state.seconds + time.monotonic() - self._since
+        steps, took = iteration - self._timed[0], seconds - self._timed[1]
+        self._timed, self._measured_at = (iteration, seconds), time.monotonic()
+        if steps > 0 and took > 0:
+            self.pace = self.pace.updated(took / steps, iteration <= self.config.static_iterations)
+            self._follow_clock()
+            self.stepper.config = self.config
 
     def _build_stepper(self) -> None:
         seed = self.job.train.seed + len(self.state.lowered)  # draws other windows than before
@@ -225,10 +271,14 @@ class TrainingRun:
         """Do one iteration."""
         self._within_memory(lambda: self.stepper.run(self.state.iteration))
         self.state.iteration += 1
+        # On a processor steps are long, and those launched are done.
+        if self.device.type == "cpu" and time.monotonic() - self._measured_at >= PACE_INTERVAL:
+            self._measure_pace()
 
     def check(self, seconds_left: float) -> None:
-        """Report progress and skipped steps; recover if training diverges."""
+        """Report progress and skipped steps, follow the clock, and recover if training diverges."""
         self._report_progress(seconds_left)
+        self._measure_pace()
         if text := self.monitor.check():
             self.report(Message(text, "warning"))
         if self.monitor.is_diverging:
@@ -247,7 +297,11 @@ class TrainingRun:
     def validation_due(self) -> bool:
         """Whether the schedule asks for a validation now."""
         config, iteration = self.config, self.state.iteration
-        scheduled = iteration % config.validate_every == 0 or iteration == config.iterations
+        scheduled = iteration % config.validate_every == 0
+        if self.state.validations:  # the plan changes, and with it the interval
+            last = self.state.curve[-1].iteration if self.state.curve else config.static_iterations
+            scheduled = iteration - last >= config.validate_every
+        scheduled |= iteration == config.iterations
         return scheduled and iteration >= max(1, config.static_iterations) and iteration != self.saved
 
     def validate(self) -> None:
@@ -401,8 +455,8 @@ def train(
 
 def _loop(run: TrainingRun, stop: threading.Event) -> bool:
     """Iterate until all iterations are done, the time is up or `stop` is set; return False in the last case."""
-    began, steps, total = time.monotonic(), 0, run.config.iterations
-    while run.state.iteration < total and not run.should_stop(stop):
+    began, steps = time.monotonic(), 0
+    while run.state.iteration < (total := run.config.iterations) and not run.should_stop(stop):
         if run.time_left <= 0:
             run.end_early()
             return True
@@ -416,4 +470,4 @@ def _loop(run: TrainingRun, stop: threading.Event) -> bool:
             run.validate()
         elif run.save_due:
             run.save()
-    return run.state.iteration >= total
+    return run.state.iteration >= run.config.iterations

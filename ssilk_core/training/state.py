@@ -81,6 +81,8 @@ class RunState:
         skipped: number of skipped steps; "undone" in the file.
         seconds: as in `CurvePoint`.
         planned: iterations that fit into the job's minutes; zero for those of its schedule.
+        static: those of them that were static training, once that is over.
+        validations: how many fit; zero for those of the schedule.
         curve: the validations.
     """
 
@@ -91,6 +93,8 @@ class RunState:
     skipped: int = 0
     seconds: float = 0.0
     planned: int = 0
+    static: int = 0
+    validations: int = 0
     curve: list[CurvePoint] = field(default_factory=list)
 
 
@@ -213,7 +217,8 @@ def _need_possible(state: RunState) -> None:
     """Raise `ValueError` unless a run can have reached this state; files of earlier versions have no checksum."""
     asked, scored = state.asked["train"], [each for each in (state.best, *state.curve) if each]
     last = state.planned or asked["iterations"]
-    _need_counts("planned", 0, inf, [state.planned])
+    _need_counts("planned", 0, inf, [state.planned, state.validations])
+    _need_counts("static", 0, last, [state.static])
     _need_counts("iteration", 0, last, [state.iteration])
     _need_counts("undone", 0, 2 * last, [state.skipped])  # a run that diverges goes back once
     _need_counts("an earlier iteration", 0, state.iteration, [each.iteration for each in (*scored, *state.lowered)])

@@ -9,12 +9,19 @@ from math import inf
 import pytest
 import torch
 
-from ssilk_core.config import TrainConfig
+from ssilk_core.config import PRESETS, TrainConfig
 from ssilk_core.errors import SsilkError
 from ssilk_core.events import Message, Progress, Started, silent
 from ssilk_core.training import budget
 from ssilk_core.training import run as training
-from ssilk_core.training.budget import fitting_iterations, scale_schedule
+from ssilk_core.training.budget import (
+    Pace,
+    affordable_validations,
+    check_enough,
+    fitting_iterations,
+    scale_schedule,
+    timed_pace,
+)
 from ssilk_core.training.parallel import ProcessGroup
 from ssilk_core.training.run import TrainingRun, train
 from ssilk_core.training.state import load_state, state_path
@@ -50,32 +57,71 @@ class Clocked:
         self.now += self.times[iteration >= PLAN.static_iterations]
 
 
-def planned(monkeypatch: pytest.MonkeyPatch, seconds: float, scoring: float = 0.0) -> int:
+def test_steps_of_both_phases_are_timed(monkeypatch):
     stepper = Clocked(0.1, 0.4)
     monkeypatch.setattr(budget, "_clock", lambda device: stepper.now)
-    return fitting_iterations(stepper, PLAN, seconds, scoring, "cape.safetensors")  # type: ignore[arg-type]
+    pace = timed_pace(stepper, PLAN)  # type: ignore[arg-type]
+    assert (pace.static, pace.dynamic) == (pytest.approx(0.1), pytest.approx(0.4))
 
 
-def test_as_many_iterations_are_planned_as_fit(monkeypatch):
-    each = 0.3 * 0.1 + 0.7 * 0.4
-    assert planned(monkeypatch, 600) == int(0.9 * 600 / each)
-    assert planned(monkeypatch, 600, scoring=10) == int((0.9 * 600 - 8 * 10) / each)
+def test_as_many_iterations_are_planned_as_fit():
+    pace, each = Pace(0.1, 0.4), 0.3 * 0.1 + 0.7 * 0.4
+    assert fitting_iterations(pace, PLAN, 600) == int(0.98 * 600 / each)
+    # In static training: the rest of it, and all that follows.
+    found = fitting_iterations(pace, PLAN, 60, done=20)
+    assert (0.3 * found - 20) * 0.1 + 0.7 * found * 0.4 == pytest.approx(0.98 * 60, rel=0.01)
+    assert fitting_iterations(pace, PLAN, 40, done=300) == 300 + int(0.98 * 40 / 0.4)
+    slower = pace.updated(1.4, is_static=False)
+    assert slower.dynamic / slower.static == pytest.approx(4) and 0.4 < slower.dynamic < 1.4
+    check_enough(20, "cape.safetensors")
     with pytest.raises(
         SsilkError, match=r"^cape.safetensors: 14 iterations fit into the remaining minutes .* smaller preset"
     ):
-        planned(monkeypatch, 5)
+        check_enough(14, "cape.safetensors")
+
+
+def test_validations_take_a_tenth_of_the_time_at_most():
+    final = PRESETS["final"].train
+    assert affordable_validations(final, 240, 1.0) == 24
+    assert affordable_validations(final, 1e6, 1.0) == 226
+    assert affordable_validations(final, 5, 1.0) == 1
+    assert affordable_validations(final, 240, 0.0) == 226
+    stretched = scale_schedule(final, 9000, validations=24)
+    assert stretched.validate_every == round(0.9 * 9000 / 24)
+
+
+def test_the_schedule_follows_the_clock(job, monkeypatch):  # noqa: F811
+    """A machine that becomes three times slower gets fewer iterations, and ends in time at the last learning rate."""
+    now, rates = [0.0], []
+    monkeypatch.setattr(training.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(training, "timed_pace", lambda *_: Pace(1.0, 1.0))
+    monkeypatch.setattr(training, "CHECK_INTERVAL", 2)
+    real = TrainingRun.step
+
+    def step(run: TrainingRun) -> None:
+        rates.append(learning_rate(run.stepper.config, run.state.iteration))
+        real(run)
+        now[0] += 1.0 if now[0] < 20 else 3.0
+
+    monkeypatch.setattr(TrainingRun, "step", step)
+    trained = train(job("clock", minutes=1.0), silent)
+    state, _ = load_state(state_path(job("clock").output), job("clock").identity())
+    assert trained.finished and trained.iterations == state.planned == len(rates)
+    assert 28 <= trained.iterations <= 35 and now[0] <= 60
+    assert rates[-1] < 0.1 * max(rates[state.static :])
+    assert state.curve[-1].iteration == trained.iterations
 
 
 def test_a_run_with_minutes_is_one_of_as_many_iterations(job, monkeypatch):  # noqa: F811
     """Timing its steps leaves no trace in what is learned."""
-    real, said = training.fitting_iterations, []
+    said: list = []
     monkeypatch.setattr(budget, "MIN_ITERATIONS", 1)
-    monkeypatch.setattr(training, "fitting_iterations", lambda *given: real(*given) * 0 + 11)
+    monkeypatch.setattr(training, "fitting_iterations", lambda *_: 11)
     trained = train(job("minutes", minutes=5.0), said.append)
     assert trained.finished and trained.iterations == 11
     assert [event.total for event in said if isinstance(event, Started)] == [11]
     assert any(
-        "11 iterations are planned for 5 minutes" in event.text for event in said if isinstance(event, Message)
+        "about 11 iterations are planned for 5 minutes" in event.text for event in said if isinstance(event, Message)
     )
     lbs = job("iterations", scale_schedule(SHORT, 11))
     train(lbs, silent)
@@ -87,6 +133,7 @@ def test_a_run_with_minutes_is_one_of_as_many_iterations(job, monkeypatch):  # n
 
 def test_a_run_ends_with_its_time_and_goes_on_with_more(job, monkeypatch):  # noqa: F811
     monkeypatch.setattr(training, "fitting_iterations", lambda *_: 13)
+    monkeypatch.setattr(budget, "MIN_ITERATIONS", 1)
     with monkeypatch.context() as patch:
         patch.setattr(TrainingRun, "time_left", property(lambda run: 8.0 - run.state.iteration))
         said: list = []
@@ -109,6 +156,7 @@ def test_a_process_group_has_no_minutes(job, resume):  # noqa: F811
 
 def test_time_is_up_when_no_validation_fits_any_more(job, monkeypatch):  # noqa: F811
     monkeypatch.setattr(training, "fitting_iterations", lambda *_: 13)
+    monkeypatch.setattr(budget, "MIN_ITERATIONS", 1)
     run = TrainingRun(job("clock", minutes=1.0), silent)
     now = run._began
     monkeypatch.setattr(training.time, "monotonic", lambda: now)

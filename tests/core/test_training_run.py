@@ -3,7 +3,6 @@
 
 import json
 import math
-import os
 import signal
 import threading
 from collections.abc import Callable
@@ -638,9 +637,9 @@ def test_interrupts_set_the_event_once_and_are_immediate_the_second_time():
     before = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt), stop_on_signals() as stop:
         assert not stop.is_set()
-        os.kill(os.getpid(), signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
         assert stop.wait(1)
-        os.kill(os.getpid(), signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
         stop.clear()
         stop.wait(1)
     assert signal.getsignal(signal.SIGINT) is before
