@@ -53,6 +53,7 @@ PAPER = {
     "recombinations": 0,
     "perturbations": 0,
     "outlier_energy": 0,
+    "newton_weight": 0,
     "noise_correlation": 0,
     "noise_probability": "not stated",
     "static_fraction": 0,
