@@ -18,6 +18,7 @@ from ssilk_core.kinematics import local_transforms, world_transforms
 from .body_faces import HiddenPolygons, author_faces, hide_polygons
 from .garment_api import GarmentRecord, apply_garment_api
 from .names import CLASS, LBS_SKIN, PROXIES, shape_name
+from .read_skin import leaf
 from .units import StageUnits
 
 
@@ -138,10 +139,24 @@ def define_skeleton(
         )
     prim = UsdSkel.Skeleton.Define(stage, path)
     prim.CreateJointsAttr(Vt.TokenArray(joints))
+    prim.CreateJointNamesAttr(Vt.TokenArray(unique_names(joints)))
     prim.CreateBindTransformsAttr(matrix_array(units.transforms_from_core(binds)))
     prim.CreateRestTransformsAttr(matrix_array(_rest_transforms(skeleton, binds, parents, units)))
     UsdSkel.BindingAPI.Apply(prim.GetPrim())
     return prim
+
+
+def unique_names(joints: Sequence[str]) -> list[str]:
+    """Return a name of its own for each joint path: its last part, numbered where several joints have it."""
+    names: list[str] = []
+    taken = {leaf(joint) for joint in joints}
+    for joint in joints:
+        name, number = leaf(joint), 1
+        while name in names or (number > 1 and name in taken):
+            number += 1
+            name = f"{leaf(joint)}_{number}"
+        names.append(name)
+    return names
 
 
 def _rest_transforms(skeleton: Skeleton, binds: Floats, parents: Ints, units: StageUnits) -> Floats:
