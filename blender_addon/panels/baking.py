@@ -8,7 +8,7 @@ import bpy
 from ..errors import SetupError
 from ..scene.garment import unusable
 from ..scene.models import model_of
-from .base import SidebarPanel, draw_text
+from .base import SidebarPanel, draw_text, saying_errors
 
 
 def model_line(garment: bpy.types.Object) -> str:
@@ -27,6 +27,7 @@ class BakingPanel(SidebarPanel, bpy.types.Panel):
     def poll(cls, context: bpy.types.Context) -> bool:
         return not unusable(context.object)
 
+    @saying_errors
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         layout.prop(context.object.ssilk, "model")

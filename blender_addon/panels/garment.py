@@ -8,7 +8,7 @@ import bpy
 from ..errors import SetupError
 from ..preferences import unready
 from ..scene.garment import armature_of, garments_of, unusable
-from .base import SidebarPanel, draw_text, draw_work
+from .base import SidebarPanel, draw_text, draw_work, saying_errors
 
 
 def draw_garments(layout: bpy.types.UILayout, shown: bpy.types.Object) -> None:
@@ -29,6 +29,7 @@ class GarmentPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_garment"
     bl_label = "Garment"
 
+    @saying_errors
     def draw(self, context: bpy.types.Context) -> None:
         layout, reason = self.layout, unusable(context.object)
         if reason:

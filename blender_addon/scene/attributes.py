@@ -14,10 +14,11 @@ from ssilk_core.assets import TIGHT
 
 from .. import classes as palette
 from ..errors import SetupError
+from .editing import edited_classes, edited_colors
 
 
 def read_classes(mesh: bpy.types.Mesh) -> np.ndarray | None:
-    """Return the class of each vertex, shape (V,); None where the mesh has none. Not in edit mode.
+    """Return the class of each vertex, shape (V,); None where the mesh has none, or in edit mode 8 bits each.
 
     Raises:
         SetupError: the attribute is no integer for each point, or holds other values.
@@ -30,9 +31,12 @@ def read_classes(mesh: bpy.types.Mesh) -> np.ndarray | None:
             f"The attribute '{palette.ATTRIBUTE}' of '{mesh.name}' is {attribute.data_type} on {attribute.domain}; "
             "integers on points are needed: remove it and paint again."
         )
-    values = np.empty(len(mesh.vertices), dtype=np.int32)
-    attribute.data.foreach_get("value", values)
-    if not palette.in_range(values):
+    if mesh.is_editmode:  # the attribute itself is empty then
+        values = edited_classes(mesh)
+    else:
+        values = np.empty(len(mesh.vertices), dtype=np.int32)
+        attribute.data.foreach_get("value", values)
+    if values is not None and not palette.in_range(values):
         raise SetupError(
             f"The attribute '{palette.ATTRIBUTE}' of '{mesh.name}' holds values besides 0, 1 and 2; paint these "
             "again."
@@ -70,7 +74,10 @@ def show_classes(mesh: bpy.types.Mesh) -> None:
 
 
 def painted_classes(mesh: bpy.types.Mesh) -> np.ndarray | None:
-    """Return the class whose colour each vertex is nearest to, shape (V,); None without colours. Not in edit mode."""
+    """Return the class whose colour each vertex is nearest to, shape (V,); None without colours."""
+    if mesh.is_editmode:
+        colors = edited_colors(mesh)
+        return None if colors is None else palette.nearest(colors)
     layer = mesh.color_attributes.get(palette.COLOR_ATTRIBUTE)
     if layer is None:
         return None
