@@ -48,9 +48,6 @@ class RigOperator(tasks.OutsideOperator):
         """Return a sentence with names of objects in place of files and prims."""
         return self.handover.in_blender_words(sentence) if self.handover else sentence
 
-    def explain(self, work: Work) -> str:
-        return self.rephrase(work.error)
-
 
 class Classify(RigOperator, bpy.types.Operator):
     """Find classes by the garment's distance to the body and by where limbs part; replaces what is painted"""

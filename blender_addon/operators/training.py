@@ -17,6 +17,7 @@ from ..errors import SetupError
 from ..fabric_properties import fabric_options
 from ..names import identifiers
 from ..outside import jobs
+from ..outside.wording import remember
 from ..outside.work import Work
 from ..preferences import interpreter, preferences, unready
 from ..scene import playing
@@ -147,10 +148,11 @@ class Train(tasks.OutsideOperator, bpy.types.Operator):
     def finish(self, context: bpy.types.Context, work: Work) -> str:
         (garment, _), name = self.pair.objects(), self.pair.name
         folder = jobs.create(Path(bpy.data.filepath).parent / "ssilk", identifiers([name])[0])
-        prim = hand_over(self.scene, self.pair, folder).prim
+        given = hand_over(self.scene, self.pair, folder)
+        remember(folder, {**given.words, **self.chosen.words, jobs.MODEL: f"the model of '{name}'"})
         shutil.move(work.folder / MOTIONS, folder / MOTIONS)
         files = [beside(path, folder) for path in self.chosen.files]
-        command = train_command(garment, prim, self.chosen.names, files)
+        command = train_command(garment, given.prim, self.chosen.names, files)
         jobs.begin(interpreter(preferences(context)), folder, command)
         begun.add(folder)
         garment.ssilk.training.folder = relative(folder)

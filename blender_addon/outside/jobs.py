@@ -18,6 +18,7 @@ from typing import Any
 from ..errors import SetupError
 from .process import environment
 from .runner import BEAT, CANCEL, ORDER, STATE
+from .wording import recall, reworded
 
 MODEL = "model.safetensors"
 CURVE = "model.curve.json"  # what validations found, as `ssilk train` writes it beside the model
@@ -42,8 +43,8 @@ class JobState:
         terms: energies of the last batch [J] by name; None where one is not finite.
         curve: [iteration, terms] now and then.
         checkpoint: iteration of the model on disk; None before there is one.
-        text: the last message.
-        error: why it failed.
+        text: the last message, in an artist's words.
+        error: why it failed, likewise.
     """
 
     state: str
@@ -150,6 +151,9 @@ def read_state(folder: Path) -> JobState | None:
     known = {name: fields[name] for name in JobState.__dataclass_fields__ if name in fields}
     if "state" not in known:
         return None
+    if said := {name: known[name] for name in ("text", "error") if known.get(name)}:
+        names = recall(folder)
+        known.update({name: reworded(sentence, folder, names) for name, sentence in said.items()})
     state = JobState(**known)
     if state.alive and time.time() - state.beat > SILENCE:
         return JobState(**{**known, "state": "lost"})

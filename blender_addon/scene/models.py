@@ -10,6 +10,8 @@ import bpy
 from ..errors import SetupError
 from ..outside.jobs import MODEL
 
+FIRST = "wait for the training's first validation, or resume it"
+
 
 def job_of(garment: bpy.types.Object) -> Path | None:
     """Return the folder of a garment's training; None where it has none."""
@@ -27,9 +29,9 @@ def model_of(garment: bpy.types.Object) -> Path:
     if not chosen and not job:
         raise SetupError(f"'{garment.name}' has no trained model; train it, or choose a model in the Baking panel.")
     path = Path(bpy.path.abspath(chosen)) if chosen else job / MODEL
-    todo = "choose another" if chosen else "wait for the training's first validation, or resume it"
     if not path.is_file():
-        raise SetupError(f"'{garment.name}' has no model at {path}; {todo}.")
+        where, todo = (f" at {path}", "choose another") if chosen else (" yet", FIRST)
+        raise SetupError(f"'{garment.name}' has no model{where}; {todo}.")
     return path
 
 

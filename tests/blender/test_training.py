@@ -220,7 +220,8 @@ def test_what_a_training_finds_wrong_is_kept_for_the_panel(ready, rigged):
     ready.ops.ssilk.train()
     state = ended(rigged)
     assert state.state == "failed"
-    assert "longer motions are needed to train" in state.error
+    assert "'Timeline': " in state.error and "longer motions are needed to train" in state.error
+    assert ".usdc" not in state.error
 
 
 def test_panels_draw_a_training(ready, rigged):
