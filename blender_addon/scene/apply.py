@@ -13,6 +13,7 @@ from ..errors import SetupError
 from ..joints import Joints
 from .armature import need_editable, proxy_names
 from .attributes import write_classes
+from .carrying import hang_on_armature
 from .edit_tracking import find_edits, generated, remember_weights
 from .gather import own_weights
 from .proxies import replace_proxies
@@ -104,7 +105,8 @@ def _need_same_vertices(garment: bpy.types.Object, classes: np.ndarray) -> None:
 
 
 def _bind(garment: bpy.types.Object, armature: bpy.types.Object) -> None:
-    """Give a garment an Armature modifier, the first one, unless it has one for this armature."""
+    """Give a garment an Armature modifier, the first one, unless it has one; no bone carries it any more."""
+    hang_on_armature(garment)
     if any(modifier.type == "ARMATURE" and modifier.object == armature for modifier in garment.modifiers):
         return
     modifier = garment.modifiers.new("Armature", "ARMATURE")

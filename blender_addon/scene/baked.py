@@ -14,6 +14,7 @@ from ssilk_core.kinematics import local_transforms, multiply_quaternions, quater
 from ..errors import SetupError
 from ..joints import Joints, joint_order
 from .armature import proxy_names
+from .carrying import need_uncarried
 from .keys import Channel, bake_keys, remove_keys
 from .shapes import need_relative, remove_shapes, rest_points, write_shapes
 from .trained_weights import put_trained_weights, restore_own_weights
@@ -30,6 +31,7 @@ def need_bakeable(garment: bpy.types.Object, armature: bpy.types.Object, joints:
         SetupError: an option of the modifier, of a bone or of shape keys is in the way.
     """
     need_relative(garment)
+    need_uncarried(garment)
     _need_linear(garment, armature)
     names = joints.names
     for name, parent in list(zip(names, joints.parents))[joints.character_count :]:

@@ -7,6 +7,7 @@ import bpy
 
 from ..classes import ATTRIBUTE
 from ..errors import SetupError
+from .carrying import carrier_of, is_carried
 from .follower import leader_of
 
 # Modifiers that leave points where they are, and those that may come after the armature's.
@@ -44,14 +45,15 @@ def is_garment(thing: bpy.types.Object) -> bool:
 
 
 def armature_of(garment: bpy.types.Object) -> bpy.types.Object:
-    """Return the armature that a garment was given, else that of its modifier, else its parent, else the only one.
+    """Return the armature that a garment was given, else that of its modifier, else of its parent, else the only one.
 
     Raises:
         SetupError: there is none, or there are several.
     """
     bound = _modifier_armature(garment)
     above = garment.parent if garment.parent and garment.parent.type == "ARMATURE" else None
-    chosen = garment.ssilk.armature or bound or above
+    carrier = carrier_of(garment)
+    chosen = garment.ssilk.armature or bound or above or (carrier and carrier[0])
     if chosen:
         return chosen
     found = [thing for thing in bpy.context.scene.objects if thing.type == "ARMATURE" and leader_of(thing) == thing]
@@ -83,8 +85,12 @@ def bodies_of(garment: bpy.types.Object, armature: bpy.types.Object) -> list[bpy
     meshes = [thing for thing in things if thing.type == "MESH" and thing != garment]
     wearers = (armature, leader_of(armature))
     bound = [thing for thing in meshes if _modifier_armature(thing) in wearers]
-    if not chosen:
+    carried = [thing for thing in meshes if is_carried(thing, wearers)]
+    if chosen:
+        bound = [thing for thing in meshes if thing in (*bound, *carried)]
+    else:  # armour and weapons count where they are chosen, or where the whole character is made like them
         bound = [thing for thing in bound if not is_garment(thing)]
+        bound = bound or [thing for thing in carried if not is_garment(thing)]
     loose = [thing.name for thing in meshes if thing not in bound] if chosen else []
     if loose:
         raise SetupError(f"'{loose[0]}' is not bound to '{armature.name}'; bind it, or take it from '{chosen.name}'.")

@@ -18,6 +18,8 @@ from ..joints import Joints
 from ..names import identifiers
 from .armature import read_joints
 from .attributes import current_classes
+from .carrying import carried_weights, is_carried, rest_world
+from .follower import leader_of
 from .garment import armature_of, bodies_of, need_undeformed_shape, shaping_modifiers
 from .masks import unmasked
 from .trained_weights import own_groups
@@ -88,6 +90,8 @@ def own_weights(armature: bpy.types.Object, garment: bpy.types.Object, joints: J
     kept = read_kept(garment.data, PLAIN, names)
     if kept is not None or joints.proxy_count:
         return kept
+    if is_carried(garment, (armature, leader_of(armature))):
+        return carried_weights(garment, joints.character, len(garment.data.vertices))
     weights = own_groups(armature, garment, names)
     bare = int(np.count_nonzero(~weights.any(axis=1)))
     if bare == len(weights):
@@ -115,17 +119,22 @@ def _proxy_rig(armature: bpy.types.Object, garment: bpy.types.Object, joints: Jo
 def _read_body(thing: bpy.types.Object, armature: bpy.types.Object, joints: Joints, path: str) -> Body:
     """Return a body at rest; evaluated where modifiers shape it before its armature does."""
     if not shaping_modifiers(thing):
-        return _bound(thing, thing.data, joints, path)
+        return _bound(thing, thing.data, armature, joints, path)
     with _at_rest(armature) as depsgraph:
         evaluated = thing.evaluated_get(depsgraph)
         try:
-            return _bound(thing, evaluated.to_mesh(), joints, path)
+            return _bound(thing, evaluated.to_mesh(), armature, joints, path)
         finally:
             evaluated.to_mesh_clear()
 
 
-def _bound(thing: bpy.types.Object, mesh: bpy.types.Mesh, joints: Joints, path: str) -> Body:
-    weights = read_groups(thing, mesh, joints.names)
+def _bound(
+    thing: bpy.types.Object, mesh: bpy.types.Mesh, armature: bpy.types.Object, joints: Joints, path: str
+) -> Body:
+    if is_carried(thing, (armature, leader_of(armature))):
+        weights = carried_weights(thing, joints, len(mesh.vertices))
+    else:
+        weights = read_groups(thing, mesh, joints.names)
     bare = int(np.count_nonzero(~weights.any(axis=1)))
     if bare:
         raise SetupError(f"{bare} of {len(weights)} vertices of '{thing.name}' have no bone's weight; paint these.")
@@ -144,7 +153,7 @@ def _at_rest(armature: bpy.types.Object) -> Iterator[bpy.types.Depsgraph]:
 
 
 def _read_mesh(thing: bpy.types.Object, mesh: bpy.types.Mesh, path: str) -> Mesh:
-    world = np.array(thing.matrix_world)
+    world = np.array(rest_world(thing))
     points = _values(mesh.vertices, "co", 3).reshape(-1, 3) @ world[:3, :3].T + world[:3, 3]
     counts = _values(mesh.polygons, "loop_total", 1, np.int32)
     corners = np.arange(len(mesh.loops))

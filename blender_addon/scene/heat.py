@@ -18,6 +18,7 @@ from ssilk_core.shown_skin import COVER_REACH, SHOW_DEPTH
 
 from .. import heat
 from ..errors import SetupError
+from .carrying import rest_world
 from .garment import armature_of, bodies_of
 from .masks import need_unmasked
 from .meshes import need_same_vertices, world_points
@@ -199,9 +200,9 @@ def _shown(garment: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Generat
     cloth, triangles = _surface(garment.evaluated_get(depsgraph))
     trees = [
         BVHTree.FromPolygons(points.tolist(), triangles.tolist(), all_triangles=True)
-        for points in (_in_world(garment, rest_points(garment)), cloth)
+        for points in (_at_rest(garment, rest_points(garment)), cloth)
     ]
-    skins = [(_in_world(body, mixed_points(body)), *_surface(body.evaluated_get(depsgraph))) for body in bodies]
+    skins = [(_at_rest(body, mixed_points(body)), *_surface(body.evaluated_get(depsgraph))) for body in bodies]
     found = []
     for number, (rest, now, faces) in enumerate(skins):
         steps = _shown_on(rest, now, faces, *trees, 1 / scale)
@@ -236,8 +237,8 @@ def _distances(
     return found
 
 
-def _in_world(thing: bpy.types.Object, points: np.ndarray) -> np.ndarray:
-    world = np.array(thing.matrix_world)
+def _at_rest(thing: bpy.types.Object, points: np.ndarray) -> np.ndarray:
+    world = np.array(rest_world(thing))
     return points @ world[:3, :3].T + world[:3, 3]
 
 

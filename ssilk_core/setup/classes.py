@@ -3,7 +3,8 @@
 
 The paper paints the classes by hand. Here a vertex is tight where the body is near and either supports the cloth
 from below or is enclosed by it. Cloth that only hangs close to the back is not tight. The band along the border
-from which an island hangs is pinned. All other vertices are loose.
+from which an island hangs is pinned. All other vertices are loose. An island that is near the body nowhere hangs
+from its top where a single joint carries the garment, as a bone carries what an artist parents to it.
 """
 
 from __future__ import annotations
@@ -70,13 +71,19 @@ class ClassOptions:
 
 
 def classify(
-    character: Character, mesh: Mesh, skin: SkinWeights, options: ClassOptions | None = None
+    character: Character,
+    mesh: Mesh,
+    skin: SkinWeights,
+    options: ClassOptions | None = None,
+    *,
+    carried: bool = False,
 ) -> NDArray[np.int8]:
     """Return PINNED, TIGHT or LOOSE for each garment vertex, shape (V,).
 
     Args:
         mesh: the garment at the character's bind pose.
         skin: its skinning weights for LBS. Unsmoothed weights show most clearly where limbs part.
+        carried: whether an island that is near the body nowhere hangs from its top.
 
     Raises:
         SsilkError: an island of the garment has no pinned or tight vertex.
@@ -92,6 +99,8 @@ def classify(
     held = smooth(held[:, None].astype(float), pairs, options.rounds)[:, 0] > 0.5
     held = _with_specks(held, mesh, pairs, options.speck_reach)
     held = ~_with_specks(~held, mesh, pairs, options.speck_reach) | _band(mesh, rim, options.pinned_width)
+    if carried:
+        held |= _tops(mesh, ~held, np.isin(island, island[held]), island, options)
     _need_held(held, mesh, island)
     classes = np.where(held, TIGHT, LOOSE).astype(np.int8)
     classes[held & _band(mesh, rim | _tops(mesh, held, rim, island, options), options.pinned_width)] = PINNED
@@ -178,7 +187,7 @@ def _need_held(held: Mask, mesh: Mesh, island: Ints) -> None:
 
 
 def _tops(mesh: Mesh, held: Mask, rim: Mask, island: Ints, options: ClassOptions) -> Mask:
-    """Return the highest tight vertices of each island without a rim, such as a closed hood, shape (V,)."""
+    """Return the highest `held` vertices of each island without a rim, such as a closed hood, shape (V,)."""
     result = np.zeros(mesh.vertex_count, dtype=bool)
     for number in np.setdiff1d(island, island[rim]):
         height = np.where(held & (island == number), mesh.points @ UP, -np.inf)

@@ -54,7 +54,8 @@ def _find_classes(
     """Classify by authored weights, or else by unsmoothed ones from the body, which jump where limbs part."""
     unsmoothed = WeightOptions(tight_rounds=0, loose_rounds=0)
     skin = garment.skin or transfer_weights(character, garment.mesh, options=unsmoothed)
-    classes = classify(character, garment.mesh, skin, options)
+    carried = garment.skin is not None and garment.skin.only_joint is not None
+    classes = classify(character, garment.mesh, skin, options, carried=carried)
     shares = ", ".join(f"{np.mean(classes == value):.0%} {name}" for value, name in enumerate(CLASS_NAMES))
     report(events.Message(f"{garment.mesh.path}: no vertex classes; classified as {shares}"))
     return classes

@@ -154,6 +154,17 @@ def test_island_that_rests_nowhere_is_refused(trunk):
         found(trunk, both)
 
 
+def test_what_one_joint_carries_hangs_from_its_top_however_far_from_the_body(trunk):
+    far = tube([0.3, 0.5], [1.3, 0.7], turn=140)
+    alone = SkinWeights("/Cape", np.full((far.vertex_count, 1), 1), np.ones((far.vertex_count, 1)))
+    classes = prepare_scene(trunk, Garment(far, alone, None), rig_options=RigOptions(proxies=2)).classes
+    top = far.points[:, 1] > 1.3 - ClassOptions().pinned_width
+    assert (classes[top] == PINNED).all() and (classes[~top] == LOOSE).all()
+    shared = SkinWeights("/Cape", np.arange(far.vertex_count)[:, None] % 2, np.ones((far.vertex_count, 1)))
+    with pytest.raises(SsilkError, match="rest nowhere on the body"):
+        prepare_scene(trunk, Garment(far, shared, None))
+
+
 def test_classes_follow_the_vertices_when_renumbered_or_turned_about_the_vertical(trunk):
     mesh = tube([0.16, 0.16, 0.5], [1.1, 0.95, 0.4])
     order = np.random.default_rng(2).permutation(mesh.vertex_count)
