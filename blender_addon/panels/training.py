@@ -23,9 +23,8 @@ PLOT_SCALE = 8.0  # in heights of a line of text
 _stamps: dict[Path, float] = {}
 
 
-def changed(garment: bpy.types.Object) -> bool:
-    """Return whether a garment's training has written something since this was asked last."""
-    folder = job_of(garment)
+def changed(folder: Path) -> bool:
+    """Return whether a training has written something since this was asked last."""
     before, now = _stamps.get(folder, 0.0), stamp(folder)
     _stamps[folder] = now
     return before != now

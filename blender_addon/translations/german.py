@@ -261,6 +261,9 @@ WORDS = {
     "End the training; its best model is kept, and it can go on from where it is": (
         "Das Training beenden; sein bestes Modell bleibt, und es kann von hier weitergehen"
     ),
+    "End a training whose garment is not in this file any more; its best model is kept": (
+        "Ein Training beenden, dessen Kleidungsstück nicht mehr in dieser Datei ist; sein bestes Modell bleibt"
+    ),
     "Resume Training": "Training fortsetzen",
     "Let the training go on from where it ended": "Das Training dort fortsetzen, wo es endete",
     # Baking and playback
