@@ -10,13 +10,6 @@ from ..errors import SetupError
 from .carrying import carrier_of, is_carried
 from .follower import leader_of
 
-# Modifiers that leave points where they are, and those that may come after the armature's.
-HARMLESS = {
-    "DATA_TRANSFER", "NORMAL_EDIT", "UV_PROJECT", "UV_WARP", "VERTEX_WEIGHT_EDIT", "VERTEX_WEIGHT_MIX",
-    "VERTEX_WEIGHT_PROXIMITY", "WEIGHTED_NORMAL",
-}  # fmt: skip
-AFTERWARDS = {"SUBSURF", "SOLIDIFY"}
-
 
 def unusable(thing: bpy.types.Object | None) -> str:
     """Return why an object cannot be a garment; empty if it can."""
@@ -97,27 +90,6 @@ def bodies_of(garment: bpy.types.Object, armature: bpy.types.Object) -> list[bpy
     if not bound:
         raise SetupError(f"No body is bound to '{armature.name}'; give the character's mesh an Armature modifier.")
     return bound
-
-
-def shaping_modifiers(thing: bpy.types.Object) -> list[bpy.types.Modifier]:
-    """Return the modifiers that shape a mesh before its armature deforms it."""
-    kinds = [modifier.type for modifier in thing.modifiers]
-    bound = "ARMATURE" in kinds
-    before = thing.modifiers[: kinds.index("ARMATURE")] if bound else thing.modifiers[:]
-    passed = HARMLESS if bound else HARMLESS | AFTERWARDS
-    return [modifier for modifier in before if modifier.show_viewport and modifier.type not in passed]
-
-
-def need_undeformed_shape(garment: bpy.types.Object) -> None:
-    """Check that a garment's own vertices are those that its armature moves.
-
-    Raises:
-        SetupError: a modifier shapes it first.
-    """
-    for modifier in shaping_modifiers(garment):
-        raise SetupError(
-            f"'{garment.name}' is shaped by its modifier '{modifier.name}' before bones move it; apply the modifier."
-        )
 
 
 def _modifier_armature(thing: bpy.types.Object) -> bpy.types.Object | None:

@@ -20,8 +20,9 @@ from .armature import read_joints
 from .attributes import current_classes
 from .carrying import carried_weights, is_carried, rest_world
 from .follower import leader_of
-from .garment import armature_of, bodies_of, need_undeformed_shape, shaping_modifiers
+from .garment import armature_of, bodies_of
 from .masks import unmasked
+from .modifiers import need_plain_modifiers, reshapes
 from .trained_weights import own_groups
 from .units import scene_units
 from .weights import PLAIN, read_groups, read_kept
@@ -59,7 +60,7 @@ def gather(garment: bpy.types.Object, *, classes: bool = True, proxies: bool = T
         SetupError: something is missing or cannot be used; the sentence names the object.
     """
     armature = armature_of(garment)
-    need_undeformed_shape(garment)
+    need_plain_modifiers(garment)
     joints = read_joints(armature, garment)
     things = [garment, *bodies_of(garment, armature)]
     paths = [f"{ROOT}/{name}" for name in identifiers((thing.name for thing in things), taken=(SKELETON,))]
@@ -118,7 +119,7 @@ def _proxy_rig(armature: bpy.types.Object, garment: bpy.types.Object, joints: Jo
 
 def _read_body(thing: bpy.types.Object, armature: bpy.types.Object, joints: Joints, path: str) -> Body:
     """Return a body at rest; evaluated where modifiers shape it before its armature does."""
-    if not shaping_modifiers(thing):
+    if not reshapes(thing):
         return _bound(thing, thing.data, armature, joints, path)
     with _at_rest(armature) as depsgraph:
         evaluated = thing.evaluated_get(depsgraph)

@@ -254,7 +254,7 @@ MALFORMED = {
     two_armatures: "'Skirt' could belong to 'Rig', 'Twin'; choose its armature",
     no_armature: "There is no armature for 'Skirt'",
     unequal_scale: "'Rig' is scaled unequally or mirrored; apply its scale",
-    mirror_modifier: "'Skirt' is shaped by its modifier 'Mirror'",
+    mirror_modifier: "The modifier 'Mirror' of 'Skirt' gives it parts that its mesh does not have; apply it",
     no_body: "No body is bound to 'Rig'",
     unbound_body: "'Skirt.001' is not bound to 'Rig'; bind it, or take it from 'Colliders'",
     bare_vertices: "1 of 288 vertices of 'Pillar' have no bone's weight",
