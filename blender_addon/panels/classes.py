@@ -39,7 +39,10 @@ class ClassesPanel(SidebarPanel, bpy.types.Panel):
             found = class_counts(context.object)
         except SetupError as error:
             draw_text(layout, str(error), icon="ERROR")
+        settings = context.object.ssilk
         layout.operator("ssilk.classify")
+        layout.prop(settings, "tightness", slider=True)
+        layout.prop_search(settings, "pins", context.object, "vertex_groups")
         layout.operator("ssilk.paint_classes", icon="BRUSH_DATA")
         editing = context.mode == "EDIT_MESH"
         row = layout.row(align=True)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import bpy
 import numpy as np
 
-from ssilk_core.assets import TIGHT
+from ssilk_core.assets import TIGHT, classes_at
 
 from .. import classes as palette
 from ..errors import SetupError
@@ -55,6 +55,25 @@ def write_classes(mesh: bpy.types.Mesh, values: np.ndarray) -> None:
     if palette.COLOR_ATTRIBUTE in mesh.attributes:
         show_classes(mesh)
     mesh.update()
+
+
+def write_levels(mesh: bpy.types.Mesh, levels: np.ndarray | None) -> None:
+    """Keep the least tightness at which each vertex is tight, shape (V,), or forget it. Not in edit mode."""
+    if palette.LEVELS in mesh.attributes:
+        mesh.attributes.remove(mesh.attributes[palette.LEVELS])
+    if levels is not None:
+        attribute = mesh.attributes.new(palette.LEVELS, "FLOAT", "POINT")
+        attribute.data.foreach_set("value", np.ascontiguousarray(levels, dtype=np.float32))
+
+
+def tighten(mesh: bpy.types.Mesh, tightness: float) -> None:
+    """Make classes again at another tightness, where they were found automatically. Not in edit mode."""
+    attribute = mesh.attributes.get(palette.LEVELS)
+    if attribute is None or (attribute.domain, attribute.data_type) != ("POINT", "FLOAT"):
+        return
+    levels = np.empty(len(mesh.vertices), dtype=np.float32)
+    attribute.data.foreach_get("value", levels)
+    write_classes(mesh, classes_at(levels, tightness))
 
 
 def show_classes(mesh: bpy.types.Mesh) -> None:

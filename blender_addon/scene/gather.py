@@ -27,6 +27,7 @@ from .trained_weights import own_groups
 from .units import scene_units
 from .weights import PLAIN, read_groups, read_kept
 
+HALF = 0.5  # weight from which on a vertex is in a group
 ROOT, SKELETON = "/Character", "Skeleton"  # prims of the stage that is handed over
 
 
@@ -76,6 +77,7 @@ def gather(garment: bpy.types.Object, *, classes: bool = True, proxies: bool = T
             mesh,
             None if lbs is None else SkinWeights.from_dense(paths[0], lbs),
             current_classes(garment.data) if classes else None,
+            None if classes else _pins(garment),
         ),
         rig=rig,
         meshes=dict(zip((thing.name for thing in things), (mesh, *(body.mesh for body in bodies)))),
@@ -103,6 +105,16 @@ def own_weights(armature: bpy.types.Object, garment: bpy.types.Object, joints: J
             "the vertex groups so that all weights are taken from the body."
         )
     return weights
+
+
+def _pins(garment: bpy.types.Object) -> np.ndarray | None:
+    """Return which vertices are in the group of pins, by half at least, shape (V,); None without such a group."""
+    name = garment.ssilk.pins
+    if not name:
+        return None
+    if name not in garment.vertex_groups:
+        raise SetupError(f"'{garment.name}' has no vertex group '{name}' for its pins; choose another, or none.")
+    return (read_groups(garment, garment.data, [name])[:, 0] >= HALF).astype(np.int8)
 
 
 def _proxy_rig(armature: bpy.types.Object, garment: bpy.types.Object, joints: Joints, path: str) -> ProxyRig:

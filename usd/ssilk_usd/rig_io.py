@@ -28,7 +28,7 @@ from .author import (
 )
 from .export import export, need_layer_suffix
 from .garment_api import apply_garment_api
-from .names import CLASS, LBS_SKIN, PROXIES, SKEL
+from .names import CLASS, LBS_SKIN, LEVEL, PIN, PROXIES, SKEL
 from .read_carried import carried_by
 from .read_garment import find_garment, fitted_skeleton, garment_to_core, lbs_skin
 from .read_mesh import is_garment
@@ -309,7 +309,7 @@ def _bind_garment(
     Its own joint order holds the names, so that its weights survive joints that are removed or reordered by hand.
     """
     prim, character_joints = mesh.GetPrim(), scene.character.skeleton.joint_names
-    for name in (CLASS, *SKEL, *LBS_SKIN):
+    for name in (CLASS, PIN, LEVEL, *SKEL, *LBS_SKIN):
         prim.RemoveProperty(name)
         prim.RemoveProperty(f"{name}:indices")  # of an indexed primvar
     apply_garment_api(prim)
@@ -317,5 +317,5 @@ def _bind_garment(
     binding = UsdSkel.BindingAPI(prim)
     binding.CreateGeomBindTransformAttr(Gf.Matrix4d(to_bind.T.tolist()))
     binding.CreateJointsAttr(Vt.TokenArray((*character_joints, *proxies)))
-    mark_garment(prim, scene.classes, proxies)
+    mark_garment(prim, scene.garment, proxies)
     keep_lbs_skin(prim, scene.lbs_skin, character_joints)
