@@ -20,6 +20,7 @@ from ssilk_core.quality import QUALITIES
 
 from ..errors import SetupError
 from ..joints import Joints, joint_order
+from ..outside.wording import recall, reworded
 from ..outside.work import Work
 from ..preferences import interpreter, preferences, unready
 from ..scene import playing
@@ -99,13 +100,20 @@ class BakeGarment(tasks.OutsideOperator, bpy.types.Operator):
         (self.take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
         self.scene = None if (self.model.parent / STAGE).exists() else gather(garment)
         self.pair = Pair.of(garment, armature)
+        self.words = {f"{INPUTS}/{MOTION}": "the timeline"}
         self.shot = usd_path(garment, self.filepath) if self.to_usd else None
         self.python = interpreter(preferences(context))
         self.character = joints.character
         closing = self.closing() if self.to_timeline else None
         return Work(
-            f"Baking '{garment.name}'", self.commands, parent=bpy.app.tempdir, steps=self.steps(), closing=closing
-        )
+            f"Baking '{garment.name}'", self.commands, parent=bpy.app.tempdir, steps=self.steps(), closing=closing,
+            rephrase=self.rephrase,
+        )  # fmt: skip
+
+    def rephrase(self, sentence: str) -> str:
+        """Return a sentence with names of objects in place of files that were made for the bake."""
+        sentence = reworded(sentence, self.work.folder, {SHOT: f"the bake of '{self.pair.name}'"})
+        return reworded(sentence, self.model.parent, {**recall(self.model.parent), **self.words})
 
     def steps(self) -> Iterator[float]:
         """Sample the timeline, then write it."""
@@ -124,7 +132,8 @@ class BakeGarment(tasks.OutsideOperator, bpy.types.Operator):
         shutil.copyfile(folder / MOTION, inputs / MOTION)
         stage = self.model.parent / STAGE
         if self.scene:
-            hand_over(self.scene, self.pair, inputs)
+            given = hand_over(self.scene, self.pair, inputs)
+            self.words |= {f"{INPUTS}/{made}": name for made, name in given.words.items()}
             stage = inputs / STAGE
         self.shot = self.shot or folder / SHOT
         level = [] if self.quality == WHOLE else ["--quality", self.quality]

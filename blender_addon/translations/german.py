@@ -249,6 +249,14 @@ WORDS = {
     "Wall time to fill with as many steps as fit, in place of the preset's; zero for these": (
         "Zeit, die mit so vielen Schritten gefüllt wird, wie hineinpassen, statt denen der Vorgabe; null: diese"
     ),
+    "Tightness": "Enge",
+    "How much of the garment is tight: nothing but what is pinned, or all; replaces what is painted": (
+        "Wie viel des Kleidungsstücks anliegt: nichts, was nicht fest ist, oder alles; ersetzt, was gemalt ist"
+    ),
+    "Pins": "Festes",
+    "Vertex group of what is pinned when classes are found; the band it hangs from when empty": (
+        "Vertexgruppe dessen, was fest ist, wenn Klassen gesucht werden; wenn leer, der Rand, an dem es hängt"
+    ),
     "Folder": "Ordner",
     "Folder of the garment's training, relative to the blend file": (
         "Ordner des Trainings dieses Kleidungsstücks, relativ zur Blend-Datei"
@@ -260,6 +268,9 @@ WORDS = {
     "Cancel Training": "Training beenden",
     "End the training; its best model is kept, and it can go on from where it is": (
         "Das Training beenden; sein bestes Modell bleibt, und es kann von hier weitergehen"
+    ),
+    "End a training whose garment is not in this file any more; its best model is kept": (
+        "Ein Training beenden, dessen Kleidungsstück nicht mehr in dieser Datei ist; sein bestes Modell bleibt"
     ),
     "Resume Training": "Training fortsetzen",
     "Let the training go on from where it ended": "Das Training dort fortsetzen, wo es endete",

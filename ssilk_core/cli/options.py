@@ -22,7 +22,6 @@ from ..targets import TARGETS
 
 if TYPE_CHECKING:
     from ..assets import Character, Garment, ProxyRig, Scene
-    from ..setup.classes import ClassOptions
     from ..setup.rig import RigOptions
 
 
@@ -265,11 +264,10 @@ def load_scene(
     options: argparse.Namespace,
     report: Reporter,
     *,
-    classes: ClassOptions | None = None,
     rigging: RigOptions | None = None,
 ) -> Scene:
-    """Read a scene and make the weights, classes and rig that it lacks, as `classes` and `rigging` say."""
+    """Read a scene and make the weights, classes and rig that it lacks, as `rigging` says."""
     from ..setup.prepare import prepare_scene
 
     character, garment, rig = read(options, report)
-    return prepare_scene(character, garment, rig, class_options=classes, rig_options=rigging, report=report)
+    return prepare_scene(character, garment, rig, rig_options=rigging, report=report)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import subprocess
 
 import numpy as np
@@ -284,6 +285,16 @@ def test_what_does_not_fit_any_more_is_said(ready, trained):
     armature = ready.data.objects["Rig"]
     edit_bone(ready, armature, "Skirt_proxy_03", lambda bones, bone: bone.translate(armature.location + bone.vector))
     assert "was moved since the garment was trained" in refused(ready, trained)
+
+
+def test_a_character_that_a_chosen_model_does_not_know_is_called_by_its_name(ready, trained, tmp_path):
+    from blender_addon.scene.models import model_of
+
+    trained.ssilk.model = str(shutil.copy(model_of(trained), tmp_path / "chosen.safetensors"))
+    edit_bone(ready, ready.data.objects["Rig"], "Head", lambda bones, bone: bone.translate(bone.vector))
+    told = refused(ready, trained)
+    assert "'Rig': joint 'Hips/Spine/Head' is bound 0.2 m from where the model has it" in told
+    assert ".usdc" not in told
 
 
 @pytest.mark.parametrize(

@@ -48,7 +48,7 @@ def write_scene(
         if skin is not None:
             bind_skin(mesh, skin, joints)
         mesh.GetPrim().CreateAttribute(GARMENT, Sdf.ValueTypeNames.Bool).Set(True)
-        mark_garment(mesh.GetPrim(), garment.classes, None if rig is None else rig.joint_names)
+        mark_garment(mesh.GetPrim(), garment, None if rig is None else rig.joint_names)
         if rig is not None and garment.skin is not None:
             keep_lbs_skin(mesh.GetPrim(), garment.skin, skeleton.joint_names)
         for place, body in zip(paths[2:], bodies):
