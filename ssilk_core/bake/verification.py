@@ -4,16 +4,25 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from dataclasses import replace
+from itertools import zip_longest
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+import numpy as np
+
+from ..assets import Floats
 from ..errors import VerificationError
 from ..events import Message, Reporter, Result, Started, silent
 from .load import load_rollout
 from .origin import read_origin
-from .refinement import refined, verify_energies
+from .refinement import refined_points, verify_energies
 from .result import Verification
 from .rollout import BakeRollout
+
+if TYPE_CHECKING:
+    from ssilk_usd.play import Shot
 
 
 def verify(
@@ -53,7 +62,8 @@ def verify(
 def verify_file(rollout: BakeRollout, path: Path, report: Reporter) -> Verification:
     """Check a file and compare it, re-skinned by UsdSkel alone, with the rollout that it should hold.
 
-    Points of an earlier refinement are compared by energy (`verify_energies`), unless the rollout has its own.
+    Points of an earlier refinement are compared by energy (`verify_energies`), unless the rollout has its own. Joints
+    of one are compared with the refined points, with the tolerance that they were fitted with.
 
     Raises:
         VerificationError: a check fails, or a vertex is further off than allowed.
@@ -66,8 +76,13 @@ def verify_file(rollout: BakeRollout, path: Path, report: Reporter) -> Verificat
     times = frame_times(shot.stage, samples)
     if not shot.is_skinned and rollout.request.refine and rollout.refinement is None:
         return verify_energies(rollout, map(shot.garment_points, times), report)
-    if not rollout.request.writes_points:
-        rollout = refined(rollout)
+    if (
+        shot.is_skinned
+        and rollout.request.refine
+        and rollout.refinement is None
+        and not rollout.request.writes_points
+    ):
+        return compare_trajectories(shot, refined_points(rollout, report), samples_per_frame=samples)
     expected = rollout.vertices(report) if shot.is_skinned else rollout.points(report)
     found = compare_points(shot, expected, samples_per_frame=samples)
     if not found.passed:
@@ -77,6 +92,46 @@ def verify_file(rollout: BakeRollout, path: Path, report: Reporter) -> Verificat
             "origin if it is many kilometres away."
         )
     return Verification(frames=len(times), largest_error_m=found.worst, allowed_error_m=found.bound)
+
+
+def compare_trajectories(shot: Shot, points: Iterable[Floats], *, samples_per_frame: int = 1) -> Verification:
+    """Compare the garment of a shot, re-skinned by UsdSkel alone, with the points that it stands for.
+
+    Args:
+        points: of each of its samples in the world [m], shape (V, 3).
+
+    Raises:
+        VerificationError: other frames or vertices, or they are further off than a `FitTolerance` allows.
+    """
+    from ssilk_usd.check import allowed_error
+    from ssilk_usd.play import frame_times
+
+    from ..decomposition import FitTolerance
+
+    tolerance, squares, worst = FitTolerance(), 0.0, (0.0, FitTolerance().largest, 0.0, 0)
+    times = frame_times(shot.stage, samples_per_frame)
+    slack, count = 0.0, 0
+    for time, wanted in zip_longest(times, points):
+        if time is None or wanted is None:
+            raise VerificationError(f"{shot.name}: the shot has another number of frames than what it stands for.")
+        found = shot.garment_points(time)
+        if found.shape != wanted.shape:
+            raise VerificationError(
+                f"{shot.name}: the garment has {len(found)} vertices, but what it stands for has {len(wanted)}."
+            )
+        away = np.nan_to_num(np.linalg.norm(found - wanted, axis=-1), nan=np.inf)
+        slack = max(slack, allowed_error(wanted))
+        squares, count, vertex = squares + float((away**2).sum()), count + len(away), int(away.argmax())
+        bound = tolerance.largest + allowed_error(wanted)
+        worst = max(worst, (float(away[vertex]), bound, time, vertex), key=lambda each: each[0] / each[1])
+    rms = float(np.sqrt(squares / max(count, 1)))
+    if not (rms <= tolerance.rms + slack and worst[0] <= worst[1]):
+        raise VerificationError(
+            f"{shot.name}: joints and blendshapes are {rms:.3g} m RMS from the points that they stand for, and "
+            f"vertex {worst[3]} at time code {worst[2]:g} is {worst[0]:.3g} m off; {tolerance.rms:g} m and "
+            f"{tolerance.largest:g} m are allowed."
+        )
+    return Verification(frames=len(times), largest_error_m=worst[0], allowed_error_m=worst[1], rms_error_m=rms)
 
 
 def _check(path: Path, report: Reporter) -> None:
