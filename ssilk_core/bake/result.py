@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from ..decomposition import Decomposition
 
 SHOT_SHAPES = "shapes of the shot"
+SKINNED = "skinned"  # what a shot says of the points of another simulator that it stands for
 
 
 @dataclass(frozen=True)
@@ -150,6 +151,7 @@ class BakeResult:
         verification: None where none was asked for.
         reduction: what was kept of the model, where less than all.
         refinement: what the solver changed, where it was asked to.
+        shapes: how the vertices of another simulator became joints and blendshapes; None where nothing was fitted.
         hidden_faces: faces of the bodies that are hidden; None where that was not asked for.
         recovered: frames at which the rollout was lost and the garment was put to rest.
         shown_skin: the share of the covered skin that shows; None where the garment covers nothing.
@@ -166,6 +168,7 @@ class BakeResult:
     verification: Verification | None = None
     reduction: SizeReduction | None = None
     refinement: RefinementSummary | None = None
+    shapes: ShotShapes | None = None
     hidden_faces: int | None = None
     recovered: tuple[FrameSpan, ...] = ()
     shown_skin: ShownSkin | None = None
@@ -186,6 +189,7 @@ class BakeResult:
             "bytes": self.size_bytes,
             **(self.reduction.to_metadata() if self.reduction else {}),
             **{f"refined: {name}": value for name, value in refined.items()},
+            **(self.shapes.to_metadata() if self.shapes else {}),
             **(self.shown_skin.summary() if self.shown_skin else {}),
             **(self.verification.figures() if self.verification else {}),
             **({} if self.hidden_faces is None else {"hidden faces of the body": self.hidden_faces}),

@@ -26,9 +26,17 @@ if TYPE_CHECKING:
     from ..setup.rig import RigOptions
 
 
+STAGE = "USD file with the character (SkelRoot, Skeleton, body meshes)"
+
+
 def add_scene(verb: argparse.ArgumentParser) -> None:
     """Add the options that name the character and the garment."""
-    verb.add_argument("stage", type=Path, help="USD file with the character (SkelRoot, Skeleton, body meshes)")
+    verb.add_argument("stage", type=Path, help=STAGE)
+    add_garment(verb)
+
+
+def add_garment(verb: argparse.ArgumentParser) -> None:
+    """Add the options that name what is taken of a stage."""
     verb.add_argument(
         "--garment", metavar="FILE[:/PRIM]|PRIM", help="garment: a file of its own, or a mesh of the stage"
     )

@@ -27,7 +27,8 @@ SIMULATE = ["simulate", "rigged.usda", "--no-body", "--tolerance", "50", "--moti
 
 
 def test_a_cache_holds_the_garment_beside_its_body(stage):
-    assert main(["simulate", "rigged.usda", "--tolerance", "50", "--motion", "brief.usda", "-o", "cache.usda"]) == 0
+    words = "simulate rigged.usda --points --tolerance 50 --motion brief.usda -o cache.usda"
+    assert main(words.split()) == 0
     baked, cache = Shot(stage / "shot.usda"), Shot(stage / "cache.usda")
     assert cache.fps == 30 and len(cache.frame_times) == 5
     assert [mesh.is_garment for mesh in cache.meshes] == [mesh.is_garment for mesh in baked.meshes]
@@ -46,6 +47,21 @@ def test_a_cache_holds_the_garment_beside_its_body(stage):
     low, high = np.array(root.GetExtentAttr().Get(Usd.TimeCode(cache.frame_times[-1])))
     drawn = np.concatenate(cache.points(cache.frame_times[-1]))
     assert (drawn >= low - 1e-5).all() and (drawn <= high + 1e-5).all()
+
+
+def test_joints_and_shapes_stand_for_the_points(stage, capsys):
+    for form, out in (["--points"], "points.usda"), ([], "joints.usda"):
+        assert main([*SIMULATE, "brief.usda", "-o", out, *form]) == 0
+    assert "bytes of the points alone: 18720" in capsys.readouterr().err
+    points, joints = Shot(stage / "points.usda"), Shot(stage / "joints.usda")
+    assert joints.is_skinned and not points.is_skinned
+    away = [
+        np.linalg.norm(joints.garment_points(time) - points.garment_points(time), axis=-1)
+        for time in points.frame_times
+    ]
+    assert np.max(away) <= 5e-3 and np.sqrt(np.square(away).mean()) <= 1e-3
+    assert main(["verify", "joints.usda"]) == 2
+    assert "its points were simulated and not kept" in capsys.readouterr().err
 
 
 def test_several_motions_become_files_of_their_own(stage):
