@@ -17,6 +17,7 @@ import numpy as np
 from ..assets import Floats, Ints
 
 BASIS_FRAMES = 512  # that components are found from, at most; their Gram matrix takes 2 MB
+FIRST_SHARE = 1.25  # of the tolerance that is left to local shapes, which lower the RMS too
 SHARE = 0.97  # of the tolerance that components use; the rest is for what is left out of shapes as too small
 # Of the RMS tolerance: the most by which R shapes may move a vertex and leave it out, times the square root of R.
 NEGLIGIBLE = 0.3
@@ -64,6 +65,9 @@ class OffsetShapes:
 
     def find(self) -> None:
         """Add shapes until what is left is within the tolerance."""
+        if self._rms() > self.tolerance.rms:
+            self._add_components(FIRST_SHARE * self.tolerance.rms)
+            self._add_local()  # which may bring the RMS down as well
         while not self._is_done():
             rms = self._rms()
             if rms > self.tolerance.rms:
