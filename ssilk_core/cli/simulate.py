@@ -12,6 +12,7 @@ what is missing; delete a file to simulate it again.
 from __future__ import annotations
 
 import argparse
+import shutil
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -22,9 +23,10 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from ..bake import naming
-from ..errors import EXIT_OK, fail
-from ..events import Progress, Reporter, Result, Started
+from ..errors import EXIT_OK, SsilkError, fail
+from ..events import Message, Progress, Reporter, Result, Started
 from ..fabrics import Fabric
+from ..files import replacing
 from . import options as shared
 
 if TYPE_CHECKING:
@@ -224,7 +226,7 @@ class _Caches:
     def _path(self, shot: int) -> Path:
         """Return where the points of a shot are written."""
         output = self.shots[shot].output
-        return output if self.options.points else self.folder / f"{shot}.usdc"
+        return output if self.options.points else self.folder / f"{shot}{output.suffix}"
 
     def _skin(self, shot: int) -> None:
         """Turn the points of a shot into joints and blendshapes."""
@@ -234,20 +236,26 @@ class _Caches:
 
         asked, path = self.shots[shot], self._path(shot)
         points = MeshTrajectories(str(path), self.scene.garment.mesh.vertex_count)
-        result = skin_trajectories(
-            rig_deformer(self.scene),
-            self.played[shot],
-            points,
-            asked.output,
-            units=self.units,
-            origin={},
-            about={"simulated": asked.provenance},
-            include_body=not self.options.no_body,
-            device=self.options.device,
-            report=self.report,
-        )
-        assert result.shapes is not None
-        self.fits.append(result.shapes)
+        try:
+            result = skin_trajectories(
+                rig_deformer(self.scene),
+                self.played[shot],
+                points,
+                asked.output,
+                units=self.units,
+                origin={},
+                about={"simulated": asked.provenance},
+                include_body=not self.options.no_body,
+                device=self.options.device,
+                report=self.report,
+            )
+        except SsilkError as error:  # what took hours is kept
+            self.report(Message(f"{error} They are written as points.", "warning"))
+            with replacing(asked.output) as temporary:
+                shutil.copyfile(path, temporary)
+        else:
+            assert result.shapes is not None
+            self.fits.append(result.shapes)
         path.unlink()
 
     def _opened(self, shot: int) -> tuple[ExitStack, PointCache]:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -107,6 +108,27 @@ def test_offsets_in_the_rest_pose_give_the_vertices_back(played):
         shaped = replace(deformer, shapes=np.concatenate([deformer.shapes, offsets[frame][None]]))
         one = GarmentPose(frame, pose.rotations[frame : frame + 1], weights[frame : frame + 1])
         np.testing.assert_allclose(deform(shaped, motion, one)[0], points[frame], atol=2e-6)
+
+
+def test_offsets_that_lie_in_a_file_become_the_same_shapes(played, monkeypatch):
+    deformer, motion, pose = played
+    points = deform(deformer, motion, pose) + 0.004 * np.random.default_rng(0).standard_normal((FRAMES, 60, 3))
+    inside = decompose(deformer, motion, points, [pose])
+    monkeypatch.setattr(sys.modules[decompose.__module__], "IN_MEMORY", 0)
+    found = decompose(deformer, motion, points, [pose])
+    np.testing.assert_array_equal(found.deformer.shapes, inside.deformer.shapes)
+
+
+def test_many_frames_are_fitted_from_some_of_them(monkeypatch):
+    rng = np.random.default_rng(0)
+    offsets = (np.sin(np.outer(np.arange(96), [0.1, 0.3, 0.7])) @ rng.standard_normal((3, 180))).reshape(96, 60, 3)
+    offsets[40:44] += rng.standard_normal((60, 3))  # which frames that are evenly spread do not tell of
+    monkeypatch.setattr("ssilk_core.decomposition.shapes.BASIS_FRAMES", 6)
+    own = OffsetShapes((0.01 * offsets).astype(np.float32), FitTolerance())
+    own.find()
+    shapes, weights = own.all_shapes()
+    away = np.linalg.norm(np.einsum("fk,kvc->fvc", weights, shapes) - 0.01 * offsets, axis=-1)
+    assert np.sqrt((away**2).mean()) <= 1.001e-3 and away.max() <= 5.001e-3 and len(shapes) < 20
 
 
 def test_points_of_another_garment_and_broken_ones_are_refused(played):

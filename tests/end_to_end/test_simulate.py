@@ -10,6 +10,7 @@ from ssilk_usd.play import Shot
 
 from ssilk_core.bake import BakeRequest, plan_layers
 from ssilk_core.cli import main, simulate
+from ssilk_core.errors import fail
 from ssilk_core.simulate import Simulator
 
 
@@ -62,6 +63,15 @@ def test_joints_and_shapes_stand_for_the_points(stage, capsys):
     assert np.max(away) <= 5e-3 and np.sqrt(np.square(away).mean()) <= 1e-3
     assert main(["verify", "joints.usda"]) == 2
     assert "its points were simulated and not kept" in capsys.readouterr().err
+
+
+def test_points_that_no_skinning_reaches_are_kept_as_points(stage, monkeypatch, capsys):
+    def folded(*_, **__):
+        fail("clip", "its skinning folds", "joints cannot reach it")
+
+    monkeypatch.setattr("ssilk_core.decomposition.decompose", folded)
+    assert main([*SIMULATE, "short.usda", "-o", "kept.usdc"]) == 0
+    assert "its skinning folds" in capsys.readouterr().err and not Shot(stage / "kept.usdc").is_skinned
 
 
 def test_several_motions_become_files_of_their_own(stage):
