@@ -182,6 +182,8 @@ class _PoseSearch:
         mean = left.mean(axis=0, dtype=np.float64)
         chosen = evenly(frames, BASIS_FRAMES)
         basis = components((left[chosen] - mean).reshape(len(chosen), -1), 0.0, len(self.sample))[:count]
+        if not basis:  # what is left stays the same
+            return pose
         scale = SPREAD * np.sqrt(len(self.sample))
         flat = np.stack(basis)
         weights = (left - mean.astype(np.float32)).reshape(frames, -1) @ (flat.T / scale).astype(np.float32)

@@ -98,6 +98,15 @@ def test_what_moves_few_vertices_becomes_a_local_shape():
     assert shapes.any(axis=-1).sum() <= 8 and not shapes[:, 20:].any()
 
 
+def test_another_shape_that_stays_is_one_blendshape(played):
+    deformer, motion, pose = played
+    bones = replace(deformer, shapes=deformer.shapes[:0])
+    held = replace(deformer, shapes=np.random.default_rng(0).uniform(0.01, 0.02, (1, 60, 3)))
+    points = deform(held, motion, GarmentPose(0, pose.rotations, np.ones((FRAMES, 1))))
+    found = decompose(bones, motion, points, [GarmentPose(0, pose.rotations, np.zeros((FRAMES, 0)))])
+    assert found.own_shapes == 1 and found.largest < 1e-6
+
+
 def test_offsets_in_the_rest_pose_give_the_vertices_back(played):
     deformer, motion, pose = played
     rng = np.random.default_rng(2)
