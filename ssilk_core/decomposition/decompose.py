@@ -22,7 +22,7 @@ from ..errors import fail
 from ..kinematics import deform, local_transforms, quaternion_from_matrix
 from .poses import MAX_STEPS, PoseFitter, model_bounds
 from .rest import FRAMES_PER_BLOCK, rest_residuals
-from .shapes import BASIS_FRAMES, FitTolerance, OffsetShapes, components, evenly
+from .shapes import BASIS_FRAMES, FitTolerance, OffsetShapes, components, evenly, regions_of
 
 if TYPE_CHECKING:
     import torch
@@ -33,6 +33,7 @@ ROUNDS, STEPS = 3, 1  # of fitting poses with components, and iterations in each
 SPREAD = 0.1  # [m] RMS of these components, which makes them as stiff as rotations
 IN_MEMORY = 256 * 2**20  # bytes of offsets; more of them lie in a temporary file
 LOCAL = 0.3  # of the vertices: a shape that moves fewer is local
+REGIONS = 4  # of the garment, for shapes of parts of it
 ROUNDED = 1e-5  # [m] by which float32 may exceed the tolerance
 
 
@@ -83,7 +84,7 @@ def decompose(
     _need_points(deformer, motion, points)
     pose = _PoseSearch(deformer, motion, points, tolerance, device).found(_whole(deformer, motion, poses))
     left = _offsets(deformer, motion, pose, points)
-    own = OffsetShapes(left, tolerance)
+    own = OffsetShapes(left, tolerance, regions_of(deformer.scene.garment.mesh.points, REGIONS))
     own.find()
     del left
     shapes, weights = own.all_shapes()

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """As many blendshapes as a tolerance needs for offsets that change over the frames of a shot.
 
-Principal components of all offsets [Eckart, Young 1936] bring the RMS within its bound. What then leaves the bound of
+Principal components [Eckart, Young 1936] bring the RMS within its bound: of all vertices together, or where a long
+shot makes that pay, of a few regions, each as often as it moves. What then leaves the bound of
 single vertices lies in few places, so shapes of these places alone bring it back at little cost. Weights lie in
 [0, 1], because importers clamp them: each weight runs over the range of its component, and one shape of constant
 weight holds where the ranges begin.
@@ -23,6 +24,8 @@ SHARE = 0.97  # of the tolerance that components use; the rest is for what is le
 NEGLIGIBLE = 0.3
 TIGHTER = 0.7  # of the RMS at hand: the next bound where local shapes are too many
 NEAR = 0.8  # of the largest distance: vertices that come so near to it are in a local shape
+PAYS = 0.8  # of the bytes of shapes of all vertices: shapes of regions have to take less, because they have borders
+OVERHEAD = 300  # bytes of a blendshape's prim
 MAX_LOCAL = 64  # local shapes after which components are cheaper
 MAX_LOCAL_OFFSETS = 2_000_000  # vertices times frames that a local search holds, 24 MB
 POWER_STEPS = 30
@@ -49,6 +52,7 @@ class OffsetShapes:
     Attributes:
         left: offsets that no shape reproduces yet [m], shape (F, V, 3), float32; reduced in place.
         tolerance: to be met in the rest pose.
+        regions: parts of the vertices, which get shapes of their own where these take far fewer bytes.
         shapes: offsets [m], shape (V, 3) each, float32.
         weights: in [0, 1], shape (F,) each, float32.
         constant: where the ranges of the weights begin [m], shape (V, 3).
@@ -56,6 +60,7 @@ class OffsetShapes:
 
     left: Floats
     tolerance: FitTolerance
+    regions: Sequence[Ints]
     shapes: list[Floats] = field(default_factory=list)
     weights: list[Floats] = field(default_factory=list)
     constant: Floats = field(init=False)
@@ -101,14 +106,18 @@ class OffsetShapes:
         """Add principal components until the RMS of the frames that they are found from is at most `rms` [m]."""
         negligible = 0.0 if self.shapes else NEGLIGIBLE * self.tolerance.rms
         chosen = self._basis_frames()
-        sample = self.left[chosen].reshape(len(chosen), -1).astype(np.float64)
+        sample = self.left[chosen].astype(np.float64)
         mean = sample.mean(axis=0)
         sample -= mean
-        self.constant += mean.reshape(self.constant.shape)
-        self.left -= mean.reshape(self.constant.shape).astype(np.float32)
-        found = components(sample, rms, len(self.constant))
-        for component in found:
-            self._add(component.reshape(self.constant.shape), None, negligible / len(found) ** 0.5)
+        self.constant += mean
+        self.left -= mean.astype(np.float32)
+        whole = regional_components(sample, [np.arange(len(self.constant))], rms)
+        parts = regional_components(sample, self.regions, rms)
+        pays = _bytes(parts, len(self.left)) < PAYS * _bytes(whole, len(self.left))
+        found = parts if pays else whole
+        each = (len(self.regions) / len(found)) ** 0.5 if pays else len(found) ** -0.5
+        for rows, component in found:
+            self._add(component, rows, negligible * min(each, 1.0))
 
     def _basis_frames(self) -> Ints:
         """Return all frames; of many, as many evenly spread ones, and later those that are furthest off."""
@@ -168,6 +177,53 @@ def components(sample: Floats, tolerance: float, vertices: int) -> Sequence[Floa
     left = np.sqrt((values.sum() - np.cumsum(values)).clip(min=0) / (len(sample) * vertices))
     count = min(int(np.count_nonzero(left > tolerance)) + 1, int(np.count_nonzero(values > ROUNDING**2)))
     return [turn[:, index] @ sample / np.sqrt(values[index]) for index in range(count)]
+
+
+def _bytes(found: Sequence[tuple[Ints, Floats]], frames: int) -> int:
+    """Return what shapes of these components take."""
+    return sum(_bytes_of(len(rows), frames) for rows, _ in found)
+
+
+def _bytes_of(vertices: int, frames: int) -> int:
+    return 12 * vertices + 4 * frames + OVERHEAD
+
+
+def regional_components(sample: Floats, regions: Sequence[Ints], tolerance: float) -> list[tuple[Ints, Floats]]:
+    """Return the principal components of regions that reduce the error of centred offsets (N, V, 3) most per byte.
+
+    As many as leave an RMS within the tolerance [m], at least one unless there is nothing; the vertices of each, and
+    its offsets of unit length, shape (R, 3).
+    """
+    squares = float((sample**2).sum())
+    bound, offered = tolerance**2 * sample.shape[0] * sample.shape[1], []
+    for number, rows in enumerate(regions):
+        flat = sample[:, rows].reshape(len(sample), -1)
+        values, turn = np.linalg.eigh(flat @ flat.T)
+        cost = _bytes_of(len(rows), len(sample))
+        for rank in range(1, 1 + int(np.count_nonzero(values > ROUNDING**2))):
+            offered.append((values[-rank] / cost, number, float(values[-rank]), turn[:, -rank]))
+    found: list[tuple[Ints, Floats]] = []
+    for _, number, value, direction in sorted(offered, key=lambda each: -each[0]):
+        if found and squares <= bound:
+            break
+        rows = regions[number]
+        flat = sample[:, rows].reshape(len(sample), -1)
+        found.append((rows, (direction @ flat / np.sqrt(value)).reshape(-1, 3)))
+        squares -= value
+    return found
+
+
+def regions_of(points: Floats, count: int) -> list[Ints]:
+    """Divide points (V, 3) among as many that are far apart, each to the nearest."""
+    seeds = [int(np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
+    nearest = np.linalg.norm(points - points[seeds[0]], axis=1)
+    label = np.zeros(len(points), dtype=int)
+    while len(seeds) < count and nearest.max() > 0:
+        seeds.append(int(nearest.argmax()))
+        away = np.linalg.norm(points - points[seeds[-1]], axis=1)
+        label[away < nearest] = len(seeds) - 1
+        nearest = np.minimum(nearest, away)
+    return [np.flatnonzero(label == number) for number in range(len(seeds))]
 
 
 def local_component(left: Floats, largest: float) -> Floats:

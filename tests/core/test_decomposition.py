@@ -12,7 +12,7 @@ import pytest
 from ssilk_core.assets import GarmentPose
 from ssilk_core.decomposition import FitTolerance, decompose
 from ssilk_core.decomposition.rest import rest_residuals
-from ssilk_core.decomposition.shapes import OffsetShapes
+from ssilk_core.decomposition.shapes import OffsetShapes, regions_of
 from ssilk_core.errors import SsilkError
 from ssilk_core.kinematics import deform, lbs_deformer
 from ssilk_core.rollout import garment_poses
@@ -91,7 +91,7 @@ def test_a_tighter_tolerance_needs_more_shapes(played):
 def test_what_moves_few_vertices_becomes_a_local_shape():
     offsets = np.zeros((30, 400, 3), np.float32)
     offsets[10:14, 5:9, 1] = 0.02
-    own = OffsetShapes(offsets, FitTolerance())
+    own = OffsetShapes(offsets, FitTolerance(), [np.arange(400)])
     own.find()
     shapes, weights = own.all_shapes()
     assert np.abs(np.einsum("fk,kvc->fvc", weights, shapes)[12, 6] - [0, 0.02, 0]).max() < 5e-3
@@ -105,6 +105,30 @@ def test_another_shape_that_stays_is_one_blendshape(played):
     points = deform(held, motion, GarmentPose(0, pose.rotations, np.ones((FRAMES, 1))))
     found = decompose(bones, motion, points, [GarmentPose(0, pose.rotations, np.zeros((FRAMES, 0)))])
     assert found.own_shapes == 1 and found.largest < 1e-6
+
+
+@pytest.mark.parametrize("apart", [False, True])
+def test_regions_get_shapes_of_their_own_where_that_pays(apart):
+    """Two halves that wave each in its own way take half of the bytes; where they wave together they take more."""
+    rng, halves = np.random.default_rng(0), [np.arange(200), np.arange(200, 400)]
+    ways = [rng.standard_normal((80, 4)) for _ in halves]
+    fields = [rng.standard_normal((4, 600)) for _ in halves]
+    waves = [way @ field for way, field in zip(ways if apart else ways[:1] * 2, fields)]
+    own = OffsetShapes(
+        (0.01 * np.concatenate(waves, axis=1)).reshape(80, 400, 3).astype(np.float32), FitTolerance(), halves
+    )
+    own.find()
+    moved = [shape.any(axis=1) for shape in own.shapes]
+    assert len(own.shapes) == (8 if apart else 4)
+    assert all((each[:200].any() != each[200:].any()) == apart for each in moved)
+
+
+def test_regions_cover_all_points_once():
+    points = np.random.default_rng(0).standard_normal((300, 3))
+    regions = regions_of(points, 4)
+    assert sorted(np.concatenate(regions).tolist()) == list(range(300)) and len(regions) == 4
+    assert min(map(len, regions)) > 20
+    assert [len(each) for each in regions_of(np.zeros((5, 3)), 4)] == [5]
 
 
 def test_offsets_in_the_rest_pose_give_the_vertices_back(played):
@@ -133,7 +157,7 @@ def test_many_frames_are_fitted_from_some_of_them(monkeypatch):
     offsets = (np.sin(np.outer(np.arange(96), [0.1, 0.3, 0.7])) @ rng.standard_normal((3, 180))).reshape(96, 60, 3)
     offsets[40:44] += rng.standard_normal((60, 3))  # which frames that are evenly spread do not tell of
     monkeypatch.setattr("ssilk_core.decomposition.shapes.BASIS_FRAMES", 6)
-    own = OffsetShapes((0.01 * offsets).astype(np.float32), FitTolerance())
+    own = OffsetShapes((0.01 * offsets).astype(np.float32), FitTolerance(), [np.arange(30), np.arange(30, 60)])
     own.find()
     shapes, weights = own.all_shapes()
     away = np.linalg.norm(np.einsum("fk,kvc->fvc", weights, shapes) - 0.01 * offsets, axis=-1)
