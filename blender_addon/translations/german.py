@@ -301,8 +301,8 @@ WORDS = {
         "Für viele Figuren in der Ferne: wenige Formen und Stellvertreter, vier Einflüsse"
     ),
     "Hero": "Hauptfigur",
-    "Refined by a solver: points to USD alone; on the timeline bones and shape keys nearest to them": (
-        "Von einem Löser verfeinert: nur nach USD Punkte; auf der Zeitleiste nächste Knochen und Formschlüssel"
+    "Refined by a solver, on bones and shape keys of this shot's own; takes long": (
+        "Von einem Löser verfeinert, auf Knochen und eigenen Formschlüsseln dieses Shots; dauert lange"
     ),
     "To USD": "Nach USD",
     "Write a UsdSkel shot, with the body": "Einen UsdSkel-Shot schreiben, mit dem Körper",
@@ -313,6 +313,11 @@ WORDS = {
     "Pre-Roll": "Vorlauf",
     "How long the garment settles in the first pose before the first frame": (
         "Wie lange das Kleidungsstück sich in der ersten Pose setzt, vor dem ersten Bild"
+    ),
+    "To Bones": "In Knochen",
+    "Turn the garment's baked Cloth modifier into keys of its proxies and shape keys, and switch it off": (
+        "Den gebackenen Stoff-Modifikator des Kleidungsstücks in Schlüsselbilder seiner Stellvertreter und "
+        "Formschlüssel umwandeln und abschalten"
     ),
     "Remove Bake": "Gebackenes entfernen",
     "Remove the keys and shape keys that were baked or played live, and give the garment its own weights back": (

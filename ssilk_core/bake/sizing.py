@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ..assets import GarmentPose
 from ..checkpoint import ModelFile, load_model
-from ..cost import POINT_BYTES, ShotBytes
+from ..cost import ShotBytes
 from ..errors import fail
 from ..events import Reporter
 from ..quality import quality_named, size_at, spend
@@ -73,12 +73,12 @@ def _at_quality(request: BakeRequest, quality: str | None, budget: str | None) -
         )
     if quality:
         request = replace(request, refine=request.refine or quality_named(quality).refine)
-    if budget and request.writes_points:
+    if budget and request.refine:
         fail(
             "--budget",
-            "a budget for points",
-            "every vertex is stored at every frame, whatever is kept of the model",
-            "use --refined-output joints, or leave the budget out",
+            "a budget for refined frames",
+            "they are stored as points, or as blendshapes of the shot's own, whatever is kept of the model",
+            "leave one of them out",
         )
     return request
 
@@ -89,8 +89,7 @@ def shot_bytes(rollout: BakeRollout, suffix: str, *, include_body: bool) -> Shot
     few = max(many // 4, 1)
     first, second = (_excerpt_bytes(rollout, count, suffix, include_body) for count in (few, many))
     frame = (second - first) / max(many - few, 1)
-    points = POINT_BYTES * rollout.deformer.scene.garment.mesh.vertex_count if rollout.request.writes_points else 0
-    return ShotBytes(second - frame * many, frame + points)
+    return ShotBytes(second - frame * many, frame)
 
 
 def _excerpt_bytes(rollout: BakeRollout, frames: int, suffix: str, include_body: bool) -> int:

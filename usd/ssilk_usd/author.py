@@ -76,7 +76,7 @@ def define_asset(
     mark_garment(garment.GetPrim(), scene.garment, scene.rig.joint_names or None)
     apply_garment_api(garment.GetPrim(), record)
     bind_skin(garment, deformer.skin, skeleton)
-    _define_blendshapes(garment, shape_names, deformer.shapes[shapes], units)
+    define_blendshapes(garment, shape_names, deformer.shapes[shapes], units)
     for path, body in zip(paths[3:], bodies):
         bind_skin(define_mesh(stage, path, body.mesh, units), body.skin, skeleton)
     if hidden_polygons is not None:
@@ -244,8 +244,14 @@ def sorted_influences(skin: SkinWeights) -> tuple[np.ndarray, np.ndarray]:
     return np.ascontiguousarray(merged.indices), weights
 
 
-def _define_blendshapes(mesh: UsdGeom.Mesh, names: Sequence[str], offsets: Floats, units: StageUnits) -> None:
-    """Define blendshapes below a bound mesh, with only the nonzero rows of their offsets [m], shape (K, V, 3)."""
+def define_blendshapes(
+    mesh: UsdGeom.Mesh, names: Sequence[str], offsets: Floats, units: StageUnits, *, before: Sequence[str] = ()
+) -> None:
+    """Define blendshapes below a bound mesh, with only the nonzero rows of their offsets [m], shape (K, V, 3).
+
+    Args:
+        before: blendshapes that the mesh has already, which stay in front.
+    """
     if not names:
         return
     binding, path = UsdSkel.BindingAPI(mesh), mesh.GetPath()
@@ -256,5 +262,6 @@ def _define_blendshapes(mesh: UsdGeom.Mesh, names: Sequence[str], offsets: Float
         prim = UsdSkel.BlendShape.Define(stage, path.AppendChild(name))
         prim.CreateOffsetsAttr(Vt.Vec3fArray.FromNumpy(moved))
         prim.CreatePointIndicesAttr(Vt.IntArray.FromNumpy(rows.astype(np.int32)))
+    names = [*before, *names]
     binding.CreateBlendShapesAttr(Vt.TokenArray(names))
     binding.CreateBlendShapeTargetsRel().SetTargets([path.AppendChild(name) for name in names])
