@@ -80,6 +80,13 @@ def read_origin(shot: Path, elsewhere: Mapping[str, str | os.PathLike[str] | Non
              "bake it again")  # fmt: skip
     refined = provenance.get("refined")
     if isinstance(refined, Mapping) and SHOT_SHAPES not in refined:
+        if provenance["request"].get("refined_output", "points") != "points":
+            fail(
+                str(shot),
+                "an earlier version fitted it to the joints and shapes of its model",
+                "refined shots have shapes of their own now",
+                "bake it again",
+            )
         stored = replace(stored, refined_output="points")  # the default of earlier versions
     beside = provenance.get("beside")  # earlier versions stored paths as they were given, and these here
     hashes = {name: provenance.get(f"{name}_sha256") for name in ("model", "motion")}

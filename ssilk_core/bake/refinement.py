@@ -12,8 +12,8 @@ import numpy as np
 
 from ..assets import Floats
 from ..devices import select_device
-from ..errors import VerificationError
-from ..events import Progress, Reporter, silent
+from ..errors import SsilkError, VerificationError
+from ..events import Message, Progress, Reporter, silent
 from .result import RefinementSummary, ShotShapes, Verification
 from .rollout import BakeRollout, Refinement
 
@@ -30,13 +30,14 @@ ROUNDING_STIFFNESS = 1e3
 def refined(rollout: BakeRollout, report: Reporter = silent, *, add_shapes: bool = False) -> BakeRollout:
     """Return a rollout with its refined frames, or the rollout itself where its request asks for none.
 
-    Where joints are written, its deformer gets the shot's own blendshapes.
+    Where joints are written, its deformer gets the shot's own blendshapes. Points that these cannot reach are written
+    as points.
 
     Args:
         add_shapes: to those of the model, instead of in their place: assets are the same for all shots.
 
     Raises:
-        SsilkError: a number of iterations that is not allowed, or frames that joints and blendshapes cannot reach.
+        SsilkError: a number of iterations that is not allowed.
     """
     if not rollout.request.refine or rollout.refinement is not None:
         return rollout
@@ -49,7 +50,15 @@ def refined(rollout: BakeRollout, report: Reporter = silent, *, add_shapes: bool
     if rollout.request.writes_points:
         found = _summary(rollout.request.refine, means.figures(), None)
         return replace(rollout, refinement=Refinement(tuple(points), (), found))
-    shot = _decomposed(rollout, points, add_shapes)
+    try:
+        shot = _decomposed(rollout, points, add_shapes)
+    except SsilkError as error:  # what the solver made is kept
+        report(Message(f"{error} They are written as points.", "warning"))
+        as_points = replace(rollout, request=replace(rollout.request, refined_output="points"))
+        return replace(
+            as_points,
+            refinement=Refinement(tuple(points), (), _summary(rollout.request.refine, means.figures(), None)),
+        )
     found = _summary(rollout.request.refine, means.figures(), ShotShapes.of(shot))
     return replace(rollout, deformer=shot.deformer, refinement=Refinement(tuple(points), shot.poses, found))
 

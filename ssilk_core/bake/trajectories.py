@@ -55,7 +55,7 @@ def motion_at(motion: Motion, cache: MeshTrajectories, where: str) -> Motion:
     Raises:
         SsilkError: the motion does not last from the first to the last of them.
     """
-    seconds = np.array(cache.times) / cache.fps
+    seconds = cache.seconds
     position = seconds * motion.fps - motion.start
     if not (position[0] > -SLACK and position[-1] < motion.frame_count - 1 + SLACK):
         first, last = motion.start / motion.fps, (motion.start + motion.frame_count - 1) / motion.fps
@@ -67,7 +67,7 @@ def motion_at(motion: Motion, cache: MeshTrajectories, where: str) -> Motion:
         )
     near = np.round(position)
     position = np.where(np.abs(position - near) < SLACK, near, position).clip(0, motion.frame_count - 1)
-    return Motion(motion.path, cache.fps, *sample_motion(motion, position), start=cache.times[0])
+    return Motion(motion.path, cache.fps, *sample_motion(motion, position), start=float(seconds[0]) * cache.fps)
 
 
 def skin_trajectories(

@@ -69,6 +69,13 @@ class References:
 
         path = self._paths[clip]
         shot = Shot(path)
+        if shot.is_skinned:
+            fail(
+                str(path),
+                "joints and blendshapes, which are millimetres off what was simulated",
+                "references are points",
+                "simulate with --points",
+            )
         if not abs(shot.fps - self.fps) < 1e-6:
             fail(
                 str(path),

@@ -15,7 +15,7 @@ import argparse
 import shutil
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -121,7 +121,19 @@ class _Shot:
         """Return whether the file is there and was simulated from the same."""
         from ssilk_usd.provenance import read_provenance
 
-        return self.output.is_file() and read_provenance(self.output).get("simulated") == self.provenance
+        if not self.output.is_file():
+            return False
+        found = read_provenance(self.output).get("simulated")
+        if isinstance(found, Mapping):
+            found = {"points": True, **found}  # earlier versions wrote points alone
+            if found == {**self.provenance, "points": True} and not self.provenance["points"]:
+                fail(
+                    str(self.output),
+                    "it holds the points of this simulation",
+                    "joints and blendshapes would replace them",
+                    "give --points or another output; 'ssilk skin' makes joints and blendshapes of points",
+                )
+        return found == self.provenance
 
 
 def _outputs(output: Path, motions: Sequence[str], pattern: str | None) -> list[Path]:
@@ -235,8 +247,8 @@ class _Caches:
         from ..bake import rig_deformer, skin_trajectories
 
         asked, path = self.shots[shot], self._path(shot)
-        points = MeshTrajectories(str(path), self.scene.garment.mesh.vertex_count)
         try:
+            points = MeshTrajectories(str(path), self.scene.garment.mesh.vertex_count)
             result = skin_trajectories(
                 rig_deformer(self.scene),
                 self.played[shot],
@@ -249,10 +261,12 @@ class _Caches:
                 device=self.options.device,
                 report=self.report,
             )
-        except SsilkError as error:  # what took hours is kept
-            self.report(Message(f"{error} They are written as points.", "warning"))
+        except BaseException as error:  # what took hours is kept, whatever happens to the fit
             with replacing(asked.output) as temporary:
                 shutil.copyfile(path, temporary)
+            if not isinstance(error, SsilkError):
+                raise
+            self.report(Message(f"{error} They are written as points.", "warning"))
         else:
             assert result.shapes is not None
             self.fits.append(result.shapes)

@@ -65,7 +65,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     inputs = (options.stage, options.model, split_location(options.cache)[0], split_location(where)[0])
     shared.check_output(options.output, *inputs)
     deformer = cap_influences(_deformer(options, report), target)
-    points = MeshTrajectories(options.cache, deformer.scene.garment.mesh.vertex_count)
+    mesh = deformer.scene.garment.mesh
+    points = MeshTrajectories(options.cache, mesh.vertex_count, mesh.faces)
     motion = motion_at(
         read_motion(where, deformer.scene.character.skeleton, root=options.root), points, options.cache
     )
@@ -95,6 +96,7 @@ def _deformer(options: argparse.Namespace, report: Reporter) -> Deformer:
 
     if options.model is None:
         return rig_deformer(shared.load_scene(options, report))
-    if options.garment:
-        fail("--garment", "a garment beside a model", "the model holds its garment", "leave one of them out")
+    for name in ("garment", "body"):
+        if getattr(options, name):
+            fail(f"--{name}", f"a {name} beside a model", f"the model holds its {name}", "leave one of them out")
     return trained_deformer(options.model, options.stage, options.root)

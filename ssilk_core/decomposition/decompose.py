@@ -98,7 +98,7 @@ def decompose(
             f"joints and blendshapes are {1000 * rms:.3g} mm RMS off the garment's points, and up to "
             f"{1000 * largest:.3g} mm in frame {frame}",
             f"{1000 * tolerance.rms:g} mm RMS and {1000 * tolerance.largest:g} mm at most are allowed",
-            "the joints fold its skinning there: write points",
+            "the joints fold its skinning there; keep the points",
         )
     moved = [int(shape.any(axis=1).sum()) for shape in shapes]
     local = sum(count < LOCAL * deformer.scene.garment.mesh.vertex_count for count in moved)

@@ -115,9 +115,11 @@ class OffsetShapes:
         parts = regional_components(sample, self.regions, rms)
         pays = _bytes(parts, len(self.left)) < PAYS * _bytes(whole, len(self.left))
         found = parts if pays else whole
+        if not found:  # all frames are the same, and the mean was all that they lacked
+            return
         each = (len(self.regions) / len(found)) ** 0.5 if pays else len(found) ** -0.5
         for rows, component in found:
-            self._add(component, rows, negligible * min(each, 1.0))
+            self._add(component, rows if pays else None, negligible * min(each, 1.0))
 
     def _basis_frames(self) -> Ints:
         """Return all frames; of many, as many evenly spread ones, and later those that are furthest off."""

@@ -40,6 +40,7 @@ class SolverErrors:
 
     Attributes:
         windows, steps: how many windows were simulated, and single steps solved.
+        lost: windows that are left out, because the method is not finite in them.
         step_energy: energy of a step above its minimum, from the method's own past [J].
         step_distance: RMS distance over mass and steps to that minimum [m].
         position_error: RMS distance over mass and windows to a simulation from the method's own first two states,
@@ -50,6 +51,7 @@ class SolverErrors:
     """
 
     windows: int
+    lost: int
     steps: int
     step_energy: float
     step_distance: float

@@ -44,13 +44,19 @@ def windows_of(dressed: EvaluationScene, take_set: TakeSet, takes: Iterable[int]
 @torch.no_grad()
 def solver_errors(
     dressed: EvaluationScene, take_set: TakeSet, method: Method, windows: Sequence[Window]
-) -> SolverErrors:
+) -> SolverErrors | None:
     """Measure single steps from the method's own past, and simulations from its own first two states.
+
+    Windows in which the method is not finite are left out and counted; None where none is left.
 
     Args:
         windows: at least one, by decreasing length.
     """
-    simulator, played = dressed.simulator, [_World(dressed, take_set, method, window) for window in windows]
+    simulator = dressed.simulator
+    played = [_World(dressed, take_set, method, window) for window in windows]
+    played = [world for world in played if bool(world.x.isfinite().all())]
+    if not played:
+        return None
     steps, shots = [], []
     for start in range(0, len(played), BATCH):
         shots.append(_shots(simulator, played[start : start + BATCH], dressed.energy.mass))
@@ -60,7 +66,8 @@ def solver_errors(
     energy, square = (torch.cat(values) for values in zip(*steps))
     distance, velocity, lbs = (torch.cat([found[part] for found in shots], dim=1) for part in range(3))
     return SolverErrors(
-        windows=len(windows),
+        windows=len(played),
+        lost=len(windows) - len(played),
         steps=len(singles),
         step_energy=float(energy.mean()),
         step_distance=float(square.mean().sqrt()),

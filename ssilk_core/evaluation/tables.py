@@ -54,7 +54,7 @@ MOTION = ("kinetic energy [J]", "RMS distance to static state [mm]", "RMS jerk [
 REFERENCE = ("frames", "L_tot excess over simulator [J]", "simulator L_tot [J]",
              "gravity excess over simulator [% m g L]", "RMS position error [mm]", "RMS velocity error [m/s]",
              "RMS acceleration error [m/s2]", "RMS jerk / simulator")  # fmt: skip
-SOLVER = ("windows", "energy of a step over its minimum [mJ]", "RMS distance to it [mm]",
+SOLVER = ("windows", "lost", "energy of a step over its minimum [mJ]", "RMS distance to it [mm]",
           *(f"RMS distance after {count} frames [mm] (median)" for count in AFTER), "RMS velocity error [m/s]",
           "of LBS [m/s]")  # fmt: skip
 SETTLING = ("stops", "kinetic energy at stop [J]", "kinetic energy at end [J]", "settled stops [%]",
@@ -95,7 +95,7 @@ def _reference(f: ReferenceErrors) -> list[str]:
 def _solver(f: SolverErrors) -> list[str]:
     each = zip(f.position_error, f.median_position_error)
     distances = [f"{_millimetres(rms)} ({_millimetres(median)})" for rms, median in each]
-    return [str(f.windows), f"{1000 * f.step_energy:.1f}", _millimetres(f.step_distance), *distances,
+    return [str(f.windows), str(f.lost), f"{1000 * f.step_energy:.1f}", _millimetres(f.step_distance), *distances,
             f"{f.velocity_error:.3f}", f"{f.lbs_velocity_error:.3f}"]  # fmt: skip
 
 

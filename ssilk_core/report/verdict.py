@@ -15,6 +15,7 @@ from .terms import SHARE, SHOWN, STRETCH
 
 # Beyond these the eye finds it at once [%]: skin on average and in one frame, stretch of 99 triangles in 100.
 SHOWN_MEAN, SHOWN_WORST, STRETCHED = 0.05, 0.5, 15.0
+INSIDE = 10.0  # share of the vertices inside the body in one frame [%]
 
 
 def verdict(
@@ -43,6 +44,8 @@ def verdict(
         share = f"{shown.mean():.3f} % of the covered skin shows on average"
         seen = f"{share}, and {shown[worst]:.2f} % {when(worst)}{where}."
         words.append(seen if shown[worst] else "No covered skin shows.")
+    else:
+        words.append("Skin was not measured, because the garment covers none.")
     if len(lost) < len(frame_times):
         worst = int(np.nanargmax(values[STRETCH]))
         if values[STRETCH][worst] > STRETCHED:
@@ -52,6 +55,8 @@ def verdict(
             f"99 triangles in 100 stretch by at most {middle:.0f} % as a rule, and by {most:.0f} % {when(worst)}."
         )
         inside = int(np.nanargmax(values[SHARE]))
+        if values[SHARE][inside] > INSIDE:
+            faults.append("it is inside the body")
         if values[SHARE][inside]:
             words.append(
                 f"At most {values[SHARE][inside]:.1f} % of its vertices are inside the body, {when(inside)}."

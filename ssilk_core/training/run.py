@@ -34,6 +34,7 @@ from .validation import Score
 from .verdict import non_finite_terms, validation_message
 
 SAVE_INTERVAL = 60.0  # [s] between saved states
+MORE_TIME = 0.1  # of the minutes: what has to be left for a run that is done to go on
 PACE_INTERVAL = 5.0  # [s] between measurements of the speed on a processor
 RECOVERY_PACE = 0.25  # factor on learning rates after divergence
 
@@ -72,7 +73,7 @@ class TrainingRun:
         self.job, self.report, self.device, self.group = job, report, select_device(job.device), group
         self.files, identity = RunFiles(job, self.device, group), {**job.identity(), "processes": group.size}
         self.state, tensors = load_state(self.files.state, identity) if job.resume else (RunState(identity), None)
-        self._began -= self.state.seconds
+        self._began -= max(self.state.wall, self.state.seconds)
         self.parts = build_parts(job, self.device, group)
         if not job.resume:
             self._fit_batch()
@@ -124,13 +125,16 @@ class TrainingRun:
         self.report(Message(f"about {planned} iterations are planned for {seconds / 60:g} minutes"))
 
     def _continue_plan(self) -> None:
-        """Plan the rest of a resumed run at its mean speed; without time left it is done."""
+        """Plan the rest of a resumed run; one that is done goes on where much more time is left."""
         state = self.state
-        if not (state.planned and state.seconds and state.iteration):
+        if not (state.seconds and state.iteration):
             return
         each = state.seconds / state.iteration
-        self.pace = Pace(each, each)
-        if state.iteration < state.planned or self._training_time_left() > 0:
+        self.pace = Pace(*(state.pace or [each, each]))
+        left, asked = self._training_time_left(), 60 * (self.job.minutes or 0)
+        if not state.validations:
+            state.validations = affordable_validations(self.job.train, asked, self.validation_seconds)
+        if state.iteration != state.planned or left > MORE_TIME * asked:
             self._follow_clock()
 
     def _training_time_left(self) -> float:
@@ -156,6 +160,7 @@ class TrainingRun:
         self._timed, self._measured_at = (iteration, seconds), time.monotonic()
         if steps > 0 and took > 0:
             self.pace = self.pace.updated(took / steps, iteration <= self.config.static_iterations)
+            self.state.pace = [self.pace.static, self.pace.dynamic]
             self._follow_clock()
             self.stepper.config = self.config
 
@@ -399,7 +404,7 @@ class TrainingRun:
         return self.state.iteration % CHECK_INTERVAL == 0 and self.group.any(wish)
 
     def _write_state(self) -> None:
-        self.state.skipped = int(self.stepper.skipped.count)
+        self.state.skipped, self.state.wall = int(self.stepper.skipped.count), time.monotonic() - self._began
         self.files.save_state(self.stepper, self.state)
         self.saved, self._saved_at = self.state.iteration, time.monotonic()
 

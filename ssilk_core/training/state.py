@@ -83,6 +83,8 @@ class RunState:
         planned: iterations that fit into the job's minutes; zero for those of its schedule.
         static: those of them that were static training, once that is over.
         validations: how many fit; zero for those of the schedule.
+        pace: seconds of a step of static and of dynamic training, as last measured; empty where nothing was planned.
+        wall: time spent, validations and files included [s].
         curve: the validations.
     """
 
@@ -95,6 +97,8 @@ class RunState:
     planned: int = 0
     static: int = 0
     validations: int = 0
+    pace: list[float] = field(default_factory=list, compare=False)
+    wall: float = field(default=0.0, compare=False)
     curve: list[CurvePoint] = field(default_factory=list)
 
 
@@ -224,7 +228,7 @@ def _need_possible(state: RunState) -> None:
     _need_counts("an earlier iteration", 0, state.iteration, [each.iteration for each in (*scored, *state.lowered)])
     for name in ("batch", "pretraining_batch"):
         _need_counts(name, 1, asked[name], [getattr(each, name) for each in state.lowered])
-    times = [state.seconds, *(point.seconds for point in state.curve)]
+    times = [state.seconds, state.wall, *state.pace, *(point.seconds for point in state.curve)]
     paces = [each.pace for each in state.lowered]
     if not (all(0 <= time < inf for time in times) and all(0 < pace <= 1 for pace in paces)):
         raise ValueError("a duration or a pace is out of range")

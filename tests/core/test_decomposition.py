@@ -174,3 +174,14 @@ def test_points_of_another_garment_and_broken_ones_are_refused(played):
     points[3, 4] = np.nan
     with pytest.raises(SsilkError, match="frame 3 has NaN or infinity"):
         decompose(deformer, motion, points)
+
+
+@pytest.mark.parametrize("frames", [1, 3])
+def test_frames_that_are_all_the_same_need_one_constant_shape(frames):
+    left = np.zeros((frames, 20, 3), np.float32)
+    left[:, :10, 1] = 0.05
+    found = OffsetShapes(left, FitTolerance(), [np.arange(20)])
+    found.find()
+    shapes, weights = found.all_shapes()
+    assert shapes.shape == (1, 20, 3) and (weights == 1).all()
+    np.testing.assert_allclose(shapes[0, :, 1], np.repeat([0.05, 0.0], 10), atol=1e-6)

@@ -165,3 +165,24 @@ def test_time_is_up_when_no_validation_fits_any_more(job, monkeypatch):  # noqa:
         now = run._began + spent
         assert run.time_left == pytest.approx(50.0 - spent)
     assert TrainingRun(job("endless"), silent).time_left == inf
+
+
+def test_a_run_that_is_done_goes_on_with_more_minutes_alone(job, monkeypatch):  # noqa: F811
+    monkeypatch.setattr(training, "timed_pace", lambda *_: Pace(1.0, 1.0))
+    now = [0.0]
+    monkeypatch.setattr(training.time, "monotonic", lambda: now[0])
+    real = TrainingRun.step
+
+    def step(run: TrainingRun) -> None:
+        real(run)
+        now[0] += 1.0
+
+    monkeypatch.setattr(TrainingRun, "step", step)
+    first = train(job("more", minutes=0.5), silent).iterations
+    assert 25 <= first <= 30
+    assert train(job("more", minutes=0.5, resume=True), silent).iterations == first
+    assert train(job("more", minutes=1.0, resume=True), silent).iterations > first + 20
+
+
+def test_time_that_ends_with_static_training_is_no_error():
+    assert scale_schedule(PLAN, 300, static=300).static_iterations in (299, 300)

@@ -229,11 +229,16 @@ def _let_go(stage: Usd.Stage, skel: SkelSource, prim: Usd.Prim) -> Usd.Prim:
     """Take the xforms from a mesh that its joint moves from now on; move it where others hang on them too."""
     above = prim
     while above != skel.root and not above.IsPseudoRoot():
-        if sum(other.IsA(UsdGeom.Mesh) for other in Usd.PrimRange(above)) > 1:
+        if any(_is_beside(other.GetPath(), prim.GetPath()) for other in Usd.PrimRange(above)):
             return _move(stage, prim, _free_path(skel, prim.GetName()))
         UsdGeom.Xformable(above).ClearXformOpOrder()
         above = above.GetParent()
     return prim
+
+
+def _is_beside(path: Sdf.Path, own: Sdf.Path) -> bool:
+    """Return whether a path is neither above another one nor below it."""
+    return not (own.HasPrefix(path) or path.HasPrefix(own))
 
 
 def _copy_garment(stage: Usd.Stage, skel: SkelSource, garment: Garment) -> UsdGeom.Mesh:

@@ -7,13 +7,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import overload
 
-from pxr import Sdf
+import numpy as np
+from pxr import Sdf, UsdGeom
 
-from ssilk_core.assets import Floats
+from ssilk_core.assets import Floats, Ints
 from ssilk_core.errors import fail
 
 from .play import Shot
 from .read_stage import USD_SUFFIXES, split_location
+
+MOST_OTHER_EDGES = 0.1  # share of the edges: quads may be divided along another diagonal
 
 
 class MeshTrajectories(Sequence[Floats]):
@@ -22,31 +25,32 @@ class MeshTrajectories(Sequence[Floats]):
     A frame is read when it is asked for, so any number of them take little memory.
 
     Attributes:
-        fps: frames per second [1/s].
+        fps: frames per second [1/s], those of the points' samples.
         times: time code of each frame.
+        seconds: the same in seconds, shape (F,).
         mesh: path of the mesh.
         vertex_count: of the mesh.
     """
 
-    def __init__(self, source: str, vertex_count: int | None = None) -> None:
+    def __init__(self, source: str, vertex_count: int | None = None, faces: Ints | None = None) -> None:
         """Open a cache.
 
         Args:
             source: "file[:/Prim/Path]". Where no prim is named, it is the mesh that is marked as a garment, or the
                 one mesh that has `vertex_count` points.
+            faces: triangles of the garment, which the mesh has to have as well, shape (F, 3).
 
         Raises:
-            SsilkError: the file cannot be read, or holds no such mesh, or several.
+            SsilkError: the file cannot be read, or holds no such mesh, or several, or another mesh.
         """
         file, prim = split_location(source)
         _need_readable(file)
         self._shot = Shot(file)
         self._index = _chosen(self._shot, prim, vertex_count)
-        self.mesh, self.fps, self.times = (
-            self._shot.meshes[self._index].path,
-            self._shot.fps,
-            self._shot.frame_times,
-        )
+        self.mesh = self._shot.meshes[self._index].path
+        self.times, step = self._sampled()
+        second = float(self._shot.stage.GetTimeCodesPerSecond())
+        self.fps, self.seconds = second / step, np.array(self.times) / second
         self.vertex_count = len(self[0])
         if vertex_count is not None and self.vertex_count != vertex_count:
             fail(
@@ -55,6 +59,23 @@ class MeshTrajectories(Sequence[Floats]):
                 f"the garment has {vertex_count}",
                 "cache the same mesh, its vertices in the same order",
             )
+        if faces is not None and _other_edges(self._shot.meshes[self._index].faces, faces) > MOST_OTHER_EDGES:
+            fail(
+                f"{file}:{self.mesh}",
+                "its edges join other vertices than the garment's",
+                "point i of the cache is vertex i of the garment",
+                "cache the same mesh, its vertices in the same order",
+            )
+
+    def _sampled(self) -> tuple[Sequence[float], float]:
+        """Return the time codes of the frames, as the points are sampled or else all, and the step between them."""
+        prim = self._shot.stage.GetPrimAtPath(self.mesh)
+        samples = np.array(UsdGeom.Mesh(prim).GetPointsAttr().GetTimeSamples())
+        if len(samples) < 2:
+            return self._shot.frame_times, 1.0
+        step = float(np.median(np.diff(samples)))
+        count = round((samples[-1] - samples[0]) / step) + 1
+        return [float(samples[0] + number * step) for number in range(count)], step
 
     def __len__(self) -> int:
         return len(self.times)
@@ -67,6 +88,13 @@ class MeshTrajectories(Sequence[Floats]):
         if isinstance(frame, slice):
             return [self[each] for each in range(*frame.indices(len(self)))]
         return self._shot.mesh_points(self._index, self.times[frame])
+
+
+def _other_edges(faces: Ints, own: Ints) -> float:
+    """Return the share of the edges of triangles (F, 3) that `own` ones (G, 3) do not have."""
+    one, other = ({(min(a, b), max(a, b)) for t in each.tolist() for a, b in zip(t, t[1:] + t[:1])}
+                  for each in (faces, own))  # fmt: skip
+    return len(one - other) / max(1, len(one))
 
 
 def _need_readable(file: str) -> None:
