@@ -41,9 +41,15 @@ class Objection:
     todo: str
 
 
-def objections(garment: bpy.types.Object) -> list[Objection]:
-    """Return what is wrong with a garment's modifiers that are switched on, in viewports or renders."""
-    used = [modifier for modifier in garment.modifiers if modifier.show_viewport or modifier.show_render]
+def objections(garment: bpy.types.Object, *, simulated: bool = False) -> list[Objection]:
+    """Return what is wrong with a garment's modifiers that are switched on, in viewports or renders.
+
+    Args:
+        simulated: whether it may have modifiers that move it by themselves.
+    """
+    passed = MOVING if simulated else set()
+    switched_on = [modifier for modifier in garment.modifiers if modifier.show_viewport or modifier.show_render]
+    used = [modifier for modifier in switched_on if modifier.type not in passed]
     deforms = [modifier.type == "ARMATURE" and modifier.object is not None for modifier in used]
     bones = deforms.index(True) if any(deforms) else -1
     judged = (
@@ -72,13 +78,13 @@ def _objection(modifier: bpy.types.Modifier, *, after: bool, bound: bool) -> tup
     return "shapes it before bones move it", ", or ".join(todo)
 
 
-def need_plain_modifiers(garment: bpy.types.Object) -> None:
-    """Check that bones move the vertices of a garment's mesh, and nothing else does.
+def need_plain_modifiers(garment: bpy.types.Object, *, simulated: bool = False) -> None:
+    """Check that bones move the vertices of a garment's mesh, and nothing else does but what may simulate it.
 
     Raises:
         SetupError: a modifier is in the way.
     """
-    for objection in objections(garment):
+    for objection in objections(garment, simulated=simulated):
         raise SetupError(
             f"The modifier '{objection.modifier}' of '{garment.name}' {objection.does}; {objection.todo}."
         )

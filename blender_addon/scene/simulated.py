@@ -11,7 +11,7 @@ import bpy
 import numpy as np
 
 from ..errors import SetupError
-from .garment import AFTERWARDS, HARMLESS
+from .modifiers import HARMLESS, REFINING
 from .objects import found_again
 from .sampling import SLICE
 from .units import scene_units
@@ -19,7 +19,7 @@ from .units import scene_units
 
 def simulating(garment: bpy.types.Object) -> list[bpy.types.Modifier]:
     """Return the modifiers that move a garment besides its armature, where they are switched on."""
-    still = {"ARMATURE", *HARMLESS, *AFTERWARDS}
+    still = {"ARMATURE", *HARMLESS, *REFINING}
     return [modifier for modifier in garment.modifiers if modifier.show_viewport and modifier.type not in still]
 
 
@@ -94,7 +94,7 @@ def _evaluated(garment: bpy.types.Object) -> np.ndarray:
 @contextmanager
 def _without_thickness(garment: bpy.types.Object) -> Iterator[None]:
     """Switch off what only refines the surface, which is done to the bones' result as well."""
-    shown = [modifier for modifier in garment.modifiers if modifier.type in AFTERWARDS and modifier.show_viewport]
+    shown = [modifier for modifier in garment.modifiers if modifier.type in REFINING and modifier.show_viewport]
     for modifier in shown:
         modifier.show_viewport = False
     try:
