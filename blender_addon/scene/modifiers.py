@@ -45,19 +45,21 @@ def objections(garment: bpy.types.Object, *, simulated: bool = False) -> list[Ob
     """Return what is wrong with a garment's modifiers that are switched on, in viewports or renders.
 
     Args:
-        simulated: whether it may have modifiers that move it by themselves.
+        simulated: whether modifiers that are seen to move what bones have moved may do so.
     """
-    passed = MOVING if simulated else set()
-    switched_on = [modifier for modifier in garment.modifiers if modifier.show_viewport or modifier.show_render]
-    used = [modifier for modifier in switched_on if modifier.type not in passed]
+    used = [modifier for modifier in garment.modifiers if modifier.show_viewport or modifier.show_render]
     deforms = [modifier.type == "ARMATURE" and modifier.object is not None for modifier in used]
     bones = deforms.index(True) if any(deforms) else -1
     judged = (
-        (modifier, _objection(modifier, after=0 <= bones < place, bound=bones >= 0))
+        (modifier, 0 <= bones < place, _objection(modifier, after=0 <= bones < place, bound=bones >= 0))
         for place, modifier in enumerate(used)
         if place != bones
     )
-    return [Objection(modifier.name, *said) for modifier, said in judged if said]
+    return [
+        Objection(modifier.name, *said)
+        for modifier, after, said in judged
+        if said and not (simulated and after and modifier.show_viewport and modifier.type in MOVING)
+    ]
 
 
 def _objection(modifier: bpy.types.Modifier, *, after: bool, bound: bool) -> tuple[str, str] | None:
