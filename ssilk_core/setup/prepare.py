@@ -49,8 +49,9 @@ def prepare_scene(
     elif tightness is not None:
         classes = held_classes(garment.mesh, levels, tightness)
         changed = int(np.count_nonzero(classes != garment.classes))
+        anew = ", so its proxies are placed anew" if changed and rig else ""
+        report(events.Message(f"{garment.mesh.path}: {changed} classes are others at tightness {tightness:g}{anew}"))
         rig = None if changed else rig
-        report(events.Message(f"{garment.mesh.path}: {changed} classes are others at tightness {tightness:g}"))
     skin = garment.skin
     if skin is None:
         report(events.Message(f"{garment.mesh.path}: no skinning weights; they are transferred from the body"))
