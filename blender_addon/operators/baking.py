@@ -62,8 +62,10 @@ class TimelineOperator(tasks.OutsideOperator):
         pair: the garment and its armature.
         shot: the file to read.
         take: the frames.
+        simulated: whether modifiers may simulate the garment until the shot is on the timeline.
     """
 
+    simulated = False
     pair: Pair
     shot: Path
     take: SampledTake
@@ -80,7 +82,7 @@ class TimelineOperator(tasks.OutsideOperator):
         """Return the joints as they are by now; raise `SetupError` where nothing can be baked onto them any more."""
         garment, armature = self.pair.objects()
         joints = read_joints(armature, garment)
-        need_bakeable(garment, armature, joints)
+        need_bakeable(garment, armature, joints, simulated=self.simulated)
         need_tracks(animated(garment, armature))
         return joints
 

@@ -35,6 +35,7 @@ class SimulationToBones(TimelineOperator, bpy.types.Operator):
     bl_idname = "ssilk.to_bones"
     bl_label = "To Bones"
     undo = "To Bones"
+    simulated = True
 
     @classmethod
     def refusal(cls, context: bpy.types.Context) -> str:
@@ -46,11 +47,11 @@ class SimulationToBones(TimelineOperator, bpy.types.Operator):
         joints = read_joints(armature, garment)
         if not joints.proxy_count:
             raise SetupError(f"'{garment.name}' has no proxies; generate its rig.")
-        need_bakeable(garment, armature, joints)
+        need_bakeable(garment, armature, joints, simulated=True)
         need_tracks(animated(garment, armature))
         need_simulated(garment)
         (self.take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
-        self.scene, self.pair = gather(garment), Pair.of(garment, armature)
+        self.scene, self.pair = gather(garment, simulated=True), Pair.of(garment, armature)
         self.points: list[np.ndarray] = []
         self.python, self.character = interpreter(preferences(context)), joints.character
         return Work(

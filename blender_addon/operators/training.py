@@ -20,7 +20,7 @@ from ..outside import jobs
 from ..outside.wording import remember
 from ..outside.work import Work
 from ..preferences import interpreter, preferences, unready
-from ..scene import playing
+from ..scene import models, playing
 from ..scene.baked import need_bakeable
 from ..scene.follower import leader_of
 from ..scene.garment import armature_of, unusable, unusable_here
@@ -200,7 +200,8 @@ class CancelOrphan(ReportingOperator, bpy.types.Operator):
     folder: StringProperty(description="Folder of the training", options={"HIDDEN", "SKIP_SAVE"})
 
     def apply(self, context: bpy.types.Context) -> str:
-        job = next((job for job in orphans() if str(job.folder) == self.folder), None)
+        models.look_for_orphans()
+        job = next((orphan.job for orphan in orphans() if str(orphan.job.folder) == self.folder), None)
         if job is None:
             raise SetupError("This training has ended, or its garment is back.")
         jobs.cancel(job.folder)
@@ -274,7 +275,8 @@ def watch() -> float:
     known = trainings()
     things = [thing for thing in bpy.data.objects if thing.type == "MESH"]
     folders = {job.folder for job in known} | {job_of(thing, known) for thing in things} - {None}
-    if sum(changed(folder) for folder in folders):  # all are asked, so that none is drawn for once more
+    fresh = [models.look_for_orphans(known), *map(changed, folders)]  # all are asked, so that none is drawn once more
+    if any(fresh):
         tasks.redraw(bpy.context)
     playing.take_up_models()
     return LOOK

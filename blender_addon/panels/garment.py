@@ -6,7 +6,6 @@ from __future__ import annotations
 import bpy
 
 from ..errors import SetupError
-from ..outside.jobs import read_state
 from ..preferences import unready
 from ..scene.garment import armature_of, garments_of, unusable
 from ..scene.models import orphans
@@ -28,14 +27,13 @@ def draw_garments(layout: bpy.types.UILayout, shown: bpy.types.Object) -> None:
 
 
 def draw_orphans(layout: bpy.types.UILayout) -> None:
-    """Draw the trainings that go on for garments which are not in the file, each to be cancelled."""
-    for job in orphans():
-        state = read_state(job.folder)
+    """Draw the file's trainings that go on for garments which are not in it any more, each to be cancelled."""
+    for orphan in orphans():
+        job = orphan.job
         row = layout.row(align=True)
-        row.progress(factor=state.fraction if state else 0.0, text=job.garment)
+        row.progress(factor=orphan.fraction, text=job.garment)
         row.operator("ssilk.cancel_orphan", text="", icon="CANCEL").folder = str(job.folder)
-        where = "" if job.file == bpy.path.basename(bpy.data.filepath) else f", which is in {job.file}"
-        draw_text(layout, f"This training goes on without its garment '{job.garment}'{where}", icon="INFO")
+        draw_text(layout, f"This training goes on without its garment '{job.garment}'", icon="INFO")
 
 
 class GarmentPanel(SidebarPanel, bpy.types.Panel):

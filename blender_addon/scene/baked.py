@@ -25,15 +25,17 @@ MOVED = 1e-4  # how far rest points may be from those that were trained on, as a
 TURNED = 1e-3  # how far the axes and places of bones may be
 
 
-def need_bakeable(garment: bpy.types.Object, armature: bpy.types.Object, joints: Joints) -> None:
-    """Check that Blender will deform a garment as ssilk does.
+def need_bakeable(
+    garment: bpy.types.Object, armature: bpy.types.Object, joints: Joints, *, simulated: bool = False
+) -> None:
+    """Check that Blender will deform a garment as ssilk does, apart from what may simulate it.
 
     Raises:
         SetupError: an option of the modifier, of a bone or of shape keys is in the way.
     """
     need_relative(garment)
     need_uncarried(garment)
-    need_plain_modifiers(garment)
+    need_plain_modifiers(garment, simulated=simulated)
     _need_linear(garment, armature)
     names = joints.names
     for name, parent in list(zip(names, joints.parents))[joints.character_count :]:

@@ -50,18 +50,21 @@ class GatheredScene:
     meshes: dict[str, Mesh]
 
 
-def gather(garment: bpy.types.Object, *, classes: bool = True, proxies: bool = True) -> GatheredScene:
+def gather(
+    garment: bpy.types.Object, *, classes: bool = True, proxies: bool = True, simulated: bool = False
+) -> GatheredScene:
     """Return a garment with its armature and bodies. In object mode.
 
     Args:
         classes: whether to take the painted classes along.
         proxies: whether to take the proxies and their weights along; without, the garment's own weights are.
+        simulated: whether modifiers may simulate the garment.
 
     Raises:
         SetupError: something is missing or cannot be used; the sentence names the object.
     """
     armature = armature_of(garment)
-    need_plain_modifiers(garment)
+    need_plain_modifiers(garment, simulated=simulated)
     joints = read_joints(armature, garment)
     things = [garment, *bodies_of(garment, armature)]
     paths = [f"{ROOT}/{name}" for name in identifiers((thing.name for thing in things), taken=(SKELETON,))]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
@@ -18,6 +19,7 @@ from ..outside.jobs import MODEL, OwnedJob, owned, owner, read_state
 
 FIRST = "wait for the training's first validation, or resume it"
 FOLDER = "ssilk"  # of trainings, beside the blend file
+_orphans: tuple[str, list[Orphan]] = ("", [])  # the blend file, and what was found beside it
 
 
 def trainings_folder() -> Path:
@@ -50,15 +52,40 @@ def job_of(garment: bpy.types.Object, known: Sequence[OwnedJob] | None = None) -
     return own
 
 
-def orphans() -> list[OwnedJob]:
-    """Return the trainings beside the blend file that go on and belong to no garment in it."""
-    known = trainings()
-    if not known:
+@dataclass(frozen=True)
+class Orphan:
+    """A training that goes on without its garment, and the part of it that is done, in [0, 1]."""
+
+    job: OwnedJob
+    fraction: float
+
+
+def orphans() -> list[Orphan]:
+    """Return the trainings of this file that went on and belonged to no garment in it when they were looked for."""
+    file, found = _orphans
+    return found if file == bpy.data.filepath else []
+
+
+def look_for_orphans(known: Sequence[OwnedJob] | None = None) -> bool:
+    """Read from disk what `orphans` returns from now on; return whether it has changed.
+
+    Args:
+        known: the trainings beside the file, where they were read already.
+    """
+    global _orphans
+    before = orphans()
+    _orphans = bpy.data.filepath, _read_orphans(trainings() if known is None else known)
+    return before != orphans()
+
+
+def _read_orphans(known: Sequence[OwnedJob]) -> list[Orphan]:
+    here = [job for job in known if job.file == Path(bpy.data.filepath).name]
+    if not here:
         return []
     things = [thing for thing in bpy.data.objects if thing.type == "MESH"]
     linked = {job for thing in things if (job := job_of(thing, known)) and thing.users_scene}
-    alone = [job for job in known if job.folder not in linked]
-    return [job for job in alone if (state := read_state(job.folder)) and state.alive]
+    states = ((job, read_state(job.folder)) for job in here if job.folder not in linked)
+    return [Orphan(job, state.fraction) for job, state in states if state and state.alive]
 
 
 def model_of(garment: bpy.types.Object) -> Path:

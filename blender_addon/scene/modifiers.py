@@ -41,17 +41,25 @@ class Objection:
     todo: str
 
 
-def objections(garment: bpy.types.Object) -> list[Objection]:
-    """Return what is wrong with a garment's modifiers that are switched on, in viewports or renders."""
+def objections(garment: bpy.types.Object, *, simulated: bool = False) -> list[Objection]:
+    """Return what is wrong with a garment's modifiers that are switched on, in viewports or renders.
+
+    Args:
+        simulated: whether modifiers that are seen to move what bones have moved may do so.
+    """
     used = [modifier for modifier in garment.modifiers if modifier.show_viewport or modifier.show_render]
     deforms = [modifier.type == "ARMATURE" and modifier.object is not None for modifier in used]
     bones = deforms.index(True) if any(deforms) else -1
     judged = (
-        (modifier, _objection(modifier, after=0 <= bones < place, bound=bones >= 0))
+        (modifier, 0 <= bones < place, _objection(modifier, after=0 <= bones < place, bound=bones >= 0))
         for place, modifier in enumerate(used)
         if place != bones
     )
-    return [Objection(modifier.name, *said) for modifier, said in judged if said]
+    return [
+        Objection(modifier.name, *said)
+        for modifier, after, said in judged
+        if said and not (simulated and after and modifier.show_viewport and modifier.type in MOVING)
+    ]
 
 
 def _objection(modifier: bpy.types.Modifier, *, after: bool, bound: bool) -> tuple[str, str] | None:
@@ -72,13 +80,13 @@ def _objection(modifier: bpy.types.Modifier, *, after: bool, bound: bool) -> tup
     return "shapes it before bones move it", ", or ".join(todo)
 
 
-def need_plain_modifiers(garment: bpy.types.Object) -> None:
-    """Check that bones move the vertices of a garment's mesh, and nothing else does.
+def need_plain_modifiers(garment: bpy.types.Object, *, simulated: bool = False) -> None:
+    """Check that bones move the vertices of a garment's mesh, and nothing else does but what may simulate it.
 
     Raises:
         SetupError: a modifier is in the way.
     """
-    for objection in objections(garment):
+    for objection in objections(garment, simulated=simulated):
         raise SetupError(
             f"The modifier '{objection.modifier}' of '{garment.name}' {objection.does}; {objection.todo}."
         )

@@ -11,7 +11,9 @@ import bpy
 import numpy as np
 
 from ..errors import SetupError
-from .garment import AFTERWARDS, HARMLESS
+from .cage import is_refined
+from .meshes import world_points
+from .modifiers import HARMLESS, REFINING
 from .objects import found_again
 from .sampling import SLICE
 from .units import scene_units
@@ -19,7 +21,7 @@ from .units import scene_units
 
 def simulating(garment: bpy.types.Object) -> list[bpy.types.Modifier]:
     """Return the modifiers that move a garment besides its armature, where they are switched on."""
-    still = {"ARMATURE", *HARMLESS, *AFTERWARDS}
+    still = {"ARMATURE", *HARMLESS, *REFINING}
     return [modifier for modifier in garment.modifiers if modifier.show_viewport and modifier.type not in still]
 
 
@@ -63,7 +65,7 @@ def sample_vertices(garment: bpy.types.Object, frames: range, points: list[np.nd
 def _sample_slice(garment: bpy.types.Object, frames: range, points: list[np.ndarray]) -> None:
     scene, until = bpy.context.scene, time.monotonic() + SLICE
     before = scene.frame_current, scene.frame_subframe
-    with _without_thickness(garment):
+    with _unrefined(garment):
         try:
             while len(points) < len(frames):
                 scene.frame_set(frames[len(points)])
@@ -75,26 +77,20 @@ def _sample_slice(garment: bpy.types.Object, frames: range, points: list[np.ndar
 
 
 def _evaluated(garment: bpy.types.Object) -> np.ndarray:
-    evaluated = garment.evaluated_get(bpy.context.evaluated_depsgraph_get())
-    mesh = evaluated.to_mesh()
-    try:
-        if len(mesh.vertices) != len(garment.data.vertices):
-            raise SetupError(
-                f"Modifiers give '{garment.name}' {len(mesh.vertices)} vertices, and the mesh has "
-                f"{len(garment.data.vertices)}; switch off those that add or remove any."
-            )
-        found = np.empty(len(mesh.vertices) * 3, dtype=np.float32)
-        mesh.vertices.foreach_get("co", found)
-    finally:
-        evaluated.to_mesh_clear()
-    world = np.array(evaluated.matrix_world)
-    return scene_units().points_to_core(found.reshape(-1, 3) @ world[:3, :3].T + world[:3, 3])
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    evaluated = garment.evaluated_get(depsgraph)
+    if is_refined(garment, depsgraph):  # `cage_points` would leave out the simulation
+        raise SetupError(
+            f"Modifiers give '{garment.name}' {len(evaluated.data.vertices)} vertices, and the mesh has "
+            f"{len(garment.data.vertices)}; switch off those that add or remove any."
+        )
+    return scene_units().points_to_core(world_points(evaluated))
 
 
 @contextmanager
-def _without_thickness(garment: bpy.types.Object) -> Iterator[None]:
+def _unrefined(garment: bpy.types.Object) -> Iterator[None]:
     """Switch off what only refines the surface, which is done to the bones' result as well."""
-    shown = [modifier for modifier in garment.modifiers if modifier.type in AFTERWARDS and modifier.show_viewport]
+    shown = [modifier for modifier in garment.modifiers if modifier.type in REFINING and modifier.show_viewport]
     for modifier in shown:
         modifier.show_viewport = False
     try:

@@ -27,9 +27,9 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     shared.add_scene(verb)
     verb.add_argument("-o", "--output", type=Path, required=True, help="stage to write (.usdc, .usd or .usda)")
     verb.add_argument(
-        "--tightness", type=shared.NumberRange(0, 1), default=USUAL, metavar="SHARE",
-        help="how much is tight of a garment without classes: 0 nothing, 1 all that is not pinned (default "
-             "%(default)s)",
+        "--tightness", type=shared.NumberRange(0, 1), metavar="SHARE",
+        help="how much is tight: 0 nothing, 1 all that is not pinned (default: the classes that the garment has, "
+             f"else {USUAL:g}). Classes are made again by primvars:ssilk:tightness, with their proxies",
     )  # fmt: skip
     verb.add_argument(
         "--proxies",

@@ -16,7 +16,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from ..assets import UP, Character, Floats, Ints, Mesh, SkinWeights, classes_at
+from ..assets import LOOSE, UP, Character, Floats, Ints, Mesh, SkinWeights, classes_at
 from ..errors import fail
 from ..mesh.geodesic import distances, within, within_of
 from ..mesh.topology import components, edge_use, edges, islands, smooth, vertex_areas
@@ -87,7 +87,21 @@ def classify(
 ) -> NDArray[np.int8]:
     """Return PINNED, TIGHT or LOOSE for each garment vertex, shape (V,), at one tightness; see `hold_levels`."""
     levels = hold_levels(character, mesh, skin, options, ladder=[tightness], carried=carried, pins=pins)
-    return classes_at(levels, tightness)
+    return held_classes(mesh, levels, tightness)
+
+
+def held_classes(mesh: Mesh, levels: Floats, tightness: float) -> NDArray[np.int8]:
+    """Return the classes at a tightness in [0, 1], shape (V,), of the levels that `hold_levels` returns, shape (V,).
+
+    Raises:
+        SsilkError: an island of the garment is all loose at that tightness.
+    """
+    classes = classes_at(levels, tightness)
+    _need_held(
+        classes != LOOSE, mesh, islands(mesh.faces, mesh.vertex_count), f"are all loose at tightness {tightness:g}",
+        "raise the tightness, pin some of each island, or paint primvars:ssilk:class",
+    )  # fmt: skip
+    return classes
 
 
 def hold_levels(
@@ -114,7 +128,7 @@ def hold_levels(
         pins: what is pinned, shape (V,), in place of the band from which islands hang.
 
     Raises:
-        SsilkError: an island of the garment has no pinned or tight vertex.
+        SsilkError: an island of the garment rests nowhere on the body, and `pins` do not say what holds it.
     """
     options = options or ClassOptions()
     pairs, island = edges(mesh.faces), islands(mesh.faces, mesh.vertex_count)
@@ -142,10 +156,11 @@ def hold_levels(
     if carried:
         held |= _tops(mesh, ~held, np.isin(island, island[held]), island, options)
     if pins is None:
-        _need_held(held, mesh, island)
+        _need_held(
+            held, mesh, island, "rest nowhere on the body",
+            "move the garment onto the body, or paint primvars:ssilk:class",
+        )  # fmt: skip
         pins = held & _band(mesh, rim | _tops(mesh, held, rim, island, options), options.pinned_width)
-    else:
-        _need_held(held | pins, mesh, island)
     return np.where(pins, 0.0, _levels(held, held_at, sorted(step for step in ladder if 0 < step < 1)))
 
 
@@ -203,16 +218,16 @@ def _with_specks(kind: Mask, mesh: Mesh, pairs: Ints, reach: float) -> Mask:
     return kind | ~beyond[patch]
 
 
-def _need_held(held: Mask, mesh: Mesh, island: Ints) -> None:
+def _need_held(held: Mask, mesh: Mesh, island: Ints, otherwise: str, todo: str) -> None:
     adrift = np.setdiff1d(island, island[held])
     if len(adrift):
         lost = np.isin(island, adrift)
         fail(
             mesh.path,
             f"{len(adrift)} of {island.max() + 1} islands ({np.count_nonzero(lost)} vertices, the first "
-            f"{np.flatnonzero(lost)[0]}) rest nowhere on the body",
+            f"{np.flatnonzero(lost)[0]}) {otherwise}",
             "every island needs a pinned or tight vertex, or it falls off",
-            "move the garment onto the body, or paint primvars:ssilk:class",
+            todo,
         )
 
 

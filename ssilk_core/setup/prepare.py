@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from .. import events
-from ..assets import CLASS_NAMES, LOOSE, Character, Floats, Garment, ProxyRig, Scene, classes_at
-from .classes import USUAL, hold_levels
+from ..assets import CLASS_NAMES, LOOSE, Character, Floats, Garment, ProxyRig, Scene
+from .classes import USUAL, held_classes, hold_levels
 from .rig import RigOptions, build_rig
 from .weights import WeightOptions, transfer_weights
 
@@ -20,14 +20,16 @@ def prepare_scene(
     rig: ProxyRig | None = None,
     *,
     weight_options: WeightOptions | None = None,
-    tightness: float = USUAL,
+    tightness: float | None = None,
     rig_options: RigOptions | None = None,
     report: events.Reporter = events.silent,
 ) -> Scene:
     """Add the weights, classes and proxies that a garment lacks, and keep those that are authored.
 
     Args:
-        tightness: how much becomes tight of what has no classes, in [0, 1]: nothing, or all.
+        tightness: how much becomes tight, in [0, 1]: nothing, or all. None stands for the usual tightness, and
+            leaves classes that are there. Otherwise those are made again by the garment's levels, and with other
+            classes the rig is, too.
         garment: fitted to the character's bind pose, with or without weights and classes.
         rig: proxies authored for the garment, or None.
         report: receives a message about each thing that is added.
@@ -38,9 +40,18 @@ def prepare_scene(
     classes, levels = garment.classes, garment.levels
     if classes is None:
         levels = _find_levels(character, garment)
-        classes = classes_at(levels, tightness)
+        classes = held_classes(garment.mesh, levels, USUAL if tightness is None else tightness)
         shares = ", ".join(f"{np.mean(classes == value):.0%} {name}" for value, name in enumerate(CLASS_NAMES))
         report(events.Message(f"{garment.mesh.path}: no vertex classes; classified as {shares}"))
+    elif tightness is not None and levels is None:
+        kept = "its classes are kept, whatever the tightness: it has no primvars:ssilk:tightness to make others by"
+        report(events.Message(f"{garment.mesh.path}: {kept}", "warning"))
+    elif tightness is not None:
+        classes = held_classes(garment.mesh, levels, tightness)
+        changed = int(np.count_nonzero(classes != garment.classes))
+        anew = ", so its proxies are placed anew" if changed and rig else ""
+        report(events.Message(f"{garment.mesh.path}: {changed} classes are others at tightness {tightness:g}{anew}"))
+        rig = None if changed else rig
     skin = garment.skin
     if skin is None:
         report(events.Message(f"{garment.mesh.path}: no skinning weights; they are transferred from the body"))

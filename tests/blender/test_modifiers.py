@@ -93,6 +93,27 @@ def test_training_baking_and_playing_say_the_same(bpy, skirt):
     assert set(said) == {f"The modifier 'Cloth' of 'Skirt' moves it in place of what is trained; {REMOVE}."}
 
 
+def test_what_bones_may_be_made_of_is_seen_to_move_what_bones_moved(bpy, skirt):
+    from blender_addon.errors import SetupError
+    from blender_addon.scene.armature import read_joints
+    from blender_addon.scene.baked import need_bakeable
+    from blender_addon.scene.gather import gather
+    from blender_addon.scene.modifiers import need_plain_modifiers
+
+    rig = bpy.data.objects["Rig"]
+    skirt.modifiers.new("Armature", "ARMATURE").object = rig
+    cloth = skirt.modifiers.new("Cloth", "CLOTH")
+    gather(skirt, simulated=True)
+    need_bakeable(skirt, rig, read_joints(rig, skirt), simulated=True)
+    cloth.show_viewport = False  # it would be rendered, and stay on
+    with pytest.raises(SetupError, match=REMOVE):
+        need_plain_modifiers(skirt, simulated=True)
+    cloth.show_viewport = True
+    skirt.modifiers.move(1, 0)
+    with pytest.raises(SetupError, match=REMOVE):
+        need_plain_modifiers(skirt, simulated=True)
+
+
 @pytest.mark.parametrize("kinds", [["SUBSURF"], ["SOLIDIFY", "SUBSURF"], ["DECIMATE"], ["SMOOTH"]])
 def test_the_mesh_beneath_what_refines_it_is_where_bones_move_it(bpy, skirt, kinds):
     from blender_addon.scene.cage import cage_points

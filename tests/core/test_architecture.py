@@ -138,6 +138,48 @@ def test_one_path_leads_to_each_public_name():
     assert past == []
 
 
+def defined(path: Path) -> set[str]:
+    """Return the names that a module has, by its code: where there is no Blender it cannot be imported."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            found.add(node.name)
+        elif isinstance(node, ast.Import | ast.ImportFrom):
+            found |= {(alias.asname or alias.name).split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            found.add(node.id)
+    return found
+
+
+def imported_in_vain(folder: Path) -> list[str]:
+    """Return what modules under a package's folder import from a package of ours that does not have it."""
+    homes = {home.name: home for home in (CORE, USD, folder)}
+    vain = []
+    for path, package in modules(folder):
+        for target in imports(path, package):
+            if target[0] not in homes or len(target) < 2:
+                continue
+            place = homes[target[0]].joinpath(*target[1:-1])
+            if (place / target[-1]).is_dir() or (place / f"{target[-1]}.py").is_file():
+                continue
+            home = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
+            if not home.is_file() or target[-1] not in defined(home):
+                vain.append(f"{path.relative_to(folder.parent)}: {'.'.join(target)}")
+    return vain
+
+
+def test_the_extension_imports_nothing_that_is_not_there(tmp_path):
+    assert imported_in_vain(ADDON) == []
+    package = tmp_path / "extension"
+    package.mkdir()
+    (package / "garment.py").write_text("from .names import HERE\n")
+    (package / "names.py").write_text("HERE = 1\n")
+    code = "from . import garment\nfrom .garment import GONE, HERE\nfrom .lost import HERE\n"
+    (package / "__init__.py").write_text(f"{code}from ssilk_core.errors import fail, gone\n")
+    lost = ("extension.garment.GONE", "extension.lost.HERE", "ssilk_core.errors.gone")
+    assert imported_in_vain(package) == [f"extension/__init__.py: {name}" for name in lost]
+
+
 def test_imports_are_seen_through_relative_names_and_functions(tmp_path):
     code = "from ..errors import fail\nfrom . import sibling\ndef f():\n    import torch.nn\n"
     code += "if TYPE_CHECKING:\n    import pxr\n"

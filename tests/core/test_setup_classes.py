@@ -167,6 +167,39 @@ def test_pins_are_taken_in_place_of_the_band_and_hold_what_is_adrift(trunk):
         Garment(near, pins=np.ones(3))
 
 
+def test_islands_are_held_at_the_tightness_that_is_asked_for(trunk):
+    upper, lower = (tube([0.16, 0.16], [high, high - 0.3], columns=31, rows=9) for high in (1.3, 0.8))
+    count = upper.vertex_count
+    both = Mesh("/Both", np.r_[upper.points, lower.points], np.r_[upper.faces, lower.faces + count])
+    garment = Garment(both, pins=both.points[:, 1] > 1.25)
+    rigging = RigOptions(proxies=0)
+    lost = rf"/Both: 1 of 2 islands \({count} vertices, the first {count}\) are all loose at tightness 0; .*raise"
+    with pytest.raises(SsilkError, match=lost):
+        prepare_scene(trunk, garment, tightness=0.0, rig_options=rigging)
+    found = prepare_scene(trunk, garment, tightness=0.9, rig_options=rigging).garment
+    with pytest.raises(SsilkError, match=lost):
+        prepare_scene(trunk, found, tightness=0.0, rig_options=rigging)
+    far = Mesh("/Both", np.r_[upper.points, lower.points * [3, 1, 3]], both.faces)
+    assert (prepare_scene(trunk, Garment(far, pins=garment.pins), tightness=1.0).classes != LOOSE).all()
+
+
+def test_classes_that_are_there_follow_a_tightness_by_their_levels(trunk):
+    said: list[events.Event] = []
+    mesh = tube([0.16, 0.16, 0.5], [1.1, 0.95, 0.4], columns=31, rows=21)
+    first = prepare_scene(trunk, Garment(mesh), tightness=0.5, rig_options=RigOptions(proxies=2))
+    kept = prepare_scene(trunk, first.garment, first.rig, report=said.append)
+    assert kept.rig is first.rig and said == []
+    again = prepare_scene(trunk, first.garment, first.rig, tightness=0.8, rig_options=RigOptions(proxies=3))
+    np.testing.assert_array_equal(again.classes, classes_at(first.garment.levels, 0.8))
+    assert np.any(again.classes != first.classes) and again.rig.proxy_count == 3
+    same = prepare_scene(trunk, first.garment, first.rig, tightness=0.5)
+    assert same.rig is first.rig
+    painted = Garment(mesh, classes=first.classes)
+    kept = prepare_scene(trunk, painted, first.rig, tightness=0.8, report=said.append)
+    np.testing.assert_array_equal(kept.classes, first.classes)
+    assert kept.rig is first.rig and "no primvars:ssilk:tightness" in said[0].text and said[0].level == "warning"
+
+
 def test_narrow_strips_hang_free_however_close(trunk):
     mesh = tube([0.16, 0.16], [1.1, 0.5])
     row, column = np.divmod(np.arange(len(mesh.points)), 61)
