@@ -9,6 +9,7 @@ from . import overlay, panels, preferences, preflight_properties, properties, tr
 from .operators import (
     baking,
     classes,
+    demo_motions,
     environment,
     fill,
     garments,
@@ -40,6 +41,7 @@ CLASSES = (
     *stages.CLASSES,
     *preflight.CLASSES,
     *training.CLASSES,
+    *demo_motions.CLASSES,
     *baking.CLASSES,
     *to_bones.CLASSES,
     *playback.CLASSES,
