@@ -14,6 +14,7 @@ from .operators import (
     fill,
     garments,
     hiding,
+    make_it_move,
     playback,
     preflight,
     quality_view,
@@ -42,6 +43,7 @@ CLASSES = (
     *preflight.CLASSES,
     *training.CLASSES,
     *demo_motions.CLASSES,
+    *make_it_move.CLASSES,
     *baking.CLASSES,
     *to_bones.CLASSES,
     *playback.CLASSES,
@@ -68,6 +70,7 @@ def register() -> None:
 def unregister() -> None:
     """Stop what runs outside, then remove properties and classes in reverse."""
     tasks.stop()
+    make_it_move.stop()
     overlay.hide()
     quality_view.remove_key()
     heat_updates.stop_listening()

@@ -303,6 +303,7 @@ def watch() -> float:
     if sum(changed(folder) for folder in folders):  # all are asked, so that none is drawn for once more
         tasks.redraw(bpy.context)
     playing.take_up_models()
+    playing.play_what_is_awaited()
     return LOOK
 
 

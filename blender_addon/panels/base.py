@@ -35,12 +35,21 @@ def draw_work(layout: bpy.types.UILayout) -> None:
     """Draw what runs outside, with a button that stops it."""
     work = tasks.current
     if work is None:
+        draw_failure(layout)
         return
     row = layout.row(align=True)
     row.progress(factor=work.fraction or 0.0, text=work.title)
     row.operator("ssilk.cancel", text="", icon="CANCEL")
     if work.text:
         draw_text(layout, work.text)
+
+
+def draw_failure(layout: bpy.types.UILayout) -> None:
+    """Draw why the latest work failed, until it is dismissed or other work begins."""
+    if tasks.failed:
+        row = layout.row()
+        draw_text(row, tasks.failed, icon="ERROR")
+        row.operator("ssilk.dismiss_failure", text="", icon="X")
 
 
 def saying_errors(draw: Callable[[Any, bpy.types.Context], None]) -> Callable[[Any, bpy.types.Context], None]:
