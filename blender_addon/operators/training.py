@@ -26,6 +26,7 @@ from ..scene.follower import leader_of
 from ..scene.garment import armature_of, unusable, unusable_here
 from ..scene.gather import GatheredScene, gather
 from ..scene.handover import MOTIONS, STAGE, hand_over
+from ..scene.mended import look_again
 from ..scene.models import job_of, orphans, relative, trainings, trainings_folder
 from ..scene.motions import FILE, TIMELINE, Source, sources
 from ..scene.objects import Pair
@@ -301,6 +302,9 @@ def watch() -> float:
     things = [thing for thing in bpy.data.objects if thing.type == "MESH"]
     folders = {job.folder for job in known} | {job_of(thing, known) for thing in things} - {None}
     if sum(changed(folder) for folder in folders):  # all are asked, so that none is drawn for once more
+        tasks.redraw(bpy.context)
+    preflight = bpy.context.window_manager.ssilk_preflight
+    if bpy.context.mode == "OBJECT" and look_again(preflight):
         tasks.redraw(bpy.context)
     playing.take_up_models()
     playing.play_what_is_awaited()

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import bpy
 
+from ssilk_core.preflight.finding import format_count
+
 from ..operators.preflight import fixer
 from ..preflight_properties import shown_finding
 from ..scene.garment import unusable
@@ -39,6 +41,8 @@ class PreflightPanel(SidebarPanel, bpy.types.Panel):
         layout.template_list(FindingList.bl_idname, "", preflight, "findings", preflight, "active", rows=4)
         for text in (item.target, item.found, item.why, item.fix):
             draw_text(layout, text)
+        if item.old:
+            draw_text(layout, "It has changed since; inspect again", icon="FILE_REFRESH")
         row = layout.row(align=True)
         row.operator("ssilk.select_finding")
         row.operator(fixer(item) or "ssilk.fix_finding")
@@ -46,5 +50,10 @@ class PreflightPanel(SidebarPanel, bpy.types.Panel):
 
 def line(item: bpy.types.PropertyGroup) -> str:
     """Return a finding in a few words."""
-    words = item.code.replace("-", " ")
-    return f"{len(item.indices)} {words}" if item.indices else words
+    words, noun = item.code.replace("-", " "), {"polygons": "faces"}.get(item.elements, item.elements)
+    if not item.indices:
+        return words
+    counted = format_count(len(item.indices), noun)
+    return f"{counted[: counted.rindex(' ')]} {words[: -len(noun)]}{counted.split()[-1]}" if words.endswith(noun) else (
+        f"{words}: {counted}"
+    )
