@@ -66,8 +66,18 @@ def saying_errors(draw: Callable[[Any, bpy.types.Context], None]) -> Callable[[A
 
 
 class SidebarPanel:
-    """Base of all panels, whose `draw` is `saying_errors`."""
+    """Base of all panels, whose `draw` is `saying_errors`.
+
+    Attributes:
+        section: chapter of the guide that is about the panel.
+    """
+
+    section = ""
 
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
     bl_category = "SSILK"
+
+    def draw_header_preset(self, _: bpy.types.Context) -> None:
+        """Draw a button that opens the guide, at the right end of the panel's header."""
+        self.layout.operator("ssilk.open_guide", text="", icon="HELP", emboss=False).section = self.section

@@ -59,6 +59,7 @@ def draw_orphans(layout: bpy.types.UILayout) -> None:
 class GarmentPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_garment"
     bl_label = "Garment"
+    section = "2-garment"
 
     @saying_errors
     def draw(self, context: bpy.types.Context) -> None:

@@ -25,6 +25,7 @@ class FindingList(bpy.types.UIList):
 class PreflightPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_preflight"
     bl_label = "Preflight"
+    section = "2-garment"
     bl_options = {"DEFAULT_CLOSED"}
 
     @classmethod

@@ -99,6 +99,7 @@ def draw_energies(layout: bpy.types.UILayout, folder: Path, state: JobState) -> 
 class TrainingPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_training"
     bl_label = "Training"
+    section = "5-train"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -122,6 +123,7 @@ class TrainingPanel(SidebarPanel, bpy.types.Panel):
 class EnergiesPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_energies"
     bl_label = "Energies"
+    section = "5-train"
     bl_parent_id = "SSILK_PT_training"
     bl_options = {"DEFAULT_CLOSED"}
 

@@ -67,6 +67,9 @@ def test_the_zip_is_valid_and_holds_what_it_needs(package):
     with zipfile.ZipFile(package) as files:
         names = set(files.namelist())
     sources = {str(path.relative_to(ADDON)) for path in ADDON.rglob("*.py")}
+    pictures = {name for name in names if name.startswith("guide/images/")}
+    assert len(pictures) == 7 and "guide/index.html" in names
+    sources |= {*pictures, "guide/index.html"}
     assert names == {*sources, "LICENSE", "blender_manifest.toml", "wheels/ssilk-0.1.9-py3-none-any.whl"}
 
 
