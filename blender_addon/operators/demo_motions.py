@@ -29,7 +29,7 @@ SHOWN = "walk"  # the motion that the armature plays from then on
 
 
 class AddDemoMotions(tasks.OutsideOperator, bpy.types.Operator):
-    """Give a two-legged character that nothing moves the demo's motions as actions: it walks, runs, jumps and turns"""
+    """Give a two-legged character that nothing moves the demo's motions as actions: it walks, runs, jumps, turns"""
 
     bl_idname = "ssilk.add_demo_motions"
     bl_label = "Add Demo Motions"

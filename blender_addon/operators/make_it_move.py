@@ -64,7 +64,7 @@ class MakeItMove(RefusingOperator, bpy.types.Operator):
     def refusal(cls, context: bpy.types.Context) -> str:
         if reason := tasks.busy() or unusable_here(context):
             return reason
-        if course:
+        if under_way():
             return f"'{course.name}' is under way"
         return "" if bpy.data.filepath else "Save the file first; the training lies beside it"
 
@@ -93,7 +93,7 @@ class StopCourse(ReportingOperator, bpy.types.Operator):
 
     @classmethod
     def refusal(cls, context: bpy.types.Context) -> str:
-        return "" if course or (context.object and context.object.ssilk.awaited) else "Nothing is under way"
+        return "" if under_way() or (context.object and context.object.ssilk.awaited) else "Nothing is under way"
 
     def apply(self, context: bpy.types.Context) -> str:
         stop()
@@ -129,6 +129,11 @@ def go_on() -> float | None:
     return LOOK
 
 
+def under_way() -> bool:
+    """Return whether there are steps to come; none are once another file was opened, with which timers go."""
+    return course is not None and (bpy.app.background or bpy.app.timers.is_registered(go_on))
+
+
 def stop() -> None:
     """Take no further step."""
     global course
@@ -137,7 +142,7 @@ def stop() -> None:
 
 def line(garment: bpy.types.Object) -> str:
     """Return what a garment that is under way waits for; empty where it is not."""
-    if course and course.uid == garment.session_uid:
+    if under_way() and course.uid == garment.session_uid:
         if bpy.context.mode != "OBJECT":
             return "Goes on in Object Mode"
         return f"Step {len(course.begun)} of at most {len(STEPS)}"

@@ -20,10 +20,10 @@ def make(given, made):
     with np.load(given) as joints:
         paths, parents, binds = (joints[name] for name in ("paths", "parents", "binds"))
     motions = training_motions(Skeleton("/", tuple(paths.tolist()), parents, binds, local_transforms(binds, parents)))
-    arrays = {"names": [motion.path for motion in motions], "rates": [motion.fps for motion in motions]}
-    for number, motion in enumerate(motions):
-        arrays |= {f"rotations{number}": motion.rotations, f"translations{number}": motion.translations}
-    np.savez(made, **arrays)
+    rotations = {f"rotations{number}": motion.rotations for number, motion in enumerate(motions)}
+    translations = {f"translations{number}": motion.translations for number, motion in enumerate(motions)}
+    names, rates = [motion.path for motion in motions], [motion.fps for motion in motions]
+    np.savez(made, names=names, rates=rates, **rotations, **translations)
 
 
 if __name__ == "__main__":

@@ -54,7 +54,6 @@ def line(item: bpy.types.PropertyGroup) -> str:
     words, noun = item.code.replace("-", " "), {"polygons": "faces"}.get(item.elements, item.elements)
     if not item.indices:
         return words
-    counted = format_count(len(item.indices), noun)
-    return f"{counted[: counted.rindex(' ')]} {words[: -len(noun)]}{counted.split()[-1]}" if words.endswith(noun) else (
-        f"{words}: {counted}"
-    )
+    number, counted = format_count(len(item.indices), noun).rsplit(" ", 1)
+    kind = words.removesuffix(noun)
+    return f"{words}: {number} {counted}" if kind == words else f"{number} {kind}{counted}"

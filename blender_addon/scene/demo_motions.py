@@ -37,9 +37,7 @@ def read_motions(path: Path) -> list[Motion]:
     ]
 
 
-def channels_of(
-    armature: bpy.types.Object, joints: Joints, motion: Motion
-) -> Iterator[tuple[float, list[Channel]]]:
+def channels_of(armature: bpy.types.Object, joints: Joints, motion: Motion) -> Iterator[tuple[float, list[Channel]]]:
     """Yield of each bone in turn the part that is done, and what moves it: turns, and shifts where it has any."""
     units = scene_units()
     binds, skeleton = units.transforms_from_core(joints.binds), joints.skeleton("/")
@@ -58,9 +56,7 @@ def channels_of(
             yield (done + 1) / len(armature.data.bones), _channels(bone.name, local, STILL * size)
 
 
-def add_action(
-    armature: bpy.types.Object, motion: Motion, channels: list[Channel]
-) -> bpy.types.Action:
+def add_action(armature: bpy.types.Object, motion: Motion, channels: list[Channel]) -> bpy.types.Action:
     """Give an armature an action with the keys of a motion, in the scene's time."""
     return new_action(f"{PREFIX}{motion.path}", armature, FIRST, scene_rate() / motion.fps, channels)
 

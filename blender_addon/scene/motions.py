@@ -60,7 +60,8 @@ def is_still(armature: bpy.types.Object) -> bool:
     above: bpy.types.Object | None = armature
     while above:
         animation = above.animation_data
-        animated = animation and (animation.action or animation.drivers or any(t.strips for t in animation.nla_tracks))
+        tracks = animation.nla_tracks if animation else ()
+        animated = animation and (animation.action or animation.drivers or any(track.strips for track in tracks))
         if animated or above.constraints:
             return False
         above = above.parent

@@ -56,7 +56,8 @@ def test_the_page_in_the_zip_says_what_the_guide_says():
             assert f'id="{slug(line.lstrip("# "))}"' in html
     assert html.count("<img ") == GUIDE.count("![") and html.count("<table>") == GUIDE.count("\n\n|") > 0
     assert "**" not in html and "](" not in html
-    _, _, body = page("a *b* `c<d>` [e](#f)\n\n* one\n  two\n* three\n\n| a | b |\n|---|---|\n| c | d |").partition("<body>")
+    text = "a *b* `c<d>` [e](#f)\n\n* one\n  two\n* three\n\n| a | b |\n|---|---|\n| c | d |"
+    _, _, body = page(text).partition("<body>")
     assert body.split("\n")[1:8] == [
         '<p>a <em>b</em> <code>c&lt;d&gt;</code> <a href="#f">e</a></p>', "<ul>", "<li>one two</li>",
         "<li>three</li>", "</ul>", "<table>", "<tr><td>a</td><td>b</td></tr>",

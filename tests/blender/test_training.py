@@ -90,7 +90,9 @@ def test_motions_are_found_and_choices_stay(ready, rigged):
     track.strips.new("Spin Ö", 100, ready.data.actions["Spin Ö"])
     ready.ops.ssilk.find_motions()
     assert listed(rigged) == [
-        ("TIMELINE", "Timeline", False), ("ACTION", "Spin Ö", True), ("ACTION", "Walk", True),
+        ("TIMELINE", "Timeline", False),
+        ("ACTION", "Spin Ö", True),
+        ("ACTION", "Walk", True),
     ]  # fmt: skip; the strip plays the action as it is
     rigged.ssilk.training.motions[1].use = False
     ready.data.actions.remove(ready.data.actions["Walk"])
