@@ -15,7 +15,10 @@ from typing import Any
 import numpy as np
 
 from ssilk_core.assets import Mesh
-from ssilk_core.preflight.finding import Finding
+from ssilk_core.mesh.topology import edge_use
+from ssilk_core.preflight.finding import Finding, format_count
+
+HOLES = "body-not-watertight"
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,7 @@ def read_findings(
         if file in clips:
             found.append(_on_timeline(finding, clips[file]))
         elif finding.prim:
-            found.append(_on_polygons(finding, meshes[finding.prim]))
+            found.append(on_polygons(finding, meshes[finding.prim]))
         elif finding.elements in {"vertices", "faces"}:
             found += _by_body(finding, bodies)
         else:
@@ -74,7 +77,7 @@ def _on_timeline(finding: Finding, clip: Clip) -> Finding:
     return replace(finding, prim=clip.name)
 
 
-def _on_polygons(finding: Finding, mesh: Mesh) -> Finding:
+def on_polygons(finding: Finding, mesh: Mesh) -> Finding:
     """Return a finding on triangles as one on polygons; on all of them where it names none."""
     if finding.elements != "faces":
         return finding
@@ -90,4 +93,11 @@ def _by_body(finding: Finding, bodies: Mapping[str, Mesh]) -> Iterator[Finding]:
         own = tuple(index - start for index in finding.indices if start <= index < start + size)
         start += size
         if own or not finding.indices:
-            yield _on_polygons(replace(finding, prim=name, indices=own), mesh)
+            found = finding.found if finding.code != HOLES else open_edges(mesh)
+            yield on_polygons(replace(finding, prim=name, indices=own, found=found), mesh)
+
+
+def open_edges(mesh: Mesh) -> str:
+    """Return along how many edges one of several bodies is open."""
+    _, uses = edge_use(mesh.faces)
+    return f"it is open along {format_count(int(np.count_nonzero(uses == 1)), 'edges')}"

@@ -10,6 +10,8 @@ from bpy.props import BoolProperty, CollectionProperty, IntProperty, PointerProp
 
 from ssilk_core.preflight.finding import Finding
 
+from .scene.mended import mark_of
+
 INDICES = "indices"  # custom property: what the finding is about
 
 
@@ -25,11 +27,18 @@ class FindingItem(bpy.types.PropertyGroup):
     fixable: BoolProperty(description="Whether it can be repaired without asking")
     elements: StringProperty(description="What the indices count")
     size: IntProperty(description="How many vertices the object had")
+    mark: StringProperty(description="What differs once the object has changed; empty where it is no mesh")
+    old: BoolProperty(description="Whether the object has changed since")
 
     @property
     def indices(self) -> list[int]:
         """What it is about."""
         return list(self.get(INDICES, ()))
+
+    def take(self, finding: Finding, mark: str) -> None:
+        """Show how many things a finding is about by now."""
+        self.found, self.elements, self[INDICES] = finding.found, finding.elements, finding.indices
+        self.size, self.mark, self.old = size_of(self.target), mark, False
 
 
 class Preflight(bpy.types.PropertyGroup):
@@ -50,7 +59,7 @@ def keep_findings(context: bpy.types.Context, garment: str, findings: Sequence[F
         for name in ("severity", "code", "found", "why", "fix", "fixable", "elements"):
             setattr(item, name, getattr(finding, name))
         item.target, item[INDICES] = finding.prim, finding.indices
-        item.size = size_of(finding.prim)
+        item.size, item.mark = size_of(finding.prim), mark_of(finding.prim)
 
 
 def shown_finding(context: bpy.types.Context) -> FindingItem | None:

@@ -57,7 +57,9 @@ class GarmentSettings(bpy.types.PropertyGroup):
         description="Trained model of the garment; that of its own training when empty",
     )
     live: BoolProperty(description="Whether the garment is played live", options={"HIDDEN"})
+    awaited: BoolProperty(description="Whether it is played as soon as its training has a model", options={"HIDDEN"})
     heat: StringProperty(description="What the heat map shows; empty for none", options={"HIDDEN"})
+    heat_told: StringProperty(description="What the heat map shows in this frame, in words", options={"HIDDEN"})
     heat_red: FloatProperty(description="Value that is red", options={"HIDDEN"})
     training: PointerProperty(type=TrainingSettings, name="Training", description="How the garment is trained")
 

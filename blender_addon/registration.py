@@ -9,10 +9,13 @@ from . import overlay, panels, preferences, preflight_properties, properties, tr
 from .operators import (
     baking,
     classes,
+    demo_motions,
     environment,
     fill,
     garments,
+    help,
     hiding,
+    make_it_move,
     playback,
     preflight,
     quality_view,
@@ -40,6 +43,9 @@ CLASSES = (
     *stages.CLASSES,
     *preflight.CLASSES,
     *training.CLASSES,
+    *demo_motions.CLASSES,
+    *make_it_move.CLASSES,
+    *help.CLASSES,
     *baking.CLASSES,
     *to_bones.CLASSES,
     *playback.CLASSES,
@@ -66,6 +72,7 @@ def register() -> None:
 def unregister() -> None:
     """Stop what runs outside, then remove properties and classes in reverse."""
     tasks.stop()
+    make_it_move.stop()
     overlay.hide()
     quality_view.remove_key()
     heat_updates.stop_listening()

@@ -8,7 +8,7 @@ from bpy.props import BoolProperty, CollectionProperty, EnumProperty, FloatPrope
 
 from ssilk_core.config import PRESETS
 
-from .scene.motions import KINDS
+from .scene.motions import FILE, KINDS
 
 # Paths may begin with "//", the folder of the blend file; Blender wants to be told since 4.5.
 RELATIVE = {"ANIMATABLE", "PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) else {"ANIMATABLE"}
@@ -24,6 +24,11 @@ CHOICES = [(name, name.capitalize(), ABOUT[name]) for name in PRESETS]
 class MotionChoice(bpy.types.PropertyGroup):
     """A motion that can be trained on; its name is that of the action, the strip, or the path of the file."""
 
+    @property
+    def called(self) -> str:
+        """What people call it."""
+        return bpy.path.basename(self.name) if self.kind == FILE else self.name
+
     kind: EnumProperty(name="Kind", items=KINDS)
     track: StringProperty(name="Track", description="NLA track of the strip")
     use: BoolProperty(name="Use", description="Train on this motion", default=True)
@@ -32,7 +37,17 @@ class MotionChoice(bpy.types.PropertyGroup):
 class TrainingSettings(bpy.types.PropertyGroup):
     """Choices for the training of one garment."""
 
+    def listed(self) -> list[bool]:
+        """Return of each motion whether the filter leaves it in the list."""
+        return [self.search.lower() in item.called.lower() for item in self.motions]
+
     motions: CollectionProperty(type=MotionChoice, name="Motions", description="What can be trained on")
+    active: IntProperty(description="The motion that is marked in the list", options={"HIDDEN"})
+    search: StringProperty(
+        name="Filter",
+        description="List only motions with this in their names; All and None then choose among these",
+        options={"TEXTEDIT_UPDATE"},
+    )
     preset: EnumProperty(name="Preset", items=CHOICES, default="preview")
     iterations: IntProperty(
         name="Iterations",

@@ -18,9 +18,12 @@ import sys
 import tempfile
 from pathlib import Path
 
+from guide_page import page
+
 ROOT = Path(__file__).parents[1]
 ADDON, MANIFEST, WHEELS = ROOT / "blender_addon", "blender_manifest.toml", "wheels"
 PROJECT = ("pyproject.toml", "README.md", "LICENSE", "NOTICE", "ssilk_core", "usd/ssilk_usd")
+GUIDE = "docs/artist_guide.md"
 JUNK = shutil.ignore_patterns("__pycache__", ".*")
 NOT_IN_BLENDER = ("ssilk_core/demo/models",)
 
@@ -29,6 +32,7 @@ def stage(target: Path, wheel: Path | None = None) -> None:
     """Write the extension into a folder, in place of what was there."""
     shutil.rmtree(target, ignore_errors=True)
     shutil.copytree(ADDON, target, ignore=JUNK)
+    write_guide(target / "guide")
     wheels = target / WHEELS
     wheels.mkdir()
     if wheel is None:
@@ -41,6 +45,15 @@ def stage(target: Path, wheel: Path | None = None) -> None:
     if not table:
         raise SystemExit(f"{manifest}: no table [permissions]; the list of wheels goes before it.")
     manifest.write_text(f"{own}wheels = [{listed}]\n{table}{rest}", encoding="utf-8")
+
+
+def write_guide(folder: Path) -> None:
+    """Write the artist guide as a page with its pictures."""
+    text = (ROOT / GUIDE).read_text(encoding="utf-8")
+    (folder / "images").mkdir(parents=True)
+    (folder / "index.html").write_text(page(text), encoding="utf-8")
+    for name in re.findall(r"\(images/([^)]+)\)", text):
+        shutil.copy(ROOT / "docs" / "images" / name, folder / "images")
 
 
 def build_wheel(folder: Path) -> None:

@@ -9,6 +9,8 @@ from pathlib import Path
 import bpy
 import numpy as np
 
+from ssilk_core.preflight.finding import format_count
+
 from ..errors import SetupError
 from ..findings import Clip, read_findings
 from ..outside.work import Work
@@ -19,6 +21,7 @@ from ..scene.checks import SCALE, scene_findings
 from ..scene.garment import armature_of
 from ..scene.gather import gather
 from ..scene.handover import MOTIONS, REPAIRED, hand_over, inspect_command, loading_usd
+from ..scene.mended import look_again
 from ..scene.objects import Pair
 from ..scene.repairs import REPAIRS, apply_scale, move_points, repair_mesh
 from ..scene.selecting import select_bones, select_elements
@@ -90,7 +93,9 @@ class Inspect(InspectOperator, bpy.types.Operator):
         keep_findings(context, self.handover.name, findings)
         bad = sum(finding.severity != "info" for finding in findings)
         return (
-            f"{bad} findings on '{self.handover.name}'." if bad else f"Nothing is wrong with '{self.handover.name}'."
+            f"{format_count(bad, 'findings')} on '{self.handover.name}'."
+            if bad
+            else f"Nothing is wrong with '{self.handover.name}'."
         )
 
 
@@ -142,9 +147,9 @@ class FixFinding(ReportingOperator, bpy.types.Operator):
             apply_scale(thing)
         else:
             repair_mesh(thing, item.code, item.indices)
-        told = f"'{thing.name}' is repaired; inspect it again."
         forget(context)
-        return told
+        look_again(context.window_manager.ssilk_preflight)
+        return f"'{thing.name}' is repaired; inspect it again."
 
 
 class PushOut(InspectOperator, bpy.types.Operator):

@@ -15,6 +15,7 @@ from .reporting import RefusingOperator
 
 INTERVAL = 0.1  # seconds between two looks at a running work
 current: Work | None = None
+failed = ""  # why the latest work failed, for panels; empty where it did not
 
 
 class OutsideOperator(RefusingOperator):
@@ -77,17 +78,19 @@ class OutsideOperator(RefusingOperator):
             self._leave(context)
 
     def _begin(self, context: bpy.types.Context) -> bool:
-        global current
+        global current, failed
         try:
             self.work = self.prepare(context)
         except SsilkError as error:
-            self.report({"ERROR"}, str(error))
+            failed = str(error)
+            self.report({"ERROR"}, failed)
             return False
-        current = self.work
+        current, failed = self.work, ""
         return True
 
     def _end(self, context: bpy.types.Context) -> set[str]:
         """Report how the work ended, with what it made."""
+        global failed
         work = self.work
         try:
             reason = work.error and self.explain(work)
@@ -95,6 +98,7 @@ class OutsideOperator(RefusingOperator):
                 raise SetupError(reason)
             self.report({"INFO"}, self.finish(context, work))
         except SsilkError as error:
+            failed = "" if work.cancelled else str(error)
             self.report({"WARNING" if work.cancelled else "ERROR"}, str(error))
             return {"CANCELLED"}
         finally:
@@ -121,7 +125,8 @@ def busy() -> str:
 
 def stop() -> None:
     """Stop what runs, for good."""
-    global current
+    global current, failed
+    failed = ""
     if current:
         current.close()
         current = None
@@ -150,4 +155,17 @@ class CancelWork(RefusingOperator, bpy.types.Operator):
         return {"FINISHED"}
 
 
-CLASSES = (CancelWork,)
+class DismissFailure(RefusingOperator, bpy.types.Operator):
+    """Take this message away"""
+
+    bl_idname = "ssilk.dismiss_failure"
+    bl_label = "Dismiss"
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        global failed
+        failed = ""
+        redraw(context)
+        return {"FINISHED"}
+
+
+CLASSES = (CancelWork, DismissFailure)

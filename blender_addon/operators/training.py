@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import bpy
-from bpy.props import CollectionProperty, IntProperty, StringProperty
+from bpy.props import CollectionProperty, EnumProperty, IntProperty, StringProperty
 
 from ssilk_core.assets import LOOSE
 
@@ -26,8 +26,9 @@ from ..scene.follower import leader_of
 from ..scene.garment import armature_of, unusable, unusable_here
 from ..scene.gather import GatheredScene, gather
 from ..scene.handover import MOTIONS, STAGE, hand_over
+from ..scene.mended import look_again
 from ..scene.models import job_of, orphans, relative, trainings, trainings_folder
-from ..scene.motions import FILE, Source, sources
+from ..scene.motions import FILE, TIMELINE, Source, sources
 from ..scene.objects import Pair
 from ..scene.takes import ChosenMotions
 from . import tasks
@@ -57,13 +58,15 @@ class FindMotions(MotionOperator, bpy.types.Operator):
         garment = context.object
         armature = leader_of(armature_of(garment))
         found = sources(armature)
-        motions = garment.ssilk.training.motions
+        settings = garment.ssilk.training
+        motions = settings.motions
         used = {(item.kind, item.name, item.track): item.use for item in motions}
         files = [item.name for item in motions if item.kind == FILE]
         motions.clear()
         for source in (*found, *(Source(FILE, path) for path in files)):
             key = (source.kind, source.name, source.track)
-            add_motion(garment, source).use = used.get(key, source.kind != "TIMELINE" or len(found) == 1)
+            add_motion(garment, source).use = used.get(key, source.kind != TIMELINE or len(found) == 1)
+        settings.active, settings.search = 0, ""
         count = len(found) - 1
         return f"'{armature.name}' has {count} motion{'' if count == 1 else 's'} besides the timeline."
 
@@ -108,6 +111,30 @@ class RemoveMotion(MotionOperator, bpy.types.Operator):
         if self.index >= len(motions):
             raise SetupError(f"There are only {len(motions)} motions.")
         motions.remove(self.index)
+        return ""
+
+
+class ChooseMotions(MotionOperator, bpy.types.Operator):
+    """Choose all motions that are listed, or none of them"""
+
+    bl_idname = "ssilk.choose_motions"
+    bl_label = "Choose Motions"
+
+    value: EnumProperty(
+        name="Choose",
+        items=[("ALL", "All", "Train on all that are listed"), ("NONE", "None", "Train on none of them")],
+    )
+
+    @classmethod
+    def refusal(cls, context: bpy.types.Context) -> str:
+        if reason := super().refusal(context):
+            return reason
+        return "" if context.object.ssilk.training.motions else "There are no motions; find some first"
+
+    def apply(self, context: bpy.types.Context) -> str:
+        settings = context.object.ssilk.training
+        for item, listed in zip(settings.motions, settings.listed()):
+            item.use = self.value == "ALL" if listed else item.use
         return ""
 
 
@@ -278,7 +305,11 @@ def watch() -> float:
     fresh = [models.look_for_orphans(known), *map(changed, folders)]  # all are asked, so that none is drawn once more
     if any(fresh):
         tasks.redraw(bpy.context)
+    preflight = bpy.context.window_manager.ssilk_preflight
+    if bpy.context.mode == "OBJECT" and look_again(preflight):
+        tasks.redraw(bpy.context)
     playing.take_up_models()
+    playing.play_what_is_awaited()
     return LOOK
 
 
@@ -298,4 +329,6 @@ def stop_watching(context: bpy.types.Context) -> None:
     begun.clear()
 
 
-CLASSES = (FindMotions, AddMotionFiles, RemoveMotion, Train, CancelTraining, CancelOrphan, ResumeTraining)
+CLASSES = (
+    FindMotions, AddMotionFiles, RemoveMotion, ChooseMotions, Train, CancelTraining, CancelOrphan, ResumeTraining,
+)  # fmt: skip

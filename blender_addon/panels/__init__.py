@@ -11,16 +11,18 @@ from .playback import PlaybackPanel
 from .preflight import FindingList, PreflightPanel
 from .quality import QualityPanel
 from .rig import RigPanel
-from .training import TrainingPanel
+from .training import EnergiesPanel, MotionList, TrainingPanel
 
 CLASSES = (
     FindingList,
+    MotionList,
     GarmentPanel,
     FabricPanel,
     PreflightPanel,
     ClassesPanel,
     RigPanel,
     TrainingPanel,
+    EnergiesPanel,
     BakingPanel,
     PlaybackPanel,
     QualityPanel,

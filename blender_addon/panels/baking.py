@@ -22,6 +22,7 @@ def model_line(garment: bpy.types.Object) -> str:
 class BakingPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_baking"
     bl_label = "Baking"
+    section = "6-bake"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:

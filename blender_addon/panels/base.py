@@ -35,12 +35,21 @@ def draw_work(layout: bpy.types.UILayout) -> None:
     """Draw what runs outside, with a button that stops it."""
     work = tasks.current
     if work is None:
+        draw_failure(layout)
         return
     row = layout.row(align=True)
     row.progress(factor=work.fraction or 0.0, text=work.title)
     row.operator("ssilk.cancel", text="", icon="CANCEL")
     if work.text:
         draw_text(layout, work.text)
+
+
+def draw_failure(layout: bpy.types.UILayout) -> None:
+    """Draw why the latest work failed, until it is dismissed or other work begins."""
+    if tasks.failed:
+        row = layout.row()
+        draw_text(row, tasks.failed, icon="ERROR")
+        row.operator("ssilk.dismiss_failure", text="", icon="X")
 
 
 def saying_errors(draw: Callable[[Any, bpy.types.Context], None]) -> Callable[[Any, bpy.types.Context], None]:
@@ -57,8 +66,18 @@ def saying_errors(draw: Callable[[Any, bpy.types.Context], None]) -> Callable[[A
 
 
 class SidebarPanel:
-    """Base of all panels, whose `draw` is `saying_errors`."""
+    """Base of all panels, whose `draw` is `saying_errors`.
+
+    Attributes:
+        section: chapter of the guide that is about the panel.
+    """
+
+    section = ""
 
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
     bl_category = "SSILK"
+
+    def draw_header_preset(self, _: bpy.types.Context) -> None:
+        """Draw a button that opens the guide, at the right end of the panel's header."""
+        self.layout.operator("ssilk.open_guide", text="", icon="HELP", emboss=False).section = self.section

@@ -27,6 +27,7 @@ def class_counts(thing: bpy.types.Object) -> tuple[int, int, int] | None:
 class ClassesPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_classes"
     bl_label = "Classes"
+    section = "3-classes"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:

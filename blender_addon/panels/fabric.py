@@ -15,6 +15,7 @@ CONTACT = {"surface": ("contact", "loose_contact"), "vertex": ("collision",)}  #
 class FabricPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_fabric"
     bl_label = "Fabric"
+    section = "2-garment"
     bl_parent_id = "SSILK_PT_garment"
     bl_options = {"DEFAULT_CLOSED"}
 

@@ -6,9 +6,12 @@ from __future__ import annotations
 import bpy
 
 from ..errors import SetupError
+from ..operators import make_it_move
+from ..outside.jobs import read_state
+from ..outside.report import progress
 from ..preferences import unready
 from ..scene.garment import armature_of, garments_of, unusable
-from ..scene.models import orphans
+from ..scene.models import job_of, orphans
 from .base import SidebarPanel, draw_text, draw_work, saying_errors
 
 
@@ -26,6 +29,22 @@ def draw_garments(layout: bpy.types.UILayout, shown: bpy.types.Object) -> None:
         chosen.garment = garment.name
 
 
+def draw_course(layout: bpy.types.UILayout, garment: bpy.types.Object) -> None:
+    """Draw the button that does all at once, what it waits for, and how the training is."""
+    layout.operator("ssilk.make_it_move", icon="PLAY")
+    waits = make_it_move.line(garment)
+    if waits:
+        row = layout.row()
+        draw_text(row, waits, icon="TIME")
+        row.operator("ssilk.stop_course", text="", icon="X")
+    folder = job_of(garment)
+    state = folder and read_state(folder)
+    if state and state.state == "failed":
+        draw_text(layout, f"Training: {state.error}", icon="ERROR")
+    elif state and state.alive:
+        draw_text(layout, f"Training: {progress(state)}", icon="INFO")
+
+
 def draw_orphans(layout: bpy.types.UILayout) -> None:
     """Draw the file's trainings that go on for garments which are not in it any more, each to be cancelled."""
     for orphan in orphans():
@@ -39,6 +58,7 @@ def draw_orphans(layout: bpy.types.UILayout) -> None:
 class GarmentPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_garment"
     bl_label = "Garment"
+    section = "2-garment"
 
     @saying_errors
     def draw(self, context: bpy.types.Context) -> None:
@@ -50,6 +70,7 @@ class GarmentPanel(SidebarPanel, bpy.types.Panel):
             layout.use_property_split = True
             layout.prop(context.object.ssilk, "armature")
             layout.prop(context.object.ssilk, "bodies")
+            draw_course(layout, context.object)
             draw_garments(layout, context.object)
         missing = unready(context)
         if missing:

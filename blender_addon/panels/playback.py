@@ -23,6 +23,7 @@ def live_line(garment: bpy.types.Object) -> str:
 class PlaybackPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_playback"
     bl_label = "Live Playback"
+    section = "7-look"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import bpy
 
+from ssilk_core.preflight.finding import format_count
+
 from ..operators.preflight import fixer
 from ..preflight_properties import shown_finding
 from ..scene.garment import unusable
@@ -23,6 +25,7 @@ class FindingList(bpy.types.UIList):
 class PreflightPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_preflight"
     bl_label = "Preflight"
+    section = "2-garment"
     bl_options = {"DEFAULT_CLOSED"}
 
     @classmethod
@@ -39,6 +42,8 @@ class PreflightPanel(SidebarPanel, bpy.types.Panel):
         layout.template_list(FindingList.bl_idname, "", preflight, "findings", preflight, "active", rows=4)
         for text in (item.target, item.found, item.why, item.fix):
             draw_text(layout, text)
+        if item.old:
+            draw_text(layout, "It has changed since; inspect again", icon="FILE_REFRESH")
         row = layout.row(align=True)
         row.operator("ssilk.select_finding")
         row.operator(fixer(item) or "ssilk.fix_finding")
@@ -46,5 +51,9 @@ class PreflightPanel(SidebarPanel, bpy.types.Panel):
 
 def line(item: bpy.types.PropertyGroup) -> str:
     """Return a finding in a few words."""
-    words = item.code.replace("-", " ")
-    return f"{len(item.indices)} {words}" if item.indices else words
+    words, noun = item.code.replace("-", " "), {"polygons": "faces"}.get(item.elements, item.elements)
+    if not item.indices:
+        return words
+    number, counted = format_count(len(item.indices), noun).rsplit(" ", 1)
+    kind = words.removesuffix(noun)
+    return f"{words}: {number} {counted}" if kind == words else f"{number} {kind}{counted}"

@@ -9,7 +9,7 @@ from ..scene.garment import unusable
 from ..scene.heat import PENETRATION, PUSHED_OUT, SKIN, STRETCH
 from ..scene.lbs_copy import find_copy
 from ..scene.repairs import DISPLACEMENT
-from .base import SidebarPanel, saying_errors
+from .base import SidebarPanel, draw_text, saying_errors
 
 
 def draw_kind(layout: bpy.types.UILayout, kind: str, text: str) -> None:
@@ -22,6 +22,7 @@ def draw_kind(layout: bpy.types.UILayout, kind: str, text: str) -> None:
 class QualityPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_quality"
     bl_label = "Quality"
+    section = "7-look"
     bl_options = {"DEFAULT_CLOSED"}
 
     @classmethod
@@ -36,6 +37,8 @@ class QualityPanel(SidebarPanel, bpy.types.Panel):
         draw_kind(layout, STRETCH, text="Show Stretch")
         if DISPLACEMENT in context.object.data.attributes:
             layout.operator("ssilk.show_heat", text="Show Pushed Out", icon="SHADING_RENDERED").kind = PUSHED_OUT
+        if context.object.ssilk.heat_told:
+            draw_text(layout, context.object.ssilk.heat_told, icon="INFO")
         row = layout.row(align=True)
         if context.object.ssilk.heat:
             row.operator("ssilk.hide_heat")

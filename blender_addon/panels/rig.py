@@ -30,6 +30,7 @@ def rig_line(garment: bpy.types.Object) -> str:
 class RigPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_rig"
     bl_label = "Proxy Rig"
+    section = "4-proxy-rig"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:

@@ -19,6 +19,7 @@ from .base import SidebarPanel, draw_text, saying_errors
 from .plot import plot, swatch
 
 ICONS = {"TIMELINE": "TIME", "ACTION": "ACTION", "STRIP": "NLA", "FILE": "FILE"}
+FEWEST_ROWS, MOST_ROWS = 3, 8  # of the list of motions
 PLOT_SCALE = 8.0  # in heights of a line of text
 _stamps: dict[Path, float] = {}
 
@@ -38,22 +39,41 @@ def has_proxies(garment: bpy.types.Object) -> bool:
         return False
 
 
-def draw_motions(layout: bpy.types.UILayout, garment: bpy.types.Object) -> None:
-    """Draw the list of motions, each to be chosen or left."""
-    column = layout.column(align=True)
-    for index, item in enumerate(garment.ssilk.training.motions):
-        row = column.row(align=True)
-        name = bpy.path.basename(item.name) if item.kind == FILE else item.name
-        row.prop(item, "use", text=name, icon=ICONS[item.kind])
+class MotionList(bpy.types.UIList):
+    bl_idname = "SSILK_UL_motions"
+
+    def draw_item(self, _context, layout, _data, item, _icon, _active, _property, index=0) -> None:  # type: ignore[no-untyped-def]
+        row = layout.row(align=True)
+        row.prop(item, "use", text="")
+        row.label(text=item.called, icon=ICONS[item.kind], translate=False)
         if item.kind == FILE:
             row.operator("ssilk.remove_motion", text="", icon="X").index = index
+
+    def draw_filter(self, _context, _layout) -> None:  # type: ignore[no-untyped-def]
+        """Draw nothing: the filter stands above the list, where it is seen."""
+
+    def filter_items(self, _context, data, _property) -> tuple[list[int], list[int]]:  # type: ignore[no-untyped-def]
+        return [self.bitflag_filter_item if listed else 0 for listed in data.listed()], []
+
+
+def draw_motions(layout: bpy.types.UILayout, garment: bpy.types.Object) -> None:
+    """Draw the list of motions, each to be chosen or left."""
+    settings = garment.ssilk.training
+    if count := len(settings.motions):
+        layout.prop(settings, "search", text="", icon="VIEWZOOM")
+        rows = min(max(count, FEWEST_ROWS), MOST_ROWS)
+        layout.template_list(MotionList.bl_idname, "", settings, "motions", settings, "active", rows=rows)
+        row = layout.row(align=True)
+        row.operator("ssilk.choose_motions", text="All").value = "ALL"
+        row.operator("ssilk.choose_motions", text="None").value = "NONE"
+        row.label(text=f"{sum(item.use for item in settings.motions)} of {count}", translate=False)
     column = layout.column(align=True)  # side by side their German names would be cut
     column.operator("ssilk.find_motions", icon="FILE_REFRESH")
     column.operator("ssilk.add_motion_files", icon="FILE_FOLDER")
 
 
 def draw_state(layout: bpy.types.UILayout, folder: Path, state: JobState, *, moves: bool) -> None:
-    """Draw how far a training is, what it found, and its energies."""
+    """Draw how far a training is, and what it found."""
     row = layout.row(align=True)
     row.progress(factor=state.fraction, text=f"{state.done} of {state.total}" if state.total else "")
     if state.alive:
@@ -63,8 +83,13 @@ def draw_state(layout: bpy.types.UILayout, folder: Path, state: JobState, *, mov
     draw_text(layout, progress(state), icon="NONE" if state.alive or state.state == "done" else "INFO")
     for text, warns in findings(state, read_curve(folder), moves=moves):
         draw_text(layout, text, icon="ERROR" if warns else "NONE")
+
+
+def draw_energies(layout: bpy.types.UILayout, folder: Path, state: JobState) -> None:
+    """Draw the energies of a training over its iterations."""
     lines = series(state.curve)
     if not lines:
+        layout.label(text="Nothing was computed yet")
         return
     layout.template_icon(icon_value=plot(str(folder), stamp(folder), list(lines.values())), scale=PLOT_SCALE)
     for index, (name, values) in enumerate(lines.items()):
@@ -74,6 +99,7 @@ def draw_state(layout: bpy.types.UILayout, folder: Path, state: JobState, *, mov
 class TrainingPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_training"
     bl_label = "Training"
+    section = "5-train"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -92,3 +118,23 @@ class TrainingPanel(SidebarPanel, bpy.types.Panel):
         state = folder and read_state(folder)
         if state:
             draw_state(layout, folder, state, moves=has_proxies(garment))
+
+
+class EnergiesPanel(SidebarPanel, bpy.types.Panel):
+    bl_idname = "SSILK_PT_energies"
+    bl_label = "Energies"
+    section = "5-train"
+    bl_parent_id = "SSILK_PT_training"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        folder = None if unusable(context.object) else job_of(context.object)
+        return bool(folder and read_state(folder))
+
+    @saying_errors
+    def draw(self, context: bpy.types.Context) -> None:
+        folder = job_of(context.object)
+        state = folder and read_state(folder)
+        if state:
+            draw_energies(self.layout, folder, state)

@@ -11,7 +11,7 @@ from .armature import is_evenly_scaled
 from .garment import armature_of
 from .modifiers import objections
 
-SCALE = "unequal-scale"
+SCALE, MODIFIER = "unequal-scale", "shaping-modifier"
 
 
 def scene_findings(garment: bpy.types.Object) -> list[Finding]:
@@ -28,7 +28,7 @@ def scene_findings(garment: bpy.types.Object) -> list[Finding]:
         ))  # fmt: skip
     found += [
         Finding(
-            severity="error", code="shaping-modifier", prim=garment.name,
+            severity="error", code=MODIFIER, prim=garment.name,
             found=f"its modifier '{objection.modifier}' {objection.does}",
             why="what is trained are the vertices of its mesh, which bones move", fix=objection.todo,
         )

@@ -69,7 +69,7 @@ def gather(
     things = [garment, *bodies_of(garment, armature)]
     paths = [f"{ROOT}/{name}" for name in identifiers((thing.name for thing in things), taken=(SKELETON,))]
     lbs = own_weights(armature, garment, joints)
-    mesh = _read_mesh(garment, garment.data, paths[0])
+    mesh = read_mesh(garment, garment.data, paths[0])
     rig = _proxy_rig(armature, garment, joints, paths[0]) if proxies and joints.proxy_count else None
     bodies = [_read_body(thing, armature, joints.character, path) for thing, path in zip(things[1:], paths[1:])]
     return GatheredScene(
@@ -154,7 +154,7 @@ def _bound(
     bare = int(np.count_nonzero(~weights.any(axis=1)))
     if bare:
         raise SetupError(f"{bare} of {len(weights)} vertices of '{thing.name}' have no bone's weight; paint these.")
-    return Body(_read_mesh(thing, mesh, path), SkinWeights.from_dense(path, weights))
+    return Body(read_mesh(thing, mesh, path), SkinWeights.from_dense(path, weights))
 
 
 @contextmanager
@@ -168,7 +168,8 @@ def _at_rest(armature: bpy.types.Object) -> Iterator[bpy.types.Depsgraph]:
         armature.data.pose_position = before
 
 
-def _read_mesh(thing: bpy.types.Object, mesh: bpy.types.Mesh, path: str) -> Mesh:
+def read_mesh(thing: bpy.types.Object, mesh: bpy.types.Mesh, path: str) -> Mesh:
+    """Return a mesh of an object at its place at rest, as the core has it."""
     world = np.array(rest_world(thing))
     points = _values(mesh.vertices, "co", 3).reshape(-1, 3) @ world[:3, :3].T + world[:3, 3]
     counts = _values(mesh.polygons, "loop_total", 1, np.int32)

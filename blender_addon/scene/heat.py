@@ -27,6 +27,7 @@ from .repairs import displacements
 from .shapes import mixed_points, rest_points
 
 ATTRIBUTE = "SSILK Heat"
+IN_FRONT_BEFORE = "ssilk_in_front"  # custom property of a garment that is drawn over the skin: whether it was before
 ACTIVE_BEFORE = "ssilk_active_color"  # custom property of a coloured mesh: its active colour attribute before
 PENETRATION, STRETCH, SKIN, PUSHED_OUT = "PENETRATION", "STRETCH", "SKIN", "PUSHED_OUT"
 CHUNK = 1000  # vertices at a time
@@ -124,6 +125,8 @@ def showing(garment: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Iterat
 def show(garment: bpy.types.Object, measured: HeatMap, red: float) -> None:
     """Colour a garment, or for SKIN its bodies, by what was measured, and again at each frame from now on.
 
+    For PENETRATION the garment is drawn over the skin in which it lies.
+
     Args:
         red: the value that is red, in metres or as a share.
 
@@ -134,12 +137,16 @@ def show(garment: bpy.types.Object, measured: HeatMap, red: float) -> None:
         raise SetupError(f"'{garment.name}' was edited while it was measured; look again.")
     hide(garment)
     garment.ssilk.heat, garment.ssilk.heat_red = measured.kind, red
+    if measured.kind == PENETRATION:
+        garment[IN_FRONT_BEFORE], garment.show_in_front = garment.show_in_front, True
     _paint(garment, measured, red)
 
 
 def hide(garment: bpy.types.Object) -> None:
     """Remove the colours of a garment, and those that it gave its bodies."""
-    kind, garment.ssilk.heat = garment.ssilk.heat, ""
+    kind, garment.ssilk.heat, garment.ssilk.heat_told = garment.ssilk.heat, "", ""
+    if IN_FRONT_BEFORE in garment:
+        garment.show_in_front = garment.pop(IN_FRONT_BEFORE)
     for thing in (garment, *(_coloured(garment, kind) if kind == SKIN else ())):
         colors, before = thing.data.color_attributes, thing.data.pop(ACTIVE_BEFORE, "")
         if ATTRIBUTE in colors:
@@ -163,6 +170,7 @@ def _fits(garment: bpy.types.Object, measured: HeatMap) -> bool:
 
 
 def _paint(garment: bpy.types.Object, measured: HeatMap, red: float) -> None:
+    garment.ssilk.heat_told = measured.summary()
     colors = heat.colors_of(measured.values, red).astype(np.float32)
     for thing in _coloured(garment, measured.kind):
         mesh, count = thing.data, len(thing.data.vertices)

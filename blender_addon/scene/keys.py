@@ -101,6 +101,20 @@ def bake_keys(garment: bpy.types.Object, start: int, moved: Sequence[tuple[Any, 
         bag.play_on(track, start, start + len(channels[0].values) - 1)
 
 
+def new_action(name: str, thing: Any, start: float, step: float, channels: Sequence[Channel]) -> bpy.types.Action:
+    """Return a new action that moves a thing, and stays in the file though nothing plays it.
+
+    Args:
+        start, step: the frame of the first key, and how many frames lie between two.
+    """
+    action = bpy.data.actions.new(name)
+    action.use_fake_user = True
+    bag = _Bag(action, thing)
+    for channel in channels:
+        _write(bag.new_curve(channel), start, channel.values, step)
+    return action
+
+
 def remove_keys(garment: bpy.types.Object, things: Sequence[Any]) -> None:
     """Remove what was baked for a garment from the animation of objects and shape keys."""
     for thing in things:
@@ -164,8 +178,8 @@ class _Bag:
             strip.action_slot = self.slot
 
 
-def _write(curve: bpy.types.FCurve, start: int, values: np.ndarray) -> None:
-    points = np.stack([start + np.arange(len(values)), values], axis=1).astype(np.float32)
+def _write(curve: bpy.types.FCurve, start: float, values: np.ndarray, step: float = 1.0) -> None:
+    points = np.stack([start + step * np.arange(len(values)), values], axis=1).astype(np.float32)
     curve.keyframe_points.add(len(values))
     curve.keyframe_points.foreach_set("co", points.reshape(-1))
     curve.keyframe_points.foreach_set("interpolation", np.full(len(values), LINEAR, dtype=np.int32))

@@ -37,7 +37,7 @@ class Source:
 
 
 def sources(armature: bpy.types.Object) -> list[Source]:
-    """Return all motions of an armature except baked ones."""
+    """Return all motions of an armature except baked ones; a strip that plays an action as it is counts as that."""
     if armature.library:  # of which nothing can be changed, not even for a moment
         return [Source(TIMELINE, "Timeline")]
     bones = set(armature.pose.bones.keys())
@@ -45,11 +45,27 @@ def sources(armature: bpy.types.Object) -> list[Source]:
     tracks = armature.animation_data.nla_tracks if armature.animation_data else ()
     strips = [(track, strip) for track in tracks for strip in track.strips]
     own = [(track, strip) for track, strip in strips if not (strip.action and is_baked(strip.action))]
+    own = [(track, strip) for track, strip in own if not (strip.action in actions and _plays_as_it_is(strip))]
     return [
         Source(TIMELINE, "Timeline"),
         *(Source(ACTION, action.name) for action in actions),
         *(Source(STRIP, strip.name, track.name) for track, strip in own),
     ]
+
+
+def is_still(armature: bpy.types.Object) -> bool:
+    """Return whether nothing moves an armature: neither animation, nor drivers, nor constraints."""
+    if armature.library or any(bone.constraints for bone in armature.pose.bones):
+        return False
+    above: bpy.types.Object | None = armature
+    while above:
+        animation = above.animation_data
+        tracks = animation.nla_tracks if animation else ()
+        animated = animation and (animation.action or animation.drivers or any(track.strips for track in tracks))
+        if animated or above.constraints:
+            return False
+        above = above.parent
+    return True
 
 
 def frames_of(armature: bpy.types.Object, source: Source) -> range:
@@ -86,7 +102,7 @@ def playing(armature: bpy.types.Object, source: Source) -> Iterator[None]:
     try:
         if source.kind == ACTION:
             animation.use_nla = False
-            _assign(animation, _action(source))
+            assign(animation, _action(source))
         else:
             _play_alone(animation, _strip(armature, source))
         yield
@@ -100,6 +116,15 @@ def playing(armature: bpy.types.Object, source: Source) -> Iterator[None]:
 
 def _moves(action: bpy.types.Action, bones: set[str]) -> bool:
     return any(_bone(curve.data_path) in bones for curve in curves_of(action))
+
+
+def _plays_as_it_is(strip: bpy.types.NlaStrip) -> bool:
+    """Return whether a strip plays the whole of its action, once, forwards, at its own speed, and in full."""
+    whole = (strip.action_frame_start, strip.action_frame_end) == tuple(strip.action.frame_range)
+    plain = (strip.scale, strip.repeat) == (1.0, 1.0) and strip.blend_type == "REPLACE"
+    changed = strip.use_reverse or strip.use_animated_influence or strip.use_animated_time or strip.modifiers
+    faded = strip.blend_in or strip.blend_out or strip.use_auto_blend
+    return whole and plain and not (changed or faded)
 
 
 def _bone(path: str) -> str:
@@ -122,7 +147,8 @@ def _strip(armature: bpy.types.Object, source: Source) -> bpy.types.NlaStrip:
         raise SetupError(text) from error
 
 
-def _assign(animation: bpy.types.AnimData, action: bpy.types.Action) -> None:
+def assign(animation: bpy.types.AnimData, action: bpy.types.Action) -> None:
+    """Play an action, by the slot that suits."""
     animation.action = action
     if SLOTS and animation.action_slot is None and animation.action_suitable_slots:
         animation.action_slot = animation.action_suitable_slots[0]

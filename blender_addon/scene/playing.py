@@ -11,8 +11,9 @@ from bpy.app.handlers import persistent
 
 from ssilk_core.errors import SsilkError
 
+from ..outside.jobs import MODEL, read_state
 from .live import Live
-from .models import model_of
+from .models import job_of, model_of
 
 PATIENCE = 0.3  # seconds after an edit before the motion is read again
 BETWEEN = 0.01  # seconds between two slices of reading, for the artist
@@ -64,6 +65,22 @@ def take_up_models() -> None:
         if played.renewed and played.done is None and _attempt(uid, played.ready):
             _attempt(uid, played.refresh)
             _read_soon(0.0)
+
+
+def play_what_is_awaited() -> None:
+    """Play the garments that wait for the first model of their training; in object mode."""
+    if bpy.context.mode != "OBJECT":
+        return
+    for garment in bpy.data.objects:
+        if not garment.ssilk.awaited or garment.name not in bpy.context.scene.objects:
+            continue
+        job = job_of(garment)
+        state = job and read_state(job)
+        if job and (job / MODEL).is_file():
+            garment.ssilk.awaited = False
+            _attempt(garment.session_uid, play, garment)
+        elif not (state and state.alive):  # it ended before there was a model, and the panel says why
+            garment.ssilk.awaited = False
 
 
 def start_listening() -> None:

@@ -205,7 +205,39 @@ WORDS = {
         "Eine bekleidete Figur importieren, die `ssilk rig` schrieb, mit Stellvertretern und Bildrate"
     ),
     "USD file that ssilk wrote": "USD-Datei, die ssilk schrieb",
+    # All at once, help, failures
+    "Make It Move": "In Bewegung setzen",
+    "Classify, rig, choose motions, train what fits the device, and play it live as soon as there is a model": (
+        "Klassen finden, Rig erzeugen, Bewegungen wählen, trainieren, was zum Gerät passt, und live spielen, sobald "
+        "es ein Modell gibt"
+    ),
+    "Stop Here": "Hier aufhören",
+    "Take no further step; what was done stays, and a training goes on": (
+        "Keinen weiteren Schritt tun; was getan ist, bleibt, und ein Training läuft weiter"
+    ),
+    "Dismiss": "Ausblenden",
+    "Take this message away": "Diese Meldung wegnehmen",
+    "Help": "Hilfe",
+    "Open the guide at what it says of this panel": "Die Anleitung dort öffnen, wo sie von diesem Bereich spricht",
     # Training
+    "Add Demo Motions": "Demo-Bewegungen hinzufügen",
+    "Give a two-legged character that nothing moves the demo's motions as actions: it walks, runs, jumps, turns": (
+        "Einer zweibeinigen Figur, die nichts bewegt, die Bewegungen der Demo als Aktionen geben: Sie geht, läuft, "
+        "springt und dreht sich"
+    ),
+    "Choose": "Wählen",
+    "Choose Motions": "Bewegungen wählen",
+    "Choose all motions that are listed, or none of them": "Alle Bewegungen der Liste wählen, oder keine davon",
+    "All": "Alle",
+    "Train on all that are listed": "Mit allen trainieren, die in der Liste stehen",
+    "None": "Keine",
+    "Train on none of them": "Mit keiner davon trainieren",
+    "Filter": "Filter",
+    "List only motions with this in their names; All and None then choose among these": (
+        "Nur Bewegungen auflisten, in deren Namen das steht; Alle und Keine wählen dann unter diesen"
+    ),
+    "Energies": "Energien",
+    "Nothing was computed yet": "Noch wurde nichts berechnet",
     "Training": "Training",
     "How the garment is trained": "Wie das Kleidungsstück trainiert wird",
     "Motions": "Bewegungen",

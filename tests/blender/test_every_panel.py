@@ -160,7 +160,7 @@ def draw_everything(context: Any) -> list[str]:
     """Draw each panel and ask each button whether it can be pressed; return what was raised."""
     from blender_addon.operators.reporting import RefusingOperator
     from blender_addon.operators.training import watch
-    from blender_addon.panels import CLASSES, FindingList
+    from blender_addon.panels import CLASSES, FindingList, MotionList
     from blender_addon.registration import CLASSES as EVERY
 
     raised = []
@@ -172,11 +172,17 @@ def draw_everything(context: Any) -> list[str]:
             raised.append(f"{what}: {type(error).__name__}: {error}")
             return None
 
-    for panel in (kind for kind in CLASSES if kind is not FindingList):
+    for panel in (kind for kind in CLASSES if kind not in (FindingList, MotionList)):
         if attempt(f"{panel.__name__}.poll", getattr(panel, "poll", lambda _: True), context):
             attempt(panel.__name__, panel.draw, SimpleNamespace(layout=Layout()), context)
     for item in context.window_manager.ssilk_preflight.findings:
         attempt("finding", FindingList.draw_item, None, context, Layout(), None, item, None, None, None)
+    settings = context.object.ssilk.training if context.object else None
+    for number, item in enumerate(settings.motions if settings else ()):
+        attempt("motion", MotionList.draw_item, None, context, Layout(), None, item, None, None, None, number)
+    if settings:
+        flags = SimpleNamespace(bitflag_filter_item=1)
+        attempt("filter", MotionList.filter_items, flags, context, settings, "motions")
     for kind in EVERY:
         if issubclass(kind, RefusingOperator):
             attempt(kind.__name__, kind.refusal, context)

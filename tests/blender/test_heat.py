@@ -158,12 +158,21 @@ def test_heat_is_shown_follows_frames_and_goes(bpy, dressed):
     expected = heat.colors_of(expected_depths(dressed), 0.02)
     np.testing.assert_allclose(colors(dressed), expected, atol=2e-3)
     assert np.ptp(colors(dressed), axis=0)[:3].min() > 0.2
+    assert dressed.show_in_front  # else the skin that it lies in would hide it
+    inside, deepest = np.sum(expected_depths(dressed) > 0), 1000 * expected_depths(dressed).max()
+    from blender_addon.panels import QualityPanel
+
+    said = f"{inside} vertices inside, {deepest:.1f} mm at most"
+    assert said in " ".join(drawn(QualityPanel, bpy.context))
     dressed.scale = (3, 3, 1)
     bpy.context.scene.frame_set(5)
     while heat_updates.go_on() is not None:  # what a timer does as soon as the frame stands
         pass
     np.testing.assert_allclose(colors(dressed)[:, :3], np.tile(heat.GREY, (len(expected), 1)), atol=2e-3)
+    assert "Nothing is inside" in drawn(QualityPanel, bpy.context)
     assert bpy.ops.ssilk.hide_heat() == {"FINISHED"}
+    assert not dressed.show_in_front and "ssilk_in_front" not in dressed
+    assert "Nothing is inside" not in drawn(QualityPanel, bpy.context)
     assert "SSILK Heat" not in dressed.data.color_attributes and not dressed.ssilk.heat
 
 
@@ -234,7 +243,10 @@ def test_the_panel_offers_to_hide_what_is_shown(bpy, dressed):
     shown = ["ssilk.show_heat", "ssilk.find_worst"] * 3
     assert drawn(QualityPanel, bpy.context) == [*shown, "ssilk.clear_worst", "ssilk.toggle_lbs"]
     bpy.ops.ssilk.show_heat()
-    assert drawn(QualityPanel, bpy.context) == [*shown, "ssilk.hide_heat", "ssilk.clear_worst", "ssilk.toggle_lbs"]
+    told = dressed.ssilk.heat_told
+    assert drawn(QualityPanel, bpy.context) == [
+        *shown, told, "ssilk.hide_heat", "ssilk.clear_worst", "ssilk.toggle_lbs"
+    ]  # fmt: skip
 
 
 def test_stretch_is_that_of_what_blender_shows(bpy, dressed):

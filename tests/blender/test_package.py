@@ -19,6 +19,7 @@ from .test_outside import write_wheel
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
 ADDON = ROOT / "blender_addon"
+GUIDE = (ROOT / "docs" / "artist_guide.md").read_text(encoding="utf-8")
 INSTALL = """
 import importlib, sys, bpy
 package = "bl_ext.user_default.ssilk"
@@ -67,6 +68,9 @@ def test_the_zip_is_valid_and_holds_what_it_needs(package):
     with zipfile.ZipFile(package) as files:
         names = set(files.namelist())
     sources = {str(path.relative_to(ADDON)) for path in ADDON.rglob("*.py")}
+    pictures = {name for name in names if name.startswith("guide/images/")}
+    assert len(pictures) == GUIDE.count("](images/") and "guide/index.html" in names
+    sources |= {*pictures, "guide/index.html"}
     assert names == {*sources, "LICENSE", "blender_manifest.toml", "wheels/ssilk-0.1.9-py3-none-any.whl"}
 
 

@@ -46,7 +46,9 @@ class Layout:
         assert hasattr(data, name) and hasattr(source, items), name
         self.notes.append(name)
 
-    def operator(self, name: str, text: str = "", icon: str = "NONE", depress: bool = False) -> SimpleNamespace:
+    def operator(
+        self, name: str, text: str = "", icon: str = "NONE", depress: bool = False, emboss: bool = True
+    ) -> SimpleNamespace:
         module, _, function = name.partition(".")
         import bpy
 

@@ -284,8 +284,62 @@ def test_the_panel_lists_findings_with_their_buttons(ready, skirt):
     item = show(ready, "isolated-vertices")
     notes = drawn(PreflightPanel, ready.context)
     assert {"ssilk.inspect", "ssilk.select_finding", "ssilk.fix_finding", "findings", "Skirt"} <= set(notes)
-    assert line(item) == "1 isolated vertices"
+    assert line(item) == "1 isolated vertex"
     assert lines("one two three four five", 200) == ["one two three four", "five"]
+
+
+def told(code: str, elements: str, indices: list[int]) -> str:
+    from types import SimpleNamespace
+
+    from blender_addon.panels.preflight import line
+
+    return line(SimpleNamespace(code=code, elements=elements, indices=indices))
+
+
+def test_findings_are_counted_in_words():
+    assert told("penetration", "vertices", list(range(1200))) == "penetration: 1,200 vertices"
+    assert told("sliver-faces", "polygons", [1]) == "1 sliver face"
+    assert told("duplicate-vertices", "vertices", [1, 2]) == "2 duplicate vertices"
+    assert told("rest-pose", "", []) == "rest pose"
+
+
+def test_each_body_is_told_its_own_holes():
+    quad = Mesh("/Character/Torso", np.zeros((4, 3)), np.array([[0, 1, 2], [0, 2, 3]]), np.array([4]), np.arange(4))
+    triangle = Mesh("/Character/Hand", np.zeros((3, 3)), np.array([[0, 1, 2]]), np.array([3]), np.arange(3))
+    document = {"severity": "warning", "code": "body-not-watertight", "prim": "a.usdc:/Character", "why": "",
+                "found": "the body is open along 7 edges", "fix": "", "fixable": False, "elements": "vertices",
+                "indices": list(range(7))}  # fmt: skip
+    found = read_findings([document], "Shirt", {**SHIRT, "Torso": quad, "Hand": triangle})
+    assert [(each.prim, each.found) for each in found] == [
+        ("Torso", "it is open along 4 edges"), ("Hand", "it is open along 3 edges"),
+    ]  # fmt: skip
+
+
+def test_what_was_mended_by_hand_goes_and_the_rest_says_that_it_is_old(ready, skirt):
+    from blender_addon.operators.training import watch
+    from blender_addon.panels.preflight import PreflightPanel
+
+    spoil(ready, skirt, loose_vertex)
+    spoil(ready, skirt, loose_vertex)
+    ready.ops.ssilk.inspect()
+    kept = set(findings(ready)) - {"isolated-vertices"}
+    watch()
+    assert not any(item.old for item in findings(ready).values())
+    assert len(show(ready, "isolated-vertices").indices) == 2
+    spoil(ready, skirt, lambda mesh: mesh.verts.remove(mesh.verts[-1]))
+    watch()
+    assert len(show(ready, "isolated-vertices").indices) == 1
+    spoil(ready, skirt, lambda mesh: mesh.verts.remove(mesh.verts[-1]))
+    watch()
+    assert set(findings(ready)) == kept and kept
+    old = [item.code for item in findings(ready).values() if item.old]
+    assert set(old) == {code for code, item in findings(ready).items() if item.target == "Skirt"}
+    mirror = skirt.modifiers.new("Mirror", "MIRROR")
+    with pytest.raises(RuntimeError, match="its modifier 'Mirror'"):
+        ready.ops.ssilk.inspect()
+    skirt.modifiers.remove(mirror)
+    watch()
+    assert not findings(ready) and drawn(PreflightPanel, ready.context)[-1] == "ssilk.inspect"
 
 
 def test_a_garment_far_from_the_body_is_an_error(ready, skirt):

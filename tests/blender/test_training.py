@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -89,13 +90,35 @@ def test_motions_are_found_and_choices_stay(ready, rigged):
     track.strips.new("Spin Ö", 100, ready.data.actions["Spin Ö"])
     ready.ops.ssilk.find_motions()
     assert listed(rigged) == [
-        ("TIMELINE", "Timeline", False), ("ACTION", "Spin Ö", True), ("ACTION", "Walk", True),
-        ("STRIP", "Spin Ö", True),
-    ]  # fmt: skip
+        ("TIMELINE", "Timeline", False),
+        ("ACTION", "Spin Ö", True),
+        ("ACTION", "Walk", True),
+    ]  # fmt: skip; the strip plays the action as it is
     rigged.ssilk.training.motions[1].use = False
     ready.data.actions.remove(ready.data.actions["Walk"])
+    track.strips["Spin Ö"].use_reverse = True
     ready.ops.ssilk.find_motions()
     assert listed(rigged) == [("TIMELINE", "Timeline", False), ("ACTION", "Spin Ö", False), ("STRIP", "Spin Ö", True)]
+
+
+def test_all_or_none_of_the_motions_that_the_filter_leaves_are_chosen(ready, rigged):
+    from blender_addon.panels.training import MotionList, TrainingPanel
+
+    from .test_panels import drawn
+
+    assert not ready.ops.ssilk.choose_motions.poll()
+    choose(ready, rigged, "Walk")
+    settings = rigged.ssilk.training
+    notes = drawn(TrainingPanel, ready.context)
+    assert notes.count("ssilk.choose_motions") == 2 and {"search", "motions", "1 of 3"} <= set(notes)
+    settings.search = "sPIN"
+    flags = MotionList.filter_items(SimpleNamespace(bitflag_filter_item=4), ready.context, settings, "motions")
+    assert flags == ([0, 4, 0], [])
+    assert ready.ops.ssilk.choose_motions(value="ALL") == {"FINISHED"}
+    assert [item.name for item in settings.motions if item.use] == ["Spin Ö", "Walk"]
+    settings.search = ""
+    ready.ops.ssilk.choose_motions(value="NONE")
+    assert not any(item.use for item in settings.motions)
 
 
 def test_a_budget_is_in_minutes_or_in_iterations(ready, rigged):
@@ -234,18 +257,18 @@ def test_what_a_training_finds_wrong_is_kept_for_the_panel(ready, rigged):
 def test_panels_draw_a_training(ready, rigged):
     from blender_addon.curves import picture, series
     from blender_addon.panels import plot
-    from blender_addon.panels.training import TrainingPanel, changed
+    from blender_addon.panels.training import EnergiesPanel, TrainingPanel, changed
 
     from .test_panels import drawn
 
     choose(ready, rigged, "Walk")
-    assert drawn(TrainingPanel, ready.context).count("use") == 3
     ready.ops.ssilk.train()
     ended(rigged)
     notes = drawn(TrainingPanel, ready.context)
     assert {"4 of 4 100%", "Trained for 4 iterations"} <= set(notes)
     assert "energy than linear blend skinning" in " ".join(notes)  # in as many lines as it needs
-    assert any(note.startswith("stretch: ") for note in notes)
+    assert not any(note.endswith(" J") for note in notes)
+    assert any(note.startswith("stretch: ") for note in drawn(EnergiesPanel, ready.context))
     assert changed(job_of(rigged))
     assert not changed(job_of(rigged))
     shown = plot._pictures[str(job_of(rigged))]

@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""From a mesh to a garment that plays, by the operators that artists have: what is there already is left as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import bpy
+
+from ssilk_core.assets import LOOSE
+from ssilk_core.errors import SsilkError
+
+from ..errors import SetupError
+from ..outside.jobs import read_state
+from ..preferences import handshake, interpreter, preferences
+from ..scene import playing
+from ..scene.armature import proxy_names
+from ..scene.attributes import current_classes
+from ..scene.follower import leader_of
+from ..scene.garment import armature_of, unusable_here
+from ..scene.models import job_of
+from ..scene.motions import TIMELINE, is_still
+from ..scene.objects import found_again
+from ..scene.selecting import select_object
+from . import tasks
+from .reporting import RefusingOperator, ReportingOperator
+
+LOOK = 0.2  # seconds between two looks at a step that runs
+CPU = ("cpu", "mps")  # begin the names of devices that want a draft
+
+
+@dataclass
+class Course:
+    """The steps that one garment still needs.
+
+    Attributes:
+        begun: names of the operators that were called.
+        before: the folder of the training that it had at first.
+    """
+
+    uid: int
+    name: str
+    before: Path | None
+    begun: list[str] = field(default_factory=list)
+
+    @property
+    def garment(self) -> bpy.types.Object:
+        """The garment; raises `SetupError` if it was deleted."""
+        return found_again(self.uid, self.name)
+
+
+course: Course | None = None  # the one that is under way
+
+
+class MakeItMove(RefusingOperator, bpy.types.Operator):
+    """Classify, rig, choose motions, train what fits the device, and play it live as soon as there is a model"""
+
+    bl_idname = "ssilk.make_it_move"
+    bl_label = "Make It Move"  # no undo step of its own: each step has one
+
+    @classmethod
+    def refusal(cls, context: bpy.types.Context) -> str:
+        if reason := tasks.busy() or unusable_here(context):
+            return reason
+        if under_way():
+            return f"'{course.name}' is under way"
+        return "" if bpy.data.filepath else "Save the file first; the training lies beside it"
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Begin; without a window do all that can be waited for."""
+        global course
+        garment = context.object
+        tasks.failed = ""
+        course = Course(garment.session_uid, garment.name, job_of(garment))
+        if not bpy.app.background:
+            bpy.app.timers.register(go_on, first_interval=0.0)
+            return {"FINISHED"}
+        while go_on() is not None:
+            pass
+        if tasks.failed:
+            self.report({"ERROR"}, tasks.failed)
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+class StopCourse(ReportingOperator, bpy.types.Operator):
+    """Take no further step; what was done stays, and a training goes on"""
+
+    bl_idname = "ssilk.stop_course"
+    bl_label = "Stop Here"
+
+    @classmethod
+    def refusal(cls, context: bpy.types.Context) -> str:
+        return "" if under_way() or (context.object and context.object.ssilk.awaited) else "Nothing is under way"
+
+    def apply(self, context: bpy.types.Context) -> str:
+        stop()
+        if tasks.current:
+            tasks.current.cancel()
+        if context.object:
+            context.object.ssilk.awaited = False
+        return ""
+
+
+def go_on() -> float | None:
+    """Take the next step once the one before has ended; return when to be called again [s], None at the end."""
+    if course is None:
+        return None
+    if tasks.current or bpy.context.mode != "OBJECT":
+        return LOOK
+    try:
+        needed = next((name for name, needs in STEPS.items() if needs(course)), None)
+        if needed is None:
+            course.garment.ssilk.awaited = True
+            playing.play_what_is_awaited()
+        elif needed in course.begun:  # it failed, or was cancelled
+            needed = None
+        else:
+            course.begun.append(needed)
+            _call(needed, course.garment)
+    except SsilkError as error:
+        needed, tasks.failed = None, str(error)
+    if needed is None:
+        stop()
+        tasks.redraw(bpy.context)
+        return None
+    return LOOK
+
+
+def under_way() -> bool:
+    """Return whether there are steps to come; none are once another file was opened, with which timers go."""
+    return course is not None and (bpy.app.background or bpy.app.timers.is_registered(go_on))
+
+
+def stop() -> None:
+    """Take no further step."""
+    global course
+    course = None
+
+
+def line(garment: bpy.types.Object) -> str:
+    """Return what a garment that is under way waits for; empty where it is not."""
+    if under_way() and course.uid == garment.session_uid:
+        if bpy.context.mode != "OBJECT":
+            return "Goes on in Object Mode"
+        return f"Step {len(course.begun)} of at most {len(STEPS)}"
+    return "Plays as soon as the training has its first model" if garment.ssilk.awaited else ""
+
+
+def _call(name: str, garment: bpy.types.Object) -> None:
+    """Call an operator on a garment as a button does, with an undo step where it has one.
+
+    Raises:
+        SetupError: it refuses.
+    """
+    windows = bpy.context.window_manager.windows
+    window = {"window": windows[0]} if windows else {}
+    if bpy.context.view_layer.objects.active != garment:  # an override alone would not hold for mode changes
+        select_object(garment)
+    with bpy.context.temp_override(**window):
+        if name == TRAIN:
+            _prepare_training(garment)
+        operator = getattr(bpy.ops.ssilk, name.removeprefix("ssilk."))
+        try:
+            operator("EXEC_DEFAULT", True)
+        except RuntimeError as error:  # Blender's own way to say what the operator reported, or that it refuses
+            raise SetupError(str(error).strip().removeprefix("Error: ").split("\n")[0]) from error
+
+
+def _prepare_training(garment: bpy.types.Object) -> None:
+    """Choose what fits the device, unless the artist has chosen; show what this training makes."""
+    settings = garment.ssilk.training
+    met = handshake(preferences(bpy.context))
+    if not settings.is_property_set("preset"):
+        slow = not (met and met.device) or met.device.startswith(CPU)
+        settings.preset = "draft" if slow else "preview"
+    garment.ssilk.model = ""
+
+
+def _needs_python(_: Course) -> bool:
+    return not interpreter(preferences(bpy.context))
+
+
+def _needs_check(_: Course) -> bool:
+    return handshake(preferences(bpy.context)) is None
+
+
+def _needs_classes(made: Course) -> bool:
+    return current_classes(made.garment.data) is None
+
+
+def _needs_rig(made: Course) -> bool:
+    garment = made.garment
+    classes = current_classes(garment.data)
+    return bool((classes == LOOSE).any() and not proxy_names(armature_of(garment), garment))
+
+
+def _needs_motions(made: Course) -> bool:
+    return not any(item.use for item in made.garment.ssilk.training.motions)
+
+
+def _needs_demo_motions(made: Course) -> bool:
+    chosen = {item.kind for item in made.garment.ssilk.training.motions if item.use}
+    return chosen <= {TIMELINE} and is_still(leader_of(armature_of(made.garment)))
+
+
+def _needs_training(made: Course) -> bool:
+    folder = job_of(made.garment)
+    state = folder and read_state(folder)
+    return folder == made.before and not (state and state.alive)
+
+
+TRAIN = "ssilk.train"
+STEPS: dict[str, Callable[[Course], bool]] = {
+    "ssilk.find_python": _needs_python,
+    "ssilk.check_python": _needs_check,
+    "ssilk.classify": _needs_classes,
+    "ssilk.generate_rig": _needs_rig,
+    "ssilk.find_motions": _needs_motions,
+    "ssilk.add_demo_motions": _needs_demo_motions,
+    TRAIN: _needs_training,
+}
+
+CLASSES = (MakeItMove, StopCourse)
