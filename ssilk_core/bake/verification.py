@@ -9,7 +9,9 @@ from pathlib import Path
 
 from ..errors import VerificationError
 from ..events import Message, Reporter, Result, Started, silent
+from ..targets import GLB
 from .load import load_rollout
+from .opened import open_shot
 from .origin import read_origin
 from .refinement import refined, verify_energies
 from .result import Verification
@@ -51,7 +53,7 @@ def verify(
 
 
 def verify_file(rollout: BakeRollout, path: Path, report: Reporter) -> Verification:
-    """Check a file and compare it, re-skinned by UsdSkel alone, with the rollout that it should hold.
+    """Check a file and compare it, re-skinned by its format's rules alone, with the rollout that it should hold.
 
     Points of an earlier refinement are compared by energy (`verify_energies`), unless the rollout has its own.
 
@@ -59,11 +61,10 @@ def verify_file(rollout: BakeRollout, path: Path, report: Reporter) -> Verificat
         VerificationError: a check fails, or a vertex is further off than allowed.
     """
     from ssilk_usd.check import compare_points
-    from ssilk_usd.play import Shot, frame_times
 
     _check(path, report)
-    shot, samples = Shot(path), rollout.request.samples_per_frame
-    times = frame_times(shot.stage, samples)
+    shot, samples = open_shot(path), rollout.request.samples_per_frame
+    times = shot.sample_times(samples)
     if not shot.is_skinned and rollout.request.refine and rollout.refinement is None:
         return verify_energies(rollout, map(shot.garment_points, times), report)
     if not rollout.request.writes_points:
@@ -80,9 +81,14 @@ def verify_file(rollout: BakeRollout, path: Path, report: Reporter) -> Verificat
 
 
 def _check(path: Path, report: Reporter) -> None:
-    """Report what a shot's checks find; raise `VerificationError` for an error among it."""
+    """Report what a shot's checks find; raise `VerificationError` for an error among it.
+
+    The checks are USD's and those of stages. A glTF binary is checked by reading it.
+    """
     from ssilk_usd.check import check_shot
 
+    if path.suffix == GLB:
+        return
     findings = check_shot(path)
     for finding in findings:
         report(Message(str(finding), "warning"))

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 from ..errors import fail
 from ..events import Message, Reporter, Result, Started, silent
 from ..files import need_not_input, need_writable, replacing
+from ..targets import GLB
+from .glb import write_glb_shot
 from .hiding import covered_polygons
 from .origin import shot_metadata
 from .refinement import refined
@@ -99,6 +101,8 @@ def _check_output(request: BakeRequest, path: Path) -> None:
     suffixes = request.receiver.suffixes
     if path.suffix not in suffixes:
         fail(str(path), f"the suffix is '{path.suffix}'", f"{request.target} takes {', '.join(suffixes)}")
+    if path.suffix == GLB and request.writes_points:
+        fail(str(path), "refined points", "a glb holds joints and morph targets", "use --refined-output joints")
     need_writable(path)
     need_not_input(path, request.model, request.stage, split_location(request.motion)[0])
 
@@ -126,6 +130,9 @@ def _write(
     layer: Path, skin: SkinMeter, output: Path, include_body: bool, hidden: HiddenPolygons | None
 ) -> ShotSummary:
     """Write a shot of joints and blendshapes, or of refined points."""
+    if output.suffix == GLB:
+        return write_glb_shot(layer, skin.rollout, skin.poses(), include_body, hidden,
+                              shot_metadata(skin.rollout, output, skin.stated))  # fmt: skip
     from ssilk_usd.points import point_cache
     from ssilk_usd.shot import write_shot
 
