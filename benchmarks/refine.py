@@ -19,8 +19,9 @@ from helpers.reports import table, write_results
 from helpers.subjects import Subject, arguments, clip_of, open_subject, parsed
 
 from ssilk_core.assets import Floats, GarmentPose, Motion
+from ssilk_core.decomposition import PoseFitter
 from ssilk_core.kinematics import deform, resample
-from ssilk_core.refine import PoseFitter, RefineOptions, Refiner
+from ssilk_core.refine import RefineOptions, Refiner
 from ssilk_core.rollout import decode, garment_poses
 from ssilk_core.simulate import SimulationOptions, simulate
 

@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 import numpy as np
-from ssilk_usd.names import CLASS
+from ssilk_usd.names import CLASS, LEVEL
 
 from ssilk_core.assets import LOOSE, PINNED
 
 COLORS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # sRGB, by class
 ATTRIBUTE = CLASS.removeprefix("primvars:")  # Blender's USD importer keeps the name
+LEVELS = LEVEL.removeprefix("primvars:")  # attribute: the least tightness at which each vertex is tight
 COLOR_ATTRIBUTE = "SSILK Classes"
 
 

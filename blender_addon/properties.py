@@ -8,11 +8,18 @@ from bpy.props import BoolProperty, FloatProperty, PointerProperty, StringProper
 
 from . import fabric_properties, training_properties
 from .fabric_properties import FabricSettings
+from .scene.attributes import tighten
 from .training_properties import RELATIVE, TrainingSettings
 
 
 def _is_armature(_: object, thing: bpy.types.Object) -> bool:
     return thing.type == "ARMATURE"
+
+
+def _tighten(settings: bpy.types.PropertyGroup, _: bpy.types.Context) -> None:
+    garment = settings.id_data
+    if garment.type == "MESH" and garment.mode != "EDIT" and not garment.data.library:
+        tighten(garment.data, settings.tightness)
 
 
 class GarmentSettings(bpy.types.PropertyGroup):
@@ -30,6 +37,19 @@ class GarmentSettings(bpy.types.PropertyGroup):
         description="Meshes that the garment collides with; all others bound to the armature when empty",
     )
     fabric: PointerProperty(type=FabricSettings, name="Fabric", description="What the garment is made of")
+    tightness: FloatProperty(
+        name="Tightness",
+        description="How much of the garment is tight: nothing but what is pinned, or all; replaces what is painted",
+        default=0.5,
+        min=0.0,
+        max=1.0,
+        subtype="FACTOR",
+        update=_tighten,
+    )
+    pins: StringProperty(
+        name="Pins",
+        description="Vertex group of what is pinned when classes are found; the band it hangs from when empty",
+    )
     model: StringProperty(
         name="Model",
         subtype="FILE_PATH",

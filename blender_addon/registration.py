@@ -19,6 +19,7 @@ from .operators import (
     rig,
     stages,
     tasks,
+    to_bones,
     training,
 )
 from .operators import overlay as overlay_switch
@@ -40,6 +41,7 @@ CLASSES = (
     *preflight.CLASSES,
     *training.CLASSES,
     *baking.CLASSES,
+    *to_bones.CLASSES,
     *playback.CLASSES,
     *quality_view.CLASSES,
     *hiding.CLASSES,

@@ -234,7 +234,7 @@ def skin_points(points: Floats, skin: SkinWeights, matrices: Floats) -> Floats:
 
 def sorted_influences(skin: SkinWeights) -> tuple[Ints, Floats]:
     """Return joint indices (int32) and weights (float32), heaviest first, each joint once, shape (V, I)."""
-    # By way of the dense matrix a joint that a row names twice is added up, where some readers keep the last one only.
+    # By way of the dense matrix a joint that a row names twice is added up, where Blender keeps the last one only.
     merged = SkinWeights.from_dense(skin.path, skin.dense(int(skin.indices.max()) + 1))
     weights = merged.weights.astype(np.float32)
     # Far from the origin an error in the sum moves the vertex: let the heaviest weight take up the rounding.

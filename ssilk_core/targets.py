@@ -47,7 +47,11 @@ TARGETS = {
     ),
     "glb": Target(meters_per_unit=1.0, up_axis="Y", suffixes=(GLB,), about="one glTF binary, four influences a set"),
     "glb4": Target(
-        influences=4, meters_per_unit=1.0, up_axis="Y", suffixes=(GLB,), about="the same for viewers that read one set"
+        influences=4,
+        meters_per_unit=1.0,
+        up_axis="Y",
+        suffixes=(GLB,),
+        about="one glTF binary, a single set",
     ),
 }
 

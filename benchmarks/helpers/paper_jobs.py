@@ -199,7 +199,7 @@ def simulation(plan: Plan, garment: str) -> Job:
     output = plan.folder / "shots" / garment
     clips = plan.files("held")
     command = (
-        *SSILK, "simulate", str(plan.stage(garment)), "--motion", *clips, "-o", str(output), "--sequence",
+        *SSILK, "simulate", str(plan.stage(garment)), "--motion", *clips, "-o", str(output), "--points", "--sequence",
         str(plan.frames), "--batch", str(plan.batch), "--iterations", str(plan.iterations), "--no-body",
         "--device", plan.device,
     )  # fmt: skip

@@ -20,6 +20,7 @@ from ssilk_core.quality import QUALITIES
 
 from ..errors import SetupError
 from ..joints import Joints, joint_order
+from ..outside.wording import recall, reworded
 from ..outside.work import Work
 from ..preferences import interpreter, preferences, unready
 from ..scene import playing
@@ -33,7 +34,7 @@ from ..scene.keys import has_keys, need_tracks
 from ..scene.models import model_of
 from ..scene.motions import TIMELINE, Source
 from ..scene.objects import Pair
-from ..scene.sampling import need_company, prepare_takes, sample
+from ..scene.sampling import SampledTake, need_company, prepare_takes, sample
 from ..scene.trained_weights import has_trained_weights
 from ..scene.units import scene_rate
 from ..training_properties import RELATIVE
@@ -45,7 +46,7 @@ ABOUT = {
     "crowd": "For many characters, far away: few shapes and proxies, four influences",
     "game": "For real time: some shapes and proxies, four influences",
     "film": "What cannot be told from the whole model",
-    "hero": "Refined by a solver: points to USD alone; on the timeline bones and shape keys nearest to them",
+    "hero": "Refined by a solver, on bones and shape keys of this shot's own; takes long",
 }
 LEVELS = [
     (WHOLE, "Whole", "All that the model has"),
@@ -54,7 +55,52 @@ LEVELS = [
 INPUTS, MOTION, SHOT = "bake", "motion.usdc", "shot.usdc"  # folder of a bake's inputs beside the model; files
 
 
-class BakeGarment(tasks.OutsideOperator, bpy.types.Operator):
+class TimelineOperator(tasks.OutsideOperator):
+    """Base of operators that put a shot on the timeline; `prepare` sets these.
+
+    Attributes:
+        pair: the garment and its armature.
+        shot: the file to read.
+        take: the frames.
+    """
+
+    pair: Pair
+    shot: Path
+    take: SampledTake
+
+    def closing(self) -> Iterator[float]:
+        """Read what was baked, before `finish` writes it: each takes time."""
+        from ssilk_usd.read_shot import read_baked
+
+        self.joints = self.bakeable_joints()
+        self.baked = read_baked(self.shot)
+        yield 1.0
+
+    def bakeable_joints(self) -> Joints:
+        """Return the joints as they are by now; raise `SetupError` where nothing can be baked onto them any more."""
+        garment, armature = self.pair.objects()
+        joints = read_joints(armature, garment)
+        need_bakeable(garment, armature, joints)
+        need_tracks(animated(garment, armature))
+        return joints
+
+    def put_on_timeline(self) -> str:
+        """Put keys in place of those baked before; return what was done."""
+        garment, armature = self.pair.objects()
+        joints, read = self.bakeable_joints(), self.joints
+        if joints.names != read.names or not np.array_equal(joints.parents, read.parents):
+            raise SetupError(
+                f"Bones of '{armature.name}' were changed while '{garment.name}' was baked; bake it again."
+            )
+        playing.stop(garment)
+        apply_bake(garment, armature, joints, self.baked)
+        order = joint_order(joints, self.baked.garment.joint_names, fewer_proxies=True)
+        left = int(np.count_nonzero(order < 0))
+        still = f" ({left} proxies are not in it and stay at rest)" if left else ""
+        return f"frames {self.take.frames[0]} to {self.take.frames[-1]}{still}"
+
+
+class BakeGarment(TimelineOperator, bpy.types.Operator):
     """Bake the trained garment over the scene's frames, as bones and shape keys; what was baked before is replaced"""
 
     bl_idname = "ssilk.bake"
@@ -99,13 +145,20 @@ class BakeGarment(tasks.OutsideOperator, bpy.types.Operator):
         (self.take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
         self.scene = None if (self.model.parent / STAGE).exists() else gather(garment)
         self.pair = Pair.of(garment, armature)
+        self.words = {f"{INPUTS}/{MOTION}": "the timeline"}
         self.shot = usd_path(garment, self.filepath) if self.to_usd else None
         self.python = interpreter(preferences(context))
         self.character = joints.character
         closing = self.closing() if self.to_timeline else None
         return Work(
-            f"Baking '{garment.name}'", self.commands, parent=bpy.app.tempdir, steps=self.steps(), closing=closing
-        )
+            f"Baking '{garment.name}'", self.commands, parent=bpy.app.tempdir, steps=self.steps(), closing=closing,
+            rephrase=self.rephrase,
+        )  # fmt: skip
+
+    def rephrase(self, sentence: str) -> str:
+        """Return a sentence with names of objects in place of files that were made for the bake."""
+        sentence = reworded(sentence, self.work.folder, {SHOT: f"the bake of '{self.pair.name}'"})
+        return reworded(sentence, self.model.parent, {**recall(self.model.parent), **self.words})
 
     def steps(self) -> Iterator[float]:
         """Sample the timeline, then write it."""
@@ -124,12 +177,11 @@ class BakeGarment(tasks.OutsideOperator, bpy.types.Operator):
         shutil.copyfile(folder / MOTION, inputs / MOTION)
         stage = self.model.parent / STAGE
         if self.scene:
-            hand_over(self.scene, self.pair, inputs)
+            given = hand_over(self.scene, self.pair, inputs)
+            self.words |= {f"{INPUTS}/{made}": name for made, name in given.words.items()}
             stage = inputs / STAGE
         self.shot = self.shot or folder / SHOT
         level = [] if self.quality == WHOLE else ["--quality", self.quality]
-        if level and QUALITIES[self.quality].refine and self.to_timeline:
-            level += ["--refined-output", "joints"]
         rate = ["--fps", repr(scene_rate())] if self.to_timeline else []  # a level may have fewer frames
         return [
             [
@@ -140,42 +192,15 @@ class BakeGarment(tasks.OutsideOperator, bpy.types.Operator):
         ]  # fmt: skip
 
     def closing(self) -> Iterator[float]:
-        """Read what was baked, before `finish` writes it: each takes time."""
-        from ssilk_usd.read_shot import read_baked
-
-        self.joints = self.bakeable_joints()
-        self.baked = read_baked(self.shot)
-        yield 0.5
+        """Read what was baked, and whether classes were changed since the garment was trained."""
+        yield from super().closing()
         self.reclassed = reclassed(self.pair.objects()[0], self.model)
         yield 1.0
 
-    def bakeable_joints(self) -> Joints:
-        """Return the joints as they are by now; raise `SetupError` where nothing can be baked onto them any more."""
-        garment, armature = self.pair.objects()
-        joints = read_joints(armature, garment)
-        need_bakeable(garment, armature, joints)
-        need_tracks(animated(garment, armature))
-        return joints
-
     def finish(self, context: bpy.types.Context, work: Work) -> str:
-        where = [self.put_on_timeline()] if self.to_timeline else []
+        where = [self.put_on_timeline() + self.reclassed] if self.to_timeline else []
         where += [str(self.shot)] if self.to_usd else []
         return f"'{self.pair.name}' is baked: {' and '.join(where)}{lost(work.result)}."
-
-    def put_on_timeline(self) -> str:
-        """Put keys in place of those baked before; return what was done."""
-        garment, armature = self.pair.objects()
-        joints, read = self.bakeable_joints(), self.joints
-        if joints.names != read.names or not np.array_equal(joints.parents, read.parents):
-            raise SetupError(
-                f"Bones of '{armature.name}' were changed while '{garment.name}' was baked; bake it again."
-            )
-        playing.stop(garment)
-        apply_bake(garment, armature, joints, self.baked)
-        order = joint_order(joints, self.baked.garment.joint_names, fewer_proxies=True)
-        left = int(np.count_nonzero(order < 0))
-        still = f" ({left} proxies are not in it and stay at rest)" if left else ""
-        return f"frames {self.take.frames[0]} to {self.take.frames[-1]}{still}{self.reclassed}"
 
 
 class RemoveBake(ReportingOperator, bpy.types.Operator):
@@ -200,11 +225,15 @@ class RemoveBake(ReportingOperator, bpy.types.Operator):
 
 
 def lost(figures: Mapping[str, Any]) -> str:
-    """Return in words how far bones and shape keys are from the refined vertices; empty where nothing was fitted."""
-    typical, most = (figures.get(f"refined: joints lose, {which} [mm]") for which in ("RMS", "at most"))
-    if typical is None:
+    """Return in words how far bones and shape keys are from what they stand for; empty where nothing was fitted."""
+    topic = "refined: " if "refined: shapes of the shot" in figures else ""
+    count = figures.get(f"{topic}shapes of the shot")
+    if count is None:
         return ""
-    return f"; bones and shape keys miss the refined vertices by {typical:g} mm (RMS), {most:g} mm at most"
+    typical, most = (figures[f"{topic}joints lose, {which} [mm]"] for which in ("RMS", "at most"))
+    return (
+        f"; bones and {count} shape keys are within {typical:g} mm (RMS), {most:g} mm at most, of what was simulated"
+    )
 
 
 def reclassed(garment: bpy.types.Object, model: Path) -> str:

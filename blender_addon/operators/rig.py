@@ -8,6 +8,7 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, IntProperty
 
+from .. import overlay
 from ..errors import SetupError
 from ..outside.work import Work
 from ..preferences import interpreter, preferences, unready
@@ -48,9 +49,6 @@ class RigOperator(tasks.OutsideOperator):
         """Return a sentence with names of objects in place of files and prims."""
         return self.handover.in_blender_words(sentence) if self.handover else sentence
 
-    def explain(self, work: Work) -> str:
-        return self.rephrase(work.error)
-
 
 class Classify(RigOperator, bpy.types.Operator):
     """Find classes by the garment's distance to the body and by where limbs part; replaces what is painted"""
@@ -60,13 +58,16 @@ class Classify(RigOperator, bpy.types.Operator):
     undo = "Classify Automatically"
 
     def prepare(self, context: bpy.types.Context) -> Work:
-        return self.begin(context, f"Classifying '{context.object.name}'", classes=False, options=("--proxies", "1"))
+        tightness = f"{context.object.ssilk.tightness:.6g}"
+        options = ("--proxies", "1", "--tightness", tightness)
+        return self.begin(context, f"Classifying '{context.object.name}'", classes=False, options=options)
 
     def finish(self, context: bpy.types.Context, work: Work) -> str:
         garment, _ = self.handover.pair.objects()
         found, _ = self.handover.rig(work.folder)
-        apply_classes(garment, found.classes)
-        return f"'{garment.name}' is classified."
+        apply_classes(garment, found.classes, found.levels)
+        overlay.show()
+        return f"'{garment.name}' is classified; Tightness makes more of it tight, or less."
 
 
 class GenerateRig(RigOperator, bpy.types.Operator):

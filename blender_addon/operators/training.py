@@ -17,6 +17,7 @@ from ..errors import SetupError
 from ..fabric_properties import fabric_options
 from ..names import identifiers
 from ..outside import jobs
+from ..outside.wording import remember
 from ..outside.work import Work
 from ..preferences import interpreter, preferences, unready
 from ..scene import playing
@@ -25,7 +26,7 @@ from ..scene.follower import leader_of
 from ..scene.garment import armature_of, unusable, unusable_here
 from ..scene.gather import GatheredScene, gather
 from ..scene.handover import MOTIONS, STAGE, hand_over
-from ..scene.models import job_of, relative
+from ..scene.models import job_of, orphans, relative, trainings, trainings_folder
 from ..scene.motions import FILE, Source, sources
 from ..scene.objects import Pair
 from ..scene.takes import ChosenMotions
@@ -114,8 +115,7 @@ class Train(tasks.OutsideOperator, bpy.types.Operator):
     """Train the garment on the chosen motions, outside Blender: it continues when Blender closes"""
 
     bl_idname = "ssilk.train"
-    bl_label = "Train"
-    undo = "Train"
+    bl_label = "Train"  # no undo step: a process outside Blender is not undone
 
     @classmethod
     def refusal(cls, context: bpy.types.Context) -> str:
@@ -146,11 +146,13 @@ class Train(tasks.OutsideOperator, bpy.types.Operator):
 
     def finish(self, context: bpy.types.Context, work: Work) -> str:
         (garment, _), name = self.pair.objects(), self.pair.name
-        folder = jobs.create(Path(bpy.data.filepath).parent / "ssilk", identifiers([name])[0])
-        prim = hand_over(self.scene, self.pair, folder).prim
+        folder = jobs.create(trainings_folder(), identifiers([name])[0])
+        given = hand_over(self.scene, self.pair, folder)
+        remember(folder, {**given.words, **self.chosen.words, jobs.MODEL: f"the model of '{name}'"})
         shutil.move(work.folder / MOTIONS, folder / MOTIONS)
         files = [beside(path, folder) for path in self.chosen.files]
-        command = train_command(garment, prim, self.chosen.names, files)
+        command = train_command(garment, given.prim, self.chosen.names, files)
+        jobs.own(folder, garment.name, Path(bpy.data.filepath).name)
         jobs.begin(interpreter(preferences(context)), folder, command)
         begun.add(folder)
         garment.ssilk.training.folder = relative(folder)
@@ -187,6 +189,22 @@ class CancelTraining(JobOperator, bpy.types.Operator):
     def apply(self, context: bpy.types.Context) -> str:
         jobs.cancel(job_of(context.object))
         return f"The training of '{context.object.name}' ends after its current step."
+
+
+class CancelOrphan(ReportingOperator, bpy.types.Operator):
+    """End a training whose garment is not in this file any more; its best model is kept"""
+
+    bl_idname = "ssilk.cancel_orphan"
+    bl_label = "Cancel Training"
+
+    folder: StringProperty(description="Folder of the training", options={"HIDDEN", "SKIP_SAVE"})
+
+    def apply(self, context: bpy.types.Context) -> str:
+        job = next((job for job in orphans() if str(job.folder) == self.folder), None)
+        if job is None:
+            raise SetupError("This training has ended, or its garment is back.")
+        jobs.cancel(job.folder)
+        return f"The training of '{job.garment}' ends after its current step."
 
 
 class ResumeTraining(JobOperator, bpy.types.Operator):
@@ -253,8 +271,10 @@ def watch() -> float:
     """Redraw panels when a training has progressed, and play its new model; return when to be called again [s]."""
     from ..panels.training import changed
 
-    garments = [thing for thing in bpy.data.objects if thing.type == "MESH" and thing.ssilk.training.folder]
-    if sum(changed(garment) for garment in garments):  # all are asked, so that none is drawn for once more
+    known = trainings()
+    things = [thing for thing in bpy.data.objects if thing.type == "MESH"]
+    folders = {job.folder for job in known} | {job_of(thing, known) for thing in things} - {None}
+    if sum(changed(folder) for folder in folders):  # all are asked, so that none is drawn for once more
         tasks.redraw(bpy.context)
     playing.take_up_models()
     return LOOK
@@ -276,4 +296,4 @@ def stop_watching(context: bpy.types.Context) -> None:
     begun.clear()
 
 
-CLASSES = (FindMotions, AddMotionFiles, RemoveMotion, Train, CancelTraining, ResumeTraining)
+CLASSES = (FindMotions, AddMotionFiles, RemoveMotion, Train, CancelTraining, CancelOrphan, ResumeTraining)

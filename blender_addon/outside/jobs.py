@@ -18,8 +18,10 @@ from typing import Any
 from ..errors import SetupError
 from .process import environment
 from .runner import BEAT, CANCEL, ORDER, STATE
+from .wording import recall, reworded
 
 MODEL = "model.safetensors"
+OWNER = "training.json"  # what is trained, as `own` wrote it
 CURVE = "model.curve.json"  # what validations found, as `ssilk train` writes it beside the model
 RUNNER = Path(__file__).with_name("runner.py")
 SILENCE = 10 * BEAT  # seconds without a beat after which a runner is no more
@@ -29,6 +31,21 @@ if sys.platform == "win32":
     DETACHED = subprocess.DETACHED_PROCESS | subprocess.CREATE_NEW_PROCESS_GROUP
 else:
     DETACHED = 0
+
+
+@dataclass(frozen=True)
+class OwnedJob:
+    """A job and what it trains; it stays what it is, whatever becomes of that.
+
+    Attributes:
+        garment, file: names of the garment and of the blend file, when the job was made.
+        begun: when that was [s].
+    """
+
+    folder: Path
+    garment: str
+    file: str
+    begun: float
 
 
 @dataclass(frozen=True)
@@ -42,8 +59,8 @@ class JobState:
         terms: energies of the last batch [J] by name; None where one is not finite.
         curve: [iteration, terms] now and then.
         checkpoint: iteration of the model on disk; None before there is one.
-        text: the last message.
-        error: why it failed.
+        text: the last message, in an artist's words.
+        error: why it failed, likewise.
     """
 
     state: str
@@ -89,6 +106,27 @@ def create(parent: Path, name: str) -> Path:
             f"{folder} cannot be made ({error.strerror or error}); save the blend file elsewhere."
         ) from error
     return folder
+
+
+def own(folder: Path, garment: str, file: str) -> None:
+    """Say what a job trains: names of a garment and of its blend file."""
+    _write(folder / OWNER, {"garment": garment, "file": file, "begun": time.time()})
+
+
+def owned(parent: Path) -> list[OwnedJob]:
+    """Return the jobs in a folder that say what they train, the latest one last."""
+    folders = [path.parent for path in parent.glob(f"*/{OWNER}")]
+    found = [job for folder in folders if (job := owner(folder))]
+    return sorted(found, key=lambda job: (job.begun, job.folder))
+
+
+def owner(folder: Path) -> OwnedJob | None:
+    """Return a job with what it trains; None where it does not say."""
+    document = _read(folder / OWNER)
+    garment, file, begun = (document.get(name) for name in ("garment", "file", "begun"))
+    if not (isinstance(garment, str) and isinstance(file, str) and isinstance(begun, int | float)):
+        return None
+    return OwnedJob(folder, garment, file, float(begun))
 
 
 def begin(python: str, folder: Path, command: Sequence[str]) -> None:
@@ -150,6 +188,9 @@ def read_state(folder: Path) -> JobState | None:
     known = {name: fields[name] for name in JobState.__dataclass_fields__ if name in fields}
     if "state" not in known:
         return None
+    if said := {name: known[name] for name in ("text", "error") if known.get(name)}:
+        names = recall(folder)
+        known.update({name: reworded(sentence, folder, names) for name, sentence in said.items()})
     state = JobState(**known)
     if state.alive and time.time() - state.beat > SILENCE:
         return JobState(**{**known, "state": "lost"})

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import isfinite
 from typing import Any
 
 from ssilk_core.events import format_seconds
@@ -41,9 +42,8 @@ def findings(state: JobState, curve: Mapping[str, Any], *, moves: bool) -> list[
     if not curve.get("points"):
         return [("No validation yet: too early to say what is being learned", False)] if state.alive else []
     score, lbs = curve["points"][-1]["validation"], curve_lbs(curve)
-    share = 1 - score["total"] / lbs["total"]
     found = [
-        (f"{abs(share):.1%} {'less' if share >= 0 else 'more'} energy than linear blend skinning", share < 0),
+        compared(score["total"], lbs["total"]),
         (f"{score['collisions']:.2%} of the vertices inside the body", False),
     ]
     if shown := score.get("shown_skin"):
@@ -59,6 +59,14 @@ def findings(state: JobState, curve: Mapping[str, Any], *, moves: bool) -> list[
             (f"Best model: from iteration {state.checkpoint}; play it live or bake it to see it on your shot", False)
         )
     return found
+
+
+def compared(total: float | None, lbs: float | None) -> tuple[str, bool]:
+    """Return how the energy of a validation [J] compares with that of linear blend skinning."""
+    if total is None or lbs is None or not isfinite(total - lbs):
+        return ("The energy of the validation is not finite", True)
+    share = 1 - total / lbs if lbs else 0.0
+    return (f"{abs(share):.1%} {'less' if share >= 0 else 'more'} energy than linear blend skinning", share < 0)
 
 
 def dynamics(moved: float) -> tuple[str, bool]:

@@ -125,7 +125,7 @@ class Work:
             case Result():
                 self.result = event.detail
             case Failed():
-                self.text, self.error = self._rephrase(event.error), event.error
+                self.text = self.error = self._rephrase(event.error)
 
     def _end(self, process: Process) -> None:
         self._process = None
@@ -133,7 +133,7 @@ class Work:
             self.error = f"{self.title} was cancelled."
         elif process.exit_code:
             reason = process.complaint or f"the command ended with code {process.exit_code}"
-            self.error = self.error or f"{self.title} failed: {reason}"
+            self.error = self.error or f"{self.title} failed: {self._rephrase(reason)}"
         else:
             self._go_on()
 

@@ -7,14 +7,14 @@ import bpy
 
 from ..errors import SetupError
 from ..scene.garment import unusable
-from ..scene.models import model_of
-from .base import SidebarPanel, draw_text
+from ..scene.models import model_of, relative
+from .base import SidebarPanel, draw_text, saying_errors
 
 
 def model_line(garment: bpy.types.Object) -> str:
     """Return which model is baked, or why there is none."""
     try:
-        return f"Bakes {bpy.path.relpath(str(model_of(garment)))}"
+        return f"Bakes {relative(model_of(garment))}"
     except SetupError as error:
         return str(error)
 
@@ -27,11 +27,13 @@ class BakingPanel(SidebarPanel, bpy.types.Panel):
     def poll(cls, context: bpy.types.Context) -> bool:
         return not unusable(context.object)
 
+    @saying_errors
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         layout.prop(context.object.ssilk, "model")
         draw_text(layout, model_line(context.object))
         layout.operator("ssilk.bake", icon="REC")
+        layout.operator("ssilk.to_bones", icon="BONE_DATA")
         layout.operator("ssilk.remove_bake", icon="TRASH")
         layout.operator("ssilk.hide_covered", icon="HIDE_ON")
         layout.operator("ssilk.show_covered", icon="HIDE_OFF")

@@ -4,8 +4,13 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Callable
+from functools import wraps
+from typing import Any
 
 import bpy
+
+from ssilk_core.errors import SsilkError
 
 from ..operators import tasks
 
@@ -38,8 +43,21 @@ def draw_work(layout: bpy.types.UILayout) -> None:
         draw_text(layout, work.text)
 
 
+def saying_errors(draw: Callable[[Any, bpy.types.Context], None]) -> Callable[[Any, bpy.types.Context], None]:
+    """Return a panel's `draw` that says what is wrong with the scene in place of the rest of the panel."""
+
+    @wraps(draw)
+    def told(panel: Any, context: bpy.types.Context) -> None:
+        try:
+            draw(panel, context)
+        except SsilkError as error:
+            draw_text(panel.layout, str(error), icon="ERROR")
+
+    return told
+
+
 class SidebarPanel:
-    """Base of all panels."""
+    """Base of all panels, whose `draw` is `saying_errors`."""
 
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"

@@ -10,19 +10,16 @@ from ..errors import SetupError
 from ..operators.classes import CHOICES
 from ..overlay import shown
 from ..scene.attributes import current_classes
-from ..scene.editing import edited_counts
 from ..scene.garment import unusable
-from .base import SidebarPanel, draw_text
+from .base import SidebarPanel, draw_text, saying_errors
 
 
 def class_counts(thing: bpy.types.Object) -> tuple[int, int, int] | None:
-    """Return how many vertices are pinned, tight and loose, in any mode; None without classes.
+    """Return how many vertices are pinned, tight and loose; None without classes.
 
     Raises:
         SetupError: what is stored are no classes.
     """
-    if thing.mode == "EDIT":
-        return edited_counts(thing.data)
     values = current_classes(thing.data)
     return None if values is None else counts(values)
 
@@ -35,13 +32,17 @@ class ClassesPanel(SidebarPanel, bpy.types.Panel):
     def poll(cls, context: bpy.types.Context) -> bool:
         return not unusable(context.object)
 
+    @saying_errors
     def draw(self, context: bpy.types.Context) -> None:
         layout, found = self.layout, None
         try:
             found = class_counts(context.object)
         except SetupError as error:
             draw_text(layout, str(error), icon="ERROR")
+        settings = context.object.ssilk
         layout.operator("ssilk.classify")
+        layout.prop(settings, "tightness", slider=True)
+        layout.prop_search(settings, "pins", context.object, "vertex_groups")
         layout.operator("ssilk.paint_classes", icon="BRUSH_DATA")
         editing = context.mode == "EDIT_MESH"
         row = layout.row(align=True)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import bpy
 
 from ..scene.garment import unusable
-from .base import SidebarPanel
+from .base import SidebarPanel, saying_errors
 
 MEMBRANE = {"stvk": ("lame_mu", "lame_lambda"), "baraff_witkin": ("stretch", "shear")}  # values of each model
 CONTACT = {"surface": ("contact", "loose_contact"), "vertex": ("collision",)}  # likewise
@@ -22,6 +22,7 @@ class FabricPanel(SidebarPanel, bpy.types.Panel):
     def poll(cls, context: bpy.types.Context) -> bool:
         return not unusable(context.object)
 
+    @saying_errors
     def draw(self, context: bpy.types.Context) -> None:
         layout, fabric = self.layout, context.object.ssilk.fabric
         layout.use_property_split, layout.use_property_decorate = True, False  # a fabric is not animated

@@ -6,9 +6,11 @@ from __future__ import annotations
 import bpy
 
 from ..errors import SetupError
+from ..outside.jobs import read_state
 from ..preferences import unready
 from ..scene.garment import armature_of, garments_of, unusable
-from .base import SidebarPanel, draw_text, draw_work
+from ..scene.models import orphans
+from .base import SidebarPanel, draw_text, draw_work, saying_errors
 
 
 def draw_garments(layout: bpy.types.UILayout, shown: bpy.types.Object) -> None:
@@ -25,10 +27,22 @@ def draw_garments(layout: bpy.types.UILayout, shown: bpy.types.Object) -> None:
         chosen.garment = garment.name
 
 
+def draw_orphans(layout: bpy.types.UILayout) -> None:
+    """Draw the trainings that go on for garments which are not in the file, each to be cancelled."""
+    for job in orphans():
+        state = read_state(job.folder)
+        row = layout.row(align=True)
+        row.progress(factor=state.fraction if state else 0.0, text=job.garment)
+        row.operator("ssilk.cancel_orphan", text="", icon="CANCEL").folder = str(job.folder)
+        where = "" if job.file == bpy.path.basename(bpy.data.filepath) else f", which is in {job.file}"
+        draw_text(layout, f"This training goes on without its garment '{job.garment}'{where}", icon="INFO")
+
+
 class GarmentPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_garment"
     bl_label = "Garment"
 
+    @saying_errors
     def draw(self, context: bpy.types.Context) -> None:
         layout, reason = self.layout, unusable(context.object)
         if reason:
@@ -44,3 +58,4 @@ class GarmentPanel(SidebarPanel, bpy.types.Panel):
             draw_text(layout, missing, icon="ERROR")
             layout.operator("ssilk.find_python")
         draw_work(layout)
+        draw_orphans(layout)

@@ -7,7 +7,7 @@ import bpy
 
 from ..scene import playing
 from ..scene.garment import unusable
-from .base import SidebarPanel
+from .base import SidebarPanel, saying_errors
 
 
 def live_line(garment: bpy.types.Object) -> str:
@@ -28,6 +28,7 @@ class PlaybackPanel(SidebarPanel, bpy.types.Panel):
     def poll(cls, context: bpy.types.Context) -> bool:
         return not unusable(context.object)
 
+    @saying_errors
     def draw(self, context: bpy.types.Context) -> None:
         layout, line = self.layout, live_line(context.object)
         if playing.live(context.object):

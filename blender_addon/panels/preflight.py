@@ -8,7 +8,7 @@ import bpy
 from ..operators.preflight import fixer
 from ..preflight_properties import shown_finding
 from ..scene.garment import unusable
-from .base import SidebarPanel, draw_text
+from .base import SidebarPanel, draw_text, saying_errors
 
 ICONS = {"error": "CANCEL", "warning": "ERROR", "info": "INFO"}
 
@@ -29,6 +29,7 @@ class PreflightPanel(SidebarPanel, bpy.types.Panel):
     def poll(cls, context: bpy.types.Context) -> bool:
         return not unusable(context.object)
 
+    @saying_errors
     def draw(self, context: bpy.types.Context) -> None:
         layout, preflight = self.layout, context.window_manager.ssilk_preflight
         layout.operator("ssilk.inspect", icon="VIEWZOOM")

@@ -9,7 +9,7 @@ from ..scene.garment import unusable
 from ..scene.heat import PENETRATION, PUSHED_OUT, SKIN, STRETCH
 from ..scene.lbs_copy import find_copy
 from ..scene.repairs import DISPLACEMENT
-from .base import SidebarPanel
+from .base import SidebarPanel, saying_errors
 
 
 def draw_kind(layout: bpy.types.UILayout, kind: str, text: str) -> None:
@@ -28,6 +28,7 @@ class QualityPanel(SidebarPanel, bpy.types.Panel):
     def poll(cls, context: bpy.types.Context) -> bool:
         return not unusable(context.object)
 
+    @saying_errors
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         draw_kind(layout, PENETRATION, text="Show Penetration")

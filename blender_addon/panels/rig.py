@@ -8,9 +8,9 @@ import bpy
 from ..classes import counts
 from ..errors import SetupError
 from ..scene.armature import proxy_names
-from ..scene.attributes import read_classes
+from ..scene.attributes import current_classes
 from ..scene.garment import armature_of, unusable
-from .base import SidebarPanel, draw_text
+from .base import SidebarPanel, draw_text, saying_errors
 
 
 def rig_line(garment: bpy.types.Object) -> str:
@@ -19,7 +19,7 @@ def rig_line(garment: bpy.types.Object) -> str:
         armature = armature_of(garment)
         if count := len(proxy_names(armature, garment)):
             return f"{count} proxies on '{armature.name}'"
-        classes = read_classes(garment.data)
+        classes = current_classes(garment.data)
     except SetupError as error:
         return str(error)
     if classes is not None and not counts(classes)[2]:
@@ -35,6 +35,7 @@ class RigPanel(SidebarPanel, bpy.types.Panel):
     def poll(cls, context: bpy.types.Context) -> bool:
         return not unusable(context.object)
 
+    @saying_errors
     def draw(self, context: bpy.types.Context) -> None:
         draw_text(self.layout, rig_line(context.object))
         self.layout.operator("ssilk.generate_rig", icon="BONE_DATA")

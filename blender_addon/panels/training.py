@@ -8,13 +8,14 @@ from pathlib import Path
 import bpy
 
 from ..curves import series
+from ..errors import SetupError
 from ..outside.jobs import JobState, read_curve, read_state, stamp
 from ..outside.report import findings, progress
 from ..scene.armature import proxy_names
 from ..scene.garment import armature_of, unusable
 from ..scene.models import job_of
 from ..scene.motions import FILE
-from .base import SidebarPanel, draw_text
+from .base import SidebarPanel, draw_text, saying_errors
 from .plot import plot, swatch
 
 ICONS = {"TIMELINE": "TIME", "ACTION": "ACTION", "STRIP": "NLA", "FILE": "FILE"}
@@ -22,12 +23,19 @@ PLOT_SCALE = 8.0  # in heights of a line of text
 _stamps: dict[Path, float] = {}
 
 
-def changed(garment: bpy.types.Object) -> bool:
-    """Return whether a garment's training has written something since this was asked last."""
-    folder = job_of(garment)
+def changed(folder: Path) -> bool:
+    """Return whether a training has written something since this was asked last."""
     before, now = _stamps.get(folder, 0.0), stamp(folder)
     _stamps[folder] = now
     return before != now
+
+
+def has_proxies(garment: bpy.types.Object) -> bool:
+    """Return whether a garment has proxies; not where its armature is gone."""
+    try:
+        return bool(proxy_names(armature_of(garment), garment))
+    except SetupError:  # a training is drawn nevertheless
+        return False
 
 
 def draw_motions(layout: bpy.types.UILayout, garment: bpy.types.Object) -> None:
@@ -71,6 +79,7 @@ class TrainingPanel(SidebarPanel, bpy.types.Panel):
     def poll(cls, context: bpy.types.Context) -> bool:
         return not unusable(context.object)
 
+    @saying_errors
     def draw(self, context: bpy.types.Context) -> None:
         layout, garment = self.layout, context.object
         settings, folder = garment.ssilk.training, job_of(garment)
@@ -82,4 +91,4 @@ class TrainingPanel(SidebarPanel, bpy.types.Panel):
         layout.operator("ssilk.train", icon="PLAY")
         state = folder and read_state(folder)
         if state:
-            draw_state(layout, folder, state, moves=bool(proxy_names(armature_of(garment), garment)))
+            draw_state(layout, folder, state, moves=has_proxies(garment))

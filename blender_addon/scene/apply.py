@@ -12,7 +12,8 @@ from ..edits import Edits
 from ..errors import SetupError
 from ..joints import Joints
 from .armature import need_editable, proxy_names
-from .attributes import write_classes
+from .attributes import write_classes, write_levels
+from .carrying import hang_on_armature
 from .edit_tracking import find_edits, generated, remember_weights
 from .gather import own_weights
 from .proxies import replace_proxies
@@ -20,14 +21,15 @@ from .trained_weights import discard_own_weights, own_groups
 from .weights import PLAIN, keep_weights, read_kept, write_groups
 
 
-def apply_classes(garment: bpy.types.Object, classes: np.ndarray) -> None:
-    """Write classes, shape (V,), to a garment.
+def apply_classes(garment: bpy.types.Object, classes: np.ndarray, levels: np.ndarray | None) -> None:
+    """Write classes, shape (V,), to a garment, and the least tightness at which each vertex is tight, (V,).
 
     Raises:
         SetupError: it was edited meanwhile.
     """
     _need_same_vertices(garment, classes)
     write_classes(garment.data, classes)
+    write_levels(garment.data, levels)
 
 
 def apply_rig(
@@ -104,7 +106,8 @@ def _need_same_vertices(garment: bpy.types.Object, classes: np.ndarray) -> None:
 
 
 def _bind(garment: bpy.types.Object, armature: bpy.types.Object) -> None:
-    """Give a garment an Armature modifier, the first one, unless it has one for this armature."""
+    """Give a garment an Armature modifier, the first one, unless it has one; no bone carries it any more."""
+    hang_on_armature(garment)
     if any(modifier.type == "ARMATURE" and modifier.object == armature for modifier in garment.modifiers):
         return
     modifier = garment.modifiers.new("Armature", "ARMATURE")

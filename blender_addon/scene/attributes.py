@@ -10,14 +10,15 @@ from __future__ import annotations
 import bpy
 import numpy as np
 
-from ssilk_core.assets import TIGHT
+from ssilk_core.assets import TIGHT, classes_at
 
 from .. import classes as palette
 from ..errors import SetupError
+from .editing import edited_classes, edited_colors
 
 
 def read_classes(mesh: bpy.types.Mesh) -> np.ndarray | None:
-    """Return the class of each vertex, shape (V,); None where the mesh has none. Not in edit mode.
+    """Return the class of each vertex, shape (V,); None where the mesh has none, or in edit mode 8 bits each.
 
     Raises:
         SetupError: the attribute is no integer for each point, or holds other values.
@@ -30,9 +31,12 @@ def read_classes(mesh: bpy.types.Mesh) -> np.ndarray | None:
             f"The attribute '{palette.ATTRIBUTE}' of '{mesh.name}' is {attribute.data_type} on {attribute.domain}; "
             "integers on points are needed: remove it and paint again."
         )
-    values = np.empty(len(mesh.vertices), dtype=np.int32)
-    attribute.data.foreach_get("value", values)
-    if not palette.in_range(values):
+    if mesh.is_editmode:  # the attribute itself is empty then
+        values = edited_classes(mesh)
+    else:
+        values = np.empty(len(mesh.vertices), dtype=np.int32)
+        attribute.data.foreach_get("value", values)
+    if values is not None and not palette.in_range(values):
         raise SetupError(
             f"The attribute '{palette.ATTRIBUTE}' of '{mesh.name}' holds values besides 0, 1 and 2; paint these "
             "again."
@@ -53,6 +57,25 @@ def write_classes(mesh: bpy.types.Mesh, values: np.ndarray) -> None:
     mesh.update()
 
 
+def write_levels(mesh: bpy.types.Mesh, levels: np.ndarray | None) -> None:
+    """Keep the least tightness at which each vertex is tight, shape (V,), or forget it. Not in edit mode."""
+    if palette.LEVELS in mesh.attributes:
+        mesh.attributes.remove(mesh.attributes[palette.LEVELS])
+    if levels is not None:
+        attribute = mesh.attributes.new(palette.LEVELS, "FLOAT", "POINT")
+        attribute.data.foreach_set("value", np.ascontiguousarray(levels, dtype=np.float32))
+
+
+def tighten(mesh: bpy.types.Mesh, tightness: float) -> None:
+    """Make classes again at another tightness, where they were found automatically. Not in edit mode."""
+    attribute = mesh.attributes.get(palette.LEVELS)
+    if attribute is None or (attribute.domain, attribute.data_type) != ("POINT", "FLOAT"):
+        return
+    levels = np.empty(len(mesh.vertices), dtype=np.float32)
+    attribute.data.foreach_get("value", levels)
+    write_classes(mesh, classes_at(levels, tightness))
+
+
 def show_classes(mesh: bpy.types.Mesh) -> None:
     """Make the active colours of a mesh those of its classes; all is tight where there are none yet."""
     values = read_classes(mesh)
@@ -70,7 +93,10 @@ def show_classes(mesh: bpy.types.Mesh) -> None:
 
 
 def painted_classes(mesh: bpy.types.Mesh) -> np.ndarray | None:
-    """Return the class whose colour each vertex is nearest to, shape (V,); None without colours. Not in edit mode."""
+    """Return the class whose colour each vertex is nearest to, shape (V,); None without colours."""
+    if mesh.is_editmode:
+        colors = edited_colors(mesh)
+        return None if colors is None else palette.nearest(colors)
     layer = mesh.color_attributes.get(palette.COLOR_ATTRIBUTE)
     if layer is None:
         return None

@@ -14,7 +14,9 @@ from ssilk_core.kinematics import local_transforms, multiply_quaternions, quater
 from ..errors import SetupError
 from ..joints import Joints, joint_order
 from .armature import proxy_names
+from .carrying import need_uncarried
 from .keys import Channel, bake_keys, remove_keys
+from .modifiers import need_plain_modifiers
 from .shapes import need_relative, remove_shapes, rest_points, write_shapes
 from .trained_weights import put_trained_weights, restore_own_weights
 from .units import scene_units
@@ -30,6 +32,8 @@ def need_bakeable(garment: bpy.types.Object, armature: bpy.types.Object, joints:
         SetupError: an option of the modifier, of a bone or of shape keys is in the way.
     """
     need_relative(garment)
+    need_uncarried(garment)
+    need_plain_modifiers(garment)
     _need_linear(garment, armature)
     names = joints.names
     for name, parent in list(zip(names, joints.parents))[joints.character_count :]:

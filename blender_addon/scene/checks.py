@@ -8,7 +8,8 @@ import bpy
 from ssilk_core.preflight.finding import Finding
 
 from .armature import is_evenly_scaled
-from .garment import armature_of, shaping_modifiers
+from .garment import armature_of
+from .modifiers import objections
 
 SCALE = "unequal-scale"
 
@@ -28,9 +29,9 @@ def scene_findings(garment: bpy.types.Object) -> list[Finding]:
     found += [
         Finding(
             severity="error", code="shaping-modifier", prim=garment.name,
-            found=f"its modifier '{modifier.name}' shapes it before bones move it",
-            why="what is trained are the vertices that bones move", fix="apply the modifier",
+            found=f"its modifier '{objection.modifier}' {objection.does}",
+            why="what is trained are the vertices of its mesh, which bones move", fix=objection.todo,
         )
-        for modifier in shaping_modifiers(garment)
+        for objection in objections(garment)
     ]  # fmt: skip
     return found

@@ -12,10 +12,10 @@ from ssilk_core.assets import Mesh
 from ssilk_core.mesh.hidden_faces import HiddenFaces, hidden_polygons
 
 from ..errors import SetupError
+from .cage import cage_points
 from .garment import armature_of, bodies_of
 from .gather import gather
 from .masks import mask, show
-from .meshes import need_same_vertices, world_points
 from .units import scene_units
 
 
@@ -79,5 +79,4 @@ def _posed(thing: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> np.ndarra
     """Return the vertices of an object as they are shown [m], y up, shape (V, 3)."""
     if not thing.visible_get():
         raise SetupError(f"'{thing.name}' is not visible; show it to compare skin and cloth.")
-    need_same_vertices(thing, depsgraph)
-    return scene_units().points_to_core(world_points(thing.evaluated_get(depsgraph)))
+    return scene_units().points_to_core(cage_points(thing, depsgraph))

@@ -3,12 +3,11 @@
 
 from __future__ import annotations
 
-from collections import Counter
-
 import bmesh
 import bpy
+import numpy as np
 
-from ssilk_core.assets import LOOSE, PINNED, TIGHT
+from ssilk_core.assets import TIGHT
 
 from .. import classes as palette
 
@@ -37,11 +36,15 @@ def fill_selected(mesh: bpy.types.Mesh, value: int) -> int:
     return len(selected)
 
 
-def edited_counts(mesh: bpy.types.Mesh) -> tuple[int, int, int] | None:
-    """Return how many vertices are pinned, tight and loose; None without classes."""
+def edited_classes(mesh: bpy.types.Mesh) -> np.ndarray | None:
+    """Return the class attribute of each vertex, shape (V,); None without one, or where Python cannot read it."""
     edited = bmesh.from_edit_mesh(mesh)
-    layer = edited.verts.layers.int.get(palette.ATTRIBUTE)
-    if layer is None:
-        return None
-    found = Counter(vertex[layer] for vertex in edited.verts)
-    return found[PINNED], found[TIGHT], found[LOOSE]
+    layer = edited.verts.layers.int.get(palette.ATTRIBUTE)  # 8 bits are no layer that Python knows
+    return None if layer is None else np.array([vertex[layer] for vertex in edited.verts], dtype=np.int32)
+
+
+def edited_colors(mesh: bpy.types.Mesh) -> np.ndarray | None:
+    """Return the painted sRGB colour of each vertex, shape (V, 4); None without."""
+    edited = bmesh.from_edit_mesh(mesh)
+    layer = edited.verts.layers.color.get(palette.COLOR_ATTRIBUTE)
+    return None if layer is None else np.array([vertex[layer] for vertex in edited.verts]).reshape(-1, 4)

@@ -7,14 +7,8 @@ import bpy
 
 from ..classes import ATTRIBUTE
 from ..errors import SetupError
+from .carrying import carrier_of, is_carried
 from .follower import leader_of
-
-# Modifiers that leave points where they are, and those that may come after the armature's.
-HARMLESS = {
-    "DATA_TRANSFER", "NORMAL_EDIT", "UV_PROJECT", "UV_WARP", "VERTEX_WEIGHT_EDIT", "VERTEX_WEIGHT_MIX",
-    "VERTEX_WEIGHT_PROXIMITY", "WEIGHTED_NORMAL",
-}  # fmt: skip
-AFTERWARDS = {"SUBSURF", "SOLIDIFY"}
 
 
 def unusable(thing: bpy.types.Object | None) -> str:
@@ -44,14 +38,15 @@ def is_garment(thing: bpy.types.Object) -> bool:
 
 
 def armature_of(garment: bpy.types.Object) -> bpy.types.Object:
-    """Return the armature that a garment was given, else that of its modifier, else its parent, else the only one.
+    """Return the armature that a garment was given, else that of its modifier, else of its parent, else the only one.
 
     Raises:
         SetupError: there is none, or there are several.
     """
     bound = _modifier_armature(garment)
     above = garment.parent if garment.parent and garment.parent.type == "ARMATURE" else None
-    chosen = garment.ssilk.armature or bound or above
+    carrier = carrier_of(garment)
+    chosen = garment.ssilk.armature or bound or above or (carrier and carrier[0])
     if chosen:
         return chosen
     found = [thing for thing in bpy.context.scene.objects if thing.type == "ARMATURE" and leader_of(thing) == thing]
@@ -83,35 +78,18 @@ def bodies_of(garment: bpy.types.Object, armature: bpy.types.Object) -> list[bpy
     meshes = [thing for thing in things if thing.type == "MESH" and thing != garment]
     wearers = (armature, leader_of(armature))
     bound = [thing for thing in meshes if _modifier_armature(thing) in wearers]
-    if not chosen:
+    carried = [thing for thing in meshes if is_carried(thing, wearers)]
+    if chosen:
+        bound = [thing for thing in meshes if thing in (*bound, *carried)]
+    else:  # armour and weapons count where they are chosen, or where the whole character is made like them
         bound = [thing for thing in bound if not is_garment(thing)]
+        bound = bound or [thing for thing in carried if not is_garment(thing)]
     loose = [thing.name for thing in meshes if thing not in bound] if chosen else []
     if loose:
         raise SetupError(f"'{loose[0]}' is not bound to '{armature.name}'; bind it, or take it from '{chosen.name}'.")
     if not bound:
         raise SetupError(f"No body is bound to '{armature.name}'; give the character's mesh an Armature modifier.")
     return bound
-
-
-def shaping_modifiers(thing: bpy.types.Object) -> list[bpy.types.Modifier]:
-    """Return the modifiers that shape a mesh before its armature deforms it."""
-    kinds = [modifier.type for modifier in thing.modifiers]
-    bound = "ARMATURE" in kinds
-    before = thing.modifiers[: kinds.index("ARMATURE")] if bound else thing.modifiers[:]
-    passed = HARMLESS if bound else HARMLESS | AFTERWARDS
-    return [modifier for modifier in before if modifier.show_viewport and modifier.type not in passed]
-
-
-def need_undeformed_shape(garment: bpy.types.Object) -> None:
-    """Check that a garment's own vertices are those that its armature moves.
-
-    Raises:
-        SetupError: a modifier shapes it first.
-    """
-    for modifier in shaping_modifiers(garment):
-        raise SetupError(
-            f"'{garment.name}' is shaped by its modifier '{modifier.name}' before bones move it; apply the modifier."
-        )
 
 
 def _modifier_armature(thing: bpy.types.Object) -> bpy.types.Object | None:

@@ -18,12 +18,16 @@ from ..joints import Joints
 from ..names import identifiers
 from .armature import read_joints
 from .attributes import current_classes
-from .garment import armature_of, bodies_of, need_undeformed_shape, shaping_modifiers
+from .carrying import carried_weights, is_carried, rest_world
+from .follower import leader_of
+from .garment import armature_of, bodies_of
 from .masks import unmasked
+from .modifiers import need_plain_modifiers, reshapes
 from .trained_weights import own_groups
 from .units import scene_units
 from .weights import PLAIN, read_groups, read_kept
 
+HALF = 0.5  # weight from which on a vertex is in a group
 ROOT, SKELETON = "/Character", "Skeleton"  # prims of the stage that is handed over
 
 
@@ -57,7 +61,7 @@ def gather(garment: bpy.types.Object, *, classes: bool = True, proxies: bool = T
         SetupError: something is missing or cannot be used; the sentence names the object.
     """
     armature = armature_of(garment)
-    need_undeformed_shape(garment)
+    need_plain_modifiers(garment)
     joints = read_joints(armature, garment)
     things = [garment, *bodies_of(garment, armature)]
     paths = [f"{ROOT}/{name}" for name in identifiers((thing.name for thing in things), taken=(SKELETON,))]
@@ -73,6 +77,7 @@ def gather(garment: bpy.types.Object, *, classes: bool = True, proxies: bool = T
             mesh,
             None if lbs is None else SkinWeights.from_dense(paths[0], lbs),
             current_classes(garment.data) if classes else None,
+            None if classes else _pins(garment),
         ),
         rig=rig,
         meshes=dict(zip((thing.name for thing in things), (mesh, *(body.mesh for body in bodies)))),
@@ -88,6 +93,8 @@ def own_weights(armature: bpy.types.Object, garment: bpy.types.Object, joints: J
     kept = read_kept(garment.data, PLAIN, names)
     if kept is not None or joints.proxy_count:
         return kept
+    if is_carried(garment, (armature, leader_of(armature))):
+        return carried_weights(garment, joints.character, len(garment.data.vertices))
     weights = own_groups(armature, garment, names)
     bare = int(np.count_nonzero(~weights.any(axis=1)))
     if bare == len(weights):
@@ -98,6 +105,16 @@ def own_weights(armature: bpy.types.Object, garment: bpy.types.Object, joints: J
             "the vertex groups so that all weights are taken from the body."
         )
     return weights
+
+
+def _pins(garment: bpy.types.Object) -> np.ndarray | None:
+    """Return which vertices are in the group of pins, by half at least, shape (V,); None without such a group."""
+    name = garment.ssilk.pins
+    if not name:
+        return None
+    if name not in garment.vertex_groups:
+        raise SetupError(f"'{garment.name}' has no vertex group '{name}' for its pins; choose another, or none.")
+    return (read_groups(garment, garment.data, [name])[:, 0] >= HALF).astype(np.int8)
 
 
 def _proxy_rig(armature: bpy.types.Object, garment: bpy.types.Object, joints: Joints, path: str) -> ProxyRig:
@@ -114,18 +131,23 @@ def _proxy_rig(armature: bpy.types.Object, garment: bpy.types.Object, joints: Jo
 
 def _read_body(thing: bpy.types.Object, armature: bpy.types.Object, joints: Joints, path: str) -> Body:
     """Return a body at rest; evaluated where modifiers shape it before its armature does."""
-    if not shaping_modifiers(thing):
-        return _bound(thing, thing.data, joints, path)
+    if not reshapes(thing):
+        return _bound(thing, thing.data, armature, joints, path)
     with _at_rest(armature) as depsgraph:
         evaluated = thing.evaluated_get(depsgraph)
         try:
-            return _bound(thing, evaluated.to_mesh(), joints, path)
+            return _bound(thing, evaluated.to_mesh(), armature, joints, path)
         finally:
             evaluated.to_mesh_clear()
 
 
-def _bound(thing: bpy.types.Object, mesh: bpy.types.Mesh, joints: Joints, path: str) -> Body:
-    weights = read_groups(thing, mesh, joints.names)
+def _bound(
+    thing: bpy.types.Object, mesh: bpy.types.Mesh, armature: bpy.types.Object, joints: Joints, path: str
+) -> Body:
+    if is_carried(thing, (armature, leader_of(armature))):
+        weights = carried_weights(thing, joints, len(mesh.vertices))
+    else:
+        weights = read_groups(thing, mesh, joints.names)
     bare = int(np.count_nonzero(~weights.any(axis=1)))
     if bare:
         raise SetupError(f"{bare} of {len(weights)} vertices of '{thing.name}' have no bone's weight; paint these.")
@@ -144,7 +166,7 @@ def _at_rest(armature: bpy.types.Object) -> Iterator[bpy.types.Depsgraph]:
 
 
 def _read_mesh(thing: bpy.types.Object, mesh: bpy.types.Mesh, path: str) -> Mesh:
-    world = np.array(thing.matrix_world)
+    world = np.array(rest_world(thing))
     points = _values(mesh.vertices, "co", 3).reshape(-1, 3) @ world[:3, :3].T + world[:3, 3]
     counts = _values(mesh.polygons, "loop_total", 1, np.int32)
     corners = np.arange(len(mesh.loops))

@@ -15,6 +15,7 @@ import numpy as np
 from ssilk_core.assets import Garment, ProxyRig
 
 from ..errors import SetupError
+from ..outside.wording import reworded
 from .gather import GatheredScene
 from .objects import Pair
 
@@ -60,11 +61,17 @@ class Handover:
         repaired = read_garment(folder / REPAIRED, self.scene.character.skeleton, garment=self.prim)
         return self.scene.units.points_from_core(repaired.mesh.points)
 
+    @property
+    def words(self) -> dict[str, str]:
+        """Names of the objects by what was made of them, for `outside.wording`."""
+        things = {mesh.path: name for name, mesh in self.scene.meshes.items()}
+        things[self.scene.character.skeleton.path] = self.pair.armature[1]
+        named = {f"{file}:{prim}": f"'{name}'" for file in (STAGE, RIGGED, REPAIRED) for prim, name in things.items()}
+        return {**named, STAGE: "the character", RIGGED: "its rig", REPAIRED: "the repaired character"}
+
     def in_blender_words(self, sentence: str) -> str:
         """Return a sentence with names of objects in place of files and prims."""
-        for name, mesh in sorted(self.scene.meshes.items(), key=lambda pair: -len(pair[1].path)):
-            sentence = sentence.replace(f"{self.stage}:{mesh.path}", f"'{name}'")
-        return sentence.replace(f"{self.stage}:", "").replace(str(self.stage), "the character")
+        return reworded(sentence, self.stage.parent, self.words)
 
 
 def hand_over(scene: GatheredScene, pair: Pair, folder: Path) -> Handover:

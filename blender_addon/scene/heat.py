@@ -18,9 +18,11 @@ from ssilk_core.shown_skin import COVER_REACH, SHOW_DEPTH
 
 from .. import heat
 from ..errors import SetupError
+from .cage import cage_points, is_refined
+from .carrying import rest_world
 from .garment import armature_of, bodies_of
 from .masks import need_unmasked
-from .meshes import need_same_vertices, world_points
+from .meshes import world_points
 from .repairs import displacements
 from .shapes import mixed_points, rest_points
 
@@ -76,15 +78,14 @@ def measuring(
     All that it needs of the frame is read before the first yield.
 
     Raises:
-        SetupError: it has no body or one with hidden skin, was not pushed out, or its modifiers change how many
-            vertices there are.
+        SetupError: it has no body or one with hidden skin, was not pushed out, or modifiers change how many vertices
+            there are before bones move them.
     """
-    need_same_vertices(garment, depsgraph)
     if kind == PUSHED_OUT:
         return HeatMap(kind, displacements(garment))
     if kind == SKIN:
         return HeatMap(kind, (yield from _shown(garment, depsgraph)))
-    points = world_points(garment.evaluated_get(depsgraph))
+    points = cage_points(garment, depsgraph)
     if kind == STRETCH:
         world = np.array(garment.matrix_world)[:3, :3]
         rest = rest_points(garment) @ world.T
@@ -190,18 +191,24 @@ def _surface(body: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
     return world_points(body), triangles
 
 
+def _cage(thing: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> tuple[np.ndarray, np.ndarray]:
+    """Return points and triangles of an object's own mesh as `_surface` does, beneath modifiers that refine it."""
+    if not is_refined(thing, depsgraph):
+        return _surface(thing.evaluated_get(depsgraph))
+    triangles = _triangles(thing.data)
+    return cage_points(thing, depsgraph), triangles[:, ::-1] if thing.matrix_world.determinant() < 0 else triangles
+
+
 def _shown(garment: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Generator[float, None, np.ndarray]:
     """Find how far beneath the skin the cloth is where skin shows [m], as `heat.shown_depths`, of all bodies."""
     bodies, scale = bodies_of(garment, armature_of(garment)), bpy.context.scene.unit_settings.scale_length
     need_unmasked(bodies)
-    for body in bodies:
-        need_same_vertices(body, depsgraph)
-    cloth, triangles = _surface(garment.evaluated_get(depsgraph))
+    cloth, triangles = _cage(garment, depsgraph)
     trees = [
         BVHTree.FromPolygons(points.tolist(), triangles.tolist(), all_triangles=True)
-        for points in (_in_world(garment, rest_points(garment)), cloth)
+        for points in (_at_rest(garment, rest_points(garment)), cloth)
     ]
-    skins = [(_in_world(body, mixed_points(body)), *_surface(body.evaluated_get(depsgraph))) for body in bodies]
+    skins = [(_at_rest(body, mixed_points(body)), *_cage(body, depsgraph)) for body in bodies]
     found = []
     for number, (rest, now, faces) in enumerate(skins):
         steps = _shown_on(rest, now, faces, *trees, 1 / scale)
@@ -236,8 +243,8 @@ def _distances(
     return found
 
 
-def _in_world(thing: bpy.types.Object, points: np.ndarray) -> np.ndarray:
-    world = np.array(thing.matrix_world)
+def _at_rest(thing: bpy.types.Object, points: np.ndarray) -> np.ndarray:
+    world = np.array(rest_world(thing))
     return points @ world[:3, :3].T + world[:3, 3]
 
 

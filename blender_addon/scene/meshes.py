@@ -10,8 +10,6 @@ import bmesh
 import bpy
 import numpy as np
 
-from ..errors import SetupError
-
 
 @contextmanager
 def opened(mesh: bpy.types.Mesh) -> Iterator[bmesh.types.BMesh]:
@@ -31,16 +29,6 @@ def edited(mesh: bpy.types.Mesh) -> Iterator[bmesh.types.BMesh]:
         yield content
         content.to_mesh(mesh)
     mesh.update()
-
-
-def need_same_vertices(thing: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> None:
-    """Raise `SetupError` if an object's modifiers change how many vertices it has."""
-    shown, count = len(thing.evaluated_get(depsgraph).data.vertices), len(thing.data.vertices)
-    if shown != count:
-        raise SetupError(
-            f"A modifier gives '{thing.name}' {shown} vertices where its mesh has {count}; switch it off in "
-            "viewports."
-        )
 
 
 def world_points(thing: bpy.types.Object) -> np.ndarray:

@@ -13,6 +13,7 @@ from mathutils import Matrix
 from ssilk_core.preflight.mesh import SAME_PLACE
 
 from ..errors import SetupError
+from .carrying import rest_world
 from .meshes import edited
 
 DISPLACEMENT = "SSILK Displacement"  # mesh attribute: how far vertices moved, in the mesh's own space
@@ -61,14 +62,14 @@ def apply_scale(armature: bpy.types.Object) -> None:
 
 
 def move_points(thing: bpy.types.Object, points: np.ndarray) -> np.ndarray:
-    """Move the vertices of a mesh to places in the world, shape (V, 3), its shape keys with them.
+    """Move the vertices of a mesh to places in the world at rest, shape (V, 3), its shape keys with them.
 
     Vertices that would not move stay exactly as they are. The mesh attribute `DISPLACEMENT` holds how they moved.
 
     Returns:
         How far each vertex moved [m], shape (V,).
     """
-    mesh, inverse = thing.data, np.array(thing.matrix_world.inverted())
+    mesh, inverse = thing.data, np.array(rest_world(thing).inverted())
     target = points @ inverse[:3, :3].T + inverse[:3, 3]
     old = _coordinates(mesh.vertices)
     moved = np.linalg.norm((target - old) @ _metres(thing).T, axis=1, keepdims=True) > ROUNDING

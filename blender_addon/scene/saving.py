@@ -10,6 +10,7 @@ from typing import Any
 import bpy
 from bpy.app.handlers import persistent
 
+from .models import job_of, relative, remembered, trainings
 from .motions import FILE
 
 _before: list[tuple[Any, str, str]] = []
@@ -26,10 +27,21 @@ def paths() -> Iterator[tuple[Any, str]]:
                     yield holder, name
 
 
+def remember_trainings() -> None:
+    """Let garments remember their trainings again, which an undo may have taken from them."""
+    known = trainings()
+    for thing in bpy.data.objects:
+        if thing.library is None and thing.type == "MESH":
+            folder = job_of(thing, known)
+            if folder and folder != remembered(thing):
+                thing.ssilk.training.folder = relative(folder)
+
+
 @persistent
 def before_saving(path: str, *_: object) -> None:
-    """Make paths relative to where the file is about to be saved."""
+    """Remember trainings, and make paths relative to where the file is about to be saved."""
     _before.clear()
+    remember_trainings()
     if not bpy.data.filepath or os.path.dirname(path) == os.path.dirname(bpy.data.filepath):
         return
     for holder, name in list(paths()):

@@ -12,7 +12,7 @@ import bpy
 from ..joints import Joints
 from ..names import identifiers
 from .gather import ROOT
-from .handover import loading_usd
+from .handover import MOTIONS, loading_usd
 from .motions import FILE, Source
 from .sampling import SampledTake, prepare_takes, sample
 
@@ -45,6 +45,11 @@ class ChosenMotions:
     def names(self) -> list[str]:
         """Names of the files that takes are written to."""
         return [f"{name}.usdc" for name in identifiers(take.source.name for take in self.takes)]
+
+    @property
+    def words(self) -> dict[str, str]:
+        """Names of the motions by the files that they are written to, for `outside.wording`."""
+        return {f"{MOTIONS}/{name}": f"'{take.source.name}'" for name, take in zip(self.names, self.takes)}
 
     def writing(self, armature: bpy.types.Object, joints: Joints, folder: Path) -> Iterator[float]:
         """Sample the takes and write them into a new folder, yielding the part of each of both that is done.

@@ -7,9 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from ssilk_core.errors import SsilkError
 from ssilk_core.runtime import Player
 
+from ..errors import SetupError
 from ..joints import Joints, joint_order
+from ..outside.wording import recall, reworded
 
 
 class TrainedGarment:
@@ -25,7 +28,11 @@ class TrainedGarment:
     """
 
     def __init__(self, path: Path, joints: Joints) -> None:
-        self.player, self.joints = Player.load(path), joints
+        try:
+            self.player = Player.load(path)
+        except SsilkError as error:
+            raise SetupError(reworded(str(error), path.parent, recall(path.parent))) from error
+        self.joints = joints
         self.order = joint_order(joints, self.player.file.scene.joint_names)
         self.own = np.argsort(self.order[: joints.character_count])
 

@@ -249,6 +249,14 @@ WORDS = {
     "Wall time to fill with as many steps as fit, in place of the preset's; zero for these": (
         "Zeit, die mit so vielen Schritten gefüllt wird, wie hineinpassen, statt denen der Vorgabe; null: diese"
     ),
+    "Tightness": "Enge",
+    "How much of the garment is tight: nothing but what is pinned, or all; replaces what is painted": (
+        "Wie viel des Kleidungsstücks anliegt: nichts, was nicht fest ist, oder alles; ersetzt, was gemalt ist"
+    ),
+    "Pins": "Festes",
+    "Vertex group of what is pinned when classes are found; the band it hangs from when empty": (
+        "Vertexgruppe dessen, was fest ist, wenn Klassen gesucht werden; wenn leer, der Rand, an dem es hängt"
+    ),
     "Folder": "Ordner",
     "Folder of the garment's training, relative to the blend file": (
         "Ordner des Trainings dieses Kleidungsstücks, relativ zur Blend-Datei"
@@ -260,6 +268,9 @@ WORDS = {
     "Cancel Training": "Training beenden",
     "End the training; its best model is kept, and it can go on from where it is": (
         "Das Training beenden; sein bestes Modell bleibt, und es kann von hier weitergehen"
+    ),
+    "End a training whose garment is not in this file any more; its best model is kept": (
+        "Ein Training beenden, dessen Kleidungsstück nicht mehr in dieser Datei ist; sein bestes Modell bleibt"
     ),
     "Resume Training": "Training fortsetzen",
     "Let the training go on from where it ended": "Das Training dort fortsetzen, wo es endete",
@@ -290,8 +301,8 @@ WORDS = {
         "Für viele Figuren in der Ferne: wenige Formen und Stellvertreter, vier Einflüsse"
     ),
     "Hero": "Hauptfigur",
-    "Refined by a solver: points to USD alone; on the timeline bones and shape keys nearest to them": (
-        "Von einem Löser verfeinert: nur nach USD Punkte; auf der Zeitleiste nächste Knochen und Formschlüssel"
+    "Refined by a solver, on bones and shape keys of this shot's own; takes long": (
+        "Von einem Löser verfeinert, auf Knochen und eigenen Formschlüsseln dieses Shots; dauert lange"
     ),
     "To USD": "Nach USD",
     "Write a UsdSkel shot, with the body": "Einen UsdSkel-Shot schreiben, mit dem Körper",
@@ -302,6 +313,11 @@ WORDS = {
     "Pre-Roll": "Vorlauf",
     "How long the garment settles in the first pose before the first frame": (
         "Wie lange das Kleidungsstück sich in der ersten Pose setzt, vor dem ersten Bild"
+    ),
+    "To Bones": "In Knochen",
+    "Turn the garment's baked Cloth modifier into keys of its proxies and shape keys, and switch it off": (
+        "Den gebackenen Stoff-Modifikator des Kleidungsstücks in Schlüsselbilder seiner Stellvertreter und "
+        "Formschlüssel umwandeln und abschalten"
     ),
     "Remove Bake": "Gebackenes entfernen",
     "Remove the keys and shape keys that were baked or played live, and give the garment its own weights back": (

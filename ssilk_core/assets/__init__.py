@@ -9,7 +9,7 @@ triangles counter-clockwise from outside. Readers convert to these conventions, 
 from .arrays import UP, Floats, Ints
 from .character import Body, Character
 from .deformer import Deformer, GarmentPose
-from .garment import CLASS_NAMES, LOOSE, PINNED, TIGHT, Garment
+from .garment import CLASS_NAMES, LOOSE, PINNED, TIGHT, Garment, classes_at
 from .mesh import Mesh
 from .motion import Motion
 from .rig import ProxyRig
@@ -20,4 +20,5 @@ from .skin import SkinWeights
 __all__ = [
     "CLASS_NAMES", "LOOSE", "PINNED", "TIGHT", "UP", "Body", "Character", "Deformer", "Floats", "Garment",
     "GarmentPose", "Ints", "Mesh", "Motion", "ProxyRig", "Scene", "Skeleton", "SkinWeights", "check_rigid",
+    "classes_at",
 ]  # fmt: skip

@@ -68,6 +68,17 @@ class SkinWeights:
         np.add.at(matrix, (np.arange(self.vertex_count)[:, None], self.indices), self.weights)
         return matrix
 
+    @property
+    def only_joint(self) -> int | None:
+        """The joint that carries all vertices alone, as a bone carries what is parented to it; None without one."""
+        used = np.unique(self.indices[self.weights > 0])
+        return int(used[0]) if len(used) == 1 else None
+
+    @classmethod
+    def rigid(cls, path: str, joint: int, vertex_count: int) -> SkinWeights:
+        """Return weights with which one joint carries all vertices."""
+        return cls(path, np.full((vertex_count, 1), joint), np.ones((vertex_count, 1)))
+
     @classmethod
     def from_dense(cls, path: str, matrix: Floats, influences: int | None = None) -> SkinWeights:
         """Keep the `influences` largest weights of each row of `matrix` (V, J); all of them by default."""

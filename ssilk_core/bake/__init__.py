@@ -17,11 +17,13 @@ from .result import BakeResult, FrameSpan, RefinementSummary, Verification
 from .rollout import BakeRollout
 from .sizing import shot_bytes
 from .task import BakeTask, plan_layers
+from .trajectories import cache_origin, motion_at, rig_deformer, skin_trajectories, trained_deformer
 from .verification import verify
 from .write import bake
 
 __all__ = [
     "BakeRequest", "BakeResult", "BakeRollout", "BakeTask", "FrameSpan", "LayerFolder", "LoadedGarment",
-    "RefinementSummary", "Verification", "bake", "bake_layers", "load_garment", "load_rollout", "on_character",
-    "plan_layers", "shot_bytes", "verify", "with_model",
+    "RefinementSummary", "Verification", "bake", "bake_layers", "cache_origin", "load_garment", "load_rollout",
+    "motion_at", "on_character", "plan_layers", "rig_deformer", "shot_bytes", "skin_trajectories",
+    "trained_deformer", "verify", "with_model",
 ]  # fmt: skip

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A rollout as one glTF binary, named as the stages of USD are."""
+"""Shots as one glTF binary each, their parts named as in stages of USD."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..assets import GarmentPose
-from .rollout import BakeRollout
+from ..assets import Deformer, GarmentPose, Motion
+from ..events import Message, Reporter
+from ..gltf.shot import SET, GlbLabels, write_glb
 
 if TYPE_CHECKING:
     from ssilk_usd.body_faces import HiddenPolygons
@@ -17,27 +18,29 @@ if TYPE_CHECKING:
 
 def write_glb_shot(
     path: Path,
-    rollout: BakeRollout,
+    deformer: Deformer,
+    motion: Motion,
     poses: Iterable[GarmentPose],
-    include_body: bool,
-    hidden: HiddenPolygons | None,
-    provenance: Mapping[str, object],
+    *,
+    start: float,
+    samples_per_frame: int = 1,
+    include_body: bool = True,
+    hidden: Sequence[tuple[int, bool]] = (),
+    hidden_polygons: HiddenPolygons | None = None,
+    provenance: Mapping[str, object] | None = None,
 ) -> ShotSummary:
-    """Write a rollout's poses, and its character.
+    """Write a shot in metres, y up.
 
     Args:
-        provenance: where the shot came from; looked at once the poses are taken.
+        path, deformer, motion, poses: as `ssilk_usd.shot.write_shot` takes them, and all others.
 
     Raises:
-        SsilkError: poses that do not cover the motion, or a file that cannot be written.
+        SsilkError: poses that do not cover the motion or do not fit it, or a file that cannot be written.
     """
     from ssilk_usd.author import prim_names, unique_names
     from ssilk_usd.names import shape_name
     from ssilk_usd.shot import TimeSpan, checked_poses, summary
 
-    from ..gltf.shot import GlbLabels, write_glb
-
-    deformer, motion, samples = rollout.deformer, rollout.motion, rollout.request.samples_per_frame
     scene = deformer.scene
     garment, *bodies = prim_names([scene.garment.mesh.path, *(body.mesh.path for body in scene.character.bodies)])
     labels = GlbLabels(
@@ -46,9 +49,8 @@ def write_glb_shot(
         shapes=[shape_name(index) for index in range(deformer.shape_count)],
         garment=garment,
         bodies=bodies,
-        animation=Path(rollout.request.motion).stem,
-        start=rollout.start,
-        samples_per_frame=samples,
+        start=start,
+        samples_per_frame=samples_per_frame,
     )
     shapes = write_glb(
         path,
@@ -57,8 +59,16 @@ def write_glb_shot(
         checked_poses(poses, deformer, motion),
         labels,
         include_body=include_body,
-        hidden=rollout.hidden,
-        hidden_polygons=None if hidden is None else hidden.masks,
+        hidden=hidden,
+        hidden_polygons=None if hidden_polygons is None else hidden_polygons.masks,
         provenance=provenance,
     )
-    return summary(path, deformer, motion, TimeSpan.of(motion, rollout.start, samples), shapes)
+    return summary(path, deformer, motion, TimeSpan.of(motion, start, samples_per_frame), shapes)
+
+
+def warn_of_sets(deformer: Deformer, output: Path, report: Reporter) -> None:
+    """Warn of influences beyond the first set, which many viewers do not read."""
+    count = deformer.skin.indices.shape[1]
+    if count > SET:
+        text = f"{count} joints move a vertex; viewers that read {SET} alone, such as three.js, show it wrongly"
+        report(Message(f"{output}: {text}; --target glb4 is for these", "warning"))

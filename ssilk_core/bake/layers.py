@@ -263,7 +263,7 @@ def _write_layer(
     """Write and verify what moves; return the result, and SHA-256 of what was written, by its path."""
     from ssilk_usd import layers
 
-    rollout = refined(rollout, report)
+    rollout = refined(rollout, report, add_shapes=True)
     hidden = covered_polygons(rollout, report) if task.request.hide_covered else None
     skin = SkinMeter(rollout)
     common: dict[str, Any] = {

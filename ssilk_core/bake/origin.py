@@ -13,6 +13,7 @@ from ..files import relative_path, sha256
 from .opened import provenance_of
 from .record import RECORD
 from .request import BakeRequest
+from .result import SHOT_SHAPES
 from .rollout import BakeRollout
 
 
@@ -76,6 +77,9 @@ def read_origin(shot: Path, elsewhere: Mapping[str, str | os.PathLike[str] | Non
     except (TypeError, ValueError) as error:
         fail(str(shot), f"the file does not say how it was baked as this version does ({error})", allowed,
              "bake it again")  # fmt: skip
+    refined = provenance.get("refined")
+    if isinstance(refined, Mapping) and SHOT_SHAPES not in refined:
+        stored = replace(stored, refined_output="points")  # the default of earlier versions
     beside = provenance.get("beside")  # earlier versions stored paths as they were given, and these here
     hashes = {name: provenance.get(f"{name}_sha256") for name in ("model", "motion")}
     found: dict[str, str] = {}

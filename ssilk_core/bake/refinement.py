@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rollouts refined by the simulator's solver, as points or as the joints and blendshapes nearest to them."""
+"""Rollouts refined by the simulator's solver, as joints and blendshapes or as points."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from ..assets import Floats
 from ..devices import select_device
 from ..errors import VerificationError
 from ..events import Progress, Reporter, silent
-from .result import RefinementSummary, Verification
+from .result import RefinementSummary, ShotShapes, Verification
 from .rollout import BakeRollout, Refinement
 
 if TYPE_CHECKING:
-    from ..refine import PoseFit, Refiner
+    from ..decomposition import Decomposition
+    from ..refine import RefinedFrame, Refiner
 
 # Rounding points to float32 may raise the energy of a frame: by this near the origin [J], ...
 ROUNDING_ENERGY = 1e-6
@@ -26,24 +27,54 @@ ROUNDING_ENERGY = 1e-6
 ROUNDING_STIFFNESS = 1e3
 
 
-def refined(rollout: BakeRollout, report: Reporter = silent) -> BakeRollout:
+def refined(rollout: BakeRollout, report: Reporter = silent, *, add_shapes: bool = False) -> BakeRollout:
     """Return a rollout with its refined frames, or the rollout itself where its request asks for none.
 
+    Where joints are written, its deformer gets the shot's own blendshapes.
+
+    Args:
+        add_shapes: to those of the model, instead of in their place: assets are the same for all shots.
+
     Raises:
-        SsilkError: a number of iterations that is not allowed.
+        SsilkError: a number of iterations that is not allowed, or frames that joints and blendshapes cannot reach.
     """
     if not rollout.request.refine or rollout.refinement is not None:
         return rollout
     from ..refine import RefinementMeans
 
-    points, summary = [], RefinementMeans()
-    for frame in _refiner(rollout).frames(rollout.motion, rollout.network_vertices()):
+    means, points = RefinementMeans(), []
+    for frame in _refined_frames(rollout, report):
         points.append(frame.points)
-        summary.changes.append(frame.change)
-        report(Progress(len(points), rollout.motion.frame_count))
-    fits = [] if rollout.request.writes_points else list(_fitted(rollout, points))
-    found = _summary(rollout.request.refine, summary.figures(), fits)
-    return replace(rollout, refinement=Refinement(tuple(points), tuple(fit.pose for fit in fits), found))
+        means.changes.append(frame.change)
+    if rollout.request.writes_points:
+        found = _summary(rollout.request.refine, means.figures(), None)
+        return replace(rollout, refinement=Refinement(tuple(points), (), found))
+    shot = _decomposed(rollout, points, add_shapes)
+    found = _summary(rollout.request.refine, means.figures(), ShotShapes.of(shot))
+    return replace(rollout, deformer=shot.deformer, refinement=Refinement(tuple(points), shot.poses, found))
+
+
+def refined_points(rollout: BakeRollout, report: Reporter = silent) -> Iterator[Floats]:
+    """Yield the refined vertices of each frame in the world [m], shape (V, 3)."""
+    return (frame.points for frame in _refined_frames(rollout, report))
+
+
+def _refined_frames(rollout: BakeRollout, report: Reporter) -> Iterator[RefinedFrame]:
+    frames = _refiner(rollout).frames(rollout.motion, rollout.network_vertices())
+    for done, frame in enumerate(frames, start=1):
+        report(Progress(done, rollout.motion.frame_count))
+        yield frame
+
+
+def _decomposed(rollout: BakeRollout, points: Sequence[Floats], add_shapes: bool) -> Decomposition:
+    """Return refined vertices as joints and blendshapes, found from the network's own poses."""
+    from ..decomposition import decompose
+
+    deformer = rollout.deformer
+    if not add_shapes:
+        deformer = replace(deformer, shapes=deformer.shapes[:0])
+    poses = list(rollout.network_poses())
+    return decompose(deformer, rollout.motion, points, poses, device=select_device(rollout.request.device))
 
 
 def _refiner(rollout: BakeRollout) -> Refiner:
@@ -55,19 +86,7 @@ def _refiner(rollout: BakeRollout) -> Refiner:
     return Refiner(rollout.deformer.scene, rollout.fabric, options, fps=rollout.motion.fps, device=device)
 
 
-def _fitted(rollout: BakeRollout, points: Sequence[Floats]) -> Iterator[PoseFit]:
-    """Yield joints and blendshape weights fitted to refined vertices by least squares over the mass."""
-    from ..energy import GarmentEnergy
-    from ..refine import PoseFitter
-
-    assert rollout.model is not None  # a request refuses joints under linear blend skinning
-    mass = GarmentEnergy(rollout.deformer.scene.garment.mesh, rollout.fabric).mass.numpy()
-    refitter = PoseFitter(rollout.model.deformer(), mass, device=select_device(rollout.request.device))
-    yield from refitter.fit(rollout.motion, rollout.network_poses(), points)
-
-
-def _summary(iterations: int, means: dict[str, float], fits: Sequence[PoseFit]) -> RefinementSummary:
-    rms = np.concatenate([fit.rms for fit in fits]) if fits else None
+def _summary(iterations: int, means: dict[str, float], shapes: ShotShapes | None) -> RefinementSummary:
     return RefinementSummary(
         iterations=iterations,
         energy_before_j=means["energy before [J]"],
@@ -75,8 +94,7 @@ def _summary(iterations: int, means: dict[str, float], fits: Sequence[PoseFit]) 
         inside_before=means["inside the body before"],
         inside=means["inside the body"],
         moved_m=means["moved [m]"],
-        fit_rms_mm=None if rms is None else 1000 * float(np.sqrt((rms**2).mean())),
-        fit_max_mm=1000 * max(float(fit.largest.max()) for fit in fits) if fits else None,
+        shapes=shapes,
     )
 
 

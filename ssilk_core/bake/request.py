@@ -16,7 +16,7 @@ from ..targets import TARGETS, Target
 from .plain import from_plain
 
 INPUTS = ("model", "stage", "motion")  # the files that a shot is baked from
-REFINED_OUTPUTS = ("points", "joints")
+REFINED_OUTPUTS = ("joints", "points")
 MAX_SAMPLES_PER_FRAME = 64
 MAX_PRE_ROLL = 600.0  # [s]
 MAX_REFINE = 10_000
@@ -46,7 +46,8 @@ class BakeRequest:
         lbs: bake linear blend skinning instead of the network.
         refine: iterations of the simulator's solver in each frame, from the network's state; 0 for none.
         feedback: refined frames look back on refined frames instead of the network's.
-        refined_output: "points" writes refined frames as points, "joints" fits joints and blendshapes to them.
+        refined_output: "joints" writes refined frames as joints and as many blendshapes as they need (see
+            `decomposition`), "points" as points.
         hide_covered: hide the body's faces that the garment covers in every frame (see `mesh.hidden_faces`).
         keep: what is kept of the model, cut to be best for this motion; None for all.
         device: where the network runs.
@@ -69,7 +70,7 @@ class BakeRequest:
     lbs: bool = False
     refine: int = 0
     feedback: bool = False
-    refined_output: str = "points"
+    refined_output: str = "joints"
     hide_covered: bool = False
     keep: ModelSize | None = None
     device: str = "cpu"
@@ -98,13 +99,6 @@ class BakeRequest:
             fail("--refined-output", f"'{self.refined_output}'", f"it is one of {', '.join(REFINED_OUTPUTS)}")
         if self.lbs and self.keep:
             fail("--lbs", "linear blend skinning with a size to keep", "only the network has one", "leave keep out")
-        if self.lbs and self.refine and not self.writes_points:
-            fail(
-                "--lbs",
-                "linear blend skinning has no proxies and no blendshapes to fit to refined vertices",
-                "they can be written as points",
-                "use --refined-output points",
-            )
 
     @property
     def time_range(self) -> tuple[float, float] | None:

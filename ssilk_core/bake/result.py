@@ -5,9 +5,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..quality import SizeReduction
 from ..shown_skin import ShownSkin
+
+if TYPE_CHECKING:
+    from ..decomposition import Decomposition
+
+SHOT_SHAPES = "shapes of the shot"
+SKINNED = "skinned"  # what a shot says of the points of another simulator that it stands for
 
 
 @dataclass(frozen=True)
@@ -26,18 +33,21 @@ class Verification:
     """How a written shot compares with what was computed.
 
     Points that an earlier bake refined are judged by energy instead: no frame has more than the network's state.
+    Joints and blendshapes that stand for refined, simulated or cached points are compared with these.
 
     Attributes:
         frames: samples of the shot that were compared.
         largest_error_m: distance of the vertex that is nearest to its bound [m]; None where energies were compared.
         allowed_error_m: the bound there [m].
         mean_energy_j: mean energy of the refined frames [J]; None where vertices were compared.
+        rms_error_m: RMS distance from the points that the shot stands for [m]; None where it holds its own vertices.
     """
 
     frames: int
     largest_error_m: float | None = None
     allowed_error_m: float | None = None
     mean_energy_j: float | None = None
+    rms_error_m: float | None = None
 
     def figures(self) -> dict[str, object]:
         """Return figures for people."""
@@ -46,9 +56,51 @@ class Verification:
                 "frames of lower energy than the network's": self.frames,
                 "mean energy [J]": f"{self.mean_energy_j:.4g}",
             }
+        rms = {} if self.rms_error_m is None else {"RMS error [m]": f"{self.rms_error_m:.3g}"}
         return {
+            **rms,
             "largest error [m]": f"{self.largest_error_m:.3g}",
             "allowed [m]": f"{self.allowed_error_m:.3g}",
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShotShapes:
+    """How vertices became joints and blendshapes.
+
+    Attributes:
+        count, local: the shot's own blendshapes, and those of them that move few vertices.
+        rms_mm, largest_mm: distance from the vertices over all of them and all frames [mm].
+        point_bytes: what the vertices take as float32 points.
+    """
+
+    count: int
+    local: int
+    rms_mm: float
+    largest_mm: float
+    point_bytes: int
+
+    @classmethod
+    def of(cls, shot: Decomposition) -> ShotShapes:
+        """Return the figures of a decomposition."""
+        vertices = shot.deformer.scene.garment.mesh.vertex_count
+        frames = sum(pose.frame_count for pose in shot.poses)
+        return cls(
+            count=shot.own_shapes,
+            local=shot.local_shapes,
+            rms_mm=1000 * shot.rms,
+            largest_mm=1000 * shot.largest,
+            point_bytes=12 * vertices * frames,  # three float32 each
+        )
+
+    def to_metadata(self) -> dict[str, float]:
+        """Return figures of four digits, as a shot stores them."""
+        return {
+            SHOT_SHAPES: self.count,
+            "of few vertices": self.local,
+            "joints lose, RMS [mm]": float(f"{self.rms_mm:.4g}"),
+            "joints lose, at most [mm]": float(f"{self.largest_mm:.4g}"),
+            "bytes of the points alone": self.point_bytes,
         }
 
 
@@ -61,8 +113,7 @@ class RefinementSummary:
         energy_before_j, energy_j: of the network's state, and of the refined one with the same past [J].
         inside_before, inside: share of the vertices inside the body.
         moved_m: RMS distance over the mass [m].
-        fit_rms_mm, fit_max_mm: distance of fitted joints and blendshapes from the refined vertices [mm]; None where
-            points are written.
+        shapes: how the refined vertices became joints and blendshapes; None where points are written.
     """
 
     iterations: int
@@ -71,8 +122,7 @@ class RefinementSummary:
     inside_before: float
     inside: float
     moved_m: float
-    fit_rms_mm: float | None = None
-    fit_max_mm: float | None = None
+    shapes: ShotShapes | None = None
 
     def to_metadata(self) -> dict[str, float]:
         """Return figures of four digits, as a shot stores them."""
@@ -82,11 +132,9 @@ class RefinementSummary:
             "inside the body before": self.inside_before,
             "inside the body": self.inside,
             "moved [m]": self.moved_m,
-            "joints lose, RMS [mm]": self.fit_rms_mm,
-            "joints lose, at most [mm]": self.fit_max_mm,
         }
-        rounded = {name: float(f"{value:.4g}") for name, value in stated.items() if value is not None}
-        return {"iterations": self.iterations, **rounded}
+        rounded = {name: float(f"{value:.4g}") for name, value in stated.items()}
+        return {"iterations": self.iterations, **rounded, **(self.shapes.to_metadata() if self.shapes else {})}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,6 +151,7 @@ class BakeResult:
         verification: None where none was asked for.
         reduction: what was kept of the model, where less than all.
         refinement: what the solver changed, where it was asked to.
+        shapes: how the vertices of another simulator became joints and blendshapes; None where nothing was fitted.
         hidden_faces: faces of the bodies that are hidden; None where that was not asked for.
         recovered: frames at which the rollout was lost and the garment was put to rest.
         shown_skin: the share of the covered skin that shows; None where the garment covers nothing.
@@ -119,6 +168,7 @@ class BakeResult:
     verification: Verification | None = None
     reduction: SizeReduction | None = None
     refinement: RefinementSummary | None = None
+    shapes: ShotShapes | None = None
     hidden_faces: int | None = None
     recovered: tuple[FrameSpan, ...] = ()
     shown_skin: ShownSkin | None = None
@@ -139,6 +189,7 @@ class BakeResult:
             "bytes": self.size_bytes,
             **(self.reduction.to_metadata() if self.reduction else {}),
             **{f"refined: {name}": value for name, value in refined.items()},
+            **(self.shapes.to_metadata() if self.shapes else {}),
             **(self.shown_skin.summary() if self.shown_skin else {}),
             **(self.verification.figures() if self.verification else {}),
             **({} if self.hidden_faces is None else {"hidden faces of the body": self.hidden_faces}),

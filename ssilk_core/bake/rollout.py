@@ -34,7 +34,7 @@ class Refinement:
 
     Attributes:
         points: garment vertices of each frame in the world [m], shape (V, 3).
-        poses: poses fitted to them, where joints are written.
+        poses: poses fitted to them with the rollout's deformer, where joints are written.
         summary: what the solver changed.
     """
 
@@ -127,11 +127,14 @@ class BakeRollout:
 
     def vertices(self, report: Reporter = silent) -> Iterator[Floats]:
         """Yield the decoder's garment vertices in the world [m], shape (V, 3), of each of the shot's poses."""
-        yield from self._decoded(self.poses(), report)
+        for pose in self.poses():
+            yield from self.decode(pose)
+            report(Progress(pose.start + pose.frame_count, self.motion.frame_count))
 
     def network_vertices(self) -> Iterator[Floats]:
         """Yield the decoder's garment vertices in the world [m], shape (V, 3), of each of the network's poses."""
-        yield from self._decoded(self.network_poses(), silent)
+        for pose in self.network_poses():
+            yield from self._network_decoded(pose)
 
     def points(self, report: Reporter = silent) -> Iterator[Floats]:
         """Yield the points [m], shape (V, 3), that a point cache holds at each sample: refined, or the decoder's."""
@@ -140,13 +143,13 @@ class BakeRollout:
         else:
             yield from self.vertices(report)
 
-    def _decoded(self, poses: Iterator[GarmentPose], report: Reporter) -> Iterator[Floats]:
-        for pose in poses:
-            yield from self.decode(pose)
-            report(Progress(pose.start + pose.frame_count, self.motion.frame_count))
-
     def decode(self, pose: GarmentPose) -> Floats:
-        """Return the decoder's vertices in the world [m], shape (F, V, 3), of consecutive poses."""
+        """Return the vertices in the world [m], shape (F, V, 3), of consecutive poses of `poses`."""
+        if self.refinement is not None and not self.request.writes_points:
+            return deform(self.deformer, self.motion, pose)
+        return self._network_decoded(pose)
+
+    def _network_decoded(self, pose: GarmentPose) -> Floats:
         if self.model is None:
             return deform(self.deformer, self.motion, pose)
         from ..rollout import decode

@@ -7,14 +7,17 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from ..assets import GarmentPose
 from ..checkpoint import ModelFile, load_model
-from ..cost import POINT_BYTES, ShotBytes
+from ..cost import ShotBytes
 from ..errors import fail
 from ..events import Reporter
 from ..quality import quality_named, size_at, spend
 from ..reduction import Reducer
+from ..targets import GLB
+from .glb import write_glb_shot
 from .load import load_rollout, with_model
 from .request import BakeRequest
 from .rollout import BakeRollout
@@ -73,12 +76,12 @@ def _at_quality(request: BakeRequest, quality: str | None, budget: str | None) -
         )
     if quality:
         request = replace(request, refine=request.refine or quality_named(quality).refine)
-    if budget and request.writes_points:
+    if budget and request.refine:
         fail(
             "--budget",
-            "a budget for points",
-            "every vertex is stored at every frame, whatever is kept of the model",
-            "use --refined-output joints, or leave the budget out",
+            "a budget for refined frames",
+            "they are stored as points, or as blendshapes of the shot's own, whatever is kept of the model",
+            "leave one of them out",
         )
     return request
 
@@ -89,24 +92,21 @@ def shot_bytes(rollout: BakeRollout, suffix: str, *, include_body: bool) -> Shot
     few = max(many // 4, 1)
     first, second = (_excerpt_bytes(rollout, count, suffix, include_body) for count in (few, many))
     frame = (second - first) / max(many - few, 1)
-    points = POINT_BYTES * rollout.deformer.scene.garment.mesh.vertex_count if rollout.request.writes_points else 0
-    return ShotBytes(second - frame * many, frame + points)
+    return ShotBytes(second - frame * many, frame)
 
 
 def _excerpt_bytes(rollout: BakeRollout, frames: int, suffix: str, include_body: bool) -> int:
     from ssilk_usd.shot import write_shot
 
+    motion, poses = rollout.motion.clip(0, frames), _first(rollout.network_poses(), frames)
+    samples = rollout.request.samples_per_frame
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"shot{'.usda' if suffix == '.usda' else '.usdc'}"
-        write_shot(
-            path,
-            rollout.deformer,
-            rollout.motion.clip(0, frames),
-            _first(rollout.network_poses(), frames),
-            units=rollout.units,
-            samples_per_frame=rollout.request.samples_per_frame,
-            include_body=include_body,
-        )
+        path = Path(folder) / f"shot{suffix if suffix in ('.usda', GLB) else '.usdc'}"
+        common: dict[str, Any] = {"samples_per_frame": samples, "include_body": include_body}
+        if suffix == GLB:
+            write_glb_shot(path, rollout.deformer, motion, poses, start=0.0, **common)
+        else:
+            write_shot(path, rollout.deformer, motion, poses, units=rollout.units, **common)
         return path.stat().st_size
 
 

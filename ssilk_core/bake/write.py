@@ -11,7 +11,7 @@ from ..errors import fail
 from ..events import Message, Reporter, Result, Started, silent
 from ..files import need_not_input, need_writable, replacing
 from ..targets import GLB
-from .glb import write_glb_shot
+from .glb import warn_of_sets, write_glb_shot
 from .hiding import covered_polygons
 from .origin import shot_metadata
 from .refinement import refined
@@ -59,6 +59,8 @@ def bake(
     report(Started("bake", rollout.motion.frame_count, {"output": str(path)}))
     rollout.tell(report)
     rollout = refined(rollout, report)
+    if path.suffix == GLB:
+        warn_of_sets(rollout.deformer, path, report)
     hidden = covered_polygons(rollout, report) if request.hide_covered else None
     skin = SkinMeter(rollout)
     summary, verification = _write_verified(skin, path, include_body, hidden, verify, report)
@@ -130,23 +132,21 @@ def _write(
     layer: Path, skin: SkinMeter, output: Path, include_body: bool, hidden: HiddenPolygons | None
 ) -> ShotSummary:
     """Write a shot of joints and blendshapes, or of refined points."""
-    if output.suffix == GLB:
-        return write_glb_shot(layer, skin.rollout, skin.poses(), include_body, hidden,
-                              shot_metadata(skin.rollout, output, skin.stated))  # fmt: skip
     from ssilk_usd.points import point_cache
     from ssilk_usd.shot import write_shot
 
     rollout = skin.rollout
     common: dict[str, Any] = {
-        "units": rollout.units,
         "start": rollout.start,
         "samples_per_frame": rollout.request.samples_per_frame,
         "include_body": include_body,
         "hidden": rollout.hidden,
         "hidden_polygons": hidden,
         "provenance": shot_metadata(rollout, output, skin.stated),
-        "record": rollout.record,
     }
+    if output.suffix == GLB:
+        return write_glb_shot(layer, rollout.deformer, rollout.motion, skin.poses(), **common)
+    common |= {"units": rollout.units, "record": rollout.record}
     if not rollout.request.writes_points:
         return write_shot(layer, rollout.deformer, rollout.motion, skin.poses(), **common)
     skin.add_points()

@@ -34,7 +34,7 @@ class References:
         from ssilk_usd.read_stage import LAYER_SUFFIXES
 
         if not folder.is_dir():
-            fail(str(folder), "there is no such folder", "one with shots of 'ssilk simulate' is needed")
+            fail(str(folder), "there is no such folder", "one with shots of 'ssilk simulate --points' is needed")
         within = folder / garment if (folder / garment).is_dir() else folder
         self._paths = {path.stem: path for path in sorted(within.iterdir()) if path.suffix in LAYER_SUFFIXES}
         self.vertex_count, self.fps = vertex_count, fps

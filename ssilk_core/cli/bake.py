@@ -9,10 +9,11 @@ A file that fails verification (exit code 3) is not kept, and an older file of i
 the same garments under linear blend skinning, to compare with.
 
 --refine continues from the network with the simulator's solver in every frame, for hero shots: it lowers the energy
-of each frame and adds wrinkles that no blendshape has. The garment is then written as time-sampled points, bound to
-no skeleton; in a folder of layers, it is the variant "points" of "deformation", beside the joints. --refined-output
-joints fits joints and blendshapes to the refined points instead. That loses much of the refinement; the result says
-how much.
+of each frame and adds wrinkles that no blendshape of the model has. The shot gets blendshapes of its own, as many as
+it takes to stay within 1 mm (RMS) and 5 mm (any vertex) of the solver's points; the result says how many, and what
+the points would take. In one file they replace the model's, in a folder of layers they come on top, in the shot's own
+layer. --refined-output points writes time-sampled points instead, bound to no skeleton; in a folder of layers, they
+are the variant "points" of "deformation", beside the network's joints.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
     add_bake(verb)
     verb.add_argument("-o", "--output", type=Path, required=True,
-                      help="shot to write (.usdc, .usd, .usda or .usdz), or a folder of layers")  # fmt: skip
+                      help="shot to write (.usdc, .usd, .usda, .usdz or .glb), or a folder of layers")  # fmt: skip
     add_level(verb, "2MB for the shot")
 
 

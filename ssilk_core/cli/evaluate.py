@@ -3,9 +3,9 @@
 
 Models of one garment share their tables with linear blend skinning, on the character that they were trained with.
 Gravity is relative to linear blend skinning. --reference compares with the reference simulator. It names a folder of
-shots of the same clips, written by 'ssilk simulate' and named after the clips, or one with such a folder for each
-garment, under its name. Two probes follow. Poses are held after stops: a garment should come to rest at its own
-static state. The first seconds of clips are looped: a garment should repeat itself. --no-probes leaves them out.
+shots of the same clips, written by 'ssilk simulate --points' and named after the clips, or one with such a folder
+for each garment, under its name. Two probes follow. Poses are held after stops: a garment should come to rest at its
+own static state. The first seconds of clips are looped: a garment should repeat itself. --no-probes leaves them out.
 --solver continues the first two states of each clip, and of its most violent second, with the reference simulator. It
 tells how far the garment is from that after 5, 10, 30 and 60 frames, and what single steps from its own past miss.
 """
@@ -44,7 +44,8 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
                       help='list of {"clip", "split", "tags"}, with "train" as poses that are known (default: '
                            "all clips in one split)")  # fmt: skip
     verb.add_argument("--clips", nargs="+", default=[], metavar="NAME", help="only these clips")
-    verb.add_argument("--reference", type=Path, metavar="FOLDER", help="shots of 'ssilk simulate' to compare with")
+    verb.add_argument("--reference", type=Path, metavar="FOLDER",
+                      help="shots of 'ssilk simulate --points' to compare with")  # fmt: skip
     verb.add_argument("--no-probes", action="store_true", help="measure clips alone, without stops and loops")
     verb.add_argument("--solver", action="store_true",
                       help="simulate from the garment's own states, and single steps (long on a CPU)")  # fmt: skip

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..bake import BakeRequest, naming
-from ..bake.request import MAX_HANDLES, MAX_PRE_ROLL, MAX_REFINE, MAX_SAMPLES_PER_FRAME
+from ..bake.request import MAX_HANDLES, MAX_PRE_ROLL, MAX_REFINE, MAX_SAMPLES_PER_FRAME, REFINED_OUTPUTS
 from ..config import apply_overrides
 from ..errors import fail
 from ..events import Reporter
@@ -22,13 +22,20 @@ from ..targets import TARGETS
 
 if TYPE_CHECKING:
     from ..assets import Character, Garment, ProxyRig, Scene
-    from ..setup.classes import ClassOptions
     from ..setup.rig import RigOptions
+
+
+STAGE = "USD file with the character (SkelRoot, Skeleton, body meshes)"
 
 
 def add_scene(verb: argparse.ArgumentParser) -> None:
     """Add the options that name the character and the garment."""
-    verb.add_argument("stage", type=Path, help="USD file with the character (SkelRoot, Skeleton, body meshes)")
+    verb.add_argument("stage", type=Path, help=STAGE)
+    add_garment(verb)
+
+
+def add_garment(verb: argparse.ArgumentParser) -> None:
+    """Add the options that name what is taken of a stage."""
     verb.add_argument(
         "--garment", metavar="FILE[:/PRIM]|PRIM", help="garment: a file of its own, or a mesh of the stage"
     )
@@ -155,10 +162,9 @@ def _add_output(verb: argparse.ArgumentParser) -> None:
     )
     verb.add_argument(
         "--refined-output",
-        choices=("points", "joints"),
-        default="points",
-        help="refined garments as time-sampled points (default), or put back onto joints and "
-        "blendshapes, with the error stated",
+        choices=REFINED_OUTPUTS,
+        default=REFINED_OUTPUTS[0],
+        help="refined garments as joints and blendshapes of the shot's own (default), or as time-sampled points",
     )
     verb.add_argument("--no-body", action="store_true", help="leave the body meshes out")
     verb.add_argument(
@@ -265,11 +271,10 @@ def load_scene(
     options: argparse.Namespace,
     report: Reporter,
     *,
-    classes: ClassOptions | None = None,
     rigging: RigOptions | None = None,
 ) -> Scene:
-    """Read a scene and make the weights, classes and rig that it lacks, as `classes` and `rigging` say."""
+    """Read a scene and make the weights, classes and rig that it lacks, as `rigging` says."""
     from ..setup.prepare import prepare_scene
 
     character, garment, rig = read(options, report)
-    return prepare_scene(character, garment, rig, class_options=classes, rig_options=rigging, report=report)
+    return prepare_scene(character, garment, rig, rig_options=rigging, report=report)

@@ -119,9 +119,8 @@ def _model(options: argparse.Namespace, report: Reporter) -> list[Section]:
 
     path: Path = options.subject
     file = load_model(path)
-    sections = learning_of(path.with_suffix(".curve.json"))
-    if options.stage:
-        sections += _baked(options, report)
+    sections = _baked(options, report) if options.stage else []
+    sections += learning_of(path.with_suffix(".curve.json"))
     scene = file.scene
     sizes = {
         "vertices": scene.garment.mesh.vertex_count,

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from ..errors import EXIT_OK
 from ..events import Message, Reporter, Result, Started
-from ..setup.classes import ClassOptions
+from ..setup.classes import USUAL
 from ..setup.rig import RigOptions
 from . import options as shared
 
@@ -27,8 +27,9 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     shared.add_scene(verb)
     verb.add_argument("-o", "--output", type=Path, required=True, help="stage to write (.usdc, .usd or .usda)")
     verb.add_argument(
-        "--tight-distance", type=shared.NumberRange(0, 1000), default=ClassOptions.tight_distance, metavar="METRES",
-        help="cloth farther than this from the body is loose (default %(default)s)",
+        "--tightness", type=shared.NumberRange(0, 1), default=USUAL, metavar="SHARE",
+        help="how much is tight of a garment without classes: 0 nothing, 1 all that is not pinned (default "
+             "%(default)s)",
     )  # fmt: skip
     verb.add_argument(
         "--proxies",
@@ -61,7 +62,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         character,
         settled or garment,
         rig,
-        class_options=ClassOptions(tight_distance=options.tight_distance),
+        tightness=options.tightness,
         rig_options=RigOptions(proxies=options.proxies, roots_per_cluster=options.roots),
         report=report,
     )

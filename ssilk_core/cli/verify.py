@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check a baked shot and compare it, re-skinned by UsdSkel alone, with the decoder's own vertices.
+"""Check a shot and compare it, re-skinned by UsdSkel alone, with the decoder's own vertices, or with its cache.
 
 The shot says which model, stage and motion it was baked from. Give the present paths of those that have moved.
 """
@@ -16,8 +16,8 @@ from ..events import Reporter
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
-    verb.add_argument("shot", type=Path, help="shot written by 'ssilk bake'")
-    for name in ("model", "stage", "motion"):
+    verb.add_argument("shot", type=Path, help="shot written by 'ssilk bake' or 'ssilk skin'")
+    for name in ("model", "stage", "motion", "cache"):
         verb.add_argument(f"--{name}", metavar="PATH", help=f"present path of the {name}")
     verb.add_argument("--device", help="where the network runs (default: where it ran for the bake)")
 
@@ -29,6 +29,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         model=options.model,
         stage=options.stage,
         motion=options.motion,
+        cache=options.cache,
         device=options.device,
         report=report,
     )

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Film a shot (.mp4) or lay out its moments as a contact sheet (.png); several shots stand side by side.
 
-Works without a display and without a GPU.
+Shots are stages of USD, or what 'ssilk bake --target glb' wrote. Works without a display and without a GPU.
 """
 
 from __future__ import annotations
@@ -33,14 +33,13 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Draw."""
-    from ssilk_usd.play import Shot
-
+    from ..bake.opened import open_shot
     from ..view.output import FILM, check_suffix
     from ..view.shots import film_of_shots, sheet_of_shots
 
     film = check_suffix(options.output) == FILM
     check_output(options.output, *options.shots)
-    players = [Shot(path) for path in options.shots]
+    players = [open_shot(path) for path in options.shots]
     labels = options.label or ([path.stem for path in options.shots] if len(players) > 1 else [])
     look = _look(options, film)
     if film:

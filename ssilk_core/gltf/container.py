@@ -21,7 +21,12 @@ HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 MAX_BYTES = 2**32 - 1  # a length is stored in four bytes
 MAX_READ = 1 << 31  # bytes that one accessor may take in memory
 VERTICES, INDICES = 34962, 34963  # what a buffer view is bound as
-COMPONENTS = {5121: np.dtype("u1"), 5123: np.dtype("<u2"), 5125: np.dtype("<u4"), 5126: np.dtype("<f4")}
+COMPONENTS: dict[int, np.dtype[Any]] = {
+    5121: np.dtype("u1"),
+    5123: np.dtype("<u2"),
+    5125: np.dtype("<u4"),
+    5126: np.dtype("<f4"),
+}
 _CODES = {kind: code for code, kind in COMPONENTS.items()}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
@@ -147,7 +152,9 @@ class GlbFile:
         if sparse := item.get("sparse"):
             few, of = sparse["count"], sparse["indices"]
             rows = self._viewed(of["bufferView"], of.get("byteOffset", 0), few, COMPONENTS[of["componentType"]])
-            new = self._viewed(sparse["values"]["bufferView"], sparse["values"].get("byteOffset", 0), few * width, kind)
+            new = self._viewed(
+                sparse["values"]["bufferView"], sparse["values"].get("byteOffset", 0), few * width, kind
+            )
             values = values.copy()
             values[rows] = new.reshape(few, width)
         return values

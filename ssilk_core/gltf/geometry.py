@@ -16,8 +16,8 @@ class DrawnMesh:
     """A mesh with one texture coordinate for each vertex.
 
     Attributes:
-        source: which point of the mesh each vertex is, shape (N,). The first ones are all points in their order. Those
-            that a seam of the texture passes through follow again, once for each further coordinate.
+        source: which point of the mesh each vertex is, shape (N,). The first ones are all points in their order.
+            Points on a seam of the texture follow again, once for each further coordinate.
         faces: triangles of vertices, shape (F, 3).
         uvs: texture coordinates from the upper left corner, shape (N, 2), or None.
     """
@@ -86,7 +86,7 @@ class ShapeNormals:
         return np.divide(across, self._length, out=np.zeros_like(across), where=self._length > 0)
 
     @staticmethod
-    def _side(corners: Floats, at: int) -> Floats:
+    def _side(corners: Floats, at: int) -> NDArray[np.float64]:
         return corners[:, at] - corners[:, 0]
 
     def _around(self, of_faces: Floats, count: int) -> Floats:

@@ -72,7 +72,9 @@ class GlbShot:
             self._joints = list(skin["joints"])
             binds = self._file.array(skin["inverseBindMatrices"]).reshape(-1, 4, 4)
             self._binds = binds.swapaxes(1, 2).astype(np.float64)
-            self._parents = {child: node for node, item in enumerate(self._nodes) for child in item.get("children", ())}
+            self._parents = {
+                child: node for node, item in enumerate(self._nodes) for child in item.get("children", ())
+            }
             drawn = [node for node, item in enumerate(self._nodes) if "mesh" in item]
             self._surfaces = [_SkinnedSurface(self._file, self._nodes[node]["mesh"], node) for node in drawn]
             (self._count,) = {len(channel.values) for channel in self._channels}
@@ -159,7 +161,7 @@ class _Channel:
             return self.values[near]
         before, share = int(position), position - int(position)
         if self.path == "rotation":
-            return slerp(self.values[before], self.values[before + 1], np.float64(share))
+            return slerp(self.values[before], self.values[before + 1], np.asarray(share))
         return (1 - share) * self.values[before] + share * self.values[before + 1]
 
 

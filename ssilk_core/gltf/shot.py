@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..assets import Deformer, Floats, GarmentPose, Mesh, Motion, SkinWeights
+from ..assets import Deformer, Floats, GarmentPose, Ints, Mesh, Motion, SkinWeights
 from ..files import replacing
 from ..kinematics import (
     combined_transforms,
@@ -43,7 +43,6 @@ class GlbLabels:
         joints: name of each joint, then of each proxy.
         shapes: name of each blendshape of the deformer.
         garment, bodies: names of the meshes.
-        animation: name of the animation.
         start: time code of the first frame.
         samples_per_frame: how many of the motion's frames make one of the shot's.
     """
@@ -53,7 +52,6 @@ class GlbLabels:
     shapes: Sequence[str]
     garment: str
     bodies: Sequence[str]
-    animation: str
     start: float = 0.0
     samples_per_frame: int = 1
 
@@ -103,13 +101,14 @@ def write_glb(
     offsets = {labels.shapes[index]: deformer.shapes[index] for index in shapes}
     drawn = [_add_mesh(glb, labels.garment, scene.garment.mesh, deformer.skin, offsets=offsets, at=weights[0])]
     if include_body:
-        masks = hidden_polygons or [None] * len(scene.character.bodies)
-        for name, body, mask in zip(labels.bodies, scene.character.bodies, masks, strict=True):
+        bodies = scene.character.bodies
+        masks: Sequence[NDArray[np.bool_] | None] = hidden_polygons or [None] * len(bodies)
+        for name, body, mask in zip(labels.bodies, bodies, masks, strict=True):
             if mask is None or not mask.all():
                 drawn.append(_add_mesh(glb, name, body.mesh, body.skin, hidden=mask))
     glb.add("scenes", {"nodes": [ARMATURE, *drawn]})
     glb.document["scene"] = 0
-    _animate(glb, labels.animation, motion.fps, (rotations, translations, weights), hidden, drawn[0])
+    _animate(glb, labels.character, motion.fps, (rotations, translations, weights), hidden, drawn[0])
     timing = {"startTimeCode": labels.start, "timeCodesPerSecond": motion.fps / labels.samples_per_frame,
               "samplesPerFrame": labels.samples_per_frame}  # fmt: skip
     glb.document["asset"]["extras"] = {**timing, "ssilk": _plain(provenance or {})}
@@ -175,7 +174,7 @@ def _add_mesh(
     return glb.add("nodes", {"name": name, "mesh": glb.add("meshes", item), "skin": 0})
 
 
-def _influences(glb: GlbBuilder, skin: SkinWeights, source: NDArray[np.int64]) -> dict[str, int]:
+def _influences(glb: GlbBuilder, skin: SkinWeights, source: Ints) -> dict[str, int]:
     """Add the influences in sets of four; return their attributes."""
     indices, weights = sorted_influences(skin)
     padding = ((0, 0), (0, -indices.shape[1] % SET))
@@ -198,7 +197,7 @@ def _animate(
     hidden: Sequence[tuple[int, bool]],
     garment: int,
 ) -> None:
-    """Add one animation of what moves. The first joint's path is always there, so that the animation lasts as long."""
+    """Add one animation of what moves, and of the first joint's path, so that it always lasts as long."""
     rotations, translations, weights = samples
     samplers: list[dict[str, object]] = []
     channels: list[dict[str, object]] = []

@@ -52,6 +52,20 @@ def within(points: Floats, faces: Ints, sources: Ints, reach: float) -> NDArray[
     return distances(points, faces[np.isfinite(straight)[faces].all(axis=1)], sources) <= reach
 
 
+def within_of(points: Floats, faces: Ints, kind: NDArray[np.bool_], reach: float) -> NDArray[np.bool_]:
+    """Return `kind` (V,) and the vertices within `reach` [m] of it along the cloth, shape (V,).
+
+    A path of that length lies near both its ends, so that only faces near the border of `kind` are searched.
+    """
+    from scipy.spatial import cKDTree
+
+    corners = points[faces]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(initial=0)
+    straight, _ = cKDTree(points[~kind]).query(points, distance_upper_bound=reach + longest)
+    border = faces[np.isfinite(straight)[faces].all(axis=1)]
+    return kind | within(points, border, np.flatnonzero(kind), reach)
+
+
 def nearest_sources(points: Floats, faces: Ints, sources: Ints) -> tuple[Floats, NDArray[np.int64]]:
     """Return the distance to the nearest of `sources` [m], and that source (-1 if unreachable), both (V,).
 

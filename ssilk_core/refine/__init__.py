@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Refinement of a network's rollout on the training energy, frame by frame."""
 
-from .fit import PoseFit, PoseFitter
 from .refiner import FrameChange, RefinedFrame, RefinementMeans, RefineOptions, Refiner
 
-__all__ = ["FrameChange", "PoseFit", "PoseFitter", "RefineOptions", "RefinedFrame", "RefinementMeans", "Refiner"]
+__all__ = ["FrameChange", "RefineOptions", "RefinedFrame", "RefinementMeans", "Refiner"]

@@ -18,6 +18,8 @@ from ..training.verdict import curve_lbs
 from .page import Section, facts, flattened, table
 from .terms import SHARE, SHOWN
 
+MAX_COLUMNS = 12  # of a table of records; a page is not wider
+
 
 def read_json(path: Path) -> Any:
     """Read a JSON file; raise `SsilkError` where it is missing or not JSON."""
@@ -88,9 +90,14 @@ def evaluation(document: Mapping[str, Any]) -> Section:
 
 
 def records(found: Sequence[Mapping[str, Any]]) -> str:
-    """Return records as a table with a column for each name that occurs."""
+    """Return records as a table with a column for each name that occurs, or a row for each where these are many."""
     flat = [flattened(record) for record in found]
     names = list(dict.fromkeys(name for record in flat for name in record))
+    if len(names) > MAX_COLUMNS:
+        return table(
+            ("", *(str(number) for number in range(1, len(flat) + 1))),
+            [[name, *(record.get(name, "") for record in flat)] for name in names],
+        )
     return table(names, [[record.get(name, "") for name in names] for record in flat])
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sections about a shot: energies over time, and its worst frames as pictures."""
+"""Sections about a shot: a verdict in words, its worst frames as pictures, and figures over time."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from ..view.render import Image, render
 from ..view.shots import shot_surfaces
 from .page import Section, figure, table
 from .terms import BARE, SHARE, SHOWN, UNITS, TermsMeter, worst_frames
+from .verdict import verdict
 
 PICTURES, SKIN_PICTURES = 4, 2  # worst frames to show: of the energy, and of the skin that shows
 APART = 0.5  # the least time between them [s]
@@ -107,8 +108,9 @@ def _sections(player: ShotPlayer, garment: ShotGarment, meter: TermsMeter) -> li
         charts += f'<p class="note">{said} Energies leave these frames out; all covered skin counts as shown.</p>'
     figures = {"shown_skin": asdict(found)} if found else {}
     return [
-        Section(f"{name}: energies over time", charts, {name: {**figures, "non-finite frames": len(lost)}}),
+        verdict(name, values, found, player.frame_times, player.fps),
         Section(f"{name}: its worst frames", f'<div class="pictures">{pictures}</div>'),
+        Section(f"{name}: over time", charts, {name: {**figures, "non-finite frames": len(lost)}}),
     ]
 
 

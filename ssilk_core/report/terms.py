@@ -14,13 +14,17 @@ from ..collision.covered_skin import shown_skin
 from ..collision.one_ring import triangle_rings
 from ..constants import GRAVITY
 from ..energy import TERMS, GarmentEnergy
+from ..energy.stretch import deformation_gradient_operator
+from ..evaluation.metrics import principal_stretches
 from ..fabrics import Fabric
 from ..mesh.topology import vertex_normals
 from ..shown_skin import ShownSkin
 
 SHOT_TERMS = tuple(term for term in TERMS if term != "tether")
 SHARE, SHOWN, BARE = "inside the body", "covered skin that shows", "covered skin that is bare"
-UNITS = {"total": "J", **dict.fromkeys(SHOT_TERMS, "J"), SHARE: "%", SHOWN: "%", BARE: "%"}
+STRETCH = "stretch of the cloth"
+UNITS = {**dict.fromkeys((SHOWN, BARE, STRETCH, SHARE), "%"), "total": "J", **dict.fromkeys(SHOT_TERMS, "J")}
+STRETCHED_SHARE = 0.99  # of the triangles, which stretch no more
 
 
 @dataclass(eq=False)
@@ -35,8 +39,9 @@ class TermsMeter:
         garment: the mesh at rest.
         body: all body meshes at rest as one, or None.
         fps: frames per second.
-        values: by name, one for each frame: energies [J], the share of vertices inside the body, and those of the
-            covered skin that shows and that is bare [%].
+        values: by name, one for each frame: energies [J], the shares of the covered skin that shows and that is
+            bare, the larger principal stretch that 99 triangles in 100 do not exceed, less one, and the share of
+            vertices inside the body [%].
         finite: whether the garment of each frame is.
     """
 
@@ -48,6 +53,7 @@ class TermsMeter:
 
     def __post_init__(self) -> None:
         self.energy = GarmentEnergy(self.garment, self.fabric)
+        self.columns = deformation_gradient_operator(self.garment, self.energy.mass.device, self.energy.mass.dtype)
         self.finite: list[bool] = []
         self.skin: list[ShownCounts] = []
         self.past: deque = deque(maxlen=2)
@@ -71,11 +77,13 @@ class TermsMeter:
         origin = points.mean(axis=0) if self.finite[-1] else np.zeros(3)
         x = torch.as_tensor(points - origin, dtype=torch.float32)[:, :, None]
         stretch, bending = self.energy.elastic(x)
+        largest = principal_stretches(self.columns(x))[0].quantile(STRETCHED_SHARE)
         found = {
             "stretch": float(stretch),
             "bending": float(bending),
             "gravity": self._height(points, body) - self.rest,
             "inertia": self._inertia(points),
+            STRETCH: 100 * (float(largest) - 1),
             **self._collision(x, None if body is None else body - origin, time),
         }
         total = sum(value for name, value in found.items() if UNITS[name] == "J")

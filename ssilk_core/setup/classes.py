@@ -2,27 +2,33 @@
 """Classify garment vertices as pinned, tight or loose, from the body under the garment (paper, Section 3.4).
 
 The paper paints the classes by hand. Here a vertex is tight where the body is near and either supports the cloth
-from below or is enclosed by it. Cloth that only hangs close to the back is not tight. The band along the border
-from which an island hangs is pinned. All other vertices are loose.
+from below or is enclosed by it. Cloth that only hangs close to the back is not tight, nor is cloth around two limbs
+together, such as a skirt below the crotch: limbs part, and it cannot follow both. The band along the border from
+which an island hangs is pinned. All other vertices are loose. An island that is near the body nowhere hangs from its
+top where a single joint carries the garment, as a bone carries what an artist parents to it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..assets import LOOSE, PINNED, TIGHT, UP, Character, Floats, Ints, Mesh, SkinWeights
+from ..assets import UP, Character, Floats, Ints, Mesh, SkinWeights, classes_at
 from ..errors import fail
-from ..mesh.geodesic import distances, within
+from ..mesh.geodesic import distances, within, within_of
 from ..mesh.topology import components, edge_use, edges, islands, smooth, vertex_areas
-from .surface import SurfacePoints, closest_on_surface
+from .limbs import LimbRays
+from .surface import closest_on_surface
 
 Mask = NDArray[np.bool_]
 HANG_RADIUS = 0.06  # [m] neighbourhood of a border vertex; it must reach past a collar that curls towards the neck
 HANG_DROP = 0.005  # [m] least height of a border that carries the cloth, above the mean of that neighbourhood
-TILT = (1.3e-3, -0.7e-3, 1.1e-3)  # tilts rays off the axes, where they slip through edges of regular meshes
+USUAL = 0.5  # tightness at which the thresholds below hold as they are
+LADDER = np.arange(1, 20) / 20  # of tightness, on which vertices become tight one after another
+RANGE = 4.0  # the factor of the distances from the usual tightness to the ends
 
 
 @dataclass(frozen=True)
@@ -70,13 +76,42 @@ class ClassOptions:
 
 
 def classify(
-    character: Character, mesh: Mesh, skin: SkinWeights, options: ClassOptions | None = None
+    character: Character,
+    mesh: Mesh,
+    skin: SkinWeights,
+    options: ClassOptions | None = None,
+    *,
+    tightness: float = USUAL,
+    carried: bool = False,
+    pins: Mask | None = None,
 ) -> NDArray[np.int8]:
-    """Return PINNED, TIGHT or LOOSE for each garment vertex, shape (V,).
+    """Return PINNED, TIGHT or LOOSE for each garment vertex, shape (V,), at one tightness; see `hold_levels`."""
+    levels = hold_levels(character, mesh, skin, options, ladder=[tightness], carried=carried, pins=pins)
+    return classes_at(levels, tightness)
+
+
+def hold_levels(
+    character: Character,
+    mesh: Mesh,
+    skin: SkinWeights,
+    options: ClassOptions | None = None,
+    *,
+    ladder: Sequence[float] = tuple(LADDER),
+    carried: bool = False,
+    pins: Mask | None = None,
+) -> Floats:
+    """Return the least tightness in (0, 1] at which each vertex is tight, 0 where it is pinned, shape (V,).
+
+    At 0 only what is pinned is held, at 1 all of the garment is. In between distances grow from a quarter of those of
+    the options to four times as much, and above the usual tightness less of the body needs to
+    be enclosed, and cloth may be tight where limbs part, the nearest first.
 
     Args:
         mesh: the garment at the character's bind pose.
         skin: its skinning weights for LBS. Unsmoothed weights show most clearly where limbs part.
+        ladder: tightnesses that are tried.
+        carried: whether an island that is near the body nowhere hangs from its top.
+        pins: what is pinned, shape (V,), in place of the band from which islands hang.
 
     Raises:
         SsilkError: an island of the garment has no pinned or tight vertex.
@@ -84,26 +119,50 @@ def classify(
     options = options or ClassOptions()
     pairs, island = edges(mesh.faces), islands(mesh.faces, mesh.vertex_count)
     body = closest_on_surface(mesh.points, character.merged_body().mesh)
-    tears = _tear_rate(mesh, skin.dense(character.skeleton.joint_count), pairs) > options.tear_rate
-    torn = _band(mesh, tears, options.tear_width)
-    near = body.distance < np.where(torn, options.torn_distance, options.tight_distance)
+    weights = skin.dense(character.skeleton.joint_count)
+    torn = _band(mesh, _tear_rate(mesh, weights, pairs) > options.tear_rate, options.tear_width)
+    rays = LimbRays.through(character, mesh, weights, body, options.thickness)
     rim = _hanging_border(mesh, body.distance < options.pinned_distance, island, options.pinned_length)
-    held = near & _holding(mesh, body, near, rim, options)
-    held = smooth(held[:, None].astype(float), pairs, options.rounds)[:, 0] > 0.5
-    held = _with_specks(held, mesh, pairs, options.speck_reach)
-    held = ~_with_specks(~held, mesh, pairs, options.speck_reach) | _band(mesh, rim, options.pinned_width)
-    _need_held(held, mesh, island)
-    classes = np.where(held, TIGHT, LOOSE).astype(np.int8)
-    classes[held & _band(mesh, rim | _tops(mesh, held, rim, island, options), options.pinned_width)] = PINNED
-    return classes
+    strips, band = _strips(mesh, options.strip_width), _band(mesh, rim, options.pinned_width)
+    yoke = _band(mesh, rim, options.yoke_width)
+    supported = body.normals @ UP > options.support
+
+    def held_at(tightness: float) -> Mask:
+        scale = RANGE ** (tightness / USUAL - 1)
+        near = body.distance < scale * np.where(torn, options.torn_distance, options.tight_distance)
+        enough = options.wrapped * min(1.0, 2 - tightness / USUAL)
+        forgiven = body.distance < RANGE * options.tight_distance * max(0.0, tightness / USUAL - 1) ** 2
+        enclosed = (rays.hits(near) > enough) & ~strips & (~rays.parting | forgiven)
+        held = near & (supported | enclosed | yoke)
+        held = smooth(held[:, None].astype(float), pairs, options.rounds)[:, 0] > 0.5
+        held = _with_specks(held, mesh, pairs, options.speck_reach)
+        return ~_with_specks(~held, mesh, pairs, options.speck_reach) | band
+
+    held = held_at(USUAL)
+    if carried:
+        held |= _tops(mesh, ~held, np.isin(island, island[held]), island, options)
+    if pins is None:
+        _need_held(held, mesh, island)
+        pins = held & _band(mesh, rim | _tops(mesh, held, rim, island, options), options.pinned_width)
+    else:
+        _need_held(held | pins, mesh, island)
+    return np.where(pins, 0.0, _levels(held, held_at, sorted(step for step in ladder if 0 < step < 1)))
 
 
-def _holding(mesh: Mesh, body: SurfacePoints, near: Mask, rim: Mask, options: ClassOptions) -> Mask:
-    """Return where the body supports the cloth or is enclosed by it, or the rim is near, shape (V,)."""
-    carried = body.normals @ UP > options.support
-    wrapped = _wrapped(mesh, body.normals, near, options.thickness) > options.wrapped
-    strips = _strips(mesh, options.strip_width)
-    return carried | (wrapped & ~strips) | _band(mesh, rim, options.yoke_width)
+def _levels(usual: Mask, held_at: Callable[[float], Mask], ladder: Sequence[float]) -> Floats:
+    """Return the least tightness of a ladder at which each vertex is held, 1 where none is enough, shape (V,).
+
+    What is held at one tightness is so at all above: smoothing, which could take it away again, is not believed.
+    """
+    levels = np.where(usual, USUAL, 1.0)
+    looser, tighter = usual, usual
+    for tightness in reversed([step for step in ladder if step < USUAL]):
+        looser = looser & held_at(tightness)
+        levels[looser] = tightness
+    for tightness in (step for step in ladder if step > USUAL):
+        added = held_at(tightness) & ~tighter
+        levels[added], tighter = tightness, tighter | added
+    return levels
 
 
 def _strips(mesh: Mesh, width: float) -> Mask:
@@ -133,35 +192,15 @@ def _tear_rate(mesh: Mesh, weights: Floats, pairs: Ints) -> Floats:
     return result
 
 
-def _wrapped(mesh: Mesh, normals: Floats, near: Mask, thickness: float) -> Floats:
-    """Return the share of rays through the body that meet `near` (V,) cloth on the other side, shape (V,).
-
-    From each vertex one ray runs against the body's normal (V, 3), and four are inclined by 45 degrees to it.
-    """
-    import igl
-
-    least = np.eye(3)[np.abs(normals).argmin(axis=1)]
-    across = np.cross(normals, least)
-    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
-    along = np.cross(normals, across)
-    tree = igl.AABB()
-    tree.init(mesh.points, mesh.faces)
-    hits = np.zeros(mesh.vertex_count)
-    for lean in (np.zeros_like(along), across, -across, along, -along):
-        rays = lean - normals + TILT
-        rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
-        face, _, _ = tree.intersect_ray_first(mesh.points, mesh.faces, mesh.points + thickness * rays, rays)
-        hits += (face >= 0) & near[mesh.faces[face]].all(axis=1)
-    return hits / 5
-
-
 def _with_specks(kind: Mask, mesh: Mesh, pairs: Ints, reach: float) -> Mask:
     """Return `kind` (V,) and the patches outside it, such as specks and hems, that stay within `reach` [m] of it."""
-    away = distances(mesh.points, mesh.faces, np.flatnonzero(kind))
+    if kind.all() or not kind.any():
+        return kind
     patch = components(pairs[~kind[pairs].any(axis=1)], mesh.vertex_count)
-    farthest = np.zeros(mesh.vertex_count)
-    np.maximum.at(farthest, patch, away)
-    return kind | (farthest[patch] <= reach)
+    near = within_of(mesh.points, mesh.faces, kind, reach)
+    beyond = np.zeros(mesh.vertex_count, dtype=bool)
+    np.logical_or.at(beyond, patch, ~near)
+    return kind | ~beyond[patch]
 
 
 def _need_held(held: Mask, mesh: Mesh, island: Ints) -> None:
@@ -178,7 +217,7 @@ def _need_held(held: Mask, mesh: Mesh, island: Ints) -> None:
 
 
 def _tops(mesh: Mesh, held: Mask, rim: Mask, island: Ints, options: ClassOptions) -> Mask:
-    """Return the highest tight vertices of each island without a rim, such as a closed hood, shape (V,)."""
+    """Return the highest `held` vertices of each island without a rim, such as a closed hood, shape (V,)."""
     result = np.zeros(mesh.vertex_count, dtype=bool)
     for number in np.setdiff1d(island, island[rim]):
         height = np.where(held & (island == number), mesh.points @ UP, -np.inf)

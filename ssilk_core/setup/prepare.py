@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from .. import events
-from ..assets import CLASS_NAMES, LOOSE, Character, Garment, Ints, ProxyRig, Scene
-from .classes import ClassOptions, classify
+from ..assets import CLASS_NAMES, LOOSE, Character, Floats, Garment, ProxyRig, Scene, classes_at
+from .classes import USUAL, hold_levels
 from .rig import RigOptions, build_rig
 from .weights import WeightOptions, transfer_weights
 
@@ -20,13 +20,14 @@ def prepare_scene(
     rig: ProxyRig | None = None,
     *,
     weight_options: WeightOptions | None = None,
-    class_options: ClassOptions | None = None,
+    tightness: float = USUAL,
     rig_options: RigOptions | None = None,
     report: events.Reporter = events.silent,
 ) -> Scene:
     """Add the weights, classes and proxies that a garment lacks, and keep those that are authored.
 
     Args:
+        tightness: how much becomes tight of what has no classes, in [0, 1]: nothing, or all.
         garment: fitted to the character's bind pose, with or without weights and classes.
         rig: proxies authored for the garment, or None.
         report: receives a message about each thing that is added.
@@ -34,30 +35,30 @@ def prepare_scene(
     Raises:
         SsilkError: an island of the garment has no pinned or tight vertex, or the authored parts do not match.
     """
-    classes = garment.classes
+    classes, levels = garment.classes, garment.levels
     if classes is None:
-        classes = _find_classes(character, garment, class_options, report)
+        levels = _find_levels(character, garment)
+        classes = classes_at(levels, tightness)
+        shares = ", ".join(f"{np.mean(classes == value):.0%} {name}" for value, name in enumerate(CLASS_NAMES))
+        report(events.Message(f"{garment.mesh.path}: no vertex classes; classified as {shares}"))
     skin = garment.skin
     if skin is None:
         report(events.Message(f"{garment.mesh.path}: no skinning weights; they are transferred from the body"))
         skin = transfer_weights(character, garment.mesh, classes=classes, options=weight_options)
-    garment = replace(garment, skin=skin, classes=classes)
+    garment = replace(garment, skin=skin, classes=classes, levels=levels)
     if rig is None:
         rig = build_rig(character, garment, rig_options, report=report)
         report(events.Message(_describe_rig(rig, bool(np.any(classes == LOOSE)))))
     return Scene(character, garment, rig)
 
 
-def _find_classes(
-    character: Character, garment: Garment, options: ClassOptions | None, report: events.Reporter
-) -> Ints:
-    """Classify by authored weights, or else by unsmoothed ones from the body, which jump where limbs part."""
+def _find_levels(character: Character, garment: Garment) -> Floats:
+    """Find levels by authored weights, or else by unsmoothed ones from the body, which jump where limbs part."""
     unsmoothed = WeightOptions(tight_rounds=0, loose_rounds=0)
     skin = garment.skin or transfer_weights(character, garment.mesh, options=unsmoothed)
-    classes = classify(character, garment.mesh, skin, options)
-    shares = ", ".join(f"{np.mean(classes == value):.0%} {name}" for value, name in enumerate(CLASS_NAMES))
-    report(events.Message(f"{garment.mesh.path}: no vertex classes; classified as {shares}"))
-    return classes
+    carried = garment.skin is not None and garment.skin.only_joint is not None
+    pins = None if garment.pins is None else garment.pins != 0
+    return hold_levels(character, garment.mesh, skin, carried=carried, pins=pins)
 
 
 def _describe_rig(rig: ProxyRig, any_loose: bool) -> str:

@@ -267,7 +267,7 @@ def test_worst_frames_are_marked_and_the_timeline_stays(bpy, dressed):
 
 
 def test_what_cannot_be_measured_is_said(bpy, dressed):
-    dressed.modifiers.new("Finer", "SUBSURF")
+    dressed.modifiers.new("Other side", "MIRROR")
     with pytest.raises(RuntimeError, match="A modifier gives 'Sleeve'"):
         bpy.ops.ssilk.show_heat()
     dressed.modifiers.clear()

@@ -38,8 +38,12 @@ class Layout:
         assert hasattr(bpy.types, kind) and hasattr(data, name) and hasattr(active, index)
         self.notes.append(name)
 
-    def prop(self, data: object, name: str, text: str = "", icon: str = "NONE") -> None:
+    def prop(self, data: object, name: str, text: str = "", icon: str = "NONE", slider: bool = False) -> None:
         assert hasattr(data, name), name
+        self.notes.append(name)
+
+    def prop_search(self, data: object, name: str, source: object, items: str) -> None:
+        assert hasattr(data, name) and hasattr(source, items), name
         self.notes.append(name)
 
     def operator(self, name: str, text: str = "", icon: str = "NONE", depress: bool = False) -> SimpleNamespace:

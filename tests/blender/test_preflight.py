@@ -229,7 +229,7 @@ def test_an_animated_armatures_scale_is_left_alone(ready, skirt):
 
 def test_a_modifier_before_the_armature_is_listed(ready, skirt):
     skirt.modifiers.new("Mirror", "MIRROR")
-    with pytest.raises(RuntimeError, match="its modifier 'Mirror' shapes it"):
+    with pytest.raises(RuntimeError, match="its modifier 'Mirror' gives it parts"):
         ready.ops.ssilk.inspect()
     assert list(findings(ready)) == ["shaping-modifier"]
     with pytest.raises(RuntimeError, match="needs your decision"):

@@ -40,6 +40,39 @@ def test_hem_is_loose_and_waist_is_not(classified):
     assert (values[heights > 1.15] < 2).all()
 
 
+def test_tightness_slides_from_what_is_pinned_to_all(ready, classified):
+    from blender_addon.scene.attributes import read_classes
+
+    found = read_classes(classified.data)
+    tight = []
+    for tightness in (0.0, 0.3, 0.5, 0.8, 1.0):
+        classified.ssilk.tightness = tightness
+        now = read_classes(classified.data)
+        np.testing.assert_array_equal(now == 0, found == 0)
+        tight.append(int((now == 1).sum()))
+        if tightness == 0.5:
+            np.testing.assert_array_equal(now, found)
+    assert tight[0] == 0 and tight[-1] == int((found != 0).sum())
+    assert tight == sorted(tight) and len(set(tight)) >= 4
+    classified.data.attributes.remove(classified.data.attributes["ssilk:tightness"])
+    classified.ssilk.tightness = 0.0  # what was painted stays
+    assert (read_classes(classified.data) != 2).all()
+
+
+def test_pins_come_from_a_vertex_group(ready, classified):
+    from blender_addon.scene.attributes import read_classes
+
+    ring = [vertex.index for vertex in classified.data.vertices if vertex.co.z < 0.62]
+    classified.vertex_groups.new(name="Hem").add(ring, 0.6, "REPLACE")
+    classified.ssilk.pins, classified.ssilk.tightness = "Hem", 0.5
+    assert ready.ops.ssilk.classify() == {"FINISHED"}
+    classes = read_classes(classified.data)
+    assert np.flatnonzero(classes == 0).tolist() == ring and (classes == 1).any()
+    classified.ssilk.pins = "None"
+    with pytest.raises(RuntimeError, match="has no vertex group 'None' for its pins"):
+        ready.ops.ssilk.classify()
+
+
 def test_a_rig_is_bones_groups_and_a_modifier(ready, rigged):
     armature = ready.data.objects["Rig"]
     proxies = proxies_of(ready)
@@ -254,7 +287,7 @@ MALFORMED = {
     two_armatures: "'Skirt' could belong to 'Rig', 'Twin'; choose its armature",
     no_armature: "There is no armature for 'Skirt'",
     unequal_scale: "'Rig' is scaled unequally or mirrored; apply its scale",
-    mirror_modifier: "'Skirt' is shaped by its modifier 'Mirror'",
+    mirror_modifier: "The modifier 'Mirror' of 'Skirt' gives it parts that its mesh does not have; apply it",
     no_body: "No body is bound to 'Rig'",
     unbound_body: "'Skirt.001' is not bound to 'Rig'; bind it, or take it from 'Colliders'",
     bare_vertices: "1 of 288 vertices of 'Pillar' have no bone's weight",

@@ -17,7 +17,7 @@ from ssilk_core.reduction import ModelSize
 INPUTS = {"model": "cape.safetensors", "stage": "hero.usdc", "motion": "walk.usdc:/Clip"}
 CHANGED = BakeRequest(
     **INPUTS, root="/Hero", fps=24.0, samples_per_frame=2, pre_roll=0.5, target="game8", refine=3, feedback=True,
-    refined_output="joints", hide_covered=True, keep=ModelSize(shapes=8, joints=4, influences=2), device="cuda",
+    refined_output="points", hide_covered=True, keep=ModelSize(shapes=8, joints=4, influences=2), device="cuda",
     garment="cape", shot="walk", range="1001-1100", handles=8,
 )  # fmt: skip
 
@@ -56,8 +56,7 @@ def test_what_is_no_request_is_not_read(document):
         ({"target": "abacus"}, "--target: 'abacus'; it is one of usd, "),
         ({"samples_per_frame": 0}, "--samples-per-frame: 0 samples in each frame; 1 to 64 are allowed"),
         ({"pre_roll": float("nan")}, "--pre-roll: nan seconds; 0 to 600 are allowed"),
-        ({"refined_output": "voxels"}, "--refined-output: 'voxels'; it is one of points, joints"),
-        ({"lbs": True, "refine": 1, "refined_output": "joints"}, "use --refined-output points"),
+        ({"refined_output": "voxels"}, "--refined-output: 'voxels'; it is one of joints, points"),
         ({"lbs": True, "keep": ModelSize(shapes=1, joints=1, influences=1)}, "leave keep out"),
     ],
 )

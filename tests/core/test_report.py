@@ -16,7 +16,9 @@ from ssilk_core.fabrics import Fabric
 from ssilk_core.report.figures import learning_of, section_of
 from ssilk_core.report.page import Section, facts, figure, flattened, page, table
 from ssilk_core.report.shots import ShotGarment, joined, shot_sections
-from ssilk_core.report.terms import BARE, SHARE, SHOWN, TermsMeter, worst_frames
+from ssilk_core.report.terms import BARE, SHARE, SHOWN, STRETCH, TermsMeter, worst_frames
+from ssilk_core.report.verdict import verdict
+from ssilk_core.shown_skin import ShownSkin
 
 CLOTH = Fabric("toy", density=0.2, contact_model="vertex", margin=0.0, thickness=0.0, collision=7.0)
 
@@ -95,11 +97,24 @@ def test_frames_that_are_not_finite_are_counted_and_named_by_their_time_code(toy
             lost = np.nan if time in (1002, 1006) else 0.02 * (time == 1005)
             return [cover.points + [0, 0, lost], body.points]
 
-    energies, worst = shot_sections(Lost(), [ShotGarment(0, cover, CLOTH)], {1: body})
+    opening, worst, energies = shot_sections(Lost(), [ShotGarment(0, cover, CLOTH)], {1: body})
+    assert "it is lost and skin shows through" in opening.body
+    assert "not finite in 2 of 6 frames, first in frame 1002, at 0.03 s" in opening.body
     assert "not finite in 2 of 6 frames, first in frame 1002." in energies.body and "nan" not in energies.body
     figures = energies.figures["Cover"]
     assert figures["non-finite frames"] == 2 and figures["shown_skin"]["frame"] == 1002
     assert "A: frame 1005, at 0.13 s, " in worst.body and "frame 1002" not in worst.body
+
+
+def test_a_verdict_tells_what_is_wrong_where_and_when():
+    values = {SHOWN: np.array([0.0, 0.0, 0.8]), STRETCH: np.array([3.0, 21.0, 4.0]), SHARE: np.zeros(3)}
+    skin = ShownSkin(frames=3, covered=100, mean=0.0027, worst=0.008, clip="c", frame=13, regions={"LeftArm": 1.0})
+    body = verdict("Cape", values, skin, [11, 12, 13], 30.0).body
+    assert "Look at Cape: skin shows through and the cloth stretches." in body
+    assert "0.267 % of the covered skin shows on average, and 0.80 % in frame 13, at 0.07 s, most at LeftArm" in body
+    assert "stretch by at most 4 % as a rule, and by 21 % in frame 12, at 0.03 s" in body and "inside" not in body
+    calm = verdict("Cape", {name: np.zeros(3) for name in values}, None, [11, 12, 13], 30.0).body
+    assert "Cape holds" in calm and "skin" not in calm
 
 
 def test_bodies_are_joined_in_their_order():

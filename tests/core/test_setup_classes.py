@@ -8,10 +8,21 @@ import pytest
 import trimesh
 
 from ssilk_core import events
-from ssilk_core.assets import LOOSE, PINNED, TIGHT, Body, Character, Garment, Mesh, Skeleton, SkinWeights
+from ssilk_core.assets import (
+    LOOSE,
+    PINNED,
+    TIGHT,
+    Body,
+    Character,
+    Garment,
+    Mesh,
+    Skeleton,
+    SkinWeights,
+    classes_at,
+)  # fmt: skip
 from ssilk_core.errors import SsilkError
 from ssilk_core.mesh.topology import components, edges, vertex_areas
-from ssilk_core.setup.classes import ClassOptions, classify
+from ssilk_core.setup.classes import ClassOptions, classify, hold_levels
 from ssilk_core.setup.prepare import prepare_scene
 from ssilk_core.setup.rig import RigOptions
 from ssilk_core.setup.weights import WeightOptions, transfer_weights
@@ -110,11 +121,50 @@ def test_skirt_around_two_legs_is_loose_between_them_and_a_trouser_leg_is_not():
     skirt = tube([0.09, 0.09], [0.9, 0.3], columns=121, width=0.105)
     middle = (np.abs(skirt.points[:, 0]) < 0.02) & (skirt.points[:, 1] < 0.75)
     assert (found(legs, skirt, options)[middle] == LOOSE).all()
-    # As near as that, it is the jump of the weights from leg to leg that makes it loose.
-    even = SkinWeights("/S", np.zeros((skirt.vertex_count, 1)), np.ones((skirt.vertex_count, 1)))
-    assert (classify(legs, skirt, even, options)[middle] != LOOSE).all()
     leg = tube([0.09, 0.09], [0.9, 0.3])
     assert (found(legs, Mesh("/Leg", leg.points + [0.105, 0, 0], leg.faces), options) != LOOSE).all()
+
+
+def test_skirt_that_hugs_two_legs_is_loose_where_they_part():
+    """Pelvis above 0.7 m, legs below; the skirt touches them all the way down."""
+    body = standing(cylinder(0.16, 0.7, 1.1), cylinder(0.07, 0.0, 0.72, -0.085), cylinder(0.07, 0.0, 0.72, 0.085))
+    skirt = tube([0.17, 0.17, 0.165, 0.165], [1.0, 0.7, 0.65, 0.2], columns=61, rows=25)
+    classes, height = found(body, skirt), skirt.points[:, 1]
+    assert (classes[height < 0.55] == LOOSE).all()
+    assert (classes[height > 0.9] != LOOSE).all()
+    trouser = tube([0.08, 0.08], [0.65, 0.1], columns=31, rows=21)
+    trouser = Mesh("/Trouser", trouser.points + [0.085, 0, 0], trouser.faces)
+    assert (found(body, trouser) != LOOSE).all()
+
+
+def test_tightness_goes_from_what_is_pinned_to_all(trunk):
+    mesh = tube([0.16, 0.16, 0.5], [1.1, 0.95, 0.4], columns=41, rows=31)
+    skin = transfer_weights(trunk, mesh, options=RAW)
+    levels = hold_levels(trunk, mesh, skin)
+    np.testing.assert_array_equal(classes_at(levels, 0.5), classify(trunk, mesh, skin))
+    shares = [np.mean(classes_at(levels, tightness) == TIGHT) for tightness in np.linspace(0, 1, 11)]
+    assert shares[0] == 0 and shares[-1] == np.mean(levels > 0) and np.all(np.diff(shares) >= 0)
+    assert len(set(shares)) > 6
+    for tightness in (0.0, 0.25, 0.8, 1.0):
+        assert set(np.flatnonzero(classes_at(levels, tightness) == PINNED)) == set(np.flatnonzero(levels == 0))
+    # A little off the body, cloth is tight sooner the nearer it is.
+    flare = (mesh.points[:, 1] < 0.9) & (mesh.points[:, 1] > 0.75)
+    order = np.argsort(mesh.points[flare, 1])
+    assert np.corrcoef(levels[flare][order], -mesh.points[flare, 1][order])[0, 1] > 0.8
+
+
+def test_pins_are_taken_in_place_of_the_band_and_hold_what_is_adrift(trunk):
+    far = tube([0.5, 0.5], [1.3, 0.7], columns=31, rows=21)
+    pins = (far.points[:, 1] < 0.75).astype(int)
+    scene = prepare_scene(trunk, Garment(far, pins=pins), rig_options=RigOptions(proxies=2))
+    np.testing.assert_array_equal(scene.classes == PINNED, pins == 1)
+    assert (scene.classes[pins == 0] == LOOSE).all()
+    near = tube([0.16, 0.16], [1.3, 0.7], columns=31, rows=21)
+    classes = prepare_scene(trunk, Garment(near, pins=pins), rig_options=RigOptions(proxies=2)).classes
+    np.testing.assert_array_equal(classes == PINNED, pins == 1)
+    assert (classes[near.points[:, 1] > 1.28] == TIGHT).all()
+    with pytest.raises(SsilkError, match=r"3 pins for \d+ points"):
+        Garment(near, pins=np.ones(3))
 
 
 def test_narrow_strips_hang_free_however_close(trunk):
@@ -152,6 +202,17 @@ def test_island_that_rests_nowhere_is_refused(trunk):
     both = Mesh("/Both", np.concatenate([near.points, far.points]), np.concatenate([near.faces, far.faces + 549]))
     with pytest.raises(SsilkError, match=r"/Both: 1 of 2 islands \(549 vertices, the first 549\).*paint"):
         found(trunk, both)
+
+
+def test_what_one_joint_carries_hangs_from_its_top_however_far_from_the_body(trunk):
+    far = tube([0.3, 0.5], [1.3, 0.7], turn=140)
+    alone = SkinWeights("/Cape", np.full((far.vertex_count, 1), 1), np.ones((far.vertex_count, 1)))
+    classes = prepare_scene(trunk, Garment(far, alone, None), rig_options=RigOptions(proxies=2)).classes
+    top = far.points[:, 1] > 1.3 - ClassOptions().pinned_width
+    assert (classes[top] == PINNED).all() and (classes[~top] == LOOSE).all()
+    shared = SkinWeights("/Cape", np.arange(far.vertex_count)[:, None] % 2, np.ones((far.vertex_count, 1)))
+    with pytest.raises(SsilkError, match="rest nowhere on the body"):
+        prepare_scene(trunk, Garment(far, shared, None))
 
 
 def test_classes_follow_the_vertices_when_renumbered_or_turned_about_the_vertical(trunk):
@@ -213,6 +274,18 @@ def test_close_garments_of_the_wardrobe_are_tight_with_a_pinned_ring(name):
     # All the way round: seen from its own middle, the ring has no gap.
     around = np.sort(np.arctan2(*(mesh.points[pinned][:, [0, 2]] - mesh.points[pinned][:, [0, 2]].mean(axis=0)).T))
     assert np.diff(np.append(around, around[0] + 2 * np.pi)).max() < np.radians(35)
+
+
+@pytest.mark.skipif(not SHARED.exists(), reason="the shared data is not beside the checkout")
+def test_a_long_skirt_is_tight_on_the_hips_alone():
+    from ssilk_usd.read_character import read_character
+    from ssilk_usd.read_garment import read_garment
+
+    character = read_character(SHARED / "character.usdc")
+    mesh = read_garment(SHARED / "garments" / "long_skirt.usdc", character.skeleton).mesh
+    classes, height = found(character, mesh), mesh.points[:, 1]
+    assert (classes[height < 0.65] == LOOSE).all() and (classes == TIGHT).mean() < 0.2
+    assert (classes[height > 0.9] != LOOSE).mean() > 0.9
 
 
 @pytest.mark.skipif(not SHARED.exists(), reason="the shared data is not beside the checkout")

@@ -246,15 +246,13 @@ def test_a_shot_begins_anew_after_a_cut(scene, toy_motion) -> None:
 
 
 def test_sequences_are_simulated_as_shots_of_their_own(scene, toy_motion) -> None:
-    motion = toy_motion(scene, 11)
-    (points,) = simulate(scene, CLOTH, [motion], replace(SHORT, sequence=4))
-    for start in (0, 4, 8):
-        (alone,) = simulate(scene, CLOTH, [motion.clip(start, start + 4)], SHORT)
-        np.testing.assert_allclose(points[start : start + 4], alone, atol=1e-3)
-    (whole,) = simulate(scene, CLOTH, [motion], SHORT)
-    assert np.abs(points[8:] - whole[8:]).max() > 5e-3  # it comes swinging there
-    (longer,) = simulate(scene, CLOTH, [motion], replace(SHORT, sequence=50))
-    np.testing.assert_array_equal(longer, whole)
+    motion = toy_motion(scene, 8)
+    (points,) = simulate(scene, CLOTH, [motion], replace(SHORT, sequence=5))
+    for start in (0, 5):
+        (alone,) = simulate(scene, CLOTH, [motion.clip(start, start + 5)], SHORT)
+        np.testing.assert_allclose(points[start : start + 5], alone, atol=1e-3)
+    (whole,) = simulate(scene, CLOTH, [motion], replace(SHORT, sequence=50))
+    assert np.abs(points[5:] - whole[5:]).max() > 5e-3  # it comes swinging there
 
 
 def test_a_garment_comes_to_rest_with_its_character(scene, toy_motion) -> None:

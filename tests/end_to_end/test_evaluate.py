@@ -66,7 +66,9 @@ def test_poses_of_the_index_that_were_trained_on_are_near(world, capsys):
 
 
 def test_the_simulators_shots_are_the_reference(world, capsys):
-    words = "simulate rigged.usda --motion clips/brief.usda --no-body --tolerance 0.3 -o ref/Skirt/brief.usdc"
+    words = (
+        "simulate rigged.usda --motion clips/brief.usda --points --no-body --tolerance 0.3 -o ref/Skirt/brief.usdc"
+    )
     assert main(words.split()) == 0
     assert evaluated(f"{QUICK} --reference ref --json") == 0
     event = json.loads(capsys.readouterr().out.splitlines()[-1])

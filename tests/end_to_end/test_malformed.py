@@ -409,9 +409,7 @@ OPTIONS = [
     Case("huge seed", f"{TRAIN} --set seed=99999999999999999999999", ("seed",)),
     Case("unknown property of the fabric", f"{TRAIN} --material silkiness=1", ("silkiness", "density")),
     Case("negative density", f"{TRAIN} --material density=-1", ("density", "-1")),
-    Case(
-        "negative distance", f"{RIG} --tight-distance -1", ("--tight-distance", "'-1' is not a number from 0 to 1000")
-    ),
+    Case("negative tightness", f"{RIG} --tightness -1", ("--tightness", "'-1' is not a number from 0 to 1")),
     Case("no roots", f"{RIG} --roots 0", ("--roots", "a whole number from 1 to 1000")),
     Case("negative proxies", f"{RIG} --proxies -3", ("--proxies", "a whole number from 0 to 1000")),
     Case("no such device to train", f"{TRAIN} --device abacus", ("--device abacus", "'cpu'")),

@@ -10,6 +10,7 @@ from ssilk_usd.play import Shot
 
 from ssilk_core.bake import BakeRequest, plan_layers
 from ssilk_core.cli import main, simulate
+from ssilk_core.errors import fail
 from ssilk_core.simulate import Simulator
 
 
@@ -27,7 +28,8 @@ SIMULATE = ["simulate", "rigged.usda", "--no-body", "--tolerance", "50", "--moti
 
 
 def test_a_cache_holds_the_garment_beside_its_body(stage):
-    assert main(["simulate", "rigged.usda", "--tolerance", "50", "--motion", "brief.usda", "-o", "cache.usda"]) == 0
+    words = "simulate rigged.usda --points --tolerance 50 --motion brief.usda -o cache.usda"
+    assert main(words.split()) == 0
     baked, cache = Shot(stage / "shot.usda"), Shot(stage / "cache.usda")
     assert cache.fps == 30 and len(cache.frame_times) == 5
     assert [mesh.is_garment for mesh in cache.meshes] == [mesh.is_garment for mesh in baked.meshes]
@@ -46,6 +48,30 @@ def test_a_cache_holds_the_garment_beside_its_body(stage):
     low, high = np.array(root.GetExtentAttr().Get(Usd.TimeCode(cache.frame_times[-1])))
     drawn = np.concatenate(cache.points(cache.frame_times[-1]))
     assert (drawn >= low - 1e-5).all() and (drawn <= high + 1e-5).all()
+
+
+def test_joints_and_shapes_stand_for_the_points(stage, capsys):
+    for form, out in (["--points"], "points.usda"), ([], "joints.usda"):
+        assert main([*SIMULATE, "brief.usda", "-o", out, *form]) == 0
+    assert "bytes of the points alone: 18720" in capsys.readouterr().err
+    points, joints = Shot(stage / "points.usda"), Shot(stage / "joints.usda")
+    assert joints.is_skinned and not points.is_skinned
+    away = [
+        np.linalg.norm(joints.garment_points(time) - points.garment_points(time), axis=-1)
+        for time in points.frame_times
+    ]
+    assert np.max(away) <= 5e-3 and np.sqrt(np.square(away).mean()) <= 1e-3
+    assert main(["verify", "joints.usda"]) == 2
+    assert "its points were simulated and not kept" in capsys.readouterr().err
+
+
+def test_points_that_no_skinning_reaches_are_kept_as_points(stage, monkeypatch, capsys):
+    def folded(*_, **__):
+        fail("clip", "its skinning folds", "joints cannot reach it")
+
+    monkeypatch.setattr("ssilk_core.decomposition.decompose", folded)
+    assert main([*SIMULATE, "short.usda", "-o", "kept.usdc"]) == 0
+    assert "its skinning folds" in capsys.readouterr().err and not Shot(stage / "kept.usdc").is_skinned
 
 
 def test_several_motions_become_files_of_their_own(stage):

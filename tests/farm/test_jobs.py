@@ -90,8 +90,8 @@ def test_requests_that_cannot_share_an_asset_are_refused(change, says):
 
 
 def test_refined_points_are_written_beside_the_joints():
-    assert [task.points for task in plan_layers([replace(REQUEST, refine=2)])] == [True]
-    assert [task.points for task in plan_layers([replace(REQUEST, refine=2, refined_output="joints")])] == [False]
+    assert [task.points for task in plan_layers([replace(REQUEST, refine=2, refined_output="points")])] == [True]
+    assert [task.points for task in plan_layers([replace(REQUEST, refine=2)])] == [False]
 
 
 @pytest.mark.parametrize(("text", "expected"), [("0-3", [0, 1, 2, 3]), ("4", [4]), ("1,3-4", [1, 3, 4])])

@@ -14,7 +14,7 @@ from ssilk_usd.read_scene import read_rigged, read_scene
 from ssilk_usd.rig_io import read_proxy_rig, write_rigged_stage
 
 from ssilk_core import kinematics
-from ssilk_core.assets import Garment, ProxyRig, Scene, SkinWeights
+from ssilk_core.assets import Garment, ProxyRig, Scene, SkinWeights, classes_at
 from ssilk_core.errors import SsilkError
 
 JOINTS = ("Hips", "Hips/Spine", "Hips/Spine/Head")
@@ -328,6 +328,20 @@ def test_a_proxy_may_not_hang_from_another_garments_proxy(tmp_path):
 
     with pytest.raises(SsilkError, match="'Hips/Spine/cape_0/cape_1' hangs from 'Hips/Spine/cape_0'"):
         read_proxy_rig(edited(out, steal), scene.character.skeleton, garment="Cape")
+
+
+def test_pins_and_levels_are_kept_with_the_classes(tmp_path):
+    source, garment = hero(tmp_path, "skelroot")
+    scene = dress(source, garment)
+    levels = np.array([0, 0.35, 1, 0.5, 0.05, 0.95])
+    kept = replace(scene.garment, pins=np.array([1, 0, 0, 0, 0, 0]), levels=levels)
+    write_rigged_stage(source, replace(scene, garment=kept), tmp_path / "out.usdc")
+    read = read_scene(tmp_path / "out.usdc")[1]
+    assert read.pins.tolist() == [1, 0, 0, 0, 0, 0]
+    np.testing.assert_allclose(read.levels, levels, atol=1e-7)
+    assert classes_at(read.levels, 0.35).tolist() == [0, 1, 2, 2, 1, 2]
+    plain = read_scene(source, garment=garment)[1]
+    assert plain.pins is None and plain.levels is None
 
 
 def test_a_rig_without_proxies_is_still_a_rig(tmp_path):

@@ -46,6 +46,7 @@ from ssilk_core.kinematics import (
     rigid,
     skin_points,
     skinning_matrices,
+    sorted_influences,
 )
 
 SHARED = Path(__file__).parents[2] / ".." / "shared"

@@ -11,13 +11,13 @@ from itertools import count
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
-from ssilk_core.assets import Body, Deformer, Floats, Ints, Mesh, ProxyRig, Skeleton, SkinWeights
+from ssilk_core.assets import Body, Deformer, Floats, Garment, Ints, Mesh, ProxyRig, Skeleton, SkinWeights
 from ssilk_core.errors import fail
 from ssilk_core.kinematics import local_transforms, sorted_influences, world_transforms
 
 from .body_faces import HiddenPolygons, author_faces, hide_polygons
 from .garment_api import GarmentRecord, apply_garment_api
-from .names import CLASS, LBS_SKIN, PROXIES, shape_name
+from .names import CLASS, LBS_SKIN, LEVEL, PIN, PROXIES, shape_name
 from .read_skin import leaf
 from .units import StageUnits
 
@@ -73,10 +73,10 @@ def define_asset(
     _define_animation(stage, paths[1], scene.joint_names, shape_names)
     _bind_root(root, skeleton, paths[1])
     garment = define_mesh(stage, paths[2], scene.garment.mesh, units)
-    mark_garment(garment.GetPrim(), scene.classes, scene.rig.joint_names or None)
+    mark_garment(garment.GetPrim(), scene.garment, scene.rig.joint_names or None)
     apply_garment_api(garment.GetPrim(), record)
     bind_skin(garment, deformer.skin, skeleton)
-    _define_blendshapes(garment, shape_names, deformer.shapes[shapes], units)
+    define_blendshapes(garment, shape_names, deformer.shapes[shapes], units)
     for path, body in zip(paths[3:], bodies):
         bind_skin(define_mesh(stage, path, body.mesh, units), body.skin, skeleton)
     if hidden_polygons is not None:
@@ -187,10 +187,14 @@ def extent_array(low: Floats, high: Floats) -> Vt.Vec3fArray:
     return Vt.Vec3fArray.FromNumpy(np.stack([low, high]).astype(np.float32))
 
 
-def mark_garment(prim: Usd.Prim, classes: Ints | None, proxies: Sequence[str] | None) -> None:
-    """Author a garment's vertex classes and the joint paths of its proxies, each unless None."""
-    if classes is not None:
-        _author_rows(prim, CLASS, classes[:, None].astype(np.int32))
+def mark_garment(prim: Usd.Prim, garment: Garment, proxies: Sequence[str] | None) -> None:
+    """Author a garment's vertex classes, what finds them, and the joint paths of its proxies, each unless None."""
+    if garment.classes is not None:
+        _author_rows(prim, CLASS, garment.classes[:, None].astype(np.int32))
+    if garment.pins is not None:
+        _author_rows(prim, PIN, garment.pins[:, None].astype(np.int32))
+    if garment.levels is not None:
+        _author_rows(prim, LEVEL, garment.levels[:, None].astype(np.float32))
     if proxies is not None:
         _author_names(prim, PROXIES, proxies)
 
@@ -230,8 +234,14 @@ def bind_skin(mesh: UsdGeom.Mesh, skin: SkinWeights, skeleton: UsdSkel.Skeleton)
     binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1))
 
 
-def _define_blendshapes(mesh: UsdGeom.Mesh, names: Sequence[str], offsets: Floats, units: StageUnits) -> None:
-    """Define blendshapes below a bound mesh, with only the nonzero rows of their offsets [m], shape (K, V, 3)."""
+def define_blendshapes(
+    mesh: UsdGeom.Mesh, names: Sequence[str], offsets: Floats, units: StageUnits, *, before: Sequence[str] = ()
+) -> None:
+    """Define blendshapes below a bound mesh, with only the nonzero rows of their offsets [m], shape (K, V, 3).
+
+    Args:
+        before: blendshapes that the mesh has already, which stay in front.
+    """
     if not names:
         return
     binding, path = UsdSkel.BindingAPI(mesh), mesh.GetPath()
@@ -242,5 +252,6 @@ def _define_blendshapes(mesh: UsdGeom.Mesh, names: Sequence[str], offsets: Float
         prim = UsdSkel.BlendShape.Define(stage, path.AppendChild(name))
         prim.CreateOffsetsAttr(Vt.Vec3fArray.FromNumpy(moved))
         prim.CreatePointIndicesAttr(Vt.IntArray.FromNumpy(rows.astype(np.int32)))
+    names = [*before, *names]
     binding.CreateBlendShapesAttr(Vt.TokenArray(names))
     binding.CreateBlendShapeTargetsRel().SetTargets([path.AppendChild(name) for name in names])

@@ -25,11 +25,12 @@ from ssilk_core.assets import Deformer, Floats, GarmentPose, Motion
 from ssilk_core.errors import SsilkError, fail
 from ssilk_core.files import replacing, sha256
 
-from .author import Asset, define_asset, extent_array
+from .author import Asset, define_asset, define_blendshapes, extent_array
 from .body_faces import HiddenPolygons, hide_polygons
 from .export import new_stage, save
 from .garment_api import GarmentRecord
 from .layers_facts import AssetFacts, asset_facts
+from .names import shape_name
 from .read_mesh import is_garment
 from .read_stage import open_stage
 from .samples import PATH_OP, Samples, kept_joints, root_path
@@ -181,6 +182,8 @@ def write_animation(
 ) -> ShotSummary:
     """Write what moves in one shot as a layer that references its asset.
 
+    Blendshapes of the deformer that the asset lacks are the shot's own, and are written with it.
+
     Args:
         motion, poses, start, samples_per_frame, hidden: as `shot.write_shot` takes them.
         lean: see `samples.Samples`.
@@ -196,6 +199,7 @@ def write_animation(
         layer = Sdf.Layer.CreateNew(str(temporary))
         stage = Usd.Stage.Open(layer, None)
         _define_animation(stage, asset, layout, kept_names(deformer, motion, lean))
+        asset = _define_own_shapes(stage, asset, deformer, units)
         set_metadata(stage, span, units)
         if lean:
             UsdGeom.Xformable(stage.GetPrimAtPath(asset.root)).AddTranslateOp(opSuffix=PATH_OP.rpartition(":")[2])
@@ -231,6 +235,21 @@ def _define_animation(stage: Usd.Stage, asset: Asset, layout: Layout, joints: li
     if len(asset.shapes):
         animation.CreateBlendShapeWeightsAttr()
     UsdGeom.Boundable(root).CreateExtentAttr()
+
+
+def _define_own_shapes(stage: Usd.Stage, asset: Asset, deformer: Deformer, units: StageUnits) -> Asset:
+    """Define the blendshapes that the asset lacks, in the variant that has any; return the asset with them."""
+    own = np.setdiff1d(np.flatnonzero(deformer.shapes.any(axis=(1, 2))), asset.shapes)
+    if not own.size:
+        return asset
+    before, names = (list(map(shape_name, indices)) for indices in (asset.shapes, own))
+    with _variant(stage.GetPrimAtPath(asset.root), QUALITY, "full"):
+        mesh = UsdGeom.Mesh(stage.OverridePrim(asset.garment))
+        define_blendshapes(mesh, names, deformer.shapes[own], units, before=before)
+    animation = UsdSkel.Animation(stage.GetPrimAtPath(asset.animation))
+    animation.CreateBlendShapesAttr(Vt.TokenArray([*before, *names]))
+    animation.CreateBlendShapeWeightsAttr()
+    return replace(asset, shapes=np.concatenate([asset.shapes, own]))
 
 
 def _define_points(stage: Usd.Stage, asset: Asset, layout: Layout) -> None:

@@ -12,7 +12,7 @@ from ssilk_core.assets import Floats, Ints
 from ssilk_core.errors import fail
 
 from .read_mesh import is_drawn, is_garment, read_mesh
-from .read_stage import PRIMS, StageLike, apply, column_matrix, open_stage, stage_name
+from .read_stage import EARLIEST, PRIMS, StageLike, apply, column_matrix, open_stage, stage_name
 from .units import StageUnits
 
 
@@ -73,6 +73,15 @@ class Shot:
         code = Usd.TimeCode(float(time))
         xforms = UsdGeom.XformCache(code)
         return [apply(self.units.matrix, player.points(code, xforms)) for player in self._players]
+
+    def mesh_points(self, index: int, time: float) -> Floats:
+        """Return the points of one of `meshes` in world space [m], y up, float64, shape (V, 3), at a time code."""
+        code = Usd.TimeCode(float(time))
+        return apply(self.units.matrix, self._players[index].points(code, UsdGeom.XformCache(code)))
+
+    def point_count(self, index: int) -> int:
+        """Return how many points one of `meshes` has."""
+        return len(UsdGeom.Mesh(self.stage.GetPrimAtPath(self.meshes[index].path)).GetPointsAttr().Get(EARLIEST))
 
     @property
     def is_skinned(self) -> bool:

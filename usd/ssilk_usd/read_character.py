@@ -7,11 +7,12 @@ from collections.abc import Sequence
 
 from pxr import Usd, UsdGeom, UsdSkel
 
-from ssilk_core.assets import Body, Character, Floats
+from ssilk_core.assets import Body, Character, Floats, SkinWeights
 from ssilk_core.errors import fail
 from ssilk_core.events import Message, Reporter, silent
 
 from .names import SKEL
+from .read_carried import carried_by
 from .read_mesh import is_drawn, is_garment, read_mesh
 from .read_skeleton import bound_skeleton, character_skeleton, find_skeleton
 from .read_skin import read_skin
@@ -42,6 +43,8 @@ def read_character(
     report: Reporter = silent,
 ) -> Character:
     """Read a character; its bodies are all drawn meshes bound to its skeleton, except garments.
+
+    Meshes that a joint carries are bodies where they are named, or where none is bound.
 
     Points and bind transforms are in the core's bind space: UsdSkel's bind space (points after
     geomBindTransform) in metres, y up. It includes the uniform scale of the character's xforms but not their
@@ -80,10 +83,13 @@ def is_skinned(prim: Usd.Prim, skel: SkelSource) -> bool:
 
 
 def _body_prims(skel: SkelSource, bodies: Sequence[str], garment: str | None) -> list[Usd.Prim]:
-    meshes = [prim for prim in Usd.PrimRange(skel.root, PRIMS) if prim.IsA(UsdGeom.Mesh) and is_skinned(prim, skel)]
-    garments = named(meshes, garment) if garment else []
+    every = [prim for prim in Usd.PrimRange(skel.root, PRIMS) if prim.IsA(UsdGeom.Mesh)]
+    garments = named(every, garment) if garment else []
+    meshes = [prim for prim in every if is_skinned(prim, skel)]
     if not bodies:
-        return [prim for prim in meshes if is_drawn(prim) and not is_garment(prim) and prim not in garments]
+        drawn = [prim for prim in every if is_drawn(prim) and not is_garment(prim) and prim not in garments]
+        return [prim for prim in drawn if prim in meshes] or [prim for prim in drawn if carried_by(prim, skel)]
+    meshes = [prim for prim in every if prim in meshes or carried_by(prim, skel)]
     unknown = next((name for name in bodies if not named(meshes, name)), None)
     if unknown is not None:
         fail(
@@ -101,6 +107,10 @@ def _read_body(prim: Usd.Prim, skel: SkelSource, order: tuple[str, ...], report:
         report(
             Message(f"{location(prim)}: its {method.Get()} skinning is evaluated as linear blend skinning", "warning")
         )
+    carried = None if is_skinned(prim, skel) else carried_by(prim, skel)
+    if carried:
+        mesh = read_mesh(prim, skel.bind_to_core @ carried.to_bind)
+        return Body(mesh, SkinWeights.rigid(mesh.path, order.index(skel.joints[carried.joint]), mesh.vertex_count))
     mesh = read_mesh(prim, geom_to_core(prim, skel))
     skin = read_skin(prim, skel.joints, order)
     assert skin is not None  # is_skinned

@@ -9,11 +9,12 @@ from pxr import Usd, UsdGeom
 from ssilk_core.assets import Floats, Garment, Ints, Skeleton, SkinWeights
 from ssilk_core.errors import fail
 
-from .names import CLASS, LBS_SKIN, PROXIES
+from .names import CLASS, LBS_SKIN, LEVEL, PIN, PROXIES
+from .read_carried import carried_by
 from .read_character import geom_to_core, is_skinned
 from .read_mesh import is_drawn, is_garment, read_mesh
 from .read_skeleton import bound_skeleton, find_skeleton, skeletons
-from .read_skin import read_influences, read_skin
+from .read_skin import match_joints, read_influences, read_skin
 from .read_spaces import SkelSource
 from .read_stage import (
     EARLIEST,
@@ -38,7 +39,8 @@ def read_garment(
     """Read a garment at rest, in the core's bind space [m], y up.
 
     A mesh with influences is placed by its geomBindTransform, as in UsdSkel. A mesh without influences is placed by
-    its world transform: relative to the character in a stage with one, and absolutely in its own file.
+    its world transform: relative to the character in a stage with one, and absolutely in its own file. One without
+    influences whose xforms move as a joint does is bound to that joint, at its bind pose.
 
     Args:
         source: the character's stage or a file with garments, each with its own units and axes.
@@ -53,8 +55,15 @@ def read_garment(
     prim = find_garment(stage, garment)
     skel = fitted_skeleton(prim, root)
     mesh = read_mesh(prim, garment_to_core(prim, skel))
-    joints = skel.joints if skel else ()
-    return Garment(mesh, lbs_skin(prim, joints, skeleton), _classes(prim))
+    skin = lbs_skin(prim, skel.joints if skel else (), skeleton)
+    carried = carried_by(prim, skel) if skel and skin is None and not has_value(prim, PROXIES) else None
+    if carried:
+        assert skel is not None
+        joint = match_joints((skel.joints[carried.joint],), skeleton.joint_names)[0]
+        skin = SkinWeights.rigid(mesh.path, joint, mesh.vertex_count)
+    pins, levels = (_per_point(prim, name) for name in (PIN, LEVEL))
+    pinned = None if pins is None else (pins >= 0.5).astype(np.int64)  # may be painted as weights
+    return Garment(mesh, skin, _whole(prim, _per_point(prim, CLASS)), pinned, levels)
 
 
 def find_garment(stage: Usd.Stage, garment: str | None = None) -> Usd.Prim:
@@ -101,6 +110,8 @@ def garment_to_core(prim: Usd.Prim, skel: SkelSource | None) -> Floats:
         return StageUnits.of(prim.GetStage()).matrix @ world_matrix(prim)
     if is_skinned(prim, skel):
         return geom_to_core(prim, skel)
+    if carried := carried_by(prim, skel):
+        return skel.bind_to_core @ carried.to_bind
     return skel.bind_to_core @ skel.world_to_bind @ world_matrix(prim)
 
 
@@ -116,21 +127,27 @@ def lbs_skin(prim: Usd.Prim, joints: tuple[str, ...], skeleton: Skeleton) -> Ski
     return None if has_value(prim, PROXIES) else read_skin(prim, joints, skeleton.joint_names)
 
 
-def _classes(prim: Usd.Prim) -> Ints | None:
-    """Return integer vertex classes, or None; `Garment` checks their count and range."""
-    primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar(CLASS.removeprefix("primvars:"))
+def _per_point(prim: Usd.Prim, name: str) -> Floats | None:
+    """Return a primvar with one value for each point, or None; `Garment` checks the count."""
+    primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar(name.removeprefix("primvars:"))
     if not primvar or not primvar.HasAuthoredValue():
         return None
-    where, interpolation = location(prim), primvar.GetInterpolation()
+    interpolation = primvar.GetInterpolation()
     if interpolation not in (UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying):
         fail(
-            where,
-            f"{CLASS} has {interpolation} interpolation",
-            "classes need one value per point (vertex interpolation)",
-            "paint them on points",
+            location(prim),
+            f"{name} has {interpolation} interpolation",
+            "it needs one value per point (vertex interpolation)",
+            "paint it on points",
         )
-    classes = np.array(primvar.ComputeFlattened(EARLIEST), dtype=np.float64).reshape(-1)
+    return np.array(primvar.ComputeFlattened(EARLIEST), dtype=np.float64).reshape(-1)
+
+
+def _whole(prim: Usd.Prim, classes: Floats | None) -> Ints | None:
+    """Return vertex classes as integers; `Garment` checks their range."""
+    if classes is None:
+        return None
     broken = int(np.count_nonzero(classes != np.round(classes)))
     if broken:
-        fail(where, f"{broken} vertex classes are not integers", "classes are 0, 1 or 2", "paint them again")
+        fail(location(prim), f"{broken} vertex classes are not integers", "classes are 0, 1 or 2", "paint them again")
     return classes.astype(np.int64)

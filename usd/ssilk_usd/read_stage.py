@@ -161,9 +161,15 @@ def split_location(text: str) -> tuple[str, str | None]:
 
 
 def named(prims: list[Usd.Prim], name: str) -> list[Usd.Prim]:
-    """Return the prims with the path `name`, or if there are none, those with that name."""
-    by_path = [prim for prim in prims if str(prim.GetPath()) == name]
-    return by_path or [prim for prim in prims if prim.GetName() == name]
+    """Return the prims with the path `name`, or else with that name, or else those that such a prim holds.
+
+    Many programs write an object as an Xform with its name, and the mesh beneath it with another one.
+    """
+    for some in (prims, [prim.GetParent() for prim in prims]):
+        for found in (str(prim.GetPath()) == name for prim in some), (prim.GetName() == name for prim in some):
+            if chosen := [prim for prim, match in zip(prims, found) if match]:
+                return chosen
+    return []
 
 
 def listed(prims: list[Usd.Prim]) -> str:

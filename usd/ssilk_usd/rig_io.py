@@ -28,7 +28,8 @@ from .author import (
 )
 from .export import export, need_layer_suffix
 from .garment_api import apply_garment_api
-from .names import CLASS, LBS_SKIN, PROXIES, SKEL
+from .names import CLASS, LBS_SKIN, LEVEL, PIN, PROXIES, SKEL
+from .read_carried import carried_by
 from .read_garment import find_garment, fitted_skeleton, garment_to_core, lbs_skin
 from .read_mesh import is_garment
 from .read_skeleton import find_skeleton
@@ -217,9 +218,22 @@ def _place_garment(
     to_bind = np.linalg.inv(skel.bind_to_core) @ to_core
     if moved is not None:
         offset_points(UsdGeom.Mesh(old), moved @ np.linalg.inv(to_core[:3, :3]).T)
+    if carried_by(old, skel):
+        old = _let_go(stage, skel, old)
     if not old.GetPath().HasPrefix(skel.root.GetPath()):
         old = _move(stage, old, _free_path(skel, old.GetName()))
     return UsdGeom.Mesh(old), to_bind
+
+
+def _let_go(stage: Usd.Stage, skel: SkelSource, prim: Usd.Prim) -> Usd.Prim:
+    """Take the xforms from a mesh that its joint moves from now on; move it where others hang on them too."""
+    above = prim
+    while above != skel.root and not above.IsPseudoRoot():
+        if sum(other.IsA(UsdGeom.Mesh) for other in Usd.PrimRange(above)) > 1:
+            return _move(stage, prim, _free_path(skel, prim.GetName()))
+        UsdGeom.Xformable(above).ClearXformOpOrder()
+        above = above.GetParent()
+    return prim
 
 
 def _copy_garment(stage: Usd.Stage, skel: SkelSource, garment: Garment) -> UsdGeom.Mesh:
@@ -295,7 +309,7 @@ def _bind_garment(
     Its own joint order holds the names, so that its weights survive joints that are removed or reordered by hand.
     """
     prim, character_joints = mesh.GetPrim(), scene.character.skeleton.joint_names
-    for name in (CLASS, *SKEL, *LBS_SKIN):
+    for name in (CLASS, PIN, LEVEL, *SKEL, *LBS_SKIN):
         prim.RemoveProperty(name)
         prim.RemoveProperty(f"{name}:indices")  # of an indexed primvar
     apply_garment_api(prim)
@@ -303,5 +317,5 @@ def _bind_garment(
     binding = UsdSkel.BindingAPI(prim)
     binding.CreateGeomBindTransformAttr(Gf.Matrix4d(to_bind.T.tolist()))
     binding.CreateJointsAttr(Vt.TokenArray((*character_joints, *proxies)))
-    mark_garment(prim, scene.classes, proxies)
+    mark_garment(prim, scene.garment, proxies)
     keep_lbs_skin(prim, scene.lbs_skin, character_joints)

@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
-from ssilk_core.assets import Character, Garment, Mesh, Motion, ProxyRig, Skeleton
+from ssilk_core.assets import Character, Floats, Garment, Mesh, Motion, ProxyRig, Skeleton
 from ssilk_core.files import replacing
 
 from .author import bind_skin, define_mesh, define_skeleton, keep_lbs_skin, mark_garment, prim_names
@@ -48,7 +49,7 @@ def write_scene(
         if skin is not None:
             bind_skin(mesh, skin, joints)
         mesh.GetPrim().CreateAttribute(GARMENT, Sdf.ValueTypeNames.Bool).Set(True)
-        mark_garment(mesh.GetPrim(), garment.classes, None if rig is None else rig.joint_names)
+        mark_garment(mesh.GetPrim(), garment, None if rig is None else rig.joint_names)
         if rig is not None and garment.skin is not None:
             keep_lbs_skin(mesh.GetPrim(), garment.skin, skeleton.joint_names)
         for place, body in zip(paths[2:], bodies):
@@ -64,6 +65,29 @@ def write_garment(path: str | Path, mesh: Mesh) -> None:
         Usd.ModelAPI(prim).SetKind(Kind.Tokens.component)
         stage.SetDefaultPrim(prim)
         save(stage.GetRootLayer(), path)
+
+
+def write_cache(path: str | Path, mesh: Mesh, points: Sequence[Floats], fps: float, start: int) -> None:
+    """Write a mesh that has its points at each frame, in metres and y up, one time code per frame.
+
+    Args:
+        points: of each frame in the world [m], shape (V, 3).
+        fps: frames per second [1/s].
+        start: time code of the first frame.
+    """
+    with replacing(path) as temporary:
+        stage = new_stage(temporary, CORE_UNITS)
+        prim = define_mesh(stage, _root_path(mesh.path), mesh, CORE_UNITS)
+        stage.SetDefaultPrim(prim.GetPrim())
+        stage.SetTimeCodesPerSecond(fps)
+        stage.SetFramesPerSecond(fps)
+        stage.SetStartTimeCode(start)
+        stage.SetEndTimeCode(start + len(points) - 1)
+        layer, places = stage.GetRootLayer(), prim.GetPointsAttr().GetPath()
+        del stage, prim  # nobody has to hear of each sample
+        for frame, each in enumerate(points):
+            layer.SetTimeSample(places, start + frame, Vt.Vec3fArray.FromNumpy(np.asarray(each, dtype=np.float32)))
+        save(layer, path)
 
 
 def write_motion(path: str | Path, motion: Motion, skeleton: Skeleton) -> None:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fit blendshape weights and proxy rotations to garment vertices: mass-weighted least squares for each frame.
 
-Levenberg-Marquardt [Marquardt 1963] on what a shot stores, blendshape weights in [0, 1] and proxy rotations, several
-frames at once. Rotating a proxy by a small w about its position c moves a vertex by w x (q - W c), where W is the sum
+Levenberg-Marquardt [Marquardt 1963] on what a shot stores, blendshape weights and proxy rotations, several frames at
+once. Rotating a proxy by a small w about its position c moves a vertex by w x (q - W c), where W is the sum
 of the vertex's weights of the proxy and its descendants, and q the sum of its positions under each, weighted alike. A
 step is accepted only where it reduces a frame's error.
 """
@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..assets import PINNED, Deformer, Floats, GarmentPose, Motion
+from ..assets import PINNED, Deformer, Floats, GarmentPose, Ints, Motion
 from ..errors import fail
 from ..kinematics import combined_transforms, matrix_from_quaternion, quaternion_from_matrix, skinning_matrices
 
@@ -41,18 +41,36 @@ class PoseFit:
 
 
 class PoseFitter:
-    """Fits poses of one garment; the last blendshape, which recentres all others, keeps its constant weight.
+    """Fits poses of one garment.
 
     Args:
         mass: of the vertices [kg], shape (V,).
+        vertices: those that are fitted; None for all that are not pinned.
+        lower, upper: bounds of the blendshape weights, shape (K,), equal where a weight is constant; by default all
+            weights lie in [0, 1], and the last blendshape, which recentres all others, keeps its weight of one.
+        steps: most iterations for a frame.
         device: where the linear algebra runs.
     """
 
-    def __init__(self, deformer: Deformer, mass: Floats, *, device: torch.device | str = "cpu") -> None:
+    def __init__(
+        self,
+        deformer: Deformer,
+        mass: Floats,
+        *,
+        vertices: Ints | None = None,
+        lower: Floats | None = None,
+        upper: Floats | None = None,
+        steps: int = MAX_STEPS,
+        device: torch.device | str = "cpu",
+    ) -> None:
         scene, skin = deformer.scene, deformer.skin
-        self.deformer, self.device = deformer, torch.device(device)
+        self.deformer, self.steps, self.device = deformer, steps, torch.device(device)
+        self.lower = model_bounds(deformer.shape_count)[0] if lower is None else lower
+        self.upper = model_bounds(deformer.shape_count)[1] if upper is None else upper
+        self.moving = np.flatnonzero(self.lower < self.upper)
         self.joints, self.proxies = scene.character.skeleton.joint_count, scene.rig.proxy_count
-        self.free, self.above = np.flatnonzero(scene.classes != PINNED), scene.rig.parents.tolist()
+        self.free = np.flatnonzero(scene.classes != PINNED) if vertices is None else vertices
+        self.above = scene.rig.parents.tolist()
         self.indices = self._tensor(skin.indices[self.free], torch.int64)
         self.weights = self._tensor(skin.weights[self.free])
         self.rest = self._tensor(scene.garment.mesh.points[self.free])
@@ -87,10 +105,16 @@ class PoseFitter:
         root = motion.translations[pose.start : pose.start + pose.frame_count, :1]
         about = replace(motion, translations=motion.translations - _of_root(motion))
         search = _Search(self, about, pose, self._tensor((vertices - root)[:, self.free]))
-        for _ in range(MAX_STEPS):
+        for _ in range(self.steps):
             if not search.advance():
                 break
         return search.found()
+
+
+def model_bounds(shapes: int) -> tuple[Floats, Floats]:
+    """Return the bounds of a trained model's blendshape weights, the last of which is constant, shape (shapes,)."""
+    upper = np.ones(shapes)
+    return np.where(np.arange(shapes) == shapes - 1, 1.0, 0.0), upper
 
 
 def _of_root(motion: Motion) -> Floats:
@@ -172,7 +196,7 @@ class _Search:
         self.posed = _Posed(*(chosen(new, old) for new, old in zip(vars(posed).values(), vars(self.posed).values())))
 
     def _step(self) -> Tensor:
-        """Return changes of weights, then of rotations about the world's axes, shape (F, K + 3 P)."""
+        """Return changes of the M moving weights, then of rotations about the world's axes, shape (F, M + 3 P)."""
         fitter, posed = self.fitter, self.posed
         root = fitter.share.sqrt()[..., None]
         jacobian = (root * self._jacobian()).float().flatten(1, 2)
@@ -188,9 +212,9 @@ class _Search:
         return torch.linalg.solve(normal, slope)[..., 0]
 
     def _jacobian(self) -> Tensor:
-        """Return derivatives of the vertices, shape (F, V, 3, K + 3 P)."""
+        """Return derivatives of the vertices, shape (F, V, 3, M + 3 P)."""
         fitter, posed = self.fitter, self.posed
-        by_weight = torch.einsum("fvij,kvj->fvik", posed.blended, fitter.shapes[:-1])
+        by_weight = torch.einsum("fvij,kvj->fvik", posed.blended, fitter.shapes[fitter.moving])
         centre = posed.world[:, fitter.joints :, :3, 3]
         q = torch.einsum("vip,fvic->fvpc", fitter.below, posed.moved)
         x, y, z = (q - fitter.bound[..., None] * centre[:, None]).unbind(-1)
@@ -200,19 +224,20 @@ class _Search:
         return torch.cat([by_weight, by_turn], dim=-1)
 
     def _stuck(self, slope: Tensor) -> Tensor:
-        """Return which unknowns are weights at an active bound of their range, shape (F, K + 3 P)."""
-        weights = self.fitter._tensor(self.pose.weights)[:, :-1]
-        ends = ((weights <= 0) & (slope[:, : weights.shape[1]] < 0)) | (
-            (weights >= 1) & (slope[:, : weights.shape[1]] > 0)
-        )
+        """Return which unknowns are weights at an active bound of their range, shape (F, M + 3 P)."""
+        fitter, moving = self.fitter, self.fitter.moving
+        weights, slope = fitter._tensor(self.pose.weights[:, moving]), slope[:, : len(moving)]
+        low, high = (fitter._tensor(bound[moving]) for bound in (fitter.lower, fitter.upper))
+        ends = ((weights <= low) & (slope < 0)) | ((weights >= high) & (slope > 0))
         return torch.cat([ends, ends.new_zeros(len(ends), 3 * self.fitter.proxies)], dim=1)
 
     def _stepped(self, step: Tensor) -> GarmentPose:
         """Return the pose after a step."""
         fitter, pose = self.fitter, self.pose
-        shapes = fitter.shapes[:-1].shape[0]
+        moving, shapes = fitter.moving, len(fitter.moving)
         weights = pose.weights.copy()
-        weights[:, :shapes] = (weights[:, :shapes] + step[:, :shapes].cpu().numpy()).clip(0, 1)
+        moved = weights[:, moving] + step[:, :shapes].cpu().numpy()
+        weights[:, moving] = moved.clip(fitter.lower[moving], fitter.upper[moving])
         turn = torch.matrix_exp(_cross(step[:, shapes:].reshape(len(step), -1, 3))).cpu().numpy()
         above = self.posed.world[:, fitter.above, :3, :3].cpu().numpy()
         turned = np.swapaxes(above, -1, -2) @ turn @ above @ matrix_from_quaternion(pose.rotations)

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from ssilk_core.assets import GarmentPose
+from ssilk_core.decomposition.poses import PoseFitter, _Search
 from ssilk_core.errors import SsilkError
 from ssilk_core.kinematics import deform
-from ssilk_core.refine.fit import PoseFitter, _Search
 from ssilk_core.rollout import garment_poses
 
 FRAMES = 5

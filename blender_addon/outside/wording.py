@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Sentences of ssilk about files that were made for it, in the words of artists, who know objects and motions.
+
+Names are by what was made, as seen from its folder: a file, "dressed.usdc", or a prim of one,
+"dressed.usdc:/Character/Skirt".
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+NAMES = "names.json"  # in a folder that outlives Blender
+PRIMS = r"(?::(?:/\w+)+)?"  # any prim of a file
+
+
+def remember(folder: Path, names: Mapping[str, str]) -> None:
+    """Keep names of what lies in a folder."""
+    (folder / NAMES).write_text(json.dumps(dict(names)), encoding="utf-8")
+
+
+def recall(folder: Path) -> dict[str, str]:
+    """Return the names that were kept in a folder; none where there are none."""
+    try:
+        document = json.loads((folder / NAMES).read_text(encoding="utf-8"))
+    except (OSError, ValueError):  # of an older version, or gone
+        return {}
+    return {str(made): str(name) for made, name in document.items()} if isinstance(document, dict) else {}
+
+
+def reworded(sentence: str, folder: Path, names: Mapping[str, str]) -> str:
+    """Return a sentence with names in place of what lies in a folder."""
+    places = "|".join(re.escape(place) for place in {str(folder), folder.as_posix()})
+    for made in sorted(names, key=len, reverse=True):
+        end = r"(?![\w/])" if ":" in made else PRIMS
+        pattern = rf"(?:(?:{places})[/\\]|(?<![\w./\\-])){re.escape(made)}{end}"
+        sentence = re.sub(pattern, lambda _, name=names[made]: name, sentence)  # type: ignore[misc]
+    return sentence

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Turn a point cache of any simulator into joints and blendshapes on the character's skeleton, and verify them.
+
+The cache is a USD file with the garment's points at each frame, from Houdini, Marvelous Designer, Blender or 'ssilk
+simulate --points', say: the same mesh, its vertices in the same order, in the character's world. The shot moves the
+character's joints, fits the garment's proxy joints, and gets as many blendshapes as it takes to stay within the
+tolerance. The result says how many, and what the points would take.
+
+With a model its trained weights are used, without one those of the stage, and 'ssilk rig' makes what is missing.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..errors import EXIT_OK, fail
+from ..events import Reporter, Result, Started
+from ..targets import TARGETS
+from . import options as shared
+
+if TYPE_CHECKING:
+    from ..assets import Deformer
+
+LARGEST = 5  # times the RMS tolerance: how far any vertex may be off
+
+
+def add_arguments(verb: argparse.ArgumentParser) -> None:
+    """Add the options of this verb."""
+    verb.add_argument("cache", metavar="CACHE[:/PRIM]", help="USD file with the garment's points at each frame; PRIM "
+                      "is its mesh, where several have as many points")  # fmt: skip
+    verb.add_argument("--stage", type=Path, required=True, help=shared.STAGE)
+    shared.add_garment(verb)
+    verb.add_argument("--model", type=Path, help="model written by 'ssilk train', whose weights are used")
+    verb.add_argument("--motion", metavar="SHOT[:/PRIM]",
+                      help="USD file with the character's motion (default: the cache itself)")  # fmt: skip
+    verb.add_argument("-o", "--output", type=Path, required=True,
+                      help="shot to write (.usdc, .usd, .usda, .usdz or .glb)")  # fmt: skip
+    verb.add_argument("--tolerance", type=shared.NumberRange(1e-3, 1e3), default=1.0, metavar="MM",
+                      help=f"RMS distance from the cache in millimetres; any vertex may be {LARGEST} times as far "
+                           "off (default 1)")  # fmt: skip
+    verb.add_argument("--target", choices=TARGETS, default="usd", help="who receives it (default usd)")
+    verb.add_argument("--no-body", action="store_true", help="leave the body meshes out")
+    verb.add_argument("--no-verify", action="store_true", help="do not re-skin the written file")
+    verb.add_argument("--device", default="cpu", help="where poses are fitted (default cpu)")
+
+
+def run(options: argparse.Namespace, report: Reporter) -> int:
+    """Fit, write and verify."""
+    from ssilk_usd.read_motion import read_motion
+    from ssilk_usd.read_stage import open_stage, split_location
+    from ssilk_usd.read_visibility import read_hidden
+    from ssilk_usd.trajectories import MeshTrajectories
+    from ssilk_usd.units import StageUnits
+
+    from ..bake import cache_origin, motion_at, skin_trajectories
+    from ..decomposition import FitTolerance
+    from ..targets import cap_influences
+
+    target, where = TARGETS[options.target], options.motion or split_location(options.cache)[0]
+    if options.output.suffix not in target.suffixes:
+        suffix, allowed = options.output.suffix, ", ".join(target.suffixes)
+        fail(str(options.output), f"the suffix is '{suffix}'", f"{options.target} takes {allowed}")
+    inputs = (options.stage, options.model, split_location(options.cache)[0], split_location(where)[0])
+    shared.check_output(options.output, *inputs)
+    deformer = cap_influences(_deformer(options, report), target)
+    points = MeshTrajectories(options.cache, deformer.scene.garment.mesh.vertex_count)
+    motion = motion_at(
+        read_motion(where, deformer.scene.character.skeleton, root=options.root), points, options.cache
+    )
+    report(Started("skin", motion.frame_count, {"output": str(options.output)}))
+    own = StageUnits.of(open_stage(options.stage))
+    result = skin_trajectories(
+        deformer,
+        motion,
+        points,
+        options.output,
+        units=StageUnits(target.meters_per_unit or own.meters_per_unit, target.up_axis or own.up_axis),
+        origin=cache_origin(options.cache, points.mesh, options.output),
+        hidden=read_hidden(where, motion, root=options.root),
+        include_body=not options.no_body,
+        verify=not options.no_verify,
+        tolerance=FitTolerance(options.tolerance / 1000, LARGEST * options.tolerance / 1000),
+        device=options.device,
+        report=report,
+    )
+    report(Result("skin", result.figures()))
+    return EXIT_OK
+
+
+def _deformer(options: argparse.Namespace, report: Reporter) -> Deformer:
+    """Return the garment on its character: with a model's weights, or with those of the stage."""
+    from ..bake import rig_deformer, trained_deformer
+
+    if options.model is None:
+        return rig_deformer(shared.load_scene(options, report))
+    if options.garment:
+        fail("--garment", "a garment beside a model", "the model holds its garment", "leave one of them out")
+    return trained_deformer(options.model, options.stage, options.root)

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a page about a shot opens with: in words, whether something is wrong with a garment, where and when."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from html import escape
+
+import numpy as np
+
+from ..assets import Floats
+from ..shown_skin import ShownSkin
+from .page import Section
+from .terms import SHARE, SHOWN, STRETCH
+
+# Beyond these the eye finds it at once [%]: skin on average and in one frame, stretch of 99 triangles in 100.
+SHOWN_MEAN, SHOWN_WORST, STRETCHED = 0.05, 0.5, 15.0
+
+
+def verdict(
+    name: str, values: Mapping[str, Floats], skin: ShownSkin | None, frame_times: Sequence[float], fps: float
+) -> Section:
+    """Return the section of a garment.
+
+    Args:
+        values: of each frame, by the names of `terms.UNITS`.
+        skin: None where the garment covers nothing.
+    """
+
+    def when(frame: int) -> str:
+        return f"in frame {frame_times[frame]:g}, at {frame / fps:.2f} s"
+
+    faults, words = [], []
+    lost = np.flatnonzero(~np.isfinite(values[STRETCH]))
+    if len(lost):
+        faults.append("it is lost")
+        words.append(f"It is not finite in {len(lost)} of {len(frame_times)} frames, first {when(int(lost[0]))}.")
+    if skin:
+        shown, worst = values[SHOWN], int(np.nanargmax(values[SHOWN]))
+        if shown.mean() > SHOWN_MEAN or shown[worst] > SHOWN_WORST:
+            faults.append("skin shows through")
+        where = f", most at {skin.where}" if skin.where else ""
+        share = f"{shown.mean():.3f} % of the covered skin shows on average"
+        seen = f"{share}, and {shown[worst]:.2f} % {when(worst)}{where}."
+        words.append(seen if shown[worst] else "No covered skin shows.")
+    if len(lost) < len(frame_times):
+        worst = int(np.nanargmax(values[STRETCH]))
+        if values[STRETCH][worst] > STRETCHED:
+            faults.append("the cloth stretches")
+        middle, most = np.nanmedian(values[STRETCH]), values[STRETCH][worst]
+        words.append(
+            f"99 triangles in 100 stretch by at most {middle:.0f} % as a rule, and by {most:.0f} % {when(worst)}."
+        )
+        inside = int(np.nanargmax(values[SHARE]))
+        if values[SHARE][inside]:
+            words.append(
+                f"At most {values[SHARE][inside]:.1f} % of its vertices are inside the body, {when(inside)}."
+            )
+    first = (
+        f"Look at {name}: {' and '.join(faults)}." if faults else f"{name} holds: nothing that the eye would find."
+    )
+    lines = "".join(f"<li>{escape(each)}</li>" for each in words)
+    return Section(f"{name}: verdict", f"<p><strong>{escape(first)}</strong></p><ul>{lines}</ul>")

@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trajectories become joints and blendshapes: what is exact stays exact, and anything else meets its tolerance."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ssilk_core.assets import GarmentPose
+from ssilk_core.decomposition import FitTolerance, decompose
+from ssilk_core.decomposition.rest import rest_residuals
+from ssilk_core.decomposition.shapes import OffsetShapes, regions_of
+from ssilk_core.errors import SsilkError
+from ssilk_core.kinematics import deform, lbs_deformer
+from ssilk_core.rollout import garment_poses
+
+FRAMES = 24
+
+
+@pytest.fixture(scope="module")
+def played(toy_scene, toy_model, toy_motion):
+    scene = toy_scene()
+    model, motion = toy_model(scene), toy_motion(scene, FRAMES)
+    (pose,) = garment_poses(model, motion, 30.0)
+    return model.deformer(), motion, pose
+
+
+def distances(deformer, motion, poses, points) -> np.ndarray:
+    return np.linalg.norm(np.concatenate([deform(deformer, motion, pose) for pose in poses]) - points, axis=-1)
+
+
+def turned(pose: GarmentPose, size: float) -> GarmentPose:
+    rotations = pose.rotations + size * np.random.default_rng(1).standard_normal(pose.rotations.shape)
+    return GarmentPose(0, rotations / np.linalg.norm(rotations, axis=-1, keepdims=True), pose.weights)
+
+
+def test_known_joints_and_shapes_are_recovered_without_further_shapes(played):
+    deformer, motion, pose = played
+    points = deform(deformer, motion, pose)
+    found = decompose(deformer, motion, points, [turned(pose, 0.2)])
+    assert distances(deformer, motion, [turned(pose, 0.2)], points).max() > 0.02
+    assert found.own_shapes == 0 and found.deformer.shape_count == deformer.shape_count
+    assert found.largest < 5e-4
+
+
+def test_joints_alone_are_recovered_from_rest(played):
+    deformer, motion, pose = played
+    bones = replace(deformer, shapes=deformer.shapes[:0])
+    few = motion.clip(0, 6)
+    points = deform(bones, few, GarmentPose(0, pose.rotations[:6], np.zeros((6, 0))))
+    found = decompose(bones, few, points)
+    assert found.own_shapes == 0 and found.largest < 5e-4
+
+
+@pytest.mark.parametrize("rig", ["model", "joints", "no proxies"])
+def test_anything_else_meets_its_tolerance(played, rig):
+    deformer, motion, pose = played
+    rng = np.random.default_rng(0)
+    unknown = replace(deformer, shapes=np.concatenate([deformer.shapes, 0.02 * rng.standard_normal((3, 60, 3))]))
+    waves = np.sin(np.outer(np.arange(FRAMES), [0.2, 0.5, 0.9]))
+    points = deform(unknown, motion, GarmentPose(0, pose.rotations, np.concatenate([pose.weights, waves], axis=1)))
+    points[7, 11] += 0.03  # one vertex in one frame
+    points += 2e-4 * rng.standard_normal(points.shape)
+    own = {
+        "model": deformer,
+        "joints": replace(deformer, shapes=deformer.shapes[:0]),
+        "no proxies": lbs_deformer(deformer.scene),
+    }[rig]
+    found = decompose(own, motion, points, [pose] if rig == "model" else None)
+    away = distances(found.deformer, motion, found.poses, points)
+    assert np.sqrt((away**2).mean()) == pytest.approx(found.rms, rel=1e-6) and found.rms <= 1e-3
+    assert away.max() == pytest.approx(found.largest, rel=1e-6) and found.largest <= 5e-3
+    assert 3 <= found.own_shapes <= 22 and found.deformer.shape_count == own.shape_count + found.own_shapes
+    weights = np.concatenate([each.weights for each in found.poses])
+    assert weights.min() >= 0 and weights.max() <= 1 and weights.dtype == np.float32
+
+
+def test_a_tighter_tolerance_needs_more_shapes(played):
+    deformer, motion, pose = played
+    points = deform(deformer, motion, pose) + 0.004 * np.random.default_rng(0).standard_normal((FRAMES, 60, 3))
+    counts = [
+        decompose(deformer, motion, points, [pose], tolerance=FitTolerance(rms, 10 * rms)).own_shapes
+        for rms in (6e-3, 4e-3, 1e-5)
+    ]
+    assert counts[0] < counts[1] < counts[2] <= FRAMES + 1
+
+
+def test_what_moves_few_vertices_becomes_a_local_shape():
+    offsets = np.zeros((30, 400, 3), np.float32)
+    offsets[10:14, 5:9, 1] = 0.02
+    own = OffsetShapes(offsets, FitTolerance(), [np.arange(400)])
+    own.find()
+    shapes, weights = own.all_shapes()
+    assert np.abs(np.einsum("fk,kvc->fvc", weights, shapes)[12, 6] - [0, 0.02, 0]).max() < 5e-3
+    assert shapes.any(axis=-1).sum() <= 8 and not shapes[:, 20:].any()
+
+
+def test_another_shape_that_stays_is_one_blendshape(played):
+    deformer, motion, pose = played
+    bones = replace(deformer, shapes=deformer.shapes[:0])
+    held = replace(deformer, shapes=np.random.default_rng(0).uniform(0.01, 0.02, (1, 60, 3)))
+    points = deform(held, motion, GarmentPose(0, pose.rotations, np.ones((FRAMES, 1))))
+    found = decompose(bones, motion, points, [GarmentPose(0, pose.rotations, np.zeros((FRAMES, 0)))])
+    assert found.own_shapes == 1 and found.largest < 1e-6
+
+
+@pytest.mark.parametrize("apart", [False, True])
+def test_regions_get_shapes_of_their_own_where_that_pays(apart):
+    """Two halves that wave each in its own way take half of the bytes; where they wave together they take more."""
+    rng, halves = np.random.default_rng(0), [np.arange(200), np.arange(200, 400)]
+    ways = [rng.standard_normal((80, 4)) for _ in halves]
+    fields = [rng.standard_normal((4, 600)) for _ in halves]
+    waves = [way @ field for way, field in zip(ways if apart else ways[:1] * 2, fields)]
+    own = OffsetShapes(
+        (0.01 * np.concatenate(waves, axis=1)).reshape(80, 400, 3).astype(np.float32), FitTolerance(), halves
+    )
+    own.find()
+    moved = [shape.any(axis=1) for shape in own.shapes]
+    assert len(own.shapes) == (8 if apart else 4)
+    assert all((each[:200].any() != each[200:].any()) == apart for each in moved)
+
+
+def test_regions_cover_all_points_once():
+    points = np.random.default_rng(0).standard_normal((300, 3))
+    regions = regions_of(points, 4)
+    assert sorted(np.concatenate(regions).tolist()) == list(range(300)) and len(regions) == 4
+    assert min(map(len, regions)) > 20
+    assert [len(each) for each in regions_of(np.zeros((5, 3)), 4)] == [5]
+
+
+def test_offsets_in_the_rest_pose_give_the_vertices_back(played):
+    deformer, motion, pose = played
+    rng = np.random.default_rng(2)
+    points = deform(deformer, motion, pose) + 0.05 * rng.standard_normal((FRAMES, 60, 3))
+    offsets = np.concatenate([each for _, each in rest_residuals(deformer, motion, pose, points)])
+    weights = np.concatenate([pose.weights, np.ones((FRAMES, 1))], axis=1)
+    for frame in (0, 9, 23):
+        shaped = replace(deformer, shapes=np.concatenate([deformer.shapes, offsets[frame][None]]))
+        one = GarmentPose(frame, pose.rotations[frame : frame + 1], weights[frame : frame + 1])
+        np.testing.assert_allclose(deform(shaped, motion, one)[0], points[frame], atol=2e-6)
+
+
+def test_offsets_that_lie_in_a_file_become_the_same_shapes(played, monkeypatch):
+    deformer, motion, pose = played
+    points = deform(deformer, motion, pose) + 0.004 * np.random.default_rng(0).standard_normal((FRAMES, 60, 3))
+    inside = decompose(deformer, motion, points, [pose])
+    monkeypatch.setattr(sys.modules[decompose.__module__], "IN_MEMORY", 0)
+    found = decompose(deformer, motion, points, [pose])
+    np.testing.assert_array_equal(found.deformer.shapes, inside.deformer.shapes)
+
+
+def test_many_frames_are_fitted_from_some_of_them(monkeypatch):
+    rng = np.random.default_rng(0)
+    offsets = (np.sin(np.outer(np.arange(96), [0.1, 0.3, 0.7])) @ rng.standard_normal((3, 180))).reshape(96, 60, 3)
+    offsets[40:44] += rng.standard_normal((60, 3))  # which frames that are evenly spread do not tell of
+    monkeypatch.setattr("ssilk_core.decomposition.shapes.BASIS_FRAMES", 6)
+    own = OffsetShapes((0.01 * offsets).astype(np.float32), FitTolerance(), [np.arange(30), np.arange(30, 60)])
+    own.find()
+    shapes, weights = own.all_shapes()
+    away = np.linalg.norm(np.einsum("fk,kvc->fvc", weights, shapes) - 0.01 * offsets, axis=-1)
+    assert np.sqrt((away**2).mean()) <= 1.001e-3 and away.max() <= 5.001e-3 and len(shapes) < 20
+
+
+def test_points_of_another_garment_and_broken_ones_are_refused(played):
+    deformer, motion, pose = played
+    points = deform(deformer, motion, pose)
+    with pytest.raises(SsilkError, match="24 frames for 23"):
+        decompose(deformer, motion, points[1:])
+    with pytest.raises(SsilkError, match=r"frame 0 has points of shape \(59, 3\)"):
+        decompose(deformer, motion, points[:, 1:])
+    points[3, 4] = np.nan
+    with pytest.raises(SsilkError, match="frame 3 has NaN or infinity"):
+        decompose(deformer, motion, points)

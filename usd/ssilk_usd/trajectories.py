@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Read the trajectories of a mesh's vertices, whoever made them: the points of a cache at each of its frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import overload
+
+from pxr import Sdf
+
+from ssilk_core.assets import Floats
+from ssilk_core.errors import fail
+
+from .play import Shot
+from .read_stage import USD_SUFFIXES, split_location
+
+
+class MeshTrajectories(Sequence[Floats]):
+    """The points of one mesh of a stage in the world [m], y up, shape (V, 3), at each of its frames.
+
+    A frame is read when it is asked for, so any number of them take little memory.
+
+    Attributes:
+        fps: frames per second [1/s].
+        times: time code of each frame.
+        mesh: path of the mesh.
+        vertex_count: of the mesh.
+    """
+
+    def __init__(self, source: str, vertex_count: int | None = None) -> None:
+        """Open a cache.
+
+        Args:
+            source: "file[:/Prim/Path]". Where no prim is named, it is the mesh that is marked as a garment, or the
+                one mesh that has `vertex_count` points.
+
+        Raises:
+            SsilkError: the file cannot be read, or holds no such mesh, or several.
+        """
+        file, prim = split_location(source)
+        _need_readable(file)
+        self._shot = Shot(file)
+        self._index = _chosen(self._shot, prim, vertex_count)
+        self.mesh, self.fps, self.times = (
+            self._shot.meshes[self._index].path,
+            self._shot.fps,
+            self._shot.frame_times,
+        )
+        self.vertex_count = len(self[0])
+        if vertex_count is not None and self.vertex_count != vertex_count:
+            fail(
+                f"{file}:{self.mesh}",
+                f"{self.vertex_count} points",
+                f"the garment has {vertex_count}",
+                "cache the same mesh, its vertices in the same order",
+            )
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    @overload
+    def __getitem__(self, frame: int) -> Floats: ...
+    @overload
+    def __getitem__(self, frame: slice) -> list[Floats]: ...
+    def __getitem__(self, frame: int | slice) -> Floats | list[Floats]:
+        if isinstance(frame, slice):
+            return [self[each] for each in range(*frame.indices(len(self)))]
+        return self._shot.mesh_points(self._index, self.times[frame])
+
+
+def _need_readable(file: str) -> None:
+    """Raise `SsilkError` for a file of Alembic that this build of USD cannot read."""
+    suffix = Path(file).suffix.removeprefix(".")
+    if suffix == "abc" and Path(file).is_file() and Sdf.FileFormat.FindByExtension(suffix) is None:
+        fail(
+            file,
+            "an Alembic cache, which this build of USD has no plug-in for",
+            f"a cache is one of {', '.join(USD_SUFFIXES)}",
+            "export the points as USD",
+        )
+
+
+def _chosen(shot: Shot, prim: str | None, vertex_count: int | None) -> int:
+    """Return the index of the mesh that is asked for."""
+    meshes = shot.meshes
+    if prim is not None:
+        found = [index for index, mesh in enumerate(meshes) if prim in (mesh.path, mesh.name)]
+        asked = f"no visible mesh '{prim}'"
+    else:
+        found = [index for index, mesh in enumerate(meshes) if mesh.is_garment]
+        if len(found) != 1:
+            found = [index for index in range(len(meshes)) if shot.point_count(index) == vertex_count]
+        asked = f"{len(found)} meshes of {vertex_count} points"
+    if len(found) != 1:
+        names = ", ".join(f"{mesh.path} ({shot.point_count(index)})" for index, mesh in enumerate(meshes[:6]))
+        fail(shot.name, asked, f"it has {names}", "name one: FILE:/PRIM")
+    return found[0]
