@@ -26,7 +26,6 @@ from ssilk_core.kinematics import deform
 from ssilk_core.targets import GLB, TARGETS, Target, cap_influences
 
 STAGES = [name for name, target in TARGETS.items() if GLB not in target.suffixes]
-
 SHOT_FILES = ("anim.usdc", "points.usdc", "bake.json")
 GARMENT, BAKE = "skirt", "bake skirt.safetensors --stage rigged.usda"
 
