@@ -17,7 +17,7 @@ void main() {
   if (dot(up, look) < 0.0) up = -up;
   float key = max(dot(up, normalize(vec3(0.4, 0.8, 0.5))), 0.0);
   float fill = max(dot(up, normalize(vec3(-0.7, 0.2, -0.3))), 0.0);
-  vec3 lit = colour * (0.22 + 0.75 * key + 0.25 * fill) + 0.05 * pow(1.0 - abs(dot(up, look)), 3.0);
+  vec3 lit = pow(colour, vec3(2.2)) * (0.22 + 0.75 * key + 0.25 * fill) + 0.05 * pow(1.0 - abs(dot(up, look)), 3.0);
   vec2 cell = floor(at.xz * 2.0);
   float board = mod(cell.x + cell.y, 2.0) < 0.5 ? 0.80 : 0.74;
   float fade = clamp(length(toEye) / 14.0, 0.0, 1.0);
