@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 SAMPLE = 512  # vertices that poses are fitted to; their weights are known, and shapes take the rest
 COMPONENTS, FRAMES_EACH = 12, 8  # fitted together with the rotations, at most, and frames for each of them
 ROUNDS, STEPS = 3, 1  # of fitting poses with components, and iterations in each
+FIRST_STEPS = 6  # before them, where there are blendshapes to fit
 SPREAD = 0.1  # [m] RMS of these components, which makes them as stiff as rotations
 IN_MEMORY = 256 * 2**20  # bytes of offsets; more of them lie in a temporary file
 LOCAL = 0.3  # of the vertices: a shape that moves fewer is local
@@ -156,7 +157,7 @@ class _PoseSearch:
             return pose
         count = min(COMPONENTS, self.motion.frame_count // FRAMES_EACH)
         if self.deformer.shape_count or not count:
-            pose = self._fitted(self.deformer, pose, *bounds)
+            pose = self._fitted(self.deformer, pose, *bounds, steps=FIRST_STEPS if count else MAX_STEPS)
         for _ in range(ROUNDS if count else 0):
             left = self._left(pose)
             distance = np.linalg.norm(left, axis=-1)

@@ -7,7 +7,10 @@ import numpy as np
 
 from ..assets import CLASS_NAMES, LOOSE, Ints, Mesh
 from ..mesh.topology import islands
+from ..setup.surface import closest_on_surface
 from .finding import Finding, Findings, index_tuple
+
+TOUCH = 0.005  # [m] between islands that lie on each other
 
 
 def class_coverage(mesh: Mesh, classes: Ints) -> Findings:
@@ -43,4 +46,36 @@ def unattached_islands(mesh: Mesh, classes: Ints) -> Findings:
             fix="paint a part of each as pinned or tight (primvars:ssilk:class), or sew it to the rest",
             elements="vertices",
             indices=index_tuple(lost),
+        )
+
+
+def touching_islands(mesh: Mesh, classes: Ints) -> Findings:
+    """Yield the places where an island lies on another one that it is not joined to, and one of both is loose there.
+
+    Of two islands the smaller one is told, as a pocket or a button is.
+    """
+    island = islands(mesh.faces, mesh.vertex_count)
+    numbers, sizes = np.unique(island[mesh.faces[:, 0]], return_counts=True)
+    order = numbers[np.argsort(-sizes, kind="stable")]
+    found, parts = [], 0
+    for place, number in enumerate(order[1:], start=1):
+        own = np.unique(mesh.faces[island[mesh.faces[:, 0]] == number])
+        others = mesh.faces[np.isin(island[mesh.faces[:, 0]], order[:place])]
+        near = closest_on_surface(mesh.points[own], Mesh(mesh.path, mesh.points, others))
+        moves = (classes[own] == LOOSE) | (classes[near.corners] == LOOSE).any(axis=1)
+        touching = own[(near.distance < TOUCH) & moves]
+        parts += len(touching) > 0
+        found.append(touching)
+    touching = np.concatenate(found) if found else np.zeros(0, dtype=np.int64)
+    if len(touching):
+        yield Finding(
+            severity="warning",
+            code="touching-islands",
+            prim=mesh.path,
+            count=len(touching),
+            found=f"{parts} of {len(order)} islands lie on others without being joined to them",
+            why="nothing holds loose cloth of two islands together, and cloth does not collide with cloth",
+            fix="join them by edges (merge or bridge vertices), or pin the smaller one where it is stiff",
+            elements="vertices",
+            indices=index_tuple(touching),
         )

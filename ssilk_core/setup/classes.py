@@ -103,8 +103,8 @@ def hold_levels(
     """Return the least tightness in (0, 1] at which each vertex is tight, 0 where it is pinned, shape (V,).
 
     At 0 only what is pinned is held, at 1 all of the garment is. In between distances grow from a quarter of those of
-    the options to four times as much, and above the usual tightness less of the body needs to
-    be enclosed, and cloth may be tight where limbs part, the nearest first.
+    the options to four times as much. Above the usual tightness less of the body needs to be enclosed, and cloth may
+    be tight where limbs part, the nearest first.
 
     Args:
         mesh: the garment at the character's bind pose.
@@ -119,9 +119,9 @@ def hold_levels(
     options = options or ClassOptions()
     pairs, island = edges(mesh.faces), islands(mesh.faces, mesh.vertex_count)
     body = closest_on_surface(mesh.points, character.merged_body().mesh)
-    weights = skin.dense(character.skeleton.joint_count)
-    torn = _band(mesh, _tear_rate(mesh, weights, pairs) > options.tear_rate, options.tear_width)
-    rays = LimbRays.through(character, mesh, weights, body, options.thickness)
+    tears = _tear_rate(mesh, skin.dense(character.skeleton.joint_count), pairs) > options.tear_rate
+    torn = _band(mesh, tears, options.tear_width)
+    rays = LimbRays.through(character, mesh, body, options.thickness)
     rim = _hanging_border(mesh, body.distance < options.pinned_distance, island, options.pinned_length)
     strips, band = _strips(mesh, options.strip_width), _band(mesh, rim, options.pinned_width)
     yoke = _band(mesh, rim, options.yoke_width)

@@ -54,10 +54,8 @@ class LimbRays:
         return np.mean(met & near[self.corners].all(axis=-1), axis=0)
 
     @classmethod
-    def through(
-        cls, character: Character, mesh: Mesh, cloth_weights: Floats, body: SurfacePoints, thickness: float
-    ) -> LimbRays:
-        """Cast the rays; each looks for cloth, of these weights (V, J), behind the first `thickness` [m] of it."""
+    def through(cls, character: Character, mesh: Mesh, body: SurfacePoints, thickness: float) -> LimbRays:
+        """Cast the rays; each looks for cloth behind the first `thickness` [m] of it."""
         import igl
 
         normals, merged = body.normals, character.merged_body()
@@ -79,11 +77,9 @@ class LimbRays:
             corners.append(np.where(face[:, None] >= 0, mesh.faces[face], -1))
         for rays in _rays(normals, UP, ACROSS):
             face = behind(under, rays)
-            far = np.flatnonzero((face >= 0) & _strange(own, cloth_weights[mesh.faces[face]].mean(axis=1)))
+            far = np.flatnonzero((face >= 0) & _strange(own, own[mesh.faces[face]].mean(axis=1)))
             if len(far):
-                count[far] += _parting(
-                    mesh, cloth_weights, merged, weights, (cloth, skin), under[far], rays[far], own[far]
-                )
+                count[far] += _parting(mesh, own, merged, weights, (cloth, skin), under[far], rays[far], own[far])
         shares = smooth((count > 0)[:, None].astype(float), edges(mesh.faces), ROUNDS)[:, 0]
         return cls(np.array(corners), shares > MOSTLY)
 
@@ -116,7 +112,7 @@ def _parting(
     """Return which rays (N, 3) from under the skin (N, 3) enter another limb, or meet its cloth behind air, (N,).
 
     Args:
-        weights, own: skinning weights of the body, and of it where rays begin (N, J).
+        cloth_weights, weights, own: of the skin beneath the cloth (V, J), of the body, of where rays begin (N, J).
         trees: of the cloth and of the body.
     """
     left, entered, at = _crossings(body.mesh, trees[1], origins, rays)

@@ -310,6 +310,21 @@ def test_a_character_that_lies_is_read_with_the_wrong_axis():
 # What holds the garment
 
 
+def test_islands_that_touch_without_being_joined():
+    sheet = grid()
+    patch = Mesh("/patch", sheet.points * 0.3 + [0.1, 0.1, 0], sheet.faces)  # a pocket
+    patch = Mesh("/patch", patch.points + 0.002 * np.array([0, 0, 1]), patch.faces)
+    points, faces = np.r_[sheet.points, patch.points], np.r_[sheet.faces, patch.faces + sheet.vertex_count]
+    two = Mesh(sheet.path, points, faces)
+    found = only(attachment.touching_islands(two, np.full(two.vertex_count, LOOSE)))
+    assert found.severity == "warning" and found.found.startswith("1 of 2 islands lie on others")
+    assert found.indices == tuple(range(sheet.vertex_count, two.vertex_count))
+    assert not list(attachment.touching_islands(two, np.full(two.vertex_count, TIGHT)))
+    away = Mesh(sheet.path, points + np.where(np.arange(len(points)) >= sheet.vertex_count, 0.01, 0)[:, None], faces)
+    assert not list(attachment.touching_islands(away, np.full(two.vertex_count, LOOSE)))
+    assert not list(attachment.touching_islands(sheet, np.full(sheet.vertex_count, LOOSE)))
+
+
 def test_class_coverage_and_unheld_islands():
     sheet = grid()
     two = Mesh(sheet.path, np.r_[sheet.points, sheet.points + 1, [[9, 9, 9]]], np.r_[sheet.faces, sheet.faces + 16])
