@@ -170,7 +170,7 @@ async function play(figure) {
     }
     slider.value = seconds;
     button.textContent = playing ? about.words.pause : about.words.play;
-    clock.textContent = `${(about.start + position * about.step).toFixed(1)} · ${seconds.toFixed(2)} s`;
+    clock.textContent = `${about.words.frame} ${(about.start + position * about.step).toFixed(1)} · ${seconds.toFixed(2)} s`;
     canvas.dataset.drawn = String(position);
   }
 

@@ -18,12 +18,12 @@ from ..view.player import PlayerMesh, ShotPlayer
 from ..view.shots import mesh_colours, need_matching
 
 FPS = 30.0  # frames per second that a page holds at most; between them, points go straight
-MAX_VALUES = 60_000_000  # coordinates that a page holds at most; of longer shots fewer frames
+MAX_VALUES = 30_000_000  # coordinates that a page holds at most; of longer shots fewer frames
 QUANTUM = 1e-4  # [m] to which points are rounded
 MOST = 2**15 - 1
 APART = 1.6  # between shots that stand side by side [m]
 SMOOTH = 1.0  # over which the camera's target is averaged [s]
-WORDS = {"play": "Play", "pause": "Pause",
+WORDS = {"play": "Play", "pause": "Pause", "frame": "Frame",
          "hint": "Drag to turn, scroll to come closer; space plays, the arrow keys step."}  # fmt: skip
 
 
@@ -39,15 +39,15 @@ def played(players: Sequence[ShotPlayer], labels: Sequence[str] = (), report: Re
     need_matching(players)
     times = players[0].frame_times
     step = _step(players)
-    shown = list(_posed(players, range(0, len(times), step), report))
-    fps = players[0].fps / step
-    origins = np.array([np.concatenate(points).mean(axis=0) for points in shown])
+    frames, fps = range(0, len(times), step), players[0].fps / step
+    origins, shown = zip(*_posed(players, frames, report))
+    path = np.array(origins)
     meshes, parts, words, floor = [], [], [], []
     for index, (word, mesh, colour) in enumerate(_described(players, labels)):
         points = np.stack([each[index] for each in shown])
         if not mesh.is_garment:
-            floor.append(points[..., 1].min())
-        quantum, values = quantised(points - origins[:, None])
+            floor.append((points[..., 1].min(axis=1) + path[:, 1]).min())
+        quantum, values = quantised(points)
         data = np.asarray(mesh.faces).astype("<u4").tobytes() + packed(values)
         parts.append(base64.b64encode(zlib.compress(data, 9)).decode())
         meshes.append({"points": points.shape[1], "triangles": len(mesh.faces), "step": quantum,
@@ -55,9 +55,9 @@ def played(players: Sequence[ShotPlayer], labels: Sequence[str] = (), report: Re
         words.append(word)
     about = {
         "fps": fps, "start": times[0], "step": (times[1] - times[0]) * step if len(times) > 1 else 1.0,
-        "ground": float(min(floor or [np.concatenate(shown[0])[:, 1].min()])),
-        "distance": round(2.6 * float(np.ptp(np.concatenate(shown[0]), axis=0).max()), 3),
-        "origins": origins.round(6).tolist(), "centres": _smoothed(origins, fps).round(4).tolist(),
+        "ground": float(min(floor or [np.concatenate(shown[0])[:, 1].min() + path[0, 1]])),
+        "distance": round(2.1 * float(np.ptp(np.concatenate(shown[0]), axis=0).max()), 3),
+        "origins": path.round(6).tolist(), "centres": _smoothed(path, fps).round(4).tolist(),
         "meshes": meshes, "words": WORDS,
     }  # fmt: skip
     boxes = "".join(f'<label><input type="checkbox" checked> {escape(word)}</label> ' for word in words)
@@ -83,14 +83,21 @@ def _step(players: Sequence[ShotPlayer]) -> int:
     return max(rate, int(np.ceil(count * width / MAX_VALUES)), 1)
 
 
-def _posed(players: Sequence[ShotPlayer], frames: Sequence[int], report: Reporter) -> Iterator[list[Floats]]:
-    """Yield the points of all meshes at each frame; what is not finite stands in the origin."""
+def _posed(
+    players: Sequence[ShotPlayer], frames: Sequence[int], report: Reporter
+) -> Iterator[tuple[Floats, list[NDArray[np.float32]]]]:
+    """Yield where the middle of all points is at each frame, shape (3,), and the points of all meshes from there.
+
+    What is not finite stands in the middle.
+    """
     for done, frame in enumerate(frames, start=1):
-        yield [
-            np.nan_to_num(points, posinf=0, neginf=0) + [APART * side, 0.0, 0.0]
-            for side, player in enumerate(players)
-            for points in player.points(player.frame_times[frame])
-        ]
+        meshes = [points + [APART * side, 0.0, 0.0] for side, player in enumerate(players)
+                  for points in player.points(player.frame_times[frame])]  # fmt: skip
+        every = np.concatenate(meshes)
+        finite = every[np.isfinite(every).all(axis=1)]
+        middle = finite.mean(axis=0) if len(finite) else np.zeros(3)
+        away = [(points - middle).astype(np.float32) for points in meshes]
+        yield middle, [np.nan_to_num(points, nan=0, posinf=0, neginf=0) for points in away]
         report(Progress(done, len(frames)))
 
 
