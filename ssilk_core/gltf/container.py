@@ -19,7 +19,7 @@ Document = dict[str, Any]
 MAGIC, VERSION, JSON, BINARY = b"glTF", 2, b"JSON", b"BIN\0"
 HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 MAX_BYTES = 2**32 - 1  # a length is stored in four bytes
-MAX_READ = 1 << 31  # bytes that one accessor may take in memory
+MAX_READ = 1 << 28  # bytes that one accessor may take in memory
 VERTICES, INDICES = 34962, 34963  # what a buffer view is bound as
 COMPONENTS: dict[int, np.dtype[Any]] = {
     5121: np.dtype("u1"),

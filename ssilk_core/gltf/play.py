@@ -61,6 +61,8 @@ class GlbShot:
             timing = document["asset"]["extras"]
             self.fps, self._start = float(timing["timeCodesPerSecond"]), float(timing["startTimeCode"])
             self._per_frame = int(timing["samplesPerFrame"])
+            if not (0 < self.fps < np.inf and self._per_frame > 0 and np.isfinite(self._start)):
+                raise ValueError("times")
             self.provenance: Mapping[str, Any] = dict(timing.get("ssilk", {}))
             self._nodes = document["nodes"]
             (animation,), (skin,) = document["animations"], document["skins"]
@@ -132,7 +134,7 @@ class GlbShot:
         try:
             yield
         except (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError) as error:
-            fail(self.name, f"its document is malformed ({type(error).__name__}: {error})", WRITTEN, "bake it again")
+            fail(self.name, f"another or a damaged glb ({type(error).__name__}: {error})", WRITTEN, "bake it again")
 
 
 @dataclass(frozen=True, eq=False)

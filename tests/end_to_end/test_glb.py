@@ -195,6 +195,9 @@ def test_verify_finds_a_key_that_was_changed_and_says_what_a_file_lacks(copy, ca
     Path("cut.glb").write_bytes(data[:-4])
     capsys.readouterr()
     assert run("verify cut.glb") == 2 and "not a whole glb" in capsys.readouterr().err
+    for right, wrong in ((b'"samplesPerFrame":1', b'"samplesPerFrame":0'), (b'"JOINTS_0"', b'"JOINTS_x"')):
+        Path("odd.glb").write_bytes(Path("all.glb").read_bytes().replace(right, wrong))
+        assert run("verify odd.glb") == 2 and "another or a damaged glb" in capsys.readouterr().err
     Path("other.glb").write_bytes(bytes(data).replace(b'"ssilk":', b'"sslik":'))
     assert run("verify other.glb") == 2 and "does not say how it was baked" in capsys.readouterr().err
 
