@@ -82,6 +82,18 @@ def slerp(p: Floats, q: Floats, t: Floats) -> Floats:
     return mixed / np.linalg.norm(mixed, axis=-1, keepdims=True)
 
 
+def continuous(rotations: Floats, before: Floats | None = None) -> Floats:
+    """Choose the signs of quaternions (F, J, 4) so that none flips between frames: some readers mix them
+    componentwise.
+
+    Args:
+        before: the quaternions of the frame before the first one, shape (1, J, 4).
+    """
+    first = rotations[:1] if before is None else before
+    steps = np.sum(np.concatenate([first, rotations[:-1]]) * rotations, axis=-1)
+    return rotations * np.cumprod(np.where(steps < 0, -1.0, 1.0), axis=0)[..., None]
+
+
 def rigid(rotations: Floats, translations: Floats) -> Floats:
     """Return (..., 4, 4) transforms from rotation matrices (..., 3, 3) and translations (..., 3)."""
     result = np.zeros((*rotations.shape[:-2], 4, 4))
@@ -218,6 +230,16 @@ def skin_points(points: Floats, skin: SkinWeights, matrices: Floats) -> Floats:
         joint = matrices[:, index]
         posed += weight[:, None] * ((joint[..., :3, :3] @ points[..., None])[..., 0] + joint[..., :3, 3])
     return posed
+
+
+def sorted_influences(skin: SkinWeights) -> tuple[Ints, Floats]:
+    """Return joint indices (int32) and weights (float32), heaviest first, each joint once, shape (V, I)."""
+    # By way of the dense matrix a joint that a row names twice is added up, where Blender keeps the last one only.
+    merged = SkinWeights.from_dense(skin.path, skin.dense(int(skin.indices.max()) + 1))
+    weights = merged.weights.astype(np.float32)
+    # Far from the origin an error in the sum moves the vertex: let the heaviest weight take up the rounding.
+    weights[:, 0] = 1 - weights[:, 1:].sum(axis=1, dtype=np.float64)
+    return np.ascontiguousarray(merged.indices), weights
 
 
 def skinning_matrices(world: Floats, bind_transforms: Floats) -> Floats:

@@ -9,6 +9,8 @@ from typing import Literal
 from .assets import Body, Deformer, SkinWeights
 from .errors import fail
 
+GLB = ".glb"  # suffix of a glTF binary, which is written and read without USD
+
 
 @dataclass(frozen=True, kw_only=True)
 class Target:
@@ -42,6 +44,14 @@ TARGETS = {
     "game4": Target(influences=4, meters_per_unit=1.0, up_axis="Y", about="4 influences, as one set of glTF holds"),
     "arkit": Target(
         influences=4, meters_per_unit=1.0, up_axis="Y", suffixes=(".usdz",), about="4 influences in one usdz package"
+    ),
+    "glb": Target(meters_per_unit=1.0, up_axis="Y", suffixes=(GLB,), about="one glTF binary, four influences a set"),
+    "glb4": Target(
+        influences=4,
+        meters_per_unit=1.0,
+        up_axis="Y",
+        suffixes=(GLB,),
+        about="one glTF binary, a single set",
     ),
 }
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from ..errors import fail
 from ..files import relative_path, sha256
+from .opened import provenance_of
 from .record import RECORD
 from .request import BakeRequest
 from .result import SHOT_SHAPES
@@ -65,12 +66,10 @@ def read_origin(shot: Path, elsewhere: Mapping[str, str | os.PathLike[str] | Non
     Raises:
         SsilkError: no such shot, one that does not say how it was baked, or an input that is not found.
     """
-    from ssilk_usd.provenance import read_provenance
-
     allowed = "a shot written by 'ssilk bake' is needed"
     if not shot.is_file():
         fail(str(shot), "there is no such shot", allowed)
-    provenance = read_provenance(shot)
+    provenance = provenance_of(shot)
     if "request" not in provenance:
         fail(str(shot), "the file does not say how it was baked", allowed)
     try:

@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from ..assets import GarmentPose
 from ..checkpoint import ModelFile, load_model
@@ -15,6 +16,8 @@ from ..errors import fail
 from ..events import Reporter
 from ..quality import quality_named, size_at, spend
 from ..reduction import Reducer
+from ..targets import GLB
+from .glb import write_glb_shot
 from .load import load_rollout, with_model
 from .request import BakeRequest
 from .rollout import BakeRollout
@@ -95,17 +98,15 @@ def shot_bytes(rollout: BakeRollout, suffix: str, *, include_body: bool) -> Shot
 def _excerpt_bytes(rollout: BakeRollout, frames: int, suffix: str, include_body: bool) -> int:
     from ssilk_usd.shot import write_shot
 
+    motion, poses = rollout.motion.clip(0, frames), _first(rollout.network_poses(), frames)
+    samples = rollout.request.samples_per_frame
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"shot{'.usda' if suffix == '.usda' else '.usdc'}"
-        write_shot(
-            path,
-            rollout.deformer,
-            rollout.motion.clip(0, frames),
-            _first(rollout.network_poses(), frames),
-            units=rollout.units,
-            samples_per_frame=rollout.request.samples_per_frame,
-            include_body=include_body,
-        )
+        path = Path(folder) / f"shot{suffix if suffix in ('.usda', GLB) else '.usdc'}"
+        common: dict[str, Any] = {"samples_per_frame": samples, "include_body": include_body}
+        if suffix == GLB:
+            write_glb_shot(path, rollout.deformer, motion, poses, start=0.0, **common)
+        else:
+            write_shot(path, rollout.deformer, motion, poses, units=rollout.units, **common)
         return path.stat().st_size
 
 

@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,7 +16,10 @@ from ..errors import fail
 from ..events import Message, Reporter, silent
 from ..files import relative_path, replacing, sha256
 from ..kinematics import sample_motion
+from ..targets import GLB
 from .character import on_character
+from .glb import warn_of_sets, write_glb_shot
+from .opened import open_shot
 from .result import SKINNED, BakeResult, ShotShapes, Verification
 from .verification import compare_trajectories, need_valid
 
@@ -104,7 +107,6 @@ def skin_trajectories(
         VerificationError: the file is not what was computed; it is not kept.
     """
     from ssilk_usd.export import packaged
-    from ssilk_usd.play import Shot
     from ssilk_usd.shot import write_shot
 
     from ..decomposition import FitTolerance, decompose
@@ -113,17 +115,22 @@ def skin_trajectories(
     path, tolerance = Path(output), tolerance or FitTolerance()
     found = decompose(deformer, motion, points, tolerance=tolerance, device=select_device(device))
     shapes = ShotShapes.of(found)
+    if path.suffix == GLB:
+        warn_of_sets(found.deformer, path, report)
     said = {**(about or {}), SKINNED: {**origin, **asdict(tolerance), **shapes.to_metadata()}}
     verification: Verification | None = None
     with replacing(path) as unverified:
         with packaged(unverified) as layer:
-            summary = write_shot(
-                layer, found.deformer, motion, found.poses, units=units, start=motion.start,
-                include_body=include_body, hidden=hidden, provenance=said,
-            )  # fmt: skip
+            common: dict[str, Any] = {
+                "start": motion.start, "include_body": include_body, "hidden": hidden, "provenance": said
+            }  # fmt: skip
+            if path.suffix == GLB:
+                summary = write_glb_shot(layer, found.deformer, motion, found.poses, **common)
+            else:
+                summary = write_shot(layer, found.deformer, motion, found.poses, units=units, **common)
         if verify:
             need_valid(unverified, report)
-            verification = compare_trajectories(Shot(unverified), points, tolerance=tolerance)
+            verification = compare_trajectories(open_shot(unverified), points, tolerance=tolerance)
         else:
             report(Message("not verified, as asked", "warning"))
     return BakeResult(

@@ -16,14 +16,16 @@ from ..assets import Floats
 from ..errors import VerificationError, fail
 from ..events import Message, Reporter, Result, Started, silent
 from ..files import sha256
+from ..targets import GLB
 from .load import load_rollout
+from .opened import open_shot, provenance_of
 from .origin import read_origin
 from .refinement import refined_points, verify_energies
 from .result import SKINNED, Verification
 from .rollout import BakeRollout
 
 if TYPE_CHECKING:
-    from ssilk_usd.play import Shot
+    from ssilk_usd.check import PosedGarment
 
     from ..decomposition import FitTolerance
 
@@ -84,7 +86,6 @@ def _verify_skinned(
         SsilkError: the cache is not found.
         VerificationError: a check fails, or the shot is further off than it was made to be.
     """
-    from ssilk_usd.play import Shot
     from ssilk_usd.trajectories import MeshTrajectories
 
     from ..decomposition import FitTolerance
@@ -99,11 +100,11 @@ def _verify_skinned(
         report(Message(f"{path}: the cache has changed since the shot was made from it", "warning"))
     need_valid(shot, report)
     tolerance = FitTolerance(rms=float(str(said["rms"])), largest=float(str(said["largest"])))
-    return compare_trajectories(Shot(shot), MeshTrajectories(f"{path}:{said['mesh']}"), tolerance=tolerance)
+    return compare_trajectories(open_shot(shot), MeshTrajectories(f"{path}:{said['mesh']}"), tolerance=tolerance)
 
 
 def verify_file(rollout: BakeRollout, path: Path, report: Reporter) -> Verification:
-    """Check a file and compare it, re-skinned by UsdSkel alone, with the rollout that it should hold.
+    """Check a file and compare it, re-skinned by its format's rules alone, with the rollout that it should hold.
 
     Points of an earlier refinement are compared by energy (`verify_energies`), unless the rollout has its own. Joints
     of one are compared with the refined points, with the tolerance that they were fitted with.
@@ -112,11 +113,10 @@ def verify_file(rollout: BakeRollout, path: Path, report: Reporter) -> Verificat
         VerificationError: a check fails, or a vertex is further off than allowed.
     """
     from ssilk_usd.check import compare_points
-    from ssilk_usd.play import Shot, frame_times
 
     need_valid(path, report)
-    shot, samples = Shot(path), rollout.request.samples_per_frame
-    times = frame_times(shot.stage, samples)
+    shot, samples = open_shot(path), rollout.request.samples_per_frame
+    times = shot.sample_times(samples)
     if not shot.is_skinned and rollout.request.refine and rollout.refinement is None:
         return verify_energies(rollout, map(shot.garment_points, times), report)
     if (
@@ -139,16 +139,14 @@ def verify_file(rollout: BakeRollout, path: Path, report: Reporter) -> Verificat
 
 def _said_of_points(shot: Path) -> Mapping[str, object] | None:
     """Return what a shot says of the points that it was made from; None where it was baked from a model."""
-    from ssilk_usd.provenance import read_provenance
-
-    said = read_provenance(shot).get(SKINNED) if shot.is_file() else None
+    said = provenance_of(shot).get(SKINNED) if shot.is_file() else None
     return said if isinstance(said, Mapping) else None
 
 
 def compare_trajectories(
-    shot: Shot, points: Iterable[Floats], *, tolerance: FitTolerance | None = None, samples_per_frame: int = 1
+    shot: PosedGarment, points: Iterable[Floats], *, tolerance: FitTolerance | None = None, samples_per_frame: int = 1
 ) -> Verification:
-    """Compare the garment of a shot, re-skinned by UsdSkel alone, with the points that it stands for.
+    """Compare the garment of a shot, re-skinned from its file alone, with the points that it stands for.
 
     Args:
         points: of each of its samples in the world [m], shape (V, 3).
@@ -158,11 +156,10 @@ def compare_trajectories(
         VerificationError: other frames or vertices, or they are further off than allowed.
     """
     from ssilk_usd.check import allowed_error
-    from ssilk_usd.play import frame_times
 
     from ..decomposition import FitTolerance
 
-    tolerance, times = tolerance or FitTolerance(), frame_times(shot.stage, samples_per_frame)
+    tolerance, times = tolerance or FitTolerance(), shot.sample_times(samples_per_frame)
     squares, count, slack, worst = 0.0, 0, 0.0, (0.0, tolerance.largest, 0.0, 0)
     for time, wanted in zip_longest(times, points):
         if time is None or wanted is None:
@@ -188,9 +185,14 @@ def compare_trajectories(
 
 
 def need_valid(path: Path, report: Reporter) -> None:
-    """Report what a shot's checks find; raise `VerificationError` for an error among it."""
+    """Report what a shot's checks find; raise `VerificationError` for an error among it.
+
+    The checks are those of stages. A glTF binary is checked by reading it.
+    """
     from ssilk_usd.check import check_shot
 
+    if path.suffix == GLB:
+        return
     findings = check_shot(path)
     for finding in findings:
         report(Message(str(finding), "warning"))

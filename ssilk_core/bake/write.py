@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 from ..errors import fail
 from ..events import Message, Reporter, Result, Started, silent
 from ..files import need_not_input, need_writable, replacing
+from ..targets import GLB
+from .glb import warn_of_sets, write_glb_shot
 from .hiding import covered_polygons
 from .origin import shot_metadata
 from .refinement import refined
@@ -57,6 +59,8 @@ def bake(
     report(Started("bake", rollout.motion.frame_count, {"output": str(path)}))
     rollout.tell(report)
     rollout = refined(rollout, report)
+    if path.suffix == GLB:
+        warn_of_sets(rollout.deformer, path, report)
     hidden = covered_polygons(rollout, report) if request.hide_covered else None
     skin = SkinMeter(rollout)
     summary, verification = _write_verified(skin, path, include_body, hidden, verify, report)
@@ -99,6 +103,8 @@ def _check_output(request: BakeRequest, path: Path) -> None:
     suffixes = request.receiver.suffixes
     if path.suffix not in suffixes:
         fail(str(path), f"the suffix is '{path.suffix}'", f"{request.target} takes {', '.join(suffixes)}")
+    if path.suffix == GLB and request.writes_points:
+        fail(str(path), "refined points", "a glb holds joints and morph targets", "use --refined-output joints")
     need_writable(path)
     need_not_input(path, request.model, request.stage, split_location(request.motion)[0])
 
@@ -131,15 +137,16 @@ def _write(
 
     rollout = skin.rollout
     common: dict[str, Any] = {
-        "units": rollout.units,
         "start": rollout.start,
         "samples_per_frame": rollout.request.samples_per_frame,
         "include_body": include_body,
         "hidden": rollout.hidden,
         "hidden_polygons": hidden,
         "provenance": shot_metadata(rollout, output, skin.stated),
-        "record": rollout.record,
     }
+    if output.suffix == GLB:
+        return write_glb_shot(layer, rollout.deformer, rollout.motion, skin.poses(), **common)
+    common |= {"units": rollout.units, "record": rollout.record}
     if not rollout.request.writes_points:
         return write_shot(layer, rollout.deformer, rollout.motion, skin.poses(), **common)
     skin.add_points()

@@ -31,7 +31,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
     add_bake(verb)
     verb.add_argument("-o", "--output", type=Path, required=True,
-                      help="shot to write (.usdc, .usd, .usda or .usdz), or a folder of layers")  # fmt: skip
+                      help="shot to write (.usdc, .usd, .usda, .usdz or .glb), or a folder of layers")  # fmt: skip
     add_level(verb, "2MB for the shot")
 
 

@@ -36,7 +36,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--motion", metavar="SHOT[:/PRIM]",
                       help="USD file with the character's motion (default: the cache itself)")  # fmt: skip
     verb.add_argument("-o", "--output", type=Path, required=True,
-                      help="shot to write (.usdc, .usd, .usda or .usdz)")  # fmt: skip
+                      help="shot to write (.usdc, .usd, .usda, .usdz or .glb)")  # fmt: skip
     verb.add_argument("--tolerance", type=shared.NumberRange(1e-3, 1e3), default=1.0, metavar="MM",
                       help=f"RMS distance from the cache in millimetres; any vertex may be {LARGEST} times as far "
                            "off (default 1)")  # fmt: skip

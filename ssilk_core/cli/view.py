@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Film a shot (.mp4) or lay out its moments as a contact sheet (.png); several shots stand side by side.
+"""Film a shot (.mp4), lay out its moments as a contact sheet (.png), or write a page that plays it (.html).
 
-Works without a display and without a GPU.
+Several shots stand side by side. The page plays in any browser, loads nothing, and can be turned.
+
+Shots are stages of USD, or what 'ssilk bake --target glb' wrote. Works without a display and without a GPU.
 """
 
 from __future__ import annotations
@@ -9,17 +11,31 @@ from __future__ import annotations
 import argparse
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..errors import EXIT_OK, fail
 from ..events import Reporter, Result
+from ..files import replacing
 from .options import RATE, NumberRange, check_output
+
+if TYPE_CHECKING:
+    from ..view.player import ShotPlayer
+
+PAGE = ".html"
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
     verb.add_argument("shots", type=Path, nargs="+", metavar="SHOT", help="shots of one length and rate")
-    verb.add_argument("-o", "--output", type=Path, required=True, help="film (.mp4) or contact sheet (.png)")
+    verb.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        required=True,
+        help="film (.mp4), contact sheet (.png) or page that plays (.html)",
+    )
     verb.add_argument("--label", action="append", default=[], help="caption of a shot (repeatable)")
     verb.add_argument("--fps", type=RATE, default=30.0, help="most frames per second of a film (default 30)")
     verb.add_argument(
@@ -33,17 +49,19 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Draw."""
-    from ssilk_usd.play import Shot
-
-    from ..view.output import FILM, check_suffix
+    from ..bake.opened import open_shot
+    from ..view.output import FILM, PICTURE, check_suffix
     from ..view.shots import film_of_shots, sheet_of_shots
 
-    film = check_suffix(options.output) == FILM
+    suffix = check_suffix(options.output, (FILM, PICTURE, PAGE))
+    film = suffix == FILM
     check_output(options.output, *options.shots)
-    players = [Shot(path) for path in options.shots]
+    players = [open_shot(path) for path in options.shots]
     labels = options.label or ([path.stem for path in options.shots] if len(players) > 1 else [])
     look = _look(options, film)
-    if film:
+    if suffix == PAGE:
+        count = _write_page(options.output, players, labels, report)
+    elif film:
         count = film_of_shots(options.output, players, labels=labels, fps=options.fps, look=look, report=report)
     else:
         count = sheet_of_shots(
@@ -56,6 +74,18 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         )
     report(Result("view", {"picture": str(options.output), "frames": count}))
     return EXIT_OK
+
+
+def _write_page(path: Path, players: Sequence[ShotPlayer], labels: Sequence[str], report: Reporter) -> int:
+    """Write a page that plays shots; return the number of their frames."""
+    from ..report.page import Section, page
+    from ..report.player import played
+
+    title = ", ".join(labels) or path.stem
+    text = page(title, [Section("The shot", played(players, labels, report), plays=True)])
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return len(players[0].frame_times)
 
 
 def _look(options: argparse.Namespace, film: bool):  # type: ignore[no-untyped-def]  # Look is heavy to import

@@ -17,6 +17,7 @@ from ..view.player import ShotPlayer
 from ..view.render import Image, render
 from ..view.shots import shot_surfaces
 from .page import Section, figure, table
+from .player import played
 from .terms import BARE, SHARE, SHOWN, UNITS, TermsMeter, worst_frames
 from .verdict import verdict
 
@@ -52,7 +53,8 @@ def shot_sections(
         for each, meter in zip(garments, meters):
             meter.add(points[each.index], body, time)
         report(Progress(number + 1, len(player.frame_times)))
-    return [part for each, meter in zip(garments, meters) for part in _sections(player, each, meter)]
+    first, *others = [part for each, meter in zip(garments, meters) for part in _sections(player, each, meter)]
+    return [first, Section("The shot", played([player]), plays=True), *others]
 
 
 def joined(meshes: Sequence[Mesh]) -> Mesh | None:
@@ -97,6 +99,7 @@ def _sections(player: ShotPlayer, garment: ShotGarment, meter: TermsMeter) -> li
             picture(player, frame),
             f"{letter}: frame {player.frame_times[frame]:g}, at {times[frame]:.2f} s, "
             f"{bad[frame]:.4g} J without gravity{skin(frame)}",
+            times[frame],
         )
         for frame, letter in marks.items()
     )

@@ -90,7 +90,7 @@ def film_of_shots(
         fail("view", f"fps = {fps:g}", "a positive rate is needed")
     look = look or Look()
     step = int(np.ceil(players[0].fps / fps - 1e-6)) if players else 1
-    frames = range(0, _frame_count(players), step)
+    frames = range(0, need_matching(players), step)
     images = _drawn(_panels(players, frames, labels, look), look, len(frames) * len(players), report)
     return write_film(path, map(compare, zip(*[images] * len(players))), players[0].fps / step)
 
@@ -114,7 +114,7 @@ def sheet_of_shots(
     if not (columns > 0 and rows > 0):
         fail("contact sheet", f"{columns} columns and {rows} rows", "both are at least 1")
     look = look or Look(width=320, height=440)
-    count = _frame_count(players)
+    count = need_matching(players)
     frames = np.linspace(0, count - 1, min(columns * rows, count)).round().astype(int).tolist()
     panels = _panels(players, frames, labels, look, label_every=columns)
     images = list(_drawn(panels, look, len(frames) * len(players), report))
@@ -127,7 +127,7 @@ def sheet_of_shots(
     return len(frames)
 
 
-def _frame_count(players: Sequence[ShotPlayer]) -> int:
+def need_matching(players: Sequence[ShotPlayer]) -> int:
     """Return the number of frames of shots that match; raise `SsilkError` when they do not."""
     if not players:
         fail("view", "no shot", "at least one is needed")
@@ -177,11 +177,12 @@ def shot_surfaces(player: ShotPlayer, frame: int) -> tuple[Surface, ...]:
     points = player.points(player.frame_times[frame])
     return tuple(
         Surface(mesh.name, at, mesh.faces, colour, two_sided=mesh.is_garment)
-        for mesh, at, colour in zip(player.meshes, points, _colours(player))
+        for mesh, at, colour in zip(player.meshes, points, mesh_colours(player))
     )
 
 
-def _colours(player: ShotPlayer) -> list[Floats]:
+def mesh_colours(player: ShotPlayer) -> list[Floats]:
+    """Return a colour in sRGB, shape (3,), for each mesh: skin in grey, each garment in a colour of its own."""
     garments = np.cumsum([mesh.is_garment for mesh in player.meshes]) - 1
     return [fabric_colour(number) if mesh.is_garment else BODY for mesh, number in zip(player.meshes, garments)]
 

@@ -97,8 +97,8 @@ def test_frames_that_are_not_finite_are_counted_and_named_by_their_time_code(toy
             lost = np.nan if time in (1002, 1006) else 0.02 * (time == 1005)
             return [cover.points + [0, 0, lost], body.points]
 
-    opening, worst, energies = shot_sections(Lost(), [ShotGarment(0, cover, CLOTH)], {1: body})
-    assert "it is lost and skin shows through" in opening.body
+    opening, playing, worst, energies = shot_sections(Lost(), [ShotGarment(0, cover, CLOTH)], {1: body})
+    assert "it is lost and skin shows through" in opening.body and playing.plays
     assert "not finite in 2 of 6 frames, first in frame 1002, at 0.03 s" in opening.body
     assert "not finite in 2 of 6 frames, first in frame 1002." in energies.body and "nan" not in energies.body
     figures = energies.figures["Cover"]

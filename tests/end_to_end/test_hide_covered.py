@@ -16,7 +16,8 @@ from ssilk_usd.play import Shot
 
 from ssilk_core.cli import main
 from ssilk_core.farm.job import read_job
-from ssilk_core.targets import TARGETS
+from ssilk_core.gltf.play import GlbShot
+from ssilk_core.targets import GLB, TARGETS
 
 BAKE = "bake skirt.safetensors --stage rigged.usda --motion walk.usda --hide-covered"
 MINE = f"""#usda 1.0
@@ -99,7 +100,10 @@ def faces_in(path: str) -> np.ndarray:
     return faces(stage)
 
 
-@pytest.mark.parametrize("name", TARGETS)
+STAGES = [name for name, target in TARGETS.items() if GLB not in target.suffixes]
+
+
+@pytest.mark.parametrize("name", STAGES)
 def test_one_file_hides_covered_faces_and_shows_them_again_where_its_reader_takes_variants(copy, name):
     output = f"new{TARGETS[name].suffixes[0]}"
     assert bake(f"--target {name} -o {output}") == 0
@@ -113,6 +117,12 @@ def test_one_file_hides_covered_faces_and_shows_them_again_where_its_reader_take
     assert variants.GetVariantNames() == [COVERED_HIDDEN, FULL] and variants.GetVariantSelection() == COVERED_HIDDEN
     variants.SetVariantSelection(FULL)
     assert np.array_equal(faces(stage), whole_body())
+
+
+def test_a_glb_lacks_the_faces_that_a_stage_hides(copy):
+    assert bake("--target glb -o new.glb") == 0 and bake("--target game8 -o new.usdc --no-verify") == 0
+    counts = [{mesh.name: len(mesh.faces) for mesh in shot.meshes} for shot in (GlbShot("new.glb"), Shot("new.usdc"))]
+    assert counts[0] == counts[1] and counts[0]["Body"] < len(whole_body())
 
 
 def test_layers_hide_covered_faces_of_a_shot_and_leave_the_asset_whole(copy):

@@ -10,6 +10,7 @@ from ssilk_usd.play import Shot
 from ssilk_usd.provenance import read_provenance
 
 from ssilk_core.cli import main
+from ssilk_core.gltf.play import GlbShot
 
 FRAMES = 16
 BAKE = ["bake", "model.safetensors", "--stage", "rigged.usda", "--motion", "brief.usda"]
@@ -50,6 +51,14 @@ def world(toy, tmp_path_factory):
         np.save("faces.npy", faces)
         write_cache("cache.usda", points, faces, scale=0.01)
     return folder
+
+
+def test_a_cache_becomes_a_glb_within_the_tolerance(world, copy):
+    assert main([*SKIN, "--target", "glb", "-o", "shot.glb"]) == 0 and main(["verify", "shot.glb"]) == 0
+    shot, points = GlbShot("shot.glb"), np.load("points.npy")
+    away = np.stack([shot.garment_points(time) for time in shot.frame_times]) - points
+    assert len(away) == FRAMES and np.sqrt((away**2).sum(axis=-1).mean()) < 1.02e-3
+    assert "cache" in shot.provenance["skinned"]
 
 
 @pytest.mark.parametrize("more", [[], ["--model", "model.safetensors"], ["--target", "game4"]])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import ssilk_usd.shot as shot_module
 from pxr import Sdf, Usd, UsdGeom, UsdSkel
-from ssilk_usd.author import prim_names, sorted_influences
+from ssilk_usd.author import prim_names
 from ssilk_usd.check import allowed_error, check_shot, compare_points
 from ssilk_usd.play import Shot
 from ssilk_usd.read_character import read_character
@@ -46,6 +46,7 @@ from ssilk_core.kinematics import (
     rigid,
     skin_points,
     skinning_matrices,
+    sorted_influences,
 )
 
 SHARED = Path(__file__).parents[2] / ".." / "shared"

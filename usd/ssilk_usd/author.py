@@ -13,7 +13,7 @@ from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from ssilk_core.assets import Body, Deformer, Floats, Garment, Ints, Mesh, ProxyRig, Skeleton, SkinWeights
 from ssilk_core.errors import fail
-from ssilk_core.kinematics import local_transforms, world_transforms
+from ssilk_core.kinematics import local_transforms, sorted_influences, world_transforms
 
 from .body_faces import HiddenPolygons, author_faces, hide_polygons
 from .garment_api import GarmentRecord, apply_garment_api
@@ -232,16 +232,6 @@ def bind_skin(mesh: UsdGeom.Mesh, skin: SkinWeights, skeleton: UsdSkel.Skeleton)
     binding.CreateJointIndicesPrimvar(False, width).Set(Vt.IntArray.FromNumpy(indices.reshape(-1)))
     binding.CreateJointWeightsPrimvar(False, width).Set(Vt.FloatArray.FromNumpy(weights.reshape(-1)))
     binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1))
-
-
-def sorted_influences(skin: SkinWeights) -> tuple[np.ndarray, np.ndarray]:
-    """Return joint indices (int32) and weights (float32), heaviest first, each joint once, shape (V, I)."""
-    # By way of the dense matrix a joint that a row names twice is added up, where Blender keeps the last one only.
-    merged = SkinWeights.from_dense(skin.path, skin.dense(int(skin.indices.max()) + 1))
-    weights = merged.weights.astype(np.float32)
-    # Far from the origin an error in the sum moves the vertex: let the heaviest weight take up the rounding.
-    weights[:, 0] = 1 - weights[:, 1:].sum(axis=1, dtype=np.float64)
-    return np.ascontiguousarray(merged.indices), weights
 
 
 def define_blendshapes(

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from pxr import Usd, UsdGeom, UsdSkel, UsdValidation
@@ -161,10 +162,22 @@ def allowed_error(points: Floats, tolerance: float = TOLERANCE) -> float:
     return tolerance + 4 * EPSILON * min(float(np.abs(points[np.isfinite(points)]).max(initial=0.0)), WORLD)
 
 
+class PosedGarment(Protocol):
+    """A shot whose garment can be posed, whatever its file format."""
+
+    name: str
+
+    def sample_times(self, per_frame: int = 1) -> tuple[float, ...]:
+        """Return the time codes of its frames, or of several samples per frame."""
+
+    def garment_points(self, time: float) -> Floats:
+        """Return the garment's points in world space [m], y up, shape (V, 3)."""
+
+
 def compare_points(
-    shot: Shot, expected: Iterable[Floats], *, tolerance: float = TOLERANCE, samples_per_frame: int = 1
+    shot: PosedGarment, expected: Iterable[Floats], *, tolerance: float = TOLERANCE, samples_per_frame: int = 1
 ) -> Comparison:
-    """Compare the garment of a shot, re-skinned by UsdSkel, with the decoder's vertices.
+    """Compare the garment of a shot, re-skinned from its file, with the decoder's vertices.
 
     Args:
         expected: for each sample of the shot in order, garment points in world space [m], y up, shape (V, 3).
@@ -174,12 +187,12 @@ def compare_points(
     Raises:
         VerificationError: frames or vertices are not as many as in the shot.
     """
-    times = frame_times(shot.stage, samples_per_frame)
+    times = shot.sample_times(samples_per_frame)
     return max(_compare_frames(shot, times, expected, tolerance), key=lambda found: found.worst / found.bound)
 
 
 def _compare_frames(
-    shot: Shot, times: Iterable[float], expected: Iterable[Floats], tolerance: float
+    shot: PosedGarment, times: Iterable[float], expected: Iterable[Floats], tolerance: float
 ) -> Iterator[Comparison]:
     for time, points in zip_longest(times, expected):
         if time is None or points is None:
@@ -187,7 +200,7 @@ def _compare_frames(
         yield _compare_frame(shot, time, points, tolerance)
 
 
-def _compare_frame(shot: Shot, time: float, expected: Floats, tolerance: float) -> Comparison:
+def _compare_frame(shot: PosedGarment, time: float, expected: Floats, tolerance: float) -> Comparison:
     points = shot.garment_points(time)
     if points.shape != expected.shape:
         raise VerificationError(

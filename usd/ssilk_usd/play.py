@@ -64,6 +64,10 @@ class Shot:
         self.meshes = tuple(_describe(prim) for prim in prims)
         self.frame_times = frame_times(self.stage)
 
+    def sample_times(self, per_frame: int = 1) -> tuple[float, ...]:
+        """Return the time codes of the frames, or of several samples per frame."""
+        return frame_times(self.stage, per_frame)
+
     def points(self, time: float) -> list[Floats]:
         """Return the points of each mesh in world space [m], y up, float64, shape (V, 3), at a time code."""
         code = Usd.TimeCode(float(time))

@@ -13,13 +13,15 @@ from ssilk_core.assets import Deformer, Floats, GarmentPose, Ints, Motion, SkinW
 from ssilk_core.errors import fail
 from ssilk_core.kinematics import (
     combined_transforms,
+    continuous,
     local_transforms,
     matrix_from_quaternion,
     quaternion_from_matrix,
     skinning_matrices,
+    sorted_influences,
 )
 
-from .author import Asset, extent_array, matrix_array, sorted_influences
+from .author import Asset, extent_array, matrix_array
 from .export import save
 from .units import StageUnits
 
@@ -80,7 +82,8 @@ class Samples:
     def _write_joints(self, times: Floats, world: Floats) -> None:
         animation, parents = self.asset.animation, self.deformer.scene.parents
         local = local_transforms(self.units.transforms_from_core(world), parents)[:, self.kept]
-        rotations = self._continuous(quaternion_from_matrix(local[..., :3, :3]))[..., [1, 2, 3, 0]]
+        rotations = continuous(quaternion_from_matrix(local[..., :3, :3]), self.last_rotations)
+        self.last_rotations, rotations = rotations[-1:], rotations[..., [1, 2, 3, 0]]
         self._write(animation, "rotations", times, map(Vt.QuatfArray.FromNumpy, rotations.astype(np.float32)))
         translations = local[..., :3, 3].astype(np.float32)
         if self.moves:
@@ -88,15 +91,6 @@ class Samples:
         else:
             attribute = self.layer.GetAttributeAtPath(animation.AppendProperty("translations"))
             attribute.default = Vt.Vec3fArray.FromNumpy(translations[0])
-
-    def _continuous(self, rotations: Floats) -> Floats:
-        """Choose the signs of quaternions (F, J, 4) so that none flips between frames: some importers mix them
-        componentwise."""
-        before = rotations[:1] if self.last_rotations is None else self.last_rotations
-        steps = np.sum(np.concatenate([before, rotations[:-1]]) * rotations, axis=-1)
-        result = rotations * np.cumprod(np.where(steps < 0, -1.0, 1.0), axis=0)[..., None]
-        self.last_rotations = result[-1:]
-        return result
 
     def _extents(self, pose: GarmentPose, world: Floats) -> Iterator[Vt.Vec3fArray]:
         """Yield the bounds of everything skinned at each frame."""

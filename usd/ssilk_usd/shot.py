@@ -102,7 +102,7 @@ def write_samples(
 
     Messages call the file `path`.
     """
-    for pose in _checked(poses, samples.deformer, samples.motion):
+    for pose in checked_poses(poses, samples.deformer, samples.motion):
         samples.append(pose)
         if samples.unsaved_count >= FRAMES_PER_SAVE:
             samples.save(path)
@@ -171,7 +171,7 @@ def _metadata(value: object) -> object:
     return value
 
 
-def _checked(poses: Iterable[GarmentPose], deformer: Deformer, motion: Motion) -> Iterator[GarmentPose]:
+def checked_poses(poses: Iterable[GarmentPose], deformer: Deformer, motion: Motion) -> Iterator[GarmentPose]:
     """Yield the chunks; raise `SsilkError` unless they belong to this garment and cover the motion in order."""
     where, count = deformer.scene.garment.mesh.path, 0
     for pose in poses:

@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Baked shots by their suffix: stages of USD, and glTF binaries."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..targets import GLB
+
+if TYPE_CHECKING:
+    from ssilk_usd.play import Shot
+
+    from ..gltf.play import GlbShot
+
+
+def open_shot(path: Path) -> Shot | GlbShot:
+    """Open a shot, to play it.
+
+    Raises:
+        SsilkError: not a readable shot.
+    """
+    if path.suffix == GLB:
+        from ..gltf.play import GlbShot
+
+        return GlbShot(path)
+    from ssilk_usd.play import Shot
+
+    return Shot(path)
+
+
+def provenance_of(path: Path) -> Mapping[str, Any]:
+    """Return what a shot says of its origin; nothing where another program wrote it.
+
+    Raises:
+        SsilkError: not a readable shot.
+    """
+    if path.suffix == GLB:
+        from ..gltf.play import GlbShot
+
+        return GlbShot(path).provenance
+    from ssilk_usd.provenance import read_provenance
+
+    return read_provenance(path)
