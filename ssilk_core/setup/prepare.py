@@ -43,15 +43,15 @@ def prepare_scene(
         classes = held_classes(garment.mesh, levels, USUAL if tightness is None else tightness)
         shares = ", ".join(f"{np.mean(classes == value):.0%} {name}" for value, name in enumerate(CLASS_NAMES))
         report(events.Message(f"{garment.mesh.path}: no vertex classes; classified as {shares}"))
-    elif tightness is not None and levels is None:
-        kept = "its classes are kept, whatever the tightness: it has no primvars:ssilk:tightness to make others by"
-        report(events.Message(f"{garment.mesh.path}: {kept}", "warning"))
-    elif tightness is not None:
+    elif tightness is not None and levels is not None:
         classes = held_classes(garment.mesh, levels, tightness)
         changed = int(np.count_nonzero(classes != garment.classes))
         anew = ", so its proxies are placed anew" if changed and rig else ""
         report(events.Message(f"{garment.mesh.path}: {changed} classes are others at tightness {tightness:g}{anew}"))
         rig = None if changed else rig
+    elif tightness is not None:
+        kept = "its classes are kept, whatever the tightness: it has no primvars:ssilk:tightness to make others by"
+        report(events.Message(f"{garment.mesh.path}: {kept}", "warning"))
     skin = garment.skin
     if skin is None:
         report(events.Message(f"{garment.mesh.path}: no skinning weights; they are transferred from the body"))
