@@ -21,13 +21,13 @@ import numpy as np
 import torch
 from helpers.reports import table, write_results
 from pxr import Sdf
-from ssilk_usd.play import Shot
 from ssilk_usd.read_character import read_character
 from ssilk_usd.read_motion import read_motion
 from ssilk_usd.write import write_motion
 
 from ssilk_core.assets import Floats
 from ssilk_core.bake import BakeRequest, BakeTask, LayerFolder
+from ssilk_core.bake.opened import open_shot
 from ssilk_core.cli import main
 from ssilk_core.kinematics import deform
 from ssilk_core.targets import TARGETS, cap_influences
@@ -134,7 +134,7 @@ def _heaviest(layers: LayerFolder, task: BakeTask, exact: Floats) -> Row:
 
 
 def _errors(path: Path, exact: Floats) -> Floats:
-    shot = Shot(path)
+    shot = open_shot(path)
     played = np.stack([shot.garment_points(time) for time in shot.frame_times])
     return np.linalg.norm(played - exact, axis=-1)
 
