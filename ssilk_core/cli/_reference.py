@@ -69,18 +69,18 @@ class References:
 
         path = self._paths[clip]
         shot = Shot(path)
-        if shot.is_skinned:
-            fail(
-                str(path),
-                "joints and blendshapes, which are millimetres off what was simulated",
-                "references are points",
-                "simulate with --points",
-            )
         if not abs(shot.fps - self.fps) < 1e-6:
             fail(
                 str(path),
                 f"{shot.fps:g} frames per second",
                 f"the model steps at {self.fps:g}",
                 f"simulate with --fps {self.fps:g}",
+            )
+        if shot.is_skinned:
+            fail(
+                str(path),
+                "joints and blendshapes, which are millimetres off what was simulated",
+                "references are points",
+                "simulate with --points",
             )
         return shot
