@@ -50,3 +50,10 @@ def test_vertices_in_another_order_are_refused(cache):
     other = np.random.default_rng(0).permutation(len(points))
     with pytest.raises(SsilkError, match="its edges join other vertices than the garment's"):
         MeshTrajectories(path, len(points), other[faces])
+
+
+def test_quads_may_be_divided_along_their_other_diagonals(cache):
+    path, points, faces = cache
+    first, second = np.split(faces, 2)
+    turned = np.concatenate([np.c_[first[:, :2], second[:, 2]], np.c_[first[:, 1:], second[:, 2]]])
+    assert len(MeshTrajectories(path, len(points), turned)) == FRAMES

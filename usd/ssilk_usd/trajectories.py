@@ -16,7 +16,7 @@ from ssilk_core.errors import fail
 from .play import Shot
 from .read_stage import USD_SUFFIXES, split_location
 
-MOST_OTHER_EDGES = 0.1  # share of the edges: quads may be divided along another diagonal
+MOST_OTHER_EDGES = 0.5  # share of the edges: with all quads divided along their other diagonals a third is others
 
 
 class MeshTrajectories(Sequence[Floats]):
