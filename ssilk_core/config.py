@@ -11,6 +11,7 @@ from .schemes import need_scheme
 
 CLOSEST_POINTS = ("triangles", "vertices")
 MAX_SIZE = 65_536  # of a part of the network; larger ones fit into no machine
+MOST_OF_ALL = 0.99999  # largest share of static training, and decay of an average
 NO_BOUND = 1e9  # upper limit of settings without a limit of their own
 
 # Constants of `model.integrators.SpringVerlet`, shared with the numpy runtime and explained there.
@@ -155,7 +156,7 @@ class TrainConfig:
         _need_between(self, 1, NO_BOUND, "iterations", "batch", "pretraining_batch", "static_batch", "validate_every")
         _need_between(self, 3, NO_BOUND, "valid_frames")
         _need_between(self, 0, 1, "state_reuse", "rotated_fraction", "noise_correlation", "noise_probability")
-        _need_between(self, 0, 0.99999, "static_fraction", "ema_decay")
+        _need_between(self, 0, MOST_OF_ALL, "static_fraction", "ema_decay")
         _need_between(
             self,
             0,

@@ -55,12 +55,13 @@ def touching_islands(mesh: Mesh, classes: Ints) -> Findings:
     Of two islands the smaller one is told, as a pocket or a button is.
     """
     island = islands(mesh.faces, mesh.vertex_count)
-    numbers, sizes = np.unique(island[mesh.faces[:, 0]], return_counts=True)
+    of_face = island[mesh.faces[:, 0]]
+    numbers, sizes = np.unique(of_face, return_counts=True)
     order = numbers[np.argsort(-sizes, kind="stable")]
     found, parts = [], 0
     for place, number in enumerate(order[1:], start=1):
-        own = np.unique(mesh.faces[island[mesh.faces[:, 0]] == number])
-        others = mesh.faces[np.isin(island[mesh.faces[:, 0]], order[:place])]
+        own = np.unique(mesh.faces[of_face == number])
+        others = mesh.faces[np.isin(of_face, order[:place])]
         near = closest_on_surface(mesh.points[own], Mesh(mesh.path, mesh.points, others))
         moves = (classes[own] == LOOSE) | (classes[near.corners] == LOOSE).any(axis=1)
         touching = own[(near.distance < TOUCH) & moves]

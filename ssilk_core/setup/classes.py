@@ -33,7 +33,7 @@ RANGE = 4.0  # the factor of the distances from the usual tightness to the ends
 
 @dataclass(frozen=True)
 class ClassOptions:
-    """Thresholds of `classify`.
+    """Thresholds of `hold_levels`.
 
     Attributes:
         tight_distance: largest distance of tight cloth from the body [m].
@@ -73,21 +73,6 @@ class ClassOptions:
             value = getattr(self, item.name)
             if not value >= 0:
                 fail("classes", f"{item.name} = {value}", "it must not be negative")
-
-
-def classify(
-    character: Character,
-    mesh: Mesh,
-    skin: SkinWeights,
-    options: ClassOptions | None = None,
-    *,
-    tightness: float = USUAL,
-    carried: bool = False,
-    pins: Mask | None = None,
-) -> NDArray[np.int8]:
-    """Return PINNED, TIGHT or LOOSE for each garment vertex, shape (V,), at one tightness; see `hold_levels`."""
-    levels = hold_levels(character, mesh, skin, options, ladder=[tightness], carried=carried, pins=pins)
-    return held_classes(mesh, levels, tightness)
 
 
 def held_classes(mesh: Mesh, levels: Floats, tightness: float) -> NDArray[np.int8]:

@@ -45,10 +45,15 @@ class BlockMatrix:
         """Multiply vectors (N, U, 3)."""
         return torch.mv(self.rows, vectors.reshape(-1)).reshape(vectors.shape)
 
-    def solve(self, right: Tensor, reduction: float, iterations: int) -> tuple[Tensor, int]:
+    def solve(
+        self, right: Tensor, reduction: float, iterations: int, check_every: int = CHECK_EVERY
+    ) -> tuple[Tensor, int]:
         """Solve approximately for right sides (U, 3, N).
 
-        Arguments and result are those of `conjugate_gradient.solve`.
+        Other arguments and the result are those of `conjugate_gradient.solve`.
+
+        Args:
+            check_every: iterations between checks of a GPU for convergence, which wait for it.
         """
         diagonal = self.blocks[: self.pattern.count].permute(3, 0, 1, 2)
         inverse = inverse_blocks(diagonal.contiguous())
@@ -56,7 +61,7 @@ class BlockMatrix:
             from ..kernels.conjugate_gradient import solve_kernel
 
             inverse, table = inverse.permute(1, 2, 3, 0), self.pattern.table
-            return solve_kernel(self.blocks, table, inverse, right, reduction, iterations, CHECK_EVERY)
+            return solve_kernel(self.blocks, table, inverse, right, reduction, iterations, check_every)
         z, count = solve(
             lambda v: self @ v,
             lambda r: (inverse * r[..., None, :]).sum(-1),

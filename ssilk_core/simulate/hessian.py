@@ -9,8 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..assets import Ints
+from ..assets import PINNED, Ints, Scene
 from ..collision.samples import ContactSamples
+from ..energy import GarmentEnergy
+from ..mesh import topology
 from ..operators import SparseOperator
 from .blocks import BlockMatrix, BlockPattern
 from .hinges import Hinges
@@ -22,6 +24,9 @@ FIXED_STIFFNESS_FACTOR = 1e6
 class Hessian:
     """Assembles the Hessian over the vertices `free` (U,), in float32; positions are (V, 3, N).
 
+    Attributes:
+        membrane, hinges: what bears stretch and bending; no hinges where nothing resists bending.
+
     Args:
         corners: vertices of the hinges, shape (H, 4).
         samples: of contact, each within a face.
@@ -32,6 +37,7 @@ class Hessian:
     ) -> None:
         device = membrane.area.device
         self.membrane, self.hinges, self.free_count = membrane, hinges, len(free)
+        self.free = torch.as_tensor(free, device=device)
         # A row of the membrane's operator has a face's corners in ascending order of vertex indices.
         matrix = membrane.operator.matrix
         faces = matrix.col_indices().cpu().numpy().reshape(2, -1, 3)[0]
@@ -52,6 +58,16 @@ class Hessian:
             self.sum_hinges = self.pattern.summation(
                 self.pattern.slots(across), np.arange(len(across)), np.ones(len(across)), len(across)
             )
+
+    @classmethod
+    def of(cls, scene: Scene, energy: GarmentEnergy) -> Hessian:
+        """Return that of a scene's garment, over the vertices that are not pinned and have mass."""
+        mesh, device = scene.garment.mesh, energy.mass.device
+        corners = topology.hinges(mesh.faces) if energy.fabric.bending else np.zeros((0, 4), dtype=np.int64)
+        membrane = Membrane(mesh, energy.fabric, device, energy.mass.dtype)
+        hinges = Hinges(corners, energy, mesh.vertex_count) if len(corners) else None
+        free = np.flatnonzero((scene.classes != PINNED) & (topology.vertex_areas(mesh.points, mesh.faces) > 0))
+        return cls(membrane, hinges, corners, energy.cloth.samples, free)
 
     def _face_sum(self, near: Ints, weights: np.ndarray) -> SparseOperator:
         """Return the operator from `Membrane.stiffness` to blocks: w_ik w_jl times the block k, l for pairs i, j."""

@@ -19,16 +19,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..assets import PINNED, Scene
+from ..assets import Scene
 from ..collision import Contacts, PosedBody, SmoothedDistance
 from ..constants import GRAVITY
 from ..energy import GarmentEnergy
 from ..fabrics import Fabric
-from ..mesh import topology
 from .blocks import BlockMatrix
 from .hessian import Hessian
-from .hinges import Hinges
-from .membrane import Membrane, outer
+from .membrane import outer
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +74,6 @@ class IncrementalPotential:
     ) -> None:
         mesh = scene.garment.mesh
         energy = GarmentEnergy(mesh, fabric, scene.classes, device=device, dtype=dtype)
-        hinges = topology.hinges(mesh.faces) if fabric.bending else np.zeros((0, 4), dtype=np.int64)
         self.fabric, self.dtype = fabric, dtype
         self.mass: Tensor = energy.mass[:, None]
         self.tether = torch.zeros_like(self.mass)
@@ -84,11 +81,8 @@ class IncrementalPotential:
         self.size = float(np.linalg.norm(np.ptp(mesh.points, axis=0)))
         self.cloth, self.law = energy.cloth, energy.law
         self.contacts = Contacts(scene, self.cloth.samples, device=device)
-        self.membrane = Membrane(mesh, fabric, device, dtype)
-        self.hinges = Hinges(hinges, energy, mesh.vertex_count) if len(hinges) else None
-        free = np.flatnonzero((scene.classes != PINNED) & (topology.vertex_areas(mesh.points, mesh.faces) > 0))
-        self.free = torch.as_tensor(free, device=device)
-        self._hessian = Hessian(self.membrane, self.hinges, hinges, self.cloth.samples, free)
+        self._hessian = Hessian.of(scene, energy)
+        self.membrane, self.hinges, self.free = self._hessian.membrane, self._hessian.hinges, self._hessian.free
 
     def body_distance(self, x: Tensor, inputs: StepInputs) -> SmoothedDistance | None:
         """Return the distances of the samples of x to the body, to second order."""

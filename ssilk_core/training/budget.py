@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from ..config import TrainConfig
+from ..config import MOST_OF_ALL, TrainConfig
 from ..errors import fail
 from .step import EAGER_STEPS, Stepper
 
@@ -20,8 +20,6 @@ PLANNED_SHARE = 0.98  # of the remaining time
 VALIDATION_SHARE = 0.1  # of the time that validations may take at most
 TIMED_STEPS = 3  # in each phase
 MIN_ITERATIONS = 20  # fewer do not train a usable model
-MAX_EMA_DECAY = 0.99999
-MOST_STATIC = 0.99999  # share of static training that settings allow
 SMOOTHING = 0.3  # weight of a new measurement of the speed
 
 
@@ -53,10 +51,10 @@ def scale_schedule(config: TrainConfig, iterations: int, static: int = 0, valida
     return replace(
         config,
         iterations=iterations,
-        static_fraction=min(MOST_STATIC, (static + 0.5) / iterations) if static else config.static_fraction,
+        static_fraction=min(MOST_OF_ALL, (static + 0.5) / iterations) if static else config.static_fraction,
         learning_rate_warmup=round(config.learning_rate_warmup * factor),
         validate_every=max(1, round(every)),
-        ema_decay=min(MAX_EMA_DECAY, config.ema_decay ** (1 / factor)),
+        ema_decay=min(MOST_OF_ALL, config.ema_decay ** (1 / factor)),
     )
 
 

@@ -13,18 +13,13 @@ vanishes where that of E does.
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from .. import kernels
-from ..assets import PINNED, Scene
+from ..assets import Scene
 from ..energy import GarmentEnergy
-from ..mesh import topology
-from ..simulate.conjugate_gradient import inverse_blocks, solve
 from ..simulate.hessian import Hessian
-from ..simulate.hinges import Hinges
-from ..simulate.membrane import Membrane, outer
+from ..simulate.membrane import outer
 
 Planes = tuple[Tensor, Tensor]
 EVERY = 4  # of so many frames one is solved; its part of the gradient counts for all of them
@@ -47,22 +42,14 @@ class NewtonDistance:
     planes: Planes
 
     def __init__(self, scene: Scene, energy: GarmentEnergy, dt: float, weight: float) -> None:
-        mesh, fabric, device = scene.garment.mesh, energy.fabric, energy.mass.device
+        fabric = energy.fabric
         self.energy, self.weight = energy, weight
         self.inertia = energy.mass[:, None] / dt**2
         still, moving = torch.zeros_like(self.inertia), fabric.drag / fabric.density * energy.mass[:, None] / dt
         still[energy.tethered, 0] = energy.tether_stiffness
         self.diagonal = still + self.inertia + moving, still + energy.mass[:, None] / STATIC_DT**2
-        hinges = topology.hinges(mesh.faces) if fabric.bending else np.zeros((0, 4), dtype=np.int64)
-        free = np.flatnonzero((scene.classes != PINNED) & (topology.vertex_areas(mesh.points, mesh.faces) > 0))
-        self.free = torch.as_tensor(free, device=device)
-        self._hessian = Hessian(
-            Membrane(mesh, fabric, device, torch.float32),
-            Hinges(hinges, energy, mesh.vertex_count) if len(hinges) else None,
-            hinges,
-            energy.cloth.samples,
-            free,
-        )
+        self._hessian = Hessian.of(scene, energy)
+        self.free = self._hessian.free
 
     def attach(self, x: Tensor, moving: int) -> Tensor:
         """Return positions x (V, 3, N), whose gradient gets the distance's added.
@@ -92,23 +79,8 @@ class NewtonDistance:
         stiffness = self.energy.cloth.area * self.energy.law.curvature(distance)
         diagonal = torch.where(moving, *self.diagonal)[self.free]
         matrix = self._hessian(x, diagonal, stiffness[:, None, None] * outer(normal, normal))
-        right, count = -gradient[self.free], matrix.pattern.count
-        inverse = inverse_blocks(matrix.blocks[:count].permute(3, 0, 1, 2).contiguous())
-        if kernels.available(x.device):
-            from ..kernels.conjugate_gradient import solve_kernel
-
-            # Checks would wait for the device, which a captured graph must not do.
-            asked = (REDUCTION, CG_ITERATIONS, CG_ITERATIONS + 1)
-            z, _ = solve_kernel(matrix.blocks, matrix.pattern.table, inverse.permute(1, 2, 3, 0), right, *asked)
-        else:
-            z, _ = solve(
-                lambda v: matrix @ v,
-                lambda r: (inverse * r[..., None, :]).sum(-1),
-                right.permute(2, 0, 1).contiguous(),
-                REDUCTION,
-                CG_ITERATIONS,
-            )
-            z = z.permute(1, 2, 0)
+        # Checks would wait for the device, which a captured graph must not do.
+        z, _ = matrix.solve(-gradient[self.free], REDUCTION, CG_ITERATIONS, check_every=CG_ITERATIONS + 1)
         return torch.zeros_like(x).index_copy(0, self.free, z)
 
 

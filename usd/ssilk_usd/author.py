@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from itertools import count
 
@@ -90,9 +90,14 @@ def prim_names(paths: Sequence[str]) -> list[str]:
     for path in paths:
         word = re.search(r"\w+", path.rsplit("/", 1)[-1])
         stem = re.sub(r"^(\d|$)", r"_\1", word.group() if word else "")
-        copies = (f"{stem}_{copy}" for copy in count(2))
-        names.append(stem if stem not in names else next(name for name in copies if name not in names))
+        names.append(free_name(stem, names))
     return names
+
+
+def free_name(stem: str, taken: Collection[str]) -> str:
+    """Return a name that is not taken: `stem`, or the first of `stem`_2, `stem`_3 and so on."""
+    copies = (f"{stem}_{copy}" for copy in count(2))
+    return stem if stem not in taken else next(name for name in copies if name not in taken)
 
 
 def _define_animation(stage: Usd.Stage, path: Sdf.Path, joints: Sequence[str], shapes: Sequence[str]) -> None:
@@ -148,15 +153,15 @@ def define_skeleton(
 
 def unique_names(joints: Sequence[str]) -> list[str]:
     """Return a name of its own for each joint path: its last part, numbered where several joints have it."""
-    names: list[str] = []
-    taken = {leaf(joint) for joint in joints}
-    for joint in joints:
-        name, number = leaf(joint), 1
-        while name in names or (number > 1 and name in taken):
-            number += 1
-            name = f"{leaf(joint)}_{number}"
-        names.append(name)
-    return names
+    leaves = [leaf(joint) for joint in joints]
+    names, taken = dict.fromkeys(leaves), set(leaves)
+    found = []
+    for name in leaves:
+        own = name if name in names else free_name(name, taken)
+        names.pop(name, None)  # the first joint of a name keeps it
+        taken.add(own)
+        found.append(own)
+    return found
 
 
 def _rest_transforms(skeleton: Skeleton, binds: Floats, parents: Ints, units: StageUnits) -> Floats:

@@ -21,6 +21,7 @@ from ssilk_core.events import Message, Reporter, silent
 from .author import (
     bind_skin,
     define_mesh,
+    free_name,
     keep_lbs_skin,
     mark_garment,
     matrix_array,
@@ -297,10 +298,7 @@ def _proxy_paths(scene: Scene, taken: tuple[str, ...]) -> tuple[str, ...]:
     leaves = {leaf(name) for name in taken}
     paths = list(scene.character.skeleton.joint_names)
     for name, parent in zip(scene.rig.joint_names, scene.rig.parents):
-        unique, copy = leaf(name), 1
-        while unique in leaves:
-            copy += 1
-            unique = f"{leaf(name)}_{copy}"
+        unique = free_name(leaf(name), leaves)
         leaves.add(unique)
         paths.append(f"{paths[parent]}/{unique}")
     return tuple(paths[scene.character.skeleton.joint_count :])
