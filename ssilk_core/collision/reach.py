@@ -12,6 +12,7 @@ from ..assets import LOOSE, TIGHT, Floats, Ints, Motion, Scene
 from ..kinematics import motion_transforms, skin_points, skinning_matrices
 from ..mesh import topology
 from ..mesh.geodesic import edge_graph
+from ..mesh.stitches import find_stitches, joined_mesh
 
 REACH_MARGIN = 0.08  # [m]; allowance for blendshapes and stretch
 SAMPLED_POSES = 200
@@ -28,9 +29,9 @@ class ReachableBody:
 def reachable_body(scene: Scene, motions: Sequence[Motion]) -> ReachableBody:
     """Find the body vertices that come within reach of the garment in any of `SAMPLED_POSES` poses.
 
-    A loose vertex hangs from its anchor, the nearest pinned or tight vertex along the cloth, and stays within the
-    length of cloth between them. Tight vertices stay within `REACH_MARGIN` of linear blend skinning. Pinned vertices
-    do not count, because nothing moves them.
+    A loose vertex hangs from its anchor, the nearest pinned or tight vertex along the cloth and its stitches, and
+    stays within the length between them. Tight vertices stay within `REACH_MARGIN` of linear blend skinning. Pinned
+    vertices do not count, because nothing moves them.
     """
     from scipy.spatial import cKDTree
     from scipy.spatial.distance import cdist
@@ -63,7 +64,7 @@ def _tethers(scene: Scene) -> tuple[Ints, Floats]:
     held, loose = np.flatnonzero(scene.classes != LOOSE), np.flatnonzero(scene.classes == LOOSE)
     if not len(held) or not len(loose):
         return np.zeros(0, dtype=int), np.zeros(0)
-    graph = edge_graph(mesh.points, topology.edges(mesh.faces))
+    graph = edge_graph(mesh.points, topology.edges(joined_mesh(mesh, find_stitches(mesh)).faces))
     distance, _, source = dijkstra(graph, directed=False, indices=held, min_only=True, return_predecessors=True)
     tied = loose[np.isfinite(distance[loose])]
     anchors, group = np.unique(source[tied], return_inverse=True)

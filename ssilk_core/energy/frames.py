@@ -41,5 +41,6 @@ def energy_terms(
         "inertia": torch.cat([inertia.new_zeros(x.shape[-1] - len(inertia)), inertia]),
         "collision": energy.collision_at(contact_distance),
         "tether": energy.tether(x, lbs[energy.tethered]),
+        "stitch": energy.stitch(x),
         "collisions": (body_distance[: len(x)] < 0).double().mean(0),
     }

@@ -18,10 +18,11 @@ from ..mesh.topology import SLIVER
 from ..operators import difference_operator
 from .bending import bending_energy, dihedral_angles
 from .collision import ContactLaw
+from .stitching import Stitching, held_stitches
 from .stretch import column_weights, deformation_gradient_operator, stretch_density, stretched_areas
 
-TERMS = ("stretch", "bending", "gravity", "inertia", "collision", "tether")
-"""The paper's terms, and the tether, which its fabric does without.
+TERMS = ("stretch", "bending", "gravity", "inertia", "collision", "tether", "stitch")
+"""The paper's terms, and tether and stitches, which its fabric does without.
 
 Drag is part of training but not of totals, so that these compare with the paper's.
 """
@@ -37,9 +38,11 @@ class GarmentEnergy:
         cloth: the samples of the cloth, at which it meets the body.
         tethered: indices of the vertices that a tether holds, shape (T,).
         tether_stiffness: of each of these [N/m], shape (T,).
+        stitching: what holds islands on one another, or None.
 
     Args:
         classes: of the vertices, shape (V,). Without them contact has its full stiffness and there are no tethers.
+            Pinned vertices need no stitches.
     """
 
     def __init__(
@@ -66,6 +69,9 @@ class GarmentEnergy:
         tethered = np.flatnonzero(classes == TIGHT) if held else np.zeros(0, dtype=np.int64)
         self.tethered = torch.as_tensor(tethered, device=device)
         self.tether_stiffness = tensor(fabric.tether * vertex_areas[tethered])
+        stitches = held_stitches(mesh, fabric, classes)
+        springs = fabric.stitch * vertex_areas[stitches.vertices]
+        self.stitching = Stitching(mesh, stitches, springs, device, dtype) if len(stitches) else None
         samples = contact_samples(mesh, fabric)
         self.law = ContactLaw.of(fabric)
         shares = _stiffness_shares(samples, fabric, self.law, classes)
@@ -107,6 +113,9 @@ class GarmentEnergy:
     def tether(self, x: Tensor, skinned: Tensor) -> Tensor:
         """Return sum k/2 |x - skinned|^2 over the tethered vertices; `skinned` (T, 3, N) has no gradient."""
         return self.tether_stiffness @ ((x.index_select(0, self.tethered) - skinned.detach()) ** 2).sum(1) / 2
+
+    def stitch(self, x: Tensor) -> Tensor:
+        return self.stitching.energy(x) if self.stitching else x.new_zeros(x.shape[-1])
 
     def collision(self, x: Tensor, body: PosedBody) -> Tensor:
         return self.collision_at(signed_distance(self.cloth.positions(x), body))

@@ -6,11 +6,10 @@ from __future__ import annotations
 import numpy as np
 
 from ..assets import CLASS_NAMES, LOOSE, Ints, Mesh
+from ..mesh.stitches import TOUCH, find_carried, find_feet, find_stitches, joined_islands, touching
 from ..mesh.topology import islands
 from ..setup.surface import closest_on_surface
 from .finding import Finding, Findings, index_tuple
-
-TOUCH = 0.005  # [m] between islands that lie on each other
 
 
 def class_coverage(mesh: Mesh, classes: Ints) -> Findings:
@@ -31,8 +30,11 @@ def class_coverage(mesh: Mesh, classes: Ints) -> Findings:
 
 
 def unattached_islands(mesh: Mesh, classes: Ints) -> Findings:
-    """Yield the islands of a garment without a pinned or tight vertex; isolated vertices do not count."""
-    island = islands(mesh.faces, mesh.vertex_count)
+    """Yield the islands of a garment without a pinned or tight vertex; isolated vertices do not count.
+
+    What stitches join counts as one island.
+    """
+    island = joined_islands(mesh, find_stitches(mesh))
     adrift = np.setdiff1d(island[np.unique(mesh.faces)], island[np.flatnonzero(classes != LOOSE)])
     if len(adrift):
         lost = np.flatnonzero(np.isin(island, adrift))
@@ -49,34 +51,62 @@ def unattached_islands(mesh: Mesh, classes: Ints) -> Findings:
         )
 
 
-def touching_islands(mesh: Mesh, classes: Ints) -> Findings:
-    """Yield the places where an island lies on another one that it is not joined to, and one of both is loose there.
+def stitched_islands(mesh: Mesh, classes: Ints) -> Findings:
+    """Yield what lies on other islands and is stitched to them, and how much of it these carry."""
+    feet = find_feet(mesh)
+    stitches, island = touching(mesh, feet), islands(mesh.faces, mesh.vertex_count)
+    held = stitches.select(stitches.on_larger & _moves(classes, stitches.vertices, stitches.corners))
+    parts = np.unique(island[held.vertices])
+    carried = np.intersect1d(parts, island[find_carried(mesh, feet).vertices])
+    if len(parts):
+        whole = len(np.unique(island[mesh.faces]))
+        yield Finding(
+            severity="info",
+            code="stitched-islands",
+            prim=mesh.path,
+            count=len(held),
+            found=f"{len(parts)} of {whole} islands lie on others: stitches (of the material) hold them there, and "
+            f"{len(carried)} that lie wholly on others take their weights and classes from these",
+            elements="vertices",
+            indices=index_tuple(held.vertices),
+        )
 
-    Of two islands the smaller one is told, as a pocket or a button is.
+
+def touching_islands(mesh: Mesh, classes: Ints) -> Findings:
+    """Yield where islands are near others without being joined to them or lying on them, and one of both is loose.
+
+    Of two islands the smaller one is told. One that a stitch or a class holds anywhere is not.
     """
-    island = islands(mesh.faces, mesh.vertex_count)
+    stitches, island = find_stitches(mesh), islands(mesh.faces, mesh.vertex_count)
+    sewn = np.unique(island[stitches.vertices])
     of_face = island[mesh.faces[:, 0]]
     numbers, sizes = np.unique(of_face, return_counts=True)
     order = numbers[np.argsort(-sizes, kind="stable")]
     found, parts = [], 0
     for place, number in enumerate(order[1:], start=1):
+        if number in sewn:
+            continue
         own = np.unique(mesh.faces[of_face == number])
         others = mesh.faces[np.isin(of_face, order[:place])]
         near = closest_on_surface(mesh.points[own], Mesh(mesh.path, mesh.points, others))
-        moves = (classes[own] == LOOSE) | (classes[near.corners] == LOOSE).any(axis=1)
-        touching = own[(near.distance < TOUCH) & moves]
-        parts += len(touching) > 0
-        found.append(touching)
-    touching = np.concatenate(found) if found else np.zeros(0, dtype=np.int64)
-    if len(touching):
+        touch = own[(near.distance < TOUCH) & _moves(classes, own, near.corners)]
+        parts += len(touch) > 0
+        found.append(touch)
+    loose = np.concatenate(found) if found else np.zeros(0, dtype=np.int64)
+    if len(loose):
         yield Finding(
             severity="warning",
             code="touching-islands",
             prim=mesh.path,
-            count=len(touching),
-            found=f"{parts} of {len(order)} islands lie on others without being joined to them",
-            why="nothing holds loose cloth of two islands together, and cloth does not collide with cloth",
-            fix="join them by edges (merge or bridge vertices), or pin the smaller one where it is stiff",
+            count=len(loose),
+            found=f"{parts} of {len(order)} islands touch others side by side without being joined to them",
+            why="stitches hold only what lies on other cloth, and cloth does not collide with cloth",
+            fix="join them by edges (merge or bridge vertices), or lay one over the other, unless they are to part",
             elements="vertices",
-            indices=index_tuple(touching),
+            indices=index_tuple(loose),
         )
+
+
+def _moves(classes: Ints, vertices: Ints, corners: Ints) -> np.ndarray:
+    """Return where vertices (N,) or one of three corners each (N, 3) are loose, shape (N,)."""
+    return (classes[vertices] == LOOSE) | (classes[corners] == LOOSE).any(axis=1)

@@ -139,6 +139,7 @@ def _on_scene(inputs: PreflightInput, blocked: bool) -> Findings:
         return
     if garment.classes is None:
         yield from attachment.class_coverage(garment.mesh, scene.classes)
+    yield from attachment.stitched_islands(garment.mesh, scene.classes)
     yield from attachment.touching_islands(garment.mesh, scene.classes)
     yield from _on_training(scene, inputs)
 

@@ -43,7 +43,7 @@ def duplicate_vertices(mesh: Mesh, mergeable: Ints) -> Findings:
             prim=mesh.path,
             count=len(copies),
             found="at the same position as others: panels that are not sewn",
-            why="the cloth comes apart there as soon as it moves",
+            why="the cloth comes apart there as soon as it moves, or folds freely where stitches join islands",
             fix="merge by distance, unless the cloth is meant to open there"
             + (
                 "" if merged.all() else f" (--fix merges {np.count_nonzero(merged)}, whose weights and classes agree)"

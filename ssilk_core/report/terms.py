@@ -82,6 +82,7 @@ class TermsMeter:
             "stretch": float(stretch),
             "bending": float(bending),
             "gravity": self._height(points, body) - self.rest,
+            "stitch": float(self.energy.stitch(x)),
             "inertia": self._inertia(points),
             STRETCH: 100 * (float(largest) - 1),
             **self._collision(x, None if body is None else body - origin, time),

@@ -5,7 +5,8 @@ The paper paints the classes by hand. Here a vertex is tight where the body is n
 from below or is enclosed by it. Cloth that only hangs close to the back is not tight, nor is cloth around two limbs
 together, such as a skirt below the crotch: limbs part, and it cannot follow both. The band along the border from
 which an island hangs is pinned. All other vertices are loose. An island that is near the body nowhere hangs from its
-top where a single joint carries the garment, as a bone carries what an artist parents to it.
+top where a single joint carries the garment, as a bone carries what an artist parents to it. An island that lies on
+another one, wholly, has the classes beneath it; stitches hold one that lies on others in part.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from ..assets import LOOSE, UP, Character, Floats, Ints, Mesh, SkinWeights, clas
 from ..errors import fail
 from ..mesh.geodesic import distances, within, within_of
 from ..mesh.topology import components, edge_use, edges, islands, smooth, vertex_areas
+from .hosts import Hosts
 from .limbs import LimbRays
 from .surface import closest_on_surface
 
@@ -79,11 +81,11 @@ def held_classes(mesh: Mesh, levels: Floats, tightness: float) -> NDArray[np.int
     """Return the classes at a tightness in [0, 1], shape (V,), of the levels that `hold_levels` returns, shape (V,).
 
     Raises:
-        SsilkError: an island of the garment is all loose at that tightness.
+        SsilkError: an island of the garment is all loose at that tightness, and no stitch holds it.
     """
     classes = classes_at(levels, tightness)
     _need_held(
-        classes != LOOSE, mesh, islands(mesh.faces, mesh.vertex_count), f"are all loose at tightness {tightness:g}",
+        classes != LOOSE, mesh, Hosts.of(mesh).joined_islands, f"are all loose at tightness {tightness:g}",
         "raise the tightness, pin some of each island, or paint primvars:ssilk:class",
     )  # fmt: skip
     return classes
@@ -113,9 +115,10 @@ def hold_levels(
         pins: what is pinned, shape (V,), in place of the band from which islands hang.
 
     Raises:
-        SsilkError: an island of the garment rests nowhere on the body, and `pins` do not say what holds it.
+        SsilkError: an island of the garment rests nowhere on the body, no stitch holds it, and `pins` do not say
+            what does.
     """
-    options = options or ClassOptions()
+    options, hosts = options or ClassOptions(), Hosts.of(mesh)
     pairs, island = edges(mesh.faces), islands(mesh.faces, mesh.vertex_count)
     body = closest_on_surface(mesh.points, character.merged_body().mesh)
     tears = _tear_rate(mesh, skin.dense(character.skeleton.joint_count), pairs) > options.tear_rate
@@ -137,16 +140,18 @@ def hold_levels(
         held = _with_specks(held, mesh, pairs, options.speck_reach)
         return ~_with_specks(~held, mesh, pairs, options.speck_reach) | band
 
-    held = held_at(USUAL)
+    held, asked = held_at(USUAL), pins
     if carried:
         held |= _tops(mesh, ~held, np.isin(island, island[held]), island, options)
     if pins is None:
         _need_held(
-            held, mesh, island, "rest nowhere on the body",
+            hosts.carry(held), mesh, hosts.joined_islands, "rest nowhere on the body",
             "move the garment onto the body, or paint primvars:ssilk:class",
         )  # fmt: skip
         pins = held & _band(mesh, rim | _tops(mesh, held, rim, island, options), options.pinned_width)
-    return np.where(pins, 0.0, _levels(held, held_at, sorted(step for step in ladder if 0 < step < 1)))
+    levels = np.where(pins, 0.0, _levels(held, held_at, sorted(step for step in ladder if 0 < step < 1)))
+    levels = hosts.carry(levels)
+    return levels if asked is None else np.where(asked, 0.0, levels)
 
 
 def _levels(usual: Mask, held_at: Callable[[float], Mask], ladder: Sequence[float]) -> Floats:

@@ -17,6 +17,7 @@ from ..errors import fail
 from ..kinematics import rigid
 from ..mesh.topology import vertex_areas, vertex_normals
 from .clusters import Cluster, Mask, Seam, build_cluster, distribute_proxies, find_pieces, find_seam
+from .hosts import Hosts
 from .proxy_weights import proxy_weights
 
 
@@ -64,12 +65,15 @@ def build_rig(
     loose vertices near the seam keep a share of the weights of the nearest vertex on it. Without this the cloth
     tears there as soon as a root rotates, because tight vertices follow only the body.
 
+    Stitches connect the islands that lie on one another. What is carried wholly follows its host and gets no proxies.
+
     Args:
         garment: has weights and classes.
         report: receives progress after each proxy, and a message if the number of proxies was changed.
 
     Raises:
-        SsilkError: the garment has no weights or classes, or an island has only loose vertices.
+        SsilkError: the garment has no weights or classes, or an island has only loose vertices and no
+            stitch holds it.
     """
     options = options or RigOptions()
     if garment.skin is None:
@@ -77,14 +81,16 @@ def build_rig(
     if garment.classes is None:
         fail(garment.mesh.path, "no vertex classes", "classes are needed", "classify the vertices")
     assert garment.skin is not None and garment.classes is not None
-    loose: Mask = np.equal(garment.classes, LOOSE)
+    hosts = Hosts.of(garment.mesh)
+    authored: Mask = np.equal(garment.classes, LOOSE)
+    loose, joined = hosts.carry(authored), hosts.joined_mesh
     if options.proxies == 0 or not loose.any():
         return ProxyRig(garment.mesh.path, (), np.zeros(0, dtype=int), np.zeros((0, 4, 4)), garment.skin)
     body_weights = garment.skin.dense(character.skeleton.joint_count)
-    seam = find_seam(garment.mesh, loose)
-    clusters = _clusters(character, garment.mesh, loose, body_weights, seam, options, report)
+    seam = find_seam(joined, loose)
+    clusters = _clusters(character, joined, loose, body_weights, seam, options, report)
     weights = proxy_weights(
-        garment.mesh,
+        joined,
         loose,
         body_weights,
         seam,
@@ -92,7 +98,9 @@ def build_rig(
         influences=options.influences,
         seam_blend=options.seam_blend,
     )
-    return _assemble(character, garment.mesh, clusters, weights, seam)
+    influences = int((weights > 0).sum(axis=1).max())
+    weights = np.where(authored[:, None], hosts.blend(weights, authored), weights)
+    return _assemble(character, garment.mesh, clusters, weights, influences, seam)
 
 
 def _clusters(
@@ -144,7 +152,9 @@ def _affordable(piece_count: int, options: RigOptions, path: str, report: events
     return count
 
 
-def _assemble(character: Character, mesh: Mesh, clusters: list[Cluster], weights: Floats, seam: Seam) -> ProxyRig:
+def _assemble(
+    character: Character, mesh: Mesh, clusters: list[Cluster], weights: Floats, influences: int, seam: Seam
+) -> ProxyRig:
     """Return the rig of all clusters; proxies are ordered by cluster, breadth first within each."""
     skeleton = character.skeleton
     parents: list[int] = []
@@ -157,7 +167,7 @@ def _assemble(character: Character, mesh: Mesh, clusters: list[Cluster], weights
         _names(mesh.path, skeleton.joint_names, parents),
         np.array(parents),
         _bind_transforms(mesh, samples, np.array(parents) - skeleton.joint_count, seam),
-        SkinWeights.from_dense(mesh.path, weights),
+        SkinWeights.from_dense(mesh.path, weights, influences),
     )
 
 

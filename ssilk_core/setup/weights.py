@@ -11,6 +11,7 @@ from ..assets import LOOSE, Character, Ints, Mesh, SkinWeights
 from ..errors import fail
 from ..mesh.topology import edges, smooth, vertex_areas, vertex_mask
 from .binding import bind_to_skin
+from .hosts import Hosts
 from .surface import closest_on_surface
 
 
@@ -47,6 +48,8 @@ def transfer_weights(
     those whose normals agree, and filling the gaps from their surroundings, changed the strain under motion at
     armpits and crotches by less than one percent.
 
+    Islands that lie on others follow these (`Hosts.blend`).
+
     Args:
         mesh: the garment at the character's bind pose.
         classes: PINNED, TIGHT or LOOSE for each vertex, shape (V,).
@@ -70,7 +73,8 @@ def transfer_weights(
             weights[held] = bind_to_skin(character, *cloth, (copied + weights)[held] / 2, options.influences)
         for _ in range(options.tight_rounds, options.loose_rounds if loose.any() else 0):
             weights[loose] = smooth(weights, pairs, 1)[loose]
-    return SkinWeights.from_dense(mesh.path, weights[place], options.influences)
+    movable = None if classes is None else np.asarray(classes) == LOOSE
+    return SkinWeights.from_dense(mesh.path, Hosts.of(mesh).blend(weights[place], movable), options.influences)
 
 
 def _among(pairs: Ints, chosen: Ints, count: int) -> Ints:

@@ -3,7 +3,7 @@
 
 Implicit Euler with time step dt is the minimum of
 
-    stretch + bending + gravity + collision + tether
+    stretch + bending + gravity + collision + tether + stitches
     + m/(2 dt^2) |x - (2 x' - x'')|^2 + drag a/(2 dt) |x - advected|^2
 
 (`energy.GarmentEnergy`); a quasi-static state has none of the last two terms. The distance to the body is that to the
@@ -27,6 +27,7 @@ from ..fabrics import Fabric
 from .blocks import BlockMatrix
 from .hessian import Hessian
 from .membrane import outer
+from .stitches import stitch_gradient
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +80,7 @@ class IncrementalPotential:
         self.tether = torch.zeros_like(self.mass)
         self.tether[energy.tethered, 0] = energy.tether_stiffness
         self.size = float(np.linalg.norm(np.ptp(mesh.points, axis=0)))
-        self.cloth, self.law = energy.cloth, energy.law
+        self.cloth, self.law, self.stitching = energy.cloth, energy.law, energy.stitching
         self.contacts = Contacts(scene, self.cloth.samples, device=device)
         self._hessian = Hessian.of(scene, energy)
         self.membrane, self.hinges, self.free = self._hessian.membrane, self._hessian.hinges, self._hessian.free
@@ -99,6 +100,8 @@ class IncrementalPotential:
         total = self.membrane.energy(x) - (self.mass * (x * inputs.gravity).sum(1)).sum(0)
         if self.hinges:
             total = total + self.hinges.energy(x)
+        if self.stitching:
+            total = total + self.stitching.energy(x)
         for weight, target in self._anchors(inputs):
             total = total + (0.5 * weight * ((x - target) ** 2).sum(1)).sum(0)
         return total + self.collision(x, body_distance).sum(0)
@@ -118,6 +121,8 @@ class IncrementalPotential:
         total = self.membrane.gradient(x) - self.mass[:, None] * inputs.gravity
         if self.hinges:
             total += self.hinges.gradient(x)
+        if self.stitching:
+            total += stitch_gradient(self.stitching, x)
         for weight, target in self._anchors(inputs):
             total += weight[:, None] * (x - target)
         if body_distance:

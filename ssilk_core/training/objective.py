@@ -75,6 +75,8 @@ class Objective:
         terms = {"stretch": stretch, "bending": bending, "gravity": gravity, "collision": collision}
         if self.skin:
             terms["tether"] = energy.tether(x, self.skin(self.tethered_rest, None, self.skin.weights, character))
+        if energy.stitching:
+            terms["stitch"] = energy.stitch(x)
         return terms
 
     def _planes(self, x: Tensor, character: Tensor) -> tuple[Tensor, Tensor]:

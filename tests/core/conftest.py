@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -142,6 +143,25 @@ def toy_scene() -> Callable[..., Scene]:
 @pytest.fixture(scope="session")
 def scene() -> Scene:
     return build_scene()
+
+
+def with_patch(scene: Scene) -> Scene:
+    """A scene whose garment has a patch, an island of its own, that lies a millimetre over its loose part."""
+    mesh = scene.garment.mesh
+    points, faces = grid(3, 3, height=0.06, width=0.06)
+    points = points + mesh.points.mean(axis=0) + [0.01, -0.05, -0.001]
+    host = np.linalg.norm(points[:, None] - mesh.points, axis=2).argmin(axis=1)
+    rows = np.concatenate([np.arange(mesh.vertex_count), host])
+    joined = Mesh(
+        mesh.path, np.concatenate([mesh.points, points]), np.concatenate([mesh.faces, faces + mesh.vertex_count])
+    )
+    plain, rig = (SkinWeights(s.path, s.indices[rows], s.weights[rows]) for s in (scene.lbs_skin, scene.rig.skin))
+    return replace(scene, garment=Garment(joined, plain, scene.classes[rows]), rig=replace(scene.rig, skin=rig))
+
+
+@pytest.fixture(scope="session")
+def patched_scene() -> Scene:
+    return with_patch(build_scene())
 
 
 @pytest.fixture(scope="session")

@@ -168,6 +168,19 @@ def test_collapsing_faces_count_as_flat_and_pull_nowhere(fabric):
     assert bending[4:14].tolist() == pytest.approx([fabric.bending / 8 * 0.5**2] * 10) and not flat.any()
 
 
+def test_stitches_are_those_of_the_reference(sheet):
+    over = np.concatenate([sheet.points, sheet.points[:9] * 0.4 + [0.005, -0.01, 0.002]])
+    mesh = Mesh("/two", over, np.concatenate([sheet.faces, sheet.faces + 10]))
+    x, found = over[:, :, None] + 0.004 * np.random.default_rng(4).normal(size=(19, 3, FRAMES)), []
+    for dtype in (torch.float32, torch.float64):
+        energy, at = GarmentEnergy(mesh, STVK, device=DEVICE, dtype=dtype), tensor(x, dtype).requires_grad_()
+        value = energy.stitch(at)
+        found += [value.detach().double().cpu(), torch.autograd.grad(value.sum(), at)[0].double().cpu()]
+        assert len(energy.stitching) > 5
+    torch.testing.assert_close(found[0], found[2], rtol=1e-5, atol=0)
+    torch.testing.assert_close(found[1], found[3], rtol=0, atol=2e-6 * float(found[3].abs().max()))
+
+
 @pytest.mark.parametrize("terms", ["elastic", "potential", "kinetic"])
 def test_a_second_call_gives_the_same_bits(scrap, terms):
     first, second = (evaluate(terms, scrap, WOVEN, crumpled(scrap.points), torch.float32) for _ in range(2))

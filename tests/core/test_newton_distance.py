@@ -20,6 +20,11 @@ CPU, FABRIC, DT = torch.device("cpu"), Fabric("toy", bending=1e-4, margin=0.02),
 
 
 @pytest.fixture
+def scene(patched_scene):
+    return patched_scene
+
+
+@pytest.fixture
 def cloth(scene):
     """A garment's energy, and positions (V, 3, 2) near rest, with planes that some of its samples press into."""
     energy = GarmentEnergy(scene.garment.mesh, FABRIC, scene.classes)

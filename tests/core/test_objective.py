@@ -21,6 +21,11 @@ CONFIG = TrainConfig(batch=3, window=6, static_batch=6, rotated_fraction=0.5, no
 
 
 @pytest.fixture
+def scene(patched_scene):
+    return patched_scene
+
+
+@pytest.fixture
 def objective(scene, toy_motion, toy_model, toy_objective) -> Objective:
     return toy_objective(scene, toy_model(scene), toy_motion(scene, 40), toy_motion(scene, 20, speed=2.0))
 
@@ -43,6 +48,7 @@ def at_frame(objective: Objective, z: torch.Tensor, frame: torch.Tensor, down: t
     terms = {
         "stretch": energy.stretch(x),
         "bending": energy.bending(x),
+        "stitch": energy.stitch(x),
         "gravity": energy.gravity(x - character[0, :, 3], GRAVITY * down.T),
         "collision": energy.collision_at(
             signed_distance_to_planes(sampled, *objective.contacts.planes(sampled, objective.body.pose(character)))

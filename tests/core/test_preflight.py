@@ -310,19 +310,35 @@ def test_a_character_that_lies_is_read_with_the_wrong_axis():
 # What holds the garment
 
 
-def test_islands_that_touch_without_being_joined():
+def lying(offset: tuple[float, float, float]) -> Mesh:
+    """A sheet of 30 cm with a patch of 9 cm, moved from its corner."""
     sheet = grid()
-    patch = Mesh("/patch", sheet.points * 0.3 + [0.1, 0.1, 0], sheet.faces)  # a pocket
-    patch = Mesh("/patch", patch.points + 0.002 * np.array([0, 0, 1]), patch.faces)
-    points, faces = np.r_[sheet.points, patch.points], np.r_[sheet.faces, patch.faces + sheet.vertex_count]
-    two = Mesh(sheet.path, points, faces)
-    found = only(attachment.touching_islands(two, np.full(two.vertex_count, LOOSE)))
-    assert found.severity == "warning" and found.found.startswith("1 of 2 islands lie on others")
-    assert found.indices == tuple(range(sheet.vertex_count, two.vertex_count))
-    assert not list(attachment.touching_islands(two, np.full(two.vertex_count, TIGHT)))
-    away = Mesh(sheet.path, points + np.where(np.arange(len(points)) >= sheet.vertex_count, 0.01, 0)[:, None], faces)
-    assert not list(attachment.touching_islands(away, np.full(two.vertex_count, LOOSE)))
-    assert not list(attachment.touching_islands(sheet, np.full(sheet.vertex_count, LOOSE)))
+    patch = sheet.points * 0.3 + np.array(offset)
+    points, faces = np.r_[sheet.points, patch], np.r_[sheet.faces, sheet.faces + sheet.vertex_count]
+    return Mesh(sheet.path, points, faces)
+
+
+def test_what_lies_on_an_island_is_stitched_and_what_touches_it_at_its_side_is_not():
+    on, beside, off = lying((0.1, 0.1, 0.002)), lying((0.302, 0.1, 0)), lying((0.1, 0.1, 0.02))
+    loose, tight = (np.full(on.vertex_count, kind) for kind in (LOOSE, TIGHT))
+    found = only(attachment.stitched_islands(on, loose))
+    assert found.severity == "info" and found.found.startswith("1 of 2 islands lie on others: stitches")
+    assert "and 1 that lie wholly" in found.found and found.indices == tuple(range(16, 32))
+    assert not list(attachment.touching_islands(on, loose))
+    warned = only(attachment.touching_islands(beside, loose))
+    assert warned.severity == "warning" and warned.found.startswith("1 of 2 islands touch others side by side")
+    assert warned.indices == (16, 20, 24, 28) and not list(attachment.stitched_islands(beside, loose))
+    sheet = grid()
+    for mesh, classes in ((on, tight), (beside, tight), (off, loose), (sheet, loose[:16])):
+        assert not list(attachment.touching_islands(mesh, classes))
+        assert not list(attachment.stitched_islands(mesh, classes))
+
+
+def test_an_island_that_is_stitched_to_a_held_one_is_held():
+    classes = np.full(32, LOOSE)
+    classes[0] = PINNED
+    assert not list(attachment.unattached_islands(lying((0.1, 0.1, 0.002)), classes))
+    assert only(attachment.unattached_islands(lying((0.1, 0.1, 0.02)), classes)).indices == tuple(range(16, 32))
 
 
 def test_class_coverage_and_unheld_islands():

@@ -15,6 +15,7 @@ from ssilk_core.assets import LOOSE, PINNED, Scene
 from ssilk_core.collision import CollisionBody, PosedBody, SmoothedDistance
 from ssilk_core.energy import TERMS, GarmentEnergy
 from ssilk_core.energy.bending import dihedral_angles
+from ssilk_core.energy.stitching import Stitching
 from ssilk_core.energy.stretch import stretch_density
 from ssilk_core.errors import SsilkError
 from ssilk_core.fabrics import Fabric
@@ -53,6 +54,11 @@ def moving(scene: Scene, frames: int = 2) -> tuple[torch.Tensor, StepInputs]:
     )
 
 
+@pytest.fixture(scope="session")
+def scene(patched_scene: Scene) -> Scene:
+    return patched_scene
+
+
 @pytest.fixture(params=FABRICS)
 def potential(request: pytest.FixtureRequest, scene: Scene) -> IncrementalPotential:
     return IncrementalPotential(scene, FABRICS[request.param], device=CPU)
@@ -70,6 +76,7 @@ def test_the_energy_is_that_of_training(potential: IncrementalPotential, scene: 
         "drag": energy.drag(x, inputs.advected, inputs.dt),
         "collision": energy.collision(x, body),
         "tether": energy.tether(x, inputs.skinned[energy.tethered]),
+        "stitch": energy.stitch(x),
     }
     assert terms.keys() == {*TERMS, "drag"}, "a new term is part of the simulator too"
     numbers = {name: value for name, value in vars(potential.fabric).items() if isinstance(value, float)}
@@ -211,13 +218,21 @@ def test_the_assembled_hessian_is_the_gauss_newton_hessian(potential: Incrementa
     own = inertia[:, None, None] * torch.eye(3)
     for v in range(count):
         expected[v, :, v] += own[v]
-    assert (contact > 0).any()
+    springs = potential.stitching
+    held = torch.autograd.functional.jacobian(lambda x: _stretched(springs, x), x)[..., 0]
+    expected += torch.einsum("scia,scjb->iajb", held, held)
+    assert (contact > 0).any() and len(springs) > 9
     found = dense_hessian(potential, x, inputs, body_distance)
     torch.testing.assert_close(found, expected[free][:, :, free].float(), rtol=1e-3, atol=2e-3)
 
 
 def _angles(hinges: Hinges, x: torch.Tensor) -> torch.Tensor:
     return dihedral_angles(*hinges.operator(x).chunk(3))[:, 0]
+
+
+def _stretched(springs: Stitching, x: torch.Tensor) -> torch.Tensor:
+    arm, first, second = springs.arms(x)
+    return (springs.stiffness.sqrt()[:, None] * (arm - springs.height * springs.normal(first, second)[0]))[..., 0]
 
 
 def test_no_hessian_has_a_negative_eigenvalue(potential: IncrementalPotential, scene: Scene) -> None:
@@ -381,8 +396,9 @@ def creased(
 
 
 def test_a_vertex_on_a_crease_does_not_keep_the_others_from_coming_to_rest(
-    monkeypatch, potential: IncrementalPotential, scene: Scene
+    monkeypatch, potential: IncrementalPotential, toy_scene: Callable[[], Scene]
 ) -> None:
+    scene = toy_scene()
     x, inputs = moving(scene, 2)
     potential = IncrementalPotential(scene, replace(potential.fabric, contact_model="vertex", tether=0.0), device=CPU)
     vertex = int(potential.free[len(potential.free) // 2])

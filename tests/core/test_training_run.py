@@ -298,7 +298,7 @@ def test_events_say_what_is_trained_and_how_it_goes(job):
     progress = [event for event in events if isinstance(event, Progress)]
     assert [event.done for event in progress] == [1, 20, 40]
     assert progress[-1].seconds_left == 0
-    assert set(progress[-1].terms) == {*TERMS, "drag"}
+    assert set(progress[-1].terms) == {*TERMS, "drag"} - {"stitch"}  # a garment of one island has none
     judged = [event.text for event in events if isinstance(event, Message) and "validation at" in event.text]
     assert len(judged) == 2 and "under linear blend skinning's" in judged[0]
 
