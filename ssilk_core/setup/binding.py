@@ -80,7 +80,7 @@ def bind_to_skin(
     gap = np.einsum("vc,vc->v", points - _on_skin(body.mesh.points, skin), skin.normals)
     offsets = _offsets(body, points, skin, gap, candidates, matrices)
     importance = areas / (1 + (gap / FAR) ** 2)
-    couplings = SMOOTHING * _laplacian(points, areas, pairs)
+    couplings = SMOOTHING * laplacian(points, areas, pairs)
     fitted = _fit(start, candidates, offsets, np.maximum(gap - CLEARANCE, 0), importance, couplings)
     result = np.zeros_like(weights)
     np.put_along_axis(result, candidates, fitted, axis=1)
@@ -137,7 +137,7 @@ def _offsets(
     return _Offsets(square, along)
 
 
-def _laplacian(points: Floats, areas: Floats, pairs: Ints) -> csr_matrix:
+def laplacian(points: Floats, areas: Floats, pairs: Ints) -> csr_matrix:
     """Return the matrix L (V, V) of which w^T L w is the integral of the squared gradient of w over the cloth [1]."""
     from scipy.sparse import coo_matrix, diags
 

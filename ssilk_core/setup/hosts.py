@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..assets import Floats, Ints, Mesh
-from ..mesh.geodesic import nearest_sources
 from ..mesh.stitches import SAME_PLACE, Stitches, find_carried, find_feet, joined_islands, joined_mesh, touching
-from ..mesh.topology import islands, vertex_mask
+from ..mesh.topology import edges, islands, vertex_areas, vertex_mask
+from .binding import laplacian
 
 Mask = NDArray[np.bool_]
-BLEND = 0.03  # [m] along a strap over which its weights turn from its host's to its own
+FADING = 0.1  # [m] r, over which the weights of a strap turn from its host's to its own
+TINY = 1e-15  # [m2]; keeps vertices without area from making the equations singular
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,8 +58,9 @@ class Hosts:
     def blend(self, rows: Floats, loose: Mask | None = None) -> Floats:
         """Return weights (V, J) where carried vertices have those of the points under them.
 
-        Elsewhere `loose` (V,) vertices, all by default, that are not carried turn to the weights of the point under
-        the nearest stitch, by the difference there times exp(-(d/r)^2), with their distance d along their island.
+        Stitched vertices that are `loose` (V,), all by default, and not carried have these too. From them the
+        difference fades over the rest of their islands, by the screened Poisson equation (laplace u = u / r^2), to
+        none at vertices that are not loose.
         """
         if not len(self.stitches):
             return rows
@@ -67,15 +69,29 @@ class Hosts:
         sewn = self.stitches
         sewn = sewn.select(sewn.on_larger & (sewn.distance > SAME_PLACE) & free[sewn.vertices])
         if len(sewn):
-            difference = np.zeros_like(result)
-            difference[sewn.vertices] = _under(sewn, result) - result[sewn.vertices]
-            distance, nearest = nearest_sources(self.mesh.points, self.mesh.faces, sewn.vertices)
-            near = np.flatnonzero(free & (distance < 3 * BLEND))
-            share = np.exp(-((distance[near] / BLEND) ** 2))
-            turned = (result[near] + share[:, None] * difference[nearest[near]]).clip(0)
-            result[near] = turned / turned.sum(axis=1, keepdims=True)
+            turned = (result + self._faded(sewn, _under(sewn, result) - result[sewn.vertices], free)).clip(0)
+            changed = (turned != result).any(axis=1)
+            result[changed] = turned[changed] / turned[changed].sum(axis=1, keepdims=True)
         for part in self._by_island():
             result[part.vertices] = _under(part, result)
+        return result
+
+    def _faded(self, sewn: Stitches, difference: Floats, free: Mask) -> Floats:
+        """Return differences (V, J) that are given at stitches (S, J) and fade over the `free` (V,) vertices."""
+        from scipy.sparse import diags
+        from scipy.sparse.linalg import splu
+
+        mesh = self.mesh
+        island = islands(mesh.faces, mesh.vertex_count)
+        areas = vertex_areas(mesh.points, mesh.faces)
+        result = np.zeros((mesh.vertex_count, difference.shape[1]))
+        result[sewn.vertices] = difference
+        inner = free & np.isin(island, island[sewn.vertices])
+        inner[sewn.vertices] = False
+        if inner.any():
+            matrix = laplacian(mesh.points, areas, edges(mesh.faces))[inner]
+            screened = matrix[:, inner] + diags(areas[inner] / FADING**2 + TINY)
+            result[inner] = splu(screened.tocsc()).solve(-(matrix @ result))
         return result
 
     def _by_island(self) -> list[Stitches]:

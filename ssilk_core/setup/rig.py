@@ -98,8 +98,9 @@ def build_rig(
         influences=options.influences,
         seam_blend=options.seam_blend,
     )
-    influences = int((weights > 0).sum(axis=1).max())
-    weights = np.where(authored[:, None], hosts.blend(weights, authored), weights)
+    influences = int((weights > 0).sum(axis=1).max()) + (options.influences if len(hosts.stitches) else 0)
+    held = np.concatenate([body_weights, np.zeros((len(weights), weights.shape[1] - body_weights.shape[1]))], axis=1)
+    weights = np.where(authored[:, None], hosts.blend(weights, authored), np.where(loose[:, None], held, weights))
     return _assemble(character, garment.mesh, clusters, weights, influences, seam)
 
 
