@@ -107,6 +107,12 @@ class FabricSettings(bpy.types.PropertyGroup):
     tether: _number(
         "tether", "Tether", "How firmly tight cloth stays over its skin, in N/m³; zero lets it slide", precision=0
     )
+    stitch: _number(
+        "stitch",
+        "Stitch",
+        "How firmly parts that lie on others hold there, such as straps and pockets, in N/m³; zero lets them part",
+        precision=0,
+    )
     drag: _number("drag", "Air Drag", "Resistance of the air for each area and speed, in kg/(m² s); zero is a vacuum")
 
 

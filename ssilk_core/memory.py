@@ -17,6 +17,7 @@ from .errors import fail
 PLANNED_SHARE = 0.8  # of the free memory
 DEFAULT_FREE_MEMORY = 8 << 30  # bytes, where the system offers no portable way to ask
 MAX_SEARCHED = 1 << 25  # pairs of a sample and a triangle of the body at once, as `collision.closest_point` takes
+STITCH_NUMBERS = 60  # for each frame: arms, normal and offset, with their gradients
 MEMINFO = Path("/proc/meminfo")
 CONTAINER = Path("/sys/fs/cgroup")
 # Limit, usage, statistics and the name of reclaimable cache in them, for versions 2 and 1 of control groups.
@@ -52,7 +53,9 @@ def _numbers(path: Path) -> dict[str, str]:
     return {words[0]: words[1] for line in path.read_text().splitlines() if len(words := line.split()) > 1}
 
 
-def step_memory(scene: Scene, config: ModelConfig, frames: int, body_vertices: int, samples: int) -> int:
+def step_memory(
+    scene: Scene, config: ModelConfig, frames: int, body_vertices: int, samples: int, stitches: int = 0
+) -> int:
     """Predict the bytes that one training step holds at its peak, for `frames` decoded at once.
 
     Counts float32 numbers for each frame and vertex, contact sample, body vertex, joint and unit of the network, one
@@ -61,8 +64,10 @@ def step_memory(scene: Scene, config: ModelConfig, frames: int, body_vertices: i
 
     Args:
         samples: at which the garment meets the body (`collision.samples`), its vertices among them.
+        stitches: that hold its islands on one another.
     """
-    numbers = 200 * scene.garment.mesh.vertex_count + 25 * samples + 22 * body_vertices + 60 * len(scene.joint_names)
+    cloth = 200 * scene.garment.mesh.vertex_count + 25 * samples + STITCH_NUMBERS * stitches
+    numbers = cloth + 22 * body_vertices + 60 * len(scene.joint_names)
     network = 12 * sum(config.widths) + 20 * config.latent
     pairs = min(MAX_SEARCHED, 2 * frames * samples * body_vertices)  # a closed mesh has twice as many faces
     return 4 * frames * (numbers + network) + 4 * samples * body_vertices + 8 * pairs + (40 << 20)
@@ -79,12 +84,18 @@ def _frames_of_a_window(config: TrainConfig) -> float:
 
 
 def fitting_batch(
-    scene: Scene, model: ModelConfig, config: TrainConfig, body_vertices: int, samples: int, available: int
+    scene: Scene,
+    model: ModelConfig,
+    config: TrainConfig,
+    body_vertices: int,
+    samples: int,
+    available: int,
+    stitches: int = 0,
 ) -> tuple[int, int]:
     """Return the largest batch and pretraining batch, up to the configured ones, that fit into `available` bytes."""
 
     def needed(frames: int) -> int:
-        return step_memory(scene, model, frames, body_vertices, samples)
+        return step_memory(scene, model, frames, body_vertices, samples, stitches)
 
     most = decoded_frames(config, config.batch)
     frames = bisect_right(range(most + 1), PLANNED_SHARE * available, key=needed) - 1
@@ -94,10 +105,16 @@ def fitting_batch(
 
 
 def check_one_window_fits(
-    scene: Scene, model: ModelConfig, config: TrainConfig, body_vertices: int, samples: int, available: int
+    scene: Scene,
+    model: ModelConfig,
+    config: TrainConfig,
+    body_vertices: int,
+    samples: int,
+    available: int,
+    stitches: int = 0,
 ) -> None:
     """Raise `SsilkError` unless a step on a single window fits into `available` bytes."""
-    needed = step_memory(scene, model, ceil(_frames_of_a_window(config)), body_vertices, samples)
+    needed = step_memory(scene, model, ceil(_frames_of_a_window(config)), body_vertices, samples, stitches)
     if not needed <= available:
         fail(
             scene.garment.mesh.path,

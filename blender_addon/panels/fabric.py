@@ -30,5 +30,5 @@ class FabricPanel(SidebarPanel, bpy.types.Panel):
         for name in ("preset", "density", "stretch_model", *MEMBRANE[fabric.stretch_model]):
             layout.prop(fabric, name)
         contact = CONTACT[fabric.contact_model]
-        for name in ("bending", "drag", "contact_model", *contact, "margin", "thickness", "tether"):
+        for name in ("bending", "drag", "contact_model", *contact, "margin", "thickness", "tether", "stitch"):
             layout.prop(fabric, name)

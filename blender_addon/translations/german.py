@@ -37,6 +37,10 @@ WORDS = {
     "How firmly tight cloth stays over its skin, in N/m³; zero lets it slide": (
         "Wie fest enger Stoff über seiner Haut bleibt, in N/m³; null lässt ihn gleiten"
     ),
+    "Stitch": "Naht",
+    "How firmly parts that lie on others hold there, such as straps and pockets, in N/m³; zero lets them part": (
+        "Wie fest Teile halten, die auf anderen liegen, etwa Träger und Taschen, in N/m³; null lässt sie auseinander"
+    ),
     "Thickness": "Dicke",
     "Paper": "Artikel",
     "Surface": "Fläche",

@@ -226,7 +226,8 @@ def _units(stage: Usd.Stage, target: Target) -> StageUnits:
 def _record(file: ModelFile, model_hash: str) -> GarmentRecord:
     from ssilk_usd.garment_api import GarmentRecord
 
-    unused = ("collision",) if file.fabric.contact_model == "surface" else ("contact", "loose_contact")
+    unused = {"collision"} if file.fabric.contact_model == "surface" else {"contact", "loose_contact"}
+    unused |= set() if file.fabric.stitch else {"stitch"}
     values = asdict(file.fabric).items()
     numbers = {name: float(value) for name, value in values if isinstance(value, int | float) and name not in unused}
     return GarmentRecord(

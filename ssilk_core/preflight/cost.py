@@ -35,14 +35,16 @@ def memory(scene: Scene, preset: Preset, body_vertices: int) -> Findings:
     """Yield the memory and time that a preset takes when the garment can touch `body_vertices` vertices."""
     from ..collision.samples import contact_samples
     from ..devices import select_device
+    from ..energy.stitching import held_stitches
     from ..fabrics import FABRICS
     from ..memory import decoded_frames, fitting_batch, free_memory, step_memory
 
     model, train, device = preset.model, preset.train, select_device("auto")
     free = free_memory(device)
     samples = len(contact_samples(scene.garment.mesh, FABRICS["default"]).area)
-    needed = step_memory(scene, model, decoded_frames(train, train.batch), body_vertices, samples)
-    batch, pretraining_batch = fitting_batch(scene, model, train, body_vertices, samples, free)
+    stitches = len(held_stitches(scene.garment.mesh, FABRICS["default"], scene.classes))
+    needed = step_memory(scene, model, decoded_frames(train, train.batch), body_vertices, samples, stitches)
+    batch, pretraining_batch = fitting_batch(scene, model, train, body_vertices, samples, free, stitches)
     lowered = (batch, pretraining_batch) != (train.batch, train.pretraining_batch)
     note = (
         f"; the batch is reduced from {train.batch} to {batch} windows "

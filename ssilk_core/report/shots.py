@@ -78,6 +78,8 @@ def _sections(player: ShotPlayer, garment: ShotGarment, meter: TermsMeter) -> li
     ]
     times, marks = np.arange(len(values["total"])) / player.fps, dict(zip(worst, LETTERS))
     shown = [name for name in UNITS if meter.body or name not in ("collision", SHARE)]
+    if meter.energy.stitching is None:
+        shown.remove("stitch")
     if meter.covered is None:
         shown = [name for name in shown if name not in (SHOWN, BARE)]
     panels = [

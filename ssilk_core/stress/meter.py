@@ -98,7 +98,7 @@ class ExtentMeter:
 
     def _energies(self, x: Tensor, velocity: Tensor) -> list[float]:
         kinetic = self.energy.mass @ (velocity**2).sum(1) / 2
-        return (self.energy.stretch(x) + self.energy.bending(x) + kinetic).tolist()
+        return (self.energy.stretch(x) + self.energy.bending(x) + self.energy.stitch(x) + kinetic).tolist()
 
     @property
     def growth(self) -> float:

@@ -196,9 +196,11 @@ class TrainingRun:
         job, config, group, free = self.job, self.job.train, self.group, free_memory(self.device)
         if self.device.type == "cpu":
             free //= group.size
-        check_one_window_fits(job.scene, job.model, config, *self._contact_sizes(), free)
+        check_one_window_fits(job.scene, job.model, config, *self._contact_sizes(), free, self._stitches)
         fitting = group.gather(
-            fitting_batch(job.scene, job.model, group.local_config(config), *self._contact_sizes(), free)
+            fitting_batch(
+                job.scene, job.model, group.local_config(config), *self._contact_sizes(), free, self._stitches
+            )
         )
         batch, pretraining_batch = (group.size * min(counts) for counts in zip(*fitting))
         if (batch, pretraining_batch) != (config.batch, config.pretraining_batch):
@@ -209,7 +211,12 @@ class TrainingRun:
         """Predict the memory of a step in this process [bytes]."""
         own = self.group.local_config(self.config)
         frames = decoded_frames(own, own.batch)
-        return step_memory(self.job.scene, self.job.model, frames, *self._contact_sizes())
+        return step_memory(self.job.scene, self.job.model, frames, *self._contact_sizes(), self._stitches)
+
+    @property
+    def _stitches(self) -> int:
+        """Number of stitches of the garment."""
+        return len(self.parts.energy.stitching or ())
 
     def _contact_sizes(self) -> tuple[int, int]:
         """Return the vertices of the body that the garment can touch, and the samples at which it meets them."""

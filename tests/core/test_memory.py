@@ -31,6 +31,7 @@ def test_more_of_anything_needs_more(scene):
     assert step_memory(scene, MODEL, 65, 1000, 200) > base
     assert step_memory(scene, MODEL, 64, 1001, 200) > base
     assert step_memory(scene, MODEL, 64, 1000, 201) > base
+    assert step_memory(scene, MODEL, 64, 1000, 200, 1) > base
     assert step_memory(scene, replace(MODEL, widths=(256, 512, 513)), 64, 1000, 200) > base
 
 
@@ -53,6 +54,21 @@ def test_what_a_step_keeps_of_its_contact_samples_is_counted(scene):
         counts.append(len(energy.cloth.samples.area))
     few, many = (step_memory(scene, MODEL, frames, 0, count) for count in counts)
     assert counts[1] > 2 * counts[0] and many - few > kept[1] - kept[0] > 0
+
+
+def test_what_a_step_keeps_of_its_stitches_is_counted(patched_scene):
+    mesh, frames, kept = patched_scene.garment.mesh, 8, {}
+    energy = GarmentEnergy(mesh, FABRICS["default"], patched_scene.classes)
+
+    def keep(found: torch.Tensor) -> torch.Tensor:
+        kept[found.untyped_storage().data_ptr()] = found.untyped_storage().nbytes()
+        return found
+
+    x = torch.tensor(mesh.points, dtype=torch.float32)[:, :, None].repeat(1, 1, frames)
+    with torch.autograd.graph.saved_tensors_hooks(keep, lambda found: found):
+        energy.stitch(x.requires_grad_())
+    none, some = (step_memory(patched_scene, MODEL, frames, 0, 0, count) for count in (0, len(energy.stitching)))
+    assert some - none > sum(kept.values()) > 0
 
 
 def test_frames_cost_the_same_each(scene):

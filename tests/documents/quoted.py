@@ -17,6 +17,7 @@ from ssilk_core.decomposition import FitTolerance
 from ssilk_core.fabrics import FABRICS, Fabric
 from ssilk_core.farm.openjd import CHUNK, CHUNK_SECONDS
 from ssilk_core.mesh import hidden_faces
+from ssilk_core.mesh.stitches import TOUCH
 
 from .measured import default, digits, fixed, micro, milli, percent, result, row, series
 from .quoted_results import results
@@ -89,6 +90,8 @@ def training() -> Text:
     yield f"| `contact` (material) [N/m³] | {cloth.contact:g} | none |"
     yield f"| `loose_contact` (material) [N/m³] | {cloth.loose_contact:g} | none |"
     yield f"| `tether` (material) [N/m³] | {cloth.tether:g} | {papers.tether:g} |"
+    yield f"| `stitch` (material) [N/m³] | {cloth.stitch:g} | {papers.stitch:g} |"
+    yield f"A vertex within {1000 * TOUCH:g} mm of a face of another island"
     yield f"| `margin` (material) [mm] | {1000 * cloth.margin:g} | {1000 * papers.margin:g} |"
     yield f"| `thickness` (material) [mm] | {1000 * cloth.thickness:g} | none |"
     yield f"{default('fps'):g} times a second"
