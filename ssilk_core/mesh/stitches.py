@@ -168,23 +168,34 @@ def _ranks(mesh: Mesh, island: Ints) -> Ints:
 
 
 def _near(mesh: Mesh, island: Ints, sound: Ints) -> tuple[Ints, Ints]:
-    """Return vertices (M,) and faces (M,) of other islands that may lie within `ABOVE`."""
+    """Return vertices (M,) and faces (M,) of other islands that may lie within `ABOVE` of one another."""
+    used, of_face = np.unique(mesh.faces), island[mesh.faces[:, 0]]
+    widest = np.bincount(of_face).argmax()  # most faces are its own, and of most vertices
+    large = of_face[sound] == widest
+    found = [
+        _in_balls(mesh, used[island[used] != widest], sound[large]),
+        _in_balls(mesh, used, sound[~large]),
+    ]
+    vertices, faces = (np.concatenate(each) for each in zip(*found))
+    apart = island[vertices] != of_face[faces]
+    return vertices[apart], faces[apart]
+
+
+def _in_balls(mesh: Mesh, vertices: Ints, faces: Ints) -> tuple[Ints, Ints]:
+    """Return those of some vertices (M,) that lie within `ABOVE` of the ball around a face, and that face (M,)."""
     from scipy.spatial import cKDTree
 
-    used = np.unique(mesh.faces)
-    tree, found = cKDTree(mesh.points[used]), [(np.zeros(0, dtype=np.int64),) * 2]
-    for start in range(0, len(sound), FACES_AT_ONCE):
-        part = sound[start : start + FACES_AT_ONCE]
+    tree, found = cKDTree(mesh.points[vertices]), [(np.zeros(0, dtype=np.int64),) * 2]
+    for start in range(0, len(faces), FACES_AT_ONCE):
+        part = faces[start : start + FACES_AT_ONCE]
         corners = mesh.points[mesh.faces[part]]
         centre = corners.mean(axis=1)
         radius = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
         near = tree.query_ball_point(centre, radius + ABOVE)
-        faces = np.repeat(part, [len(each) for each in near])
-        vertices = used[np.concatenate([np.asarray(each, dtype=np.int64) for each in near])]
-        apart = island[vertices] != island[mesh.faces[faces, 0]]
-        found.append((vertices[apart], faces[apart]))
-    vertices, faces = (np.concatenate(each) for each in zip(*found))
-    return vertices, faces
+        inside = np.concatenate([np.asarray(each, dtype=np.int64) for each in near])
+        found.append((vertices[inside], np.repeat(part, [len(each) for each in near])))
+    inner, around = (np.concatenate(each) for each in zip(*found))
+    return inner, around
 
 
 def _on_plane(offset: Floats, sides: Floats, normal: Floats) -> Floats:
