@@ -25,8 +25,8 @@ import numpy as np
 
 from .assets import Deformer, GarmentPose, Motion, Scene
 from .checkpoint import ModelFile, save_model
-from .runtime import Player
-from .runtime.playback import BLOCK, VERTEX_BLOCK, Playback
+from .runtime import Playback, Player
+from .runtime.playback import BLOCK, VERTEX_BLOCK
 from .runtime.skinning import Tile
 from .runtime.stored import StoredPlayer
 
