@@ -117,6 +117,8 @@ def test_materials_of_rigid_things_and_of_looks_are_none_of_a_surface():
         ({"material": "float physics:youngsModulus = nan"}, "physics:youngsModulus: nan; a finite number"),
         ({"material": "float physics:poissonsRatio = 0.7"}, "poissons_ratio of its physics material is 0.7"),
         ({"mesh": "float[] physics:thicknesses = [-1]"}, "physics:thicknesses: not all are positive"),
+        ({"mesh": 'string[] physics:thicknesses = ["thin"]'}, "physics:thicknesses: not all are positive"),
+        ({"material": 'string physics:youngsModulus = "stiff"'}, "physics:youngsModulus: stiff; a finite number"),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_sentence(wrong, words):

@@ -136,8 +136,8 @@ def _stiffness(
 
 def _array(prim: Usd.Prim, name: str) -> Floats:
     """Return what a mesh says of its whole, its faces or its points; nothing where it does not."""
-    found = value(prim, PROPOSAL + name) if has_value(prim, PROPOSAL + name) else []
-    numbers = np.array(found, dtype=np.float64).reshape(-1)
+    found = np.array(value(prim, PROPOSAL + name) if has_value(prim, PROPOSAL + name) else [])
+    numbers = found.reshape(-1).astype(np.float64) if found.dtype.kind in "iuf" else np.full(1, np.nan)
     if not (np.isfinite(numbers) & (numbers > 0)).all():
         fail(f"{location(prim)}.{PROPOSAL}{name}", "not all are positive and finite", "they must be", "correct them")
     return numbers
