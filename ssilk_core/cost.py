@@ -8,22 +8,27 @@ Times are measured on this machine. All other costs follow from sizes. The multi
     blendshapes     3 V shapes
     skinning        12 V influences to blend matrices, 9 V to apply them
 
-With more vertices, the share of blendshapes and skinning grows and that of the networks falls.
+With more vertices, the share of blendshapes and skinning grows and that of the networks falls. What a shot stores,
+such as a refined garment, is played without networks.
 """
 
 from __future__ import annotations
 
 import tempfile
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from .assets import Motion
+from .assets import Deformer, GarmentPose, Motion, Scene
 from .checkpoint import ModelFile, save_model
-from .runtime import Player
-from .runtime.playback import BLOCK
+from .runtime import Playback, Player
+from .runtime.playback import BLOCK, VERTEX_BLOCK
+from .runtime.skinning import Tile
+from .runtime.stored import StoredPlayer
 
 POINT_BYTES = 12  # bytes of a vertex in a point cache
 TILE_PARAMETERS = ("decoder.shapes", "decoder.skin_offset")  # the runtime stores these only as tiles
@@ -57,22 +62,48 @@ class ShotBytes:
 
 def play_time(player: Player, motion: Motion, *, seconds: float = MIN_SECONDS) -> Time:
     """Measure the time to play a frame on the CPU: character, latents, decoder and all vertices."""
-    _pass(player, motion)  # warms up
+
+    def frames(playback: Playback, block: range) -> None:
+        for frame in block:
+            playback.vertices(frame)
+
+    return _timed(lambda: partial(frames, player.play(motion)), motion.frame_count, seconds)
+
+
+def stored_time(
+    deformer: Deformer, motion: Motion, poses: Sequence[GarmentPose], *, seconds: float = MIN_SECONDS
+) -> Time:
+    """Measure the time to play a frame of stored poses on the CPU: character, joints, blendshapes, all vertices."""
+    player = StoredPlayer(deformer)
+    rotations, weights = (
+        np.concatenate([getattr(pose, name) for pose in poses]) for name in ("rotations", "weights")
+    )
+
+    def frames(block: range) -> None:
+        for start in range(block.start, block.stop, VERTEX_BLOCK):
+            part = slice(start, min(start + VERTEX_BLOCK, block.stop))
+            player.vertices(motion, GarmentPose(start, rotations[part], weights[part]))
+
+    return _timed(lambda: frames, motion.frame_count, seconds)
+
+
+def _timed(begin: Callable[[], Callable[[range], None]], count: int, seconds: float) -> Time:
+    """Return the time per frame of what plays blocks of consecutive frames, in passes over all of them."""
+    _pass(begin(), count)  # warms up
     blocks, passes, end = [], 0, time.perf_counter() + seconds
     while passes < MIN_PASSES or time.perf_counter() < end:
-        blocks += _pass(player, motion)
+        blocks += _pass(begin(), count)
         passes += 1
     return Time.of(blocks)
 
 
-def _pass(player: Player, motion: Motion) -> list[float]:
-    """Play a motion once; return the time per frame of each block [ms]."""
-    playback, found = player.play(motion), []
-    for start in range(0, motion.frame_count, BLOCK):
-        frames = range(start, min(start + BLOCK, motion.frame_count))
+def _pass(play: Callable[[range], None], count: int) -> list[float]:
+    """Play all frames once; return the time per frame of each block [ms]."""
+    found = []
+    for start in range(0, count, BLOCK):
+        frames = range(start, min(start + BLOCK, count))
         begun = time.perf_counter()
-        for frame in frames:
-            playback.vertices(frame)
+        play(frames)
         found.append(1000 * (time.perf_counter() - begun) / len(frames))
     return found
 
@@ -80,14 +111,23 @@ def _pass(player: Player, motion: Motion) -> list[float]:
 def operations(file: ModelFile) -> dict[str, int]:
     """Return the multiply-adds of one frame, by part."""
     parameters, config = file.parameters, file.config
-    vertices, free = file.scene.garment.mesh.vertex_count, parameters["decoder.shapes"].shape[0]
+    free = parameters["decoder.shapes"].shape[0]
     networks = {name: _weights(file, part) for name, part in zip("PSD", ("initialiser", "stepper", "output"))}
     return {
         **networks,
         "readout": config.shapes * config.activations,
         "blendshapes": 3 * free * config.shapes,
-        "skinning": vertices * (12 * file.scene.rig.skin.indices.shape[1] + 9),
+        "skinning": _skinning(file.scene),
     }
+
+
+def stored_operations(deformer: Deformer) -> dict[str, int]:
+    """Return the multiply-adds of a frame of stored poses, by part."""
+    return {"blendshapes": deformer.shapes.size, "skinning": _skinning(deformer.scene)}
+
+
+def _skinning(scene: Scene) -> int:
+    return scene.garment.mesh.vertex_count * (12 * scene.rig.skin.indices.shape[1] + 9)
 
 
 def _weights(file: ModelFile, network: str) -> int:
@@ -97,8 +137,16 @@ def _weights(file: ModelFile, network: str) -> int:
 def memory(player: Player) -> int:
     """Return the memory that playback uses for parameters and for the tiles of shapes and weights [bytes]."""
     parameters = (value.size * 4 for name, value in player.file.parameters.items() if name not in TILE_PARAMETERS)
-    tiles = (tile.shapes.nbytes + tile.weights.nbytes + tile.joints.nbytes for tile in player.tiles)
-    return sum(parameters) + sum(tiles)
+    return sum(parameters) + _of_tiles(player.tiles)
+
+
+def stored_memory(deformer: Deformer) -> int:
+    """Return the memory that playing stored poses uses for the tiles of shapes and weights [bytes]."""
+    return _of_tiles(StoredPlayer(deformer).tiles)
+
+
+def _of_tiles(tiles: list[Tile]) -> int:
+    return sum(tile.shapes.nbytes + tile.weights.nbytes + tile.joints.nbytes for tile in tiles)
 
 
 def model_bytes(file: ModelFile, *, pack: bool) -> int:

@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fabrics in physical units, and their presets."""
+"""Fabrics in physical units, their presets, and those that stages state."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
+from .assets import PLATE_THICKNESS, SurfaceMaterial
 from .errors import fail
 
 STRETCH_MODELS = ("stvk", "baraff_witkin")
 CONTACT_MODELS = ("surface", "vertex")
+PLATE_POISSON = 0.3  # of a stage that says none: the fallback of USD's proposal
 
 
 @dataclass(frozen=True)
@@ -157,3 +159,66 @@ def fabric_of_file(values: dict[str, Any]) -> Fabric:
     if "contact" in values:
         absent = {"tether": 0.0, "stitch": 0.0, "loose_contact": values["contact"]}
     return Fabric(**(absent | values))
+
+
+def fabric_of_surface(surface: SurfaceMaterial) -> Fabric:
+    """Return the default fabric with everything that a stage's physics material says.
+
+    A plate of the thickness h has, in plane stress, lame_mu = E h / (2 (1 + nu)), lame_lambda = E h nu / (1 - nu^2),
+    and the bending stiffness D = E h^3 / (12 (1 - nu^2)) (Timoshenko and Woinowsky-Krieger, Theory of Plates and
+    Shells, 1959). Rolled up to the curvature kappa it stores D kappa^2 / 2 for each area, and the hinges of
+    `energy.bending` store `bending` kappa^2 / 8: `bending` is 4 D. Stiffnesses that the stage states go before E.
+    """
+    thickness = surface.thickness or PLATE_THICKNESS
+    changes = {"thickness": surface.thickness, "density": surface.area_density}
+    if surface.density is not None and surface.area_density is None:
+        changes["density"] = surface.density * thickness
+    stretch, shear, bend = _stiffnesses(surface)
+    if stretch is not None and shear is not None:
+        mu = min(shear, stretch / 2)
+        changes |= {"lame_mu": mu, "lame_lambda": stretch - 2 * mu, "stretch": stretch / 2, "shear": mu / 2}
+    changes["bending"] = None if bend is None else 4 * bend
+    said = {name: value for name, value in changes.items() if value is not None}
+    return replace(FABRICS["default"], name=surface.path.rpartition("/")[2], **said)  # type: ignore[arg-type]
+
+
+def surface_message(surface: SurfaceMaterial, fabric: Fabric) -> str:
+    """Return a sentence without its stop: what a fabric takes of a stage's physics material, and what it cannot."""
+    default, units = FABRICS["default"], {"density": "kg/m2", "thickness": "m", "bending": "N m"}
+    own = ("density", "thickness", "lame_mu", "lame_lambda", "bending")
+    taken = [
+        f"{name} {getattr(fabric, name):.4g} {units.get(name, 'N/m')}"
+        for name in own
+        if getattr(fabric, name) != getattr(default, name)
+    ]
+    values = ", ".join(taken) or "the values of the default"
+    text = f"the fabric is that of the stage's physics material, with {values}"
+    stiffest = max(preset.lame_mu for preset in FABRICS.values())
+    if fabric.lame_mu > stiffest:
+        text += f", {fabric.lame_mu / stiffest:.3g} times the lame_mu of the stiffest preset"
+    stretch, shear, _ = _stiffnesses(surface)
+    excess = stretch is not None and shear is not None and shear > stretch / 2 * (1 + 1e-6)
+    beyond = ["shear that is stiffer than half the stretch"] if excess else []
+    if lost := [*surface.others, *beyond]:
+        text += f"; it has no place for {', '.join(lost)}"
+    return text
+
+
+def _stiffnesses(surface: SurfaceMaterial) -> tuple[float | None, float | None, float | None]:
+    """Return the stiffness of uniaxial strain, of simple shear [N/m], and of bending [N m].
+
+    What is stated goes before what follows from E. Where neither is there, stretch and shear follow from each other.
+    """
+    stretch, shear, bend = surface.stretch, surface.shear, surface.bend
+    nu = PLATE_POISSON if surface.poissons_ratio is None else surface.poissons_ratio
+    if surface.youngs_modulus is not None:
+        thickness = surface.thickness or PLATE_THICKNESS
+        plate = surface.youngs_modulus * thickness
+        stretch = plate / (1 - nu**2) if stretch is None else stretch
+        shear = plate / (2 * (1 + nu)) if shear is None else shear
+        bend = plate * thickness**2 / (12 * (1 - nu**2)) if bend is None else bend
+    elif stretch is not None and shear is None:
+        shear = stretch * (1 - nu) / 2
+    elif shear is not None and stretch is None:
+        stretch = 2 * shear / (1 - nu)
+    return stretch, shear, bend

@@ -194,6 +194,13 @@ def split_at_cuts(motion: Motion, *, max_joint_speed: float = np.inf) -> list[Mo
     return [motion.clip(start, stop) for start, stop in zip([0, *ends[:-1]], ends)]
 
 
+def held_at_cuts(motion: Motion, position: Floats) -> Floats:
+    """Return fractional frames, shape (N,), without those between a cut's two frames: the first of them is held."""
+    firsts = np.cumsum([span.frame_count for span in split_at_cuts(motion)])[:-1]
+    low = np.floor(position)
+    return np.where(np.isin(low + 1, firsts), low, position)
+
+
 def _deviation_from_median(steps: Floats) -> Floats:
     """Return the distance of each step (N, 3) from the median of those around it [m], shape (N,)."""
     if not len(steps):

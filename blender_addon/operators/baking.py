@@ -48,7 +48,7 @@ ABOUT = {
     "film": "What cannot be told from the whole model",
     "hero": "Refined by a solver, on bones and shape keys of this shot's own; takes long",
 }
-LEVELS = [
+QUALITY_ITEMS = [
     (WHOLE, "Whole", "All that the model has"),
     *((name, name.capitalize(), ABOUT[name]) for name in QUALITIES),
 ]
@@ -117,7 +117,7 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         name="USD File", description="Shot to write; named like the garment, beside the blend file, when empty",
         subtype="FILE_PATH", options=RELATIVE,
     )  # fmt: skip
-    quality: EnumProperty(name="Quality", items=LEVELS)
+    quality: EnumProperty(name="Quality", items=QUALITY_ITEMS)
     pre_roll: FloatProperty(
         name="Pre-Roll",
         description="How long the garment settles in the first pose before the first frame",

@@ -35,6 +35,7 @@ class BakingPanel(SidebarPanel, bpy.types.Panel):
         draw_text(layout, model_line(context.object))
         layout.operator("ssilk.bake", icon="REC")
         layout.operator("ssilk.to_bones", icon="BONE_DATA")
+        layout.operator("ssilk.export_gltf", icon="EXPORT")
         layout.operator("ssilk.remove_bake", icon="TRASH")
         layout.operator("ssilk.hide_covered", icon="HIDE_ON")
         layout.operator("ssilk.show_covered", icon="HIDE_OFF")

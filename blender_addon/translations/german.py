@@ -419,4 +419,10 @@ WORDS = {
     "Show beside the garment how linear blend skinning alone would move it, or remove that": (
         "Daneben zeigen, wie lineares Skinning allein das Kleidungsstück bewegt, oder das wieder entfernen"
     ),
+    "Export glTF": "glTF exportieren",
+    "Write the character and its baked garment as a glTF binary over the scene's frames, and compare it with them": (
+        "Die Figur mit ihrem gebackenen Kleidungsstück über die Bilder der Szene als glTF-Binärdatei schreiben und "
+        "mit ihnen vergleichen"
+    ),
+    "The .glb to write": "Die zu schreibende .glb",
 }

@@ -12,6 +12,7 @@ from ..errors import fail
 from .arrays import Floats, Ints, assign, frozen
 from .mesh import Mesh
 from .skin import SkinWeights
+from .surface import SurfaceMaterial
 
 PINNED, TIGHT, LOOSE = 0, 1, 2
 ROUNDING = 1e-6  # of levels that were stored as float32
@@ -38,6 +39,7 @@ class Garment:
         classes: PINNED, TIGHT or LOOSE for each vertex, shape (V,), or None if not authored.
         pins: 1 for each vertex that is to be pinned when classes are found, 0 for others, shape (V,), or None.
         levels: the least tightness at which each vertex is tight, as `classes_at` takes it, shape (V,), or None.
+        surface: the physics material that its stage states, or None.
     """
 
     mesh: Mesh
@@ -45,6 +47,7 @@ class Garment:
     classes: Ints | None = None
     pins: Ints | None = None
     levels: Floats | None = None
+    surface: SurfaceMaterial | None = None
 
     def __post_init__(self) -> None:
         count = self.mesh.vertex_count

@@ -15,7 +15,7 @@ from .load import LoadedGarment, load_garment, load_rollout, with_model
 from .request import BakeRequest
 from .result import BakeResult, FrameSpan, RefinementSummary, Verification
 from .rollout import BakeRollout
-from .sizing import shot_bytes
+from .sizing import shot_bytes, stored_bytes
 from .task import BakeTask, plan_layers
 from .trajectories import cache_origin, motion_at, rig_deformer, skin_trajectories, trained_deformer
 from .verification import verify
@@ -24,6 +24,6 @@ from .write import bake
 __all__ = [
     "BakeRequest", "BakeResult", "BakeRollout", "BakeTask", "FrameSpan", "LayerFolder", "LoadedGarment",
     "RefinementSummary", "Verification", "bake", "bake_layers", "cache_origin", "load_garment", "load_rollout",
-    "motion_at", "on_character", "plan_layers", "rig_deformer", "shot_bytes", "skin_trajectories",
+    "motion_at", "on_character", "plan_layers", "rig_deformer", "shot_bytes", "skin_trajectories", "stored_bytes",
     "trained_deformer", "verify", "with_model",
 ]  # fmt: skip

@@ -25,7 +25,7 @@ from .request import BakeRequest
 from .result import BakeResult
 from .rollout import BakeRollout
 from .shots import write_shot_stage
-from .skin import SkinMeter
+from .shown_skin import ShownSkinMeter
 from .task import BakeTask, has_possible_names, need_possible_names, plan_layers
 from .verification import verify_file
 from .write import result_of
@@ -265,7 +265,7 @@ def _write_layer(
 
     rollout = refined(rollout, report, add_shapes=True)
     hidden = covered_polygons(rollout, report) if task.request.hide_covered else None
-    skin = SkinMeter(rollout)
+    meter = ShownSkinMeter(rollout)
     common: dict[str, Any] = {
         "units": rollout.units,
         "start": rollout.start,
@@ -283,18 +283,18 @@ def _write_layer(
             asset,
             rollout.deformer,
             rollout.motion,
-            skin.poses(),
+            meter.poses(),
             **common,
             hidden=rollout.hidden,
             hidden_polygons=hidden,
-            provenance=shot_metadata(rollout, layout.animation, skin.stated),
+            provenance=shot_metadata(rollout, layout.animation, meter.stated),
             path=unverified,
             points=task.points,
         )
         verification = verify_file(rollout, unverified, report) if task.verify else None
         digests[layout.animation] = sha256(unverified)  # not later: another process may replace the file
     rollout.warn(report)
-    return result_of(skin, layout.animation, summary, verification, hidden), digests
+    return result_of(meter, layout.animation, summary, verification, hidden), digests
 
 
 def _outdated_shots(layout: Layout, current: Container[str]) -> Iterator[str]:

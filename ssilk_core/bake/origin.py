@@ -17,16 +17,16 @@ from .result import SHOT_SHAPES
 from .rollout import BakeRollout
 
 
-def shot_metadata(rollout: BakeRollout, output: Path, skin: Mapping[str, object]) -> dict[str, object]:
-    """Return what a shot says of its origin and quality; `recovered` and `skin` fill while the poses are written.
+def shot_metadata(rollout: BakeRollout, output: Path, shown_skin: Mapping[str, object]) -> dict[str, object]:
+    """Return what a shot says of its origin and quality; `recovered` and `shown_skin` fill while poses are written.
 
     Args:
-        skin: figures of the covered skin that shows.
+        shown_skin: figures of the covered skin that shows.
     """
     refined = {"refined": rollout.refinement.summary.to_metadata()} if rollout.refinement else {}
     request = rollout.request.relocated(lambda path: _from_folder(path, output.absolute().parent)).to_metadata()
     return {
-        **rollout.provenance, "request": request, "recovered": rollout.recovered, "shown_skin": skin, **refined
+        **rollout.provenance, "request": request, "recovered": rollout.recovered, "shown_skin": shown_skin, **refined
     }  # fmt: skip
 
 

@@ -4,12 +4,12 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ..assets import GarmentPose
+from ..assets import Deformer, GarmentPose, Motion
 from ..checkpoint import ModelFile, load_model
 from ..cost import ShotBytes
 from ..errors import fail
@@ -21,6 +21,11 @@ from .glb import write_glb_shot
 from .load import load_rollout, with_model
 from .request import BakeRequest
 from .rollout import BakeRollout
+
+if TYPE_CHECKING:
+    from ssilk_usd.units import StageUnits
+
+    from ..decomposition import Decomposition
 
 EXCERPT = 64  # frames that are written to estimate the bytes of a whole shot
 
@@ -88,26 +93,48 @@ def _at_quality(request: BakeRequest, quality: str | None, budget: str | None) -
 
 def shot_bytes(rollout: BakeRollout, suffix: str, *, include_body: bool) -> ShotBytes:
     """Estimate the bytes of a shot from two excerpts, one of more frames than the other."""
-    many = min(EXCERPT * rollout.request.samples_per_frame, rollout.motion.frame_count)
-    few = max(many // 4, 1)
-    first, second = (_excerpt_bytes(rollout, count, suffix, include_body) for count in (few, many))
-    frame = (second - first) / max(many - few, 1)
-    return ShotBytes(second - frame * many, frame)
+    excerpt = _Excerpt(
+        rollout.deformer, rollout.motion, rollout.units, rollout.request.samples_per_frame, suffix, include_body
+    )
+    return excerpt.extrapolated(rollout.network_poses)
 
 
-def _excerpt_bytes(rollout: BakeRollout, frames: int, suffix: str, include_body: bool) -> int:
-    from ssilk_usd.shot import write_shot
+def stored_bytes(rollout: BakeRollout, motion: Motion, shot: Decomposition) -> ShotBytes:
+    """Estimate the bytes of a .usdc shot of other poses and blendshapes, in a rollout's units, without the body."""
+    return _Excerpt(shot.deformer, motion, rollout.units, 1, ".usdc", False).extrapolated(lambda: iter(shot.poses))
 
-    motion, poses = rollout.motion.clip(0, frames), _first(rollout.network_poses(), frames)
-    samples = rollout.request.samples_per_frame
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"shot{suffix if suffix in ('.usda', GLB) else '.usdc'}"
-        common: dict[str, Any] = {"samples_per_frame": samples, "include_body": include_body}
-        if suffix == GLB:
-            write_glb_shot(path, rollout.deformer, motion, poses, start=0.0, **common)
-        else:
-            write_shot(path, rollout.deformer, motion, poses, units=rollout.units, **common)
-        return path.stat().st_size
+
+@dataclass(frozen=True, eq=False)
+class _Excerpt:
+    """The first frames of a shot, as they are written."""
+
+    deformer: Deformer
+    motion: Motion
+    units: StageUnits
+    samples_per_frame: int
+    suffix: str
+    include_body: bool
+
+    def extrapolated(self, poses: Callable[[], Iterator[GarmentPose]]) -> ShotBytes:
+        """Return the size of the whole."""
+        many = min(EXCERPT * self.samples_per_frame, self.motion.frame_count)
+        few = max(many // 4, 1)
+        first, second = (self._bytes(_first(poses(), count), count) for count in (few, many))
+        frame = (second - first) / max(many - few, 1)
+        return ShotBytes(second - frame * many, frame)
+
+    def _bytes(self, poses: Iterator[GarmentPose], frames: int) -> int:
+        from ssilk_usd.shot import write_shot
+
+        motion = self.motion.clip(0, frames)
+        common: dict[str, Any] = {"samples_per_frame": self.samples_per_frame, "include_body": self.include_body}
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / f"shot{self.suffix if self.suffix in ('.usda', GLB) else '.usdc'}"
+            if self.suffix == GLB:
+                write_glb_shot(path, self.deformer, motion, poses, start=0.0, **common)
+            else:
+                write_shot(path, self.deformer, motion, poses, units=self.units, **common)
+            return path.stat().st_size
 
 
 def _first(poses: Iterator[GarmentPose], frames: int) -> Iterator[GarmentPose]:

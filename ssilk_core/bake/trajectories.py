@@ -15,7 +15,7 @@ from ..assets import Deformer, Floats, Motion, Scene
 from ..errors import fail
 from ..events import Message, Reporter, silent
 from ..files import relative_path, replacing, sha256
-from ..kinematics import sample_motion
+from ..kinematics import held_at_cuts, sample_motion
 from ..targets import GLB
 from .character import on_character
 from .glb import warn_of_sets, write_glb_shot
@@ -53,7 +53,7 @@ def trained_deformer(model: str | os.PathLike[str], stage: str | os.PathLike[str
 
 
 def motion_at(motion: Motion, cache: MeshTrajectories, where: str) -> Motion:
-    """Return the character's motion at the frames of a cache.
+    """Return the character's motion at the frames of a cache; nothing is interpolated across a cut.
 
     Raises:
         SsilkError: the motion does not last from the first to the last of them.
@@ -70,6 +70,7 @@ def motion_at(motion: Motion, cache: MeshTrajectories, where: str) -> Motion:
         )
     near = np.round(position)
     position = np.where(np.abs(position - near) < SLACK, near, position).clip(0, motion.frame_count - 1)
+    position = held_at_cuts(motion, position)
     return Motion(motion.path, cache.fps, *sample_motion(motion, position), start=float(seconds[0]) * cache.fps)
 
 

@@ -17,8 +17,8 @@ from .origin import shot_metadata
 from .refinement import refined
 from .request import BakeRequest, need_body
 from .result import BakeResult, Verification
+from .shown_skin import ShownSkinMeter
 from .sizing import load_sized
-from .skin import SkinMeter
 from .verification import verify_file
 
 if TYPE_CHECKING:
@@ -62,23 +62,23 @@ def bake(
     if path.suffix == GLB:
         warn_of_sets(rollout.deformer, path, report)
     hidden = covered_polygons(rollout, report) if request.hide_covered else None
-    skin = SkinMeter(rollout)
-    summary, verification = _write_verified(skin, path, include_body, hidden, verify, report)
-    result = result_of(skin, path, summary, verification, hidden)
+    meter = ShownSkinMeter(rollout)
+    summary, verification = _write_verified(meter, path, include_body, hidden, verify, report)
+    result = result_of(meter, path, summary, verification, hidden)
     rollout.warn(report)
     report(Result("bake", result.figures()))
     return result
 
 
 def result_of(
-    skin: SkinMeter,
+    meter: ShownSkinMeter,
     path: Path,
     summary: ShotSummary,
     verification: Verification | None,
     hidden: HiddenPolygons | None,
 ) -> BakeResult:
     """Return the result of a rollout that was written."""
-    rollout = skin.rollout
+    rollout = meter.rollout
     return BakeResult(
         path=path,
         frames=summary.frame_count,
@@ -92,7 +92,7 @@ def result_of(
         refinement=rollout.refinement.summary if rollout.refinement else None,
         hidden_faces=None if hidden is None else sum(int(mask.sum()) for mask in hidden.masks),
         recovered=tuple(rollout.recovered),
-        shown_skin=skin.shown(),
+        shown_skin=meter.shown(),
     )
 
 
@@ -110,7 +110,7 @@ def _check_output(request: BakeRequest, path: Path) -> None:
 
 
 def _write_verified(
-    skin: SkinMeter,
+    meter: ShownSkinMeter,
     output: Path,
     include_body: bool,
     hidden: HiddenPolygons | None,
@@ -122,34 +122,34 @@ def _write_verified(
 
     with replacing(output) as unverified:
         with packaged(unverified) as layer:
-            summary = _write(layer, skin, output, include_body, hidden)
+            summary = _write(layer, meter, output, include_body, hidden)
         if not verify:
             report(Message("not verified, as asked", "warning"))
-        return summary, verify_file(skin.rollout, unverified, report) if verify else None
+        return summary, verify_file(meter.rollout, unverified, report) if verify else None
 
 
 def _write(
-    layer: Path, skin: SkinMeter, output: Path, include_body: bool, hidden: HiddenPolygons | None
+    layer: Path, meter: ShownSkinMeter, output: Path, include_body: bool, hidden: HiddenPolygons | None
 ) -> ShotSummary:
     """Write a shot of joints and blendshapes, or of refined points."""
     from ssilk_usd.points import point_cache
     from ssilk_usd.shot import write_shot
 
-    rollout = skin.rollout
+    rollout = meter.rollout
     common: dict[str, Any] = {
         "start": rollout.start,
         "samples_per_frame": rollout.request.samples_per_frame,
         "include_body": include_body,
         "hidden": rollout.hidden,
         "hidden_polygons": hidden,
-        "provenance": shot_metadata(rollout, output, skin.stated),
+        "provenance": shot_metadata(rollout, output, meter.stated),
     }
     if output.suffix == GLB:
-        return write_glb_shot(layer, rollout.deformer, rollout.motion, skin.poses(), **common)
+        return write_glb_shot(layer, rollout.deformer, rollout.motion, meter.poses(), **common)
     common |= {"units": rollout.units, "record": rollout.record}
     if not rollout.request.writes_points:
-        return write_shot(layer, rollout.deformer, rollout.motion, skin.poses(), **common)
-    skin.add_points()
+        return write_shot(layer, rollout.deformer, rollout.motion, meter.poses(), **common)
+    meter.add_points()
     with point_cache(layer, rollout.deformer.scene, rollout.motion, **common) as cache:
         for frame, points in enumerate(rollout.points()):
             cache.write(frame, points)

@@ -13,8 +13,8 @@ from ..bake import BakeRequest, naming
 from ..bake.request import MAX_HANDLES, MAX_PRE_ROLL, MAX_REFINE, MAX_SAMPLES_PER_FRAME, REFINED_OUTPUTS
 from ..config import apply_overrides
 from ..errors import fail
-from ..events import Reporter
-from ..fabrics import FABRICS, Fabric, fabric_named
+from ..events import Message, Reporter
+from ..fabrics import FABRICS, Fabric, fabric_named, fabric_of_surface, surface_message
 from ..files import need_not_input, need_writable
 from ..kinematics import MAX_FPS, MIN_FPS
 from ..quality import QUALITIES
@@ -54,8 +54,8 @@ def add_fabric(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--fabric",
         choices=FABRICS,
-        default="default",
-        help="material (default: default); 'paper' has the paper's contact",
+        help="material (default: that of the garment's physics material, or 'default'); 'paper' has the paper's "
+        "contact",
     )
     verb.add_argument(
         "--material",
@@ -66,9 +66,24 @@ def add_fabric(verb: argparse.ArgumentParser) -> None:
     )
 
 
-def fabric(options: argparse.Namespace) -> Fabric:
-    """Return the fabric that the options ask for; raise `SsilkError` for an unknown property or a bad value."""
-    return apply_overrides(fabric_named(options.fabric), options.material)
+def asked_fabric(options: argparse.Namespace) -> Fabric:
+    """Return the fabric that the options alone ask for; raise `SsilkError` for an unknown property or a bad value."""
+    return apply_overrides(fabric_named(options.fabric or "default"), options.material)
+
+
+def fabric(options: argparse.Namespace, garment: Garment, report: Reporter) -> Fabric:
+    """Return the fabric of a garment: what the options name, else its stage's, else the default.
+
+    Properties that the options set go before those of its stage.
+
+    Raises:
+        SsilkError: an unknown property, or a bad value.
+    """
+    if options.fabric or garment.surface is None:
+        return asked_fabric(options)
+    stated = fabric_of_surface(garment.surface)
+    report(Message(f"{garment.surface.path}: {surface_message(garment.surface, stated)}"))
+    return apply_overrides(stated, options.material)
 
 
 @dataclass(frozen=True)

@@ -87,8 +87,9 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     for output in outputs:
         shared.check_output(output, options.stage, *motion_files(options.motion))
     device = select_device(options.device)
+    shared.asked_fabric(options)
     scene = shared.load_scene(options, report)
-    fabric = shared.fabric(options)
+    fabric = shared.fabric(options, scene.garment, report)
     settings = SimulationOptions(
         fps=options.fps,
         batch=options.batch,
@@ -98,7 +99,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     )
     motions = [read_motion(str(path), scene.character.skeleton) for path in options.motion]
     shots = [
-        _Shot(output, motion, _provenance(options, path))
+        _Shot(output, motion, _provenance(options, path, fabric))
         for output, motion, path in zip(outputs, motions, options.motion)
     ]
     missing = [shot for shot in shots if outputs == [options.output] or not shot.is_done]
@@ -289,12 +290,12 @@ class _Caches:
         return own, cache
 
 
-def _provenance(options: argparse.Namespace, motion: Path) -> dict[str, str | float]:
+def _provenance(options: argparse.Namespace, motion: Path, fabric: Fabric) -> dict[str, str | float]:
     """Return everything that decides what a shot's file holds."""
     from ..bake.inputs import stage_contents
 
     garment, _ = shared.wardrobe(options)
-    names = ("fabric", "fps", "tolerance", "iterations", "points", "no_body")
+    names = ("fps", "tolerance", "iterations", "points", "no_body")
     lists = ("material", "body")
     return {
         "stage": str(options.stage),
@@ -303,6 +304,7 @@ def _provenance(options: argparse.Namespace, motion: Path) -> dict[str, str | fl
         "root": options.root or "",
         "contents": " ".join(stage_contents(str(path)).digest for path in (options.stage, garment, motion)),
         "sequence": options.sequence or 0,
+        "fabric": fabric.name,
         **{name: getattr(options, name) for name in names},
         **{name: ", ".join(getattr(options, name)) for name in lists},
     }  # fmt: skip

@@ -26,8 +26,9 @@ if TYPE_CHECKING:
     from ..assets import Motion
     from ..bake import BakeRollout
     from ..checkpoint import ModelFile
+    from ..cost import ShotBytes
     from ..evaluation.methods import EvaluationScene
-    from ..trade.measure import VariantMeter, Weigh
+    from ..trade.measure import StoredTake, VariantMeter, Weigh
 
 CLIPS = 2  # are measured on where --clips names none
 
@@ -154,7 +155,7 @@ class Bench:
 
     def _weigh(self, path: Path) -> Weigh:
         """Return a function that gives the size of a model's shots of the first clip, without the body."""
-        from ..bake import BakeRequest, load_rollout, shot_bytes, with_model
+        from ..bake import BakeRequest, load_rollout, shot_bytes, stored_bytes, with_model
 
         motion, stage = str(next(iter(self.paths.values()))), str(self.options.stage)
 
@@ -164,7 +165,12 @@ class Bench:
                 BakeRequest(model=str(path), stage=stage, motion=motion, range="all", fps=fps, root=self.options.root)
             )
 
-        return lambda file, fps: shot_bytes(with_model(rollout(fps), file), ".usdc", include_body=False)
+        def weigh(file: ModelFile, fps: float, stored: StoredTake | None) -> ShotBytes:
+            if stored is not None:
+                return stored_bytes(rollout(fps), stored.motion, stored.shot)
+            return shot_bytes(with_model(rollout(fps), file), ".usdc", include_body=False)
+
+        return weigh
 
     def _motions(self, file: ModelFile) -> tuple[dict[str, Path], list[Motion]]:
         """Return the files of the clips to measure on, and the motions to reduce models for: the others, if any."""

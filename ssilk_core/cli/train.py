@@ -15,7 +15,6 @@ from pathlib import Path
 from ..config import PRESETS, ModelConfig, TrainConfig, apply_overrides, preset_named
 from ..errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_WORSE, fail
 from ..events import Message, Reporter, Result, silent
-from ..fabrics import Fabric
 from ..wardrobe.training import WORSE_FIGURE
 from . import options as shared
 
@@ -106,8 +105,9 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
     from ..files import sha256
     from ..training.job import TrainJob, split_motions
 
-    model, train, fabric = configured(options)
+    model, train = configured(options)
     scene = shared.load_scene(options, report)
+    fabric = shared.fabric(options, scene.garment, report)
     motions = read_motions(options.motions, scene.character.skeleton)
     held = read_motions(options.valid, scene.character.skeleton)
     if not held:
@@ -129,15 +129,15 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
     )
 
 
-def configured(options: argparse.Namespace) -> tuple[ModelConfig, TrainConfig, Fabric]:
-    """Return the network, the schedule and the fabric that the options ask for.
+def configured(options: argparse.Namespace) -> tuple[ModelConfig, TrainConfig]:
+    """Return the network and the schedule that the options ask for; check what they ask of the fabric, too.
 
     Raises:
         SsilkError: a setting that does not exist, or a value that it cannot have.
     """
     preset = preset_named(options.preset)
-    model, train = _settings(options.settings, preset.model, preset.train)
-    return model, train, shared.fabric(options)
+    shared.asked_fabric(options)
+    return _settings(options.settings, preset.model, preset.train)
 
 
 def _settings(settings: list[str], model: ModelConfig, train: TrainConfig) -> tuple[ModelConfig, TrainConfig]:

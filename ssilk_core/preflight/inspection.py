@@ -12,6 +12,7 @@ import numpy as np
 from ..assets import Character, Garment, Motion, ProxyRig, Scene
 from ..config import Preset
 from ..errors import SsilkError
+from ..fabrics import fabric_of_surface, surface_message
 from ..setup.prepare import prepare_scene
 from . import attachment, cost, fit, motion, pose, units, winding
 from . import mesh as meshes
@@ -85,6 +86,9 @@ def _on_mesh(inputs: PreflightInput) -> Findings:
     yield from meshes.non_manifold_edges(mesh)
     yield from meshes.degenerate_faces(mesh, int((corners == np.roll(corners, 1, axis=1)).any(axis=1).sum()))
     yield from winding.inconsistent_winding(mesh)
+    if surface := inputs.garment.surface:
+        told = surface_message(surface, fabric_of_surface(surface))
+        yield Finding(severity="info", code="fabric", prim=surface.path, found=told)
 
 
 def _on_fit(inputs: PreflightInput) -> Findings:

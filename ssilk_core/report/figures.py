@@ -108,9 +108,9 @@ def learning(document: Mapping[str, Any]) -> Section:
     times = [point["seconds"] for point in points]
     totals, inside = ([point["validation"][name] for point in points] for name in ("total", "collisions"))
     shown = {"total at validation": ("J", totals), SHARE: ("%", [100 * share for share in inside])}
-    skin = [point["validation"].get("shown_skin") for point in points]
-    if all(skin):
-        shown[SHOWN] = ("%", [100 * found["mean"] for found in skin])
+    found = [point["validation"].get("shown_skin") for point in points]
+    if all(found):
+        shown[SHOWN] = ("%", [100 * each["mean"] for each in found])
     rows = [
         [ChartPanel(title=title, x="training time [s]", y=unit, curves={"": (times, values)},
                     marks={"best": (times[best], values[best])})]
@@ -120,6 +120,6 @@ def learning(document: Mapping[str, Any]) -> Section:
         f"Best: {totals[best]:.4g} J at {times[best]:.0f} s. "
         f"Linear blend skinning: {lbs['total']:.4g} J, {lbs['collisions']:.2%} inside the body."
     )
-    if skin[best]:
-        words += f" At the best, {ShownSkin(**skin[best])}."
+    if found[best]:
+        words += f" At the best, {ShownSkin(**found[best])}."
     return Section("Training", svg_chart("validations during training", rows) + f'<p class="note">{words}</p>')

@@ -93,14 +93,14 @@ def _sections(player: ShotPlayer, garment: ShotGarment, meter: TermsMeter) -> li
     rows = [[f"{name} [{UNITS[name]}]", *_spread(values[name])] for name in shown]
     name = player.meshes[garment.index].name
 
-    def skin(frame: int) -> str:
+    def shown_skin(frame: int) -> str:
         return f", {values[SHOWN][frame]:.2f} % of the covered skin shows" if SHOWN in shown else ""
 
     pictures = "".join(
         figure(
             picture(player, frame),
             f"{letter}: frame {player.frame_times[frame]:g}, at {times[frame]:.2f} s, "
-            f"{bad[frame]:.4g} J without gravity{skin(frame)}",
+            f"{bad[frame]:.4g} J without gravity{shown_skin(frame)}",
             times[frame],
         )
         for frame, letter in marks.items()

@@ -55,7 +55,7 @@ class TermsMeter:
         self.energy = GarmentEnergy(self.garment, self.fabric)
         self.columns = deformation_gradient_operator(self.garment, self.energy.mass.device, self.energy.mass.dtype)
         self.finite: list[bool] = []
-        self.skin: list[ShownCounts] = []
+        self.counts: list[ShownCounts] = []
         self.past: deque = deque(maxlen=2)
         import torch
 
@@ -93,7 +93,7 @@ class TermsMeter:
 
     def shown_skin(self, name: str) -> ShownSkin | None:
         """Return the share of the covered skin that shows in the shot `name`; None where nothing is covered."""
-        return shown_skin([(name, ShownCounts.joined(self.skin))]) if self.covered else None
+        return shown_skin([(name, ShownCounts.joined(self.counts))]) if self.covered else None
 
     def _height(self, points: Floats, body: Floats | None) -> float:
         """Return the garment's weight times its height above the middle of the body, or above y = 0 [J]."""
@@ -120,8 +120,8 @@ class TermsMeter:
         if self.covered:
             vertices = self.covered.vertices
             states = self.covered.states(x, at[vertices], towards[vertices])
-            self.skin.append(ShownCounts.of(states, [time]))
-            found |= {SHOWN: 100 * float(self.skin[-1].shares), BARE: 100 * float(self.skin[-1].bare)}
+            self.counts.append(ShownCounts.of(states, [time]))
+            found |= {SHOWN: 100 * float(self.counts[-1].shares), BARE: 100 * float(self.counts[-1].bare)}
         return found
 
 

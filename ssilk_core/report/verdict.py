@@ -19,13 +19,13 @@ INSIDE = 10.0  # share of the vertices inside the body in one frame [%]
 
 
 def verdict(
-    name: str, values: Mapping[str, Floats], skin: ShownSkin | None, frame_times: Sequence[float], fps: float
+    name: str, values: Mapping[str, Floats], shown_skin: ShownSkin | None, frame_times: Sequence[float], fps: float
 ) -> Section:
     """Return the section of a garment.
 
     Args:
         values: of each frame, by the names of `terms.UNITS`.
-        skin: None where the garment covers nothing.
+        shown_skin: None where the garment covers nothing.
     """
 
     def when(frame: int) -> str:
@@ -36,11 +36,11 @@ def verdict(
     if len(lost):
         faults.append("it is lost")
         words.append(f"It is not finite in {len(lost)} of {len(frame_times)} frames, first {when(int(lost[0]))}.")
-    if skin:
+    if shown_skin:
         shown, worst = values[SHOWN], int(np.nanargmax(values[SHOWN]))
         if shown.mean() > SHOWN_MEAN or shown[worst] > SHOWN_WORST:
             faults.append("skin shows through")
-        where = f", most at {skin.where}" if skin.where else ""
+        where = f", most at {shown_skin.where}" if shown_skin.where else ""
         share = f"{shown.mean():.3f} % of the covered skin shows on average"
         seen = f"{share}, and {shown[worst]:.2f} % {when(worst)}{where}."
         words.append(seen if shown[worst] else "No covered skin shows.")

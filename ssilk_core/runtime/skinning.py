@@ -72,10 +72,14 @@ def tiles(scene: Scene, parameters: Parameters) -> list[Tile]:
     shapes[-1] = scene.garment.mesh.points.T
     if "decoder.offset" in parameters:
         shapes[-1][:, free] += parameters["decoder.offset"].T
-    indices, weights = scene.rig.skin.indices, trained_weights(scene, parameters)
+    return tiles_of(shapes, scene.rig.skin.indices, trained_weights(scene, parameters))
+
+
+def tiles_of(shapes: NDArray, indices: NDArray, weights: NDArray) -> list[Tile]:
+    """Return tiles of blendshapes, then the rest shape [m], (K + 1, 3, V), and of influences, (V, I) each."""
     return [
         _tile(slice(start, start + TILE), shapes, indices[start : start + TILE], weights[start : start + TILE])
-        for start in range(0, count, TILE)
+        for start in range(0, len(indices), TILE)
     ]
 
 

@@ -72,13 +72,13 @@ def bind_to_skin(
         weights: initial weights, shape (V, J). The largest of each row, up to `influences`, are the candidates.
     """
     body = character.merged_body()
-    skin = closest_on_surface(points, body.mesh)
+    under = closest_on_surface(points, body.mesh)
     candidates = np.argsort(-weights, axis=1, kind="stable")[:, :influences]
     start = np.take_along_axis(weights, candidates, axis=1)
     poses = sample_poses(character.skeleton, POSES)
     matrices = skinning_matrices(poses, character.skeleton.bind_transforms)
-    gap = np.einsum("vc,vc->v", points - _on_skin(body.mesh.points, skin), skin.normals)
-    offsets = _offsets(body, points, skin, gap, candidates, matrices)
+    gap = np.einsum("vc,vc->v", points - _on_skin(body.mesh.points, under), under.normals)
+    offsets = _offsets(body, points, under, gap, candidates, matrices)
     importance = areas / (1 + (gap / FAR) ** 2)
     couplings = SMOOTHING * laplacian(points, areas, pairs)
     fitted = _fit(start, candidates, offsets, np.maximum(gap - CLEARANCE, 0), importance, couplings)
@@ -110,26 +110,26 @@ def to_simplex(values: Floats) -> Floats:
     return np.maximum(values - np.take_along_axis(excess, last[:, None], axis=1), 0)
 
 
-def _on_skin(values: Floats, skin: SurfacePoints) -> Floats:
+def _on_skin(values: Floats, under: SurfacePoints) -> Floats:
     """Interpolate values (B, C) of the body's vertices, shape (V, C)."""
-    return np.einsum("vk,vkc->vc", skin.barycentric, values[skin.corners])
+    return np.einsum("vk,vkc->vc", under.barycentric, values[under.corners])
 
 
 def _offsets(
-    body: Body, points: Floats, skin: SurfacePoints, gap: Floats, candidates: Ints, matrices: Floats
+    body: Body, points: Floats, under: SurfacePoints, gap: Floats, candidates: Ints, matrices: Floats
 ) -> _Offsets:
     """Return the offsets from the targets under skinning matrices (N, J, 4, 4); `gap` (V,) is along the normal."""
     vertices, count = candidates.shape
     square = np.zeros((vertices, count, count))
     along = np.empty((vertices, count, len(matrices)), np.float32)
-    own = _on_skin(body.skin.dense(matrices.shape[1]), skin)
-    aside = points - _on_skin(body.mesh.points, skin) - gap[:, None] * skin.normals
+    own = _on_skin(body.skin.dense(matrices.shape[1]), under)
+    aside = points - _on_skin(body.mesh.points, under) - gap[:, None] * under.normals
     for number, pose in enumerate(matrices):
         posed = skin_points(body.mesh.points, body.skin, pose[None])[0]
-        normals = _on_skin(vertex_normals(posed, body.mesh.faces), skin)
+        normals = _on_skin(vertex_normals(posed, body.mesh.faces), under)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
         turned = np.einsum("vj,jab,vb->va", own, pose[:, :3, :3], aside, optimize=True)
-        target = _on_skin(posed, skin) + gap[:, None] * normals + turned
+        target = _on_skin(posed, under) + gap[:, None] * normals + turned
         moved = (pose[candidates, :3, :3] @ points[:, None, :, None])[..., 0] + pose[candidates, :3, 3]
         away = moved - target[:, None]
         square += away @ away.transpose(0, 2, 1)

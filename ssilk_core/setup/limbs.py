@@ -61,9 +61,9 @@ class LimbRays:
         normals, merged = body.normals, character.merged_body()
         weights = merged.skin.dense(character.skeleton.joint_count)
         own = np.einsum("vk,vkj->vj", body.barycentric, weights[body.corners])
-        cloth, skin = igl.AABB(), igl.AABB()
+        cloth, solid = igl.AABB(), igl.AABB()
         cloth.init(mesh.points, mesh.faces)
-        skin.init(merged.mesh.points, merged.mesh.faces)
+        solid.init(merged.mesh.points, merged.mesh.faces)
 
         def behind(origins: Floats, rays: Floats) -> Ints:
             """Return the triangle of the cloth that each ray meets, -1 where it meets none, shape (V,)."""
@@ -79,7 +79,7 @@ class LimbRays:
             face = behind(under, rays)
             far = np.flatnonzero((face >= 0) & _strange(own, own[mesh.faces[face]].mean(axis=1)))
             if len(far):
-                count[far] += _parting(mesh, own, merged, weights, (cloth, skin), under[far], rays[far], own[far])
+                count[far] += _parting(mesh, own, merged, weights, (cloth, solid), under[far], rays[far], own[far])
         shares = smooth((count > 0)[:, None].astype(float), edges(mesh.faces), ROUNDS)[:, 0]
         return cls(np.array(corners), shares > MOSTLY)
 

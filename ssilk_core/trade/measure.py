@@ -5,14 +5,25 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 
 from ..assets import Motion
 from ..checkpoint import ModelFile, network
-from ..cost import POINT_BYTES, ShotBytes, Time, memory, model_bytes, operations, play_time
+from ..cost import (
+    POINT_BYTES,
+    ShotBytes,
+    memory,
+    model_bytes,
+    operations,
+    play_time,
+    stored_memory,
+    stored_operations,
+    stored_time,
+)
+from ..decomposition import Decomposition
 from ..evaluation.methods import EvaluationScene, Method, TakeSet
 from ..evaluation.record import recorded
 from ..evaluation.tally import Tally
@@ -27,8 +38,16 @@ from .variants import Variant
 HALF_PRECISIONS = ("float16", "bfloat16")  # two bytes on disk for each parameter
 
 
-Weigh = Callable[[ModelFile, float], ShotBytes]
-"""Returns the size of a model's shots at a frame rate."""
+Weigh = Callable[[ModelFile, float, "StoredTake | None"], ShotBytes]
+"""Returns the size of a model's shots at a frame rate, or of a take that is stored otherwise."""
+
+
+@dataclass(frozen=True, eq=False)
+class StoredTake:
+    """A refined take as a bake stores it: joints, and blendshapes of its own."""
+
+    motion: Motion
+    shot: Decomposition
 
 
 class VariantMeter:
@@ -60,8 +79,7 @@ class VariantMeter:
         cut = self._cut(variant.size)
         player = Player(variant.in_precision(cut))
         method = ShotMethod(variant.name, player, self.dressed, self.take_set, fps=variant.fps, refine=variant.refine)
-        tally, timed = self._tally(method, self.whole), self._time(variant, method)
-        shot = self._shot(variant, cut)
+        tally = self._tally(method, self.whole)
         total = float(tally.totals().mean())
         return TradePoint(
             model=self.name,
@@ -71,13 +89,10 @@ class VariantMeter:
             precision=variant.precision,
             fps=variant.fps,
             refine=variant.refine,
-            milliseconds=timed.median,
-            high=timed.high,
+            refining=float(np.median(method.refining)) if variant.refine else None,
             torch=None if variant.refine else self._torch(variant.size),
-            operations=sum(operations(cut).values()),
-            memory=memory(player),
             model_bytes=_bytes(cut, variant.precision),
-            shot_bytes=shot.of(round(SECONDS * variant.fps)),
+            **vars(self._played(variant, method, cut)),
             total=total,
             excess=total - float(self.base),
             collisions=tally.mean("collisions"),
@@ -96,10 +111,25 @@ class VariantMeter:
         records = {take: recorded(self.dressed, self.take_set, method, take, truth) for take in takes}
         return Tally(records, {take: self.take_set.takes[take].clip for take in takes})
 
-    def _time(self, variant: Variant, method: ShotMethod) -> Time:
-        if variant.refine:
-            return Time.of(method.milliseconds)
-        return play_time(method.player, resample(self.motion, variant.fps))
+    def _played(self, variant: Variant, method: ShotMethod, cut: ModelFile) -> _Played:
+        """Measure what playing and storing the shot of a variant costs.
+
+        A refined shot has as many blendshapes as its first take needs.
+        """
+        frames = round(SECONDS * variant.fps)
+        shot = method.shots.get(0)
+        if shot is not None:
+            timed = stored_time(shot.deformer, self.motion, shot.poses)
+            used, size = stored_operations(shot.deformer), self.weigh(cut, variant.fps, StoredTake(self.motion, shot))
+            return _Played(
+                timed.median, timed.high, sum(used.values()), stored_memory(shot.deformer), size.of(frames)
+            )
+        timed, size = play_time(method.player, resample(self.motion, variant.fps)), self.weigh(cut, variant.fps, None)
+        if variant.refine:  # points, beside joints of the body
+            size = replace(size, frame=size.frame + POINT_BYTES * self.dressed.scene.garment.mesh.vertex_count)
+        return _Played(
+            timed.median, timed.high, sum(operations(cut).values()), memory(method.player), size.of(frames)
+        )
 
     def _torch_time(self, size: ModelSize) -> float:
         """Return the time of a frame in PyTorch [ms], measured in the second of two passes over a clip."""
@@ -110,11 +140,16 @@ class VariantMeter:
                 decode(model, self.motion, pose)
         return 1000 * (time.perf_counter() - begun) / self.motion.frame_count
 
-    def _shot(self, variant: Variant, cut: ModelFile) -> ShotBytes:
-        shot = self.weigh(cut, variant.fps)
-        if not variant.refine:
-            return shot
-        return replace(shot, frame=shot.frame + POINT_BYTES * self.dressed.scene.garment.mesh.vertex_count)
+
+@dataclass(frozen=True)
+class _Played:
+    """Costs of a shot, as `TradePoint` has them."""
+
+    milliseconds: float
+    high: float
+    operations: int
+    memory: int
+    shot_bytes: float
 
 
 def _bytes(file: ModelFile, precision: str) -> int:

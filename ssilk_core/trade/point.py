@@ -20,7 +20,10 @@ class TradePoint:
     Attributes:
         model, swept, variant: names of the model, of the sweep, and of the variant.
         shapes, joints, influences, precision, fps, refine: as in `variants.Variant`.
-        milliseconds, high: median and 95 % quantile of the time per frame in the numpy runtime on the CPU [ms].
+        milliseconds, high: median and 95 % quantile of the time to play a frame in the numpy runtime on the CPU [ms].
+            Refined variants are played as the joints and blendshapes that a bake stores.
+        refining: time of the solver for a frame [ms], which a bake takes once; None without it, or where an earlier
+            version told it as `milliseconds`.
         torch: time per frame of network and decoder in PyTorch on the device [ms]; None if not measured.
         operations: multiply-adds per frame.
         memory: memory used by playback [bytes].
@@ -56,6 +59,7 @@ class TradePoint:
     position: float
     velocity: float
     shown_skin: ShownSkin | None = None
+    refining: float | None = None
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> TradePoint:
@@ -66,7 +70,7 @@ class TradePoint:
         """
         values = {item.name: document[item.name] for item in fields(cls) if item.default is MISSING}
         shown = document.get("shown_skin")
-        return cls(**values, shown_skin=ShownSkin(**shown) if shown else None)
+        return cls(**values, shown_skin=ShownSkin(**shown) if shown else None, refining=document.get("refining"))
 
     @property
     def mean_shown_skin(self) -> float:

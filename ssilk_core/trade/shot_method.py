@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -12,8 +13,10 @@ import torch
 from torch import Tensor
 
 from ..assets import Floats, GarmentPose, Motion
+from ..decomposition import Decomposition, decompose
+from ..errors import SsilkError
 from ..evaluation.methods import EvaluationScene, TakeSet
-from ..kinematics import resample, sample_motion
+from ..kinematics import deform, resample, sample_motion
 from ..refine import RefineOptions, Refiner
 from ..runtime import Player
 from ..runtime.character import character_matrices
@@ -28,7 +31,12 @@ class ShotMethod:
 
     Args:
         fps: frame rate of the shot [1/s]. Poses of garment and character are interpolated between frames, as in USD.
-        refine: solver iterations per frame; 0 for no refinement.
+        refine: solver iterations per frame; 0 for no refinement. Refined frames are played as a bake stores them:
+            as joints and blendshapes of the shot's own, or as points where these cannot reach them.
+
+    Attributes:
+        refining: time of the solver for a frame [ms], for each take that was computed.
+        shots: refined takes as joints and blendshapes.
     """
 
     def __init__(
@@ -36,7 +44,8 @@ class ShotMethod:
     ) -> None:
         self.name, self.player, self.dressed, self.take_set, self.fps = name, player, dressed, take_set, fps
         self.options = RefineOptions(iterations=refine) if refine else None
-        self.milliseconds: list[float] = []  # of a frame, for each take that was computed
+        self.refining: list[float] = []
+        self.shots: dict[int, Decomposition] = {}
         self._points = lru_cache(1)(self._take)
 
     def vertices(self, take: int, frames: range) -> Tensor:
@@ -49,18 +58,31 @@ class ShotMethod:
 
     def _take(self, take: int) -> Floats:
         """Return all frames of a take, shape (N, V, 3)."""
-        motion, begun = self.take_set.takes[take].motion, time.perf_counter()
-        points = self._finished(motion)
-        self.milliseconds.append(1000 * (time.perf_counter() - begun) / len(points))
+        motion = self.take_set.takes[take].motion
+        points = self.unrefined(motion)
+        if self.options is not None:
+            points = self._stored(take, self._refined(motion, points))
         return points - motion.translations[0, 0]
 
-    def _finished(self, motion: Motion) -> Floats:
-        """Return the vertices at the frames of a motion, with refinement if enabled [m], shape (N, V, 3)."""
-        points, dressed = self.unrefined(motion), self.dressed
-        if self.options is None:
-            return points
+    def _refined(self, motion: Motion, points: Floats) -> Floats:
+        """Return refined vertices at the frames of a motion [m], shape (N, V, 3)."""
+        assert self.options is not None
+        dressed, begun = self.dressed, time.perf_counter()
         refiner = Refiner(dressed.scene, dressed.fabric, self.options, fps=motion.fps, device=dressed.device)
-        return np.stack([frame.points for frame in refiner.frames(motion, points)])
+        found = np.stack([frame.points for frame in refiner.frames(motion, points)])
+        self.refining.append(1000 * (time.perf_counter() - begun) / len(found))
+        return found
+
+    def _stored(self, take: int, points: Floats) -> Floats:
+        """Return vertices as a bake's joints and blendshapes have them [m], shape (N, V, 3)."""
+        motion, whole = self.take_set.takes[take].motion, self.player.deformer()
+        own = replace(whole, shapes=whole.shapes[:0])
+        poses = list(self.player.play(motion).poses())
+        try:
+            self.shots[take] = shot = decompose(own, motion, list(points), poses, device=self.dressed.device)
+        except SsilkError:  # a bake writes them as points
+            return points
+        return np.concatenate([deform(shot.deformer, motion, pose) for pose in shot.poses])
 
     def unrefined(self, motion: Motion) -> Floats:
         """Return the vertices at the frames of a motion before refinement [m], shape (N, V, 3)."""

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from ssilk_core.checkpoint import model_file
-from ssilk_core.cost import ShotBytes, model_bytes
+from ssilk_core.cost import ShotBytes, model_bytes, operations, stored_memory, stored_operations
 from ssilk_core.energy import TERMS
 from ssilk_core.errors import SsilkError
 from ssilk_core.evaluation.methods import EvaluationScene, Network, build_take_set
@@ -21,6 +21,7 @@ from ssilk_core.fabrics import FABRICS
 from ssilk_core.kinematics import deform, resample, sample_motion
 from ssilk_core.reduction import ModelSize, Reducer
 from ssilk_core.runtime import Player
+from ssilk_core.runtime.stored import StoredPlayer
 from ssilk_core.sampling import sample_pose
 from ssilk_core.trade.collision_cost import measure_collisions
 from ssilk_core.trade.measure import VariantMeter
@@ -54,7 +55,11 @@ def bench(scene, model, toy_motion):
 
 @pytest.fixture(scope="module")
 def meter(bench):
-    return VariantMeter("toy", *bench, lambda file, fps: ShotBytes(1000.0 * file.config.shapes, 60.0))
+    def weigh(file, fps, stored):
+        shapes = file.config.shapes if stored is None else stored.shot.deformer.shape_count
+        return ShotBytes(1000.0 * shapes, 60.0)
+
+    return VariantMeter("toy", *bench, weigh)
 
 
 def chosen(meter: VariantMeter, name: str):
@@ -138,9 +143,49 @@ def test_what_costs_less_is_seen_to_cost_less(points):
     assert points["int16"].model_bytes < whole.model_bytes and points["float16"].model_bytes < whole.model_bytes
     assert 0 < points["int16"].position < points["float16"].position < 1e-3
     assert points["15 frames/s"].shot_bytes == 6000 + 150 * 60
-    assert points["1 iterations"].shot_bytes == 6000 + 300 * (60 + 12 * 60)
-    assert points["1 iterations"].total < whole.total
-    assert points["1 iterations"].milliseconds > whole.milliseconds and points["1 iterations"].torch is None
+
+
+def test_refined_variants_are_counted_as_what_a_bake_stores(meter, bench, points):
+    whole, found = points["as trained"], points["1 iterations"]
+    assert found.total < whole.total and found.torch is None
+    assert whole.refining is None and found.refining > 0
+    method = ShotMethod("refined", meter.reducer.player, *bench[1:], fps=FPS, refine=1)
+    stored = method.vertices(0, range(50))
+    shot = method.shots[0]
+    assert shot.deformer.shape_count == shot.own_shapes
+    assert found.shot_bytes == 1000 * shot.own_shapes + 300 * 60
+    shapes, skinning = stored_operations(shot.deformer).values()
+    assert found.operations == shapes + skinning and skinning == operations(bench[0].file)["skinning"]
+    assert shapes == 3 * shot.own_shapes * shot.deformer.scene.garment.mesh.vertex_count
+    assert found.memory == stored_memory(shot.deformer)
+    # What is measured is what is stored, and it is played by numpy as by the reference.
+    motion, player = method.take_set.takes[0].motion, StoredPlayer(shot.deformer)
+    for pose in shot.poses:
+        np.testing.assert_allclose(player.vertices(motion, pose), deform(shot.deformer, motion, pose), atol=1e-5)
+    first = deform(shot.deformer, motion, shot.poses[0])[0] - motion.translations[0, 0]
+    np.testing.assert_allclose(stored[..., 0].numpy(), first, atol=1e-5)
+
+
+def test_points_that_joints_cannot_reach_are_counted_as_points(meter, bench, monkeypatch):
+    def out_of_reach(*arguments, **options):
+        raise SsilkError("the joints fold its skinning there")
+
+    monkeypatch.setattr("ssilk_core.trade.shot_method.decompose", out_of_reach)
+    found = meter.point(chosen(meter, "1 iterations"))
+    vertices = bench[1].scene.garment.mesh.vertex_count
+    assert found.shot_bytes == 6000 + 300 * (60 + 12 * vertices) and found.refining > 0
+
+
+def test_refined_points_of_earlier_versions_are_measured_again(points, tmp_path):
+    results = Results(tmp_path / "t.json", {"a": 1})
+    for name in ("int16", "1 iterations"):
+        results.add(points[name])
+    document = json.loads((tmp_path / "t.json").read_text())
+    for point in document["points"]:
+        del point["refining"]
+    (tmp_path / "t.json").write_text(json.dumps(document))
+    results.resume(lambda event: None)
+    assert [point.variant for point in results.points] == ["int16"]
 
 
 def test_between_frames_of_a_shot_poses_are_interpolated(meter, bench, model):

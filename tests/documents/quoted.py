@@ -201,6 +201,8 @@ def pipeline() -> Text:
         "game8": ("8", "y up, metres (as glTF)", "layers or a file"),
         "game4": ("4", "y up, metres", "layers or a file"),
         "arkit": ("4", "y up, metres", "one `.usdz`"),
+        "glb": ("all", "y up, metres", "one `.glb`"),
+        "glb4": ("4", "y up, metres", "one `.glb`"),
     }
     for name, texts in targets.items():
         line = compact_row(f"one file for {name}, garment alone")

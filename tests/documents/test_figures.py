@@ -15,7 +15,7 @@ from ssilk_usd.check import TOLERANCE, WORLD
 from ssilk_usd.read_motion import FARTHEST
 
 from benchmarks.helpers.paper_schemes import PAPER_SCHEMES
-from ssilk_core.bake.skin import SKIN_FRAMES
+from ssilk_core.bake.shown_skin import SKIN_FRAMES
 from ssilk_core.cli import parser
 from ssilk_core.collision.covered_skin import SKIN_POINTS
 from ssilk_core.config import ModelConfig, TrainConfig, apply_overrides

@@ -81,6 +81,25 @@ def test_the_simulators_shots_are_the_reference(world, capsys):
     assert rows["ssilk"]["settling"] is None and rows["ssilk"]["loop_drift"] is None
 
 
+def test_only_points_are_a_reference(world, capsys):
+    """What was fitted to points is off them, so that it is refused; points of a refined bake are taken."""
+    motion = "--stage rigged.usda --motion clips/brief.usda --no-body"
+    points = f"bake model.safetensors {motion} --refine 1 --refined-output points -o points/Skirt/brief.usda"
+    refined = f"bake model.safetensors {motion} --refine 1 -o refined/Skirt/brief.usda"
+    skinned = f"skin points/Skirt/brief.usda {motion} -o skinned/Skirt/brief.usda"
+    for command in (points, refined, skinned):
+        assert main(command.split()) == 0
+    capsys.readouterr()
+    for folder in ("refined", "skinned"):
+        assert evaluated(f"{QUICK} --clips brief --reference {folder}") == 2
+        complaint = f"{folder}/Skirt/brief.usda: joints and blendshapes, which are millimetres off what was simulated"
+        assert complaint in capsys.readouterr().err
+    assert evaluated(f"{QUICK} --clips brief --reference points --json") == 0
+    event = json.loads(capsys.readouterr().out.splitlines()[-1])
+    rows = {row["method"]: row["figures"] for row in event["detail"]["figures"]}
+    assert rows["simulator"]["frames"] == 6 and rows["ssilk"]["reference"]["position_error"] > 0
+
+
 def test_several_models_of_a_garment_share_its_table(world, capsys):
     (world / "again.safetensors").write_bytes((world / "model.safetensors").read_bytes())
     assert evaluated(f"again.safetensors {QUICK} --clips brief") == 0

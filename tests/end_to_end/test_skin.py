@@ -3,12 +3,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
-from pxr import Gf, Usd, UsdGeom, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 from ssilk_usd.play import Shot
 from ssilk_usd.provenance import read_provenance
 
+from ssilk_core.assets import Motion
+from ssilk_core.bake import motion_at
 from ssilk_core.cli import main
 from ssilk_core.gltf.play import GlbShot
 
@@ -101,9 +105,48 @@ def test_a_shot_with_a_skeleton_is_its_own_motion(world, copy):
     assert main(["skin", "baked.usda", "--stage", "rigged.usda", "-o", "shot.usda", "--no-body"]) == 0
 
 
+def test_transforms_above_the_mesh_move_it_and_may_name_it(world, copy):
+    """The top of the cache sways; its points are what is left, and its mesh is beside another one."""
+    points, faces = np.load("points.npy"), np.load("faces.npy")
+    swaying = np.stack([0.1 * np.arange(FRAMES), np.zeros(FRAMES), np.sin(np.arange(FRAMES))], axis=-1)
+    write_cache("swaying.usda", points - swaying[:, None], faces, names=("Cloth", "Other"))
+    stage = Usd.Stage.Open("swaying.usda")
+    edit = Sdf.BatchNamespaceEdit()
+    for mesh in ("Cloth", "Other"):
+        UsdGeom.Xform.Define(stage, f"/sim/{mesh}Top")
+        edit.Add(Sdf.NamespaceEdit(f"/sim/{mesh}", f"/sim/{mesh}Top/Shape", Sdf.NamespaceEdit.atEnd))
+    assert stage.GetRootLayer().Apply(edit)
+    sway = UsdGeom.Xform(stage.GetPrimAtPath("/sim/ClothTop")).AddTranslateOp()
+    for frame, each in enumerate(swaying):
+        sway.Set(Gf.Vec3d(*each.tolist()), frame)
+    stage.GetRootLayer().Save()
+    for mesh in ("/sim/ClothTop", "/sim/ClothTop/Shape"):
+        assert main(["skin", f"swaying.usda:{mesh}", *SKIN[2:], "-o", "shot.usda", "--no-body"]) == 0
+        shot = Shot("shot.usda")
+        away = np.stack([shot.garment_points(time) for time in shot.frame_times]) - points
+        assert np.linalg.norm(away, axis=-1).max() < 5e-3
+
+
+@pytest.mark.parametrize("rate", [24.0, 60.0])
+def test_a_cut_is_held_where_the_cache_has_another_rate(rate):
+    """A character that jumps by 10 m between frames 7 and 8 is never between both places."""
+    at = np.zeros((16, 3, 3))
+    at[8:, 0, 0] = 10.0
+    turned = np.tile([1.0, 0, 0, 0], (16, 3, 1))
+    motion = Motion("clip", 30.0, turned, at + 0.01 * np.arange(16)[:, None, None])
+    cache = SimpleNamespace(fps=rate, seconds=np.arange(int(rate * 0.4)) / rate)
+    placed = motion_at(motion, cache, "cache").translations[:, 0, 0]
+    code = cache.seconds * 30
+    between = (code > 7) & (code < 8)
+    assert between.any() and np.allclose(placed[between], 0.07)
+    expected = np.where(code < 8, 0, 10) + 0.01 * code
+    np.testing.assert_allclose(placed[~between], expected[~between], atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
+        ("two.usda:/sim --stage rigged.usda --motion brief.usda -o x.usda", "2 meshes of 312 points in '/sim'"),
         ("cache.abc --stage rigged.usda --motion brief.usda -o x.usda", "an Alembic cache"),
         ("two.usda --stage rigged.usda --motion brief.usda -o x.usda", "2 meshes of 312 points"),
         ("cache.usda:/sim/Shirt --stage rigged.usda --motion brief.usda -o x.usda", "no visible mesh '/sim/Shirt'"),

@@ -29,6 +29,7 @@ from .read_stage import (
     stage_name,
     world_matrix,
 )
+from .read_surface import read_surface
 from .units import StageUnits
 
 
@@ -63,7 +64,8 @@ def read_garment(
         skin = SkinWeights.rigid(mesh.path, joint, mesh.vertex_count)
     pins, levels = (_per_point(prim, name) for name in (PIN, LEVEL))
     pinned = None if pins is None else (pins >= 0.5).astype(np.int64)  # may be painted as weights
-    return Garment(mesh, skin, _whole(prim, _per_point(prim, CLASS)), pinned, levels)
+    surface = read_surface(prim, mesh)
+    return Garment(mesh, skin, _whole(prim, _per_point(prim, CLASS)), pinned, levels, surface)
 
 
 def find_garment(stage: Usd.Stage, garment: str | None = None) -> Usd.Prim:

@@ -48,8 +48,10 @@ from .read_stage import (
     split_location,
     value,
 )
+from .read_surface import read_surface
 from .repair_mesh import offset_points
 from .units import StageUnits
+from .write_surface import write_surface
 
 
 @needs_whole_files
@@ -98,7 +100,8 @@ def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path, *, mov
 
     The copy keeps the stage's units and axes. Proxies are appended to the skeleton's joints, in place of older ones
     of the same garment. The garment's mesh stands under the SkelRoot with its classes, the rig's weights, and the
-    LBS weights over the character beside them (`primvars:ssilk:plainJointIndices` and `...Weights`).
+    LBS weights over the character beside them (`primvars:ssilk:plainJointIndices` and `...Weights`). A physics
+    material that the mesh would lose is bound to it.
 
     Args:
         source: the stage that `scene.character` was read from.
@@ -114,6 +117,9 @@ def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path, *, mov
     stage = Usd.Stage.Open(layer)
     skel = find_skeleton(stage, root=_prim_path(scene.character.skeleton.path))
     mesh, to_bind = _place_garment(stage, skel, source, scene.garment, moved)
+    surface = scene.garment.surface
+    if surface is not None and read_surface(mesh.GetPrim(), scene.garment.mesh) is None:
+        write_surface(mesh.GetPrim(), _free_path(skel, leaf(surface.path)), surface)
     proxies = _append_proxies(skel, str(mesh.GetPath()), scene)
     _bind_garment(mesh, to_bind, skel, scene, proxies)
     export(layer, out)

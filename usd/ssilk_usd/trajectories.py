@@ -110,17 +110,24 @@ def _need_readable(file: str) -> None:
 
 
 def _chosen(shot: Shot, prim: str | None, vertex_count: int | None) -> int:
-    """Return the index of the mesh that is asked for."""
-    meshes = shot.meshes
+    """Return the index of the mesh that is asked for, by itself or by a prim that holds it."""
+    meshes, wanted = shot.meshes, f"meshes of {vertex_count} points"
+    among = list(range(len(meshes)))
+    found = [index for index, mesh in enumerate(meshes) if mesh.is_garment]
     if prim is not None:
         found = [index for index, mesh in enumerate(meshes) if prim in (mesh.path, mesh.name)]
-        asked = f"no visible mesh '{prim}'"
-    else:
-        found = [index for index, mesh in enumerate(meshes) if mesh.is_garment]
-        if len(found) != 1:
-            found = [index for index in range(len(meshes)) if shot.point_count(index) == vertex_count]
-        asked = f"{len(found)} meshes of {vertex_count} points"
+        among = found = found or [index for index, mesh in enumerate(meshes) if _holds(prim, mesh.path)]
+        wanted += f" in '{prim}'"
+    if len(found) != 1:
+        found = [index for index in among if shot.point_count(index) == vertex_count]
     if len(found) != 1:
         names = ", ".join(f"{mesh.path} ({shot.point_count(index)})" for index, mesh in enumerate(meshes[:6]))
+        asked = f"{len(found)} {wanted}" if among else f"no visible mesh '{prim}'"
         fail(shot.name, asked, f"it has {names}", "name one: FILE:/PRIM")
     return found[0]
+
+
+def _holds(prim: str, mesh: str) -> bool:
+    """Return whether a prim, by its path or name, is above a mesh, as the Xforms are that many programs write."""
+    above = mesh.rpartition("/")[0]
+    return above == prim or above.startswith(f"{prim}/") or prim in above.split("/")

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 SKIN_FRAMES = 48  # samples of a shot that are counted at most, spread evenly: a count takes as long as two frames
 
 
-class SkinMeter:
+class ShownSkinMeter:
     """Counts the covered skin that shows in a rollout.
 
     Attributes:

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A baked garment on its character as a glTF binary."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+from bpy.props import StringProperty
+
+from ssilk_core.files import replacing
+
+from ..errors import SetupError
+from ..scene import playing
+from ..scene.exporting import MOST_LOST, export_glb, largest_loss
+from ..scene.garment import armature_of, unusable_here
+from ..scene.keys import has_keys
+from .reporting import ReportingOperator
+
+SUFFIX = ".glb"
+
+
+class ExportGltf(ReportingOperator, bpy.types.Operator):
+    """Write the character and its baked garment as a glTF binary over the scene's frames, and compare it with them"""
+
+    bl_idname = "ssilk.export_gltf"
+    bl_label = "Export glTF"
+
+    filepath: StringProperty(name="File", description="The .glb to write", subtype="FILE_PATH")
+    filter_glob: StringProperty(description="Which files are offered", default="*.glb", options={"HIDDEN"})
+
+    @classmethod
+    def refusal(cls, context: bpy.types.Context) -> str:
+        if reason := unusable_here(context):
+            return reason
+        if playing.live(context.object):
+            return f"'{context.object.name}' is played live; bake it first"
+        return "" if has_keys(context.object) else f"Nothing was baked for '{context.object.name}'"
+
+    def invoke(self, context: bpy.types.Context, _: bpy.types.Event) -> set[str]:
+        """Ask for the file."""
+        if not self.filepath:
+            self.filepath = str(
+                Path(bpy.data.filepath).with_name(f"{bpy.path.clean_name(context.object.name)}{SUFFIX}")
+            )
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def apply(self, context: bpy.types.Context) -> str:
+        garment, path = context.object, Path(bpy.path.abspath(self.filepath))
+        if path.suffix != SUFFIX:
+            raise SetupError(f"'{path.name}' is no name for a glTF binary; it ends in {SUFFIX}.")
+        with replacing(path) as unverified:
+            export_glb(garment, armature_of(garment), unverified)
+            loss, frame = largest_loss(garment, unverified)
+            if not loss <= MOST_LOST:
+                raise SetupError(
+                    f"'{garment.name}' would be {1000 * loss:.3g} mm off what Blender shows in frame {frame}; "
+                    "modifiers besides its armature are not in a glTF file, so switch those off."
+                )
+        return f"'{garment.name}' is in {path.name}, at most {1000 * loss:.2g} mm off what Blender shows."
+
+
+CLASSES = (ExportGltf,)

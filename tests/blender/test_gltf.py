@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Export glTF: what Blender's exporter writes of a bake is what Blender shows; by its defaults it is not."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
+
+from blender_addon.scene.exporting import SETTINGS, largest_loss
+from ssilk_core.errors import SsilkError
+from ssilk_core.gltf.container import GlbFile
+
+from .conftest import activate
+from .scenes import shown
+
+FRAMES = range(1, 13)
+
+
+@pytest.fixture
+def baked(ready, trained):
+    """The skirt with a short bake that moves it visibly, on a rig that hangs on a scaled and moving object."""
+    scene, rig = ready.context.scene, ready.data.objects["Rig"]
+    scene.frame_end = FRAMES.stop - 1
+    assert ready.ops.ssilk.bake(pre_roll=0.0) == {"FINISHED"}
+    trained.parent = rig
+    top = ready.data.objects.new("Top", None)
+    scene.collection.objects.link(top)
+    rig.parent, top.scale = top, (2.0, 2.0, 2.0)
+    for frame in (1, 12):
+        top.location, top.rotation_euler = (frame / 8, 1.0, 0.5), (0.2, 0.0, frame / 30)
+        top.keyframe_insert("location", frame=frame)
+        top.keyframe_insert("rotation_euler", frame=frame)
+    ready.context.view_layer.update()
+    return trained
+
+
+def test_a_glb_shows_what_blender_shows(ready, baked, tmp_path):
+    activate(ready, ready.data.objects["Pillar"])
+    selected = ready.data.objects["Pillar"]
+    ready.context.view_layer.objects.active = baked
+    before = shown(ready, baked, FRAMES)
+    path = tmp_path / "Skirt.glb"
+    assert ready.ops.ssilk.export_gltf(filepath=str(path)) == {"FINISHED"}
+    assert ready.context.selected_objects == [selected] and [file.name for file in tmp_path.iterdir()] == [path.name]
+    loss, frame = largest_loss(baked, path)
+    assert loss < 5e-4 and frame in FRAMES
+    document = GlbFile(path).document
+    assert len(document["animations"]) == 1 and len(document["meshes"]) == 2
+    np.testing.assert_array_equal(shown(ready, baked, FRAMES), before)
+    # The comparison sees what is lost: with four influences, and with an animation for each action.
+    few = {**SETTINGS, "export_all_influences": False, "use_selection": False}
+    ready.ops.export_scene.gltf(filepath=str(path), **few)
+    assert largest_loss(baked, path)[0] > 5e-3
+    ready.ops.export_scene.gltf(filepath=str(path), **{**few, "export_animation_mode": "ACTIONS"})
+    with pytest.raises(SsilkError, match=r"1 skinned nodes 'Skirt' and [2-9] animations"):
+        largest_loss(baked, path)
+
+
+def test_what_a_glb_cannot_hold_is_refused_and_leaves_no_file(ready, baked, tmp_path):
+    path = tmp_path / "Skirt.glb"
+    with pytest.raises(RuntimeError, match=r"'Skirt.usd' is no name for a glTF binary; it ends in .glb"):
+        ready.ops.ssilk.export_gltf(filepath=str(tmp_path / "Skirt.usd"))
+    wave = baked.modifiers.new("Wave", "WAVE")
+    wave.height, wave.speed = 0.2, 0.5
+    with pytest.raises(RuntimeError) as error:
+        ready.ops.ssilk.export_gltf(filepath=str(path))
+    assert re.search(r"'Skirt' would be \S+ mm off what Blender shows in frame \d+", str(error.value))
+    assert not list(tmp_path.iterdir())
+    baked.modifiers.remove(wave)
+    assert ready.ops.ssilk.remove_bake() == {"FINISHED"}
+    assert not ready.ops.ssilk.export_gltf.poll()
