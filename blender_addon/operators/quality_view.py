@@ -15,6 +15,7 @@ from ..outside.work import Work
 from ..scene import heat, lbs_copy
 from ..scene.garment import unusable_here
 from ..scene.objects import found_again
+from ..scene.progress import no_model
 from . import tasks
 from .reporting import ReportingOperator
 
@@ -158,6 +159,12 @@ class ToggleLbsCopy(QualityOperator, bpy.types.Operator):
 
     bl_idname = "ssilk.toggle_lbs"
     bl_label = "Linear Blend Skinning Beside"
+
+    @classmethod
+    def refusal(cls, context: bpy.types.Context) -> str:
+        if reason := super().refusal(context):
+            return reason
+        return "" if lbs_copy.find_copy(context.object) else no_model(context.object)
 
     def apply(self, context: bpy.types.Context) -> str:
         garment = context.object

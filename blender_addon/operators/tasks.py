@@ -66,6 +66,7 @@ class OutsideOperator(RefusingOperator):
             self._leave(context)
             return {"CANCELLED"}
         if not self.work.poll():
+            tell(context, self.work.status)
             return {"PASS_THROUGH"}
         if self.undo and context.mode != "OBJECT" and not self.work.error:
             self.work.text = "Done; it is applied as soon as you are in Object Mode"
@@ -111,6 +112,7 @@ class OutsideOperator(RefusingOperator):
         global current
         if self.timer:
             context.window_manager.event_timer_remove(self.timer)
+            tell(context, None)
             self.timer = None
         self.work.close()
         if current is self.work:
@@ -130,6 +132,12 @@ def stop() -> None:
     if current:
         current.close()
         current = None
+
+
+def tell(context: bpy.types.Context, text: str | None) -> None:
+    """Show text in the status bar, since the panel may be out of sight; None for what Blender shows there."""
+    if context.workspace:  # there is none while a file is closed
+        context.workspace.status_text_set(text)
 
 
 def redraw(context: bpy.types.Context) -> None:

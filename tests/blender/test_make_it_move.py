@@ -105,9 +105,40 @@ def test_a_mesh_comes_to_play_while_it_is_trained(ready, skirt, tmp_path):
     assert not skirt.ssilk.awaited
 
 
-def refused(bpy) -> str:
+def test_it_gets_better_until_it_is_finished(ready, skirt, tmp_path, monkeypatch):
+    """Rounds of the real training, each resumed from the one before; what is played is the best of them."""
+    from blender_addon.operators import training
+    from blender_addon.operators.training import watch
+    from blender_addon.outside.jobs import read_curve
+    from blender_addon.panels import GarmentPanel
+    from blender_addon.scene import playing
+
+    bpy, command = ready, training.train_command
+    tiny = ["--set", "iterations=4", "--set", "batch=2", "--set", "pretraining_batch=2", "--set", "valid_frames=8"]
+    monkeypatch.setattr(training, "train_command", lambda *given: [*command(*given), *tiny])
+    animate(bpy, bpy.data.objects["Rig"], "Walk", 0.3, 37)
+    bpy.context.scene.frame_end = 4
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "skirt.blend"))
+    _, job = lines_up(bpy, skirt)
+    state = ended(skirt, until=lambda state: state.round and (state.checkpoint or 0) > 4)
+    assert state.alive and state.round == 1 and state.done > 4 and state.spent > 0
+    watch()
+    assert playing.live(skirt).model == job / "model.safetensors"
+    notes = drawn(GarmentPanel, bpy.context)
+    assert "ssilk.cancel_training" in notes and "Gets better until you finish it" in " ".join(notes)
+    assert "'Skirt' is being trained already" in refused(bpy, bpy.ops.ssilk.train)
+    bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)  # it is found again, though nothing was saved
+    garment = bpy.data.objects["Skirt"]
+    activate(bpy, garment)
+    assert bpy.ops.ssilk.cancel_training() == {"FINISHED"}
+    assert ended(garment).state == "stopped"
+    points = read_curve(job)["points"]
+    assert min(points, key=lambda point: point["validation"]["total"])["iteration"] == ended(garment).checkpoint
+
+
+def refused(bpy, call=None) -> str:
     with pytest.raises(RuntimeError) as error:
-        bpy.ops.ssilk.make_it_move()
+        (call or bpy.ops.ssilk.make_it_move)()
     return str(error.value)
 
 
