@@ -117,7 +117,7 @@ class OutsideOperator(RefusingOperator):
         self.work.close()
         if current is self.work:
             current = None
-        redraw(context)
+        redraw(context, views=True)
 
 
 def busy() -> str:
@@ -140,12 +140,13 @@ def tell(context: bpy.types.Context, text: str | None) -> None:
         context.workspace.status_text_set(text)
 
 
-def redraw(context: bpy.types.Context) -> None:
-    """Draw again what shows progress."""
+def redraw(context: bpy.types.Context, *, views: bool = False) -> None:
+    """Draw again what shows progress, and what views show besides where asked: a heavy scene takes long to draw."""
     for window in context.window_manager.windows:
         for area in window.screen.areas:
-            if area.type in {"VIEW_3D", "PREFERENCES"}:
-                area.tag_redraw()
+            for region in area.regions if area.type in {"VIEW_3D", "PREFERENCES"} else ():
+                if views or area.type == "PREFERENCES" or region.type == "UI":
+                    region.tag_redraw()
 
 
 class CancelWork(RefusingOperator, bpy.types.Operator):
