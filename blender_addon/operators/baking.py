@@ -137,6 +137,14 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         """Ask for the options."""
         return context.window_manager.invoke_props_dialog(self)
 
+    def draw(self, _: bpy.types.Context) -> None:
+        """Draw the options; a file is asked for only where one is written."""
+        self.layout.use_property_split, self.layout.use_property_decorate = True, False
+        for name in ("to_timeline", "to_usd", "filepath", "quality", "pre_roll"):
+            row = self.layout.row()
+            row.enabled = name != "filepath" or self.to_usd
+            row.prop(self, name)
+
     def prepare(self, context: bpy.types.Context) -> Work:
         garment = context.object
         if not self.to_timeline and not self.to_usd:

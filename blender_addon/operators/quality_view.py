@@ -150,6 +150,10 @@ class ClearWorst(ReportingOperator, bpy.types.Operator):
     bl_label = "Clear Marks"
     bl_options = {"REGISTER", "UNDO"}
 
+    @classmethod
+    def refusal(cls, context: bpy.types.Context) -> str:
+        return "" if own_markers(context.scene) else "No frames are marked"
+
     def apply(self, context: bpy.types.Context) -> str:
         return f"{clear_markers(context.scene)} markers removed."
 
@@ -176,9 +180,14 @@ class ToggleLbsCopy(QualityOperator, bpy.types.Operator):
         return ""
 
 
+def own_markers(scene: bpy.types.Scene) -> list[bpy.types.TimelineMarker]:
+    """Return the markers that were set here."""
+    return [marker for marker in scene.timeline_markers if marker.name.startswith(MARKER)]
+
+
 def clear_markers(scene: bpy.types.Scene) -> int:
     """Remove the markers that were set here; return how many."""
-    own = [marker for marker in scene.timeline_markers if marker.name.startswith(MARKER)]
+    own = own_markers(scene)
     for marker in own:
         scene.timeline_markers.remove(marker)
     return len(own)

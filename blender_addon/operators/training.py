@@ -155,7 +155,7 @@ class Train(tasks.OutsideOperator, bpy.types.Operator):
         known = progress_of(context.object)
         if known and known.alive:
             return f"'{context.object.name}' is being trained already; cancel that first"
-        return "" if any(item.use for item in context.object.ssilk.training.motions) else "Choose a motion first"
+        return "" if any(item.use for item in context.object.ssilk.training.motions) else no_motion(context.object)
 
     def prepare(self, context: bpy.types.Context) -> Work:
         garment = context.object
@@ -164,7 +164,7 @@ class Train(tasks.OutsideOperator, bpy.types.Operator):
         if running and running.alive:
             raise SetupError(f"'{garment.name}' is being trained already; cancel that first.")
         if not any(item.use for item in settings.motions):
-            raise SetupError(f"No motion is chosen for '{garment.name}'; find motions, or add files of motions.")
+            raise SetupError(f"{no_motion(garment)}.")
         if settings.iterations and settings.minutes:
             raise SetupError(f"'{garment.name}' has a budget in iterations and in minutes; set one of them to zero.")
         self.scene = gather(garment)
@@ -266,6 +266,11 @@ class ResumeTraining(JobOperator, bpy.types.Operator):
         begun.add(folder)
         progress.forget()
         return f"The training of '{context.object.name}' goes on."
+
+
+def no_motion(garment: bpy.types.Object) -> str:
+    """Return what to do for a garment whose motions are not chosen."""
+    return f"No motion is chosen for '{garment.name}'; find motions, or add files of motions"
 
 
 def add_motion(garment: bpy.types.Object, source: Source) -> bpy.types.PropertyGroup:

@@ -17,7 +17,7 @@ import bpy
 from ..errors import SetupError
 from ..outside.jobs import MODEL, OwnedJob, owned, owner, read_state
 
-FIRST = "wait for the first one of its training, or resume that"
+FIRST = "wait for its training, or resume it"
 FOLDER = "ssilk"  # of trainings, beside the blend file
 _orphans: tuple[str, list[Orphan]] = ("", [])  # the blend file, and what was found beside it
 

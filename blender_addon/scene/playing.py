@@ -64,7 +64,7 @@ def take_up_models() -> None:
     """Switch to the newest models of trainings that are played."""
     for uid, played in list(_played.items()):
         if played.renewed and played.done is None and _attempt(uid, played.ready):
-            _attempt(uid, played.refresh)
+            _attempt(uid, played.take_up)
             _read_soon(0.0)
 
 
