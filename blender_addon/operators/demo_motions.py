@@ -80,7 +80,8 @@ class AddDemoMotions(tasks.OutsideOperator, bpy.types.Operator):
             armature.pose.bones[name].rotation_mode = "QUATERNION"
         shown = actions[[motion.path for motion, _ in self.moved].index(SHOWN)]
         assign(armature.animation_data_create(), shown)
-        context.scene.frame_end = max(context.scene.frame_end, int(shown.frame_range[1]))  # a still import has one frame
+        scene = context.scene
+        scene.frame_end = max(scene.frame_end, int(shown.frame_range[1]))  # the import of a still character has one
         for item in garment.ssilk.training.motions:
             item.use = item.use and item.kind != TIMELINE
         for action in actions:

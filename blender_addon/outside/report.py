@@ -59,8 +59,9 @@ def improvement(state: JobState, curve: Mapping[str, Any]) -> list[str]:
     else:
         before = f", {first:.2%} at first" if first is not None and first != shown else ""
         said = f"{shown:.2%} of the covered skin shows{before}"
-    goes_on = [f"Gets better until you finish it: {rounded(state.spent)} so far"] if state.round and not state.cancelled else []
-    return [said, *goes_on]
+    if state.cancelled or not state.round:
+        return [said]
+    return [said, f"Gets better until you finish it: {rounded(state.spent)} so far"]
 
 
 def findings(state: JobState, curve: Mapping[str, Any], *, moves: bool) -> list[tuple[str, bool]]:

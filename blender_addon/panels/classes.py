@@ -6,6 +6,8 @@ from __future__ import annotations
 import bpy
 import numpy as np
 
+from ssilk_core.preflight.finding import format_count
+
 from ..classes import LEVELS, adrift, counts
 from ..errors import SetupError
 from ..operators.classes import CHOICES
@@ -33,7 +35,8 @@ def adrift_line(thing: bpy.types.Object) -> str:
         _adrift = (looked, adrift(values, pairs.reshape(-1, 2)))
     if not _adrift[1]:
         return ""
-    return f"{_adrift[1]} vertices fall off: each separate piece needs some that are pinned or tight"
+    falling = format_count(_adrift[1], "vertices")
+    return f"{falling} would fall off: each separate piece needs some that are pinned or tight"
 
 
 def class_counts(thing: bpy.types.Object) -> tuple[int, int, int] | None:
