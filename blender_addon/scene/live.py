@@ -39,6 +39,7 @@ class Live:
     Attributes:
         done: the part of the motion that was read; None when there is nothing to read.
         stale: whether the armature does something else by now than what was read.
+        model_only: whether a newer model is read, for the motion that was read before.
 
     Raises:
         SetupError: bones or the garment do not deform as ssilk has it.
@@ -52,7 +53,7 @@ class Live:
         self.model, self.trained, self._written = model, None, 0.0
         self.playback, self.first, self.placed = None, 0, np.zeros((0, 0, 4, 4))
         self.done: float | None = None
-        self.stale = False
+        self.stale = self.model_only = False
         self.refresh()
 
     def refresh(self) -> None:
@@ -60,14 +61,14 @@ class Live:
         _, armature = self.objects()
         (take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
         self._steps = self._reading(take)
-        self.done, self.stale = 0.0, False
+        self.done, self.stale, self.model_only = 0.0, False, False
 
     def take_up(self) -> None:
         """Read the model again, for the motion that was read; the old one is played until the new one can be."""
         if self.playback is None or self.stale:
             self.refresh()
         else:
-            self._steps, self.done = self._taking_up(), 0.0
+            self._steps, self.done, self.model_only = self._taking_up(), 0.0, True
 
     @property
     def renewed(self) -> bool:
