@@ -19,6 +19,8 @@ from ssilk_core.mesh.topology import edge_use
 from ssilk_core.preflight.finding import Finding, format_count
 
 HOLES = "body-not-watertight"
+PUSHED = "penetration"  # the finding that Push Out mends; all others are mended by Fix
+OPTION = "--fix"  # which does so in a console
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,7 @@ def read_findings(
     names = {mesh.path: name for name, mesh in meshes.items()}
     bodies = {name: mesh for name, mesh in meshes.items() if name != garment}
     for document in documents:
-        finding = Finding(**{**document, "indices": tuple(document["indices"])})
+        finding = _with_buttons(Finding(**{**document, "indices": tuple(document["indices"])}))
         file, _, prim = finding.prim.rpartition(":")
         finding = replace(finding, prim=names.get(prim, ""))
         if file in clips:
@@ -66,6 +68,12 @@ def polygons_of(counts: np.ndarray, triangles: Sequence[int]) -> tuple[int, ...]
     owner = np.repeat(np.arange(len(counts)), counts - 2)
     named = np.bincount(owner[list(triangles)], minlength=len(counts))
     return tuple(np.flatnonzero(named == counts - 2).tolist())
+
+
+def _with_buttons(finding: Finding) -> Finding:
+    """Return a finding that speaks of the button which mends it, and not of an option."""
+    button = "Push Out" if finding.code == PUSHED else "Fix"
+    return replace(finding, found=finding.found.replace(OPTION, button), fix=finding.fix.replace(OPTION, button))
 
 
 def _on_timeline(finding: Finding, clip: Clip) -> Finding:

@@ -39,7 +39,8 @@ class GarmentSettings(bpy.types.PropertyGroup):
     fabric: PointerProperty(type=FabricSettings, name="Fabric", description="What the garment is made of")
     tightness: FloatProperty(
         name="Tightness",
-        description="How much of the garment is tight: nothing but what is pinned, or all; replaces what is painted",
+        description="How much of the garment is tight: nothing but what is pinned, or all; replaces what is painted, "
+        "once classes were found automatically",
         default=0.5,
         min=0.0,
         max=1.0,

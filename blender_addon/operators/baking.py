@@ -34,6 +34,7 @@ from ..scene.keys import has_keys, need_tracks
 from ..scene.models import model_of
 from ..scene.motions import TIMELINE, Source
 from ..scene.objects import Pair
+from ..scene.progress import no_model
 from ..scene.sampling import SampledTake, need_company, prepare_takes, sample
 from ..scene.trained_weights import has_trained_weights
 from ..scene.units import scene_rate
@@ -130,11 +131,19 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
 
     @classmethod
     def refusal(cls, context: bpy.types.Context) -> str:
-        return tasks.busy() or unusable_here(context) or unready(context)
+        return tasks.busy() or unusable_here(context) or unready(context) or no_model(context.object)
 
     def invoke(self, context: bpy.types.Context, _: bpy.types.Event) -> set[str]:
         """Ask for the options."""
         return context.window_manager.invoke_props_dialog(self)
+
+    def draw(self, _: bpy.types.Context) -> None:
+        """Draw the options; a file is asked for only where one is written."""
+        self.layout.use_property_split, self.layout.use_property_decorate = True, False
+        for name in ("to_timeline", "to_usd", "filepath", "quality", "pre_roll"):
+            row = self.layout.row()
+            row.enabled = name != "filepath" or self.to_usd
+            row.prop(self, name)
 
     def prepare(self, context: bpy.types.Context) -> Work:
         garment = context.object

@@ -52,21 +52,36 @@ class PaintClasses(ClassOperator, bpy.types.Operator):
         return ""
 
 
+class ClassifiedOperator(ClassOperator):
+    """Base of operators on classes that are there already."""
+
+    @classmethod
+    def refusal(cls, context: bpy.types.Context) -> str:
+        if reason := super().refusal(context):
+            return reason
+        there = {palette.ATTRIBUTE, palette.COLOR_ATTRIBUTE} & set(context.object.data.attributes.keys())
+        return "" if there else f"'{context.object.name}' has no classes; classify or paint it first"
+
+
 class TakeUpPainting(ClassOperator, bpy.types.Operator):
     """Turn painted colours into classes, each into the nearest one, and make the colours pure again"""
 
     bl_idname = "ssilk.take_up_painting"
     bl_label = "Take Up Painting"
 
+    @classmethod
+    def refusal(cls, context: bpy.types.Context) -> str:
+        if reason := super().refusal(context):
+            return reason
+        painted = palette.COLOR_ATTRIBUTE in context.object.data.attributes
+        return "" if painted else f"'{context.object.name}' has no painted classes; choose Paint Classes first"
+
     def apply(self, context: bpy.types.Context) -> str:
         thing = context.object
-        painted = palette.COLOR_ATTRIBUTE in thing.data.attributes
-        if not painted:
-            raise SetupError(f"'{thing.name}' has no painted classes; choose Paint Classes first.")
         return f"{attributes.take_up_painting(thing.data)} vertices of '{thing.name}' changed class."
 
 
-class ShowClasses(ClassOperator, bpy.types.Operator):
+class ShowClasses(ClassifiedOperator, bpy.types.Operator):
     """Show classes as colours, made again from the stored ones; in Solid shading, in this view"""
 
     bl_idname = "ssilk.show_classes"
@@ -98,7 +113,7 @@ class BrushClass(ReportingOperator, bpy.types.Operator):
         return ""
 
 
-class MirrorClasses(ClassOperator, bpy.types.Operator):
+class MirrorClasses(ClassifiedOperator, bpy.types.Operator):
     """Give one side the classes of the other, by the places of vertices along the garment's own x axis"""
 
     bl_idname = "ssilk.mirror_classes"

@@ -78,13 +78,15 @@ class AddDemoMotions(tasks.OutsideOperator, bpy.types.Operator):
         actions = [add_action(armature, motion, channels) for motion, channels in self.moved]
         for name in self.joints.names:
             armature.pose.bones[name].rotation_mode = "QUATERNION"
-        names = [motion.path for motion, _ in self.moved]
-        assign(armature.animation_data_create(), actions[names.index(SHOWN)])
+        shown = actions[[motion.path for motion, _ in self.moved].index(SHOWN)]
+        assign(armature.animation_data_create(), shown)
+        scene = context.scene
+        scene.frame_end = max(scene.frame_end, int(shown.frame_range[1]))  # the import of a still character has one
         for item in garment.ssilk.training.motions:
             item.use = item.use and item.kind != TIMELINE
         for action in actions:
             add_motion(garment, Source(ACTION, action.name))
-        return f"'{armature.name}' has {len(actions)} motions; it plays '{actions[names.index(SHOWN)].name}'."
+        return f"'{armature.name}' has {len(actions)} motions; it plays '{shown.name}'."
 
 
 CLASSES = (AddDemoMotions,)

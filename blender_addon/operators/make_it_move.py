@@ -55,7 +55,7 @@ course: Course | None = None  # the one that is under way
 
 
 class MakeItMove(RefusingOperator, bpy.types.Operator):
-    """Classify, rig, choose motions, train what fits the device, and play it live as soon as there is a model"""
+    """Classify, rig, choose motions, train, and play it live: it gets better until you finish the training"""
 
     bl_idname = "ssilk.make_it_move"
     bl_label = "Make It Move"  # no undo step of its own: each step has one
@@ -164,9 +164,14 @@ def _call(name: str, garment: bpy.types.Object) -> None:
             _prepare_training(garment)
         operator = getattr(bpy.ops.ssilk, name.removeprefix("ssilk."))
         try:
-            operator("EXEC_DEFAULT", True)
+            operator("EXEC_DEFAULT", True, **({"improves": not has_budget(garment)} if name == TRAIN else {}))
         except RuntimeError as error:  # Blender's own way to say what the operator reported, or that it refuses
             raise SetupError(str(error).strip().removeprefix("Error: ").split("\n")[0]) from error
+
+
+def has_budget(garment: bpy.types.Object) -> bool:
+    """Return whether the artist has said how long a garment is trained; without that it goes on and gets better."""
+    return bool(garment.ssilk.training.iterations or garment.ssilk.training.minutes)
 
 
 def _prepare_training(garment: bpy.types.Object) -> None:

@@ -25,7 +25,7 @@ class ToggleOverlay(RefusingOperator, bpy.types.Operator):
             overlay.hide()
         else:
             overlay.show()
-        redraw(context)
+        redraw(context, views=True)
         return {"FINISHED"}
 
 

@@ -9,6 +9,7 @@ from ..errors import SetupError
 from ..scene import playing
 from ..scene.garment import unusable, unusable_here
 from ..scene.models import model_of
+from ..scene.progress import no_model
 from .reporting import ReportingOperator
 
 
@@ -23,7 +24,9 @@ class PlayLive(ReportingOperator, bpy.types.Operator):
     def refusal(cls, context: bpy.types.Context) -> str:
         if reason := unusable_here(context):
             return reason
-        return f"'{context.object.name}' is played already" if playing.live(context.object) else ""
+        if playing.live(context.object):
+            return f"'{context.object.name}' is played already"
+        return no_model(context.object)
 
     def apply(self, context: bpy.types.Context) -> str:
         playing.play(context.object)

@@ -12,7 +12,7 @@ import numpy as np
 from ssilk_core.preflight.finding import format_count
 
 from ..errors import SetupError
-from ..findings import Clip, read_findings
+from ..findings import PUSHED, Clip, read_findings
 from ..outside.work import Work
 from ..preferences import interpreter, preferences
 from ..preflight_properties import FindingItem, keep_findings, shown_finding, size_of
@@ -30,7 +30,6 @@ from .reporting import ReportingOperator
 from .rig import RigOperator
 
 MOVED, LEFT = "moved ", "left "  # begin what `ssilk inspect --fix` says of settled cloth, and of what stays inside
-PUSHED = "penetration"  # the finding that Push Out mends
 
 
 class InspectOperator(RigOperator):

@@ -15,6 +15,7 @@ from ..outside.work import Work
 from ..scene import heat, lbs_copy
 from ..scene.garment import unusable_here
 from ..scene.objects import found_again
+from ..scene.progress import no_model
 from . import tasks
 from .reporting import ReportingOperator
 
@@ -149,6 +150,10 @@ class ClearWorst(ReportingOperator, bpy.types.Operator):
     bl_label = "Clear Marks"
     bl_options = {"REGISTER", "UNDO"}
 
+    @classmethod
+    def refusal(cls, context: bpy.types.Context) -> str:
+        return "" if own_markers(context.scene) else "No frames are marked"
+
     def apply(self, context: bpy.types.Context) -> str:
         return f"{clear_markers(context.scene)} markers removed."
 
@@ -158,6 +163,12 @@ class ToggleLbsCopy(QualityOperator, bpy.types.Operator):
 
     bl_idname = "ssilk.toggle_lbs"
     bl_label = "Linear Blend Skinning Beside"
+
+    @classmethod
+    def refusal(cls, context: bpy.types.Context) -> str:
+        if reason := super().refusal(context):
+            return reason
+        return "" if lbs_copy.find_copy(context.object) else no_model(context.object)
 
     def apply(self, context: bpy.types.Context) -> str:
         garment = context.object
@@ -169,9 +180,14 @@ class ToggleLbsCopy(QualityOperator, bpy.types.Operator):
         return ""
 
 
+def own_markers(scene: bpy.types.Scene) -> list[bpy.types.TimelineMarker]:
+    """Return the markers that were set here."""
+    return [marker for marker in scene.timeline_markers if marker.name.startswith(MARKER)]
+
+
 def clear_markers(scene: bpy.types.Scene) -> int:
     """Remove the markers that were set here; return how many."""
-    own = [marker for marker in scene.timeline_markers if marker.name.startswith(MARKER)]
+    own = own_markers(scene)
     for marker in own:
         scene.timeline_markers.remove(marker)
     return len(own)

@@ -66,6 +66,7 @@ class OutsideOperator(RefusingOperator):
             self._leave(context)
             return {"CANCELLED"}
         if not self.work.poll():
+            tell(context, self.work.status)
             return {"PASS_THROUGH"}
         if self.undo and context.mode != "OBJECT" and not self.work.error:
             self.work.text = "Done; it is applied as soon as you are in Object Mode"
@@ -111,11 +112,12 @@ class OutsideOperator(RefusingOperator):
         global current
         if self.timer:
             context.window_manager.event_timer_remove(self.timer)
+            tell(context, None)
             self.timer = None
         self.work.close()
         if current is self.work:
             current = None
-        redraw(context)
+        redraw(context, views=True)
 
 
 def busy() -> str:
@@ -132,12 +134,19 @@ def stop() -> None:
         current = None
 
 
-def redraw(context: bpy.types.Context) -> None:
-    """Draw again what shows progress."""
+def tell(context: bpy.types.Context, text: str | None) -> None:
+    """Show text in the status bar, since the panel may be out of sight; None for what Blender shows there."""
+    if context.workspace:  # there is none while a file is closed
+        context.workspace.status_text_set(text)
+
+
+def redraw(context: bpy.types.Context, *, views: bool = False) -> None:
+    """Draw again what shows progress, and what views show besides where asked: a heavy scene takes long to draw."""
     for window in context.window_manager.windows:
         for area in window.screen.areas:
-            if area.type in {"VIEW_3D", "PREFERENCES"}:
-                area.tag_redraw()
+            for region in area.regions if area.type in {"VIEW_3D", "PREFERENCES"} else ():
+                if views or area.type == "PREFERENCES" or region.type == "UI":
+                    region.tag_redraw()
 
 
 class CancelWork(RefusingOperator, bpy.types.Operator):

@@ -39,7 +39,13 @@ class SimulationToBones(TimelineOperator, bpy.types.Operator):
 
     @classmethod
     def refusal(cls, context: bpy.types.Context) -> str:
-        return tasks.busy() or unusable_here(context) or unready(context)
+        if reason := tasks.busy() or unusable_here(context) or unready(context):
+            return reason
+        try:
+            need_simulated(context.object)
+        except SetupError as error:
+            return str(error).removesuffix(".")
+        return ""
 
     def prepare(self, context: bpy.types.Context) -> Work:
         garment = context.object

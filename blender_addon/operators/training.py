@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import bpy
-from bpy.props import CollectionProperty, EnumProperty, IntProperty, StringProperty
+from bpy.props import BoolProperty, CollectionProperty, EnumProperty, IntProperty, StringProperty
 
 from ssilk_core.assets import LOOSE
 
@@ -20,7 +20,7 @@ from ..outside import jobs
 from ..outside.wording import remember
 from ..outside.work import Work
 from ..preferences import interpreter, preferences, unready
-from ..scene import models, playing
+from ..scene import models, playing, progress
 from ..scene.baked import need_bakeable
 from ..scene.follower import leader_of
 from ..scene.garment import armature_of, unusable, unusable_here
@@ -30,6 +30,7 @@ from ..scene.mended import look_again
 from ..scene.models import job_of, orphans, relative, trainings, trainings_folder
 from ..scene.motions import FILE, TIMELINE, Source, sources
 from ..scene.objects import Pair
+from ..scene.progress import progress_of
 from ..scene.takes import ChosenMotions
 from . import tasks
 from .reporting import ReportingOperator
@@ -144,10 +145,17 @@ class Train(tasks.OutsideOperator, bpy.types.Operator):
     bl_idname = "ssilk.train"
     bl_label = "Train"  # no undo step: a process outside Blender is not undone
 
+    improves: BoolProperty(description="Go on after the preset, until cancelled", options={"HIDDEN", "SKIP_SAVE"})
+
     @classmethod
     def refusal(cls, context: bpy.types.Context) -> str:
         saved = "" if bpy.data.filepath else "Save the file first; the training lies beside it"
-        return tasks.busy() or unusable_here(context) or unready(context) or saved
+        if reason := tasks.busy() or unusable_here(context) or unready(context) or saved:
+            return reason
+        known = progress_of(context.object)
+        if known and known.alive:
+            return f"'{context.object.name}' is being trained already; cancel that first"
+        return "" if any(item.use for item in context.object.ssilk.training.motions) else no_motion(context.object)
 
     def prepare(self, context: bpy.types.Context) -> Work:
         garment = context.object
@@ -156,7 +164,7 @@ class Train(tasks.OutsideOperator, bpy.types.Operator):
         if running and running.alive:
             raise SetupError(f"'{garment.name}' is being trained already; cancel that first.")
         if not any(item.use for item in settings.motions):
-            raise SetupError(f"No motion is chosen for '{garment.name}'; find motions, or add files of motions.")
+            raise SetupError(f"{no_motion(garment)}.")
         if settings.iterations and settings.minutes:
             raise SetupError(f"'{garment.name}' has a budget in iterations and in minutes; set one of them to zero.")
         self.scene = gather(garment)
@@ -180,8 +188,9 @@ class Train(tasks.OutsideOperator, bpy.types.Operator):
         files = [beside(path, folder) for path in self.chosen.files]
         command = train_command(garment, given.prim, self.chosen.names, files)
         jobs.own(folder, garment.name, Path(bpy.data.filepath).name)
-        jobs.begin(interpreter(preferences(context)), folder, command)
+        jobs.begin(interpreter(preferences(context)), folder, command, improves=self.improves)
         begun.add(folder)
+        progress.forget()
         garment.ssilk.training.folder = relative(folder)
         return f"The training of '{name}' began; it lies in {folder}."
 
@@ -193,9 +202,10 @@ class JobOperator(ReportingOperator):
     def refusal(cls, context: bpy.types.Context) -> str:
         if reason := unusable(context.object):
             return reason
-        folder = job_of(context.object)
-        state = folder and jobs.read_state(folder)
-        return cls.refused(context, state) if state else f"'{context.object.name}' is not being trained"
+        known = progress_of(context.object)
+        if known is None or known.state is None:
+            return f"'{context.object.name}' is not being trained"
+        return cls.refused(context, known.state)
 
     @classmethod
     def refused(cls, context: bpy.types.Context, state: jobs.JobState) -> str:
@@ -211,10 +221,13 @@ class CancelTraining(JobOperator, bpy.types.Operator):
 
     @classmethod
     def refused(cls, context: bpy.types.Context, state: jobs.JobState) -> str:
+        if state.alive and state.cancelled:
+            return f"The training of '{context.object.name}' ends after its current step"
         return "" if state.alive else f"The training of '{context.object.name}' has ended"
 
     def apply(self, context: bpy.types.Context) -> str:
         jobs.cancel(job_of(context.object))
+        progress.forget()
         return f"The training of '{context.object.name}' ends after its current step."
 
 
@@ -251,7 +264,13 @@ class ResumeTraining(JobOperator, bpy.types.Operator):
         folder = job_of(context.object)
         jobs.resume(interpreter(preferences(context)), folder)
         begun.add(folder)
+        progress.forget()
         return f"The training of '{context.object.name}' goes on."
+
+
+def no_motion(garment: bpy.types.Object) -> str:
+    """Return what to do for a garment whose motions are not chosen."""
+    return f"No motion is chosen for '{garment.name}'; find motions, or add files of motions"
 
 
 def add_motion(garment: bpy.types.Object, source: Source) -> bpy.types.PropertyGroup:
@@ -297,12 +316,8 @@ def beside(path: Path, folder: Path) -> str:
 
 def watch() -> float:
     """Redraw panels when a training has progressed, and play its new model; return when to be called again [s]."""
-    from ..panels.training import changed
-
     known = trainings()
-    things = [thing for thing in bpy.data.objects if thing.type == "MESH"]
-    folders = {job.folder for job in known} | {job_of(thing, known) for thing in things} - {None}
-    fresh = [models.look_for_orphans(known), *map(changed, folders)]  # all are asked, so that none is drawn once more
+    fresh = [models.look_for_orphans(known), progress.read_all(known)]  # both are asked, so that none is drawn twice
     if any(fresh):
         tasks.redraw(bpy.context)
     preflight = bpy.context.window_manager.ssilk_preflight

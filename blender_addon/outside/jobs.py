@@ -20,7 +20,7 @@ from .process import environment
 from .runner import BEAT, CANCEL, ORDER, STATE
 from .wording import recall, reworded
 
-MODEL = "model.safetensors"
+MODEL, TRAINING_STATE = "model.safetensors", "model.resume.safetensors"  # both as `ssilk train` writes them
 OWNER = "training.json"  # what is trained, as `own` wrote it
 CURVE = "model.curve.json"  # what validations found, as `ssilk train` writes it beside the model
 RUNNER = Path(__file__).with_name("runner.py")
@@ -61,6 +61,9 @@ class JobState:
         checkpoint: iteration of the model on disk; None before there is one.
         text: the last message, in an artist's words.
         error: why it failed, likewise.
+        cancelled: whether it was asked to end.
+        round: how often it went on to improve after it was done.
+        spent: time spent in trainings so far [s].
     """
 
     state: str
@@ -73,6 +76,9 @@ class JobState:
     text: str = ""
     error: str = ""
     beat: float = 0.0
+    cancelled: bool = False
+    round: int = 0
+    spent: float = 0.0
 
     @property
     def fraction(self) -> float:
@@ -129,22 +135,23 @@ def owner(folder: Path) -> OwnedJob | None:
     return OwnedJob(folder, garment, file, float(begun))
 
 
-def begin(python: str, folder: Path, command: Sequence[str]) -> None:
+def begin(python: str, folder: Path, command: Sequence[str], *, improves: bool = False) -> None:
     """Let a job begin when its turn comes.
 
     Args:
         python: the Python that has ssilk.
         command: arguments of that Python, run in the job's folder.
+        improves: whether it goes on after it is done, until it is cancelled (see `runner`).
 
     Raises:
         SetupError: the Python cannot be started.
     """
-    _write(folder / ORDER, {"command": list(command)})
+    _write(folder / ORDER, {"command": list(command), "improves": improves})
     _launch(python, folder)
 
 
 def resume(python: str, folder: Path) -> None:
-    """Let a job go on where it ended.
+    """Let a job go on where it ended; it begins again where that was before it had written anything.
 
     Raises:
         SetupError: it works already, its files are gone, or the Python cannot be started.
@@ -154,7 +161,9 @@ def resume(python: str, folder: Path) -> None:
         raise SetupError(f"There is no training in {folder} any more; train again.")
     if state and state.alive:
         raise SetupError("The training is under way already.")
-    _write(folder / ORDER, {"command": [*(word for word in order["command"] if word != "--resume"), "--resume"]})
+    command = [word for word in order["command"] if word != "--resume"]
+    again = ["--resume"] if (folder / TRAINING_STATE).is_file() else []
+    _write(folder / ORDER, {**order, "command": [*command, *again]})
     _launch(python, folder)
 
 
@@ -191,6 +200,7 @@ def read_state(folder: Path) -> JobState | None:
     if said := {name: known[name] for name in ("text", "error") if known.get(name)}:
         names = recall(folder)
         known.update({name: reworded(sentence, folder, names) for name, sentence in said.items()})
+    known["cancelled"] = (folder / CANCEL).exists()
     state = JobState(**known)
     if state.alive and time.time() - state.beat > SILENCE:
         return JobState(**{**known, "state": "lost"})

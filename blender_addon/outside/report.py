@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from math import isfinite
 from typing import Any
 
-from ssilk_core.events import format_seconds
 from ssilk_core.training.verdict import ADVICE, NO_DYNAMICS, curve_lbs
 
 from .jobs import JobState
@@ -18,18 +17,51 @@ ENDED = {
     "lost": "Ended without a word at {done} of {total}, perhaps with the machine; resume it",
     "waiting": "Waits until the trainings before it have ended",
 }
+IMPROVED = {
+    "done": "Trained for {done} iterations, until it got no better",
+    "stopped": "Finished after {done} iterations; it can go on and get better",
+    "waiting": "Waits until other trainings have ended, and goes on",
+}
 
 
 def progress(state: JobState) -> str:
     """Return how far a training is."""
     if state.state == "failed":
         return state.error
-    if state.state in ENDED:
-        return ENDED[state.state].format(done=state.done, total=state.total)
+    if state.alive and state.cancelled:
+        return "Ends after its current step"
+    ended = {**ENDED, **(IMPROVED if state.round else {})}
+    if state.state in ended:
+        return ended[state.state].format(done=state.done, total=state.total)
     if not state.total:
         return "Prepares the training"
-    left = "" if state.seconds_left is None else f", {format_seconds(state.seconds_left)} left"
-    return f"Iteration {state.done} of {state.total}{left}"
+    if state.seconds_left is None:
+        return "Prepares to go on" if state.round else f"{state.done} of {state.total}"
+    return f"{state.done} of {state.total}, {rounded(state.seconds_left)} left"
+
+
+def rounded(seconds: float) -> str:
+    """Return a duration as people estimate it."""
+    minutes = max(1, round(seconds / 60))
+    if seconds < 60:
+        return f"{max(1, round(seconds))} s"
+    return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def improvement(state: JobState, curve: Mapping[str, Any]) -> list[str]:
+    """Return in short lines what a training has reached and whether it goes on; none before its first validation."""
+    if not (points := curve.get("points")):
+        return []
+    best = next((each for each in points if each.get("iteration") == state.checkpoint), points[-1])["validation"]
+    shown, first = ((score.get("shown_skin") or {}).get("mean") for score in (best, points[0]["validation"]))
+    if shown is None:
+        said = compared(best["total"], curve_lbs(curve)["total"])[0]
+    else:
+        before = f", {first:.2%} at first" if first is not None and first != shown else ""
+        said = f"{shown:.2%} of the covered skin shows{before}"
+    if state.cancelled or not state.round:
+        return [said]
+    return [said, f"Gets better until you finish it: {rounded(state.spent)} so far"]
 
 
 def findings(state: JobState, curve: Mapping[str, Any], *, moves: bool) -> list[tuple[str, bool]]:

@@ -4,6 +4,10 @@
 Run by the Python that has ssilk, from its standard library alone: `python runner.py JOB QUEUE`. JOB is a folder with
 `job.json`; `state.json` is written in it, and a file named `cancel` in it asks for an end. QUEUE is a folder in which
 all runners of a user line up: one of them trains at a time.
+
+A job that improves goes on after its command is done, until it is asked to end: in rounds, each of which resumes the
+training with twice the time spent so far, so that the learning rate falls again to where it ended. It ends by itself
+after a round without a better model. Rounds line up behind all first trainings, and make way for them.
 """
 
 import contextlib
@@ -22,7 +26,10 @@ LOOK = 0.25  # seconds between two looks at the queue, the training and the wish
 BEAT = 2.0  # seconds after which the state is written though nothing was heard: Blender sees that somebody is there
 MOST_POINTS = 300  # of the curve
 UNLOCKED = 5.0  # seconds that a new place in the queue may be unlocked before it counts as left behind
-WORSE, INTERRUPTED = 5, 130  # exit codes of ssilk: the model is worse than linear blend skinning; stopped
+DONE, FAULT, BAD_INPUT, WORSE, INTERRUPTED = 0, 1, 2, 5, 130  # exit codes of ssilk; worse: than linear blend skinning
+KEPT = ("curve", "checkpoint", "done", "total", "round", "spent", "minutes", "best_before")  # of an earlier run
+GROWTH = 2.0  # of the time that is spent, from round to round
+LATER = "later-"  # begins names of places in the queue, after all digits
 
 # On Windows an interrupt reaches a whole group, so that the training needs one of its own.
 if sys.platform == "win32":
@@ -35,9 +42,11 @@ class StateFile:
     """The state of a job: what its training said last, written whole."""
 
     def __init__(self, folder):
-        """Take up the curve of an earlier run."""
+        """Take up what an earlier run has reached."""
         self.path = folder / STATE
-        self.fields = {"curve": read(self.path).get("curve", [])}
+        before = read(self.path)
+        kept = {name: before[name] for name in KEPT if name in before}
+        self.fields = {"curve": [], "round": 0, "spent": 0.0, **kept}
         self.written = 0.0
 
     def hear(self, event):
@@ -76,10 +85,10 @@ def read(path):
 
 
 @contextlib.contextmanager
-def place_in(folder):
-    """Yield a function that says whether it is our turn: whether all who came earlier have left the queue."""
+def place_in(folder, prefix=""):
+    """Yield a function that says whether it is our turn: whether all who come earlier have left the queue."""
     folder.mkdir(parents=True, exist_ok=True)
-    own = folder / f"{time.time_ns():020d}-{os.getpid()}"
+    own = folder / f"{prefix}{time.time_ns():020d}-{os.getpid()}"
     with own.open("w") as stream:
         if not locks(stream):
             raise OSError(f"{own} cannot be locked")
@@ -130,8 +139,8 @@ def wait(folder, record, our_turn):
     return False
 
 
-def train(folder, record, command):
-    """Run the training; return its exit code."""
+def train(folder, record, command, our_turn):
+    """Run the training; return its exit code: INTERRUPTED where it was asked to end, however it did."""
     with (folder / LOG).open("w", encoding="utf-8") as log:
         process = subprocess.Popen(
             [sys.executable, *command], cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log,
@@ -141,23 +150,26 @@ def train(folder, record, command):
     reader = threading.Thread(target=pass_on, args=(process.stdout, said.put), daemon=True)
     reader.start()
     try:
-        attend(process, said, reader, folder, record)
+        asked = attend(process, said, reader, folder, record, our_turn)
     finally:
         if process.poll() is None:  # the folder is gone, and nobody will ask for the model
             process.terminate()
-    return process.returncode
+    told = process.returncode in (DONE, FAULT, BAD_INPUT, WORSE)
+    return INTERRUPTED if asked and not told else process.returncode
 
 
-def attend(process, said, reader, folder, record):
-    """Write what a training says until it ends; interrupt it when that is asked for."""
-    asked = False
+def attend(process, said, reader, folder, record, our_turn):
+    """Write what a training says until it ends; interrupt it when that is asked for. Return whether it was."""
+    asked, began, before = False, time.monotonic(), record.fields["spent"]
     while process.poll() is None or reader.is_alive() or not said.empty():
-        if not asked and (folder / CANCEL).exists() and process.poll() is None:
+        if not asked and process.poll() is None and ((folder / CANCEL).exists() or not our_turn()):
             process.send_signal(INTERRUPT)
             asked = True
+        record.fields["spent"] = before + time.monotonic() - began
         if listen(said, record) or time.monotonic() - record.written > BEAT:
             record.write()
         time.sleep(LOOK)
+    return asked
 
 
 def pass_on(stream, take):
@@ -184,18 +196,40 @@ def last_words(folder):
 
 def main(folder, queue_folder):
     """Wait and train; the state says how it ended."""
-    record = StateFile(folder)
+    record, order = StateFile(folder), read(folder / ORDER)
+    while not (end := run_round(folder, queue_folder, record, order)):
+        pass
+    record.write(**end)
+
+
+def run_round(folder, queue_folder, record, order):
+    """Wait and train once; return how the job ended, as fields of its state, or nothing where there is more to do."""
+    fields, improves = record.fields, order.get("improves", False)
+    later = fields["round"] > 0
     record.write(state="waiting")
-    with place_in(queue_folder) as our_turn:
+    with place_in(queue_folder, LATER if later else "") as our_turn:
         if not wait(folder, record, our_turn):
-            record.write(state="stopped")
-            return
+            return {"state": "stopped"}
         record.write(state="running")
-        code = train(folder, record, read(folder / ORDER)["command"])
-    if code in (0, WORSE, INTERRUPTED):
-        record.write(state="stopped" if code == INTERRUPTED else "done", seconds_left=None)
-    else:
-        record.write(state="failed", error=record.fields.get("error") or last_words(folder))
+        code = train(folder, record, command_of(order, fields), our_turn if later else lambda: True)
+    if code == INTERRUPTED:  # by the artist, or to make way
+        return {} if later and not (folder / CANCEL).exists() else {"state": "stopped", "seconds_left": None}
+    if code not in (DONE, WORSE):
+        return {"state": "failed", "error": fields.get("error") or last_words(folder)}
+    best = fields.get("checkpoint")
+    if not improves or (later and best == fields["best_before"]):
+        return {"state": "done", "seconds_left": None}
+    minutes = GROWTH * fields["spent"] / 60
+    fields.update(round=fields["round"] + 1, minutes=minutes, best_before=best, seconds_left=None)
+    return {}
+
+
+def command_of(order, fields):
+    """Return the arguments of a round: all but the first resume, with minutes in place of the preset's iterations."""
+    if not fields["round"]:
+        return order["command"]
+    command = [word for word in order["command"] if word != "--resume"]
+    return [*command, "--resume", "--minutes", f"{fields['minutes']:g}"]
 
 
 if __name__ == "__main__":

@@ -66,6 +66,11 @@ class Work:
             self.close()
             raise
 
+    @property
+    def status(self) -> str:
+        """What is done and how far it is, in one line."""
+        return self.title if self.fraction is None else f"{self.title}: {self.fraction:.0%}"
+
     def poll(self) -> bool:
         """Do some steps, or take in what was said meanwhile; return whether everything has ended."""
         if self._steps is not None:

@@ -5,18 +5,15 @@ from __future__ import annotations
 
 import bpy
 
-from ..errors import SetupError
 from ..scene.garment import unusable
-from ..scene.models import model_of, relative
+from ..scene.progress import no_model
 from .base import SidebarPanel, draw_text, saying_errors
 
 
 def model_line(garment: bpy.types.Object) -> str:
     """Return which model is baked, or why there is none."""
-    try:
-        return f"Bakes {relative(model_of(garment))}"
-    except SetupError as error:
-        return str(error)
+    own = "Bakes the chosen model" if garment.ssilk.model else "Bakes the best model of its training"
+    return no_model(garment) or own
 
 
 class BakingPanel(SidebarPanel, bpy.types.Panel):

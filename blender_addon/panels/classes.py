@@ -4,14 +4,39 @@
 from __future__ import annotations
 
 import bpy
+import numpy as np
 
-from ..classes import counts
+from ssilk_core.preflight.finding import format_count
+
+from ..classes import LEVELS, adrift, counts
 from ..errors import SetupError
 from ..operators.classes import CHOICES
 from ..overlay import shown
 from ..scene.attributes import current_classes
 from ..scene.garment import unusable
 from .base import SidebarPanel, draw_text, saying_errors
+
+_adrift: tuple[object, int] = (None, 0)  # what was looked at last, and what was found
+
+
+def adrift_line(thing: bpy.types.Object) -> str:
+    """Return how much of a garment falls off, since islands of it are all loose; empty where nothing does.
+
+    Only what has changed is looked at again: panels are drawn many times a second.
+    """
+    global _adrift
+    mesh, values = thing.data, current_classes(thing.data)
+    if values is None or mesh.is_editmode:
+        return ""
+    looked = (mesh.session_uid, len(mesh.edges), values.tobytes())
+    if _adrift[0] != looked:
+        pairs = np.empty(2 * len(mesh.edges), dtype=np.int32)
+        mesh.edges.foreach_get("vertices", pairs)
+        _adrift = (looked, adrift(values, pairs.reshape(-1, 2)))
+    if not _adrift[1]:
+        return ""
+    falling = format_count(_adrift[1], "vertices")
+    return f"{falling} would fall off: each separate piece needs some that are pinned or tight"
 
 
 def class_counts(thing: bpy.types.Object) -> tuple[int, int, int] | None:
@@ -35,14 +60,18 @@ class ClassesPanel(SidebarPanel, bpy.types.Panel):
 
     @saying_errors
     def draw(self, context: bpy.types.Context) -> None:
-        layout, found = self.layout, None
+        layout, found, falling = self.layout, None, ""
         try:
-            found = class_counts(context.object)
+            found, falling = class_counts(context.object), adrift_line(context.object)
         except SetupError as error:
             draw_text(layout, str(error), icon="ERROR")
         settings = context.object.ssilk
         layout.operator("ssilk.classify")
-        layout.prop(settings, "tightness", slider=True)
+        row = layout.row()
+        row.enabled = LEVELS in context.object.data.attributes  # which Classify Automatically makes
+        row.prop(settings, "tightness", slider=True)
+        if falling:
+            draw_text(layout, falling, icon="ERROR")
         layout.prop_search(settings, "pins", context.object, "vertex_groups")
         layout.operator("ssilk.paint_classes", icon="BRUSH_DATA")
         editing = context.mode == "EDIT_MESH"
@@ -50,7 +79,9 @@ class ClassesPanel(SidebarPanel, bpy.types.Panel):
         for index, (name, label, _) in enumerate(CHOICES):
             column = row.column(align=True)
             column.operator("ssilk.fill_class" if editing else "ssilk.brush_class", text=label).value = name
-            column.label(text=str(found[index]) if found else "-")
+            count = column.row()
+            count.alignment = "CENTER"
+            count.label(text=str(found[index]) if found else "-")
         layout.operator("ssilk.take_up_painting")
         layout.operator("ssilk.toggle_overlay", icon="OVERLAY", depress=shown())
         row = layout.row(align=True)

@@ -6,13 +6,14 @@ from __future__ import annotations
 import bpy
 
 from ..errors import SetupError
-from ..operators import make_it_move
-from ..outside.jobs import read_state
-from ..outside.report import progress
-from ..preferences import unready
+from ..operators import make_it_move, tasks
+from ..outside.report import improvement
+from ..preferences import ROOT, unready
 from ..scene.garment import armature_of, garments_of, unusable
-from ..scene.models import job_of, orphans
+from ..scene.models import orphans
+from ..scene.progress import progress_of
 from .base import SidebarPanel, draw_text, draw_work, saying_errors
+from .training import draw_bar
 
 
 def draw_garments(layout: bpy.types.UILayout, shown: bpy.types.Object) -> None:
@@ -37,12 +38,13 @@ def draw_course(layout: bpy.types.UILayout, garment: bpy.types.Object) -> None:
         row = layout.row()
         draw_text(row, waits, icon="TIME")
         row.operator("ssilk.stop_course", text="", icon="X")
-    folder = job_of(garment)
-    state = folder and read_state(folder)
-    if state and state.state == "failed":
-        draw_text(layout, f"Training: {state.error}", icon="ERROR")
-    elif state and state.alive:
-        draw_text(layout, f"Training: {progress(state)}", icon="INFO")
+    training = progress_of(garment)
+    if training and training.state and training.state.state == "failed":
+        draw_text(layout, f"Training: {training.state.error}", icon="ERROR")
+    elif training and training.alive:
+        draw_bar(layout, training.state)
+        for line in improvement(training.state, training.curve):
+            draw_text(layout, line)
 
 
 def draw_orphans(layout: bpy.types.UILayout) -> None:
@@ -72,9 +74,11 @@ class GarmentPanel(SidebarPanel, bpy.types.Panel):
             layout.prop(context.object.ssilk, "bodies")
             draw_course(layout, context.object)
             draw_garments(layout, context.object)
-        missing = unready(context)
+        missing = "" if tasks.current else unready(context)  # what runs may be finding it
         if missing:
             draw_text(layout, missing, icon="ERROR")
-            layout.operator("ssilk.find_python")
+            row = layout.row(align=True)
+            row.operator("ssilk.find_python")
+            row.operator("preferences.addon_show", text="Preferences", icon="PREFERENCES").module = ROOT
         draw_work(layout)
         draw_orphans(layout)

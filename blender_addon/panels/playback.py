@@ -16,7 +16,7 @@ def live_line(garment: bpy.types.Object) -> str:
     if played is None:
         return playing.reason(garment)
     if played.done is not None:
-        return f"Reading the motion: {played.done:.0%}"
+        return f"{'Taking up a better model' if played.model_only else 'Reading the motion'}: {played.done:.0%}"
     return "The motion changed since it was read" if played.stale else "Follows the armature"
 
 

@@ -19,7 +19,7 @@ class FindingList(bpy.types.UIList):
     bl_idname = "SSILK_UL_findings"
 
     def draw_item(self, _context, layout, _data, item, _icon, _active, _property) -> None:  # type: ignore[no-untyped-def]
-        layout.label(text=line(item), icon=ICONS.get(item.severity, "INFO"), translate=False)
+        layout.label(text=sentence(line(item)), icon=ICONS.get(item.severity, "INFO"), translate=False)
 
 
 class PreflightPanel(SidebarPanel, bpy.types.Panel):
@@ -40,13 +40,18 @@ class PreflightPanel(SidebarPanel, bpy.types.Panel):
         if item is None:
             return
         layout.template_list(FindingList.bl_idname, "", preflight, "findings", preflight, "active", rows=4)
-        for text in (item.target, item.found, item.why, item.fix):
+        for text in (item.target, item.found, sentence(item.why), sentence(item.fix)):
             draw_text(layout, text)
         if item.old:
             draw_text(layout, "It has changed since; inspect again", icon="FILE_REFRESH")
         row = layout.row(align=True)
         row.operator("ssilk.select_finding")
         row.operator(fixer(item) or "ssilk.fix_finding")
+
+
+def sentence(text: str) -> str:
+    """Return text that begins with a capital letter."""
+    return text[:1].upper() + text[1:]
 
 
 def line(item: bpy.types.PropertyGroup) -> str:

@@ -3,32 +3,22 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import bpy
 
 from ..curves import series
 from ..errors import SetupError
-from ..outside.jobs import JobState, read_curve, read_state, stamp
+from ..outside.jobs import JobState
 from ..outside.report import findings, progress
 from ..scene.armature import proxy_names
 from ..scene.garment import armature_of, unusable
-from ..scene.models import job_of
 from ..scene.motions import FILE
+from ..scene.progress import TrainingProgress, progress_of
 from .base import SidebarPanel, draw_text, saying_errors
 from .plot import plot, swatch
 
 ICONS = {"TIMELINE": "TIME", "ACTION": "ACTION", "STRIP": "NLA", "FILE": "FILE"}
 FEWEST_ROWS, MOST_ROWS = 3, 8  # of the list of motions
 PLOT_SCALE = 8.0  # in heights of a line of text
-_stamps: dict[Path, float] = {}
-
-
-def changed(folder: Path) -> bool:
-    """Return whether a training has written something since this was asked last."""
-    before, now = _stamps.get(folder, 0.0), stamp(folder)
-    _stamps[folder] = now
-    return before != now
 
 
 def has_proxies(garment: bpy.types.Object) -> bool:
@@ -72,28 +62,38 @@ def draw_motions(layout: bpy.types.UILayout, garment: bpy.types.Object) -> None:
     column.operator("ssilk.add_motion_files", icon="FILE_FOLDER")
 
 
-def draw_state(layout: bpy.types.UILayout, folder: Path, state: JobState, *, moves: bool) -> None:
-    """Draw how far a training is, and what it found."""
+def draw_bar(layout: bpy.types.UILayout, state: JobState) -> None:
+    """Draw how far a training is, with a button that ends it or lets it go on."""
     row = layout.row(align=True)
-    row.progress(factor=state.fraction, text=f"{state.done} of {state.total}" if state.total else "")
-    if state.alive:
+    row.progress(factor=state.fraction, text=progress(state) if state.alive else f"{state.done} of {state.total}")
+    if state.alive and state.round:
+        layout.operator("ssilk.cancel_training", text="Finish", icon="CHECKMARK")
+    elif state.alive:
         row.operator("ssilk.cancel_training", text="", icon="CANCEL")
     elif state.state != "done":
         row.operator("ssilk.resume_training", text="", icon="PLAY")
-    draw_text(layout, progress(state), icon="NONE" if state.alive or state.state == "done" else "INFO")
-    for text, warns in findings(state, read_curve(folder), moves=moves):
+
+
+def draw_training(layout: bpy.types.UILayout, training: TrainingProgress, *, moves: bool) -> None:
+    """Draw how far a training is, and what it found."""
+    state = training.state
+    draw_bar(layout, state)
+    if not state.alive:
+        draw_text(layout, progress(state), icon="NONE" if state.state == "done" else "INFO")
+    for text, warns in findings(state, training.curve, moves=moves):
         draw_text(layout, text, icon="ERROR" if warns else "NONE")
 
 
-def draw_energies(layout: bpy.types.UILayout, folder: Path, state: JobState) -> None:
+def draw_energies(layout: bpy.types.UILayout, training: TrainingProgress) -> None:
     """Draw the energies of a training over its iterations."""
-    lines = series(state.curve)
+    lines = series(training.state.curve)
     if not lines:
         layout.label(text="Nothing was computed yet")
         return
-    layout.template_icon(icon_value=plot(str(folder), stamp(folder), list(lines.values())), scale=PLOT_SCALE)
+    picture = plot(str(training.folder), training.written, list(lines.values()))
+    layout.template_icon(icon_value=picture, scale=PLOT_SCALE)
     for index, (name, values) in enumerate(lines.items()):
-        layout.label(text=f"{name}: {values[-1, 1]:.3g} J", icon_value=swatch(index))
+        layout.label(text=f"{name.capitalize()}: {values[-1, 1]:.3g} J", icon_value=swatch(index), translate=False)
 
 
 class TrainingPanel(SidebarPanel, bpy.types.Panel):
@@ -108,16 +108,15 @@ class TrainingPanel(SidebarPanel, bpy.types.Panel):
     @saying_errors
     def draw(self, context: bpy.types.Context) -> None:
         layout, garment = self.layout, context.object
-        settings, folder = garment.ssilk.training, job_of(garment)
+        settings, training = garment.ssilk.training, progress_of(garment)
         draw_motions(layout, garment)
         layout.prop(settings, "preset")
         column = layout.column(align=True)
         column.prop(settings, "iterations")
         column.prop(settings, "minutes")
         layout.operator("ssilk.train", icon="PLAY")
-        state = folder and read_state(folder)
-        if state:
-            draw_state(layout, folder, state, moves=has_proxies(garment))
+        if training and training.state:
+            draw_training(layout, training, moves=has_proxies(garment))
 
 
 class EnergiesPanel(SidebarPanel, bpy.types.Panel):
@@ -129,12 +128,11 @@ class EnergiesPanel(SidebarPanel, bpy.types.Panel):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        folder = None if unusable(context.object) else job_of(context.object)
-        return bool(folder and read_state(folder))
+        training = None if unusable(context.object) else progress_of(context.object)
+        return bool(training and training.state)
 
     @saying_errors
     def draw(self, context: bpy.types.Context) -> None:
-        folder = job_of(context.object)
-        state = folder and read_state(folder)
-        if state:
-            draw_energies(self.layout, folder, state)
+        training = progress_of(context.object)
+        if training and training.state:
+            draw_energies(self.layout, training)

@@ -58,7 +58,8 @@ def channels_of(armature: bpy.types.Object, joints: Joints, motion: Motion) -> I
 
 def add_action(armature: bpy.types.Object, motion: Motion, channels: list[Channel]) -> bpy.types.Action:
     """Give an armature an action with the keys of a motion, in the scene's time."""
-    return new_action(f"{PREFIX}{motion.path}", armature, FIRST, scene_rate() / motion.fps, channels)
+    name = PREFIX + motion.path.replace("_", " ")
+    return new_action(name, armature, FIRST, scene_rate() / motion.fps, channels)
 
 
 def _channels(name: str, local: np.ndarray, still: float) -> list[Channel]:

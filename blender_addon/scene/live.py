@@ -8,7 +8,7 @@ armature differs from what was read, latents are kept up to that frame and rolle
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import bpy
@@ -16,6 +16,7 @@ import numpy as np
 from ssilk_usd.skinned import SkinnedGarment
 
 from ssilk_core.assets import Motion
+from ssilk_core.runtime import Playback
 
 from ..errors import SetupError
 from .armature import read_joints
@@ -38,6 +39,7 @@ class Live:
     Attributes:
         done: the part of the motion that was read; None when there is nothing to read.
         stale: whether the armature does something else by now than what was read.
+        model_only: whether a newer model is read, for the motion that was read before.
 
     Raises:
         SetupError: bones or the garment do not deform as ssilk has it.
@@ -51,7 +53,7 @@ class Live:
         self.model, self.trained, self._written = model, None, 0.0
         self.playback, self.first, self.placed = None, 0, np.zeros((0, 0, 4, 4))
         self.done: float | None = None
-        self.stale = False
+        self.stale = self.model_only = False
         self.refresh()
 
     def refresh(self) -> None:
@@ -59,7 +61,14 @@ class Live:
         _, armature = self.objects()
         (take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
         self._steps = self._reading(take)
-        self.done, self.stale = 0.0, False
+        self.done, self.stale, self.model_only = 0.0, False, False
+
+    def take_up(self) -> None:
+        """Read the model again, for the motion that was read; the old one is played until the new one can be."""
+        if self.playback is None or self.stale:
+            self.refresh()
+        else:
+            self._steps, self.done, self.model_only = self._taking_up(), 0.0, True
 
     @property
     def renewed(self) -> bool:
@@ -123,11 +132,31 @@ class Live:
         yield from (READING * done for done in sample(armature, self.joints.character, [take]))
         need_company(*self.objects(), take)
         placed = np.array(take.worlds)
-        playback = self.trained.player.play(self._motion(placed), pre_roll=PRE_ROLL, block=BLOCK)
+        playback = yield from self._rolling(self.trained, placed, READING)
+        self.first, self.placed, self.playback = take.frames.start, placed, playback
+
+    def _rolling(self, trained: TrainedGarment, placed: np.ndarray, done: float) -> Generator[float, None, Playback]:
+        """Return what plays joints to the world, shape (F, J, 4, 4); yield the part that is done, from `done` on."""
+        playback = trained.player.play(_motion(trained, placed), pre_roll=PRE_ROLL, block=BLOCK)
         for frame in range(0, len(placed), BLOCK):
             playback.pose(frame)
-            yield READING + (1 - READING) * frame / len(placed)
-        self.first, self.placed, self.playback = take.frames.start, placed, playback
+            yield done + (1 - done) * frame / len(placed)
+        return playback
+
+    def _taking_up(self) -> Iterator[float]:
+        """Read the model and roll it out, then give the garment its shapes and weights and play it at once."""
+        written, trained, placed = _written(self.model), TrainedGarment(self.model, self.joints), self.placed.copy()
+        yield 0.0
+        skinned = SkinnedGarment.of(trained.player.deformer())
+        playback = yield from self._rolling(trained, placed, 0.0)
+        garment, armature = self.objects()
+        if not self.ready():  # the artist edits it; the model is still a new one afterwards
+            return
+        moved = np.flatnonzero((placed != self.placed).any(axis=(1, 2, 3)))
+        if len(moved):
+            playback = playback.with_motion(_motion(trained, self.placed), int(moved[0]))
+        self.shapes = apply_deformation(garment, armature, self.joints, skinned, trained.order)
+        self.trained, self.playback, self._written = trained, playback, written
 
     def _dressing(self) -> Iterator[float]:
         """Read the model and give the garment its shapes and weights; it is held until it is played by them."""
@@ -150,11 +179,12 @@ class Live:
         if np.allclose(placed, self.placed[index], rtol=MOVED, atol=MOVED):
             return
         self.placed[index] = placed
-        self.playback, self.stale = self.playback.with_motion(self._motion(self.placed), index), True
+        self.playback, self.stale = self.playback.with_motion(_motion(self.trained, self.placed), index), True
 
-    def _motion(self, placed: np.ndarray) -> Motion:
-        """Return joints of the armature to the world, shape (F, J, 4, 4), as a motion of the model's skeleton."""
-        return motion_of(placed[:, self.trained.own], self.trained.player.skeleton.parents, "the timeline")
+
+def _motion(trained: TrainedGarment, placed: np.ndarray) -> Motion:
+    """Return joints of the armature to the world, shape (F, J, 4, 4), as a motion of the model's skeleton."""
+    return motion_of(placed[:, trained.own], trained.player.skeleton.parents, "the timeline")
 
 
 def _written(path: Path) -> float:

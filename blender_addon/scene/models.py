@@ -17,7 +17,7 @@ import bpy
 from ..errors import SetupError
 from ..outside.jobs import MODEL, OwnedJob, owned, owner, read_state
 
-FIRST = "wait for the training's first validation, or resume it"
+FIRST = "wait for its training, or resume it"
 FOLDER = "ssilk"  # of trainings, beside the blend file
 _orphans: tuple[str, list[Orphan]] = ("", [])  # the blend file, and what was found beside it
 
@@ -94,7 +94,16 @@ def model_of(garment: bpy.types.Object) -> Path:
     Raises:
         SetupError: there is none.
     """
-    job, chosen = job_of(garment), garment.ssilk.model
+    return need_model(garment, job_of(garment))
+
+
+def need_model(garment: bpy.types.Object, job: Path | None) -> Path:
+    """Return the model that was chosen for a garment, else the one in the folder of its training.
+
+    Raises:
+        SetupError: there is none.
+    """
+    chosen = garment.ssilk.model
     if not chosen and not job:
         raise SetupError(f"'{garment.name}' has no trained model; train it, or choose a model in the Baking panel.")
     path = Path(bpy.path.abspath(chosen)) if chosen else job / MODEL

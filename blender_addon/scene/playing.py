@@ -11,6 +11,7 @@ from bpy.app.handlers import persistent
 
 from ssilk_core.errors import SsilkError
 
+from .. import overlay
 from ..outside.jobs import MODEL, read_state
 from .live import Live
 from .models import job_of, model_of
@@ -63,7 +64,7 @@ def take_up_models() -> None:
     """Switch to the newest models of trainings that are played."""
     for uid, played in list(_played.items()):
         if played.renewed and played.done is None and _attempt(uid, played.ready):
-            _attempt(uid, played.refresh)
+            _attempt(uid, played.take_up)
             _read_soon(0.0)
 
 
@@ -79,6 +80,7 @@ def play_what_is_awaited() -> None:
         if job and (job / MODEL).is_file():
             garment.ssilk.awaited = False
             _attempt(garment.session_uid, play, garment)
+            overlay.hide()  # classes would lie over what the artist has waited for
         elif not (state and state.alive):  # it ended before there was a model, and the panel says why
             garment.ssilk.awaited = False
 

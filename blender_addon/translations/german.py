@@ -211,10 +211,12 @@ WORDS = {
     "USD file that ssilk wrote": "USD-Datei, die ssilk schrieb",
     # All at once, help, failures
     "Make It Move": "In Bewegung setzen",
-    "Classify, rig, choose motions, train what fits the device, and play it live as soon as there is a model": (
-        "Klassen finden, Rig erzeugen, Bewegungen wählen, trainieren, was zum Gerät passt, und live spielen, sobald "
-        "es ein Modell gibt"
+    "Classify, rig, choose motions, train, and play it live: it gets better until you finish the training": (
+        "Klassen finden, Rig erzeugen, Bewegungen wählen, trainieren und live spielen: Es wird besser, bis Sie das "
+        "Training beenden"
     ),
+    "Finish": "Fertig",
+    "Preferences": "Einstellungen",
     "Stop Here": "Hier aufhören",
     "Take no further step; what was done stays, and a training goes on": (
         "Keinen weiteren Schritt tun; was getan ist, bleibt, und ein Training läuft weiter"
@@ -286,8 +288,10 @@ WORDS = {
         "Zeit, die mit so vielen Schritten gefüllt wird, wie hineinpassen, statt denen der Vorgabe; null: diese"
     ),
     "Tightness": "Enge",
-    "How much of the garment is tight: nothing but what is pinned, or all; replaces what is painted": (
-        "Wie viel des Kleidungsstücks anliegt: nichts, was nicht fest ist, oder alles; ersetzt, was gemalt ist"
+    "How much of the garment is tight: nothing but what is pinned, or all; replaces what is painted, once classes "
+    "were found automatically": (
+        "Wie viel des Kleidungsstücks anliegt: nichts, was nicht fest ist, oder alles; ersetzt, was gemalt ist, "
+        "sobald Klassen automatisch gefunden wurden"
     ),
     "Pins": "Festes",
     "Vertex group of what is pinned when classes are found; the band it hangs from when empty": (

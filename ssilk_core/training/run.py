@@ -36,6 +36,7 @@ from .verdict import non_finite_terms, validation_message
 SAVE_INTERVAL = 60.0  # [s] between saved states
 MORE_TIME = 0.1  # of the minutes: what has to be left for a run that is done to go on
 PACE_INTERVAL = 5.0  # [s] between measurements of the speed on a processor
+REPORT_INTERVAL = 10.0  # [s] between reports of progress there, where steps are long
 RECOVERY_PACE = 0.25  # factor on learning rates after divergence
 
 
@@ -92,7 +93,7 @@ class TrainingRun:
         else:
             self._resume(tensors)
         self.files.save_curve(self.state, self.lbs)
-        self._since = self._saved_at = self._measured_at = time.monotonic()
+        self._since = self._saved_at = self._measured_at = self._reported_at = time.monotonic()
         self._timed = self.state.iteration, self.state.seconds
 
     @property
@@ -289,7 +290,7 @@ class TrainingRun:
 
     def check(self, seconds_left: float) -> None:
         """Report progress and skipped steps, follow the clock, and recover if training diverges."""
-        self._report_progress(seconds_left)
+        self.report_progress(seconds_left)
         self._measure_pace()
         if text := self.monitor.check():
             self.report(Message(text, "warning"))
@@ -298,7 +299,14 @@ class TrainingRun:
                 f"more than half of the last {DIVERGENCE_WINDOW} steps were skipped", self.monitor.non_finite_terms
             )
 
-    def _report_progress(self, seconds_left: float) -> None:
+    @property
+    def report_due(self) -> bool:
+        """Whether nothing was said of the progress for long; a GPU would have to be waited for."""
+        return self.device.type == "cpu" and time.monotonic() - self._reported_at >= REPORT_INTERVAL
+
+    def report_progress(self, seconds_left: float) -> None:
+        """Report the progress and the energies of the last batch."""
+        self._reported_at = time.monotonic()
         self.report(Progress(self.state.iteration, self.config.iterations, seconds_left, self._batch_terms()))
 
     def _batch_terms(self) -> dict[str, float]:
@@ -337,7 +345,7 @@ class TrainingRun:
 
     def end_early(self) -> None:
         """End because the time is up, with a validation if there were steps since the last one."""
-        self._report_progress(0.0)
+        self.report_progress(0.0)
         self.report(Message(f"time is up at iteration {self.state.iteration} of {self.config.iterations}"))
         if self.state.iteration != self.saved and self.state.iteration >= self.config.static_iterations:
             self.validate()
@@ -474,10 +482,11 @@ def _loop(run: TrainingRun, stop: threading.Event) -> bool:
             return True
         run.step()
         steps += 1
+        left = min((time.monotonic() - began) / steps * (total - run.state.iteration), max(0.0, run.time_left))
         if run.state.iteration % CHECK_INTERVAL == 0 or run.state.iteration == total or steps == 1:
-            run.check(
-                min((time.monotonic() - began) / steps * (total - run.state.iteration), max(0.0, run.time_left))
-            )
+            run.check(left)
+        elif run.report_due:
+            run.report_progress(left)
         if run.validation_due:
             run.validate()
         elif run.save_due:

@@ -66,13 +66,14 @@ def rig_and_animate(bpy: ModuleType, garment: Any, frames: int = 40) -> None:
     bpy.context.scene.frame_start, bpy.context.scene.frame_end = 1, frames
 
 
-def ended(garment: Any, *, after: int = 0, seconds: float = 120) -> Any:
-    """Wait until the training of a garment has come so far, or has ended; return its state."""
+def ended(garment: Any, *, after: int = 0, until: Any = None, seconds: float = 120) -> Any:
+    """Wait until the training of a garment has come so far, is as asked, or has ended; return its state."""
     from blender_addon.outside.jobs import read_state
     from blender_addon.scene.models import job_of
 
     deadline = time.monotonic() + seconds
-    while (state := read_state(job_of(garment))).alive and not (after and state.done >= after):
+    until = until or (lambda state: after and state.done >= after)
+    while (state := read_state(job_of(garment))).alive and not until(state):
         assert time.monotonic() < deadline, state
         time.sleep(0.05)
     return state

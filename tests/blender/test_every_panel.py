@@ -141,7 +141,7 @@ def states(bpy: Any, monkeypatch: Any, folder: Path) -> Iterator[tuple[str, Call
     yield "motions", motions
     yield "found", found
     yield "heat", shown_heat
-    yield "reads", live(monkeypatch, done=0.5, stale=False, renewed=False)
+    yield "reads", live(monkeypatch, done=0.5, stale=False, renewed=False, model_only=True)
     yield "stale", live(monkeypatch, done=None, stale=True, renewed=False)
     yield "another drive", lambda garment: setattr(garment.ssilk, "model", __file__)
     yield "no folder", training(folder / "none")

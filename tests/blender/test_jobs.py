@@ -37,6 +37,17 @@ for _ in range(1500):
 sys.exit(130)
 """
 
+DONE_ONCE = "import sys\nif '--resume' not in sys.argv: sys.exit()\n"
+IMPROVES = """
+import json, sys
+with open("rounds", "a+") as file:
+    file.write(json.dumps(sys.argv[1:]) + chr(10))
+    file.seek(0)
+    done = 10 * len(file.readlines())
+print(json.dumps({"event": "progress", "done": done, "total": done, "seconds_left": 0, "terms": {}}))
+if done < 40: print(json.dumps({"event": "checkpoint", "path": "model.safetensors", "done": done, "best": True}))
+"""
+
 
 @pytest.fixture(autouse=True)
 def own_queue(tmp_path, monkeypatch):
@@ -84,6 +95,10 @@ def test_a_training_whose_model_is_worse_than_none_is_done_and_says_so(folder):
 def test_a_curve_goes_on_where_a_job_is_resumed(folder):
     jobs.begin(sys.executable, folder, ["-c", SAYS])
     until(folder, "done")
+    jobs.resume(sys.executable, folder)  # it ended before its training wrote a state: there is nothing to resume
+    until(folder, "done")
+    assert "--resume" not in json.loads((folder / "job.json").read_text())["command"]
+    (folder / "model.resume.safetensors").touch()
     jobs.resume(sys.executable, folder)
     state = until(folder, "done")
     assert [done for done, _ in state.curve] == [1, 2, 3, 4]
@@ -113,6 +128,26 @@ def test_cancel_lets_the_training_end_by_itself(folder):
 def test_why_a_job_failed_is_kept(folder, program, told):
     jobs.begin(sys.executable, folder, ["-c", program])
     assert until(folder, "failed").error == told
+
+
+def test_a_job_that_improves_goes_on_in_rounds_until_one_finds_nothing_better(folder):
+    jobs.begin(sys.executable, folder, ["-c", IMPROVES, "--resume"], improves=True)  # as after a loss of the machine
+    state = until(folder, "done")
+    rounds = [json.loads(line) for line in (folder / "rounds").read_text().splitlines()]
+    minutes = [float(words[-1]) for words in rounds[1:]]
+    assert rounds[0] == ["--resume"] and all(words[:-1] == ["--resume", "--minutes"] for words in rounds[1:])
+    assert len(minutes) == 3 and 0 < minutes[0] < minutes[1] < minutes[2]
+    assert (state.round, state.checkpoint, state.done) == (3, 30, 40) and 60 * minutes[-1] < 2 * state.spent
+
+
+def test_an_improvement_makes_way_for_a_training_and_goes_on_after_it(folder, tmp_path):
+    jobs.begin(sys.executable, folder, ["-c", DONE_ONCE + WAITS], improves=True)
+    until_heard(folder)
+    jobs.begin(sys.executable, other := jobs.create(tmp_path, "B"), ["-c", SAYS])
+    until(other, "done")
+    assert (until(folder, "running").round, until(other, "done").round) == (1, 0)
+    jobs.cancel(folder)
+    assert (until(folder, "stopped").done, jobs.read_state(folder).round) == (1, 1)
 
 
 def test_jobs_line_up_and_one_at_a_time_runs(folder, tmp_path):

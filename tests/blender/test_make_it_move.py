@@ -31,7 +31,9 @@ def test_a_character_that_nothing_moves_gets_the_motions_of_the_demo(ready, monk
     armature = next(thing for thing in bpy.data.objects if thing.type == "ARMATURE")
     skirt = add_mesh(bpy, "Skirt", *tube(24, 5, (0.6, 1.0), (0.5, 0.3)))
     activate(bpy, skirt)
+    bpy.context.scene.frame_start = bpy.context.scene.frame_end = 0  # as an import of a still character leaves it
     assert bpy.ops.ssilk.add_demo_motions() == {"FINISHED"}
+    assert bpy.context.scene.frame_end == int(armature.animation_data.action.frame_range[1]) > 20
     names = [source.name for source in sources(armature)[1:]]
     assert len(names) == 20 and [item.name for item in skirt.ssilk.training.motions if item.use] == sorted(
         names, key=[item.name for item in skirt.ssilk.training.motions].index
@@ -70,10 +72,10 @@ def lines_up(bpy, garment) -> tuple[list[str], object]:
     return called, job_of(garment)
 
 
-def test_a_mesh_comes_to_play_while_it_is_trained(ready, skirt, tmp_path):
+def test_a_mesh_comes_to_play_while_it_is_trained(ready, skirt, tmp_path, monkeypatch):
     from blender_addon.operators.training import watch
     from blender_addon.panels import GarmentPanel
-    from blender_addon.scene import playing
+    from blender_addon.scene import live, playing
 
     bpy, settings = ready, skirt.ssilk.training
     animate(bpy, bpy.data.objects["Rig"], "Walk", 0.3, 37)
@@ -93,7 +95,9 @@ def test_a_mesh_comes_to_play_while_it_is_trained(ready, skirt, tmp_path):
     assert first and first.model == job / "model.safetensors" and not skirt.ssilk.awaited
     before = first._written
     os.utime(first.model, (before + 5, before + 5))  # as a better model is written
-    watch()
+    with monkeypatch.context() as patch:
+        patch.setattr(live, "sample", None)  # the motion is not read again
+        watch()
     assert playing.live(skirt) is first and first._written == before + 5 and first.done is None
     playing.stop(skirt)
     settings.preset = "preview"  # what an artist chose stays
@@ -105,9 +109,40 @@ def test_a_mesh_comes_to_play_while_it_is_trained(ready, skirt, tmp_path):
     assert not skirt.ssilk.awaited
 
 
-def refused(bpy) -> str:
+def test_it_gets_better_until_it_is_finished(ready, skirt, tmp_path, monkeypatch):
+    """Rounds of the real training, each resumed from the one before; what is played is the best of them."""
+    from blender_addon.operators import training
+    from blender_addon.operators.training import watch
+    from blender_addon.outside.jobs import read_curve
+    from blender_addon.panels import GarmentPanel
+    from blender_addon.scene import playing
+
+    bpy, command = ready, training.train_command
+    tiny = ["--set", "iterations=4", "--set", "batch=2", "--set", "pretraining_batch=2", "--set", "valid_frames=8"]
+    monkeypatch.setattr(training, "train_command", lambda *given: [*command(*given), *tiny])
+    animate(bpy, bpy.data.objects["Rig"], "Walk", 0.3, 37)
+    bpy.context.scene.frame_end = 4
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "skirt.blend"))
+    _, job = lines_up(bpy, skirt)
+    state = ended(skirt, until=lambda state: state.round and (state.checkpoint or 0) > 4)
+    assert state.alive and state.round == 1 and state.done > 4 and state.spent > 0
+    watch()
+    assert playing.live(skirt).model == job / "model.safetensors"
+    notes = drawn(GarmentPanel, bpy.context)
+    assert "ssilk.cancel_training" in notes and "Gets better until you finish it" in " ".join(notes)
+    assert "'Skirt' is being trained already" in refused(bpy, bpy.ops.ssilk.train)
+    bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)  # it is found again, though nothing was saved
+    garment = bpy.data.objects["Skirt"]
+    activate(bpy, garment)
+    assert bpy.ops.ssilk.cancel_training() == {"FINISHED"}
+    assert ended(garment).state == "stopped"
+    points = read_curve(job)["points"]
+    assert min(points, key=lambda point: point["validation"]["total"])["iteration"] == ended(garment).checkpoint
+
+
+def refused(bpy, call=None) -> str:
     with pytest.raises(RuntimeError) as error:
-        bpy.ops.ssilk.make_it_move()
+        (call or bpy.ops.ssilk.make_it_move)()
     return str(error.value)
 
 

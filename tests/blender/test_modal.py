@@ -36,7 +36,8 @@ def world(bpy, monkeypatch):
     """Blender with a window, in object mode; `undone` are the steps that were pushed."""
     from blender_addon.operators import tasks
 
-    world = SimpleNamespace(tasks=tasks, window_manager=Windows(), window=None, mode="OBJECT", undone=[])
+    world = SimpleNamespace(tasks=tasks, window_manager=Windows(), window=None, mode="OBJECT", undone=[], told=[])
+    world.workspace = SimpleNamespace(status_text_set=world.told.append)
     push = SimpleNamespace(undo_push=lambda message: world.undone.append(message))
     fake = SimpleNamespace(app=SimpleNamespace(background=False), ops=SimpleNamespace(ed=push))
     monkeypatch.setattr(tasks, "bpy", fake)
@@ -81,6 +82,7 @@ def test_work_is_watched_and_its_result_taken(world):
     assert watch(run, world) == {"FINISHED"}
     assert (run.told, world.undone) == (({"INFO"}, "said hello"), ["Run"])
     assert (world.window_manager.timers, world.tasks.current) == ([], None)
+    assert (set(world.told), world.told[-1]) == ({"Running", None}, None)  # in the status bar
     assert not run.work.folder.exists()
 
 

@@ -85,6 +85,19 @@ def test_classes_are_counted_and_buttons_follow_the_mode(bpy, skirt):
     assert drawn(ClassesPanel, bpy.context).count("ssilk.fill_class") == 3
 
 
+def test_pieces_that_fall_off_are_told_until_they_are_held(bpy, skirt):
+    from blender_addon.panels import ClassesPanel
+    from blender_addon.scene.attributes import write_classes
+
+    skirt.data.vertices.add(1)
+    values = np.array([0] * 24 + [2] * 289, dtype=np.int32)
+    write_classes(skirt.data, values)
+    assert "1 vertex would fall off" in " ".join(drawn(ClassesPanel, bpy.context))
+    values[-1] = 1
+    write_classes(skirt.data, values)
+    assert "fall off" not in " ".join(drawn(ClassesPanel, bpy.context))
+
+
 def test_broken_classes_are_told_and_drawn_around(bpy, skirt):
     from blender_addon.panels import ClassesPanel
 

@@ -35,6 +35,14 @@ def test_triangles_are_named_by_their_polygons():
     assert polygons_of(counts, [3, 4, 5]) == (2,)
 
 
+@pytest.mark.parametrize(("code", "button"), [("penetration", "Push Out"), ("sliver-faces", "Fix")])
+def test_findings_speak_of_buttons_in_place_of_options(code, button):
+    document = {"severity": "error", "code": code, "prim": "a.usdc:/Character/Shirt", "why": "", "fixable": True,
+                "found": "3 (--fix merges 2)", "fix": "--fix repairs it", "elements": "", "indices": []}  # fmt: skip
+    (said,) = read_findings([document], "Shirt", SHIRT)
+    assert (said.found, said.fix) == (f"3 ({button} merges 2)", f"{button} repairs it")
+
+
 def test_findings_on_several_bodies_come_apart():
     meshes = {**SHIRT, "Torso": mesh("Torso", [4], 4), "Hand": mesh("Hand", [3, 3], 5)}
     document = {"severity": "warning", "code": "holes", "found": "", "why": "", "fix": "", "fixable": False}

@@ -10,7 +10,7 @@ import pytest
 
 from blender_addon.curves import COLORS, GROUND, picture, series
 from blender_addon.outside.jobs import JobState
-from blender_addon.outside.report import findings, progress
+from blender_addon.outside.report import findings, improvement, progress
 
 SCORE = {"total": 0.6, "collisions": 0.0123, "dynamics": 0.023}
 CURVE = {"lbs": {"total": 1.0}, "points": [{"iteration": 5, "validation": SCORE}]}
@@ -21,8 +21,14 @@ CURVE = {"lbs": {"total": 1.0}, "points": [{"iteration": 5, "validation": SCORE}
     [
         (JobState("waiting"), "Waits until the trainings before it have ended"),
         (JobState("running"), "Prepares the training"),
-        (JobState("running", 120, 500, 185.2), "Iteration 120 of 500, 3 min 05 s left"),
-        (JobState("running", 1, 500), "Iteration 1 of 500"),
+        (JobState("running", 120, 500, 185.2), "120 of 500, 3 min left"),
+        (JobState("running", 120, 500, 42.2), "120 of 500, 42 s left"),
+        (JobState("running", 120, 500, 7380), "120 of 500, 2 h 3 min left"),
+        (JobState("running", 1, 500), "1 of 500"),
+        (JobState("running", 120, 500, 185.2, cancelled=True), "Ends after its current step"),
+        (JobState("running", 600, 900, 65, round=1), "600 of 900, 1 min left"),
+        (JobState("stopped", 600, 900, round=1), "Finished after 600 iterations; it can go on and get better"),
+        (JobState("done", 900, 900, round=2), "Trained for 900 iterations, until it got no better"),
         (JobState("done", 500, 500), "Trained for 500 iterations"),
         (JobState("done", 420, 500), "Trained for 420 iterations"),
         (JobState("stopped", 120, 500), "Stopped at 120 of 500; it can be resumed"),
@@ -52,6 +58,22 @@ def test_validations_say_what_is_learned():
     assert not any("ynamic" in text for text, _ in findings(running, stiff, moves=False))
     assert findings(running, {}, moves=True)[0][0].startswith("No validation yet")
     assert findings(JobState("stopped"), {}, moves=True) == []
+
+
+def test_what_a_training_has_reached_is_told_beside_where_it_began():
+    points = [
+        {"iteration": done, "validation": {**SCORE, "shown_skin": {"mean": mean, "worst": 0.1}}}
+        for done, mean in ((5, 0.0231), (9, 0.0084), (12, 0.0099))
+    ]
+    state = JobState("running", checkpoint=9, round=2, spent=840)
+    assert improvement(state, {**CURVE, "points": points}) == [
+        "0.84% of the covered skin shows, 2.31% at first", "Gets better until you finish it: 14 min so far",
+    ]  # fmt: skip
+    assert improvement(JobState("running", checkpoint=5), {**CURVE, "points": points[:1]}) == [
+        "2.31% of the covered skin shows"
+    ]
+    assert improvement(JobState("running", checkpoint=5), CURVE) == ["40.0% less energy than linear blend skinning"]
+    assert improvement(state, {}) == []
 
 
 def test_series_leave_out_what_is_not_finite():

@@ -290,7 +290,15 @@ def test_a_model_says_whether_it_is_worse_than_none(job, monkeypatch, factor):
     assert factor == 1.0 or (told.level == "warning" and "280% above linear blend skinning's" in told.text)
 
 
-def test_events_say_what_is_trained_and_how_it_goes(job):
+def test_long_steps_are_reported_one_by_one(job, monkeypatch):
+    events: list[Event] = []
+    monkeypatch.setattr(training, "REPORT_INTERVAL", 0.0)
+    train(job("long", replace(SHORT, iterations=4, static_fraction=0.0)), events.append)
+    assert [event.done for event in events if isinstance(event, Progress)] == [1, 2, 3, 4]
+
+
+def test_events_say_what_is_trained_and_how_it_goes(job, monkeypatch):
+    monkeypatch.setattr(training, "REPORT_INTERVAL", math.inf)
     events: list[Event] = []
     train(job("events", replace(SHORT, iterations=40, validate_every=20)), events.append)
     (started,) = (event for event in events if isinstance(event, Started))
