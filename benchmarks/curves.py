@@ -26,7 +26,8 @@ from ssilk_core.events import format_seconds
 from ssilk_core.training.curve import curve_path
 from ssilk_core.training.verdict import curve_lbs
 
-PANELS = ("total", *TERMS, "collisions")
+PANELS = ("total", *TERMS, "collisions", "dynamics")
+UNITS = {"collisions": "share of vertices", "dynamics": "m"}  # of others: J
 SHOWN = 0.9  # share of the values that a panel shows: the first ones would flatten all others
 
 
@@ -88,7 +89,9 @@ def draw(path: Path, runs: list[Run]) -> None:
     """Draw each value of all runs, over iterations on the left and over minutes on the right, as a PNG."""
     rows = []
     for key in PANELS:
-        unit, span = "share of vertices" if key == "collisions" else "J", bounds(run.values[key] for run in runs)
+        if not any(run.values[key].any() for run in runs):
+            continue  # a term that none of them has
+        unit, span = UNITS.get(key, "J"), bounds(run.values[key] for run in runs)
         along = {"iterations": [run.iterations for run in runs], "minutes": [run.seconds / 60 for run in runs]}
         rows.append([
             ChartPanel(title=key, x=x, y=unit, span=span,

@@ -16,7 +16,8 @@ RELATIVE = {"ANIMATABLE", "PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= 
 ABOUT = {
     "draft": "A first look, after minutes on any machine",
     "preview": "Nearly the final quality, after minutes on a GPU",
-    "final": "The paper's schedule, after a quarter of an hour on a fast GPU",
+    "light": "A small network for many characters, after minutes on a GPU",
+    "final": "What shots are made with, after a quarter of an hour on a fast GPU",
 }
 CHOICES = [(name, name.capitalize(), ABOUT[name]) for name in PRESETS]
 

@@ -189,7 +189,7 @@ def _legend(figure: Figure, looks: Mapping[str, tuple[str, str]], *, lines: bool
     named = {name: look for name, look in looks.items() if name}
     style: Any = "-" if lines else ""
     handles = [Line2D([], [], color=colour, marker=marker, linestyle=style) for colour, marker in named.values()]
-    figure.legend(handles, list(named), loc="outside lower center", ncols=max(1, min(len(named), 8)))
+    figure.legend(handles, list(named), loc="outside lower center", ncols=max(1, min(len(named), 4)))
 
 
 def peaks(values: Floats) -> list[int]:

@@ -225,7 +225,26 @@ PRESETS = {
                 iterations=8_000, static_fraction=0.3, shape_learning_rate_scale=1.0, validate_every=800
             ),
         ),
-        Preset(name="final", model=ModelConfig(), train=TrainConfig(ema_decay=0.9995)),
+        Preset(
+            name="light",
+            model=ModelConfig(latent=32, widths=(64, 64), shapes=16),
+            train=TrainConfig(
+                iterations=8_000, static_fraction=0.3, shape_learning_rate_scale=1.0, validate_every=800
+            ),
+        ),
+        Preset(
+            name="final",
+            model=ModelConfig(),
+            train=TrainConfig(
+                iterations=60_000,
+                static_fraction=0.3,
+                recombinations=8,
+                perturbations=3,
+                shape_learning_rate_scale=1.0,
+                ema_decay=0.9995,
+                validate_every=3000,
+            ),
+        ),
     )
 }
 

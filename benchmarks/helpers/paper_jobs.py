@@ -33,6 +33,12 @@ STEP = {
 BASELINE_STEP = 8.5  # [ms]
 START, VALIDATION, EVALUATION, FRAME = 25.0, 1.5, 3.0, 0.05  # [s]; the last: of the simulator, a frame of a shot
 VALIDATIONS = 10
+MOTION_AND_RATES = (
+    "static_fraction=0.1",
+    "recombinations=3",
+    "perturbations=1",
+    "shape_learning_rate_scale=0.3",
+)
 RECIPES = {
     "cape": ("shape_learning_rate_scale=1",),
     "hooded_dress": ("shape_learning_rate_scale=1",),
@@ -150,7 +156,8 @@ class Training:
         step = (STEP[self.garment] if own else BASELINE_STEP) / 1000
         steps = max(100, round(seconds / step))
         rates = (f"iterations={steps}", f"validate_every={max(1, steps // VALIDATIONS)}")
-        settings = [f"seed={self.seed}", *(RECIPES[self.garment] if own else ()), *rates, *self.settings]
+        recipe = RECIPES[self.garment] if own else ()
+        settings = [f"seed={self.seed}", *MOTION_AND_RATES, *recipe, *rates, *self.settings]
         settings += [*REHEARSED, *(() if self._sets("batch") else ("batch=2",))] if plan.rehearse else []
         script = "train_baseline" if not own else "train_scheme" if self._sets("scheme") else ""
         begun = (PYTHON, f"benchmarks/{script}.py", *(() if own else (self.method,))) if script else (*SSILK, "train")

@@ -20,7 +20,7 @@ _adrift: tuple[object, int] = (None, 0)  # what was looked at last, and what was
 
 
 def adrift_line(thing: bpy.types.Object) -> str:
-    """Return how much of a garment falls off, since islands of it are all loose; empty where nothing does.
+    """Return how much of a garment may fall off, since islands of it are all loose; empty where nothing does.
 
     Only what has changed is looked at again: panels are drawn many times a second.
     """
@@ -36,7 +36,7 @@ def adrift_line(thing: bpy.types.Object) -> str:
     if not _adrift[1]:
         return ""
     falling = format_count(_adrift[1], "vertices")
-    return f"{falling} would fall off: each separate piece needs some that are pinned or tight"
+    return f"{falling} would fall off unless stitched: pieces that lie on no other cloth need pinned or tight ones"
 
 
 def class_counts(thing: bpy.types.Object) -> tuple[int, int, int] | None:

@@ -277,9 +277,13 @@ WORDS = {
     "A first look, after minutes on any machine": "Ein erster Eindruck, nach Minuten auf jedem Rechner",
     "Preview": "Vorschau",
     "Nearly the final quality, after minutes on a GPU": "Fast die endgültige Qualität, nach Minuten auf einer GPU",
+    "Light": "Leicht",
+    "A small network for many characters, after minutes on a GPU": (
+        "Ein kleines Netz für viele Figuren, nach Minuten auf einer GPU"
+    ),
     "Final": "Endgültig",
-    "The paper's schedule, after a quarter of an hour on a fast GPU": (
-        "Wie im Artikel, nach einer Viertelstunde auf einer schnellen GPU"
+    "What shots are made with, after a quarter of an hour on a fast GPU": (
+        "Womit Einstellungen entstehen, nach einer Viertelstunde auf einer schnellen GPU"
     ),
     "Iterations": "Schritte",
     "Optimiser steps; zero for as many as the preset has": "Schritte des Optimierers; null: so viele wie die Vorgabe",

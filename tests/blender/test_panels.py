@@ -92,7 +92,7 @@ def test_pieces_that_fall_off_are_told_until_they_are_held(bpy, skirt):
     skirt.data.vertices.add(1)
     values = np.array([0] * 24 + [2] * 289, dtype=np.int32)
     write_classes(skirt.data, values)
-    assert "1 vertex would fall off" in " ".join(drawn(ClassesPanel, bpy.context))
+    assert "1 vertex would fall off unless stitched" in " ".join(drawn(ClassesPanel, bpy.context))
     values[-1] = 1
     write_classes(skirt.data, values)
     assert "fall off" not in " ".join(drawn(ClassesPanel, bpy.context))

@@ -36,9 +36,7 @@ def dressed(scene: Scene, mesh: Mesh, pinned: np.ndarray) -> Scene:
     """The character of a scene in a garment that hangs from its first joint."""
     skin = SkinWeights.rigid("/cloth", 0, mesh.vertex_count)
     garment = Garment(mesh, skin, np.where(pinned, PINNED, LOOSE))
-    return replace(
-        scene, garment=garment, rig=ProxyRig("/cloth", (), np.zeros(0, int), np.zeros((0, 4, 4)), skin)
-    )
+    return replace(scene, garment=garment, rig=ProxyRig("/cloth", (), np.zeros(0, int), np.zeros((0, 4, 4)), skin))
 
 
 def tensor(points: np.ndarray) -> torch.Tensor:

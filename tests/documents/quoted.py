@@ -73,7 +73,8 @@ def training() -> Text:
     sizes = {
         "draft": "a first look, on a CPU",
         "preview": "a look on a GPU",
-        "final": "the paper's number of iterations",
+        "light": "many characters",
+        "final": "what ships",
     }
     for name, purpose in sizes.items():
         preset = PRESETS[name]
@@ -98,7 +99,8 @@ def training() -> Text:
     yield f"`final` takes {PRESETS['final'].train.ema_decay:g}"
     yield default_step()
     preview, final = (preset_minutes(PRESETS[name]) for name in ("preview", "final"))
-    yield f"{60 * preview:.0f} s for `preview` and {final:.0f} minutes for `final`"
+    yield f"`preview` takes {60 * preview:.0f} s and `final` {final:.0f} minutes"
+    yield "(`recombinations={0.recombinations}`, `perturbations={0.perturbations}`)".format(PRESETS["final"].train)
 
 
 # docs/farm.md

@@ -240,10 +240,26 @@ def wardrobe() -> Text:
         kept = f"{best:,} of {run['iterations'][-1]:,}"
         yield row(garment, kept, duration(run["seconds"][-1]), *fields(evaluated(name), columns))
     yield f"{two_digits(evaluated('hooded_dress')['valid']['clip_totals'][1])} J"
-    cape = result("curves")["cape"]
-    best = min(cape["total"])
-    yield f"{two_digits(best)} J at {cape['iterations'][cape['total'].index(best)]:,} iterations"
-    yield f"{two_digits(cape['total'][-1])} J at {cape['iterations'][-1]:,}"
+
+
+def long_training() -> Text:
+    runs = result("long_training")
+    for name, run in runs.items():
+        words = name.replace("_light", ", `light`").replace("_seed", ", seed").replace("_", " ")
+        best = min(run["total"])
+        kept = f"{run['iterations'][run['total'].index(best)]:,} of {run['iterations'][-1]:,}"
+        totals = (f"{value:.4f}".replace("-", "−") for value in (best, run["total"][-1]))
+        yield row(words, kept, duration(run["seconds"][-1]), *totals)
+    cape, skirt = runs["cape"], runs["fringe_skirt"]
+    yield f"{cape['iterations'][1] - cape['iterations'][0]:,} iterations after it most is won"
+    grown = [(min(run["dynamics"][1:]), run["dynamics"][-1]) for run in (cape, skirt)]
+    first, second = (f"from {1000 * least:.0f} mm to {1000 * last:.0f} mm" for least, last in grown)
+    yield f"the cape's {first}, the fringe skirt's {second}"
+    dress, shipped_dress = result("shown_skin_dress")["hooded_dress"], result("shown_skin")["hooded_dress"]
+    yield f"stretches by {dress['valid']['network']['stretch']:.2f} J on `valid`"
+    yield f"the one that ships by {shipped_dress['valid']['network']['stretch']:.2f} J"
+    yield f"it shows {share_3(dress['valid']['network']['mean'])} % there"
+    yield f"On `test` it shows {share_3(dress['test']['network']['mean'])} %"
 
 
 def rest() -> Text:
@@ -454,8 +470,8 @@ def scenes() -> Text:
 
 
 PARTS = (
-    opening, conditions, shown, table1, findings, dynamics, ablations, wardrobe, rest, playing, sizes, levels,
-    refinement,
+    opening, conditions, shown, table1, findings, dynamics, ablations, wardrobe, long_training, rest, playing, sizes,
+    levels, refinement,
     inside_the_body, stress, training_speed, scenes,
 )  # fmt: skip
 """The parts of the document, in its order."""

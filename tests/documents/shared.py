@@ -41,8 +41,8 @@ def cache_share() -> str:
 
 
 def preset_minutes(preset: Preset) -> float:
-    """Return how long a preset's iterations take, at the pace of the shipped cape on one H200 [min]."""
-    cape = result("curves")["cape"]
+    """Return how long a preset's iterations take, at the pace of the shipped cape on a shared H200 [min]."""
+    cape = result("long_training")["cape"]
     return preset.train.iterations * cape["seconds"][-1] / cape["iterations"][-1] / 60
 
 
