@@ -77,13 +77,19 @@ def fabric(options: argparse.Namespace, garment: Garment, report: Reporter) -> F
     Properties that the options set go before those of its stage.
 
     Raises:
-        SsilkError: an unknown property, or a bad value.
+        SsilkError: an unknown property, a bad value, or a fabric without stitches for islands that these alone hold.
     """
+    from ..setup.hosts import need_stitch
+
     if options.fabric or garment.surface is None:
-        return asked_fabric(options)
-    stated = fabric_of_surface(garment.surface)
-    report(Message(f"{garment.surface.path}: {surface_message(garment.surface, stated)}"))
-    return apply_overrides(stated, options.material)
+        found = asked_fabric(options)
+    else:
+        stated = fabric_of_surface(garment.surface)
+        report(Message(f"{garment.surface.path}: {surface_message(garment.surface, stated)}"))
+        found = apply_overrides(stated, options.material)
+    if garment.classes is not None:
+        need_stitch(garment.mesh, garment.classes, found)
+    return found
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,8 @@
 
 A vertex lies on a face of another island if its foot there, the closest point, is near and beneath it: the offset
 leans from the face's normal by no more than 60 degrees, or nearly vanishes. So strips side by side do not lie on one
-another, whatever the gap between them, unless their borders coincide.
+another, whatever the gap between them, unless their borders coincide. Nor do parts whose outsides face each other,
+such as two trouser legs, unless one of them lies wholly on the other.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..assets import Floats, Ints, Mesh
-from .topology import SLIVER, components, edges, islands
+from .topology import SLIVER, components, edges, islands, vertex_normals
 
 TOUCH = 0.005  # [m] between islands that lie on one another: thick cloth, and what modelling leaves
 SAGITTA = 0.1  # of a face's longest edge: how far a curved part may lie from a coarse face under it
@@ -112,9 +113,24 @@ def find_stitches(mesh: Mesh) -> Stitches:
 
 
 def touching(mesh: Mesh, feet: Stitches) -> Stitches:
-    """Return the feet that are near enough for a stitch."""
+    """Return the feet that are stitched: those near enough, where the sides that meet do not face each other."""
+    near = _near_enough(mesh, feet)
+    carried = near.on_larger & np.isin(near.vertices, find_carried(mesh, feet).vertices)
+    return near.select(carried | ~_face_to_face(mesh, near))
+
+
+def _near_enough(mesh: Mesh, feet: Stitches) -> Stitches:
     longest = _longest_edges(mesh.points[feet.corners])
     return feet.select(feet.distance <= np.maximum(TOUCH, SAGITTA * longest))
+
+
+def _face_to_face(mesh: Mesh, feet: Stitches) -> NDArray[np.bool_]:
+    """Return where the normals of the vertex and of the face are opposed, shape (S,)."""
+    corners = mesh.points[feet.corners]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    own = vertex_normals(mesh.points, mesh.faces)[feet.vertices]
+    return np.einsum("sc,sc->s", own, normals) < -LEAST_COSINE
 
 
 def find_carried(mesh: Mesh, feet: Stitches) -> Stitches:
@@ -129,7 +145,7 @@ def find_carried(mesh: Mesh, feet: Stitches) -> Stitches:
     island = islands(mesh.faces, mesh.vertex_count)
     rank = _ranks(mesh, island)
     parts = len(rank)
-    sewn = np.bincount(island[touching(mesh, feet).vertices], minlength=parts)
+    sewn = np.bincount(island[_near_enough(mesh, feet).vertices], minlength=parts)
     whole = np.bincount(island[feet.vertices], minlength=parts) == np.bincount(
         island[np.unique(mesh.faces)], minlength=parts
     )

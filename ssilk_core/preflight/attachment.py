@@ -101,7 +101,8 @@ def touching_islands(mesh: Mesh, classes: Ints) -> Findings:
             count=len(loose),
             found=f"{parts} of {len(order)} islands touch others side by side without being joined to them",
             why="stitches hold only what lies on other cloth, and cloth does not collide with cloth",
-            fix="join them by edges (merge or bridge vertices), or lay one over the other, unless they are to part",
+            fix="join them by edges (merge or bridge vertices), or lay one over the other, outsides the same way, "
+            "unless they are to part",
             elements="vertices",
             indices=index_tuple(loose),
         )

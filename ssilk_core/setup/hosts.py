@@ -8,8 +8,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..assets import Floats, Ints, Mesh
-from ..mesh.stitches import SAME_PLACE, Stitches, find_carried, find_feet, joined_islands, joined_mesh, touching
+from ..assets import LOOSE, Floats, Ints, Mesh
+from ..errors import fail
+from ..fabrics import Fabric
+from ..mesh.stitches import (
+    SAME_PLACE,
+    Stitches,
+    find_carried,
+    find_feet,
+    find_stitches,
+    joined_islands,
+    joined_mesh,
+    touching,
+)
 from ..mesh.topology import edges, islands, vertex_areas, vertex_mask
 from .binding import laplacian
 
@@ -99,6 +110,22 @@ class Hosts:
         island = islands(self.mesh.faces, self.mesh.vertex_count)[self.feet.vertices]
         parts = np.split(np.arange(len(island)), np.flatnonzero(np.diff(island)) + 1)
         return [self.feet.select(part) for part in parts if len(part)]
+
+
+def need_stitch(mesh: Mesh, classes: Ints, fabric: Fabric) -> None:
+    """Raise `SsilkError` where the fabric has no stitch and islands that are all loose (V,) need one to hold them."""
+    if fabric.stitch:
+        return
+    island = islands(mesh.faces, mesh.vertex_count)
+    adrift = np.setdiff1d(island[np.unique(mesh.faces)], island[classes != LOOSE])
+    if len(adrift) and len(find_stitches(mesh)):
+        fail(
+            mesh.path,
+            f"{len(adrift)} of {len(np.unique(island[mesh.faces]))} islands are all loose, held by stitches alone, "
+            f"and the fabric '{fabric.name}' has stitch = 0",
+            "they would fall off",
+            f"give --material stitch={Fabric('default').stitch:g}, or paint a part of each as pinned or tight",
+        )
 
 
 def _under(stitches: Stitches, rows: Floats) -> Floats:

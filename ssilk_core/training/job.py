@@ -12,6 +12,7 @@ from ..assets import LOOSE, PINNED, Motion, Scene
 from ..config import ModelConfig, TrainConfig
 from ..errors import fail
 from ..fabrics import Fabric
+from ..mesh.stitches import find_stitches
 from .perturb import perturb_motions
 from .recombine import recombine_motions
 from .state import json_round_trip, scene_digest
@@ -78,12 +79,14 @@ class TrainJob:
         return [*self.motions, *more, *perturb_motions(self.motions, train.perturbations, train.seed)]
 
     def identity(self) -> dict[str, Any]:
-        """Return the inputs that a resumed run must share, as JSON stores them."""
+        """Return the inputs that a resumed run must share, as JSON stores them; stitches of one island are none."""
+        sewn = len(find_stitches(self.scene.garment.mesh)) > 0
+        fabric = self.fabric if sewn else replace(self.fabric, stitch=0.0)
         return json_round_trip(
             {
                 "model": asdict(self.model),
                 "train": asdict(self.train),
-                "fabric": asdict(self.fabric),
+                "fabric": asdict(fabric),
                 "inputs": self.inputs or {},
                 "motions": _frames(self.motions),
                 "held out": _frames(self.held_out),

@@ -20,6 +20,7 @@ from torch import Tensor
 from ..assets import Scene
 from ..config import TrainConfig
 from ..errors import SsilkError, fail
+from ..fabrics import fabric_of_file
 from ..files import replacing
 from ..tensors import pack_tensors, read_tensors
 from .curve import CurvePoint
@@ -252,6 +253,8 @@ def _need_finite(tensors: Tensors) -> None:
 
 def _need_same(path: Path, asked: dict[str, Any], before: dict[str, Any]) -> None:
     differing: list[str] = []
+    if "fabric" in before:
+        before = {**before, "fabric": asdict(fabric_of_file(before["fabric"]))}
     asked, before = _located(asked, asked), _located(before, asked)
     for key, value in asked.items():
         old = before.get(key)

@@ -13,9 +13,11 @@ from ssilk_core.assets import LOOSE, PINNED, Garment, Mesh, ProxyRig, Scene, Ski
 from ssilk_core.collision import reachable_body
 from ssilk_core.energy import GarmentEnergy
 from ssilk_core.energy.stitching import Stitching
+from ssilk_core.errors import SsilkError
 from ssilk_core.fabrics import FABRICS, Fabric, fabric_of_file
 from ssilk_core.mesh.stitches import ABOVE, SAGITTA, TOUCH, find_carried, find_feet, find_stitches, joined_islands
 from ssilk_core.mesh.topology import vertex_areas
+from ssilk_core.setup.hosts import need_stitch
 from ssilk_core.simulate.incremental_potential import IncrementalPotential, StepInputs
 from ssilk_core.simulate.newton import SolverOptions, minimise_from
 
@@ -201,3 +203,31 @@ def test_what_hangs_on_a_stitch_can_reach_the_body(scene, toy_grid, toy_motion):
         return len(reachable_body(tied, [toy_motion(scene, 2)]).vertices)
 
     assert reached(0.002) > 0 and reached(0.02) == 0
+
+
+def tube(count: int, radius: float, at: float, outward: bool = True) -> tuple[np.ndarray, np.ndarray]:
+    """A tube about an upright axis at x = `at`."""
+    turn = 2 * np.pi * np.arange(count) / count
+    ring = np.c_[at + radius * np.cos(turn), 0 * turn, radius * np.sin(turn)]
+    points = np.concatenate([ring + [0, height, 0] for height in np.linspace(0, 0.2, 5)])
+    one = np.arange(4 * count)
+    after = one // count * count + (one + 1) % count
+    faces = np.concatenate([np.c_[one, one + count, after], np.c_[after, one + count, after + count]])
+    return points, faces if outward else faces[:, ::-1]
+
+
+def test_parts_whose_outsides_face_each_other_are_not_sewn():
+    """Two trouser legs in the bind pose; a tube within another one is sewn to it."""
+    legs = joined(tube(24, 0.08, -0.0815), tube(24, 0.08, 0.0815))
+    assert len(find_feet(legs)) and not len(find_stitches(legs))
+    layers = joined(tube(24, 0.08, 0.0), tube(24, 0.083, 0.0))
+    assert len(find_stitches(layers)) >= 120
+
+
+def test_a_fabric_without_stitches_cannot_hold_what_they_alone_hold(parts):
+    mesh, _ = parts
+    classes = np.where(np.arange(mesh.vertex_count) < 9, PINNED, LOOSE)
+    need_stitch(mesh, classes, Fabric("default"))
+    with pytest.raises(SsilkError, match=r"2 of 3 islands are all loose, held by stitches alone, .*'paper'"):
+        need_stitch(mesh, classes, FABRICS["paper"])
+    need_stitch(mesh, np.full(mesh.vertex_count, PINNED), FABRICS["paper"])
