@@ -38,7 +38,7 @@ from .shared import (
 
 def readme() -> Text:
     preview, final = (preset_minutes(PRESETS[name]) for name in ("preview", "final"))
-    yield f"about {60 * preview:.0f} seconds on an H200 and `--preset final` about {final:.0f} minutes"
+    yield f"about {60 * preview:.0f} seconds on a shared H200 and `--preset final` about {final:.0f} minutes"
     yield f"{two_gpus(32, 1024):.1f} times as fast with 1,024 windows of 32 poses in a batch"
     yield f"{two_gpus(32, 64):.2f} times as fast with 64 windows"
 
@@ -74,7 +74,7 @@ def training() -> Text:
         "draft": "a first look, on a CPU",
         "preview": "a look on a GPU",
         "light": "many characters",
-        "final": "what ships",
+        "final": "shots",
     }
     for name, purpose in sizes.items():
         preset = PRESETS[name]

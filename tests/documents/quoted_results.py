@@ -252,9 +252,15 @@ def long_training() -> Text:
         yield row(words, kept, duration(run["seconds"][-1]), *totals)
     cape, skirt = runs["cape"], runs["fringe_skirt"]
     yield f"{cape['iterations'][1] - cape['iterations'][0]:,} iterations after it most is won"
-    grown = [(min(run["dynamics"][1:]), run["dynamics"][-1]) for run in (cape, skirt)]
-    first, second = (f"from {1000 * least:.0f} mm to {1000 * last:.0f} mm" for least, last in grown)
-    yield f"the cape's {first}, the fringe skirt's {second}"
+    moved = []
+    for run in (cape, runs["cape_seed_1"], runs["hooded_dress"], runs["fringe_skirt"]):
+        best = run["total"].index(min(run["total"]))
+        moved.append("{:.0f}, {:.0f} and {:.0f} mm".format(*(1000 * run["dynamics"][at] for at in (1, best, -1))))
+    yield "cape {}; cape, seed 1, {}; hooded dress {}; fringe skirt {}".format(*moved)
+    risen = cape["gravity"][-1] - cape["gravity"][cape["total"].index(min(cape["total"]))]
+    yield f"its gravity grows by {risen:.3f} J"
+    ends = {name: run["total"][-1] - min(run["total"]) <= 0.1 * abs(min(run["total"])) for name, run in runs.items()}
+    assert ends["hooded_dress"] and ends["fringe_skirt"] and not (ends["cape"] or ends["cape_seed_1"])
     dress, shipped_dress = result("shown_skin_dress")["hooded_dress"], result("shown_skin")["hooded_dress"]
     yield f"stretches by {dress['valid']['network']['stretch']:.2f} J on `valid`"
     yield f"the one that ships by {shipped_dress['valid']['network']['stretch']:.2f} J"
