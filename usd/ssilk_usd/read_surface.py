@@ -10,7 +10,7 @@ stiffnesses (newton, `import_usd_deformable_cloth.py`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import inf, isfinite
+from math import inf, nan
 
 import numpy as np
 from pxr import Usd, UsdPhysics
@@ -38,6 +38,7 @@ _OF_SURFACES = (
 _REST = ("restShapePoints", "restTriVertexIndices", "restBendAngles", "restBendAnglesDefault")
 _MORE = (PROPOSAL, OMNI, "physxDeformableMaterial:")  # where materials say what is not read
 _OMNI_POISSON = 0.45  # the fallback of its schema
+_CORRECT = "correct it, or remove the attribute"
 
 
 def read_surface(prim: Usd.Prim, mesh: Mesh) -> SurfaceMaterial | None:
@@ -111,12 +112,23 @@ def _number(sources: Sequence[Usd.Prim], *names: str) -> float | None:
     for source in sources:
         for name in (space + name for name in names for space in (PROPOSAL, OMNI)):
             found = value(source, name) if has_value(source, name) else None
-            if found is None or found == -inf:
-                continue
-            if not isinstance(found, int | float) or not isfinite(found):
-                fail(f"{location(source)}.{name}", f"{found}", "a finite number is needed", "correct it")
-            return float(found)
+            if found is not None and found != -inf:
+                return _checked(f"{location(source)}.{name}", found)
     return None
+
+
+def _checked(where: str, found: object) -> float:
+    """Return what an attribute says as a number; raise `SsilkError` where no cloth has it."""
+    name, number = where.rpartition(":")[2], float(found) if isinstance(found, int | float) else nan
+    fits, allowed = 0 <= number < inf, "a finite number that is not negative"
+    if name == "poissonsRatio":
+        fits, allowed = -1 < number <= 0.5, "a number above -1 and at most 0.5"
+    elif name in _THICKNESS:
+        fits, allowed = 0 < number < inf, "a finite, positive number"
+    if not fits:
+        told = f"{number:.7g}" if isinstance(found, int | float) else f"{found!r:.40}"
+        fail(where, f"it is {told}", f"{allowed} is needed", _CORRECT)
+    return number
 
 
 def _stiffness(
@@ -137,9 +149,13 @@ def _stiffness(
 def _array(prim: Usd.Prim, name: str) -> Floats:
     """Return what a mesh says of its whole, its faces or its points; nothing where it does not."""
     found = np.array(value(prim, PROPOSAL + name) if has_value(prim, PROPOSAL + name) else [])
-    numbers = found.reshape(-1).astype(np.float64) if found.dtype.kind in "iuf" else np.full(1, np.nan)
-    if not (np.isfinite(numbers) & (numbers > 0)).all():
-        fail(f"{location(prim)}.{PROPOSAL}{name}", "not all are positive and finite", "they must be", "correct them")
+    is_numeric = found.dtype.kind in "iuf"
+    numbers = found.reshape(-1).astype(np.float64) if is_numeric else np.full(1, np.nan)
+    wrong = np.flatnonzero(~(np.isfinite(numbers) & (numbers > 0)))
+    if len(wrong):
+        number = f"number {wrong[0]} of {len(numbers)} is {numbers[wrong[0]]:.7g}, counted from 0"
+        told = number if is_numeric else f"it is {found.tolist()!r:.40}"
+        fail(f"{location(prim)}.{PROPOSAL}{name}", told, "finite, positive numbers are needed", _CORRECT)
     return numbers
 
 
