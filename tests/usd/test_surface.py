@@ -112,6 +112,20 @@ def test_materials_of_rigid_things_and_of_looks_are_none_of_a_surface():
     assert surface_of(named).density == 300
 
 
+@pytest.mark.parametrize(("space", "prefix"), [("physics", "Physics"), ("omniphysics", "OmniPhysics")])
+def test_a_material_of_volumes_is_none_of_a_surface(space, prefix):
+    solid = {
+        "material": f"float {space}:youngsModulus = 5e7\nfloat {space}:density = 1000",
+        "schema": f"{prefix}VolumeDeformableMaterialAPI",
+    }
+    assert surface_of(stage(**solid)) is None
+    found = surface_of(stage(**solid, mesh=THIN))
+    assert (found.youngs_modulus, found.poissons_ratio, found.density) == (None, None, None)
+    assert found.thickness and found.others == (f"{space}:density", f"{space}:youngsModulus")
+    both = solid | {"schema": f'{solid["schema"]}", "PhysicsSurfaceDeformableMaterialAPI'}
+    assert surface_of(stage(**both)).density == 1000
+
+
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [

@@ -35,6 +35,7 @@ _OF_SURFACES = (
     *_THICKNESS,
     *(name for current, older, _ in _STIFFNESSES.values() for name in (current, older)),
 )
+_OF_VOLUMES = ("youngsModulus", "poissonsRatio", "density")  # too, where their schema is applied
 _REST = ("restShapePoints", "restTriVertexIndices", "restBendAngles", "restBendAnglesDefault")
 _MORE = (PROPOSAL, OMNI, "physxDeformableMaterial:")  # where materials say what is not read
 _OMNI_POISSON = 0.45  # the fallback of its schema
@@ -46,6 +47,7 @@ def read_surface(prim: Usd.Prim, mesh: Mesh) -> SurfaceMaterial | None:
 
     The material that is bound for the purpose "physics", else for all, goes before the mesh. As in the proposal, the
     mass of the mesh and of its deformable body go before densities, and the body's density before the material's.
+    Moduli and density of a material of volumes are none of a surface, unless it is a material of surfaces as well.
 
     Args:
         prim: the mesh.
@@ -64,7 +66,7 @@ def read_surface(prim: Usd.Prim, mesh: Mesh) -> SurfaceMaterial | None:
     thickness = float(thicknesses.mean()) if len(thicknesses) else _number(said, *_THICKNESS)
     thickness = thickness * meters if thickness is not None else None
     young, poisson = _number(said, "youngsModulus"), _number(said, "poissonsRatio")
-    if poisson is None and young is not None and any(has_value(source, f"{OMNI}youngsModulus") for source in said):
+    if poisson is None and young is not None and any(_says(source, f"{OMNI}youngsModulus") for source in said):
         poisson = _OMNI_POISSON
     density = _number(body, "density") or _number(said, "density")  # zero is ignored, as in the proposal
     mass, area = float(_array(prim, "masses").sum()) or _number(body, "mass"), _area(mesh)
@@ -95,7 +97,14 @@ def _applied(prim: Usd.Prim) -> list[str]:
 def _is_of_surfaces(prim: Usd.Prim) -> bool:
     """Return whether a prim says something that only surfaces have, or applies their schema."""
     names = (space + name for name in _OF_SURFACES for space in (PROPOSAL, OMNI))
-    return any("SurfaceDeformable" in name for name in _applied(prim)) or any(has_value(prim, name) for name in names)
+    return any("SurfaceDeformable" in name for name in _applied(prim)) or any(_says(prim, name) for name in names)
+
+
+def _says(prim: Usd.Prim, name: str) -> bool:
+    """Return whether a prim says something of a surface, and not of a volume alone."""
+    applied = _applied(prim) if name.partition(":")[2] in _OF_VOLUMES else []
+    of_volume = any("VolumeDeformable" in schema for schema in applied)
+    return has_value(prim, name) and (not of_volume or any("SurfaceDeformable" in schema for schema in applied))
 
 
 def _bodies(prim: Usd.Prim) -> list[Usd.Prim]:
@@ -111,7 +120,7 @@ def _number(sources: Sequence[Usd.Prim], *names: str) -> float | None:
     """Return the first number that prims say, in either schema; None for minus infinity, the proposal's fallback."""
     for source in sources:
         for name in (space + name for name in names for space in (PROPOSAL, OMNI)):
-            found = value(source, name) if has_value(source, name) else None
+            found = value(source, name) if _says(source, name) else None
             if found is not None and found != -inf:
                 return _checked(f"{location(source)}.{name}", found)
     return None
@@ -168,5 +177,9 @@ def _others(bound: Usd.Prim | None, prim: Usd.Prim) -> list[str]:
     """Return what material and mesh say beside what is read."""
     names = [attribute.GetName() for attribute in bound.GetAuthoredAttributes()] if bound else []
     read = {space + name for name in (*_OF_SURFACES, "density") for space in (PROPOSAL, OMNI)}
-    of_bound = [name for name in names if name.startswith(_MORE) and name not in read and has_value(bound, name)]
+    of_bound = [
+        name
+        for name in names
+        if name.startswith(_MORE) and has_value(bound, name) and not (name in read and _says(bound, name))
+    ]
     return of_bound + [PROPOSAL + name for name in _REST if has_value(prim, PROPOSAL + name)]
