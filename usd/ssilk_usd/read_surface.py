@@ -62,7 +62,7 @@ def read_surface(prim: Usd.Prim, mesh: Mesh) -> SurfaceMaterial | None:
         return None
     meters = StageUnits.of(prim.GetStage()).meters_per_unit
     kilograms = UsdPhysics.GetStageKilogramsPerUnit(prim.GetStage())
-    thicknesses, body = _array(prim, "thicknesses"), _bodies(prim)
+    thicknesses, body = _array(prim, "thicknesses"), [found for found in [deformable_body(prim)] if found]
     thickness = float(thicknesses.mean()) if len(thicknesses) else _number(said, *_THICKNESS)
     thickness = thickness * meters if thickness is not None else None
     young, poisson = _number(said, "youngsModulus"), _number(said, "poissonsRatio")
@@ -88,6 +88,15 @@ def read_surface(prim: Usd.Prim, mesh: Mesh) -> SurfaceMaterial | None:
     )
 
 
+def deformable_body(prim: Usd.Prim) -> Usd.Prim | None:
+    """Return the deformable body that a mesh belongs to: itself, the nearest one above it, or None."""
+    while prim and not prim.IsPseudoRoot():
+        if any(name.endswith("DeformableBodyAPI") for name in _applied(prim)):
+            return prim
+        prim = prim.GetParent()
+    return None
+
+
 def _applied(prim: Usd.Prim) -> list[str]:
     """Return the names of the schemas that a prim applies, whether or not USD knows them."""
     schemas = prim.GetMetadata("apiSchemas")
@@ -105,15 +114,6 @@ def _says(prim: Usd.Prim, name: str) -> bool:
     applied = _applied(prim) if name.partition(":")[2] in _OF_VOLUMES else []
     of_volume = any("VolumeDeformable" in schema for schema in applied)
     return has_value(prim, name) and (not of_volume or any("SurfaceDeformable" in schema for schema in applied))
-
-
-def _bodies(prim: Usd.Prim) -> list[Usd.Prim]:
-    """Return the deformable body that a mesh belongs to: itself, the nearest one above it, or none."""
-    while prim and not prim.IsPseudoRoot():
-        if any(name.endswith("DeformableBodyAPI") for name in _applied(prim)):
-            return [prim]
-        prim = prim.GetParent()
-    return []
 
 
 def _number(sources: Sequence[Usd.Prim], *names: str) -> float | None:
