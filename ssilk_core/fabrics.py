@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, NoReturn
 
 from .assets import PLATE_THICKNESS, SurfaceMaterial
 from .errors import fail
@@ -168,6 +168,9 @@ def fabric_of_surface(surface: SurfaceMaterial) -> Fabric:
     and the bending stiffness D = E h^3 / (12 (1 - nu^2)) (Timoshenko and Woinowsky-Krieger, Theory of Plates and
     Shells, 1959). Rolled up to the curvature kappa it stores D kappa^2 / 2 for each area, and the hinges of
     `energy.bending` store `bending` kappa^2 / 8: `bending` is 4 D. Stiffnesses that the stage states go before E.
+
+    Raises:
+        SsilkError: stretch or shear has no stiffness.
     """
     thickness = surface.thickness or PLATE_THICKNESS
     changes = {"thickness": surface.thickness, "density": surface.area_density}
@@ -176,6 +179,8 @@ def fabric_of_surface(surface: SurfaceMaterial) -> Fabric:
     stretch, shear, bend = _stiffnesses(surface)
     if stretch is not None and shear is not None:
         mu = min(shear, stretch / 2)
+        if mu == 0:
+            _fail_without_stiffness(surface)
         changes |= {"lame_mu": mu, "lame_lambda": stretch - 2 * mu, "stretch": stretch / 2, "shear": mu / 2}
     changes["bending"] = None if bend is None else 4 * bend
     said = {name: value for name, value in changes.items() if value is not None}
@@ -202,6 +207,12 @@ def surface_message(surface: SurfaceMaterial, fabric: Fabric) -> str:
     if lost := [*surface.others, *beyond]:
         text += f"; it has no place for {', '.join(lost)}"
     return text
+
+
+def _fail_without_stiffness(surface: SurfaceMaterial) -> NoReturn:
+    stated = {"surfaceStretchStiffness": surface.stretch, "surfaceShearStiffness": surface.shear}
+    name = next((name for name, value in stated.items() if value == 0), "youngsModulus")
+    fail(surface.path, f"{name} is 0, so that lame_mu is 0", "it must be positive", "correct it, or remove it")
 
 
 def _stiffnesses(surface: SurfaceMaterial) -> tuple[float | None, float | None, float | None]:

@@ -91,6 +91,22 @@ def test_the_sentence_names_what_is_taken_and_what_is_lost():
     assert told.endswith("no place for physics:dynamicFriction, shear that is stiffer than half the stretch")
 
 
+@pytest.mark.parametrize(
+    ("wrong", "name"),
+    [
+        ({"youngs_modulus": 0.0}, "youngsModulus"),
+        ({"youngs_modulus": 0.0, "stretch": 50.0}, "youngsModulus"),
+        ({"stretch": 0.0}, "surfaceStretchStiffness"),
+        ({"youngs_modulus": YOUNG, "stretch": 0.0}, "surfaceStretchStiffness"),
+        ({"stretch": 50.0, "shear": 0.0}, "surfaceShearStiffness"),
+    ],
+)
+def test_cloth_without_stiffness_in_its_plane_is_refused(wrong, name):
+    with pytest.raises(SsilkError, match=f"^set.usda:/A: {name} is 0, so that lame_mu is 0; it must be positive; "):
+        fabric_of_surface(SurfaceMaterial(path="set.usda:/A", **wrong))
+    assert fabric_of_surface(SurfaceMaterial(path="set.usda:/A", bend=0.0)).bending == 0
+
+
 @pytest.mark.parametrize("wrong", [{"poissons_ratio": 0.6}, {"thickness": 0.0}, {"bend": -1.0}])
 def test_what_no_plate_has_is_refused(wrong):
     with pytest.raises(SsilkError, match=next(iter(wrong))):

@@ -19,6 +19,7 @@ MESH = """
         int[] faceVertexCounts = [4]
         int[] faceVertexIndices = [0, 1, 2, 3]
 """
+THIN = "float[] physics:thicknesses = [0.001]"
 
 
 def stage(*, material: str = "", mesh: str = "", body: str = "", schema: str = "", meters=1.0, kilograms=1.0):
@@ -111,18 +112,35 @@ def test_materials_of_rigid_things_and_of_looks_are_none_of_a_surface():
     assert surface_of(named).density == 300
 
 
+@pytest.mark.parametrize(("space", "prefix"), [("physics", "Physics"), ("omniphysics", "OmniPhysics")])
+def test_a_material_of_volumes_is_none_of_a_surface(space, prefix):
+    solid = {
+        "material": f"float {space}:youngsModulus = 5e7\nfloat {space}:density = 1000",
+        "schema": f"{prefix}VolumeDeformableMaterialAPI",
+    }
+    assert surface_of(stage(**solid)) is None
+    found = surface_of(stage(**solid, mesh=THIN))
+    assert (found.youngs_modulus, found.poissons_ratio, found.density) == (None, None, None)
+    assert found.thickness and found.others == (f"{space}:density", f"{space}:youngsModulus")
+    both = solid | {"schema": f'{solid["schema"]}", "PhysicsSurfaceDeformableMaterialAPI'}
+    assert surface_of(stage(**both)).density == 1000
+
+
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        ({"material": "float physics:youngsModulus = nan"}, "physics:youngsModulus: nan; a finite number"),
-        ({"material": "float physics:poissonsRatio = 0.7"}, "poissons_ratio of its physics material is 0.7"),
-        ({"mesh": "float[] physics:thicknesses = [-1]"}, "physics:thicknesses: not all are positive"),
-        ({"mesh": 'string[] physics:thicknesses = ["thin"]'}, "physics:thicknesses: not all are positive"),
-        ({"material": 'string physics:youngsModulus = "stiff"'}, "physics:youngsModulus: stiff; a finite number"),
+        ({"material": "float physics:youngsModulus = nan"}, "physics:youngsModulus: it is nan; a finite number"),
+        ({"material": "float physics:stretchStiffness = -2"}, r"/Linen\.physics:stretchStiffness: it is -2; a fin"),
+        ({"mesh": THIN, "body": "float physics:mass = inf"}, r"/Dress\.physics:mass: it is inf; a finite"),
+        ({"material": "float omniphysics:poissonsRatio = 0.7"}, "omniphysics:poissonsRatio: it is 0.7; a number"),
+        ({"material": "float physics:thickness = 0"}, "physics:thickness: it is 0; a finite, positive number"),
+        ({"material": 'string physics:youngsModulus = "stiff"'}, "physics:youngsModulus: it is 'stiff'; a finite"),
+        ({"mesh": "float[] physics:thicknesses = [1, -1]"}, "physics:thicknesses: number 1 of 2 is -1, counted"),
+        ({"mesh": 'string[] physics:thicknesses = ["thin"]'}, r"thicknesses: it is \['thin'\]; finite, pos"),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_sentence(wrong, words):
-    with pytest.raises(SsilkError, match=words):
+    with pytest.raises(SsilkError, match=f"{words}.* needed; correct it, or remove the attribute.$"):
         surface_of(stage(**wrong))
 
 

@@ -10,7 +10,7 @@ stiffnesses (newton, `import_usd_deformable_cloth.py`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import inf, isfinite
+from math import inf, nan
 
 import numpy as np
 from pxr import Usd, UsdPhysics
@@ -35,9 +35,11 @@ _OF_SURFACES = (
     *_THICKNESS,
     *(name for current, older, _ in _STIFFNESSES.values() for name in (current, older)),
 )
+_OF_VOLUMES = ("youngsModulus", "poissonsRatio", "density")  # too, where their schema is applied
 _REST = ("restShapePoints", "restTriVertexIndices", "restBendAngles", "restBendAnglesDefault")
 _MORE = (PROPOSAL, OMNI, "physxDeformableMaterial:")  # where materials say what is not read
 _OMNI_POISSON = 0.45  # the fallback of its schema
+_CORRECT = "correct it, or remove the attribute"
 
 
 def read_surface(prim: Usd.Prim, mesh: Mesh) -> SurfaceMaterial | None:
@@ -45,6 +47,7 @@ def read_surface(prim: Usd.Prim, mesh: Mesh) -> SurfaceMaterial | None:
 
     The material that is bound for the purpose "physics", else for all, goes before the mesh. As in the proposal, the
     mass of the mesh and of its deformable body go before densities, and the body's density before the material's.
+    Moduli and density of a material of volumes are none of a surface, unless it is a material of surfaces as well.
 
     Args:
         prim: the mesh.
@@ -59,11 +62,11 @@ def read_surface(prim: Usd.Prim, mesh: Mesh) -> SurfaceMaterial | None:
         return None
     meters = StageUnits.of(prim.GetStage()).meters_per_unit
     kilograms = UsdPhysics.GetStageKilogramsPerUnit(prim.GetStage())
-    thicknesses, body = _array(prim, "thicknesses"), _bodies(prim)
+    thicknesses, body = _array(prim, "thicknesses"), [found for found in [deformable_body(prim)] if found]
     thickness = float(thicknesses.mean()) if len(thicknesses) else _number(said, *_THICKNESS)
     thickness = thickness * meters if thickness is not None else None
     young, poisson = _number(said, "youngsModulus"), _number(said, "poissonsRatio")
-    if poisson is None and young is not None and any(has_value(source, f"{OMNI}youngsModulus") for source in said):
+    if poisson is None and young is not None and any(_says(source, f"{OMNI}youngsModulus") for source in said):
         poisson = _OMNI_POISSON
     density = _number(body, "density") or _number(said, "density")  # zero is ignored, as in the proposal
     mass, area = float(_array(prim, "masses").sum()) or _number(body, "mass"), _area(mesh)
@@ -85,6 +88,15 @@ def read_surface(prim: Usd.Prim, mesh: Mesh) -> SurfaceMaterial | None:
     )
 
 
+def deformable_body(prim: Usd.Prim) -> Usd.Prim | None:
+    """Return the deformable body that a mesh belongs to: itself, the nearest one above it, or None."""
+    while prim and not prim.IsPseudoRoot():
+        if any(name.endswith("DeformableBodyAPI") for name in _applied(prim)):
+            return prim
+        prim = prim.GetParent()
+    return None
+
+
 def _applied(prim: Usd.Prim) -> list[str]:
     """Return the names of the schemas that a prim applies, whether or not USD knows them."""
     schemas = prim.GetMetadata("apiSchemas")
@@ -94,29 +106,38 @@ def _applied(prim: Usd.Prim) -> list[str]:
 def _is_of_surfaces(prim: Usd.Prim) -> bool:
     """Return whether a prim says something that only surfaces have, or applies their schema."""
     names = (space + name for name in _OF_SURFACES for space in (PROPOSAL, OMNI))
-    return any("SurfaceDeformable" in name for name in _applied(prim)) or any(has_value(prim, name) for name in names)
+    return any("SurfaceDeformable" in name for name in _applied(prim)) or any(_says(prim, name) for name in names)
 
 
-def _bodies(prim: Usd.Prim) -> list[Usd.Prim]:
-    """Return the deformable body that a mesh belongs to: itself, the nearest one above it, or none."""
-    while prim and not prim.IsPseudoRoot():
-        if any(name.endswith("DeformableBodyAPI") for name in _applied(prim)):
-            return [prim]
-        prim = prim.GetParent()
-    return []
+def _says(prim: Usd.Prim, name: str) -> bool:
+    """Return whether a prim says something of a surface, and not of a volume alone."""
+    applied = _applied(prim) if name.partition(":")[2] in _OF_VOLUMES else []
+    of_volume = any("VolumeDeformable" in schema for schema in applied)
+    return has_value(prim, name) and (not of_volume or any("SurfaceDeformable" in schema for schema in applied))
 
 
 def _number(sources: Sequence[Usd.Prim], *names: str) -> float | None:
     """Return the first number that prims say, in either schema; None for minus infinity, the proposal's fallback."""
     for source in sources:
         for name in (space + name for name in names for space in (PROPOSAL, OMNI)):
-            found = value(source, name) if has_value(source, name) else None
-            if found is None or found == -inf:
-                continue
-            if not isinstance(found, int | float) or not isfinite(found):
-                fail(f"{location(source)}.{name}", f"{found}", "a finite number is needed", "correct it")
-            return float(found)
+            found = value(source, name) if _says(source, name) else None
+            if found is not None and found != -inf:
+                return _checked(f"{location(source)}.{name}", found)
     return None
+
+
+def _checked(where: str, found: object) -> float:
+    """Return what an attribute says as a number; raise `SsilkError` where no cloth has it."""
+    name, number = where.rpartition(":")[2], float(found) if isinstance(found, int | float) else nan
+    fits, allowed = 0 <= number < inf, "a finite number that is not negative"
+    if name == "poissonsRatio":
+        fits, allowed = -1 < number <= 0.5, "a number above -1 and at most 0.5"
+    elif name in _THICKNESS:
+        fits, allowed = 0 < number < inf, "a finite, positive number"
+    if not fits:
+        told = f"{number:.7g}" if isinstance(found, int | float) else f"{found!r:.40}"
+        fail(where, f"it is {told}", f"{allowed} is needed", _CORRECT)
+    return number
 
 
 def _stiffness(
@@ -137,9 +158,13 @@ def _stiffness(
 def _array(prim: Usd.Prim, name: str) -> Floats:
     """Return what a mesh says of its whole, its faces or its points; nothing where it does not."""
     found = np.array(value(prim, PROPOSAL + name) if has_value(prim, PROPOSAL + name) else [])
-    numbers = found.reshape(-1).astype(np.float64) if found.dtype.kind in "iuf" else np.full(1, np.nan)
-    if not (np.isfinite(numbers) & (numbers > 0)).all():
-        fail(f"{location(prim)}.{PROPOSAL}{name}", "not all are positive and finite", "they must be", "correct them")
+    is_numeric = found.dtype.kind in "iuf"
+    numbers = found.reshape(-1).astype(np.float64) if is_numeric else np.full(1, np.nan)
+    wrong = np.flatnonzero(~(np.isfinite(numbers) & (numbers > 0)))
+    if len(wrong):
+        number = f"number {wrong[0]} of {len(numbers)} is {numbers[wrong[0]]:.7g}, counted from 0"
+        told = number if is_numeric else f"it is {found.tolist()!r:.40}"
+        fail(f"{location(prim)}.{PROPOSAL}{name}", told, "finite, positive numbers are needed", _CORRECT)
     return numbers
 
 
@@ -152,5 +177,9 @@ def _others(bound: Usd.Prim | None, prim: Usd.Prim) -> list[str]:
     """Return what material and mesh say beside what is read."""
     names = [attribute.GetName() for attribute in bound.GetAuthoredAttributes()] if bound else []
     read = {space + name for name in (*_OF_SURFACES, "density") for space in (PROPOSAL, OMNI)}
-    of_bound = [name for name in names if name.startswith(_MORE) and name not in read and has_value(bound, name)]
+    of_bound = [
+        name
+        for name in names
+        if name.startswith(_MORE) and has_value(bound, name) and not (name in read and _says(bound, name))
+    ]
     return of_bound + [PROPOSAL + name for name in _REST if has_value(prim, PROPOSAL + name)]

@@ -48,10 +48,9 @@ from .read_stage import (
     split_location,
     value,
 )
-from .read_surface import read_surface
 from .repair_mesh import offset_points
 from .units import StageUnits
-from .write_surface import write_surface
+from .write_surface import reads_as, shield_surface, write_surface
 
 
 @needs_whole_files
@@ -100,8 +99,8 @@ def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path, *, mov
 
     The copy keeps the stage's units and axes. Proxies are appended to the skeleton's joints, in place of older ones
     of the same garment. The garment's mesh stands under the SkelRoot with its classes, the rig's weights, and the
-    LBS weights over the character beside them (`primvars:ssilk:plainJointIndices` and `...Weights`). A physics
-    material that the mesh would lose is bound to it.
+    LBS weights over the character beside them (`primvars:ssilk:plainJointIndices` and `...Weights`). Where the mesh
+    would lose its physics material, or take another one from where it stands, it is bound to its own.
 
     Args:
         source: the stage that `scene.character` was read from.
@@ -117,9 +116,7 @@ def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path, *, mov
     stage = Usd.Stage.Open(layer)
     skel = find_skeleton(stage, root=_prim_path(scene.character.skeleton.path))
     mesh, to_bind = _place_garment(stage, skel, source, scene.garment, moved)
-    surface = scene.garment.surface
-    if surface is not None and read_surface(mesh.GetPrim(), scene.garment.mesh) is None:
-        write_surface(mesh.GetPrim(), _free_path(skel, leaf(surface.path)), surface)
+    _keep_surface(mesh.GetPrim(), skel, scene.garment, moved)
     proxies = _append_proxies(skel, str(mesh.GetPath()), scene)
     _bind_garment(mesh, to_bind, skel, scene, proxies)
     export(layer, out)
@@ -230,6 +227,19 @@ def _place_garment(
     if not old.GetPath().HasPrefix(skel.root.GetPath()):
         old = _move(stage, old, _free_path(skel, old.GetName()))
     return UsdGeom.Mesh(old), to_bind
+
+
+def _keep_surface(prim: Usd.Prim, skel: SkelSource, garment: Garment, moved: Floats | None) -> None:
+    """Bind the mesh to a physics material of its own where what it inherits is not what the garment was read with."""
+    surface, mesh = garment.surface, garment.mesh
+    if moved is not None:  # a mass for each area was read over the area before
+        mesh = replace(mesh, points=mesh.points - moved)
+    if reads_as(prim, mesh, surface):
+        return
+    if surface is None:
+        shield_surface(prim, _free_path(skel, f"{prim.GetName()}_without_physics"))
+    else:
+        write_surface(prim, _free_path(skel, leaf(surface.path)), surface)
 
 
 def _let_go(stage: Usd.Stage, skel: SkelSource, prim: Usd.Prim) -> Usd.Prim:
