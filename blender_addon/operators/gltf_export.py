@@ -15,6 +15,7 @@ from ..scene import playing
 from ..scene.exporting import MOST_LOST, export_glb, largest_loss
 from ..scene.garment import armature_of, unusable_here
 from ..scene.keys import has_keys
+from ..scene.simulated import simulating
 from .reporting import ReportingOperator
 
 SUFFIX = ".glb"
@@ -56,9 +57,17 @@ class ExportGltf(ReportingOperator, bpy.types.Operator):
             if not loss <= MOST_LOST:
                 raise SetupError(
                     f"'{garment.name}' would be {1000 * loss:.3g} mm off what Blender shows in frame {frame}; "
-                    "modifiers besides its armature are not in a glTF file, so switch those off."
+                    f"{_reason(garment)}."
                 )
         return f"'{garment.name}' is in {path.name}, at most {1000 * loss:.2g} mm off what Blender shows."
+
+
+def _reason(garment: bpy.types.Object) -> str:
+    """Return why what a glTF file shows of a garment may be off, and what to do."""
+    if moving := simulating(garment):
+        named = ", ".join(f"'{modifier.name}'" for modifier in moving)
+        return f"what modifiers do besides its armature is not in a glTF file, so switch off {named}"
+    return "no file was written, since bones and shape keys alone do not move it so; bake it again"
 
 
 CLASSES = (ExportGltf,)
