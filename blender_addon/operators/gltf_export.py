@@ -41,9 +41,7 @@ class ExportGltf(ReportingOperator, bpy.types.Operator):
     def invoke(self, context: bpy.types.Context, _: bpy.types.Event) -> set[str]:
         """Ask for the file."""
         if not self.filepath:
-            self.filepath = str(
-                Path(bpy.data.filepath).with_name(f"{bpy.path.clean_name(context.object.name)}{SUFFIX}")
-            )
+            self.filepath = str(proposed(context.object))
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
@@ -60,6 +58,11 @@ class ExportGltf(ReportingOperator, bpy.types.Operator):
                     f"{_reason(garment)}."
                 )
         return f"'{garment.name}' is in {path.name}, at most {1000 * loss:.2g} mm off what Blender shows."
+
+
+def proposed(garment: bpy.types.Object) -> Path:
+    """Return a file for a garment beside the scene's, or a name alone where the scene was never saved."""
+    return Path(bpy.data.filepath).parent / f"{bpy.path.clean_name(garment.name)}{SUFFIX}"
 
 
 def _reason(garment: bpy.types.Object) -> str:

@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
+from blender_addon.operators.gltf_export import proposed
 from blender_addon.scene import exporting
 from blender_addon.scene.exporting import SETTINGS, largest_loss
 from ssilk_core.errors import SsilkError
@@ -60,6 +62,12 @@ def test_a_glb_shows_what_blender_shows(ready, baked, tmp_path):
     ready.ops.export_scene.gltf(filepath=str(path), **{**few, "export_animation_mode": "ACTIONS"})
     with pytest.raises(SsilkError, match=r"1 skinned nodes 'Skirt' and [2-9] animations"):
         largest_loss(baked, path)
+
+
+def test_a_file_is_proposed_before_and_after_the_scene_is_saved(bpy, skirt, tmp_path):
+    assert proposed(skirt) == Path("Skirt.glb")
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
+    assert proposed(skirt) == tmp_path / "Skirt.glb"
 
 
 @pytest.mark.parametrize("divides", [False, True])
