@@ -36,7 +36,10 @@ class ExportGltf(ReportingOperator, bpy.types.Operator):
             return reason
         if playing.live(context.object):
             return f"'{context.object.name}' is played live; bake it first"
-        return "" if has_keys(context.object) else f"Nothing was baked for '{context.object.name}'"
+        if not has_keys(context.object):
+            return f"Nothing was baked for '{context.object.name}'"
+        several = context.scene.frame_end > context.scene.frame_start
+        return "" if several else "The scene has one frame, and an animation needs two; set its end to a later one"
 
     def invoke(self, context: bpy.types.Context, _: bpy.types.Event) -> set[str]:
         """Ask for the file."""

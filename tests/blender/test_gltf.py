@@ -100,5 +100,10 @@ def test_what_a_glb_cannot_hold_is_refused_and_leaves_no_file(ready, baked, tmp_
     assert re.search(r"'Skirt' would be \S+ mm off .* in frame \d+; what modifiers do .* 'Wave'", str(error.value))
     assert not list(tmp_path.iterdir())
     baked.modifiers.remove(wave)
+    ready.context.scene.frame_end = ready.context.scene.frame_start
+    with pytest.raises(RuntimeError, match="The scene has one frame, and an animation needs two"):
+        ready.ops.ssilk.export_gltf(filepath=str(path))
+    ready.context.scene.frame_end = FRAMES.stop - 1
+    assert ready.ops.ssilk.export_gltf.poll()
     assert ready.ops.ssilk.remove_bake() == {"FINISHED"}
     assert not ready.ops.ssilk.export_gltf.poll()
