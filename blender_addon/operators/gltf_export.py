@@ -12,7 +12,7 @@ from ssilk_core.files import replacing
 
 from ..errors import SetupError
 from ..scene import playing
-from ..scene.exporting import MOST_LOST, export_glb, largest_loss
+from ..scene.exporting import MOST_LOST, export_glb, largest_loss, visible
 from ..scene.garment import armature_of, unusable_here
 from ..scene.keys import has_keys
 from ..scene.simulated import simulating
@@ -52,8 +52,9 @@ class ExportGltf(ReportingOperator, bpy.types.Operator):
         garment, path = context.object, Path(bpy.path.abspath(self.filepath))
         if path.suffix != SUFFIX:
             raise SetupError(f"'{path.name}' is no name for a glTF binary; it ends in {SUFFIX}.")
-        with replacing(path) as unverified:
-            export_glb(garment, armature_of(garment), unverified)
+        armature = armature_of(garment)
+        with visible([garment, armature]), replacing(path) as unverified:
+            export_glb(garment, armature, unverified)
             loss, frame = largest_loss(garment, unverified)
             if not loss <= MOST_LOST:
                 raise SetupError(

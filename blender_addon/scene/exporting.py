@@ -165,6 +165,31 @@ def _moved(armature: bpy.types.Object) -> list[bpy.types.Object]:
 
 
 @contextmanager
+def visible(things: list[bpy.types.Object]) -> Iterator[None]:
+    """Show objects that are hidden, which Blender neither exports nor evaluates, and hide them again afterwards.
+
+    Raises:
+        SetupError: a collection hides one, or it is in none of the view layer.
+    """
+    layer = bpy.context.view_layer
+    there = [thing for thing in things if thing.name in layer.objects]
+    before = [(thing, thing.hide_get(), thing.hide_viewport) for thing in there]
+    try:
+        for thing in there:
+            thing.hide_viewport = False
+            thing.hide_set(False)
+        layer.update()
+        for thing in things:
+            if thing not in there or not thing.visible_get():
+                raise SetupError(f"'{thing.name}' is in a hidden collection; show that in the outliner.")
+        yield
+    finally:
+        for thing, hidden, disabled in before:
+            thing.hide_set(hidden)
+            thing.hide_viewport = disabled
+
+
+@contextmanager
 def _selected(things: list[bpy.types.Object]) -> Iterator[None]:
     """Select visible objects and nothing else, and what was selected again afterwards."""
     layer = bpy.context.view_layer

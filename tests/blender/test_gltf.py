@@ -70,6 +70,27 @@ def test_a_file_is_proposed_before_and_after_the_scene_is_saved(bpy, skirt, tmp_
     assert proposed(skirt) == tmp_path / "Skirt.glb"
 
 
+def test_what_is_hidden_is_shown_while_it_is_exported(ready, baked, tmp_path):
+    scene, rig, path = ready.context.scene, ready.data.objects["Rig"], tmp_path / "Skirt.glb"
+    baked.hide_set(True)
+    rig.hide_set(True)
+    rig.hide_viewport = True
+    assert ready.ops.ssilk.export_gltf(filepath=str(path)) == {"FINISHED"}
+    assert (baked.hide_get(), baked.hide_viewport, rig.hide_get(), rig.hide_viewport) == (True, False, True, True)
+    baked.hide_set(False)
+    assert largest_loss(baked, path)[0] < 5e-4
+    closet = ready.data.collections.new("Closet")
+    scene.collection.children.link(closet)
+    closet.objects.link(rig)
+    scene.collection.objects.unlink(rig)
+    layer = ready.context.view_layer.layer_collection.children["Closet"]
+    for hide in ("hide_viewport", "exclude"):
+        setattr(layer, hide, True)
+        with pytest.raises(RuntimeError, match="'Rig' is in a hidden collection; show that in the outliner"):
+            ready.ops.ssilk.export_gltf(filepath=str(path))
+        setattr(layer, hide, False)
+
+
 @pytest.mark.parametrize("divides", [False, True])
 def test_a_glb_plays_at_a_rate_that_is_no_integer(ready, baked, tmp_path, monkeypatch, divides):
     render, path = ready.context.scene.render, tmp_path / "Skirt.glb"
