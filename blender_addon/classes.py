@@ -7,7 +7,6 @@ import numpy as np
 from ssilk_usd.names import CLASS, LEVEL
 
 from ssilk_core.assets import LOOSE, PINNED
-from ssilk_core.mesh.topology import components
 
 COLORS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # sRGB, by class
 ATTRIBUTE = CLASS.removeprefix("primvars:")  # Blender's USD importer keeps the name
@@ -53,15 +52,14 @@ def counts(classes: np.ndarray) -> tuple[int, int, int]:
     return int(pinned), int(tight), int(loose)
 
 
-def adrift(classes: np.ndarray, pairs: np.ndarray) -> int:
-    """Return how many vertices are on islands that are all loose, and so fall off.
+def adrift(classes: np.ndarray, island: np.ndarray) -> np.ndarray:
+    """Return which vertices are on islands that are all loose, and so fall off unless stitched, shape (V,).
 
     Args:
         classes: shape (V,).
-        pairs: vertices of each edge, shape (E, 2).
+        island: number of the island of each vertex, shape (V,).
     """
-    island = components(pairs, len(classes))
-    return int(np.count_nonzero(~np.isin(island, island[classes != LOOSE])))
+    return ~np.isin(island, island[classes != LOOSE])
 
 
 def mirrored(classes: np.ndarray, points: np.ndarray, partners: np.ndarray, *, from_left: bool) -> np.ndarray:

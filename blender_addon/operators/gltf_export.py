@@ -12,9 +12,10 @@ from ssilk_core.files import replacing
 
 from ..errors import SetupError
 from ..scene import playing
-from ..scene.exporting import MOST_LOST, export_glb, largest_loss
+from ..scene.exporting import MOST_LOST, export_glb, largest_loss, visible
 from ..scene.garment import armature_of, unusable_here
 from ..scene.keys import has_keys
+from ..scene.simulated import simulating
 from .reporting import ReportingOperator
 
 SUFFIX = ".glb"
@@ -35,14 +36,15 @@ class ExportGltf(ReportingOperator, bpy.types.Operator):
             return reason
         if playing.live(context.object):
             return f"'{context.object.name}' is played live; bake it first"
-        return "" if has_keys(context.object) else f"Nothing was baked for '{context.object.name}'"
+        if not has_keys(context.object):
+            return f"Nothing was baked for '{context.object.name}'"
+        several = context.scene.frame_end > context.scene.frame_start
+        return "" if several else "The scene has one frame, and an animation needs two; set its end to a later one"
 
     def invoke(self, context: bpy.types.Context, _: bpy.types.Event) -> set[str]:
         """Ask for the file."""
         if not self.filepath:
-            self.filepath = str(
-                Path(bpy.data.filepath).with_name(f"{bpy.path.clean_name(context.object.name)}{SUFFIX}")
-            )
+            self.filepath = str(proposed(context.object))
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
@@ -50,15 +52,29 @@ class ExportGltf(ReportingOperator, bpy.types.Operator):
         garment, path = context.object, Path(bpy.path.abspath(self.filepath))
         if path.suffix != SUFFIX:
             raise SetupError(f"'{path.name}' is no name for a glTF binary; it ends in {SUFFIX}.")
-        with replacing(path) as unverified:
-            export_glb(garment, armature_of(garment), unverified)
+        armature = armature_of(garment)
+        with visible([garment, armature]), replacing(path) as unverified:
+            export_glb(garment, armature, unverified)
             loss, frame = largest_loss(garment, unverified)
             if not loss <= MOST_LOST:
                 raise SetupError(
                     f"'{garment.name}' would be {1000 * loss:.3g} mm off what Blender shows in frame {frame}; "
-                    "modifiers besides its armature are not in a glTF file, so switch those off."
+                    f"{_reason(garment)}."
                 )
         return f"'{garment.name}' is in {path.name}, at most {1000 * loss:.2g} mm off what Blender shows."
+
+
+def proposed(garment: bpy.types.Object) -> Path:
+    """Return a file for a garment beside the scene's, or a name alone where the scene was never saved."""
+    return Path(bpy.data.filepath).parent / f"{bpy.path.clean_name(garment.name)}{SUFFIX}"
+
+
+def _reason(garment: bpy.types.Object) -> str:
+    """Return why what a glTF file shows of a garment may be off, and what to do."""
+    if moving := simulating(garment):
+        named = ", ".join(f"'{modifier.name}'" for modifier in moving)
+        return f"what modifiers do besides its armature is not in a glTF file, so switch off {named}"
+    return "no file was written, since bones and shape keys alone do not move it so; bake it again"
 
 
 CLASSES = (ExportGltf,)

@@ -140,7 +140,7 @@ def wait(folder, record, our_turn):
 
 
 def train(folder, record, command, our_turn):
-    """Run the training; return its exit code: INTERRUPTED where it was asked to end, however it did."""
+    """Run the training; return its exit code and whether it was asked to end: INTERRUPTED then, however it did."""
     with (folder / LOG).open("w", encoding="utf-8") as log:
         process = subprocess.Popen(
             [sys.executable, *command], cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log,
@@ -155,7 +155,7 @@ def train(folder, record, command, our_turn):
         if process.poll() is None:  # the folder is gone, and nobody will ask for the model
             process.terminate()
     told = process.returncode in (DONE, FAULT, BAD_INPUT, WORSE)
-    return INTERRUPTED if asked and not told else process.returncode
+    return (INTERRUPTED if asked and not told else process.returncode), asked
 
 
 def attend(process, said, reader, folder, record, our_turn):
@@ -211,9 +211,10 @@ def run_round(folder, queue_folder, record, order):
         if not wait(folder, record, our_turn):
             return {"state": "stopped"}
         record.write(state="running")
-        code = train(folder, record, command_of(order, fields), our_turn if later else lambda: True)
-    if code == INTERRUPTED:  # by the artist, or to make way
-        return {} if later and not (folder / CANCEL).exists() else {"state": "stopped", "seconds_left": None}
+        code, asked = train(folder, record, command_of(order, fields), our_turn if later else lambda: True)
+    if code == INTERRUPTED:  # by the artist, to make way, or by somebody else
+        makes_way = asked and later and not (folder / CANCEL).exists()
+        return {} if makes_way else {"state": "stopped", "seconds_left": None}
     if code not in (DONE, WORSE):
         return {"state": "failed", "error": fields.get("error") or last_words(folder)}
     best = fields.get("checkpoint")

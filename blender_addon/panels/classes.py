@@ -6,6 +6,7 @@ from __future__ import annotations
 import bpy
 import numpy as np
 
+from ssilk_core.mesh.topology import components
 from ssilk_core.preflight.finding import format_count
 
 from ..classes import LEVELS, adrift, counts
@@ -14,13 +15,16 @@ from ..operators.classes import CHOICES
 from ..overlay import shown
 from ..scene.attributes import current_classes
 from ..scene.garment import unusable
+from ..scene.meshes import triangles_of
+from ..scene.shapes import rest_points
+from ..scene.stitched import unstitched
 from .base import SidebarPanel, draw_text, saying_errors
 
 _adrift: tuple[object, int] = (None, 0)  # what was looked at last, and what was found
 
 
 def adrift_line(thing: bpy.types.Object) -> str:
-    """Return how much of a garment may fall off, since islands of it are all loose; empty where nothing does.
+    """Return how much of a garment may fall off, which neither classes nor stitches hold; empty where nothing does.
 
     Only what has changed is looked at again: panels are drawn many times a second.
     """
@@ -28,15 +32,26 @@ def adrift_line(thing: bpy.types.Object) -> str:
     mesh, values = thing.data, current_classes(thing.data)
     if values is None or mesh.is_editmode:
         return ""
-    looked = (mesh.session_uid, len(mesh.edges), values.tobytes())
+    scale = bpy.context.scene.unit_settings.scale_length * np.array(thing.matrix_world.to_scale()).round(6)
+    points = rest_points(thing) * scale
+    looked = (mesh.session_uid, len(mesh.edges), values.tobytes(), points.tobytes())
     if _adrift[0] != looked:
-        pairs = np.empty(2 * len(mesh.edges), dtype=np.int32)
-        mesh.edges.foreach_get("vertices", pairs)
-        _adrift = (looked, adrift(values, pairs.reshape(-1, 2)))
+        _adrift = (looked, _falling(mesh, values, points))
     if not _adrift[1]:
         return ""
     falling = format_count(_adrift[1], "vertices")
-    return f"{falling} would fall off unless stitched: pieces that lie on no other cloth need pinned or tight ones"
+    return f"{falling} would fall off: pieces that lie on no other cloth need pinned or tight ones"
+
+
+def _falling(mesh: bpy.types.Mesh, values: np.ndarray, points: np.ndarray) -> int:
+    """Return how many vertices are on pieces that neither classes (V,) nor stitches hold; points (V, 3) are in m."""
+    pairs = np.empty(2 * len(mesh.edges), dtype=np.int32)
+    mesh.edges.foreach_get("vertices", pairs)
+    island = components(pairs.reshape(-1, 2), len(values))
+    loose = adrift(values, island)
+    if loose.any():
+        loose = unstitched(points, triangles_of(mesh), island, loose)
+    return int(np.count_nonzero(loose))
 
 
 def class_counts(thing: bpy.types.Object) -> tuple[int, int, int] | None:

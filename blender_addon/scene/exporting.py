@@ -2,7 +2,8 @@
 """A baked character as a glb of Blender's own exporter, set so that nothing of a bake is lost, and read back.
 
 By its defaults that exporter makes an animation of each action, so that a bake, which lies beneath the artist's
-action, plays without it; and it keeps four influences of each vertex.
+action, plays without it; and it keeps four influences of each vertex. In Blender 5.0 it takes the scene's rate
+as `fps * fps_base`, where Blender plays `fps / fps_base`, so that it is given the reciprocal of `fps_base`.
 """
 
 from __future__ import annotations
@@ -56,11 +57,46 @@ def export_glb(garment: bpy.types.Object, armature: bpy.types.Object, path: Path
     """
     if ADDON not in bpy.context.preferences.addons:
         raise SetupError("Blender's add-on for glTF 2.0 is switched off; switch it on in the preferences.")
+    base = bpy.context.scene.render.fps_base
     with _selected([armature, *_moved(armature), garment]):
-        try:
-            bpy.ops.export_scene.gltf(filepath=str(path), **SETTINGS)
-        except RuntimeError as error:
-            raise SetupError(f"'{path.name}' cannot be exported: {str(error).strip()}") from error
+        with _fps_base(1 / base):
+            _export(path)
+        if not _lasts_as_played(garment, path):
+            _export(path)
+
+
+def _export(path: Path) -> None:
+    try:
+        bpy.ops.export_scene.gltf(filepath=str(path), **SETTINGS)
+    except RuntimeError as error:
+        raise SetupError(f"'{path.name}' cannot be exported: {str(error).strip()}") from error
+
+
+@contextmanager
+def _fps_base(value: float) -> Iterator[None]:
+    """Change by what a scene's rate is divided, and change it back."""
+    render = bpy.context.scene.render
+    before = render.fps_base
+    render.fps_base = value
+    try:
+        yield
+    finally:
+        render.fps_base = before
+
+
+def _lasts_as_played(garment: bpy.types.Object, path: Path) -> bool:
+    """Return whether the exporter multiplied by the reciprocal of `fps_base` that it was given, in place of dividing.
+
+    Raises:
+        SsilkError: the file holds something else than one animation of the garment.
+    """
+    scene = bpy.context.scene
+    render, played = scene.render, SkinnedGlb(path, garment.name)
+    lasts = played.end - played.start
+    right, wrong = (
+        (scene.frame_end - scene.frame_start) / rate for rate in (scene_rate(), render.fps * render.fps_base)
+    )
+    return abs(lasts - right) <= abs(lasts - wrong)
 
 
 def largest_loss(garment: bpy.types.Object, path: Path) -> tuple[float, int]:
@@ -126,6 +162,31 @@ def _moved(armature: bpy.types.Object) -> list[bpy.types.Object]:
         if any(modifier.type == "ARMATURE" and modifier.object == armature for modifier in thing.modifiers)
     ]
     return [*found, *moved, *armature.children_recursive]
+
+
+@contextmanager
+def visible(things: list[bpy.types.Object]) -> Iterator[None]:
+    """Show objects that are hidden, which Blender neither exports nor evaluates, and hide them again afterwards.
+
+    Raises:
+        SetupError: a collection hides one, or it is in none of the view layer.
+    """
+    layer = bpy.context.view_layer
+    there = [thing for thing in things if thing.name in layer.objects]
+    before = [(thing, thing.hide_get(), thing.hide_viewport) for thing in there]
+    try:
+        for thing in there:
+            thing.hide_viewport = False
+            thing.hide_set(False)
+        layer.update()
+        for thing in things:
+            if thing not in there or not thing.visible_get():
+                raise SetupError(f"'{thing.name}' is in a hidden collection; show that in the outliner.")
+        yield
+    finally:
+        for thing, hidden, disabled in before:
+            thing.hide_set(hidden)
+            thing.hide_viewport = disabled
 
 
 @contextmanager

@@ -22,7 +22,7 @@ from .cage import cage_points, is_refined
 from .carrying import rest_world
 from .garment import armature_of, bodies_of
 from .masks import need_unmasked
-from .meshes import world_points
+from .meshes import triangles_of, world_points
 from .repairs import displacements
 from .shapes import mixed_points, rest_points
 
@@ -90,7 +90,7 @@ def measuring(
     if kind == STRETCH:
         world = np.array(garment.matrix_world)[:3, :3]
         rest = rest_points(garment) @ world.T
-        return HeatMap(kind, heat.elongations(rest, points, _triangles(garment.data)))
+        return HeatMap(kind, heat.elongations(rest, points, triangles_of(garment.data)))
     scale, depths = bpy.context.scene.unit_settings.scale_length, []
     bodies = bodies_of(garment, armature_of(garment))
     need_unmasked(bodies)
@@ -184,16 +184,9 @@ def _paint(garment: bpy.types.Object, measured: HeatMap, red: float) -> None:
         colors = colors[count:]
 
 
-def _triangles(mesh: bpy.types.Mesh) -> np.ndarray:
-    mesh.calc_loop_triangles()
-    triangles = np.empty(len(mesh.loop_triangles) * 3, dtype=np.int32)
-    mesh.loop_triangles.foreach_get("vertices", triangles)
-    return triangles.reshape(-1, 3)
-
-
 def _surface(body: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
     """Return the points of an evaluated body in the world, shape (V, 3), and its triangles, outward, shape (T, 3)."""
-    triangles = _triangles(body.data)
+    triangles = triangles_of(body.data)
     if body.matrix_world.determinant() < 0:  # mirrored, and so are its faces
         triangles = triangles[:, ::-1]
     return world_points(body), triangles
@@ -203,7 +196,7 @@ def _cage(thing: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> tuple[np.n
     """Return points and triangles of an object's own mesh as `_surface` does, beneath modifiers that refine it."""
     if not is_refined(thing, depsgraph):
         return _surface(thing.evaluated_get(depsgraph))
-    triangles = _triangles(thing.data)
+    triangles = triangles_of(thing.data)
     return cage_points(thing, depsgraph), triangles[:, ::-1] if thing.matrix_world.determinant() < 0 else triangles
 
 

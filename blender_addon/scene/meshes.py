@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Meshes opened as a BMesh, where Python reads and writes per-vertex lists many times faster; evaluated vertices."""
+"""Meshes opened as a BMesh, where Python reads and writes per-vertex lists many times faster; triangles, points."""
 
 from __future__ import annotations
 
@@ -29,6 +29,14 @@ def edited(mesh: bpy.types.Mesh) -> Iterator[bmesh.types.BMesh]:
         yield content
         content.to_mesh(mesh)
     mesh.update()
+
+
+def triangles_of(mesh: bpy.types.Mesh) -> np.ndarray:
+    """Return the vertices of each triangle of a mesh's faces, shape (T, 3)."""
+    mesh.calc_loop_triangles()
+    triangles = np.empty(len(mesh.loop_triangles) * 3, dtype=np.int32)
+    mesh.loop_triangles.foreach_get("vertices", triangles)
+    return triangles.reshape(-1, 3)
 
 
 def world_points(thing: bpy.types.Object) -> np.ndarray:

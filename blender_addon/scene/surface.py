@@ -9,6 +9,7 @@ import numpy as np
 from .. import classes as palette
 from ..errors import SetupError
 from .attributes import current_classes
+from .meshes import triangles_of
 
 Surface = tuple[np.ndarray, np.ndarray, np.ndarray]
 
@@ -24,7 +25,7 @@ def class_surface(thing: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Su
         classes = current_classes(mesh)
         if classes is None:
             return None
-        points, triangles = _triangles(mesh, np.array(thing.matrix_world))
+        points, triangles = _placed(mesh, np.array(thing.matrix_world))
         return points, palette.colors_of(classes), triangles
     except SetupError:
         return None
@@ -32,10 +33,7 @@ def class_surface(thing: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Su
         evaluated.to_mesh_clear()
 
 
-def _triangles(mesh: bpy.types.Mesh, world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _placed(mesh: bpy.types.Mesh, world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     points = np.empty(len(mesh.vertices) * 3, dtype=np.float32)
     mesh.vertices.foreach_get("co", points)
-    mesh.calc_loop_triangles()
-    triangles = np.empty(len(mesh.loop_triangles) * 3, dtype=np.int32)
-    mesh.loop_triangles.foreach_get("vertices", triangles)
-    return points.reshape(-1, 3) @ world[:3, :3].T + world[:3, 3], triangles.reshape(-1, 3)
+    return points.reshape(-1, 3) @ world[:3, :3].T + world[:3, 3], triangles_of(mesh)

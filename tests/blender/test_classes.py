@@ -10,10 +10,9 @@ from blender_addon import classes as palette
 
 
 def test_vertices_of_islands_that_are_all_loose_fall_off():
-    pairs = np.array([[0, 1], [1, 2], [3, 4], [5, 6]])
-    assert palette.adrift(np.array([0, 2, 2, 2, 2, 1, 2]), pairs) == 2
-    assert palette.adrift(np.array([0, 2, 2, 2, 2, 1, 2, 2]), pairs) == 3  # an isolated vertex is an island
-    assert palette.adrift(np.array([0, 2, 2, 1, 2, 1, 2]), pairs) == 0
+    island = np.array([0, 0, 0, 1, 1, 2, 2, 3])
+    assert palette.adrift(np.array([0, 2, 2, 2, 2, 1, 2, 2]), island).nonzero()[0].tolist() == [3, 4, 7]
+    assert not palette.adrift(np.array([0, 2, 2, 1, 2, 1, 2, 0]), island).any()
 
 
 def test_colors_and_classes_are_each_others_inverse():

@@ -4,15 +4,19 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
+from blender_addon.operators.gltf_export import proposed
+from blender_addon.scene import exporting
 from blender_addon.scene.exporting import SETTINGS, largest_loss
 from ssilk_core.errors import SsilkError
 from ssilk_core.gltf.container import GlbFile
+from ssilk_core.gltf.skinned import SkinnedGlb
 
 from .conftest import activate
 from .scenes import shown
@@ -60,6 +64,52 @@ def test_a_glb_shows_what_blender_shows(ready, baked, tmp_path):
         largest_loss(baked, path)
 
 
+def test_a_file_is_proposed_before_and_after_the_scene_is_saved(bpy, skirt, tmp_path):
+    assert proposed(skirt) == Path("Skirt.glb")
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
+    assert proposed(skirt) == tmp_path / "Skirt.glb"
+
+
+def test_what_is_hidden_is_shown_while_it_is_exported(ready, baked, tmp_path):
+    scene, rig, path = ready.context.scene, ready.data.objects["Rig"], tmp_path / "Skirt.glb"
+    baked.hide_set(True)
+    rig.hide_set(True)
+    rig.hide_viewport = True
+    assert ready.ops.ssilk.export_gltf(filepath=str(path)) == {"FINISHED"}
+    assert (baked.hide_get(), baked.hide_viewport, rig.hide_get(), rig.hide_viewport) == (True, False, True, True)
+    baked.hide_set(False)
+    assert largest_loss(baked, path)[0] < 5e-4
+    closet = ready.data.collections.new("Closet")
+    scene.collection.children.link(closet)
+    closet.objects.link(rig)
+    scene.collection.objects.unlink(rig)
+    layer = ready.context.view_layer.layer_collection.children["Closet"]
+    for hide in ("hide_viewport", "exclude"):
+        setattr(layer, hide, True)
+        with pytest.raises(RuntimeError, match="'Rig' is in a hidden collection; show that in the outliner"):
+            ready.ops.ssilk.export_gltf(filepath=str(path))
+        setattr(layer, hide, False)
+
+
+@pytest.mark.parametrize("divides", [False, True])
+def test_a_glb_plays_at_a_rate_that_is_no_integer(ready, baked, tmp_path, monkeypatch, divides):
+    render, path = ready.context.scene.render, tmp_path / "Skirt.glb"
+    render.fps, render.fps_base = 24, 1.001
+    before = render.fps_base
+    if divides:  # as an exporter would that has been mended
+        export = exporting._export
+
+        def mended(path):
+            with exporting._fps_base(1 / render.fps_base):
+                export(path)
+
+        monkeypatch.setattr(exporting, "_export", mended)
+    assert ready.ops.ssilk.export_gltf(filepath=str(path)) == {"FINISHED"}
+    assert render.fps_base == before
+    played = SkinnedGlb(path, "Skirt")
+    assert (played.start, played.end) == pytest.approx((1.001 / 24, 12 * 1.001 / 24), rel=1e-6)
+
+
 def test_what_a_glb_cannot_hold_is_refused_and_leaves_no_file(ready, baked, tmp_path):
     path = tmp_path / "Skirt.glb"
     with pytest.raises(RuntimeError, match=r"'Skirt.usd' is no name for a glTF binary; it ends in .glb"):
@@ -68,8 +118,13 @@ def test_what_a_glb_cannot_hold_is_refused_and_leaves_no_file(ready, baked, tmp_
     wave.height, wave.speed = 0.2, 0.5
     with pytest.raises(RuntimeError) as error:
         ready.ops.ssilk.export_gltf(filepath=str(path))
-    assert re.search(r"'Skirt' would be \S+ mm off what Blender shows in frame \d+", str(error.value))
+    assert re.search(r"'Skirt' would be \S+ mm off .* in frame \d+; what modifiers do .* 'Wave'", str(error.value))
     assert not list(tmp_path.iterdir())
     baked.modifiers.remove(wave)
+    ready.context.scene.frame_end = ready.context.scene.frame_start
+    with pytest.raises(RuntimeError, match="The scene has one frame, and an animation needs two"):
+        ready.ops.ssilk.export_gltf(filepath=str(path))
+    ready.context.scene.frame_end = FRAMES.stop - 1
+    assert ready.ops.ssilk.export_gltf.poll()
     assert ready.ops.ssilk.remove_bake() == {"FINISHED"}
     assert not ready.ops.ssilk.export_gltf.poll()

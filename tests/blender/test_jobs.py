@@ -150,6 +150,11 @@ def test_an_improvement_makes_way_for_a_training_and_goes_on_after_it(folder, tm
     assert (until(folder, "stopped").done, jobs.read_state(folder).round) == (1, 1)
 
 
+def test_an_improvement_that_somebody_else_interrupts_is_stopped(folder):
+    jobs.begin(sys.executable, folder, ["-c", DONE_ONCE + "sys.exit(130)"], improves=True)
+    assert until(folder, "stopped").round == 1
+
+
 def test_jobs_line_up_and_one_at_a_time_runs(folder, tmp_path):
     other, third = jobs.create(tmp_path, "B"), jobs.create(tmp_path, "C")
     jobs.begin(sys.executable, folder, ["-c", WAITS])

@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
-from .conftest import activate
+from .conftest import activate, add_mesh
 
 
 class Layout:
@@ -92,10 +92,35 @@ def test_pieces_that_fall_off_are_told_until_they_are_held(bpy, skirt):
     skirt.data.vertices.add(1)
     values = np.array([0] * 24 + [2] * 289, dtype=np.int32)
     write_classes(skirt.data, values)
-    assert "1 vertex would fall off unless stitched" in " ".join(drawn(ClassesPanel, bpy.context))
+    assert "1 vertex would fall off" in " ".join(drawn(ClassesPanel, bpy.context))
     values[-1] = 1
     write_classes(skirt.data, values)
     assert "fall off" not in " ".join(drawn(ClassesPanel, bpy.context))
+
+
+def test_pieces_that_stitches_hold_do_not_fall_off(bpy):
+    from blender_addon.panels.classes import adrift_line
+    from blender_addon.scene.attributes import write_classes
+
+    square, sides = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]), np.array([[0, 1, 2, 3]])
+    places = [(1, (0, 0, 0)), (0.05, (0, 0, 0.004)), (0.03, (0, 0, 0.008)), (0.05, (1.053, 0, 0)), (0.05, (0, 0, 2))]
+    points = np.concatenate([size * square + place for size, place in places])
+    sheet = add_mesh(bpy, "Sheet", points, np.concatenate([sides + 4 * piece for piece in range(5)]))
+
+    def falling(held: int) -> str:
+        write_classes(sheet.data, np.where(np.arange(20) == 4 * held, 1, 2).astype(np.int32))
+        return adrift_line(sheet).partition(" ")[0]
+
+    # The second piece lies on the first and under the third. The fourth is beside the first, the fifth is far away.
+    assert [falling(held) for held in range(5)] == ["8", "8", "8", "16", "16"]
+    sheet.scale = (10, 10, 10)
+    bpy.context.view_layer.update()
+    assert falling(0) == "16"
+    sheet.scale = (1, 1, 1)
+    bpy.context.view_layer.update()
+    for vertex in sheet.data.vertices[16:]:
+        vertex.co.z = 0.006
+    assert falling(0) == "4"
 
 
 def test_broken_classes_are_told_and_drawn_around(bpy, skirt):
