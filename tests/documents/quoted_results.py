@@ -250,7 +250,7 @@ def long_training() -> Text:
         kept = f"{run['iterations'][run['total'].index(best)]:,} of {run['iterations'][-1]:,}"
         totals = (f"{value:.4f}".replace("-", "−") for value in (best, run["total"][-1]))
         yield row(words, kept, duration(run["seconds"][-1]), *totals)
-    cape, skirt = runs["cape"], runs["fringe_skirt"]
+    cape = runs["cape"]
     yield f"{cape['iterations'][1] - cape['iterations'][0]:,} iterations after it most is won"
     moved = []
     for run in (cape, runs["cape_seed_1"], runs["hooded_dress"], runs["fringe_skirt"]):
