@@ -30,6 +30,7 @@ WAITS = """
 import json, signal, sys, time
 stopped = []
 signal.signal(signal.SIGINT, lambda *_: stopped.append(1))
+with open("begun", "a") as file: file.write("x")
 print(json.dumps({"event": "progress", "done": 1, "total": 9, "seconds_left": None, "terms": {}}), flush=True)
 for _ in range(1500):
     if stopped: break
@@ -146,6 +147,10 @@ def test_an_improvement_makes_way_for_a_training_and_goes_on_after_it(folder, tm
     jobs.begin(sys.executable, other := jobs.create(tmp_path, "B"), ["-c", SAYS])
     until(other, "done")
     assert (until(folder, "running").round, until(other, "done").round) == (1, 0)
+    deadline = time.monotonic() + 30
+    while len((folder / "begun").read_text()) < 2:  # an interrupt before that would be lost
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
     jobs.cancel(folder)
     assert (until(folder, "stopped").done, jobs.read_state(folder).round) == (1, 1)
 
