@@ -21,7 +21,7 @@ from ..quality import QUALITIES
 from ..targets import TARGETS
 
 if TYPE_CHECKING:
-    from ..assets import Character, Garment, ProxyRig, Scene
+    from ..assets import Character, Garment, ProxyRig, Scene, SurfaceMaterial
     from ..setup.rig import RigOptions
 
 
@@ -84,12 +84,17 @@ def fabric(options: argparse.Namespace, garment: Garment, report: Reporter) -> F
     if options.fabric or garment.surface is None:
         found = asked_fabric(options)
     else:
-        stated = fabric_of_surface(garment.surface)
-        report(Message(f"{garment.surface.path}: {surface_message(garment.surface, stated)}"))
-        found = apply_overrides(stated, options.material)
+        found = apply_overrides(stated_fabric(garment.surface, report), options.material)
     if garment.classes is not None:
         need_stitch(garment.mesh, garment.classes, found)
     return found
+
+
+def stated_fabric(surface: SurfaceMaterial, report: Reporter) -> Fabric:
+    """Return the fabric of a stage's physics material, and tell it."""
+    stated = fabric_of_surface(surface)
+    report(Message(f"{surface.path}: {surface_message(surface, stated)}"))
+    return stated
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 
 from ..errors import EXIT_OK
 from ..events import Message, Reporter, Result, Started
-from ..fabrics import fabric_of_surface, surface_message
 from ..setup.classes import USUAL
 from ..setup.rig import RigOptions
 from . import options as shared
@@ -59,8 +58,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     report(Started("rig", options.proxies))
     character, garment, rig = shared.read(options, report)
     if garment.surface is not None:
-        told = surface_message(garment.surface, fabric_of_surface(garment.surface))
-        report(Message(f"{garment.surface.path}: {told}"))
+        shared.stated_fabric(garment.surface, report)
     settled = None if options.keep_shape else settled_garment(character, garment, report)
     scene = prepare_scene(
         character,

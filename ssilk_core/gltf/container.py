@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -109,6 +110,15 @@ def _described(values: np.ndarray, kind: str) -> Document:
 def _bounds(values: np.ndarray) -> Document:
     columns = values.reshape(len(values), -1)
     return {"min": columns.min(axis=0).tolist(), "max": columns.max(axis=0).tolist()}
+
+
+@contextmanager
+def understood(name: str, found: str, allowed: str, todo: str) -> Iterator[None]:
+    """Raise `SsilkError` with these words where a document is of another shape than its reader takes it for."""
+    try:
+        yield
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        fail(name, f"{found} ({type(error).__name__}: {error})", allowed, todo)
 
 
 class GlbFile:

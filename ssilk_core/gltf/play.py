@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import numpy as np
 from ..assets import Floats, Ints
 from ..errors import fail
 from ..kinematics import matrix_from_quaternion, rigid, slerp
-from .container import GlbFile
+from .container import GlbFile, understood
 from .shot import ARMATURE, GARMENT
 
 WRITTEN = "a .glb that 'ssilk bake' wrote is needed"
@@ -128,13 +128,9 @@ class GlbShot:
             world[node] = own if above is None else self._place(above, values, world) @ own
         return world[node]
 
-    @contextmanager
-    def _understood(self) -> Iterator[None]:
+    def _understood(self) -> AbstractContextManager[None]:
         """Raise `SsilkError` for a document of another shape than `write_glb` writes."""
-        try:
-            yield
-        except (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError) as error:
-            fail(self.name, f"another or a damaged glb ({type(error).__name__}: {error})", WRITTEN, "bake it again")
+        return understood(self.name, "another or a damaged glb", WRITTEN, "bake it again")
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 from ..assets import Floats
 from ..errors import fail
 from ..kinematics import matrix_from_quaternion, slerp
-from .container import GlbFile
+from .container import GlbFile, understood
 
 Values = Mapping[tuple[int, str], Floats]
 
@@ -122,18 +122,9 @@ class SkinnedGlb:
             world[node] = own if above is None else self._place(above, moved, world) @ own
         return world[node]
 
-    @contextmanager
-    def _understood(self) -> Iterator[None]:
+    def _understood(self) -> AbstractContextManager[None]:
         """Raise `SsilkError` for a document that is not what the specification says."""
-        try:
-            yield
-        except (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError) as error:
-            fail(
-                self.name,
-                f"a damaged glb ({type(error).__name__}: {error})",
-                "a skinned mesh is needed",
-                "export again",
-            )
+        return understood(self.name, "a damaged glb", "a skinned mesh is needed", "export again")
 
 
 def _at(time: float, times: Floats, values: Floats, steps: bool, *, turns: bool) -> Floats:

@@ -109,14 +109,19 @@ def find_feet(mesh: Mesh) -> Stitches:
 
 def find_stitches(mesh: Mesh) -> Stitches:
     """Return what lies on another island at rest: the feet within `TOUCH`, or `SAGITTA` of a long edge."""
-    return touching(mesh, find_feet(mesh))
+    feet = find_feet(mesh)
+    return touching(mesh, feet, find_carried(mesh, feet))
 
 
-def touching(mesh: Mesh, feet: Stitches) -> Stitches:
-    """Return the feet that are stitched: those near enough, where the sides that meet do not face each other."""
+def touching(mesh: Mesh, feet: Stitches, carried: Stitches) -> Stitches:
+    """Return the feet that are stitched: those near enough, where the sides that meet do not face each other.
+
+    Args:
+        carried: those of `find_carried`, whose sides may.
+    """
     near = _near_enough(mesh, feet)
-    carried = near.on_larger & np.isin(near.vertices, find_carried(mesh, feet).vertices)
-    return near.select(carried | ~_face_to_face(mesh, near))
+    whole = near.on_larger & np.isin(near.vertices, carried.vertices)
+    return near.select(whole | ~_face_to_face(mesh, near))
 
 
 def _near_enough(mesh: Mesh, feet: Stitches) -> Stitches:

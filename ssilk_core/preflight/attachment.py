@@ -54,10 +54,11 @@ def unattached_islands(mesh: Mesh, classes: Ints) -> Findings:
 def stitched_islands(mesh: Mesh, classes: Ints) -> Findings:
     """Yield what lies on other islands and is stitched to them, and how much of it these carry."""
     feet = find_feet(mesh)
-    stitches, island = touching(mesh, feet), islands(mesh.faces, mesh.vertex_count)
+    on_hosts = find_carried(mesh, feet)
+    stitches, island = touching(mesh, feet, on_hosts), islands(mesh.faces, mesh.vertex_count)
     held = stitches.select(stitches.on_larger & _moves(classes, stitches.vertices, stitches.corners))
     parts = np.unique(island[held.vertices])
-    carried = np.intersect1d(parts, island[find_carried(mesh, feet).vertices])
+    carried = np.intersect1d(parts, island[on_hosts.vertices])
     if len(parts):
         whole = len(np.unique(island[mesh.faces]))
         yield Finding(

@@ -47,7 +47,8 @@ class Hosts:
     def of(cls, mesh: Mesh) -> Hosts:
         """Return those of a garment; a garment of one island has none."""
         feet = find_feet(mesh)
-        return cls(mesh, touching(mesh, feet), find_carried(mesh, feet))
+        carried = find_carried(mesh, feet)
+        return cls(mesh, touching(mesh, feet, carried), carried)
 
     @property
     def joined_islands(self) -> Ints:
