@@ -89,6 +89,14 @@ def islands(faces: Ints, vertex_count: int) -> NDArray[np.int64]:
     return components(edges(faces), vertex_count)
 
 
+def adrift(faces: Ints, island: Ints, held: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return the numbers of islands (V,) of faces (F, 3) without any vertex that is `held`, shape (V,), ascending.
+
+    Isolated vertices do not count.
+    """
+    return np.setdiff1d(island[np.unique(faces)], island[held])
+
+
 def components(pairs: Ints, vertex_count: int) -> NDArray[np.int64]:
     """Return the component of each vertex under the edges `pairs` (E, 2), numbered by first vertex, shape (V,)."""
     label = np.arange(vertex_count)

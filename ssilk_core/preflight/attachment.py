@@ -7,7 +7,7 @@ import numpy as np
 
 from ..assets import CLASS_NAMES, LOOSE, Ints, Mesh
 from ..mesh.stitches import TOUCH, find_carried, find_feet, find_stitches, joined_islands, touching
-from ..mesh.topology import islands
+from ..mesh.topology import adrift, islands
 from ..setup.surface import closest_on_surface
 from .finding import Finding, Findings, index_tuple
 
@@ -35,15 +35,15 @@ def unattached_islands(mesh: Mesh, classes: Ints) -> Findings:
     What stitches join counts as one island.
     """
     island = joined_islands(mesh, find_stitches(mesh))
-    adrift = np.setdiff1d(island[np.unique(mesh.faces)], island[np.flatnonzero(classes != LOOSE)])
-    if len(adrift):
-        lost = np.flatnonzero(np.isin(island, adrift))
+    falling = adrift(mesh.faces, island, classes != LOOSE)
+    if len(falling):
+        lost = np.flatnonzero(np.isin(island, falling))
         yield Finding(
             severity="error",
             code="unheld-islands",
             prim=mesh.path,
             count=len(lost),
-            found=f"{len(adrift)} of {len(np.unique(island[mesh.faces]))} islands have no pinned or tight vertex",
+            found=f"{len(falling)} of {len(np.unique(island[mesh.faces]))} islands have no pinned or tight vertex",
             why="nothing attaches them, so they fall off the body",
             fix="paint a part of each as pinned or tight (primvars:ssilk:class), or sew it to the rest",
             elements="vertices",

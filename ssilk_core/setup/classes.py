@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..assets import LOOSE, UP, Character, Floats, Ints, Mesh, SkinWeights, classes_at
 from ..errors import fail
 from ..mesh.geodesic import distances, within, within_of
-from ..mesh.topology import components, edge_use, edges, islands, smooth, vertex_areas
+from ..mesh.topology import adrift, components, edge_use, edges, islands, smooth, vertex_areas
 from .hosts import Hosts
 from .limbs import LimbRays
 from .surface import closest_on_surface
@@ -209,13 +209,13 @@ def _with_specks(kind: Mask, mesh: Mesh, pairs: Ints, reach: float) -> Mask:
 
 
 def _need_held(held: Mask, mesh: Mesh, island: Ints, otherwise: str, todo: str) -> None:
-    adrift = np.setdiff1d(island, island[held])
-    if len(adrift):
-        lost = np.isin(island, adrift)
+    falling = adrift(mesh.faces, island, held)
+    if len(falling):
+        lost = np.isin(island, falling)
         fail(
             mesh.path,
-            f"{len(adrift)} of {island.max() + 1} islands ({np.count_nonzero(lost)} vertices, the first "
-            f"{np.flatnonzero(lost)[0]}) {otherwise}",
+            f"{len(falling)} of {len(np.unique(island[mesh.faces]))} islands "
+            f"({np.count_nonzero(lost)} vertices, the first {np.flatnonzero(lost)[0]}) {otherwise}",
             "every island needs a pinned or tight vertex, or it falls off",
             todo,
         )

@@ -21,7 +21,7 @@ from ..mesh.stitches import (
     joined_mesh,
     touching,
 )
-from ..mesh.topology import edges, islands, vertex_areas, vertex_mask
+from ..mesh.topology import adrift, edges, islands, vertex_areas, vertex_mask
 from .binding import laplacian
 
 Mask = NDArray[np.bool_]
@@ -118,11 +118,11 @@ def need_stitch(mesh: Mesh, classes: Ints, fabric: Fabric) -> None:
     if fabric.stitch:
         return
     island = islands(mesh.faces, mesh.vertex_count)
-    adrift = np.setdiff1d(island[np.unique(mesh.faces)], island[classes != LOOSE])
-    if len(adrift) and len(find_stitches(mesh)):
+    falling = adrift(mesh.faces, island, classes != LOOSE)
+    if len(falling) and len(find_stitches(mesh)):
         fail(
             mesh.path,
-            f"{len(adrift)} of {len(np.unique(island[mesh.faces]))} islands are all loose, held by stitches alone, "
+            f"{len(falling)} of {len(np.unique(island[mesh.faces]))} islands are all loose, held by stitches alone, "
             f"and the fabric '{fabric.name}' has stitch = 0",
             "they would fall off",
             f"give --material stitch={Fabric('default').stitch:g}, or paint a part of each as pinned or tight",
