@@ -37,7 +37,7 @@ from ssilk_core.config import ModelConfig, TrainConfig
 from ssilk_core.energy import GarmentEnergy
 from ssilk_core.fabrics import Fabric
 from ssilk_core.kinematics import local_transforms, rigid
-from ssilk_core.memory import decoded_frames, step_memory
+from ssilk_core.memory import StepMemory, decoded_frames
 from ssilk_core.model.network import GarmentModel
 from ssilk_core.motion_bank import build_bank
 from ssilk_core.training.objective import Objective
@@ -127,7 +127,7 @@ def measure(vertices: int, body_vertices: int, frames: int, surface: str, device
         steps.run(iteration + 1)  # beside the optimiser's moments, which the first step makes
     body = whole.character.bodies[0].mesh.vertex_count
     samples = len(contact_samples(whole.garment.mesh, Fabric("default")).area)
-    predicted = step_memory(whole, ModelConfig(), frames, body, samples)
+    predicted = StepMemory(whole, ModelConfig(), body, samples).needed(frames)
     return {"measured": peak.bytes(), "predicted": predicted}
 
 

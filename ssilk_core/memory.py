@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable
+from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
 
@@ -53,24 +54,53 @@ def _numbers(path: Path) -> dict[str, str]:
     return {words[0]: words[1] for line in path.read_text().splitlines() if len(words := line.split()) > 1}
 
 
-def step_memory(
-    scene: Scene, config: ModelConfig, frames: int, body_vertices: int, samples: int, stitches: int = 0
-) -> int:
-    """Predict the bytes that one training step holds at its peak, for `frames` decoded at once.
+@dataclass(frozen=True, eq=False)
+class StepMemory:
+    """Predicts what a training step holds at its peak, from the sizes of its garment, body and network.
 
     Counts float32 numbers for each frame and vertex, contact sample, body vertex, joint and unit of the network, one
     table of squared distances, and the search for the closest triangles on a CPU. The constants were fitted to
     measured peaks, on the safe side (benchmarks/memory.py).
 
-    Args:
+    Attributes:
+        body_vertices: those of the body that the garment can touch.
         samples: at which the garment meets the body (`collision.samples`), its vertices among them.
         stitches: that hold its islands on one another.
     """
-    cloth = 200 * scene.garment.mesh.vertex_count + 25 * samples + STITCH_NUMBERS * stitches
-    numbers = cloth + 22 * body_vertices + 60 * len(scene.joint_names)
-    network = 12 * sum(config.widths) + 20 * config.latent
-    pairs = min(MAX_SEARCHED, 2 * frames * samples * body_vertices)  # a closed mesh has twice as many faces
-    return 4 * frames * (numbers + network) + 4 * samples * body_vertices + 8 * pairs + (40 << 20)
+
+    scene: Scene
+    model: ModelConfig
+    body_vertices: int
+    samples: int
+    stitches: int = 0
+
+    def needed(self, frames: int) -> int:
+        """Predict the bytes of a step that decodes so many frames at once."""
+        cloth = 200 * self.scene.garment.mesh.vertex_count + 25 * self.samples + STITCH_NUMBERS * self.stitches
+        numbers = cloth + 22 * self.body_vertices + 60 * len(self.scene.joint_names)
+        network = 12 * sum(self.model.widths) + 20 * self.model.latent
+        searched = self.samples * self.body_vertices
+        pairs = min(MAX_SEARCHED, 2 * frames * searched)  # a closed mesh has twice as many faces
+        return 4 * frames * (numbers + network) + 4 * searched + 8 * pairs + (40 << 20)
+
+    def fitting_batch(self, config: TrainConfig, available: int) -> tuple[int, int]:
+        """Return the largest batch and pretraining batch, up to the configured ones, that fit into so many bytes."""
+        most = decoded_frames(config, config.batch)
+        frames = bisect_right(range(most + 1), PLANNED_SHARE * available, key=self.needed) - 1
+        return max(1, min(config.batch, int(frames / _frames_of_a_window(config)))), max(
+            1, min(config.pretraining_batch, frames)
+        )
+
+    def check_one_window_fits(self, config: TrainConfig, available: int) -> None:
+        """Raise `SsilkError` unless a step on a single window fits into `available` bytes."""
+        needed = self.needed(ceil(_frames_of_a_window(config)))
+        if not needed <= available:
+            fail(
+                self.scene.garment.mesh.path,
+                f"a batch of one window of {config.window} poses needs {needed / 2**30:.2g} GiB",
+                f"{available / 2**30:.2g} GiB are free",
+                "free some, take another device (--device), or shorter windows (--set window=...)",
+            )
 
 
 def decoded_frames(config: TrainConfig, batch: int) -> int:
@@ -81,47 +111,6 @@ def decoded_frames(config: TrainConfig, batch: int) -> int:
 def _frames_of_a_window(config: TrainConfig) -> float:
     """Return the decoded frames per window, with its share of the single poses."""
     return config.window + config.static_batch / config.batch
-
-
-def fitting_batch(
-    scene: Scene,
-    model: ModelConfig,
-    config: TrainConfig,
-    body_vertices: int,
-    samples: int,
-    available: int,
-    stitches: int = 0,
-) -> tuple[int, int]:
-    """Return the largest batch and pretraining batch, up to the configured ones, that fit into `available` bytes."""
-
-    def needed(frames: int) -> int:
-        return step_memory(scene, model, frames, body_vertices, samples, stitches)
-
-    most = decoded_frames(config, config.batch)
-    frames = bisect_right(range(most + 1), PLANNED_SHARE * available, key=needed) - 1
-    return max(1, min(config.batch, int(frames / _frames_of_a_window(config)))), max(
-        1, min(config.pretraining_batch, frames)
-    )
-
-
-def check_one_window_fits(
-    scene: Scene,
-    model: ModelConfig,
-    config: TrainConfig,
-    body_vertices: int,
-    samples: int,
-    available: int,
-    stitches: int = 0,
-) -> None:
-    """Raise `SsilkError` unless a step on a single window fits into `available` bytes."""
-    needed = step_memory(scene, model, ceil(_frames_of_a_window(config)), body_vertices, samples, stitches)
-    if not needed <= available:
-        fail(
-            scene.garment.mesh.path,
-            f"a batch of one window of {config.window} poses needs {needed / 2**30:.2g} GiB",
-            f"{available / 2**30:.2g} GiB are free",
-            "free some, take another device (--device), or shorter windows (--set window=...)",
-        )
 
 
 def fits_in_memory(work: Callable[[], None]) -> bool:

@@ -37,14 +37,15 @@ def memory(scene: Scene, preset: Preset, body_vertices: int) -> Findings:
     from ..devices import select_device
     from ..energy.stitching import held_stitches
     from ..fabrics import FABRICS
-    from ..memory import decoded_frames, fitting_batch, free_memory, step_memory
+    from ..memory import StepMemory, decoded_frames, free_memory
 
     model, train, device = preset.model, preset.train, select_device("auto")
     free = free_memory(device)
     samples = len(contact_samples(scene.garment.mesh, FABRICS["default"]).area)
     stitches = len(held_stitches(scene.garment.mesh, FABRICS["default"], scene.classes))
-    needed = step_memory(scene, model, decoded_frames(train, train.batch), body_vertices, samples, stitches)
-    batch, pretraining_batch = fitting_batch(scene, model, train, body_vertices, samples, free, stitches)
+    step = StepMemory(scene, model, body_vertices, samples, stitches)
+    needed = step.needed(decoded_frames(train, train.batch))
+    batch, pretraining_batch = step.fitting_batch(train, free)
     lowered = (batch, pretraining_batch) != (train.batch, train.pretraining_batch)
     note = (
         f"; the batch is reduced from {train.batch} to {batch} windows "

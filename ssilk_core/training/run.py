@@ -20,7 +20,7 @@ from ..devices import select_device
 from ..errors import fail
 from ..events import Checkpoint, Message, Progress, Reporter, Started
 from ..kinematics import split_at_cuts
-from ..memory import check_one_window_fits, decoded_frames, fits_in_memory, fitting_batch, free_memory, step_memory
+from ..memory import StepMemory, decoded_frames, fits_in_memory, free_memory
 from ..motion_bank import MAX_JOINT_SPEED
 from .budget import Pace, affordable_validations, check_enough, fitting_iterations, scale_schedule, timed_pace
 from .curve import CurvePoint, append_point
@@ -194,15 +194,11 @@ class TrainingRun:
 
     def _fit_batch(self) -> None:
         """Reduce the batch until the predicted memory fits, and report it."""
-        job, config, group, free = self.job, self.job.train, self.group, free_memory(self.device)
+        config, group, free = self.job.train, self.group, free_memory(self.device)
         if self.device.type == "cpu":
             free //= group.size
-        check_one_window_fits(job.scene, job.model, config, *self._contact_sizes(), free, self._stitches)
-        fitting = group.gather(
-            fitting_batch(
-                job.scene, job.model, group.local_config(config), *self._contact_sizes(), free, self._stitches
-            )
-        )
+        self._step_memory.check_one_window_fits(config, free)
+        fitting = group.gather(self._step_memory.fitting_batch(group.local_config(config), free))
         batch, pretraining_batch = (group.size * min(counts) for counts in zip(*fitting))
         if (batch, pretraining_batch) != (config.batch, config.pretraining_batch):
             found = f"{self._memory() / 2**30:.1f} GiB needed, {free / 2**30:.1f} GiB free on {self.device}"
@@ -212,16 +208,13 @@ class TrainingRun:
         """Predict the memory of a step in this process [bytes]."""
         own = self.group.local_config(self.config)
         frames = decoded_frames(own, own.batch)
-        return step_memory(self.job.scene, self.job.model, frames, *self._contact_sizes(), self._stitches)
+        return self._step_memory.needed(frames)
 
     @property
-    def _stitches(self) -> int:
-        """Number of stitches of the garment."""
-        return len(self.parts.energy.stitching or ())
-
-    def _contact_sizes(self) -> tuple[int, int]:
-        """Return the vertices of the body that the garment can touch, and the samples at which it meets them."""
-        return self.parts.reached, len(self.parts.energy.cloth.samples.area)
+    def _step_memory(self) -> StepMemory:
+        energy = self.parts.energy
+        samples, stitches = len(energy.cloth.samples.area), len(energy.stitching or ())
+        return StepMemory(self.job.scene, self.job.model, self.parts.reached, samples, stitches)
 
     def _reduce_batch(self, found: str, batch: int, pretraining_batch: int) -> None:
         before, lowered = self.config, self.state.lowered

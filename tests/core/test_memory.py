@@ -15,24 +15,22 @@ from ssilk_core.errors import SsilkError
 from ssilk_core.fabrics import FABRICS
 from ssilk_core.memory import (
     PLANNED_SHARE,
-    check_one_window_fits,
+    StepMemory,
     decoded_frames,
     fits_in_memory,
-    fitting_batch,
     free_memory,
-    step_memory,
 )
 
 MODEL, CONFIG = ModelConfig(), TrainConfig(batch=32, window=16, static_batch=32, pretraining_batch=700)
 
 
 def test_more_of_anything_needs_more(scene):
-    base = step_memory(scene, MODEL, 64, 1000, 200)
-    assert step_memory(scene, MODEL, 65, 1000, 200) > base
-    assert step_memory(scene, MODEL, 64, 1001, 200) > base
-    assert step_memory(scene, MODEL, 64, 1000, 201) > base
-    assert step_memory(scene, MODEL, 64, 1000, 200, 1) > base
-    assert step_memory(scene, replace(MODEL, widths=(256, 512, 513)), 64, 1000, 200) > base
+    step = StepMemory(scene, MODEL, 1000, 200)
+    base = step.needed(64)
+    wider = replace(MODEL, widths=(256, 512, 513))
+    assert step.needed(65) > base
+    for change in ({"body_vertices": 1001}, {"samples": 201}, {"stitches": 1}, {"model": wider}):
+        assert replace(step, **change).needed(64) > base
 
 
 def test_what_a_step_keeps_of_its_contact_samples_is_counted(scene):
@@ -52,7 +50,7 @@ def test_what_a_step_keeps_of_its_contact_samples_is_counted(scene):
             energy.gravity_and_collision(x, x[0].detach(), x[0].detach(), sampled, *planes)
         kept.append(sum(storages.values()) + 4 * (sampled.numel() + planes[0].numel() + planes[1].numel()))
         counts.append(len(energy.cloth.samples.area))
-    few, many = (step_memory(scene, MODEL, frames, 0, count) for count in counts)
+    few, many = (StepMemory(scene, MODEL, 0, count).needed(frames) for count in counts)
     assert counts[1] > 2 * counts[0] and many - few > kept[1] - kept[0] > 0
 
 
@@ -67,12 +65,14 @@ def test_what_a_step_keeps_of_its_stitches_is_counted(patched_scene):
     x = torch.tensor(mesh.points, dtype=torch.float32)[:, :, None].repeat(1, 1, frames)
     with torch.autograd.graph.saved_tensors_hooks(keep, lambda found: found):
         energy.stitch(x.requires_grad_())
-    none, some = (step_memory(patched_scene, MODEL, frames, 0, 0, count) for count in (0, len(energy.stitching)))
+    none, some = (
+        StepMemory(patched_scene, MODEL, 0, 0, count).needed(frames) for count in (0, len(energy.stitching))
+    )
     assert some - none > sum(kept.values()) > 0
 
 
 def test_frames_cost_the_same_each(scene):
-    costs = [step_memory(scene, MODEL, frames, 1000, 200) for frames in (100, 110, 120)]  # beyond the search
+    costs = [StepMemory(scene, MODEL, 1000, 200).needed(frames) for frames in (100, 110, 120)]  # beyond the search
     assert costs[2] - costs[1] == costs[1] - costs[0] > 10 * 4 * 3 * 60  # the positions alone
 
 
@@ -83,29 +83,31 @@ def test_the_larger_phase_counts():
 
 
 def test_what_fits_is_left_as_it_is(scene):
-    assert fitting_batch(scene, MODEL, CONFIG, 1000, 200, 1 << 40) == (32, 700)
+    assert StepMemory(scene, MODEL, 1000, 200).fitting_batch(CONFIG, 1 << 40) == (32, 700)
 
 
 @pytest.mark.parametrize("megabytes", [450, 600, 900])
 def test_a_lowered_batch_fits_and_one_more_would_not(scene, megabytes):
     available = megabytes << 20
     config = replace(CONFIG, batch=10_000, pretraining_batch=100_000, static_batch=10_000)
-    batch, warm = fitting_batch(scene, MODEL, config, 1000, 200, available)
+    step = StepMemory(scene, MODEL, 1000, 200)
+    batch, warm = step.fitting_batch(config, available)
     assert 1 < batch < 10_000 and 1 < warm < 100_000
-    assert step_memory(scene, MODEL, max(batch * 17, warm), 1000, 200) <= PLANNED_SHARE * available
-    assert step_memory(scene, MODEL, (batch + 1) * 17, 1000, 200) > PLANNED_SHARE * available
-    assert step_memory(scene, MODEL, warm + 1, 1000, 200) > PLANNED_SHARE * available
+    assert step.needed(max(batch * 17, warm)) <= PLANNED_SHARE * available
+    assert step.needed((batch + 1) * 17) > PLANNED_SHARE * available
+    assert step.needed(warm + 1) > PLANNED_SHARE * available
 
 
 def test_at_least_one_window_is_trained_on(scene):
-    assert fitting_batch(scene, MODEL, CONFIG, 1000, 200, 1 << 20) == (1, 1)
+    assert StepMemory(scene, MODEL, 1000, 200).fitting_batch(CONFIG, 1 << 20) == (1, 1)
 
 
 def test_one_window_must_fit(scene):
-    needed = step_memory(scene, MODEL, CONFIG.window + 1, 1000, 200)
-    check_one_window_fits(scene, MODEL, CONFIG, 1000, 200, needed)
+    step = StepMemory(scene, MODEL, 1000, 200)
+    needed = step.needed(CONFIG.window + 1)
+    step.check_one_window_fits(CONFIG, needed)
     with pytest.raises(SsilkError, match=r"one window of 16 poses needs 0\.094 GiB; 0\.094 GiB are free; .*window="):
-        check_one_window_fits(scene, MODEL, CONFIG, 1000, 200, needed - 1)
+        step.check_one_window_fits(CONFIG, needed - 1)
 
 
 def test_a_lack_of_memory_is_told_from_other_errors():

@@ -436,9 +436,8 @@ def test_memory_says_when_the_batch_is_lowered(monkeypatch):
 
     scene = dressed(tube())
     assert next(cost.memory(scene, PRESETS["draft"], 100)).severity == "info"
-    monkeypatch.setattr(
-        memory, "free_memory", lambda device: memory.step_memory(scene, PRESETS["draft"].model, 20, 100, 900)
-    )
+    step = memory.StepMemory(scene, PRESETS["draft"].model, 100, 900)
+    monkeypatch.setattr(memory, "free_memory", lambda device: step.needed(20))
     assert next(cost.memory(scene, PRESETS["draft"], 100)).severity == "warning"
 
 
