@@ -44,11 +44,6 @@ JOINTS = np.array([[0.0, 1.0, 0.0], [0.0, 1.3, 0.02], [0.3, 1.5, 0.0]])
 PROXIES = np.array([[0.0, 1.15, -0.15], [0.02, 0.95, -0.15]])
 
 
-@pytest.fixture(autouse=True, scope="session")
-def one_thread() -> None:
-    torch.set_num_threads(1)  # on tensors this small, threads cost more than they give
-
-
 def grid(rows: int, columns: int, height: float = 0.55, width: float = 0.2) -> tuple[np.ndarray, np.ndarray]:
     """A flat strip in the plane z = 0, from y = 0 down, its faces towards -z."""
     y, x = np.meshgrid(-np.linspace(0, height, rows), np.linspace(-width / 2, width / 2, columns), indexing="ij")

@@ -17,7 +17,7 @@ from benchmarks.baselines.networks import BaselineConfig, baseline
 from ssilk_core.checkpoint import load_model, save_model
 from ssilk_core.schemes import SCHEMES
 
-WORLD = "--stage rigged.usda --motions clips --index index.json"
+WORLD = "--stage rigged.usda --motions clips --index index.json --threads 1"
 
 
 @pytest.fixture
