@@ -2,7 +2,8 @@
 """Give a garment weights, classes and proxy joints, written into a copy of the stage.
 
 The proxies are joints at the end of the skeleton and can be edited by hand like any other joint. Weights, classes and
-proxies that the stage already has are kept. A garment that lies in the body is settled out of it first.
+proxies that the stage already has are kept. A garment that lies in the body is settled out of it first. Where a limb
+goes through it, it stays as it is, with a warning.
 """
 
 from __future__ import annotations

@@ -12,11 +12,15 @@ from ..fabrics import FABRICS
 from ..mesh.topology import edge_use, is_inside_out, vertex_mask
 from ..setup.surface import closest_on_surface, is_enclosed
 from .finding import Finding, Findings, format_count, format_joints, index_tuple
-from .settle import DEEPEST, Settled, part_inside
+from .settle import DEEPEST, FARTHEST, Settled, settle
 
 COLLISION_MARGIN = FABRICS["default"].contact_distance  # [m]
 TOO_DEEP = f"leaves a garment that is more than {1000 * DEEPEST:g} mm deep as it is, because it is not fitted"
 NOT_SETTLED = "leaves this garment as it is, because settling found no shape that is less deep in the body"
+PIERCED = (
+    "the body goes through the cloth there, and settling leaves that part as it is because it would have to move "
+    f"cloth by more than {1000 * FARTHEST:g} mm"
+)
 MAX_INSIDE_SHARE = 0.25  # share of vertices inside the body above which penetration is an error
 ALIGNMENT_SAMPLES = 400  # number of vertices that the alignment is measured with
 SCALES = (1.0, 0.01, 100.0, 0.1, 10.0, 0.001, 1000.0, 0.0254, 1 / 0.0254)
@@ -140,14 +144,29 @@ def body_inside_out(body: Mesh) -> Findings:
 
 
 def penetration(mesh: Mesh, body: Mesh) -> Findings:
-    """Yield the vertices inside the body and, separately, those within the collision margin."""
+    """Yield the vertices inside the body and, separately, where it pierces the cloth, and the collision margin."""
     signed = signed_distance(mesh.points, body)
     used = vertex_mask(mesh.faces, mesh.vertex_count)
     share = float(np.mean(signed[used] < 0))
     near = np.flatnonzero(used & (signed >= 0) & (signed < COLLISION_MARGIN))
-    part = part_inside(mesh, body)
-    inside, fitted = part.vertices, part.depth <= DEEPEST
+    settled = settle(mesh, body)
+    pierced, part = settled.pierced, settled.before
+    inside = np.setdiff1d(part.vertices, pierced)
+    if len(pierced):
+        yield Finding(
+            severity="error",
+            code="pierced",
+            prim=mesh.path,
+            count=len(pierced),
+            found=f"a limb goes through the cloth, which no way of at most {1000 * FARTHEST:g} mm takes off it",
+            why="this is the rest shape: elastic and collision forces oppose each other there in every frame",
+            fix="move this part, or the limb in the bind pose, until the limb is on one side of the cloth; --fix "
+            "leaves it as it is",
+            elements="vertices",
+            indices=index_tuple(pierced),
+        )
     if len(inside):
+        fixable = bool(settled.moved) and not len(np.setdiff1d(settled.after.vertices, pierced))
         what = f"{share:.1%} of all vertices, and points inside triangles," if share else "points inside triangles"
         yield Finding(
             severity="error" if share > MAX_INSIDE_SHARE else "warning",
@@ -157,8 +176,8 @@ def penetration(mesh: Mesh, body: Mesh) -> Findings:
             found=f"{what} are inside the body, up to {1000 * part.depth:.1f} mm deep",
             why="this is the rest shape: elastic and collision forces oppose each other in every frame",
             fix="settle the garment out of the body in the bind pose, or make it wider; --fix "
-            + ("settles it" if fitted else TOO_DEEP),
-            fixable=fitted,
+            + ("settles it" if fixable else _not_all(settled)),
+            fixable=fixable,
             elements="vertices",
             indices=index_tuple(inside),
         )
@@ -195,7 +214,19 @@ def describe_left(settled: Settled, mesh: Mesh, character: Character) -> str:
     joints, count = np.unique(body.skin.indices[beneath, strongest], return_counts=True)
     where = format_joints(character.skeleton, joints[np.argsort(-count, kind="stable")], 3)
     deep = f"{format_count(len(left), 'vertices')} inside the body, up to {1000 * settled.after.depth:.1f} mm deep"
-    return f"left {deep}, at {where}" + ("" if settled.moved else f": {_why_still(settled)}")
+    return ": ".join([f"left {deep}, at {where}", *_why_left(settled)])
+
+
+def _not_all(settled: Settled) -> str:
+    """Say why --fix does not take all cloth out of the body."""
+    left = f"leaves {format_count(len(settled.after.vertices), 'vertices')} inside"
+    return left if settled.moved else _why_still(settled)
+
+
+def _why_left(settled: Settled) -> list[str]:
+    if len(settled.pierced):
+        return [PIERCED]
+    return [] if settled.moved else [_why_still(settled)]
 
 
 def _why_still(settled: Settled) -> str:

@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..assets import Floats, Ints, Mesh
-from ..mesh.topology import edges, vertex_mask
+from ..mesh.topology import components, edges, vertex_mask
 from .cloth_samples import ClothSamples, sample_cloth
 from .contact_planes import ContactPlanes, HeldSamples, covering_planes
 from .mesh import SAME_PLACE, distinct_faces
@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 Mask = NDArray[np.bool_]
 GAP = 4e-3  # [m] that settled cloth keeps from the body
 DEEPEST = 0.04  # [m] from which a garment is not fitted to this body at all
+# [m] that cloth moves at most. What is in the middle of a limb, at most `DEEPEST` deep, is as far from its own side
+# even if it has passed through all of the limb. Cloth that is led farther goes around a limb that pierces it.
+FARTHEST = 2 * DEEPEST + GAP
 TOLERANCE = 4e-4  # [m] that a sample may lie nearer than it should; cloth is settled so much beyond the gap
 SLOPE = 10.0  # cloth takes part as far from a sample as this many times the way that the sample moves ...
 LEAST_REACH = 0.04  # [m] ... and this much
@@ -61,12 +64,14 @@ class Settled:
         offsets: how far the vertices move [m], shape (V, 3); exactly zero for those that stay.
         before, after: what lies in the body.
         failed: whether no shape was found that is less deep in the body, so that the garment stays as it is.
+        pierced: vertices where a limb goes through the cloth, which stay as they are, shape (N,).
     """
 
     offsets: Floats
     before: PartInside
     after: PartInside
     failed: bool = False
+    pierced: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     @property
     def left(self) -> bool:
@@ -96,7 +101,8 @@ def settle(mesh: Mesh, body: Mesh, gap: float = GAP) -> Settled:
     as far as `ITERATIONS` allow; `Settled.after` tells what is left. The change of shape (`ShapeEnergy`) is the least
     that this allows. Coincident vertices move together. Cloth far from any that must move stays exactly as it is. So
     does all of it where nothing is inside, where it lies deeper than `DEEPEST`, or where it would come to lie deeper
-    than before (`Settled.failed`).
+    than before (`Settled.failed`). A piece in the body that could only come out by moving cloth farther than
+    `FARTHEST` stays, too (`Settled.pierced`): there a limb goes through the cloth.
     """
     return _Cloth(mesh, body).settled(gap)
 
@@ -127,13 +133,38 @@ class _Cloth:
         before, still = self.inside_now(), np.zeros((len(self.joined), 3))
         if before.depth > DEEPEST or not len(before.vertices):
             return Settled(still, before, before)
-        points = _Solve(self, gap).run()
+        points, held = self._rest(gap)
+        pierced = before.vertices[held[self.joined[before.vertices]]]
         if not np.isfinite(points).all():
             return Settled(still, before, before, failed=True)
         after = self._part_inside(sample_cloth(points, self.faces), points)  # stretched triangles need more samples
         if after.depth > before.depth:
             return Settled(still, before, before, failed=True)
-        return Settled((points - self.points)[self.joined], before, after)
+        return Settled((points - self.points)[self.joined], before, after, pierced=pierced)
+
+    def _rest(self, gap: float) -> tuple[Floats, Mask]:
+        """Return where the vertices come to rest [m], shape (V, 3), and those of pierced pieces, which stay, (V,)."""
+        inside = self.surface.nearest(self.samples.of(self.points)).inside
+        held = np.zeros(len(self.points), dtype=bool)
+        while True:
+            points = _Solve(self, gap, held).run()
+            far = np.linalg.norm(points - self.points, axis=1) > FARTHEST
+            if not far.any():
+                return points, held
+            held = held | self._pieces(inside, far)
+
+    def _pieces(self, inside: Mask, far: Mask) -> Mask:
+        """Return the vertices of the pieces of cloth in the body that touch those `far`, and these themselves, (V,).
+
+        Args:
+            inside: samples in the body, shape (S,).
+            far: vertices, shape (V,).
+        """
+        among = self.samples.weights > 0
+        within = far | vertex_mask(self.samples.corners[inside][among[inside]], len(self.points))
+        pairs = edges(self.faces)
+        piece = components(pairs[within[pairs].all(axis=1)], len(self.points))
+        return within & np.isin(piece, piece[far])
 
     def _part_inside(self, samples: ClothSamples, points: Floats) -> PartInside:
         side = self.surface.nearest(samples.of(points))
@@ -148,18 +179,26 @@ class _Cloth:
 class _Solve:
     """Newton's method on the shape energy and the penalty of contact, with the body's surface linearised anew."""
 
-    def __init__(self, cloth: _Cloth, gap: float) -> None:
+    def __init__(self, cloth: _Cloth, gap: float, held: Mask) -> None:
+        """Prepare to solve; `held` are vertices (V,) that stay, and that nothing holds off the body."""
         self.cloth, self.gap = cloth, gap
         self.facing = find_facing(cloth.points, cloth.faces, cloth.surface)
         self.planes = ContactPlanes(cloth.surface, cloth.samples, self.facing, cloth.points)
-        self.free = _reached(cloth.points, cloth.faces, cloth.samples, np.maximum(gap - self.planes.distance, 0.0))
-        self.taking_part = self.free[cloth.samples.corners].any(axis=1)
-        self.faces = cloth.faces[self.free[cloth.faces].any(axis=1)]
+        kept_off = ~(held[cloth.samples.corners] & (cloth.samples.weights > 0)).any(axis=1)
+        push = np.where(kept_off, np.maximum(gap - self.planes.distance, 0.0), 0.0)
+        self.free = _reached(cloth.points, cloth.faces, cloth.samples, push) & ~held
+        self.taking_part = self.free[cloth.samples.corners].any(axis=1) & kept_off
+        self.faces = cloth.faces[self.free[cloth.faces].any(axis=1) & ~held[cloth.faces].any(axis=1)]
         self.energy = ShapeEnergy(cloth.points, cloth.faces, _layer_ties(cloth, self.facing, self.free))
 
     def run(self) -> Floats:
-        """Return where the vertices come to rest [m], shape (V, 3); not finite if the equations have no solution."""
+        """Return where the vertices come to rest [m], shape (V, 3), or where one first is farther than `FARTHEST`.
+
+        They are not finite if the equations have no solution.
+        """
         points, step, brake = self.cloth.points, np.inf, 0.0
+        if not self.free.any():
+            return points
         for iteration in range(ITERATIONS):
             contacts = self._contacts(points)
             if step < RESTING and contacts.heights(points).min(initial=np.inf) > self.gap - TOLERANCE:
@@ -169,6 +208,8 @@ class _Solve:
             if not np.isfinite(new).all():
                 return new
             moved, points = np.linalg.norm(new - points, axis=1)[self.free], new
+            if (np.linalg.norm(points - self.cloth.points, axis=1) > FARTHEST).any():
+                break  # its piece of cloth will be held
             brake = max(DAMPING, 4 * brake) if moved.max() > LONGEST_STEP else brake / 2
             step = np.quantile(moved, 0.99)
         return points

@@ -12,7 +12,7 @@ from ssilk_core.assets import Floats, Ints, Mesh
 from ssilk_core.mesh.topology import edges
 from ssilk_core.preflight.cloth_samples import sample_cloth
 from ssilk_core.preflight.fit import _why_still, penetration
-from ssilk_core.preflight.settle import GAP, _Cloth, _layer_ties, part_inside, settle
+from ssilk_core.preflight.settle import FARTHEST, GAP, _Cloth, _layer_ties, part_inside, settle
 from ssilk_core.preflight.sides import find_facing
 
 RADIUS, COLUMNS, ROWS = 0.1, 32, 27
@@ -98,13 +98,33 @@ def test_what_settling_would_make_worse_stays(monkeypatch, end):
     assert "because settling found no shape" in _why_still(found)
 
 
-def test_an_inspection_words_its_finding_without_settling(monkeypatch):
-    monkeypatch.setattr("ssilk_core.preflight.settle._Solve.run", lambda solve: pytest.fail("settled"))
+def test_an_inspection_promises_only_what_settling_does(monkeypatch):
     cloth = dented(tube(RADIUS + 0.006))
-    found = next(penetration(cloth, limb()))
-    inside = part_inside(cloth, limb())
+    found, inside = next(penetration(cloth, limb())), part_inside(cloth, limb())
     assert found.fixable and found.fix.endswith("--fix settles it") and found.count == len(inside.vertices) > 0
     assert f"up to {1000 * inside.depth:.1f} mm deep" in found.found
+    monkeypatch.setattr("ssilk_core.preflight.settle._Solve.run", lambda solve: solve.cloth.points + [0, 1e-6, 0])
+    found = next(penetration(cloth, limb()))
+    assert not found.fixable and found.fix.endswith(f"--fix leaves {found.count} vertices inside")
+
+
+def test_cloth_that_a_limb_pierces_stays_and_a_dent_beside_it_comes_out():
+    """A sheet that a rod goes through, and a sleeve on the same rod with a dent."""
+    thin, row = 0.025, np.linspace(-0.3, 0.3, 25)
+    x, z = (part.reshape(-1) for part in np.meshgrid(row, row))
+    corner = (np.arange(24)[:, None] * 25 + np.arange(24)).reshape(-1)
+    faces = np.r_[np.c_[corner, corner + 1, corner + 26], np.c_[corner, corner + 26, corner + 25]]
+    sleeve = tube(thin + 0.006, 20, 12, 0.2)
+    dent = np.linalg.norm(sleeve.points - [0, 0.1, thin + 0.006], axis=1) < 0.02
+    points = sleeve.points - np.where(dent[:, None], [0, 0, 0.012], 0)
+    both = Mesh("Both", np.r_[np.c_[x, np.full(625, 0.4), z], points], np.r_[faces, sleeve.faces + 625])
+    found = settle(both, limb(thin))
+    assert 0 < len(found.pierced) < 20 and (found.pierced < 625).all() and not found.offsets[found.pierced].any()
+    assert np.array_equal(found.after.vertices, found.pierced) and found.offsets[625:][dent].any()
+    assert found.largest < FARTHEST and not found.failed
+    pierced, inside, *_ = penetration(both, limb(thin))
+    assert (pierced.severity, pierced.code, pierced.fixable) == ("error", "pierced", False)
+    assert inside.code == "penetration" and inside.fixable and pierced.indices == tuple(found.pierced)
 
 
 def test_a_garment_whose_equations_are_singular_stays(monkeypatch):
