@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 COVER_REACH, SHOW_DEPTH = 0.08, 0.03  # [m]: how far cloth above covers a point, and how far beneath it is seen
+MOST_MEAN, MOST_WORST = 5e-4, 5e-3  # shares that show on average and in one frame; the eye finds more at once
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +36,11 @@ class ShownSkin:
     def where(self) -> str:
         """The regions in words; empty where nothing shows, or where joints are not known."""
         return ", ".join(f"{joint} {share:.0%}" for joint, share in self.regions.items())
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether the eye finds at once what shows."""
+        return self.mean > MOST_MEAN or self.worst > MOST_WORST
 
     def summary(self) -> dict[str, str]:
         """Return figures for people."""

@@ -2,7 +2,8 @@
 """Train a garment on motions and write a model.
 
 Where the stage lacks weights, classes or a proxy rig, they are made as 'ssilk rig' makes them by default.
-Ctrl-C stops the training and keeps the best model and the state. --resume continues from there. A model that is worse
+Ctrl-C stops the training and keeps the best model and the state. --resume continues from there. A warning at the end
+says where few of the preset's iterations were done, or where skin shows, and how to go on. A model that is worse
 than linear blend skinning on the validation motions is kept and warned of, and the exit code is 5. torchrun ends with
 its own code 1 then, and names this one.
 """
@@ -64,14 +65,15 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     from ..training.parallel import join_process_group
     from ..training.run import train
     from ..training.signals import stop_on_signals
-    from ..training.verdict import is_worse, lower_by, worse_message
+    from ..training.verdict import is_worse, lower_by, shortcomings, worse_message
 
     if options.output.suffix != ".safetensors":
         fail(str(options.output), "not a name for a model", "it ends in .safetensors")
     shared.check_output(options.output)
     with join_process_group(options.device) as (group, device), stop_on_signals() as stop:
         report = report if group.is_first else silent
-        trained = train(training_job(options, device, report), report, stop, group)
+        job = training_job(options, device, report)
+        trained = train(job, report, stop, group)
     share, shown = lower_by(trained.score, trained.lbs), trained.score.shown_skin
     worse = is_worse(trained.score, trained.lbs)
     if worse:
@@ -95,6 +97,10 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     if not trained.finished:
         report(Message(f"stopped at iteration {trained.iterations}; --resume continues from there."))
         return EXIT_INTERRUPTED
+    done, asked = trained.iterations, job.train.iterations
+    lacking = shortcomings(str(options.output), trained.score, done, asked, trained.seconds)
+    if lacking and job.is_trainable:
+        report(lacking)
     return EXIT_WORSE if worse else EXIT_OK
 
 

@@ -9,12 +9,11 @@ from html import escape
 import numpy as np
 
 from ..assets import Floats
-from ..shown_skin import ShownSkin
+from ..shown_skin import MOST_MEAN, MOST_WORST, ShownSkin
 from .page import Section
 from .terms import SHARE, SHOWN, STRETCH
 
-# Beyond these the eye finds it at once [%]: skin on average and in one frame, stretch of 99 triangles in 100.
-SHOWN_MEAN, SHOWN_WORST, STRETCHED = 0.05, 0.5, 15.0
+STRETCHED = 15.0  # stretch of 99 triangles in 100 beyond which the eye finds it at once [%]
 INSIDE = 10.0  # share of the vertices inside the body in one frame [%]
 
 
@@ -38,7 +37,7 @@ def verdict(
         words.append(f"It is not finite in {len(lost)} of {len(frame_times)} frames, first {when(int(lost[0]))}.")
     if shown_skin:
         shown, worst = values[SHOWN], int(np.nanargmax(values[SHOWN]))
-        if shown.mean() > SHOWN_MEAN or shown[worst] > SHOWN_WORST:
+        if shown.mean() > 100 * MOST_MEAN or shown[worst] > 100 * MOST_WORST:
             faults.append("skin shows through")
         where = f", most at {shown_skin.where}" if shown_skin.where else ""
         share = f"{shown.mean():.3f} % of the covered skin shows on average"

@@ -42,12 +42,16 @@ RECOVERY_PACE = 0.25  # factor on learning rates after divergence
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """Result of a run: `finished` is False if it was interrupted; `score` is that of the best model."""
+    """Result of a run: `finished` is False if it was interrupted; `score` is that of the best model.
+
+    `seconds` is the wall time [s], with that before a resumption.
+    """
 
     finished: bool
     iterations: int
     score: Score
     lbs: Score
+    seconds: float
 
 
 class TrainingRun:
@@ -396,10 +400,14 @@ class TrainingRun:
         return self._any_process(time.monotonic() - self._saved_at >= SAVE_INTERVAL)
 
     @property
+    def wall(self) -> float:
+        """Wall time of the run [s]; training before a resumption counts."""
+        return time.monotonic() - self._began
+
+    @property
     def time_left(self) -> float:
-        """Time left before a last validation [s]; training before a resumption counts."""
-        spent = time.monotonic() - self._began
-        return inf if self.job.minutes is None else 60 * self.job.minutes - spent - self.validation_seconds
+        """Time left before a last validation [s]."""
+        return inf if self.job.minutes is None else 60 * self.job.minutes - self.wall - self.validation_seconds
 
     def should_stop(self, stop: threading.Event) -> bool:
         """Return whether to stop after this iteration."""
@@ -412,7 +420,7 @@ class TrainingRun:
         return self.state.iteration % CHECK_INTERVAL == 0 and self.group.any(wish)
 
     def _write_state(self) -> None:
-        self.state.skipped, self.state.wall = int(self.stepper.skipped.count), time.monotonic() - self._began
+        self.state.skipped, self.state.wall = int(self.stepper.skipped.count), self.wall
         self.files.save_state(self.stepper, self.state)
         self.saved, self._saved_at = self.state.iteration, time.monotonic()
 
@@ -463,7 +471,7 @@ def train(
     if run.state.skipped:
         report(Message(f"{run.state.skipped} steps in total were skipped.", "warning"))
     score = run.final_score()
-    return TrainingResult(finished, run.state.iteration, score, run.lbs)
+    return TrainingResult(finished, run.state.iteration, score, run.lbs, run.wall)
 
 
 def _loop(run: TrainingRun, stop: threading.Event) -> bool:

@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from math import isfinite
+from math import ceil, isfinite
 from typing import TYPE_CHECKING, Any
 
 from ..events import Message
+from ..shown_skin import MOST_MEAN
 
 if TYPE_CHECKING:
     from .validation import Score
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 NO_DYNAMICS = 2e-3  # [m]
 # A total that is higher than linear blend skinning's by less than this share of it differs by rounding.
 WORSE = 1e-3
+FEW = 0.5  # share of the iterations that were asked for, below which a garment is hardly trained
 ADVICE = "nothing dynamic is being learned: train longer, or check that the motions move"
 
 
@@ -43,6 +45,28 @@ def worse_message(model: str, score: Score, lbs: Score) -> Message:
         "--lbs",
         "warning",
     )
+
+
+def shortcomings(model: str, score: Score, done: int, asked: int, seconds: float) -> Message | None:
+    """Return a warning where minutes sufficed for few of the iterations, or where the eye finds skin that shows.
+
+    Args:
+        done, asked: iterations that were done, and those of the preset.
+        seconds: duration of the whole run [s].
+    """
+    found, shown = [], score.shown_skin
+    if done < FEW * asked:
+        found.append(f"only {done} of the preset's {asked} iterations fit into its minutes, so it is hardly trained")
+    if shown and shown.is_seen:
+        found.append(
+            f"{shown.mean:.2%} of the covered skin shows, {shown.worst:.1%} in the worst frame, and more than "
+            f"{MOST_MEAN:.2%} meets the eye at once"
+        )
+    if not found:
+        return None
+    more = ceil(seconds / 60 * max(2.0, asked / max(1, done)))
+    found.append(f"the same command with '--resume --minutes {more}' goes on")
+    return Message(f"{model}: " + "; ".join(found), "warning")
 
 
 def non_finite_terms(score: Score) -> list[str]:

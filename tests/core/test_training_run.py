@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,8 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from ssilk_core.checkpoint import load_model
+from ssilk_core.cli import main
+from ssilk_core.cli import train as command
 from ssilk_core.collision import CollisionBody, CoveredSkin
 from ssilk_core.config import ModelConfig, TrainConfig
 from ssilk_core.devices import select_device
@@ -25,6 +28,7 @@ from ssilk_core.events import Checkpoint, Event, Message, Progress, Started, sil
 from ssilk_core.fabrics import Fabric
 from ssilk_core.model.network import GarmentModel
 from ssilk_core.motion_bank import build_bank
+from ssilk_core.shown_skin import ShownSkin
 from ssilk_core.training import divergence, validation
 from ssilk_core.training import run as training
 from ssilk_core.training.curve import CurvePoint, append_point, curve_path
@@ -37,7 +41,7 @@ from ssilk_core.training.signals import stop_on_signals
 from ssilk_core.training.state import RunState, _need_same, json_round_trip, learned_tensors, load_state, state_path
 from ssilk_core.training.step import EAGER_STEPS, Stepper, learning_rate
 from ssilk_core.training.validation import Score, Validator
-from ssilk_core.training.verdict import is_worse, worse_message
+from ssilk_core.training.verdict import is_worse, shortcomings, worse_message
 from ssilk_core.training.windows import WindowSampler
 
 SHORT = TrainConfig(
@@ -751,3 +755,24 @@ def test_a_validation_counts_the_skin_that_shows_in_frames_spread_over_all_clips
     assert Score.of(document).shown_skin == found
     del document["shown_skin"]  # as earlier versions wrote it
     assert Score.of(document).shown_skin is None
+
+
+def test_a_model_that_is_hardly_trained_or_shows_skin_is_warned_of_with_what_goes_on(tmp_path, monkeypatch, capsys):
+    skin = ShownSkin(frames=3, covered=100, mean=0.043, worst=0.102, clip="c", frame=3, regions={})
+    shows, holds = (
+        Score({"stretch": 0.1}, 0.0, shown_skin=each) for each in (skin, replace(skin, mean=4e-4, worst=4e-3))
+    )
+    assert shortcomings("skirt", holds, 500, 500, 360.0) is None
+    told = shortcomings("skirt", holds, 100, 500, 360.0)
+    assert told and "only 100 of the preset's 500 iterations" in told.text and "skin shows" not in told.text
+    assert "'--resume --minutes 30' goes on" in told.text and told.level == "warning"
+    told = shortcomings("skirt", shows, 500, 500, 360.0)
+    assert told and "4.30% of the covered skin shows, 10.2% in the worst frame" in told.text
+    assert "iterations" not in told.text and "--minutes 12'" in told.text
+    model = tmp_path / "skirt.safetensors"
+    trained = training.TrainingResult(True, 86, shows, Score({"stretch": 1.0}, 0.0), 360.0)
+    monkeypatch.setattr(training, "train", lambda *_: trained)
+    ready = SimpleNamespace(train=TrainConfig(iterations=500), is_trainable=True)
+    monkeypatch.setattr(command, "training_job", lambda *_: ready)
+    words = ["train", "hero.usda", "--motions", "walks", "-o", str(model), "--device", "cpu"]
+    assert main(words) == 0 and "86 of the preset's 500 iterations" in capsys.readouterr().err
