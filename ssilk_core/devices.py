@@ -31,6 +31,15 @@ def select_device(name: str) -> torch.device:
     return device
 
 
+def default_preset(name: str) -> str:
+    """Return the preset that a device finishes while someone waits: "draft" on a processor, else "preview".
+
+    Args:
+        name: as for `select_device`.
+    """
+    return "draft" if select_device(name).type == "cpu" else "preview"
+
+
 def device_name(device: torch.device) -> str:
     """Return the name of the hardware."""
     import torch

@@ -9,6 +9,7 @@ otherwise.
 from __future__ import annotations
 
 import argparse
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,8 +35,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--preset",
         choices=PRESETS,
-        default="preview",
-        help="training to estimate memory and time for (default preview)",
+        help="training to estimate memory and time for (default: draft on a CPU, else preview)",
     )
     verb.add_argument(
         "--fix", type=Path, metavar="OUT", help="write a repaired copy of the garment's file (.usdc, .usd or .usda)"
@@ -77,9 +77,16 @@ def _read_inputs(options: argparse.Namespace, report: Reporter) -> PreflightInpu
     return PreflightInput(
         character=character, garment=garment, rig=rig, character_units=_units(options.stage),
         garment_units=_units(file), locked=repair_lock(file, prim), motions=motions,
-        preset=preset_named(options.preset),
+        preset=preset_named(options.preset or _default_preset()),
         files=[MotionFile(motion.path, *animated(motion, character.skeleton)) for motion in motions],
     )  # fmt: skip
+
+
+def _default_preset() -> str:
+    """Return the preset that 'ssilk train' takes here; without torch, which nothing is estimated without, "draft"."""
+    from ..devices import default_preset
+
+    return default_preset("auto") if find_spec("torch") else "draft"
 
 
 def _units(path: Path) -> FileUnits:

@@ -14,6 +14,7 @@ import argparse
 from pathlib import Path
 
 from ..config import PRESETS, ModelConfig, TrainConfig, apply_overrides, preset_named
+from ..devices import default_preset, select_device
 from ..errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_WORSE, fail
 from ..events import Message, Reporter, Result, silent
 from ..wardrobe.training import WORSE_FIGURE
@@ -38,7 +39,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         "-o", "--output", type=Path, required=True, metavar="MODEL", help="model to write (.safetensors)"
     )
     verb.add_argument(
-        "--preset", choices=PRESETS, default="preview", help="schedule and size of the network (default preview)"
+        "--preset", choices=PRESETS, help="schedule and size of the network (default: draft on a CPU, else preview)"
     )
     verb.add_argument(
         "--minutes",
@@ -111,6 +112,9 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
     from ..files import sha256
     from ..training.job import TrainJob, split_motions
 
+    if not options.preset:
+        options.preset = default_preset(device)
+        report(Message(f"preset '{options.preset}' is taken, the default on {select_device(device).type}"))
     model, train = configured(options)
     scene = shared.load_scene(options, report)
     fabric = shared.fabric(options, scene.garment, report)
@@ -141,7 +145,7 @@ def configured(options: argparse.Namespace) -> tuple[ModelConfig, TrainConfig]:
     Raises:
         SsilkError: a setting that does not exist, or a value that it cannot have.
     """
-    preset = preset_named(options.preset)
+    preset = preset_named(options.preset or default_preset(options.device))
     shared.asked_fabric(options)
     return _settings(options.settings, preset.model, preset.train)
 

@@ -87,11 +87,13 @@ def training_seconds(samples: int, train: TrainConfig, device: str) -> float | N
     """
     if device not in SECONDS_PER_SAMPLE:
         return None
-    trained = (
-        train.batch * (train.window - 2) + train.static_batch
-    )  # frames of a step, without the two given ones of each window
-    proper = (train.iterations - train.static_iterations) * trained
+    proper = (train.iterations - train.static_iterations) * trained_frames(train)
     return SECONDS_PER_SAMPLE[device] * samples * (train.static_iterations * train.pretraining_batch + proper)
+
+
+def trained_frames(train: TrainConfig) -> int:
+    """Return the frames of a step of dynamic training, without the two given ones of each window."""
+    return train.batch * (train.window - 2) + train.static_batch
 
 
 def irrelevant_joints(scene: Scene, colliding: np.ndarray) -> Findings:

@@ -8,18 +8,22 @@ machine that slows down there are fewer iterations, and the learning rate is low
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
 
 from ..config import MOST_OF_ALL, TrainConfig
 from ..errors import fail
+from ..preflight.cost import SECONDS_PER_SAMPLE, trained_frames
 from .step import EAGER_STEPS, Stepper
 
 PLANNED_SHARE = 0.98  # of the remaining time
 VALIDATION_SHARE = 0.1  # of the time that validations may take at most
 TIMED_STEPS = 3  # in each phase
 MIN_ITERATIONS = 20  # fewer do not train a usable model
+CAUTION = 0.5  # of an expected duration, which may be off by half: what is refused before it is measured
+LONG_STEP = 5.0  # [s] of a first step on a processor, above which no other is timed: what first steps do takes less
 SMOOTHING = 0.3  # weight of a new measurement of the speed
 
 
@@ -64,9 +68,33 @@ def affordable_validations(config: TrainConfig, seconds: float, scoring: float) 
     return max(1, min(asked, int(VALIDATION_SHARE * seconds / scoring))) if scoring > 0 else asked
 
 
-def timed_pace(stepper: Stepper, config: TrainConfig) -> Pace:
-    """Time a few steps of each phase; the stepper must not be used afterwards."""
-    return Pace(*(_seconds(stepper, iteration) for iteration in (0, config.static_iterations)))
+def timed_pace(stepper: Stepper, config: TrainConfig, left: Callable[[], float], where: str) -> Pace:
+    """Time a few steps of each phase; the stepper must not be used afterwards.
+
+    Args:
+        left: returns the time left for steps [s].
+        where: names the run.
+
+    Raises:
+        SsilkError: after any step, that its pace leaves too little time; the other phase is expected to take
+            `CAUTION` of what its frames do.
+    """
+    frames = config.pretraining_batch, trained_frames(config)
+
+    def check_static(seconds: float) -> None:
+        check_possible(Pace(seconds, CAUTION * seconds * frames[1] / frames[0]), config, left(), where)
+
+    def check_dynamic(seconds: float) -> None:
+        check_possible(Pace(static or seconds, seconds), config, left(), where)
+
+    static = _seconds(stepper, 0, check_static) if config.static_iterations else 0.0
+    dynamic = _seconds(stepper, config.static_iterations, check_dynamic)
+    return Pace(static or dynamic, dynamic)
+
+
+def check_possible(pace: Pace, config: TrainConfig, seconds: float, where: str) -> None:
+    """Raise `SsilkError` if too few iterations of a new run, named `where`, fit into so many seconds at a pace."""
+    check_enough(fitting_iterations(pace, config, seconds), where)
 
 
 def fitting_iterations(pace: Pace, config: TrainConfig, seconds: float, done: int = 0) -> int:
@@ -75,6 +103,12 @@ def fitting_iterations(pace: Pace, config: TrainConfig, seconds: float, done: in
     if done >= config.static_iterations:
         return done + int(left / pace.dynamic)
     return int((left + done * pace.static) / (share * pace.static + (1 - share) * pace.dynamic))
+
+
+def check_estimate(config: TrainConfig, samples: int, device: str, seconds: float, where: str) -> None:
+    """Raise `SsilkError` if the estimate of the preflight for so many contact samples leaves too little time [s]."""
+    if each := CAUTION * SECONDS_PER_SAMPLE.get(device, 0.0) * samples:
+        check_possible(Pace(each * config.pretraining_batch, each * trained_frames(config)), config, seconds, where)
 
 
 def check_enough(iterations: int, where: str) -> None:
@@ -88,14 +122,21 @@ def check_enough(iterations: int, where: str) -> None:
         )
 
 
-def _seconds(stepper: Stepper, iteration: int) -> float:
-    """Return the duration of a step in the phase of an iteration [s]."""
+def _seconds(stepper: Stepper, iteration: int, check: Callable[[float], None]) -> float:
+    """Return the duration of a step in the phase of an iteration [s]; call `check` with it as soon as it is known."""
+    began = _clock(stepper.device)
     for _ in range(EAGER_STEPS + 1 if stepper.device.type == "cuda" else 1):  # includes graph capture
         stepper.run(iteration)
+    first = _clock(stepper.device) - began
+    if first > LONG_STEP and stepper.device.type == "cpu":
+        check(first)
+        return first
     began = _clock(stepper.device)
     for _ in range(TIMED_STEPS):
         stepper.run(iteration)
-    return (_clock(stepper.device) - began) / TIMED_STEPS
+    each = (_clock(stepper.device) - began) / TIMED_STEPS
+    check(each)
+    return each
 
 
 def _clock(device: torch.device) -> float:

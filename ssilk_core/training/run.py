@@ -22,7 +22,15 @@ from ..events import Checkpoint, Message, Progress, Reporter, Started
 from ..kinematics import split_at_cuts
 from ..memory import StepMemory, decoded_frames, fits_in_memory, free_memory
 from ..motion_bank import MAX_JOINT_SPEED
-from .budget import Pace, affordable_validations, check_enough, fitting_iterations, scale_schedule, timed_pace
+from .budget import (
+    Pace,
+    affordable_validations,
+    check_enough,
+    check_estimate,
+    fitting_iterations,
+    scale_schedule,
+    timed_pace,
+)
 from .curve import CurvePoint, append_point
 from .divergence import CHECK_INTERVAL, DIVERGENCE_WINDOW, DivergenceMonitor
 from .job import TrainJob
@@ -82,6 +90,9 @@ class TrainingRun:
         self.parts = build_parts(job, self.device, group)
         if not job.resume:
             self._fit_batch()
+            if job.minutes and job.is_trainable:
+                samples = len(self.parts.energy.cloth.samples.area)
+                check_estimate(self.config, samples, self.device.type, 60 * job.minutes, str(job.output))
         self.lbs, self.validation_seconds = self._score_lbs()
         self.pace: Pace | None = None
         if job.minutes and job.is_trainable:
@@ -116,16 +127,17 @@ class TrainingRun:
 
     def _plan(self, seconds: float) -> None:
         """Choose the number of iterations by timing a few steps; the model is restored afterwards."""
-        model, config = self.parts.model, self.config
+        model, config, where = self.parts.model, self.config, str(self.job.output)
+        self.report(Message("a few steps are timed, to plan as many as fit into the minutes"))
         before = {name: value.clone() for name, value in model.state_dict().items()}
         stepper = self.parts.stepper(config, self.job.train.seed)
-        self.pace = timed_pace(stepper, config)
+        self.pace = timed_pace(stepper, config, self._training_time_left, where)
         del stepper
         self._empty_memory()
         model.load_state_dict(before)
         self.state.validations = affordable_validations(config, seconds, self.validation_seconds)
         planned = fitting_iterations(self.pace, config, self._training_time_left())
-        check_enough(planned, str(self.job.output))
+        check_enough(planned, where)
         self.state.planned = planned
         self.report(Message(f"about {planned} iterations are planned for {seconds / 60:g} minutes"))
 

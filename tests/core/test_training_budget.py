@@ -9,7 +9,10 @@ from math import inf
 import pytest
 import torch
 
-from ssilk_core.config import TrainConfig
+from ssilk_core.cli import parser
+from ssilk_core.cli.train import configured
+from ssilk_core.config import PRESETS, TrainConfig
+from ssilk_core.devices import default_preset
 from ssilk_core.errors import SsilkError
 from ssilk_core.events import Message, Progress, Started, silent
 from ssilk_core.training import budget
@@ -60,8 +63,35 @@ class Clocked:
 def test_steps_of_both_phases_are_timed(monkeypatch):
     stepper = Clocked(0.1, 0.4)
     monkeypatch.setattr(budget, "_clock", lambda device: stepper.now)
-    pace = timed_pace(stepper, PLAN)  # type: ignore[arg-type]
+    pace = timed_pace(stepper, PLAN, lambda: 60.0 - stepper.now, "cape")  # type: ignore[arg-type]
     assert (pace.static, pace.dynamic) == (pytest.approx(0.1), pytest.approx(0.4))
+
+
+@pytest.mark.parametrize(("static", "dynamic", "ends"), [(65.0, 80.0, 65.0), (1.0, 90.0, 94.0)])
+def test_timing_ends_with_the_step_that_shows_that_the_minutes_are_not_enough(monkeypatch, static, dynamic, ends):
+    stepper = Clocked(static, dynamic)
+    monkeypatch.setattr(budget, "_clock", lambda device: stepper.now)
+    with pytest.raises(SsilkError, match=r"^cape: \d iterations fit into the remaining minutes"):
+        timed_pace(stepper, PLAN, lambda: 360.0 - stepper.now, "cape")  # type: ignore[arg-type]
+    assert stepper.now == ends
+
+
+def test_minutes_that_no_estimate_allows_are_refused_before_anything_is_timed(job, monkeypatch):  # noqa: F811
+    preview = PRESETS["preview"].train
+    budget.check_estimate(preview, 10_000, "cpu", 360.0, "cape")  # to be measured
+    budget.check_estimate(preview, 10_000, "abacus", 1.0, "cape")
+    monkeypatch.setattr(TrainingRun, "_score_lbs", lambda run: pytest.fail("scored"))
+    with pytest.raises(SsilkError, match=r"\d iterations fit into the remaining minutes"):
+        train(job("hasty", preview, minutes=1e-3), silent)
+
+
+def test_the_default_preset_follows_the_device(monkeypatch):
+    assert default_preset("cpu") == "draft"
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert default_preset("auto") == "preview"
+    words = ["train", "hero.usda", "--motions", "walks", "-o", "cape.safetensors", "--device", "cpu"]
+    for more, size in ((), PRESETS["draft"]), (("--preset", "preview"), PRESETS["preview"]):
+        assert configured(parser().parse_args([*words, *more])) == (size.model, size.train)
 
 
 def test_as_many_iterations_are_planned_as_fit():
