@@ -180,6 +180,10 @@ def run_up(motion: Motion, seconds: float) -> Motion:
 CUT_SPEED = 25.0  # [m/s] deviation from the median velocity above which the root was teleported, not animated
 CUT_WINDOW = 5  # frames on either side for that median, so that a fast vehicle is not a jump
 
+# Flips of captured joints are faster than this [rad/s], human motion is slower; the garment must not learn from
+# flips.
+MAX_JOINT_SPEED = 40.0
+
 
 def split_at_cuts(motion: Motion, *, max_joint_speed: float = np.inf) -> list[Motion]:
     """Split a motion at jumps of its root (teleports, edits) and return the spans in order.

@@ -17,10 +17,6 @@ from .errors import fail
 from .kinematics import motion_transforms, resample, skinning_matrices, split_at_cuts
 from .model.descriptors import gravity_features
 
-# Flips of captured joints are faster than this [rad/s], human motion is slower; the garment must not learn from
-# flips.
-MAX_JOINT_SPEED = 40.0
-
 
 @dataclass(frozen=True, eq=False)
 class MotionBank:

@@ -9,10 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..assets import Floats, Ints, Motion, Skeleton
-from ..kinematics import CUT_SPEED, split_at_cuts
+from ..kinematics import CUT_SPEED, MAX_JOINT_SPEED, split_at_cuts
 from .finding import Finding, Findings, format_count, format_joints, index_tuple
 
-MAX_FRAME_ROTATION = 120.0  # [degrees] in one frame; the fastest human joints turn by about 7,000 degrees a second
 STILL_ANGLE = 0.5  # [degrees]
 USUAL_RATES = (15.0, 240.0)  # [1/s] lowest and highest
 MAX_SAMPLE_GAP = 0.5  # [s] gap that is reported if it is also ten times the usual sampling interval
@@ -72,9 +71,9 @@ def joint_jumps(motion: Motion, skeleton: Skeleton) -> Findings:
 
 
 def joint_snaps(motion: Motion, skeleton: Skeleton) -> Findings:
-    """Yield the frames at which a joint flips."""
+    """Yield the frames at which a joint flips: training cuts the motion there."""
     angles = _angles(motion.rotations[1:], motion.rotations[:-1])
-    frames = np.flatnonzero((angles > MAX_FRAME_ROTATION).any(axis=1))
+    frames = np.flatnonzero((np.radians(angles) * motion.fps > MAX_JOINT_SPEED).any(axis=1))
     if len(frames):
         joint = int(angles.max(axis=0).argmax())
         yield Finding(
@@ -82,8 +81,10 @@ def joint_snaps(motion: Motion, skeleton: Skeleton) -> Findings:
             code="joint-snaps",
             prim=motion.path,
             count=len(frames),
-            found=f"{format_joints(skeleton, [joint])} rotates by {angles.max():.0f} degrees in one frame",
-            why="this is usually a flip in captured or Euler curves, and it whips the cloth around",
+            found=f"{format_joints(skeleton, [joint])} rotates by {angles.max():.0f} degrees in one frame "
+            f"(first to frame {frames[0] + 1} of {motion.frame_count})",
+            why=f"more than {MAX_JOINT_SPEED:g} rad/s is usually a flip in captured or Euler curves: training uses "
+            "the spans between separately, and in a shot it whips the cloth around",
             fix="filter the rotation curves, or leave the clip out",
             elements="frames",
             indices=index_tuple(frames + 1),
@@ -92,7 +93,8 @@ def joint_snaps(motion: Motion, skeleton: Skeleton) -> Findings:
 
 def short_motion(motion: Motion, fps: float, window: int) -> Findings:
     """Yield a warning if no span of a motion is as long as a training window of `window` poses at `fps`."""
-    longest = max(int((span.frame_count - 1) * fps / motion.fps + 1e-6) + 1 for span in split_at_cuts(motion))
+    spans = split_at_cuts(motion, max_joint_speed=MAX_JOINT_SPEED)
+    longest = max(int((span.frame_count - 1) * fps / motion.fps + 1e-6) + 1 for span in spans)
     if longest < window:
         yield Finding(
             severity="warning",

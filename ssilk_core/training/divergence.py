@@ -14,7 +14,8 @@ from torch import Tensor
 
 from ..assets import Motion
 from ..files import replacing
-from ..motion_bank import MAX_JOINT_SPEED, MotionBank, usable_spans
+from ..kinematics import MAX_JOINT_SPEED
+from ..motion_bank import MotionBank, usable_spans
 from ..tensors import pack_tensors
 from .skipped_steps import SkippedSteps
 from .state import learned_tensors

@@ -10,8 +10,9 @@ import torch
 from ..collision import CollisionBody, reachable_body
 from ..config import TrainConfig
 from ..energy import GarmentEnergy
+from ..kinematics import MAX_JOINT_SPEED
 from ..model.network import GarmentModel, model_joints
-from ..motion_bank import MAX_JOINT_SPEED, MotionBank, build_bank, usable_spans
+from ..motion_bank import MotionBank, build_bank, usable_spans
 from .job import TrainJob
 from .objective import Objective
 from .parallel import SINGLE_PROCESS, ProcessGroup

@@ -19,9 +19,8 @@ from ..config import TrainConfig
 from ..devices import select_device
 from ..errors import fail
 from ..events import Checkpoint, Message, Progress, Reporter, Started
-from ..kinematics import split_at_cuts
+from ..kinematics import MAX_JOINT_SPEED, split_at_cuts
 from ..memory import StepMemory, decoded_frames, fits_in_memory, free_memory
-from ..motion_bank import MAX_JOINT_SPEED
 from .budget import (
     Pace,
     affordable_validations,

@@ -9,6 +9,7 @@ import trimesh
 
 from ssilk_core.assets import LOOSE, PINNED, TIGHT, Body, Character, Garment, Mesh, Motion, Skeleton, SkinWeights
 from ssilk_core.config import PRESETS
+from ssilk_core.kinematics import MAX_JOINT_SPEED, multiply_quaternions, split_at_cuts
 from ssilk_core.preflight import attachment, cost, fit, motion, pose, units, winding
 from ssilk_core.preflight import mesh as meshes
 from ssilk_core.preflight.finding import Finding
@@ -384,6 +385,21 @@ def test_joint_snaps():
     assert found.indices == (30,) and "Tail" in found.found
     assert not list(motion.joint_snaps(turning(), SKELETON))
     assert not list(motion.joint_snaps(replace(turning(), rotations=-turning().rotations), SKELETON))
+
+
+def test_what_training_cuts_at_is_told_before_it():
+    """A joint that turns by 80 degrees in a frame, at 30 frames per second, and stays there."""
+    clip = turning()
+    rotations, half = clip.rotations.copy(), np.radians(40)
+    rotations[:] = rotations[:1]
+    rotations[30:, 2] = multiply_quaternions(rotations[30:, 2], np.array([np.cos(half), 0, 0, np.sin(half)]))
+    clip = replace(clip, rotations=rotations, fps=30.0)
+    spans = split_at_cuts(clip, max_joint_speed=MAX_JOINT_SPEED)
+    found = only(motion.joint_snaps(clip, SKELETON))
+    assert found.count == len(spans) - 1 == 1 and found.indices == (30,) and "by 80 degrees" in found.found
+    assert not list(motion.joint_snaps(replace(clip, fps=24.0), SKELETON))
+    longest = max(span.frame_count for span in spans)
+    assert longest < clip.frame_count and list(motion.short_motion(clip, 30, longest + 1))
 
 
 def test_short_motions_count_the_longest_span_at_the_rate_of_the_model():
