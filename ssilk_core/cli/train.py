@@ -118,6 +118,7 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
     model, train = configured(options)
     scene = shared.load_scene(options, report)
     fabric = shared.fabric(options, scene.garment, report)
+    report(Message("the motions are read"))
     motions = read_motions(options.motions, scene.character.skeleton)
     held = read_motions(options.valid, scene.character.skeleton)
     if not held:

@@ -10,6 +10,7 @@ import torch
 from ..collision import CollisionBody, reachable_body
 from ..config import TrainConfig
 from ..energy import GarmentEnergy
+from ..events import Message, Reporter, silent
 from ..kinematics import MAX_JOINT_SPEED
 from ..model.network import GarmentModel, model_joints
 from ..motion_bank import MotionBank, build_bank, usable_spans
@@ -64,16 +65,21 @@ class TrainingParts:
         return Stepper(self.model, objective, sampler, own, group.average if group.size > 1 else None)
 
 
-def build_parts(job: TrainJob, device: torch.device, group: ProcessGroup = SINGLE_PROCESS) -> TrainingParts:
-    """Build what a run needs.
+def build_parts(
+    job: TrainJob, device: torch.device, group: ProcessGroup = SINGLE_PROCESS, report: Reporter = silent
+) -> TrainingParts:
+    """Build what a run needs, and say before each long part what is done.
 
     Raises:
         SsilkError: the motions are too short.
     """
     scene, skeleton, fps = job.scene, job.scene.character.skeleton, job.model.fps
     motions = job.training_motions()
-    reach = reachable_body(scene, [*motions, *job.held_out])
+    every = [*motions, *job.held_out]
+    report(Message(f"the body is posed in {len(every)} motions, to find what the garment can touch"))
+    reach = reachable_body(scene, every)
     joints = model_joints(scene, reach.joints)
+    report(Message(f"the network and its inputs are built on {device}"))
     model = GarmentModel(scene, job.model, joints, job.train.seed).to(device)
     bank = build_bank(motions, skeleton, joints, fps, device, max_joint_speed=MAX_JOINT_SPEED)
     held = build_bank(job.held_out, skeleton, joints, fps, device)

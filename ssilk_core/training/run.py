@@ -86,7 +86,7 @@ class TrainingRun:
         self.files, identity = RunFiles(job, self.device, group), {**job.identity(), "processes": group.size}
         self.state, tensors = load_state(self.files.state, identity) if job.resume else (RunState(identity), None)
         self._began -= max(self.state.wall, self.state.seconds)
-        self.parts = build_parts(job, self.device, group)
+        self.parts = build_parts(job, self.device, group, report)
         if not job.resume:
             self._fit_batch()
             if job.minutes and job.is_trainable:
@@ -122,6 +122,8 @@ class TrainingRun:
     def _score_lbs(self) -> tuple[Score, float]:
         """Return the score of linear blend skinning, and the duration of the validation [s]."""
         began = time.monotonic()
+        count = len(self.job.held_out)
+        self.report(Message(f"linear blend skinning is scored on {count} motions to validate on, to compare with"))
         return self.parts.validator.lbs_score(), time.monotonic() - began
 
     def _plan(self, seconds: float) -> None:

@@ -306,6 +306,9 @@ def test_events_say_what_is_trained_and_how_it_goes(job, monkeypatch):
     events: list[Event] = []
     train(job("events", replace(SHORT, iterations=40, validate_every=20)), events.append)
     (started,) = (event for event in events if isinstance(event, Started))
+    before = [event.text for event in events[: events.index(started)] if isinstance(event, Message)]
+    ways = "the body is posed in 3 motions", "the network and its inputs are built", "linear blend skinning is scored"
+    assert [text.startswith(way) for text, way in zip(before, ways)] == [True] * 3
     assert started.total == 40 and started.detail["vertices"] == 60 and started.detail["proxies"] == 2
     progress = [event for event in events if isinstance(event, Progress)]
     assert [event.done for event in progress] == [1, 20, 40]
