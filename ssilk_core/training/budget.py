@@ -116,7 +116,7 @@ def check_enough(iterations: int, where: str) -> None:
     if not iterations >= MIN_ITERATIONS:
         fail(
             where,
-            f"{max(0, iterations)} iterations fit into the remaining minutes on this device",
+            f"at most {max(0, iterations)} iterations fit into the remaining minutes on this device",
             f"at least {MIN_ITERATIONS} are needed",
             "give more minutes, or use a smaller preset",
         )

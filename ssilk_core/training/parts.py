@@ -14,6 +14,7 @@ from ..events import Message, Reporter, silent
 from ..kinematics import MAX_JOINT_SPEED
 from ..model.network import GarmentModel, model_joints
 from ..motion_bank import MotionBank, build_bank, usable_spans
+from ..preflight.finding import format_count
 from .job import TrainJob
 from .objective import Objective
 from .parallel import SINGLE_PROCESS, ProcessGroup
@@ -76,7 +77,7 @@ def build_parts(
     scene, skeleton, fps = job.scene, job.scene.character.skeleton, job.model.fps
     motions = job.training_motions()
     every = [*motions, *job.held_out]
-    report(Message(f"the body is posed in {len(every)} motions, to find what the garment can touch"))
+    report(Message(f"the body is posed in {format_count(len(every), 'motions')}, to find what the garment can touch"))
     reach = reachable_body(scene, every)
     joints = model_joints(scene, reach.joints)
     report(Message(f"the network and its inputs are built on {device}"))

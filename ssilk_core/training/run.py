@@ -21,6 +21,7 @@ from ..errors import fail
 from ..events import Checkpoint, Message, Progress, Reporter, Started
 from ..kinematics import MAX_JOINT_SPEED, split_at_cuts
 from ..memory import StepMemory, decoded_frames, fits_in_memory, free_memory
+from ..preflight.finding import format_count
 from .budget import (
     Pace,
     affordable_validations,
@@ -122,8 +123,8 @@ class TrainingRun:
     def _score_lbs(self) -> tuple[Score, float]:
         """Return the score of linear blend skinning, and the duration of the validation [s]."""
         began = time.monotonic()
-        count = len(self.job.held_out)
-        self.report(Message(f"linear blend skinning is scored on {count} motions to validate on, to compare with"))
+        count = format_count(len(self.job.held_out), "motions")
+        self.report(Message(f"linear blend skinning is scored on {count} to validate on, to compare with"))
         return self.parts.validator.lbs_score(), time.monotonic() - began
 
     def _plan(self, seconds: float) -> None:

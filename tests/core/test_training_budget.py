@@ -71,7 +71,7 @@ def test_steps_of_both_phases_are_timed(monkeypatch):
 def test_timing_ends_with_the_step_that_shows_that_the_minutes_are_not_enough(monkeypatch, static, dynamic, ends):
     stepper = Clocked(static, dynamic)
     monkeypatch.setattr(budget, "_clock", lambda device: stepper.now)
-    with pytest.raises(SsilkError, match=r"^cape: \d iterations fit into the remaining minutes"):
+    with pytest.raises(SsilkError, match=r"^cape: at most \d iterations fit into the remaining minutes"):
         timed_pace(stepper, PLAN, lambda: 360.0 - stepper.now, "cape")  # type: ignore[arg-type]
     assert stepper.now == ends
 
@@ -105,7 +105,7 @@ def test_as_many_iterations_are_planned_as_fit():
     assert slower.dynamic / slower.static == pytest.approx(4) and 0.4 < slower.dynamic < 1.4
     check_enough(20, "cape.safetensors")
     with pytest.raises(
-        SsilkError, match=r"^cape.safetensors: 14 iterations fit into the remaining minutes .* smaller preset"
+        SsilkError, match=r"^cape.safetensors: at most 14 iterations fit into the remaining minutes .* smaller preset"
     ):
         check_enough(14, "cape.safetensors")
 
