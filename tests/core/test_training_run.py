@@ -457,8 +457,8 @@ def test_the_batch_is_lowered_to_fit_and_that_is_said(job, monkeypatch):
     monkeypatch.setattr(Stepper, "run", lambda self, iteration: None)
     run = training.TrainingRun(small, events.append)
     assert 1 <= run.config.batch < 4000 and 1 <= run.config.pretraining_batch < 90_000
-    warning = next(event for event in events if isinstance(event, Message))
-    assert warning.level == "warning" and f"from 4000 to {run.config.batch} windows" in warning.text
+    (warning,) = (event for event in events if isinstance(event, Message) and event.level == "warning")
+    assert f"from 4000 to {run.config.batch} windows" in warning.text
     started = next(event for event in events if isinstance(event, Started))
     assert started.detail["memory predicted [MiB]"] <= 0.8 * 1024
     assert run.stepper.sampler.first.shape == (run.config.batch,)
