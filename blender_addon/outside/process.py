@@ -10,7 +10,8 @@ import subprocess
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
@@ -32,6 +33,23 @@ def environment() -> dict[str, str]:
     return {**kept, "PYTHONSAFEPATH": "1", "PYTHONUNBUFFERED": "1", "PYTHONIOENCODING": "utf-8"}
 
 
+@contextmanager
+def _heeding_interrupts() -> Iterator[None]:
+    """Let what is started here heed interrupts, also where Blender is a shell's background job and ignores them.
+
+    A program inherits which signals are ignored, but not which are handled: those it meets with their defaults.
+    """
+    in_main = threading.current_thread() is threading.main_thread()  # no other thread may say how signals are met
+    if not in_main or signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        yield
+        return
+    signal.signal(signal.SIGINT, lambda *_: None)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 class Process:
     """A running command; its output is collected by threads, so that `lines` never waits."""
 
@@ -41,10 +59,11 @@ class Process:
         Raises:
             OSError: it cannot be started.
         """
-        self._popen = subprocess.Popen(
-            command, cwd=folder, env=environment(), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE, encoding="utf-8", errors="replace", creationflags=NEW_GROUP,
-        )  # fmt: skip
+        with _heeding_interrupts():
+            self._popen = subprocess.Popen(
+                command, cwd=folder, env=environment(), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE, encoding="utf-8", errors="replace", creationflags=NEW_GROUP,
+            )  # fmt: skip
         self._said: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._complaints: deque[str] = deque(maxlen=LAST_WORDS)
         readers = ((self._popen.stdout, self._said.put), (self._popen.stderr, self._complaints.append))

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
 import time
 import zipfile
@@ -75,8 +76,15 @@ def test_a_missing_interpreter_is_one_sentence(tmp_path):
     failed.close()
 
 
-def test_work_is_cancelled_and_leaves_nothing():
-    running = work("import time; print('up', flush=True); time.sleep(60)", "print('never')")
+@pytest.mark.parametrize("heeds", [signal.default_int_handler, signal.SIG_IGN], ids=["heeded", "ignored"])
+def test_work_is_cancelled_and_leaves_nothing(heeds):
+    """Also where this process ignores interrupts, as a shell's background job does."""
+    before = signal.signal(signal.SIGINT, heeds)
+    try:
+        running = work("import time; print('up', flush=True); time.sleep(600)", "print('never')")
+        assert signal.getsignal(signal.SIGINT) is heeds
+    finally:
+        signal.signal(signal.SIGINT, before)
     while not running.text:
         assert not running.poll()
         time.sleep(0.01)
