@@ -639,6 +639,7 @@ def test_a_model_that_is_gone_is_no_longer_the_best(job, monkeypatch):
     train(replace(lost, resume=True), silent)
     assert load_model(lost.output).provenance["iteration"] == 4
 
+
 def test_the_learning_curve_goes_on_where_a_resumed_run_does(job, uninterrupted, monkeypatch):
     resumed = job("curve")
     train(resumed, silent, stop_after(monkeypatch, 7))
