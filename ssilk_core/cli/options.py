@@ -141,12 +141,7 @@ def add_bake(verb: argparse.ArgumentParser) -> None:
     about = "; ".join(f"{name}: {target.about}" for name, target in TARGETS.items())
     verb.add_argument("--target", choices=TARGETS, default="usd", help=f"who receives it (default usd). {about}")
     verb.add_argument("--fps", type=RATE, help="frames per second of the shot (default: the motion's)")
-    verb.add_argument(
-        "--range",
-        metavar="FIRST-LAST",
-        help="frames to bake, as time codes of the motion, such as 1001-1100, or 'all' that have samples (default: "
-        "the range of the motion's stage, or all); --range=-3-5 where FIRST is negative",
-    )
+    add_range(verb, "frames to bake", "the range of the motion's stage, or all")
     verb.add_argument("--handles", type=NumberRange(0, MAX_HANDLES, int), default=0, metavar="N",
                       help="frames before and after the range that are baked as well, where there are samples "
                            "(default 0)")  # fmt: skip
@@ -161,6 +156,16 @@ def add_bake(verb: argparse.ArgumentParser) -> None:
     )
     _add_names(verb)
     _add_output(verb)
+
+
+def add_range(verb: argparse.ArgumentParser, what: str, default: str) -> None:
+    """Add --range, which `parse_range` reads; `what` it names, and in words what is taken without it."""
+    verb.add_argument(
+        "--range",
+        metavar="FIRST-LAST",
+        help=f"{what}, as time codes of the motion, such as 1001-1100, or 'all' that have samples (default: "
+        f"{default}); --range=-3-5 where FIRST is negative",
+    )
 
 
 def _add_names(verb: argparse.ArgumentParser) -> None:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 
 from ..assets import Floats
 from ..errors import fail
-from ..events import Progress, Reporter, silent
+from ..events import Countdown, Reporter, silent
 from .camera import Camera, follow_cameras
 from .colours import BODY, fabric_colour
 from .ordered_map import ordered_map
@@ -196,9 +195,7 @@ def _drawn(panels: Iterator[Picture], look: Look, total: int, report: Reporter) 
         )
         return add_captions(image, top=panel.top, bottom=panel.bottom)
 
-    start = None
-    for done, image in enumerate(ordered_map(draw, panels, look.workers)):
-        start = start or time.monotonic()
-        left = (time.monotonic() - start) / done * (total - done - 1) if done else None
-        report(Progress(done + 1, total, seconds_left=left))
+    told = Countdown(total, report)
+    for image in ordered_map(draw, panels, look.workers):
+        told()
         yield image
