@@ -190,7 +190,7 @@ class BakeResult:
             **(self.reduction.to_metadata() if self.reduction else {}),
             **{f"refined: {name}": value for name, value in refined.items()},
             **(self.shapes.to_metadata() if self.shapes else {}),
-            **(self.shown_skin.summary() if self.shown_skin else {}),
+            **(self.shown_skin.summary("time code") if self.shown_skin else {}),
             **(self.verification.figures() if self.verification else {}),
             **({} if self.hidden_faces is None else {"hidden faces of the body": self.hidden_faces}),
             **({"put to rest": [str(span) for span in self.recovered]} if self.recovered else {}),

@@ -115,6 +115,9 @@ def test_a_verdict_tells_what_is_wrong_where_and_when():
     assert "stretch by at most 4 % as a rule, and by 21 % in frame 12, at 0.03 s" in body and "inside" not in body
     calm = verdict("Cape", {name: np.zeros(3) for name in values}, None, [11, 12, 13], 30.0).body
     assert "Cape holds" in calm and "skin" not in calm
+    few = verdict("Cape", {**values, SHARE: np.array([0.0, 0.0368, 0.0])}, skin, [11, 12, 13], 30.0).body
+    assert "At most 0.04 % of its vertices are inside the body, in frame 12" in few
+    assert "Frames are time codes of the shot." in few
 
 
 def test_bodies_are_joined_in_their_order():
