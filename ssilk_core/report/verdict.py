@@ -16,6 +16,10 @@ from .terms import SHARE, SHOWN, STRETCH
 # Beyond these the eye finds it at once [%]: skin on average and in one frame, stretch of 99 triangles in 100.
 SHOWN_MEAN, SHOWN_WORST, STRETCHED = 0.05, 0.5, 15.0
 LEAST = 0.1  # below it a share has more digits [%]: one vertex is no 0.0 %
+COUNTED = (
+    "Covered skin is the skin that the cloth covers in the bind pose. Where other parts, such as hands, push through the "
+    "cloth, it counts as vertices inside the body."
+)
 CLOCK = "Frames are time codes of the shot. Seconds count from its first frame."
 INSIDE = 10.0  # share of the vertices inside the body in one frame [%]
 
@@ -67,5 +71,5 @@ def verdict(
         f"Look at {name}: {' and '.join(faults)}." if faults else f"{name} holds: nothing that the eye would find."
     )
     lines = "".join(f"<li>{escape(each)}</li>" for each in words)
-    clock = f'<p class="note">{CLOCK}</p>'
-    return Section(f"{name}: verdict", f"<p><strong>{escape(first)}</strong></p><ul>{lines}</ul>{clock}")
+    note = f'<p class="note">{f"{COUNTED} " if shown_skin else ""}{CLOCK}</p>'
+    return Section(f"{name}: verdict", f"<p><strong>{escape(first)}</strong></p><ul>{lines}</ul>{note}")

@@ -3,6 +3,7 @@
 
 import json
 import re
+from dataclasses import asdict
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,6 +12,7 @@ import trimesh
 
 from ssilk_core.assets import Mesh
 from ssilk_core.charts import ChartPanel, svg_chart
+from ssilk_core.cli.report import _told
 from ssilk_core.errors import SsilkError
 from ssilk_core.fabrics import Fabric
 from ssilk_core.report.figures import learning_of, section_of
@@ -118,6 +120,17 @@ def test_a_verdict_tells_what_is_wrong_where_and_when():
     few = verdict("Cape", {**values, SHARE: np.array([0.0, 0.0368, 0.0])}, skin, [11, 12, 13], 30.0).body
     assert "At most 0.04 % of its vertices are inside the body, in frame 12" in few
     assert "Frames are time codes of the shot." in few
+    assert "skin that the cloth covers in the bind pose" in few and "Covered skin" not in calm
+
+
+def test_figures_are_printed_in_words():
+    skin = asdict(ShownSkin(frames=3, covered=100, mean=0.0, worst=0.0, clip="c", frame=1, regions={}))
+    told = _told({"Cape": {"shown_skin": skin, "non-finite frames": 2}, "Belt": {"non-finite frames": 0}})
+    assert told == {
+        "Cape": "0.000% of the covered skin shows",
+        "Cape: frames that are not finite": 2,
+        "Belt": "it covers no skin",
+    }
 
 
 def test_bodies_are_joined_in_their_order():
