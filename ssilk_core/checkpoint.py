@@ -22,7 +22,7 @@ from .assets import Character, Garment, Mesh, ProxyRig, Scene, Skeleton, SkinWei
 from .config import ModelConfig
 from .errors import SsilkError, fail
 from .fabrics import Fabric, fabric_of_file
-from .files import replacing
+from .files import is_usd, replacing
 from .packing import dequantize, narrowest, quantize
 from .parameters import Shapes, parameter_shapes
 from .tensors import pack_tensors, read_tensors
@@ -187,6 +187,13 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     try:
         tensors, words = read_tensors(path, HEADER_NAME)
     except ValueError as error:
+        if is_usd(path):
+            fail(
+                str(path),
+                "this is a USD stage",
+                "a model is a .safetensors file that 'ssilk train' wrote",
+                "model and stage may have been swapped",
+            )
         first = str(error).partition("\n")[0]
         raise SsilkError(
             f"{path}: this is not a safetensors file, or it is truncated or damaged ({first}); train again or fetch "

@@ -17,8 +17,8 @@ from .terms import SHARE, SHOWN, STRETCH
 SHOWN_MEAN, SHOWN_WORST, STRETCHED = 0.05, 0.5, 15.0
 LEAST = 0.1  # below it a share has more digits [%]: one vertex is no 0.0 %
 COUNTED = (
-    "Covered skin is the skin that the cloth covers in the bind pose. Where other parts, such as hands, push through the "
-    "cloth, it counts as vertices inside the body."
+    "Covered skin is the skin that the cloth covers in the bind pose. Where other parts, such as hands, push through "
+    "the cloth, it counts as vertices inside the body."
 )
 CLOCK = "Frames are time codes of the shot. Seconds count from its first frame."
 INSIDE = 10.0  # share of the vertices inside the body in one frame [%]
