@@ -207,9 +207,12 @@ def _add_output(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--device", default="cpu", help="where the network runs (default cpu)")
 
 
-def add_level(verb: argparse.ArgumentParser, size: str) -> None:
-    """Add --quality and --budget; `size` says of what a budget in bytes is."""
-    levels = "; ".join(f"{level.name}: {level.about}" for level in QUALITIES.values())
+def add_level(verb: argparse.ArgumentParser, size: str, *, plays: bool = False) -> None:
+    """Add --quality and --budget; `size` says of what a budget in bytes is, `plays` that levels limit the rate."""
+    rates = {
+        level.name: f", at most {level.fps:g} frames a second" for level in QUALITIES.values() if plays and level.fps
+    }
+    levels = "; ".join(f"{level.name}: {level.about}{rates.get(level.name, '')}" for level in QUALITIES.values())
     verb.add_argument("--quality", choices=QUALITIES, help=f"level of quality ({levels})")
     verb.add_argument("--budget", metavar="AMOUNT", help=f"keep the most within 0.3ms for each frame, or {size}")
 
