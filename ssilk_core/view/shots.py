@@ -17,7 +17,7 @@ from .colours import BODY, fabric_colour
 from .ordered_map import ordered_map
 from .output import FILM, PICTURE, check_suffix, write_film, write_image
 from .panels import add_captions, compare, contact_sheet
-from .player import ShotPlayer
+from .player import PlayerMesh, ShotPlayer
 from .render import Image, render
 from .surface import Surface
 
@@ -181,9 +181,15 @@ def shot_surfaces(player: ShotPlayer, frame: int) -> tuple[Surface, ...]:
 
 
 def mesh_colours(player: ShotPlayer) -> list[Floats]:
-    """Return a colour in sRGB, shape (3,), for each mesh: skin in grey, each garment in a colour of its own."""
+    """Return a colour in sRGB, shape (3,), for each mesh: skin in grey, each garment in its own or else a fabric's."""
     garments = np.cumsum([mesh.is_garment for mesh in player.meshes]) - 1
-    return [fabric_colour(number) if mesh.is_garment else BODY for mesh, number in zip(player.meshes, garments)]
+
+    def colour(mesh: PlayerMesh, number: int) -> Floats:
+        if not mesh.is_garment:
+            return BODY
+        return fabric_colour(number) if mesh.colour is None else np.array(mesh.colour)
+
+    return [colour(mesh, number) for mesh, number in zip(player.meshes, garments)]
 
 
 def _drawn(panels: Iterator[Picture], look: Look, total: int, report: Reporter) -> Iterator[Image]:

@@ -506,7 +506,7 @@ MODELS = [
     Case(
         "model is a stage",
         "bake rigged.usda --stage rigged.usda --motion clip.usda -o new.usdc",
-        ("rigged.usda", "not a safetensors"),
+        ("rigged.usda", "this is a USD stage", "may have been swapped"),
     ),
     Case(
         "model of another format",

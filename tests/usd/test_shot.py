@@ -160,6 +160,11 @@ def test_body_meshes_follow_the_character(tmp_path):
     matrices = skinning_matrices(motion_transforms(motion, skeleton.parents), skeleton.bind_transforms)
     shot = Shot(path)
     assert [(mesh.name, mesh.is_garment) for mesh in shot.meshes] == [("cape", True), ("Body", False)]
+    assert shot.meshes[0].colour is None
+    dyed = Usd.Stage.Open(str(path))
+    cloth = UsdGeom.PrimvarsAPI(dyed.GetPrimAtPath(shot.meshes[0].path))
+    cloth.CreatePrimvar("displayColor", Sdf.ValueTypeNames.Color3fArray, "constant").Set([(0.2140411, 0.0, 1.0)])
+    assert Shot(dyed).meshes[0].colour == pytest.approx((0.5, 0.0, 1.0), abs=1e-5)  # linear light as sRGB
     played = np.stack([shot.points(time)[1] for time in shot.frame_times])
     np.testing.assert_allclose(played, skin_points(body.mesh.points, body.skin, matrices), atol=2e-6)
 

@@ -25,12 +25,14 @@ class ShotMesh:
         path: its prim's path.
         faces: triangles, shape (F, 3).
         is_garment: it is marked as a garment (see `read_mesh.is_garment`); what is not counts as body.
+        colour: the mean of its displayColor in sRGB, each from 0 to 1; None where it has none.
     """
 
     name: str
     path: str
     faces: Ints
     is_garment: bool
+    colour: tuple[float, float, float] | None = None
 
 
 class Shot:
@@ -166,7 +168,19 @@ class _PlainMesh:
 
 
 def _describe(prim: Usd.Prim) -> ShotMesh:
-    return ShotMesh(prim.GetName(), str(prim.GetPath()), read_mesh(prim, np.eye(4)).faces, is_garment(prim))
+    faces = read_mesh(prim, np.eye(4)).faces
+    return ShotMesh(prim.GetName(), str(prim.GetPath()), faces, is_garment(prim), _colour(prim))
+
+
+def _colour(prim: Usd.Prim) -> tuple[float, float, float] | None:
+    """Return the mean of a mesh's displayColor, which is linear, in sRGB (IEC 61966-2-1); None without one."""
+    primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayColor")
+    found = primvar.Get(EARLIEST) if primvar and primvar.HasAuthoredValue() else None
+    if not found or not np.isfinite(found).all():
+        return None
+    linear = np.array(found, dtype=np.float64).reshape(-1, 3).mean(axis=0).clip(0, 1)
+    red, green, blue = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055).tolist()
+    return red, green, blue
 
 
 def frame_times(stage: Usd.Stage, per_frame: int = 1) -> tuple[float, ...]:
