@@ -138,6 +138,7 @@ def _document(model: ModelFile) -> dict[str, Any]:
         "config": asdict(model.config),
         "fabric": asdict(model.fabric),
         "provenance": model.provenance,
+        **({} if (colour := model.scene.garment.colour) is None else {"colour": colour}),
     }
 
 
@@ -300,7 +301,11 @@ def _scene_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Scene
         tensors["scene.rig.bind_transforms"],
         skin("rig", paths["rig"]),
     )
-    garment = Garment(mesh, skin("plain", paths["garment"]), tensors["scene.classes"])
+    colour = document.get("colour")
+    if colour is not None:
+        red, green, blue = (min(max(float(part), 0.0), 1.0) for part in colour)
+        colour = red, green, blue
+    garment = Garment(mesh, skin("plain", paths["garment"]), tensors["scene.classes"], colour=colour)
     return Scene(Character(paths["skeleton"], skeleton, ()), garment, rig)
 
 

@@ -151,6 +151,16 @@ def test_usdskel_reproduces_the_decoder(tmp_path, units, proxies, shapes, fps, s
     assert check_shot(path) == []
 
 
+def test_a_garment_keeps_its_colour(tmp_path):
+    rng = np.random.default_rng(4)
+    plain, motion = make_deformer(rng), make_motion(rng)
+    garment = replace(plain.scene.garment, colour=(0.25, 0.5, 1.0))
+    deformer = replace(plain, scene=replace(plain.scene, garment=garment))
+    write_shot(tmp_path / "shot.usdc", deformer, motion, make_poses(rng, deformer), units=CENTIMETRES_Z)
+    skeleton = read_character(tmp_path / "shot.usdc", garment="cape").skeleton
+    assert read_garment(tmp_path / "shot.usdc", skeleton).colour == (0.25, 0.5, 1.0)
+
+
 def test_body_meshes_follow_the_character(tmp_path):
     rng = np.random.default_rng(4)
     deformer, motion = make_deformer(rng), make_motion(rng)

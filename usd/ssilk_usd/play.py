@@ -11,7 +11,7 @@ from pxr import Usd, UsdGeom, UsdSkel
 from ssilk_core.assets import Floats, Ints
 from ssilk_core.errors import fail
 
-from .read_mesh import is_drawn, is_garment, read_mesh
+from .read_mesh import display_colour, is_drawn, is_garment, read_mesh
 from .read_stage import EARLIEST, PRIMS, StageLike, apply, column_matrix, open_stage, stage_name
 from .units import StageUnits
 
@@ -173,12 +173,11 @@ def _describe(prim: Usd.Prim) -> ShotMesh:
 
 
 def _colour(prim: Usd.Prim) -> tuple[float, float, float] | None:
-    """Return the mean of a mesh's displayColor, which is linear, in sRGB (IEC 61966-2-1); None without one."""
-    primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayColor")
-    found = primvar.Get(EARLIEST) if primvar and primvar.HasAuthoredValue() else None
-    if not found or not np.isfinite(found).all():
+    """Return a mesh's colour in sRGB (IEC 61966-2-1); None without one."""
+    found = display_colour(prim)
+    if found is None:
         return None
-    linear = np.array(found, dtype=np.float64).reshape(-1, 3).mean(axis=0).clip(0, 1)
+    linear = np.array(found)
     red, green, blue = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055).tolist()
     return red, green, blue
 
