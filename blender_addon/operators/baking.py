@@ -243,7 +243,8 @@ def lost(figures: Mapping[str, Any]) -> str:
         return ""
     typical, most = (figures[f"{topic}joints lose, {which} [mm]"] for which in ("RMS", "at most"))
     return (
-        f"; bones and {count} shape keys are within {typical:g} mm (RMS), {most:g} mm at most, of what was simulated"
+        f"; bones and {count} shape keys are within {typical:.2g} mm (RMS), {most:.2g} mm at most, "
+        "of what was simulated"
     )
 
 

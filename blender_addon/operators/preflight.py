@@ -14,11 +14,11 @@ from ssilk_core.preflight.finding import format_count
 from ..errors import SetupError
 from ..findings import PUSHED, Clip, read_findings
 from ..outside.work import Work
-from ..preferences import interpreter, preferences
+from ..preferences import interpreter, preferences, unready
 from ..preflight_properties import FindingItem, keep_findings, shown_finding, size_of
 from ..scene.armature import read_joints
 from ..scene.checks import SCALE, scene_findings
-from ..scene.garment import armature_of
+from ..scene.garment import armature_of, unusable
 from ..scene.gather import gather
 from ..scene.handover import MOTIONS, REPAIRED, hand_over, inspect_command, loading_usd
 from ..scene.mended import look_again
@@ -26,6 +26,7 @@ from ..scene.objects import Pair
 from ..scene.repairs import REPAIRS, apply_scale, move_points, repair_mesh
 from ..scene.selecting import select_bones, select_elements
 from ..scene.takes import ChosenMotions
+from . import tasks
 from .reporting import ReportingOperator
 from .rig import RigOperator
 
@@ -33,14 +34,20 @@ MOVED, LEFT = "moved ", "left "  # begin what `ssilk inspect --fix` says of sett
 
 
 class InspectOperator(RigOperator):
-    """Base of operators that hand the garment to `ssilk inspect`; subclasses give `words`."""
+    """Base of operators that hand the garment to `ssilk inspect`; subclasses give `words`.
+
+    Attributes:
+        doing: what is done with the garment.
+    """
+
+    doing = ""
 
     def prepare(self, context: bpy.types.Context) -> Work:
         garment = context.object
         self.pair, self.scene = Pair.of(garment, armature_of(garment)), gather(garment)
         self.python = interpreter(preferences(context))
         return Work(
-            f"Inspecting '{garment.name}'", self.commands, parent=bpy.app.tempdir, steps=self.steps(),
+            f"{self.doing} '{garment.name}'", self.commands, parent=bpy.app.tempdir, steps=self.steps(),
             rephrase=self.rephrase,
         )  # fmt: skip
 
@@ -66,6 +73,7 @@ class Inspect(InspectOperator, bpy.types.Operator):
 
     bl_idname = "ssilk.inspect"
     bl_label = "Inspect"
+    doing = "Inspecting"
 
     def prepare(self, context: bpy.types.Context) -> Work:
         garment = context.object
@@ -157,6 +165,17 @@ class PushOut(InspectOperator, bpy.types.Operator):
     bl_idname = "ssilk.push_out"
     bl_label = "Push Out"
     undo = "Push Out of Body"
+    doing = "Pushing out"
+
+    @classmethod
+    def refusal(cls, context: bpy.types.Context) -> str:
+        return tasks.busy() or unusable(context.object) or unready(context)
+
+    def prepare(self, context: bpy.types.Context) -> Work:
+        """Leave the mode in which *Select* shows what is inside."""
+        if context.mode != "OBJECT":
+            bpy.ops.object.mode_set(mode="OBJECT")
+        return super().prepare(context)
 
     def words(self, folder: Path) -> list[str]:
         return ["--fix", str(folder / REPAIRED)]

@@ -323,6 +323,8 @@ def watch() -> float:
     preflight = bpy.context.window_manager.ssilk_preflight
     if bpy.context.mode == "OBJECT" and look_again(preflight):
         tasks.redraw(bpy.context)
+    if bpy.context.mode == "PAINT_VERTEX":  # a stroke does not draw the panel that counts what is painted
+        tasks.redraw(bpy.context)
     playing.take_up_models()
     playing.play_what_is_awaited()
     return LOOK

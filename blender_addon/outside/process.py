@@ -10,7 +10,8 @@ import subprocess
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
@@ -41,10 +42,11 @@ class Process:
         Raises:
             OSError: it cannot be started.
         """
-        self._popen = subprocess.Popen(
-            command, cwd=folder, env=environment(), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE, encoding="utf-8", errors="replace", creationflags=NEW_GROUP,
-        )  # fmt: skip
+        with _interruptible():
+            self._popen = subprocess.Popen(
+                command, cwd=folder, env=environment(), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE, encoding="utf-8", errors="replace", creationflags=NEW_GROUP,
+            )  # fmt: skip
         self._said: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._complaints: deque[str] = deque(maxlen=LAST_WORDS)
         readers = ((self._popen.stdout, self._said.put), (self._popen.stderr, self._complaints.append))
@@ -89,6 +91,22 @@ class Process:
             self._popen.wait()
         for thread in self._threads:
             thread.join(PATIENCE)  # what it said last is being read
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Let what is started meanwhile be interrupted, also where Blender itself is not: in the background of a script.
+
+    A process inherits that an interrupt is ignored, but not that it is handled.
+    """
+    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
+        yield
+        return
+    signal.signal(signal.SIGINT, lambda *_: None)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _read(stream: IO[str], take: Callable[[str], object]) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ssilk_core.errors import SsilkError
-from ssilk_core.events import Failed, Message, Progress, Result, read_event
+from ssilk_core.events import Failed, Message, Progress, Result, format_seconds, read_event
 
 from ..errors import SetupError
 from .process import Process
@@ -51,6 +51,7 @@ class Work:
             rephrase: turns messages into words for people, without the folder's paths.
         """
         self.title, self.text, self.error = title, "", ""
+        self._since = time.monotonic()
         self.fraction: float | None = None
         self.result: dict[str, Any] = {}
         self.cancelled = False
@@ -68,8 +69,13 @@ class Work:
 
     @property
     def status(self) -> str:
-        """What is done and how far it is, in one line."""
-        return self.title if self.fraction is None else f"{self.title}: {self.fraction:.0%}"
+        """What is done and how far it is, in one line; how long it has run where the part that is done is unknown."""
+        if self.cancelled:
+            return f"{self.title}: stopping"
+        if self.fraction is not None:
+            return f"{self.title}: {self.fraction:.0%}"
+        seconds = int(time.monotonic() - self._since)
+        return f"{self.title}: {format_seconds(seconds)}" if seconds else self.title
 
     def poll(self) -> bool:
         """Do some steps, or take in what was said meanwhile; return whether everything has ended."""

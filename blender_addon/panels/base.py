@@ -38,7 +38,7 @@ def draw_work(layout: bpy.types.UILayout) -> None:
         draw_failure(layout)
         return
     row = layout.row(align=True)
-    row.progress(factor=work.fraction or 0.0, text=work.title)
+    row.progress(factor=work.fraction or 0.0, text=work.status)
     row.operator("ssilk.cancel", text="", icon="CANCEL")
     if work.text:
         draw_text(layout, work.text)

@@ -9,13 +9,14 @@ import numpy as np
 from ssilk_core.mesh.topology import components
 from ssilk_core.preflight.finding import format_count
 
-from ..classes import LEVELS, adrift, counts
+from ..classes import COLORS, LEVELS, adrift, counts
 from ..errors import SetupError
 from ..operators.classes import CHOICES
 from ..overlay import shown
 from ..scene.attributes import current_classes
 from ..scene.garment import unusable
 from ..scene.meshes import triangles_of
+from ..scene.painting import is_chosen
 from ..scene.shapes import rest_points
 from ..scene.stitched import unstitched
 from .base import SidebarPanel, draw_text, saying_errors
@@ -93,7 +94,8 @@ class ClassesPanel(SidebarPanel, bpy.types.Panel):
         row = layout.row(align=True)
         for index, (name, label, _) in enumerate(CHOICES):
             column = row.column(align=True)
-            column.operator("ssilk.fill_class" if editing else "ssilk.brush_class", text=label).value = name
+            choice = "ssilk.fill_class" if editing else "ssilk.brush_class"
+            column.operator(choice, text=label, depress=is_chosen(context, COLORS[index])).value = name
             count = column.row()
             count.alignment = "CENTER"
             count.label(text=str(found[index]) if found else "-")

@@ -10,6 +10,8 @@ from ssilk_core.preflight.finding import format_count
 from ..operators.preflight import fixer
 from ..preflight_properties import shown_finding
 from ..scene.garment import unusable
+from ..scene.heat import PUSHED_OUT
+from ..scene.repairs import DISPLACEMENT
 from .base import SidebarPanel, draw_text, saying_errors
 
 ICONS = {"error": "CANCEL", "warning": "ERROR", "info": "INFO"}
@@ -36,11 +38,13 @@ class PreflightPanel(SidebarPanel, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         layout, preflight = self.layout, context.window_manager.ssilk_preflight
         layout.operator("ssilk.inspect", icon="VIEWZOOM")
+        if DISPLACEMENT in context.object.data.attributes:
+            layout.operator("ssilk.show_heat", text="Show Pushed Out", icon="SHADING_RENDERED").kind = PUSHED_OUT
         item = shown_finding(context)
         if item is None:
             return
         layout.template_list(FindingList.bl_idname, "", preflight, "findings", preflight, "active", rows=4)
-        for text in (item.target, item.found, sentence(item.why), sentence(item.fix)):
+        for text in (item.target, *map(sentence, (item.found, item.why, item.fix))):
             draw_text(layout, text)
         if item.old:
             draw_text(layout, "It has changed since; inspect again", icon="FILE_REFRESH")

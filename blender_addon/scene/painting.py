@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import bpy
+import numpy as np
 
 from ..classes import COLOR_ATTRIBUTE, COLORS
 
@@ -27,6 +28,19 @@ def choose_color(context: bpy.types.Context, color: Sequence[float]) -> None:
     paint = context.tool_settings.vertex_paint
     brush = paint.brush
     brush.blend, brush.color = "MIX", color
-    # Blender 5 keeps settings that brushes share in each mode, earlier versions in one place.
-    unified = getattr(paint, "unified_paint_settings", None) or context.tool_settings.unified_paint_settings
-    unified.color = color
+    _shared(context).color = color
+
+
+def is_chosen(context: bpy.types.Context, color: Sequence[float]) -> bool:
+    """Return whether the brush of vertex paint brushes with a colour; not in other modes."""
+    brush = context.tool_settings.vertex_paint.brush if context.mode == "PAINT_VERTEX" else None
+    if brush is None:
+        return False
+    shared = _shared(context)
+    return np.allclose(shared.color if shared.use_unified_color else brush.color, color, atol=1e-3)
+
+
+def _shared(context: bpy.types.Context) -> bpy.types.UnifiedPaintSettings:
+    """Return the settings that brushes share: Blender 5 has them in each mode, earlier versions in one place."""
+    settings = context.tool_settings
+    return getattr(settings.vertex_paint, "unified_paint_settings", None) or settings.unified_paint_settings

@@ -5,21 +5,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import bmesh
 import bpy
-import numpy as np
 
 
 def select_elements(thing: bpy.types.Object, elements: str, indices: Sequence[int]) -> None:
     """Be in edit mode of a mesh with these of its "vertices" or "polygons" selected, and nothing else."""
     select_object(thing)
-    mesh, vertices = thing.data, elements == "vertices"
-    for items in (mesh.vertices, mesh.edges, mesh.polygons):
-        items.foreach_set("select", np.zeros(len(items), dtype=bool))
-    chosen = np.zeros(len(mesh.vertices if vertices else mesh.polygons), dtype=bool)
-    chosen[list(indices)] = True
-    (mesh.vertices if vertices else mesh.polygons).foreach_set("select", chosen)
+    vertices = elements == "vertices"
     bpy.context.tool_settings.mesh_select_mode = (vertices, False, not vertices)
     bpy.ops.object.mode_set(mode="EDIT")
+    bpy.ops.mesh.select_all(action="DESELECT")
+    mesh = bmesh.from_edit_mesh(thing.data)  # Blender 5.0 ends where edges of a script's mesh are deselected before
+    items = mesh.verts if vertices else mesh.faces
+    items.ensure_lookup_table()
+    for index in indices:
+        items[index].select_set(True)
+    mesh.select_flush_mode()
+    bmesh.update_edit_mesh(thing.data, loop_triangles=False, destructive=False)
 
 
 def select_bones(armature: bpy.types.Object, names: Sequence[str]) -> None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
 import time
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -58,6 +60,20 @@ def test_work_hears_events_and_ends_with_a_result():
     assert not done.folder.exists()
 
 
+def test_work_tells_how_far_it_is_or_else_how_long_it_has_run(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("blender_addon.outside.work.time", SimpleNamespace(monotonic=lambda: now[0]))
+    running = Work("Testing", lambda _: ())
+    assert running.status == "Testing"
+    now[0] += 65
+    assert running.status == "Testing: 1 min 05 s"
+    running.fraction = 0.5
+    assert running.status == "Testing: 50%"
+    running.cancel()
+    assert running.status == "Testing: stopping"
+    running.close()
+
+
 def test_a_failed_command_ends_the_work_with_its_last_word():
     failed = wait(work("import sys; print('no room', file=sys.stderr); sys.exit(3)", "print('never')"))
     assert (failed.error, failed.text) == ("Testing failed: no room", "")
@@ -65,6 +81,21 @@ def test_a_failed_command_ends_the_work_with_its_last_word():
     assert silent.error == "Testing failed: the command ended with code 3"
     for ended in (failed, silent):
         ended.close()
+
+
+def test_work_is_cancelled_where_interrupts_are_ignored():
+    """As in a Blender that a script started in the background; what it starts must not inherit that."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        running = work("import time; print('up', flush=True); time.sleep(20); print('slept')")
+        while running.text != "up":
+            running.poll()
+        running.cancel()
+        assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+        assert (wait(running).text, running.error) == ("up", "Testing was cancelled.")
+        running.close()
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_a_missing_interpreter_is_one_sentence(tmp_path):

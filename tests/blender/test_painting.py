@@ -54,6 +54,9 @@ def test_painting_starts_tight_with_a_palette(bpy, quad):
 def test_blenders_brush_paints_the_chosen_class(bpy, quad, value, number):
     bpy.ops.ssilk.paint_classes()
     assert bpy.ops.ssilk.brush_class(value=value) == {"FINISHED"}
+    from blender_addon.scene.painting import is_chosen
+
+    assert [is_chosen(bpy.context, color) for color in palette.COLORS] == [number == each for each in range(3)]
     bpy.ops.paint.vertex_color_set()
     bpy.ops.ssilk.take_up_painting()
     assert classes_of(quad) == [number] * 4

@@ -157,7 +157,8 @@ def test_work_shows_its_progress_and_a_way_out(bpy, skirt, monkeypatch):
     from blender_addon.operators import tasks
     from blender_addon.panels import GarmentPanel
 
-    monkeypatch.setattr(tasks, "current", SimpleNamespace(title="Rigging", fraction=0.25, text="half way", close=int))
+    current = SimpleNamespace(status="Rigging", fraction=0.25, text="half way", close=int)
+    monkeypatch.setattr(tasks, "current", current)
     assert drawn(GarmentPanel, bpy.context)[-3:] == ["Rigging 25%", "ssilk.cancel", "half way"]
 
 

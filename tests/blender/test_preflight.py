@@ -184,9 +184,13 @@ def test_cloth_in_the_body_is_pushed_out_with_its_shape_keys(ready, skirt, scale
     assert set(item.indices) <= set(waist)
     before = [vertex.co.copy() for vertex in skirt.data.vertices]
     from blender_addon.operators.preflight import fixer
+    from blender_addon.panels import PreflightPanel
 
     assert fixer(item) == "ssilk.push_out"
-    assert ready.ops.ssilk.push_out() == {"FINISHED"}
+    assert "ssilk.show_heat" not in drawn(PreflightPanel, ready.context)
+    ready.ops.ssilk.select_finding()
+    assert (ready.context.mode, ready.ops.ssilk.push_out()) == ("EDIT_MESH", {"FINISHED"})
+    assert "ssilk.show_heat" in drawn(PreflightPanel, ready.context)
     radius = [scale * np.hypot(*skirt.data.vertices[index].co.xy) for index in waist]
     assert min(radius) > 0.15
     wide = skirt.data.shape_keys.key_blocks["Wide"]

@@ -20,11 +20,12 @@ from ssilk_usd.write import write_garment, write_motion
 from ssilk_core.assets import LOOSE, TIGHT, Garment, Motion, Scene, Skeleton
 from ssilk_core.bake import BakeRequest, load_rollout
 from ssilk_core.checkpoint import ModelFile, load_model, save_model
-from ssilk_core.cli import demo, main, parser
+from ssilk_core.cli import demo, main, parser, view
 from ssilk_core.cli.options import load_scene
 from ssilk_core.demo import garments, motions, shipped
 from ssilk_core.energy import GarmentEnergy
 from ssilk_core.events import silent
+from ssilk_core.view.shots import Look
 
 SHORT = shlex.split(
     "--set iterations=2 --set static_fraction=0.5 --set validate_every=2 --set valid_frames=4 --set batch=1 --set "
@@ -41,7 +42,7 @@ def wardrobe() -> dict[str, Garment]:
 
 @pytest.fixture
 def brief(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A wardrobe that is built once, a shot of six frames instead of 225, and two short motions instead of twenty."""
+    """A wardrobe that is built once, a shot of six frames instead of 225, small pictures, and two short motions."""
     built, every, shot = wardrobe(), motions.training_motions, motions.demo_shot
 
     def few(skeleton: Skeleton) -> list[Motion]:
@@ -50,6 +51,7 @@ def brief(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(garments, "build_garment", lambda name, character: built[name])
     monkeypatch.setattr(motions, "training_motions", few)
     monkeypatch.setattr(motions, "demo_shot", lambda skeleton: shot(skeleton).clip(60, 66))
+    monkeypatch.setattr(view, "_look", lambda options, film: Look(width=96, height=128, samples=1))
 
 
 def rigged(garment: str, folder: Path) -> Scene:

@@ -33,6 +33,11 @@ SETTINGS = settings(max_examples=60, deadline=None, derandomize=True, database=N
 REFUSED, READ = 2, 0
 
 
+@pytest.fixture(autouse=True, scope="module")
+def read_at_once() -> None:
+    """Files are read in another process first, as users' are."""
+
+
 @pytest.fixture(scope="module")
 def files(toy, tmp_path_factory):
     """Valid files of each kind that is read."""

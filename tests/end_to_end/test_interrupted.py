@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import multiprocessing
 import os
@@ -30,7 +29,7 @@ pytestmark = pytest.mark.skipif(os.name != "posix", reason="processes are forked
 
 # Files are written after every step, and steps are so large that some models are the best so far and some are not.
 SETTINGS = (
-    "iterations=24 static_fraction=0.1 validate_every=1 learning_rate=0.004 final_learning_rate=0.004 "
+    "iterations=14 static_fraction=0.1 validate_every=1 learning_rate=0.004 final_learning_rate=0.004 "
     "learning_rate_warmup=0 ema_decay=0"
 )
 MODEL, STATE, CURVE = Path("model.safetensors"), Path("model.resume.safetensors"), Path("model.curve.json")
@@ -129,7 +128,7 @@ def check_equal(whole: Path) -> None:
 def test_killed_wherever_a_file_gets_its_name(forks, command, whole, tmp_path, monkeypatch):
     """Resumed ones write a model that was lost, and the curve; each step then a state, a curve, and maybe a model."""
     monkeypatch.chdir(tmp_path)
-    places = [*itertools.product(range(1, 8), (False, True)), (None, False)]
+    places = [*((count, False) for count in (1, 3, 5, 7)), *((count, True) for count in range(1, 7)), (None, False)]
     codes = []
     for place in places:
         process = forks.Process(target=train, args=(command, *place))
@@ -144,7 +143,7 @@ def test_killed_wherever_a_file_gets_its_name(forks, command, whole, tmp_path, m
 def test_killed_at_any_time(forks, command, whole, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     dice, began = random.Random(2), []
-    for kill in (True, True, True, True, False):
+    for kill in (True, True, True, False):
         before = STATE.stat().st_mtime_ns if STATE.exists() else 0
         process = forks.Process(target=train, args=(command,))
         process.start()
@@ -156,5 +155,5 @@ def test_killed_at_any_time(forks, command, whole, tmp_path, monkeypatch):
         process.join(60)
         check_files()
         began.append(len(json.loads(CURVE.read_text())["points"]) if CURVE.exists() else 0)
-    assert process.exitcode in TRAINED and began == sorted(began) and began[0] < began[-2] < 24
+    assert process.exitcode in TRAINED and began == sorted(began) and began[0] < began[-2] < 14
     check_equal(whole)

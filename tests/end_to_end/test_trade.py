@@ -22,7 +22,9 @@ def run(command: str) -> int:
 
 @pytest.fixture
 def world(toy, tmp_path, monkeypatch):
-    """A folder with the toy's files and three motions, as the working folder."""
+    """A folder with the toy's files and three motions, as the working folder; few variants are tried."""
+    for name, values in (("SHAPES", (0.5,)), ("JOINTS", (0.0,)), ("INFLUENCES", ()), ("RATES", (0.5,))):
+        monkeypatch.setattr(f"ssilk_core.trade.variants.{name}", values)
     monkeypatch.chdir(toy.copy(tmp_path))
     (tmp_path / "motions").mkdir()
     for name, frames in (("long", 14), ("short", 10), ("other", 14)):
@@ -51,10 +53,7 @@ def test_a_sweep_is_written_drawn_and_taken_up_again(world, capsys, no_clock):
     assert json.loads((world / "trade.json").read_text()) == document
 
 
-def test_models_are_put_on_one_table(world, capsys, no_clock, monkeypatch):
-    monkeypatch.setattr("ssilk_core.trade.variants.SHAPES", (0.5,))
-    for name in ("JOINTS", "INFLUENCES", "RATES"):
-        monkeypatch.setattr(f"ssilk_core.trade.variants.{name}", ())
+def test_models_are_put_on_one_table(world, capsys, no_clock):
     shutil.copy("model.safetensors", "again.safetensors")
     command = TRADE.replace("trade model", "trade model.safetensors again", 1)
     assert run(f"{command} --clips short --no-refine --json") == 0
