@@ -10,7 +10,7 @@ from ..assets import Floats, Ints
 
 
 class PlayerMesh(Protocol):
-    """A mesh of a shot: its triangles (F, 3), whether it is cloth or skin, and its colour in sRGB, where it has one."""
+    """A mesh of a shot: its triangles (F, 3), whether it is cloth or skin, and its colour in sRGB or None."""
 
     @property
     def name(self) -> str: ...

@@ -181,7 +181,7 @@ def shot_surfaces(player: ShotPlayer, frame: int) -> tuple[Surface, ...]:
 
 
 def mesh_colours(player: ShotPlayer) -> list[Floats]:
-    """Return a colour in sRGB, shape (3,), for each mesh: skin in grey, each garment in its own or else a fabric's."""
+    """Return a colour in sRGB, shape (3,), for each mesh: skin in grey, each garment in its own or a fabric's."""
     garments = np.cumsum([mesh.is_garment for mesh in player.meshes]) - 1
 
     def colour(mesh: PlayerMesh, number: int) -> Floats:
