@@ -49,7 +49,7 @@ def recorded(
         stretch = principal_stretches(dressed.columns(x))[0]
         stretches += stretch_histogram(stretch)
         states = dressed.covered.states(x, take_set.character(take, frames))
-        shown.append(ShownCounts.of(states, codes[frames.start : frames.stop]))
+        shown.append(ShownCounts.of(states, codes[frames.start : frames.stop].tolist()))
         values = {
             **frame_energies(dressed, take_set, take, frames, path),
             **_moving(dressed, path, len(frames)),
