@@ -496,7 +496,7 @@ MODELS = [
         folder_at("no.safetensors"),
     ),
     Case("truncated model", BAKE, ("model.safetensors", "truncated"), truncated("model.safetensors")),
-    Case("empty model", BAKE, ("model.safetensors", "not a safetensors"), text("model.safetensors", "")),
+    Case("empty model", BAKE, ("model.safetensors", "this is a USD stage"), text("model.safetensors", "")),
     Case(
         "foreign model",
         BAKE,
@@ -724,7 +724,7 @@ def test_a_full_disk_leaves_nothing(command, room, file, toy, tmp_path, monkeypa
 
 COMMANDS = [
     ("rig hero.usda --garment Hat -o new.usda", ("'Hat'",)),
-    ("bake clip.usda --stage rigged.usda --motion clip.usda -o new.usdc", ("not a safetensors",)),
+    ("bake clip.usda --stage rigged.usda --motion clip.usda -o new.usdc", ("this is a USD stage",)),
     ("train rigged.usda", ("--motions",)),
 ]
 
