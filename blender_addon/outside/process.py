@@ -33,6 +33,23 @@ def environment() -> dict[str, str]:
     return {**kept, "PYTHONSAFEPATH": "1", "PYTHONUNBUFFERED": "1", "PYTHONIOENCODING": "utf-8"}
 
 
+@contextmanager
+def _heeding_interrupts() -> Iterator[None]:
+    """Let what is started here heed interrupts, also where Blender is a shell's background job and ignores them.
+
+    A program inherits which signals are ignored, but not which are handled: those it meets with their defaults.
+    """
+    in_main = threading.current_thread() is threading.main_thread()  # no other thread may say how signals are met
+    if not in_main or signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        yield
+        return
+    signal.signal(signal.SIGINT, lambda *_: None)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 class Process:
     """A running command; its output is collected by threads, so that `lines` never waits."""
 
@@ -42,7 +59,7 @@ class Process:
         Raises:
             OSError: it cannot be started.
         """
-        with _interruptible():
+        with _heeding_interrupts():
             self._popen = subprocess.Popen(
                 command, cwd=folder, env=environment(), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE, encoding="utf-8", errors="replace", creationflags=NEW_GROUP,
@@ -91,22 +108,6 @@ class Process:
             self._popen.wait()
         for thread in self._threads:
             thread.join(PATIENCE)  # what it said last is being read
-
-
-@contextmanager
-def _interruptible() -> Iterator[None]:
-    """Let what is started meanwhile be interrupted, also where Blender itself is not: in the background of a script.
-
-    A process inherits that an interrupt is ignored, but not that it is handled.
-    """
-    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
-        yield
-        return
-    signal.signal(signal.SIGINT, lambda *_: None)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _read(stream: IO[str], take: Callable[[str], object]) -> None:

@@ -308,14 +308,14 @@ class TrainingRun:
 
     @property
     def validation_due(self) -> bool:
-        """Whether the schedule asks for a validation now."""
+        """Whether the schedule asks for a validation now: of static training too, for a first model to look at."""
         config, iteration = self.config, self.state.iteration
         scheduled = iteration % config.validate_every == 0
         if self.state.validations:  # the plan changes, and with it the interval
             last = self.state.curve[-1].iteration if self.state.curve else config.static_iterations
             scheduled = iteration - last >= config.validate_every
         scheduled |= iteration == config.iterations
-        return scheduled and iteration >= max(1, config.static_iterations) and iteration != self.saved
+        return scheduled and iteration > 0 and iteration != self.saved
 
     def validate(self) -> None:
         """Score the model on the held-out clips and save it if it is the best so far."""

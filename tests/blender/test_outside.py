@@ -83,21 +83,6 @@ def test_a_failed_command_ends_the_work_with_its_last_word():
         ended.close()
 
 
-def test_work_is_cancelled_where_interrupts_are_ignored():
-    """As in a Blender that a script started in the background; what it starts must not inherit that."""
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        running = work("import time; print('up', flush=True); time.sleep(20); print('slept')")
-        while running.text != "up":
-            running.poll()
-        running.cancel()
-        assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
-        assert (wait(running).text, running.error) == ("up", "Testing was cancelled.")
-        running.close()
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
 def test_a_missing_interpreter_is_one_sentence(tmp_path):
     failed = wait(Work("Testing", lambda _: [[str(tmp_path / "python")]]))
     assert (
@@ -106,8 +91,15 @@ def test_a_missing_interpreter_is_one_sentence(tmp_path):
     failed.close()
 
 
-def test_work_is_cancelled_and_leaves_nothing():
-    running = work("import time; print('up', flush=True); time.sleep(60)", "print('never')")
+@pytest.mark.parametrize("heeds", [signal.default_int_handler, signal.SIG_IGN], ids=["heeded", "ignored"])
+def test_work_is_cancelled_and_leaves_nothing(heeds):
+    """Also where this process ignores interrupts, as a shell's background job does."""
+    before = signal.signal(signal.SIGINT, heeds)
+    try:
+        running = work("import time; print('up', flush=True); time.sleep(600)", "print('never')")
+        assert signal.getsignal(signal.SIGINT) is heeds
+    finally:
+        signal.signal(signal.SIGINT, before)
     while not running.text:
         assert not running.poll()
         time.sleep(0.01)

@@ -35,30 +35,24 @@ def small_blocks(monkeypatch) -> None:
 
 
 @pytest.fixture(scope="module")
-def sheet(toy_grid) -> Mesh:
-    """Nine vertices that lie bent, and a tenth that no triangle uses."""
-    points, faces = toy_grid(3, 3, 0.06, 0.05)
-    points[:, 2] = 0.4 * np.abs(points[:, 0]) + 0.002 * np.random.default_rng(0).normal(size=9)
+def sheet() -> Mesh:
+    """A triangle with a hinge at each of its edges, bent, and a seventh vertex that no triangle uses."""
+    points = np.array([[0.0, 0, 0], [0.03, 0, 0], [0.06, 0, 0], [0.015, 0.03, 0], [0.045, 0.03, 0], [0.03, 0.06, 0]])
+    points[:, 2] = 0.4 * np.abs(points[:, 0] - 0.03) + 0.002 * np.random.default_rng(0).normal(size=6)
+    faces = np.array([[0, 1, 3], [1, 2, 4], [1, 4, 3], [3, 4, 5]])
     return Mesh("/sheet", np.concatenate([points, [[0.1, 0, 0]]]), faces)
 
 
-@pytest.fixture(scope="module")
-def scrap(sheet) -> Mesh:
-    """Three triangles of it with two hinges."""
-    return Mesh("/scrap", sheet.points, sheet.faces[[0, 2, 4]])
-
-
 def crumpled(rest: np.ndarray) -> np.ndarray:
-    return rest[:, :, None] + 0.006 * np.random.default_rng(1).normal(size=(10, 3, FRAMES))
+    return rest[:, :, None] + 0.006 * np.random.default_rng(1).normal(size=(7, 3, FRAMES))
 
 
 def extreme(rest: np.ndarray) -> np.ndarray:
-    """Frames of every kind: crumpled, stretched, one side turned almost onto the other, and collapsed bit by bit."""
-    x, side, angle = crumpled(rest), rest[:, 0] > 0.01, np.linspace(-2.9, 2.9, 6)
+    """Frames of every kind: crumpled, stretched, the tip turned almost onto the others, and collapsed bit by bit."""
+    x, angle = crumpled(rest), np.linspace(-2.9, 2.9, 6)
     x[..., 3:6] *= [1.5, 2, 4]
-    x[side, ::2, 6:12] = 0
-    x[side, :, 6:12] += 0.025 * np.stack([np.cos(angle), 0 * angle, np.sin(angle)])
-    for start, gone in zip((12, 14, 16, 18), ([0], [0, 3], [0, 2, 3, 4, 5], range(9))):
+    x[5, :, 6:12] = x[3:5, :, 6:12].mean(axis=0) + 0.03 * np.stack([0 * angle, np.cos(angle), np.sin(angle)])
+    for start, gone in zip((12, 14, 16, 18), ([0], [4], [3, 4], range(6))):
         x[list(gone), :, start : start + 2] = x[1, :, start : start + 2]
     return x
 
@@ -73,7 +67,7 @@ def evaluate(terms: str, mesh: Mesh, fabric: Fabric, positions: np.ndarray, dtyp
     samples = contact_samples(mesh, fabric)
     sampled = np.einsum("sk,skcn->scn", samples.weights, positions[samples.corners])
     normal = rng.normal(size=sampled.shape)
-    offset = (normal * sampled).sum(1) + 0.03 * rng.normal(size=(len(sampled), FRAMES))
+    offset = (normal * sampled).sum(1) + 0.03 * rng.normal(0.5, size=(len(sampled), FRAMES))
     path = positions[:, :, :1] + 0.02 * rng.normal(size=(len(positions), 3, MOVING + 2)) + 0.5
     root = rng.normal([[0], [-2], [0]], 0.3, size=(3, FRAMES))
     gravity = rng.normal([[0], [-9], [0]], size=(3, FRAMES))
@@ -121,10 +115,10 @@ def test_terms_of_single_vertices(sheet, terms, fabric):
     assert_equal_to_reference(terms, sheet, fabric, crumpled(sheet.points))
 
 
-def test_a_triangle_that_is_wound_the_other_way(scrap):
-    faces = scrap.faces.copy()
-    faces[2] = faces[2, ::-1]
-    assert_equal_to_reference("elastic", Mesh("/mixed", scrap.points, faces), STVK, crumpled(scrap.points))
+def test_a_triangle_that_is_wound_the_other_way(sheet):
+    faces = sheet.faces.copy()
+    faces[3] = faces[3, ::-1]
+    assert_equal_to_reference("elastic", Mesh("/mixed", sheet.points, faces), STVK, crumpled(sheet.points))
 
 
 def test_without_hinges_only_stretch_is_left(sheet):
@@ -149,7 +143,7 @@ def folding(rest: float, fabric: Fabric = STVK) -> GarmentEnergy:
 
 
 def test_angles_all_around():
-    x = tensor(fold(np.concatenate([np.linspace(-np.pi, np.pi, 200)[1:-1], [1e-6, -1e-3]])))
+    x = tensor(fold(np.concatenate([np.linspace(-np.pi, np.pi, 80)[1:-1], [1e-6, -1e-3]])))
     turned = torch.atan2(-x[3, 1].double(), -x[3, 0].double()).cpu()
     found = folding(0.0).elastic(x)[1].double().cpu()
     np.testing.assert_allclose(found, STVK.bending / 8 * turned**2, rtol=2e-6)
@@ -169,9 +163,9 @@ def test_collapsing_faces_count_as_flat_and_pull_nowhere(fabric):
 
 
 def test_stitches_are_those_of_the_reference(sheet):
-    over = np.concatenate([sheet.points, sheet.points[:9] * 0.4 + [0.005, -0.01, 0.002]])
-    mesh = Mesh("/two", over, np.concatenate([sheet.faces, sheet.faces + 10]))
-    x, found = over[:, :, None] + 0.004 * np.random.default_rng(4).normal(size=(19, 3, FRAMES)), []
+    over = np.concatenate([sheet.points, sheet.points[:6] * 0.4 + [0.018, 0.01, 0.002]])
+    mesh = Mesh("/two", over, np.concatenate([sheet.faces, sheet.faces + 7]))
+    x, found = over[:, :, None] + 0.004 * np.random.default_rng(4).normal(size=(13, 3, FRAMES)), []
     for dtype in (torch.float32, torch.float64):
         energy, at = GarmentEnergy(mesh, STVK, device=DEVICE, dtype=dtype), tensor(x, dtype).requires_grad_()
         value = energy.stitch(at)
@@ -182,16 +176,11 @@ def test_stitches_are_those_of_the_reference(sheet):
 
 
 @pytest.mark.parametrize("terms", ["elastic", "potential", "kinetic"])
-def test_a_second_call_gives_the_same_bits(scrap, terms):
-    first, second = (evaluate(terms, scrap, WOVEN, crumpled(scrap.points), torch.float32) for _ in range(2))
-    for one, other in zip(first, second):
-        assert all(np.array_equal(*pair) for pair in zip(one, other))
-
-
-@pytest.mark.parametrize("terms", ["elastic", "potential", "kinetic"])
-def test_a_position_that_is_not_a_number_shows_in_its_frame_alone(scrap, terms):
-    x = crumpled(scrap.points)
+def test_a_second_call_gives_the_same_bits_but_for_a_frame_that_is_not_a_number(sheet, terms):
+    x = crumpled(sheet.points)
+    whole = evaluate(terms, sheet, WOVEN, x, torch.float32)
     x[4, 1, 2] = np.nan
-    for value, gradient in evaluate(terms, scrap, STVK, x, torch.float32):
+    for (value, gradient), (expected, slope) in zip(evaluate(terms, sheet, WOVEN, x, torch.float32), whole):
         assert np.flatnonzero(np.isnan(value)).tolist() == [2]
-        assert not np.isnan(np.delete(gradient, 2, axis=2)).any()
+        assert np.array_equal(np.delete(value, 2), np.delete(expected, 2))
+        assert np.array_equal(np.delete(gradient, 2, axis=2), np.delete(slope, 2, axis=2))

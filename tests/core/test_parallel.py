@@ -28,6 +28,7 @@ from ssilk_core.errors import EXIT_OK, EXIT_WORSE, SsilkError
 from ssilk_core.events import silent
 from ssilk_core.fabrics import Fabric
 from ssilk_core.training import parallel
+from ssilk_core.training import run as training
 from ssilk_core.training.job import TrainJob
 from ssilk_core.training.parallel import TORCHRUN_VARIABLES, ProcessGroup, join_process_group
 from ssilk_core.training.run import TrainingRun, train
@@ -35,8 +36,8 @@ from ssilk_core.training.state import state_path
 from ssilk_core.training.validation import Score
 
 SHORT = TrainConfig(
-    iterations=24, static_fraction=0.3, pretraining_batch=8, batch=4, window=5, static_batch=8,
-    learning_rate_warmup=2, ema_decay=0.9, validate_every=12, valid_frames=12, seed=7,
+    iterations=8, static_fraction=0.3, pretraining_batch=8, batch=4, window=5, static_batch=8,
+    learning_rate_warmup=2, ema_decay=0.9, validate_every=4, valid_frames=12, seed=7,
 )  # fmt: skip
 # Without noise, a step depends on where the windows stand and on nothing drawn.
 ONE_STEP = replace(SHORT, static_fraction=0.0, noise=0.0)
@@ -113,6 +114,7 @@ def resumed(job: TrainJob, group: ProcessGroup) -> list[tuple[bool, int]]:
 
 def main(folder: Path) -> None:
     torch.set_num_threads(1)
+    training.CHECK_INTERVAL = 4  # iterations after which processes agree to stop
     job: TrainJob = pickle.loads((folder / "job").read_bytes())
     with join_process_group("cpu") as (group, device):
         job = replace(job, device=device)
@@ -191,11 +193,11 @@ def test_a_step_that_one_cannot_do_is_skipped_by_all(together):
 
 def test_all_know_the_same_score(together):
     ours, theirs = (found["trained"] for found in together)
-    assert ours == theirs and ours.finished and ours.iterations == 24
+    assert ours == theirs and ours.finished and ours.iterations == 8
 
 
 def test_one_that_is_asked_to_stop_stops_all_and_a_resumed_run_equals_a_whole_one(job, together):
-    assert together[0]["resumed"] == together[1]["resumed"] == [(False, 20), (True, 24)]
+    assert together[0]["resumed"] == together[1]["resumed"] == [(False, 4), (True, 8)]
     whole, halves = (job.output.parent / f"{name}.safetensors" for name in ("whole", "halves"))
     assert halves.read_bytes() == whole.read_bytes()
     ours, theirs = (load_file(state_path(path)) for path in (halves, whole))

@@ -30,11 +30,11 @@ def tube(radius: float, columns: int = COLUMNS, rows: int = ROWS, height: float 
 
 def limb(radius: float = RADIUS) -> Mesh:
     """Return a closed cylinder about the y axis, longer than the tube."""
-    side = tube(radius, 96, 21, 1.0)
+    side = tube(radius, 96, 11, 1.0)
     ends = np.array([[0.0, 0, 0], [0, 1, 0]])
-    ring, last = np.arange(96), 20 * 96 + np.arange(96)
-    low = np.c_[np.roll(ring, -1), ring, np.full(96, 21 * 96)]
-    high = np.c_[last, np.roll(last, -1), np.full(96, 21 * 96 + 1)]
+    ring, last = np.arange(96), 10 * 96 + np.arange(96)
+    low = np.c_[np.roll(ring, -1), ring, np.full(96, 11 * 96)]
+    high = np.c_[last, np.roll(last, -1), np.full(96, 11 * 96 + 1)]
     return Mesh("Limb", np.r_[side.points, ends] - [0, 0.2, 0], np.r_[side.faces, low, high])
 
 
@@ -92,7 +92,7 @@ def test_cloth_deeper_than_40_mm_is_not_fitted_and_stays():
 @pytest.mark.parametrize("end", [lambda points: points * [0.99, 1, 0.99], lambda points: points * np.nan])
 def test_what_settling_would_make_worse_stays(monkeypatch, end):
     monkeypatch.setattr("ssilk_core.preflight.settle._Solve.run", lambda solve: end(solve.cloth.points))
-    cloth = dented(tube(RADIUS + 0.006))
+    cloth = dented(tube(RADIUS + 0.006, 24, 15))
     found = settle(cloth, limb())
     assert found.failed and found.left and not found.offsets.any() and found.after is found.before
     assert "because settling found no shape" in _why_still(found)
@@ -100,7 +100,7 @@ def test_what_settling_would_make_worse_stays(monkeypatch, end):
 
 def test_an_inspection_words_its_finding_without_settling(monkeypatch):
     monkeypatch.setattr("ssilk_core.preflight.settle._Solve.run", lambda solve: pytest.fail("settled"))
-    cloth = dented(tube(RADIUS + 0.006))
+    cloth = dented(tube(RADIUS + 0.006, 24, 15))
     found = next(penetration(cloth, limb()))
     inside = part_inside(cloth, limb())
     assert found.fixable and found.fix.endswith("--fix settles it") and found.count == len(inside.vertices) > 0
@@ -112,7 +112,7 @@ def test_a_garment_whose_equations_are_singular_stays(monkeypatch):
         raise RuntimeError("Factor is exactly singular")
 
     monkeypatch.setattr("scipy.sparse.linalg.splu", singular)
-    found = settle(dented(tube(RADIUS + 0.006)), limb())
+    found = settle(dented(tube(RADIUS + 0.006, 24, 15)), limb())
     assert found.failed and found.left and not found.offsets.any()
 
 
@@ -126,7 +126,6 @@ def test_seams_stay_closed():
     faces[beyond] = copy[faces[beyond]]
     cut = Mesh("Cut", np.r_[whole.points, whole.points[seam]], faces)
     found = settle(cut, limb())
-    assert np.array_equal(settle(cut, limb()).offsets, found.offsets)
     assert found.offsets[seam].any() and np.array_equal(found.offsets[seam], found.offsets[copy[seam]])
 
 
@@ -173,6 +172,7 @@ def test_a_corner_of_the_body_between_vertices_of_the_cloth_is_covered():
     faces = np.r_[np.c_[corner, corner + 9, corner + 1], np.c_[corner + 1, corner + 9, corner + 10]]
     roof = Mesh("Roof", np.c_[x.reshape(-1) + 0.017, np.full(81, 0.045), z.reshape(-1) + 0.008], faces)
     found = settle(roof, body)
+    assert np.array_equal(settle(roof, body).offsets, found.offsets)
     from ssilk_core.setup.surface import closest_on_surface
 
     after = Mesh("Roof", roof.points + found.offsets, faces)

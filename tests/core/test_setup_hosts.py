@@ -65,7 +65,7 @@ def character() -> Character:
     trunk = trimesh.creation.cylinder(0.1, height=1.0, sections=48)
     trunk.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
     trunk.apply_translation([0, 0.5, 0])
-    trunk = trunk.subdivide().subdivide().subdivide()
+    trunk = trunk.subdivide().subdivide()
     lean = (trunk.vertices[:, 1:2] / 0.6 - 0.3).clip(0, 1)
     skin = SkinWeights("/Body", np.tile([0, 1], (len(lean), 1)), np.hstack([1 - lean, lean]))
     bind = np.tile(np.eye(4), (2, 1, 1))

@@ -63,8 +63,8 @@ def test_what_is_free_falls_along_the_parabola_of_implicit_euler(scene, toy_grid
     points, faces = toy_grid(5, 3)
     potential = IncrementalPotential(dressed(scene, points, faces, np.zeros(15, dtype=bool)), CALM, device=CPU)
     x0, velocity, dt = tensor(points), torch.tensor([0.3, 2.0, -0.1], dtype=torch.float64)[:, None], 1 / 30
-    path = advance(potential, x0, velocity, dt, 20)
-    n = torch.arange(21, dtype=torch.float64)
+    path = advance(potential, x0, velocity, dt, 10)
+    n = torch.arange(11, dtype=torch.float64)
     fall = torch.tensor([0.0, -G, 0.0], dtype=torch.float64)[:, None] * dt**2 * n * (n + 1) / 2
     torch.testing.assert_close(path, x0 + velocity * n * dt + fall, rtol=0, atol=1e-6)
 
@@ -127,7 +127,7 @@ def swing(scene: Scene, dt: float, seconds: float, angle: float = 0.02) -> tuple
 def test_a_pendulum_swings_with_the_period_and_damping_of_implicit_euler(scene) -> None:
     # x'' = -w^2 x under implicit Euler: a step multiplies by 1 / (1 - i w dt), turning by atan(w dt).
     dt = 1 / 120
-    angles, frequency = swing(scene, dt, 2.5)
+    angles, frequency = swing(scene, dt, 1.9)
     crossings = np.flatnonzero(np.diff(np.sign(angles)))
     at = crossings + angles[crossings] / (angles[crossings] - angles[crossings + 1])
     half = np.pi / np.arctan(frequency * dt)
@@ -161,7 +161,7 @@ def test_energy_never_grows_and_less_is_lost_with_shorter_steps(scene, toy_grid)
     start = None
     left = []
     for dt in (1 / 120, 1 / 360, 1 / 1080):
-        energy = bounced(scene, toy_grid, dt, 0.1)
+        energy = bounced(scene, toy_grid, dt, 0.05)
         start = energy[0] if start is None else start
         assert (np.diff(energy) <= 1e-9 * energy[0]).all() and energy[-1] > 0
         left.append(energy[-1] / start)
@@ -188,9 +188,9 @@ CLOTH = Fabric("toy", bending=1e-4, margin=0.01)
 
 
 def test_a_batch_of_shots_equals_one_by_one(scene, toy_motion) -> None:
-    motions = [toy_motion(scene, 7), toy_motion(scene, 4, speed=1.5), toy_motion(scene, 6, fps=60.0)]
+    motions = [toy_motion(scene, 4), toy_motion(scene, 2, speed=1.5), toy_motion(scene, 6, fps=60.0)]
     together = simulate(scene, CLOTH, motions, SHORT)
-    assert [len(points) for points in together] == [7, 4, 3]
+    assert [len(points) for points in together] == [4, 2, 3]
     for motion, points in zip(motions, together):
         (alone,) = simulate(scene, CLOTH, [motion], SHORT)
         np.testing.assert_allclose(points, alone, atol=2e-5)
@@ -211,7 +211,7 @@ def test_progress_counts_every_frame_of_every_shot(scene, toy_motion) -> None:
 
 
 def test_pinned_vertices_are_skinned_plainly(scene, toy_motion) -> None:
-    motion = toy_motion(scene, 5, fps=60.0)
+    motion = toy_motion(scene, 3, fps=60.0)
     options = replace(SHORT, substeps=2)
     (points,) = simulate(scene, CLOTH, [motion], options)
     (shot,) = shots_of([motion], options)
@@ -234,33 +234,33 @@ def test_a_shot_has_the_frames_of_its_motion(scene, toy_motion) -> None:
 
 
 def test_a_shot_begins_anew_after_a_cut(scene, toy_motion) -> None:
-    motion = toy_motion(scene, 9)
+    motion = toy_motion(scene, 5)
     moved = motion.translations.copy()
-    moved[5:, 0] += [20.0, 0.0, 0.0]
+    moved[3:, 0] += [20.0, 0.0, 0.0]
     cut = replace(motion, translations=moved)
     first, second = split_into_spans(cut, 0, 30.0, 1)
-    assert (first.first, first.frame_count, second.first, second.frame_count) == (0, 5, 5, 4)
+    assert (first.first, first.frame_count, second.first, second.frame_count) == (0, 3, 3, 2)
     (points,) = simulate(scene, CLOTH, [cut], SHORT)
-    (alone,) = simulate(scene, CLOTH, [cut.clip(5, 9)], SHORT)
-    np.testing.assert_allclose(points[5:], alone, atol=1e-3)  # what the tolerance leaves a quasi-static state
+    (alone,) = simulate(scene, CLOTH, [cut.clip(3, 5)], SHORT)
+    np.testing.assert_allclose(points[3:], alone, atol=1e-3)  # what the tolerance leaves a quasi-static state
 
 
 def test_sequences_are_simulated_as_shots_of_their_own(scene, toy_motion) -> None:
-    motion = toy_motion(scene, 8)
-    (points,) = simulate(scene, CLOTH, [motion], replace(SHORT, sequence=5))
-    for start in (0, 5):
-        (alone,) = simulate(scene, CLOTH, [motion.clip(start, start + 5)], SHORT)
-        np.testing.assert_allclose(points[start : start + 5], alone, atol=1e-3)
+    motion = toy_motion(scene, 5)
+    (points,) = simulate(scene, CLOTH, [motion], replace(SHORT, sequence=3))
+    (second,) = simulate(scene, CLOTH, [motion.clip(3, 5)], SHORT)
+    np.testing.assert_allclose(points[3:], second, atol=1e-3)
     (whole,) = simulate(scene, CLOTH, [motion], replace(SHORT, sequence=50))
-    assert np.abs(points[5:] - whole[5:]).max() > 5e-3  # it comes swinging there
+    np.testing.assert_allclose(points[:3], whole[:3], atol=1e-3)
+    assert np.abs(points[3:] - whole[3:]).max() > 5e-3  # it comes swinging there
 
 
 def test_a_garment_comes_to_rest_with_its_character(scene, toy_motion) -> None:
     motion = toy_motion(scene, 8, speed=2.0)
-    held = np.r_[np.arange(8), np.full(30, 7)]
+    held = np.r_[np.arange(8), np.full(22, 7)]
     stopped = Motion("/stop", 30.0, motion.rotations[held], motion.translations[held])
     options = SimulationOptions(solver=SolverOptions(tolerance=1e-3))
-    (points,) = simulate(scene, replace(CLOTH, drag=1.0), [stopped], options)
+    (points,) = simulate(scene, replace(CLOTH, drag=2.0), [stopped], options)
     speed = np.linalg.norm(np.diff(points, axis=0), axis=2).mean(1) * 30
     assert speed[5:8].max() > 0.5 and speed[-1] < 0.02
 
@@ -279,9 +279,10 @@ def test_a_quasi_static_pose_hangs_lower_than_plain_skinning(scene, toy_motion) 
 
 
 def test_single_precision_stays_close(scene, toy_motion) -> None:
-    motion = toy_motion(scene, 5)
+    motion = toy_motion(scene, 3)
     (double,) = simulate(scene, CLOTH, [motion], SHORT)
-    options = replace(SHORT, precision="float32", solver=SolverOptions(tolerance=1e-2))
+    held = SolverOptions(tolerance=1e-3)  # rounding lets a state without inertia come no nearer
+    options = replace(SHORT, precision="float32", solver=SolverOptions(tolerance=1e-2), quasi_static_solver=held)
     (single,) = simulate(scene, CLOTH, [motion], options)
     assert np.abs(single - double).max() < 2e-3
 

@@ -18,7 +18,7 @@ from ssilk_core.stress.outcome import CaseMeasurement, markdown
 from ssilk_core.stress.subject import Effort, StressSubject
 from ssilk_core.stress.trials import gradient_error, train_trial
 
-TINY = Effort(seconds=1.0, frames=0.02, steps=2, simulated=2, vertices=120)
+TINY = Effort(seconds=1.0, frames=0.02, steps=2, simulated=2, vertices=20)
 FABRIC = Fabric("toy", bending=1e-4)
 
 

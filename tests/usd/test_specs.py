@@ -12,7 +12,7 @@ from ssilk_usd.read_stage import open_stage
 from ssilk_usd.specs import free_when_closed
 from ssilk_usd.units import StageUnits
 
-PRIMS, TIMES = 40, 300
+PRIMS, TIMES = 40, 100
 
 
 class MallocInfo(ctypes.Structure):
