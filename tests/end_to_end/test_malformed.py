@@ -496,7 +496,7 @@ MODELS = [
         folder_at("no.safetensors"),
     ),
     Case("truncated model", BAKE, ("model.safetensors", "truncated"), truncated("model.safetensors")),
-    Case("empty model", BAKE, ("model.safetensors", "this is a USD stage"), text("model.safetensors", "")),
+    Case("empty model", BAKE, ("model.safetensors", "not a safetensors"), text("model.safetensors", "")),
     Case(
         "foreign model",
         BAKE,
