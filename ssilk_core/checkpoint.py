@@ -22,7 +22,7 @@ from .assets import Character, Garment, Mesh, ProxyRig, Scene, Skeleton, SkinWei
 from .config import ModelConfig
 from .errors import SsilkError, fail
 from .fabrics import Fabric, fabric_of_file
-from .files import replacing
+from .files import is_usd, replacing
 from .packing import dequantize, narrowest, quantize
 from .parameters import Shapes, parameter_shapes
 from .tensors import pack_tensors, read_tensors
@@ -138,6 +138,7 @@ def _document(model: ModelFile) -> dict[str, Any]:
         "config": asdict(model.config),
         "fabric": asdict(model.fabric),
         "provenance": model.provenance,
+        **({} if (colour := model.scene.garment.colour) is None else {"colour": colour}),
     }
 
 
@@ -187,6 +188,13 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     try:
         tensors, words = read_tensors(path, HEADER_NAME)
     except ValueError as error:
+        if is_usd(path):
+            fail(
+                str(path),
+                "this is a USD stage",
+                "a model is a .safetensors file that 'ssilk train' wrote",
+                "model and stage may have been swapped",
+            )
         first = str(error).partition("\n")[0]
         raise SsilkError(
             f"{path}: this is not a safetensors file, or it is truncated or damaged ({first}); train again or fetch "
@@ -293,7 +301,11 @@ def _scene_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Scene
         tensors["scene.rig.bind_transforms"],
         skin("rig", paths["rig"]),
     )
-    garment = Garment(mesh, skin("plain", paths["garment"]), tensors["scene.classes"])
+    colour = document.get("colour")
+    if colour is not None:
+        red, green, blue = (min(max(float(part), 0.0), 1.0) for part in colour)
+        colour = red, green, blue
+    garment = Garment(mesh, skin("plain", paths["garment"]), tensors["scene.classes"], colour=colour)
     return Scene(Character(paths["skeleton"], skeleton, ()), garment, rig)
 
 

@@ -78,6 +78,26 @@ def silent(event: Event) -> None:
     """Ignore an event."""
 
 
+class Countdown:
+    """Report each step of a task as it is done, with the time that those to come take at the pace so far.
+
+    The first step tells no time and does not count for the pace, because it often loads or settles what the others
+    find ready.
+    """
+
+    def __init__(self, total: int, report: Reporter, done: int = 0) -> None:
+        self.total, self.report, self.done = total, report, done
+        self._first: tuple[float, int] | None = None
+
+    def __call__(self, steps: int = 1) -> None:
+        """Report that so many more steps are done."""
+        self.done += steps
+        now = time.monotonic()
+        since, before = self._first = self._first or (now, self.done)
+        pace = (now - since) / (self.done - before) if self.done > before else None
+        self.report(Progress(self.done, self.total, None if pace is None else pace * (self.total - self.done)))
+
+
 class JsonReporter:
     """Print one JSON object per line, by default on standard output: {"event": "progress", "done": ...}."""
 

@@ -20,6 +20,7 @@ from .errors import SsilkError, fail
 WRITABLE = "choose an output folder that exists and that you may write to"
 UNFINISHED = ".{}.partial-{}-"  # start of temporary names: the stem of the target, and who writes
 _WRITER = re.compile(r"\.partial-(?P<host>[0-9a-f]+)\.(?P<process>\d+)\.(?P<began>\d+)-")
+USD_NAMES, USD_BEGINNINGS = (".usd", ".usda", ".usdc", ".usdz"), (b"PXR-USDC", b"#usda ")
 STEM = 64  # characters of a target's stem in temporary names, which may have 255 in all
 ABANDONED = 24 * 3600.0  # seconds without a change after which a temporary file's writer has ended, wherever it ran
 
@@ -131,6 +132,13 @@ def _began(process: int) -> int | None:
     except OSError:
         return None
     return 0 if state in "ZX" else int(rest[18])
+
+
+def is_usd(path: Path) -> bool:
+    """Return whether a file is one of USD, by its name or by how it begins."""
+    with path.open("rb") as file:
+        begins = file.read(len(USD_BEGINNINGS[0]))
+    return path.suffix in USD_NAMES or begins.startswith(USD_BEGINNINGS)
 
 
 def need_writable(target: str | Path) -> None:

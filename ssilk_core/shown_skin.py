@@ -18,7 +18,9 @@ class ShownSkin:
         covered: points that the garment covers.
         mean, worst: mean share over frames, and that of the worst frame.
         bare, worst_bare: the same of skin with no cloth within reach; None where an earlier version counted.
-        clip, frame: the worst frame, of several equal ones the first; of a shot its time code.
+        clip, frame: the worst frame, of several equal ones the first: of a shot its time code, of a motion that was
+            evaluated the motion's, and of a validation in training the frame from the clip's start, at the model's
+            rate.
         regions: share of what shows, of all frames together, at the joints that move most of it, largest first.
     """
 
@@ -42,11 +44,12 @@ class ShownSkin:
         """Whether the eye finds at once what shows."""
         return self.mean > MOST_MEAN or self.worst > MOST_WORST
 
-    def summary(self) -> dict[str, str]:
-        """Return figures for people."""
+    def summary(self, clock: str = "frame") -> dict[str, str]:
+        """Return figures for people; `clock` is what `frame` counts. No frame is the worst where nothing shows."""
+        worst = {"in the worst frame": f"{self.worst:.2%}, {self.clip} at {clock} {self.frame:g}"}
         return {
             "covered skin that shows": f"{self.mean:.3%}",
-            "in the worst frame": f"{self.worst:.2%}, {self.clip} at {self.frame:g}",
+            **(worst if self.worst else {}),
             **({"most at": self.where} if self.where else {}),
             **({} if self.bare is None else {"bare": f"{self.bare:.2%}"}),
             **({} if self.worst_bare is None else {"bare in its worst frame": f"{self.worst_bare:.2%}"}),
@@ -61,4 +64,5 @@ class ShownSkin:
     def __str__(self) -> str:
         worst = f"{self.clip}, frame {self.frame:g}" + (f"; most at {self.where}" if self.where else "")
         bare = "" if self.bare is None else f", {self.bare:.2%} is bare ({self.worst_bare:.2%} at most)"
-        return f"{self.mean:.3%} of the covered skin shows, {self.worst:.2%} in the worst frame ({worst}){bare}"
+        most = f", {self.worst:.2%} in the worst frame ({worst})" if self.worst else ""
+        return f"{self.mean:.3%} of the covered skin shows{most}{bare}"

@@ -40,6 +40,7 @@ class Garment:
         pins: 1 for each vertex that is to be pinned when classes are found, 0 for others, shape (V,), or None.
         levels: the least tightness at which each vertex is tight, as `classes_at` takes it, shape (V,), or None.
         surface: the physics material that its stage states, or None.
+        colour: (red, green, blue) of linear light to show it in, each from 0 to 1, or None if not authored.
     """
 
     mesh: Mesh
@@ -48,6 +49,7 @@ class Garment:
     pins: Ints | None = None
     levels: Floats | None = None
     surface: SurfaceMaterial | None = None
+    colour: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
         count = self.mesh.vertex_count

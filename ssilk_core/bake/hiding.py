@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..assets import Floats
-from ..events import Message, Progress, Reporter, silent
+from ..events import Countdown, Message, Reporter, silent
 from ..kinematics import motion_transforms, skin_points, skinning_matrices
 from ..mesh.hidden_faces import HiddenFaces, hidden_polygons
 from .rollout import BakeRollout
@@ -30,10 +30,10 @@ def covered_polygons(rollout: BakeRollout, report: Reporter = silent) -> HiddenP
 
     scene = rollout.deformer.scene
     body, frames = scene.character.merged_body().mesh, rollout.motion.frame_count
-    found = HiddenFaces(body, scene.garment.mesh)
-    for done, (posed, garment) in enumerate(zip(_posed_bodies(rollout), rollout.points(), strict=True), start=1):
+    found, told = HiddenFaces(body, scene.garment.mesh), Countdown(frames, report)
+    for posed, garment in zip(_posed_bodies(rollout), rollout.points(), strict=True):
         found.add(posed, garment)
-        report(Progress(done, frames))
+        told()
     meshes = [each.mesh for each in scene.character.bodies]
     masks = hidden_polygons(found.mask(), meshes)
     hidden, total = sum(int(mask.sum()) for mask in masks), sum(len(mask) for mask in masks)

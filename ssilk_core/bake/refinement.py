@@ -13,7 +13,7 @@ import numpy as np
 from ..assets import Floats
 from ..devices import select_device
 from ..errors import SsilkError, VerificationError
-from ..events import Message, Progress, Reporter, silent
+from ..events import Countdown, Message, Reporter, silent
 from .result import RefinementSummary, ShotShapes, Verification
 from .rollout import BakeRollout, Refinement
 
@@ -69,9 +69,9 @@ def refined_points(rollout: BakeRollout, report: Reporter = silent) -> Iterator[
 
 
 def _refined_frames(rollout: BakeRollout, report: Reporter) -> Iterator[RefinedFrame]:
-    frames = _refiner(rollout).frames(rollout.motion, rollout.network_vertices())
-    for done, frame in enumerate(frames, start=1):
-        report(Progress(done, rollout.motion.frame_count))
+    told = Countdown(rollout.motion.frame_count, report)
+    for frame in _refiner(rollout).frames(rollout.motion, rollout.network_vertices()):
+        told()
         yield frame
 
 
@@ -117,6 +117,7 @@ def verify_energies(rollout: BakeRollout, points: Iterable[Floats], report: Repo
         VerificationError: a frame has more.
     """
     energies, (judged, measured) = [], tee(points)
+    told = Countdown(rollout.motion.frame_count, report)
     changes = _refiner(rollout).changes(rollout.motion, rollout.network_vertices(), judged)
     for frame, (change, vertices) in enumerate(zip(changes, measured)):
         spacing = float(np.finfo(np.float32).eps) * np.abs(vertices).max()
@@ -127,5 +128,5 @@ def verify_energies(rollout: BakeRollout, points: Iterable[Floats], report: Repo
                 f"the {change.before:.6g} J of the network's state is allowed."
             )
         energies.append(change.after)
-        report(Progress(frame + 1, rollout.motion.frame_count))
+        told()
     return Verification(frames=len(energies), mean_energy_j=float(np.mean(energies)))

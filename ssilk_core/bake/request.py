@@ -87,8 +87,8 @@ class BakeRequest:
             fail("--samples-per-frame", found, f"1 to {MAX_SAMPLES_PER_FRAME} are allowed")
         if not 0 <= self.handles <= MAX_HANDLES:
             fail("--handles", f"{self.handles} frames", f"0 to {MAX_HANDLES} are allowed")
-        if self.time_range and not self.time_range[0] <= self.time_range[1]:
-            fail(f"--range {self.range}", "it ends before it begins", "FIRST-LAST is needed, such as 1001-1100")
+        if self.range is not None:
+            parse_range(self.range)
         if not 0 <= self.pre_roll <= MAX_PRE_ROLL:
             fail("--pre-roll", f"{self.pre_roll:g} seconds", f"0 to {MAX_PRE_ROLL:g} are allowed")
         if self.fps is not None and not MIN_FPS <= self.fps <= MAX_FPS:
@@ -103,15 +103,7 @@ class BakeRequest:
     @property
     def time_range(self) -> tuple[float, float] | None:
         """First and last time code of the range, infinite for all samples; None for that of the stage."""
-        if self.range is None:
-            return None
-        if self.range == "all":
-            return -inf, inf
-        found = re.fullmatch(rf"({_NUMBER})-({_NUMBER})", self.range)
-        if not found:
-            allowed = "first and last time code are needed, such as 1001-1100, or 'all'"
-            fail("--range", f"'{self.range}'", allowed)
-        return float(found[1]), float(found[2])
+        return None if self.range is None else parse_range(self.range)
 
     @property
     def inputs(self) -> dict[str, str]:
@@ -154,6 +146,24 @@ class BakeRequest:
         if isinstance(document, Mapping) and isinstance(document.get("keep"), str):
             document = {**document, "keep": vars(ModelSize.of(document["keep"]))}
         return from_plain(cls, document)
+
+
+def parse_range(text: str) -> tuple[float, float]:
+    """Return the first and last time code of "FIRST-LAST"; infinite ones for "all".
+
+    Raises:
+        SsilkError: it is neither, or ends before it begins.
+    """
+    if text == "all":
+        return -inf, inf
+    found = re.fullmatch(rf"({_NUMBER})-({_NUMBER})", text)
+    if not found:
+        allowed = "first and last time code are needed, such as 1001-1100, or 'all'"
+        fail("--range", f"'{text}'", allowed)
+    first, last = float(found[1]), float(found[2])
+    if first > last:
+        fail(f"--range {text}", "it ends before it begins", "FIRST-LAST is needed, such as 1001-1100")
+    return first, last
 
 
 def need_body(request: BakeRequest, include_body: bool) -> None:

@@ -136,6 +136,18 @@ class RefinementSummary:
         rounded = {name: float(f"{value:.4g}") for name, value in stated.items()}
         return {"iterations": self.iterations, **rounded, **(self.shapes.to_metadata() if self.shapes else {})}
 
+    def figures(self) -> dict[str, object]:
+        """Return figures for people, in the units of the others: joules, shares in percent, lengths in mm."""
+        return {
+            "iterations": self.iterations,
+            "energy before [J]": float(f"{self.energy_before_j:.4g}"),
+            "energy [J]": float(f"{self.energy_j:.4g}"),
+            "inside the body before": f"{self.inside_before:.3%}",
+            "inside the body": f"{self.inside:.3%}",
+            "moved, RMS [mm]": float(f"{1000 * self.moved_m:.4g}"),
+            **(self.shapes.to_metadata() if self.shapes else {}),
+        }
+
 
 @dataclass(frozen=True, kw_only=True)
 class BakeResult:
@@ -178,7 +190,7 @@ class BakeResult:
         """Return figures for people; `kind` is what the file is called."""
         if self.current:
             return {kind: str(self.path), "current": True}
-        refined = self.refinement.to_metadata() if self.refinement else {}
+        refined = self.refinement.figures() if self.refinement else {}
         return {
             kind: str(self.path),
             "frames": self.frames,
@@ -190,7 +202,7 @@ class BakeResult:
             **(self.reduction.to_metadata() if self.reduction else {}),
             **{f"refined: {name}": value for name, value in refined.items()},
             **(self.shapes.to_metadata() if self.shapes else {}),
-            **(self.shown_skin.summary() if self.shown_skin else {}),
+            **(self.shown_skin.summary("time code") if self.shown_skin else {}),
             **(self.verification.figures() if self.verification else {}),
             **({} if self.hidden_faces is None else {"hidden faces of the body": self.hidden_faces}),
             **({"put to rest": [str(span) for span in self.recovered]} if self.recovered else {}),

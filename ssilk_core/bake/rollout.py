@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..assets import Deformer, Floats, GarmentPose, Motion
-from ..events import Message, Progress, Reporter, silent
+from ..events import Countdown, Message, Reporter, silent
 from ..fabrics import Fabric
 from ..kinematics import deform, lbs_poses, slerp, split_at_cuts
 from ..quality import SizeReduction
@@ -127,9 +127,10 @@ class BakeRollout:
 
     def vertices(self, report: Reporter = silent) -> Iterator[Floats]:
         """Yield the decoder's garment vertices in the world [m], shape (V, 3), of each of the shot's poses."""
+        told = Countdown(self.motion.frame_count, report)
         for pose in self.poses():
             yield from self.decode(pose)
-            report(Progress(pose.start + pose.frame_count, self.motion.frame_count))
+            told(pose.frame_count)
 
     def network_vertices(self) -> Iterator[Floats]:
         """Yield the decoder's garment vertices in the world [m], shape (V, 3), of each of the network's poses."""

@@ -32,7 +32,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     add_bake(verb)
     verb.add_argument("-o", "--output", type=Path, required=True,
                       help="shot to write (.usdc, .usd, .usda, .usdz or .glb), or a folder of layers")  # fmt: skip
-    add_level(verb, "2MB for the shot")
+    add_level(verb, "2MB for the shot", plays=True)
 
 
 def run(options: argparse.Namespace, report: Reporter) -> int:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from ..bake import BakeTask, LayerFolder, plan_layers
 from ..errors import EXIT_OK, EXIT_TASKS, fail
-from ..events import Failed, GarmentEvent, Progress, Reporter, Result, Started
+from ..events import Countdown, Failed, GarmentEvent, Reporter, Result, Started
 from ..farm.job import FarmJob, submitted
 from ..farm.openjd import TEMPLATE, BundleOptions, write_bundle
 from .options import NumberRange, add_bake, layer_options, requests_of
@@ -83,11 +83,12 @@ def _run(tasks: Sequence[BakeTask], options: argparse.Namespace, report: Reporte
 
     report(Started("farm", len(tasks), {"output": str(options.output)}))
     ended: list[TaskOutcome] = []
+    told = Countdown(len(tasks), report)
     for outcome in run_on_cluster(tasks, options.output, bake_here, address=options.cluster or None):
         ended.append(outcome)
         if outcome.error:
             report(GarmentEvent(outcome.task.name, Failed(outcome.error)))
-        report(Progress(len(ended), len(tasks)))
+        told()
     layers = LayerFolder(options.output)
     layers.remove_unfinished(tasks)
     layers.write_stages([outcome.task for outcome in ended if outcome.result], report)

@@ -9,12 +9,13 @@ otherwise.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..config import PRESETS, preset_named
-from ..errors import EXIT_BAD_INPUT, EXIT_OK, fail
+from ..errors import EXIT_BAD_INPUT, EXIT_OK, SsilkError, fail
 from ..events import Reporter, Result, silent
 from ..files import replacing
 from . import options as shared
@@ -22,6 +23,7 @@ from . import options as shared
 if TYPE_CHECKING:
     from ssilk_usd.units import StageUnits
 
+    from ..assets import Motion, Skeleton
     from ..preflight.inspection import PreflightInput
     from ..preflight.units import FileUnits
 
@@ -65,7 +67,6 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 def _read_inputs(options: argparse.Namespace, report: Reporter) -> PreflightInput:
     """Read everything that is inspected."""
     from ssilk_usd.facts import animated
-    from ssilk_usd.read_motion import read_motions
     from ssilk_usd.repair import repair_lock
 
     from ..preflight.inspection import PreflightInput
@@ -73,13 +74,30 @@ def _read_inputs(options: argparse.Namespace, report: Reporter) -> PreflightInpu
 
     character, garment, rig = shared.read(options, report)
     file, prim = shared.wardrobe(options)
-    motions = read_motions(options.motion, character.skeleton)
+    motions, unread = _readable(options.motion, character.skeleton)
     return PreflightInput(
         character=character, garment=garment, rig=rig, character_units=_units(options.stage),
         garment_units=_units(file), locked=repair_lock(file, prim), motions=motions,
-        preset=preset_named(options.preset or _default_preset()),
+        preset=preset_named(options.preset or _default_preset()), unread=unread,
         files=[MotionFile(motion.path, *animated(motion, character.skeleton)) for motion in motions],
     )  # fmt: skip
+
+
+def _readable(paths: Sequence[Path], skeleton: Skeleton) -> tuple[list[Motion], dict[str, str]]:
+    """Return the motions that can be read, and what is wrong with each other one by its file.
+
+    Raises:
+        SsilkError: a file or a folder is missing.
+    """
+    from ssilk_usd.read_motion import motion_sources, read_motion
+
+    found, unread = [], {}
+    for source in motion_sources(paths):
+        try:
+            found.append(read_motion(source, skeleton))
+        except SsilkError as error:
+            unread[str(source)] = str(error)
+    return found, unread
 
 
 def _default_preset() -> str:

@@ -141,12 +141,7 @@ def add_bake(verb: argparse.ArgumentParser) -> None:
     about = "; ".join(f"{name}: {target.about}" for name, target in TARGETS.items())
     verb.add_argument("--target", choices=TARGETS, default="usd", help=f"who receives it (default usd). {about}")
     verb.add_argument("--fps", type=RATE, help="frames per second of the shot (default: the motion's)")
-    verb.add_argument(
-        "--range",
-        metavar="FIRST-LAST",
-        help="frames to bake, as time codes of the motion, such as 1001-1100, or 'all' that have samples (default: "
-        "the range of the motion's stage, or all); --range=-3-5 where FIRST is negative",
-    )
+    add_range(verb, "frames to bake", "the range of the motion's stage, or all")
     verb.add_argument("--handles", type=NumberRange(0, MAX_HANDLES, int), default=0, metavar="N",
                       help="frames before and after the range that are baked as well, where there are samples "
                            "(default 0)")  # fmt: skip
@@ -161,6 +156,16 @@ def add_bake(verb: argparse.ArgumentParser) -> None:
     )
     _add_names(verb)
     _add_output(verb)
+
+
+def add_range(verb: argparse.ArgumentParser, what: str, default: str) -> None:
+    """Add --range, which `parse_range` reads; `what` it names, and in words what is taken without it."""
+    verb.add_argument(
+        "--range",
+        metavar="FIRST-LAST",
+        help=f"{what}, as time codes of the motion, such as 1001-1100, or 'all' that have samples (default: "
+        f"{default}); --range=-3-5 where FIRST is negative",
+    )
 
 
 def _add_names(verb: argparse.ArgumentParser) -> None:
@@ -202,9 +207,12 @@ def _add_output(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--device", default="cpu", help="where the network runs (default cpu)")
 
 
-def add_level(verb: argparse.ArgumentParser, size: str) -> None:
-    """Add --quality and --budget; `size` says of what a budget in bytes is."""
-    levels = "; ".join(f"{level.name}: {level.about}" for level in QUALITIES.values())
+def add_level(verb: argparse.ArgumentParser, size: str, *, plays: bool = False) -> None:
+    """Add --quality and --budget; `size` says of what a budget in bytes is, `plays` that levels limit the rate."""
+    rates = {
+        level.name: f", at most {level.fps:g} frames a second" for level in QUALITIES.values() if plays and level.fps
+    }
+    levels = "; ".join(f"{level.name}: {level.about}{rates.get(level.name, '')}" for level in QUALITIES.values())
     verb.add_argument("--quality", choices=QUALITIES, help=f"level of quality ({levels})")
     verb.add_argument("--budget", metavar="AMOUNT", help=f"keep the most within 0.3ms for each frame, or {size}")
 

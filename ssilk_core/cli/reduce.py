@@ -75,7 +75,7 @@ def _motions(file: ModelFile, options: argparse.Namespace) -> list[Motion]:
         fail(
             str(options.model),
             "the motions of its training are not where they were",
-            "motions are needed to measure what each part contributes",
+            "what is kept is fitted to motions, as 'ssilk bake --quality' fits it to the motion that it bakes",
             "name motion files or folders with --motions",
         )
     return read_motions(options.motions or there, file.scene.character.skeleton)

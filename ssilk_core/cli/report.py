@@ -18,6 +18,7 @@ from ..errors import EXIT_OK, fail
 from ..events import Reporter, Result, Started
 from ..fabrics import Fabric, fabric_of_file
 from ..files import replacing
+from ..shown_skin import ShownSkin
 from .options import check_output
 
 if TYPE_CHECKING:
@@ -53,13 +54,20 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     with replacing(options.output) as temporary:
         temporary.write_text(text, encoding="utf-8")
     figures = {name: value for section in measured for name, value in section.figures.items()}
-    page_bytes = options.output.stat().st_size
-    report(
-        Result(
-            "report", {"page": str(options.output), "bytes": page_bytes, **({"garments": figures} if figures else {})}
-        )
-    )
+    told: dict[str, object] = {"garments": figures} if options.json and figures else _told(figures)
+    report(Result("report", {"page": str(options.output), "bytes": options.output.stat().st_size, **told}))
     return EXIT_OK
+
+
+def _told(figures: dict[str, Any]) -> dict[str, object]:
+    """Return the figures of each garment in words."""
+    found: dict[str, object] = {}
+    for name, own in figures.items():
+        skin = own.get("shown_skin")
+        found[name] = str(ShownSkin(**skin)) if skin else "it covers no skin"
+        if own.get("non-finite frames"):
+            found[f"{name}: frames that are not finite"] = own["non-finite frames"]
+    return found
 
 
 def _check(options: argparse.Namespace) -> None:

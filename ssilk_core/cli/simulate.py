@@ -5,8 +5,8 @@ Every frame minimises, over all vertices, the energy that networks are trained w
 garment on joints and blendshapes of the shot's own, within 1 mm (RMS) and 5 mm (any vertex) of the simulated points,
 beside the moving body. --points writes the points themselves, as references are that models are compared with.
 Several motions advance together, each into a file of its own in a folder: a GPU takes about as long for many as for
-one. Each file appears when its shot is finished. The same command, given again after an interruption, simulates only
-what is missing; delete a file to simulate it again.
+one. --range starts at rest in its first frame. Each file appears when its shot is finished. The same command, given
+again after an interruption, simulates only what is missing; delete a file to simulate it again.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from ..bake import naming
+from ..bake.request import parse_range
 from ..errors import EXIT_OK, SsilkError, fail
-from ..events import Message, Progress, Reporter, Result, Started
+from ..events import Countdown, Message, Reporter, Result, Started
 from ..fabrics import Fabric
 from ..files import replacing
 from . import options as shared
@@ -52,6 +53,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--shot-name", metavar="PATTERN",
                       help="name of each file in a folder, such as '{parent}_{stem}' (default: the motion file's, "
                            f"and the prim's where one is named); {naming.FIELDS}")  # fmt: skip
+    shared.add_range(verb, "frames to simulate", "all")
     shared.add_fabric(verb)
     verb.add_argument(
         "--fps", type=shared.RATE, default=30.0, help="frames per second (default 30, as models are trained)"
@@ -77,7 +79,8 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Simulate and write."""
-    from ssilk_usd.read_motion import motion_files, read_motion
+    from ssilk_usd.frame_range import read_in_range
+    from ssilk_usd.read_motion import motion_files
 
     from ..devices import select_device
     from ..simulate import SimulationOptions
@@ -97,7 +100,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         solver=SolverOptions(tolerance=options.tolerance, iterations=options.iterations),
         quasi_static_solver=SolverOptions(tolerance=options.tolerance, iterations=150),
     )
-    motions = [read_motion(str(path), scene.character.skeleton) for path in options.motion]
+    frames = parse_range(options.range or "all")
+    motions = [read_in_range(str(path), scene.character.skeleton, frames) for path in options.motion]
     shots = [
         _Shot(output, motion, _provenance(options, path, fabric))
         for output, motion, path in zip(outputs, motions, options.motion)
@@ -172,17 +176,19 @@ def _written(
     """Simulate into open files, frame by frame; return figures for people."""
     from ..simulate import Simulator, shots_of
 
-    simulator, motions = Simulator(scene, fabric, settings, device=device), [shot.motion for shot in shots]
+    simulator = Simulator(scene, fabric, settings, device=device, report=report)
+    motions = [shot.motion for shot in shots]
     played = shots_of(motions, settings)
     total = sum(motion.frame_count for motion in played)
     report(Started("simulate", total, {"outputs": [str(shot.output) for shot in shots]}))
     figures, start = _Figures(settings.solver.tolerance), time.monotonic()
     with ExitStack() as stack:
         caches = _Caches(stack, options, shots, scene, played, report)
-        for done, frame in enumerate(simulator.frames(motions), start=1):
+        told = Countdown(total, report)
+        for frame in simulator.frames(motions):
             caches.write(frame.shot, frame.number, frame.points)
             figures.add(frame)
-            report(Progress(done, total, (time.monotonic() - start) / done * (total - done)))
+            told()
     fits = caches.figures()
     return {**figures.of_all(total, time.monotonic() - start), **fits}
 
@@ -305,6 +311,7 @@ def _provenance(options: argparse.Namespace, motion: Path, fabric: Fabric) -> di
         "contents": " ".join(stage_contents(str(path)).digest for path in (options.stage, garment, motion)),
         "sequence": options.sequence or 0,
         "fabric": fabric.name,
+        **({"range": options.range} if options.range not in (None, "all") else {}),
         **{name: getattr(options, name) for name in names},
         **{name: ", ".join(getattr(options, name)) for name in lists},
     }  # fmt: skip

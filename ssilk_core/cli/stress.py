@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import EXIT_OK, EXIT_VERIFICATION, fail
-from ..events import Message, Progress, Reporter, Result, Started
+from ..events import Countdown, Message, Reporter, Result, Started
 from .options import check_output
 
 if TYPE_CHECKING:
@@ -59,14 +59,14 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
             f"groups are {', '.join(dict.fromkeys(case.group for case in CASES))}",
         )
     report(Started("stress", len(cases)))
-    found, faults = [], []
-    for number, case in enumerate(cases):
+    found, faults, told = [], [], Countdown(len(cases), report)
+    for case in cases:
         outcome = case.run(subject)
         found.append(outcome)
         if outcome.verdict not in case.allowed:
             faults.append(f"{case.group}: {case.name}")
             report(Message(f"{faults[-1]} {outcome.verdict}: {outcome.said}", "warning"))
-        report(Progress(number + 1, len(cases)))
+        told()
     report(Message(markdown(found)))
     if options.output:
         _write(options, found)

@@ -26,7 +26,7 @@ class TakeRecord:
             "kinetic energy" [J], "largest stretch", and mean squares of "jerk", of "static distance", that to the
             method's own static state, and of `ERRORS`. NaN where a take has too short a past.
         stretches: histogram of the larger principal stretch of all triangles.
-        shown: the covered skin that shows, by frames of the clip.
+        shown: the covered skin that shows, by time codes of the clip's motion.
     """
 
     values: dict[str, Tensor]
@@ -41,7 +41,7 @@ def recorded(
     """Measure a method over a take, and its errors where there is a `reference`."""
     parts, shown, stretches = [], [], torch.zeros(BINS, dtype=torch.float64)
     ours, theirs = _Past(method, take), _Past(reference, take) if reference else None
-    count, first = take_set.takes[take].frame_count, take_set.takes[take].first
+    count, codes = take_set.takes[take].frame_count, take_set.takes[take].codes
     for start in range(0, count, FRAMES_PER_CHUNK):
         frames = range(start, min(start + FRAMES_PER_CHUNK, count))
         path, still = ours.joined(frames), method.still(take, frames)
@@ -49,7 +49,7 @@ def recorded(
         stretch = principal_stretches(dressed.columns(x))[0]
         stretches += stretch_histogram(stretch)
         states = dressed.covered.states(x, take_set.character(take, frames))
-        shown.append(ShownCounts.of(states, range(first + frames.start, first + frames.stop)))
+        shown.append(ShownCounts.of(states, codes[frames.start : frames.stop].tolist()))
         values = {
             **frame_energies(dressed, take_set, take, frames, path),
             **_moving(dressed, path, len(frames)),

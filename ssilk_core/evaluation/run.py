@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..assets import Motion
 from ..errors import fail
-from ..events import Progress, Reporter, silent
+from ..events import Countdown, Reporter, silent
 from ..motion_bank import MotionBank, build_bank
 from .figures import Figures, LoopDrift, MinimumErrors, Settling, SolverErrors
 from .methods import (
@@ -142,12 +142,12 @@ class _Run:
         options: EvaluationOptions,
         report: Reporter,
     ) -> None:
-        self.dressed, self.playlist, self.options, self.report = dressed, playlist, options, report
+        self.dressed, self.playlist, self.options = dressed, playlist, options
         cut = [takes_of(name, motion, dressed.fps, options.sequence) for name, motion in playlist.clips.items()]
         self.takes = [take for takes in cut for take in takes]
         self.clips = {number: take.clip for number, take in enumerate(self.takes)}
         self.simulated = takes_in(self.clips, playlist.simulated)
-        self.done, self.total = 0, len(self.takes) * (len(methods) + 1) + len(self.simulated)
+        self.told = Countdown(len(self.takes) * (len(methods) + 1) + len(self.simulated), report)
         self.joints = methods[0].joints
         take_set = build_take_set(self.takes, dressed, self.joints)
         read = playlist.read
@@ -161,8 +161,7 @@ class _Run:
         for take in takes:
             reference = self.cache if take in self.simulated and method is not self.cache else None
             records[take] = recorded(self.dressed, take_set, method, take, reference)
-            self.done += 1
-            self.report(Progress(self.done, self.total))
+            self.told()
         return Tally(records, self.clips)
 
     def rows(self, tally: Tally, method: str) -> Iterator[ResultRow]:

@@ -47,7 +47,7 @@ def _table(
 
 ENERGIES = ("frames", "L_tot [J]", *(f"{name} [J]" for name in TERMS), "vertices inside the body [%]",
             "gravity excess over LBS [% m g L]", "L_tot of a clip, min / median / max [J]")  # fmt: skip
-SHOWN_SKIN = ("covered points", "covered skin that shows [%]", "in the worst frame [%]", "clip", "frame",
+SHOWN_SKIN = ("covered points", "covered skin that shows [%]", "in the worst frame [%]", "clip", "time code",
               "where, share of what shows", "bare, mean / worst [%]")  # fmt: skip
 MOTION = ("kinetic energy [J]", "RMS distance to static state [mm]", "RMS jerk [m/s3]", "RMS jerk / LBS",
           "larger principal stretch, 50 / 95 / 99 / 100 %")  # fmt: skip
@@ -77,7 +77,8 @@ def _energies(f: Figures) -> list[str]:
 
 def _shown_skin(f: ShownSkin) -> list[str]:
     bare = " / ".join(_percent(share) for share in (f.bare, f.worst_bare) if share is not None)
-    return [str(f.covered), _percent(f.mean, 3), _percent(f.worst), f.clip, f"{f.frame:g}", f.where, bare]
+    worst = (f.clip, f"{f.frame:g}") if f.worst else ("", "")
+    return [str(f.covered), _percent(f.mean, 3), _percent(f.worst), *worst, f.where, bare]
 
 
 def _motion(f: Figures) -> list[str]:

@@ -23,15 +23,24 @@ class Take:
         clip: its name.
         first: frame of the clip that it begins with, at the rate of `motion`.
         motion: the character's poses at the model's rate.
+        start, step: frame of the clip's file that the clip begins with, and frames of the file from one frame of the
+            take to the next. They are time codes where a frame of the file is one.
     """
 
     clip: str
     first: int
     motion: Motion
+    start: float = 0.0
+    step: float = 1.0
 
     @property
     def frame_count(self) -> int:
         return self.motion.frame_count
+
+    @property
+    def codes(self) -> Floats:
+        """When each frame is in the clip's file, shape (F,)."""
+        return self.start + (self.first + np.arange(self.frame_count)) * self.step
 
 
 def takes_of(clip: str, motion: Motion, fps: float, longest: int | None = None) -> list[Take]:
@@ -40,7 +49,8 @@ def takes_of(clip: str, motion: Motion, fps: float, longest: int | None = None) 
     Frames are those of `ssilk simulate` at the same rate, so that a point cache of the clip lines up.
     """
     spans = split_into_spans(motion, 0, fps, 1, longest)
-    return [Take(clip, span.first, span.motion) for span in spans if span.motion.frame_count >= SHORTEST]
+    clock = motion.start, motion.fps / fps
+    return [Take(clip, span.first, span.motion, *clock) for span in spans if span.motion.frame_count >= SHORTEST]
 
 
 def _played(motion: Motion, fps: float, seconds: Floats) -> Motion:

@@ -28,11 +28,13 @@ class GlbMesh:
         name: of the mesh.
         faces: triangles, shape (F, 3).
         is_garment: it is the garment; what is not counts as body.
+        colour: none of its own, because `write_glb` gives all garments one plain material.
     """
 
     name: str
     faces: Ints
     is_garment: bool
+    colour: None = None
 
 
 class GlbShot:

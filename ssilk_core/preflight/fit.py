@@ -24,6 +24,9 @@ PIERCED = (
 MAX_INSIDE_SHARE = 0.25  # share of vertices inside the body above which penetration is an error
 ALIGNMENT_SAMPLES = 400  # number of vertices that the alignment is measured with
 SCALES = (1.0, 0.01, 100.0, 0.1, 10.0, 0.001, 1000.0, 0.0254, 1 / 0.0254)
+# Largest extents of garments, in heights of the body: those that can be, and those that most have.
+SIZES, USUAL_SIZES = (0.04, 5.0), (0.1, 2.0)
+MOVED = "; its size is that of a garment, so it appears to have been moved"
 # Rotations that correct a wrong up axis: none, z up read as y up, y up read as z up.
 UP_AXIS_ROTATIONS = {
     "": np.eye(3),
@@ -41,42 +44,58 @@ class UnitCorrection:
 
 
 def alignment(mesh: Mesh, body: Mesh, *, fixable: bool = False) -> Findings:
-    """Yield an error if the garment is not on the body, with the scale or up axis that would put it there.
+    """Yield an error if the garment is not on the body, and say whether its size, its axis or its place is wrong.
 
-    `fixable` means that its file authors neither, so that --fix may write them.
+    `fixable` means that its file authors neither units nor axis, so that --fix may write them.
     """
     guess, points = find_unit_correction(mesh, body), mesh.points[np.unique(mesh.faces)]
     if not _apart(points, body) and guess is None:
         return
-    distance, size = _distance(points, body), np.ptp(points, axis=0).max()
+    distance, size, height = _distance(points, body), float(np.ptp(points, axis=0).max()), _height(body)
+    moved = guess is None and _is_between(size, height, SIZES)
     yield Finding(
         severity="error",
         code="alignment",
         prim=mesh.path,
         found=f"the garment is {size:.3g} m in size and lies {distance.min():.3g} to {distance.max():.3g} m from "
-        f"the body, which is {_height(body):.3g} m high{_described(guess)}",
+        f"the body, which is {height:.3g} m high{MOVED if moved else _described(guess)}",
         why="a garment is trained at its authored position: it must fit the body in the bind pose",
-        fix="set metersPerUnit and upAxis of its file, or apply its transforms and move it onto the body",
+        fix="move it onto the body, and apply its transforms"
+        if moved
+        else "set metersPerUnit and upAxis of its file, or apply its transforms and move it onto the body",
         fixable=fixable,
     )
 
 
 def find_unit_correction(mesh: Mesh, body: Mesh) -> UnitCorrection | None:
-    """Return the simplest scale and up axis that put a garment on the body.
+    """Return the scale and up axis that a garment's file should have stated; None if they explain nothing.
 
-    None if it is already there, or if no candidate puts it there. Scales are tried only for a garment that does not
-    touch the body: most of a wide gown is far from the body, too.
+    The scale is judged by the sizes of garment and body, because any garment that is made small enough lies near the
+    body's origin. Of several usual sizes, the simplest that puts the garment on the body is taken, and without one
+    that nearest to the middle of the usual. Where the garment touches the body its scale is right: most of a wide
+    gown is far from the body, too.
     """
     every = mesh.points[np.unique(mesh.faces)]
     points = every[:: max(1, len(every) // ALIGNMENT_SAMPLES)]
     if _near(points, body):
         return None
-    scales = SCALES if _apart(every, body) else (1.0,)
+    size, height = float(np.ptp(every, axis=0).max()), _height(body)
+    scales: list[float] = [1.0]
+    if _apart(every, body) and not _is_between(size, height, USUAL_SIZES):
+        scales = [scale for scale in SCALES if _is_between(scale * size, height, USUAL_SIZES)]
     for up, rotation in UP_AXIS_ROTATIONS.items():
         for scale in scales:
             if _worn(scale * points @ rotation.T, body):
                 return UnitCorrection(scale, up)
-    return None
+    if not scales or _is_between(size, height, SIZES):
+        return None
+    middle = np.sqrt(np.prod(USUAL_SIZES)) * height
+    return UnitCorrection(min(scales, key=lambda scale: abs(np.log(scale * size / middle))), "")
+
+
+def _is_between(size: float, height: float, sizes: tuple[float, float]) -> bool:
+    """Return whether a garment's largest extent is one of `sizes`, given in heights of the body."""
+    return sizes[0] * height < size < sizes[1] * height
 
 
 def _height(body: Mesh) -> float:
@@ -85,8 +104,8 @@ def _height(body: Mesh) -> float:
 
 def _apart(points: Floats, body: Mesh) -> bool:
     """Return whether points are too far from the body, too small or too large to belong to a garment on it."""
-    size, height = np.ptp(points, axis=0).max(), _height(body)
-    return not 0.04 * height < size < 5 * height or bool(_distance(points, body).min() > 0.1 * height)
+    size, height = float(np.ptp(points, axis=0).max()), _height(body)
+    return not _is_between(size, height, SIZES) or bool(_distance(points, body).min() > 0.1 * height)
 
 
 def _near(points: Floats, body: Mesh) -> bool:

@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 
 import numpy as np
@@ -39,6 +39,7 @@ class PreflightInput:
         character_units, garment_units: units of the character's and the garment's file; equal if they share a file.
         locked: reason why the garment's vertices and faces must not change; empty if they may.
         motions, files: the motions, and further facts about their files.
+        unread: what keeps the other motions from being read, in a sentence, by their files.
         preset: settings for which memory and time are estimated.
     """
 
@@ -51,6 +52,7 @@ class PreflightInput:
     motions: Sequence[Motion]
     files: Sequence[MotionFile]
     preset: Preset
+    unread: Mapping[str, str] = field(default_factory=dict)
 
 
 def inspect(inputs: PreflightInput) -> list[Finding]:
@@ -106,6 +108,8 @@ def _on_fit(inputs: PreflightInput) -> Findings:
 
 def _on_motions(inputs: PreflightInput) -> Findings:
     skeleton, preset = inputs.character.skeleton, inputs.preset
+    for path, reason in inputs.unread.items():
+        yield motion.unread_motion(path, reason)
     for clip in inputs.motions:
         yield from motion.root_jumps(clip)
     for clip in inputs.motions:

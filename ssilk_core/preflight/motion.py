@@ -31,6 +31,18 @@ class MotionFile:
     times: Floats
 
 
+def unread_motion(path: str, reason: str) -> Finding:
+    """Return the error of a motion that cannot be read, for a `reason` in one sentence."""
+    return Finding(
+        severity="error",
+        code="motion-unread",
+        prim=path,
+        found=reason.removeprefix(f"{path}: ").removesuffix("."),
+        why="training refuses it, too",
+        fix="mend the file, or leave it out",
+    )
+
+
 def root_jumps(motion: Motion) -> Findings:
     """Yield the frames at which the root is teleported rather than animated."""
     starts = np.cumsum([span.frame_count for span in split_at_cuts(motion)])[:-1]

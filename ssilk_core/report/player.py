@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..assets import Floats
-from ..events import Progress, Reporter, silent
+from ..events import Countdown, Reporter, silent
 from ..view.player import PlayerMesh, ShotPlayer
 from ..view.shots import mesh_colours, need_matching
 
@@ -90,7 +90,8 @@ def _posed(
 
     What is not finite stands in the middle.
     """
-    for done, frame in enumerate(frames, start=1):
+    told = Countdown(len(frames), report)
+    for frame in frames:
         meshes = [points + [APART * side, 0.0, 0.0] for side, player in enumerate(players)
                   for points in player.points(player.frame_times[frame])]  # fmt: skip
         every = np.concatenate(meshes)
@@ -98,7 +99,7 @@ def _posed(
         middle = finite.mean(axis=0) if len(finite) else np.zeros(3)
         away = [(points - middle).astype(np.float32) for points in meshes]
         yield middle, [np.nan_to_num(points, nan=0, posinf=0, neginf=0) for points in away]
-        report(Progress(done, len(frames)))
+        told()
 
 
 def _described(

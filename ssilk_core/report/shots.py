@@ -10,7 +10,7 @@ import numpy as np
 
 from ..assets import Floats, Mesh
 from ..charts import ChartPanel, svg_chart
-from ..events import Progress, Reporter, silent
+from ..events import Countdown, Reporter, silent
 from ..fabrics import Fabric
 from ..view.camera import follow_cameras
 from ..view.player import ShotPlayer
@@ -47,12 +47,13 @@ def shot_sections(
         bodies: the meshes that garments collide with, at rest, by their index in the player.
     """
     meters = [TermsMeter(each.mesh, joined(list(bodies.values())), each.fabric, player.fps) for each in garments]
-    for number, time in enumerate(player.frame_times):
+    told = Countdown(len(player.frame_times), report)
+    for time in player.frame_times:
         points = player.points(time)
         body = np.concatenate([points[index] for index in bodies]) if bodies else None
         for each, meter in zip(garments, meters):
             meter.add(points[each.index], body, time)
-        report(Progress(number + 1, len(player.frame_times)))
+        told()
     first, *others = [part for each, meter in zip(garments, meters) for part in _sections(player, each, meter)]
     return [first, Section("The shot", played([player]), plays=True), *others]
 

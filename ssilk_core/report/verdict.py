@@ -14,6 +14,12 @@ from .page import Section
 from .terms import SHARE, SHOWN, STRETCH
 
 STRETCHED = 15.0  # stretch of 99 triangles in 100 beyond which the eye finds it at once [%]
+LEAST = 0.1  # below it a share has more digits [%]: one vertex is no 0.0 %
+COUNTED = (
+    "Covered skin is the skin that the cloth covers in the bind pose. Where other parts, such as hands, push through "
+    "the cloth, it counts as vertices inside the body."
+)
+CLOCK = "Frames are time codes of the shot. Seconds count from its first frame."
 INSIDE = 10.0  # share of the vertices inside the body in one frame [%]
 
 
@@ -57,11 +63,12 @@ def verdict(
         if values[SHARE][inside] > INSIDE:
             faults.append("it is inside the body")
         if values[SHARE][inside]:
-            words.append(
-                f"At most {values[SHARE][inside]:.1f} % of its vertices are inside the body, {when(inside)}."
-            )
+            share = values[SHARE][inside]
+            most = f"{share:.1f}" if share >= LEAST else f"{share:.1g}"
+            words.append(f"At most {most} % of its vertices are inside the body, {when(inside)}.")
     first = (
         f"Look at {name}: {' and '.join(faults)}." if faults else f"{name} holds: nothing that the eye would find."
     )
     lines = "".join(f"<li>{escape(each)}</li>" for each in words)
-    return Section(f"{name}: verdict", f"<p><strong>{escape(first)}</strong></p><ul>{lines}</ul>")
+    note = f'<p class="note">{f"{COUNTED} " if shown_skin else ""}{CLOCK}</p>'
+    return Section(f"{name}: verdict", f"<p><strong>{escape(first)}</strong></p><ul>{lines}</ul>{note}")

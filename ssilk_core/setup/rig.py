@@ -3,10 +3,7 @@
 
 from __future__ import annotations
 
-import itertools
 import re
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -120,23 +117,12 @@ def _clusters(
         np.array([areas[piece].sum() for piece in pieces]), np.array([len(piece) for piece in pieces]), count
     )
     parents, roots = character.skeleton.parents, options.roots_per_cluster
-    placed = _counting(int(shares.sum()), report)
+    placed = events.Countdown(int(shares.sum()), report)
     return [
         build_cluster(mesh, piece, seam, body_weights, parents, proxies=int(share), roots=roots, placed=placed)
         for piece, share in zip(pieces, shares)
         if share
     ]
-
-
-def _counting(total: int, report: events.Reporter) -> Callable[[], None]:
-    """Return a function to call after each of `total` proxies; it reports the progress and the time left."""
-    start, done = time.monotonic(), itertools.count(1)
-
-    def placed() -> None:
-        count = next(done)
-        report(events.Progress(count, total, (time.monotonic() - start) / count * (total - count)))
-
-    return placed
 
 
 def _affordable(piece_count: int, options: RigOptions, path: str, report: events.Reporter) -> int:

@@ -17,6 +17,7 @@ vertices are released, once.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -123,12 +124,17 @@ class State:
 
 @torch.no_grad()
 def minimise_from(
-    potential: IncrementalPotential, start: Tensor, inputs: StepInputs, options: SolverOptions
+    potential: IncrementalPotential,
+    start: Tensor,
+    inputs: StepInputs,
+    options: SolverOptions,
+    advanced: Callable[[], object] = lambda: None,
 ) -> Solution:
     """Minimise the energy of each frame over the free vertices; no frame ends higher than it starts.
 
     Args:
         start: initial positions, with pinned vertices in place, shape (V, 3, N).
+        advanced: called after each iteration.
 
     Raises:
         SsilkError: the energy of the start is not finite.
@@ -138,6 +144,7 @@ def minimise_from(
         if not search.drop_finished():
             break
         search.advance()
+        advanced()
     return search.solution
 
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from ..assets import Floats, Motion, Scene
 from ..constants import GRAVITY
 from ..errors import fail
-from ..events import Progress, Reporter, silent
+from ..events import Countdown, Message, Reporter, silent
 from ..fabrics import Fabric
 from .characters import CharacterPoser, MotionSpan, PosedCharacters, join_spans, split_into_spans
 from .incremental_potential import IncrementalPotential, StepInputs
@@ -129,7 +129,10 @@ class Simulator:
         options: SimulationOptions | None = None,
         *,
         device: torch.device | str = "cpu",
+        report: Reporter = silent,
     ) -> None:
+        """Prepare the energies of a garment; `report` hears when shots start, with their quasi-static states."""
+        self.report = report
         self.options, device = options or SimulationOptions(), torch.device(device)
         dtype = PRECISIONS[self.options.precision]
         self.potential = IncrementalPotential(scene, fabric, device=device, dtype=dtype)
@@ -153,11 +156,18 @@ class Simulator:
             running = [span for span in spans if span.motion.frame_count > step]
             poses = self.poser.poses_at(running, step)
             past = past and past.first(len(running))
-            solution = self.step(poses, past) if past else self.quasi_static(poses, poses.lbs)
+            solution = self.step(poses, past) if past else self._first(poses)
             world = solution.x.double() + poses.root
             past = StepHistory(world, past.last if past else None, poses.root, poses.lbs)
             if step % self.options.substeps == 0:
                 yield from _frames(running, step // self.options.substeps, world, solution)
+
+    def _first(self, poses: PosedCharacters) -> Solution:
+        """Return the states that spans start with, and report: on a processor they can take minutes."""
+        solver = self.options.quasi_static_solver
+        self.report(Message(f"cloth comes to rest in the first pose, in {solver.iterations} iterations at most"))
+        start, told = poses.lbs, Countdown(solver.iterations, self.report)
+        return minimise_from(self.potential, start, self.inputs(poses, None), solver, advanced=told)
 
     def quasi_static(self, poses: PosedCharacters, start: Tensor) -> Solution:
         """Return the quasi-static states of poses, minimised from `start` (V, 3, N), relative to the roots."""
@@ -224,12 +234,13 @@ def simulate(
     """
     if not motions:
         fail("simulation", "no motion given", "at least one is needed")
-    simulator = Simulator(scene, fabric, options, device=device)
+    simulator = Simulator(scene, fabric, options, device=device, report=report)
     counts = [shot.frame_count for shot in shots_of(motions, simulator.options)]
     points = [np.zeros((count, scene.garment.mesh.vertex_count, 3)) for count in counts]
-    for done, frame in enumerate(simulator.frames(motions), start=1):
+    told = Countdown(sum(counts), report)
+    for frame in simulator.frames(motions):
         points[frame.shot][frame.number] = frame.points
-        report(Progress(done, sum(counts)))
+        told()
     return points
 
 

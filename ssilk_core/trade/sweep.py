@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import SsilkError
-from ..events import Message, Progress, Reporter, silent
+from ..events import Countdown, Message, Reporter, silent
 from ..files import replacing
 from .collision_cost import CollisionCost
 from .measure import VariantMeter
@@ -71,7 +71,8 @@ class Results:
 def sweep(meter: VariantMeter, variants: Iterable[Variant], results: Results, report: Reporter = silent) -> None:
     """Measure the variants of a model that `results` lacks, and add each after its measurement."""
     tried = list(variants)
-    for done, variant in enumerate(tried):
-        report(Progress(done, len(tried)))
-        if not results.found(meter.name, variant):
-            results.add(meter.point(variant))
+    missing = [variant for variant in tried if not results.found(meter.name, variant)]
+    told = Countdown(len(tried), report, done=len(tried) - len(missing))
+    for variant in missing:
+        results.add(meter.point(variant))
+        told()

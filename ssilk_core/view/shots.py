@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,13 +11,13 @@ import numpy as np
 
 from ..assets import Floats
 from ..errors import fail
-from ..events import Progress, Reporter, silent
+from ..events import Countdown, Reporter, silent
 from .camera import Camera, follow_cameras
 from .colours import BODY, fabric_colour
 from .ordered_map import ordered_map
 from .output import FILM, PICTURE, check_suffix, write_film, write_image
 from .panels import add_captions, compare, contact_sheet
-from .player import ShotPlayer
+from .player import PlayerMesh, ShotPlayer
 from .render import Image, render
 from .surface import Surface
 
@@ -182,9 +181,15 @@ def shot_surfaces(player: ShotPlayer, frame: int) -> tuple[Surface, ...]:
 
 
 def mesh_colours(player: ShotPlayer) -> list[Floats]:
-    """Return a colour in sRGB, shape (3,), for each mesh: skin in grey, each garment in a colour of its own."""
+    """Return a colour in sRGB, shape (3,), for each mesh: skin in grey, each garment in its own or a fabric's."""
     garments = np.cumsum([mesh.is_garment for mesh in player.meshes]) - 1
-    return [fabric_colour(number) if mesh.is_garment else BODY for mesh, number in zip(player.meshes, garments)]
+
+    def colour(mesh: PlayerMesh, number: int) -> Floats:
+        if not mesh.is_garment:
+            return BODY
+        return fabric_colour(number) if mesh.colour is None else np.array(mesh.colour)
+
+    return [colour(mesh, number) for mesh, number in zip(player.meshes, garments)]
 
 
 def _drawn(panels: Iterator[Picture], look: Look, total: int, report: Reporter) -> Iterator[Image]:
@@ -196,9 +201,7 @@ def _drawn(panels: Iterator[Picture], look: Look, total: int, report: Reporter) 
         )
         return add_captions(image, top=panel.top, bottom=panel.bottom)
 
-    start = None
-    for done, image in enumerate(ordered_map(draw, panels, look.workers)):
-        start = start or time.monotonic()
-        left = (time.monotonic() - start) / done * (total - done - 1) if done else None
-        report(Progress(done + 1, total, seconds_left=left))
+    told = Countdown(total, report)
+    for image in ordered_map(draw, panels, look.workers):
+        told()
         yield image

@@ -95,6 +95,8 @@ def test_the_manifest_says_what_the_code_says():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert manifest["version"] == project["version"]
     assert manifest["license"] == ["SPDX:GPL-3.0-or-later"]
+    (holder,) = manifest["copyright"]
+    assert re.fullmatch(rf"20\d\d {manifest['maintainer']}", holder)
     assert manifest["blender_version_min"] == "4.2.0"
     for path in ADDON.rglob("*.py"):
         assert path.read_text().startswith("# SPDX-License-Identifier: GPL-3.0-or-later\n"), path

@@ -6,7 +6,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -67,6 +67,14 @@ def test_a_round_trip_is_exact(path, model):
                 np.testing.assert_array_equal(getattr(mine, item.name), getattr(theirs, item.name), err_msg=item.name)
     np.testing.assert_array_equal(read.scene.classes, model.scene.classes)
     assert read.scene.character.bodies == ()
+
+
+def test_a_model_knows_the_colour_of_its_garment(path, tmp_path):
+    file = load_model(path)
+    assert file.scene.garment.colour is None and "colour" not in header_of(path)
+    garment = replace(file.scene.garment, colour=(0.25, 0.5, 1.0))
+    save_model(tmp_path / "dyed.safetensors", replace(file, scene=replace(file.scene, garment=garment)))
+    assert load_model(tmp_path / "dyed.safetensors").scene.garment.colour == (0.25, 0.5, 1.0)
 
 
 @torch.no_grad()

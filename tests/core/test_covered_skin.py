@@ -86,6 +86,7 @@ def test_cloth_that_is_thrown_off_leaves_skin_bare_and_shows_nothing(scene):
     found = skin.figures([("flip", ShownCounts.of(skin.states(torch.cat([posed(points), thrown], -1), still(2))))])
     assert (found.mean, found.worst, found.bare, found.worst_bare) == (0, 0, 0.5, 1)
     assert str(found).endswith("50.00% is bare (100.00% at most)") and found.summary()["bare"] == "50.00%"
+    assert "worst frame" not in str(found) and "in the worst frame" not in found.summary()  # no frame is worse
     lost = skin.states(torch.full_like(thrown, torch.nan), still(1))
     assert lost.shows.all() and not lost.bare.any()  # what is nowhere is no garment that was lifted
     earlier = type(found)(**{name: value for name, value in vars(found).items() if "bare" not in name})

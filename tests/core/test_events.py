@@ -101,6 +101,18 @@ def test_a_log_gets_a_line_now_and_then_and_the_last_one_always(monkeypatch):
     assert stream.getvalue().split() == ["1/30", "11/30", "21/30", "30/30"]
 
 
+def test_the_time_left_is_told_at_the_pace_since_the_first_step(monkeypatch):
+    now, told = [100.0], []
+    monkeypatch.setattr(events.time, "monotonic", lambda: now[0])
+    done = events.Countdown(10, told.append, done=3)
+    for seconds in (60, 2, 4):  # the first one loads what the others find ready
+        now[0] += seconds
+        done()
+    assert told == [Progress(4, 10, None), Progress(5, 10, 10.0), Progress(6, 10, 12.0)]
+    done(4)
+    assert told[-1] == Progress(10, 10, 0.0)
+
+
 @pytest.mark.parametrize(
     "seconds, text",
     [

@@ -192,13 +192,18 @@ def test_inside_out():
 # Fit
 
 
+MOVED = "it appears to have been moved"
+
+
 @pytest.mark.parametrize(
     ("change", "hint"),
     [
         (lambda p: p * 100, "100 times its size"),
         (lambda p: p * 0.01, "0.01 times its size"),
         (lambda p: p[:, [0, 2, 1]] * [1, -1, 1], "Z is up"),
-        (lambda p: p + [3, 0, 0], "1."),
+        (lambda p: (p * [1, 1.6, 1] + [2.5, 0, 0]) * 100, "be 100 times its size"),  # far away besides
+        (lambda p: p + [3, 0, 0], MOVED),
+        (lambda p: p * 0.6 + [0, 0, 1], MOVED),  # made a tenth of its size, it would lie at the body's feet
     ],
 )
 def test_alignment(change, hint):
@@ -208,7 +213,8 @@ def test_alignment(change, hint):
     found, guess = only(fit.alignment(moved, body)), fit.find_unit_correction(moved, body)
     assert found.severity == "error" and hint in found.found
     # A mere offset is nothing that units could explain, and what is authored is not contradicted.
-    assert CENTIMETRES_ASSUMED.allows(guess) == (hint != "1.") and not METRES.allows(guess)
+    assert ("metersPerUnit" in found.fix) == CENTIMETRES_ASSUMED.allows(guess) == (hint != MOVED)
+    assert not METRES.allows(guess)
 
 
 def test_a_wide_gown_is_not_misplaced():

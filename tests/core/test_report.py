@@ -3,6 +3,7 @@
 
 import json
 import re
+from dataclasses import asdict
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,6 +12,7 @@ import trimesh
 
 from ssilk_core.assets import Mesh
 from ssilk_core.charts import ChartPanel, svg_chart
+from ssilk_core.cli.report import _told
 from ssilk_core.errors import SsilkError
 from ssilk_core.fabrics import Fabric
 from ssilk_core.report.figures import learning_of, section_of
@@ -89,8 +91,8 @@ def test_frames_that_are_not_finite_are_counted_and_named_by_their_time_code(toy
     class Lost:
         fps, frame_times = 30.0, [1001.0, 1002.0, 1003.0, 1004.0, 1005.0, 1006.0]
         meshes = (
-            SimpleNamespace(name="Cover", faces=faces, is_garment=True),
-            SimpleNamespace(name="Ball", faces=body.faces, is_garment=False),
+            SimpleNamespace(name="Cover", faces=faces, is_garment=True, colour=None),
+            SimpleNamespace(name="Ball", faces=body.faces, is_garment=False, colour=None),
         )
 
         def points(self, time: float) -> list[np.ndarray]:
@@ -112,9 +114,23 @@ def test_a_verdict_tells_what_is_wrong_where_and_when():
     body = verdict("Cape", values, skin, [11, 12, 13], 30.0).body
     assert "Look at Cape: skin shows through and the cloth stretches." in body
     assert "0.267 % of the covered skin shows on average, and 0.80 % in frame 13, at 0.07 s, most at LeftArm" in body
-    assert "stretch by at most 4 % as a rule, and by 21 % in frame 12, at 0.03 s" in body and "inside" not in body
+    assert "stretch by at most 4 % as a rule, and by 21 % in frame 12, at 0.03 s" in body and "At most" not in body
     calm = verdict("Cape", {name: np.zeros(3) for name in values}, None, [11, 12, 13], 30.0).body
     assert "Cape holds" in calm and "skin" not in calm
+    few = verdict("Cape", {**values, SHARE: np.array([0.0, 0.0368, 0.0])}, skin, [11, 12, 13], 30.0).body
+    assert "At most 0.04 % of its vertices are inside the body, in frame 12" in few
+    assert "Frames are time codes of the shot." in few
+    assert "skin that the cloth covers in the bind pose" in few and "Covered skin" not in calm
+
+
+def test_figures_are_printed_in_words():
+    skin = asdict(ShownSkin(frames=3, covered=100, mean=0.0, worst=0.0, clip="c", frame=1, regions={}))
+    told = _told({"Cape": {"shown_skin": skin, "non-finite frames": 2}, "Belt": {"non-finite frames": 0}})
+    assert told == {
+        "Cape": "0.000% of the covered skin shows",
+        "Cape: frames that are not finite": 2,
+        "Belt": "it covers no skin",
+    }
 
 
 def test_bodies_are_joined_in_their_order():

@@ -26,6 +26,7 @@ class Cloth:
     name: str
     is_garment: bool
     faces = FACES
+    colour = None
 
 
 class Waving:

@@ -13,8 +13,9 @@ from PIL import Image
 
 from ssilk_core.errors import SsilkError
 from ssilk_core.events import Progress
+from ssilk_core.view.colours import BODY, fabric_colour
 from ssilk_core.view.panels import GAP
-from ssilk_core.view.shots import Look, film_of_shots, sheet_of_shots, shot_surfaces
+from ssilk_core.view.shots import Look, film_of_shots, mesh_colours, sheet_of_shots, shot_surfaces
 
 BALL = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
 SMALL = Look(width=60, height=80)
@@ -26,6 +27,7 @@ class ToyMesh:
     name: str
     faces: np.ndarray
     is_garment: bool
+    colour: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,13 @@ class ToyShot:
         sheet = np.array([[-1, 1.2, -1], [-1, 1.2, 1], [1, 1.2, 1], [1, 1.2, -1]]) + drift
         sheet[:2, 1] += 0.2 * np.sin(time)
         return [BALL.vertices + [0, 0.5 + FLOOR, 0] + drift, sheet]
+
+
+def test_garments_have_the_colour_that_is_theirs():
+    sheet = np.array([[0, 1, 2], [0, 2, 3]])
+    own = ToyMesh("dyed", sheet, True, (0.1, 0.6, 0.2))
+    shot = ToyShot(meshes=(ToyMesh("skin", BALL.faces, False, (1.0, 0.0, 0.0)), own, ToyMesh("sheet", sheet, True)))
+    np.testing.assert_allclose(mesh_colours(shot), [BODY, own.colour, fabric_colour(1)])
 
 
 def frame_count(path) -> int:

@@ -193,6 +193,31 @@ def test_jumping_roots_and_still_joints_are_found(tmp_path, capsys):
     assert "Spine" in found["findings"]["still-joints"]["found"]
 
 
+def test_what_is_wrong_with_one_motion_does_not_hide_the_rest(tmp_path, capsys):
+    hero, cloth = write_hero(tmp_path / "hero.usda"), write_damaged(tmp_path / "tube.usda")
+    good = write_clip(tmp_path / "walk.usda", np.zeros(40))
+    other = tmp_path / "other.usda"
+    other.write_text(good.read_text().replace("Hips", "Pelvis").replace("Spine", "Chest"))
+    code, found = inspect(capsys, hero, "--garment", cloth, "--motion", other, good)
+    told = found["findings"]["motion-unread"]
+    assert code == 2 and told["severity"] == "error" and "another skeleton" in told["found"]
+    assert "isolated-vertices" in found["findings"] and "still-joints" in found["findings"]
+    assert main(["inspect", str(hero), "--garment", str(cloth), "--motion", str(tmp_path / "nowhere/")]) == 2
+    assert "no such file or folder; motions are USD files or folders of them" in capsys.readouterr().err
+
+
+def test_files_in_the_wrong_order_are_told_by_what_they_are(tmp_path, capsys):
+    hero, cloth = write_hero(tmp_path / "hero.usda"), write_damaged(tmp_path / "tube.usda")
+    assert main(["inspect", str(cloth), "--garment", str(hero)]) == 2
+    assert "stage and garment may have been swapped" in capsys.readouterr().err
+    model = tmp_path / "cape.safetensors"
+    model.write_bytes(b"\0")
+    words = ["bake", str(hero), "--stage", str(model), "--motion", str(cloth), "-o", str(tmp_path / "o.usda")]
+    assert main(words) == 2
+    assert "hero.usda: this is a USD stage; a model is a .safetensors file" in capsys.readouterr().err
+    assert main(["inspect", str(model)]) == 2 and "this is a trained model" in capsys.readouterr().err
+
+
 def write_textured(path: Path, radius: float) -> Path:
     """The tube pressed 3 mm into the body at its waist, in metres, with texture coordinates."""
     points, faces = tube(columns=24, rows=9)

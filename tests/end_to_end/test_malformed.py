@@ -506,7 +506,7 @@ MODELS = [
     Case(
         "model is a stage",
         "bake rigged.usda --stage rigged.usda --motion clip.usda -o new.usdc",
-        ("rigged.usda", "not a safetensors"),
+        ("rigged.usda", "this is a USD stage", "may have been swapped"),
     ),
     Case(
         "model of another format",
@@ -724,7 +724,7 @@ def test_a_full_disk_leaves_nothing(command, room, file, toy, tmp_path, monkeypa
 
 COMMANDS = [
     ("rig hero.usda --garment Hat -o new.usda", ("'Hat'",)),
-    ("bake clip.usda --stage rigged.usda --motion clip.usda -o new.usdc", ("not a safetensors",)),
+    ("bake clip.usda --stage rigged.usda --motion clip.usda -o new.usdc", ("this is a USD stage",)),
     ("train rigged.usda", ("--motions",)),
 ]
 

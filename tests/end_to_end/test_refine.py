@@ -128,7 +128,9 @@ def test_layers_offer_refined_points_beside_the_joints(there):
 def test_the_level_for_heroes_is_refined(there, capsys):
     assert main([*BAKE, "-o", "hero.usda", "--quality", "hero", "--json"]) == 0
     events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert events[-1]["detail"]["refined: iterations"] > 0 and Shot("hero.usda").is_skinned
+    detail = events[-1]["detail"]
+    assert detail["refined: inside the body"].endswith("%") and detail["refined: moved, RMS [mm]"] > 0
+    assert detail["refined: iterations"] > 0 and Shot("hero.usda").is_skinned
 
 
 def test_samples_within_frames_are_refined_too(there):

@@ -74,6 +74,17 @@ def test_points_that_no_skinning_reaches_are_kept_as_points(stage, monkeypatch, 
     assert "its skinning folds" in capsys.readouterr().err and not Shot(stage / "kept.usdc").is_skinned
 
 
+def test_a_range_is_that_of_a_bake_and_the_rest_state_is_announced(stage, capsys):
+    assert main([*SIMULATE, "brief.usda", "--points", "--range", "2-3", "-o", "part.usda"]) == 0
+    told = capsys.readouterr().err
+    assert told.index("comes to rest in the first pose") < told.index("2/2")
+    part = Shot(stage / "part.usda")
+    codes = UsdGeom.Mesh(part.stage.GetPrimAtPath(part.meshes[-1].path)).GetPointsAttr().GetTimeSamples()
+    assert codes == [2, 3]
+    assert main([*SIMULATE, "brief.usda", "--range", "2-300", "-o", "all.usda"]) == 2
+    assert "has samples from time code" in capsys.readouterr().err
+
+
 def test_several_motions_become_files_of_their_own(stage):
     assert main([*SIMULATE, "brief.usda", "short.usda", "-o", "caches"]) == 0
     lengths = {path.name: len(Shot(path).frame_times) for path in (stage / "caches").iterdir()}

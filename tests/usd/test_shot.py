@@ -151,6 +151,16 @@ def test_usdskel_reproduces_the_decoder(tmp_path, units, proxies, shapes, fps, s
     assert check_shot(path) == []
 
 
+def test_a_garment_keeps_its_colour(tmp_path):
+    rng = np.random.default_rng(4)
+    plain, motion = make_deformer(rng), make_motion(rng)
+    garment = replace(plain.scene.garment, colour=(0.25, 0.5, 1.0))
+    deformer = replace(plain, scene=replace(plain.scene, garment=garment))
+    write_shot(tmp_path / "shot.usdc", deformer, motion, make_poses(rng, deformer), units=CENTIMETRES_Z)
+    skeleton = read_character(tmp_path / "shot.usdc", garment="cape").skeleton
+    assert read_garment(tmp_path / "shot.usdc", skeleton).colour == (0.25, 0.5, 1.0)
+
+
 def test_body_meshes_follow_the_character(tmp_path):
     rng = np.random.default_rng(4)
     deformer, motion = make_deformer(rng), make_motion(rng)
@@ -160,6 +170,11 @@ def test_body_meshes_follow_the_character(tmp_path):
     matrices = skinning_matrices(motion_transforms(motion, skeleton.parents), skeleton.bind_transforms)
     shot = Shot(path)
     assert [(mesh.name, mesh.is_garment) for mesh in shot.meshes] == [("cape", True), ("Body", False)]
+    assert shot.meshes[0].colour is None
+    dyed = Usd.Stage.Open(str(path))
+    cloth = UsdGeom.PrimvarsAPI(dyed.GetPrimAtPath(shot.meshes[0].path))
+    cloth.CreatePrimvar("displayColor", Sdf.ValueTypeNames.Color3fArray, "constant").Set([(0.2140411, 0.0, 1.0)])
+    assert Shot(dyed).meshes[0].colour == pytest.approx((0.5, 0.0, 1.0), abs=1e-5)  # linear light as sRGB
     played = np.stack([shot.points(time)[1] for time in shot.frame_times])
     np.testing.assert_allclose(played, skin_points(body.mesh.points, body.skin, matrices), atol=2e-6)
 

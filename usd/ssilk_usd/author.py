@@ -18,6 +18,7 @@ from ssilk_core.kinematics import local_transforms, sorted_influences, world_tra
 from .body_faces import HiddenPolygons, author_faces, hide_polygons
 from .garment_api import GarmentRecord, apply_garment_api
 from .names import CLASS, LBS_SKIN, LEVEL, PIN, PROXIES, shape_name
+from .read_mesh import display_colour
 from .read_skin import leaf
 from .units import StageUnits
 
@@ -193,7 +194,12 @@ def extent_array(low: Floats, high: Floats) -> Vt.Vec3fArray:
 
 
 def mark_garment(prim: Usd.Prim, garment: Garment, proxies: Sequence[str] | None) -> None:
-    """Author a garment's vertex classes, what finds them, and the joint paths of its proxies, each unless None."""
+    """Author a garment's vertex classes, what finds them, the joint paths of its proxies, each unless None.
+
+    Its colour is authored where the prim has none.
+    """
+    if garment.colour is not None and display_colour(prim) is None:
+        UsdGeom.Gprim(prim).CreateDisplayColorAttr([Gf.Vec3f(*garment.colour)])
     if garment.classes is not None:
         _author_rows(prim, CLASS, garment.classes[:, None].astype(np.int32))
     if garment.pins is not None:

@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pxr import Usd
 
+from ssilk_core.assets import Motion, Skeleton
 from ssilk_core.errors import fail
 
-from .read_motion import find_animation, frame_rate, sampled_span
+from .read_motion import find_animation, frame_rate, read_motion, sampled_span
 from .read_stage import needs_whole_files, open_stage, split_location
 
 _TOLERANCE = 1e-3  # of a frame
@@ -101,6 +102,16 @@ def read_frame_range(
     before = min(handles, _whole(found_range.earlier, shown))
     after = min(handles, _whole(found_range.later, shown) - _whole(found_range.count, shown))
     return replace(found_range, before=before, after=after)
+
+
+def read_in_range(source: str, skeleton: Skeleton, asked: tuple[float, float]) -> Motion:
+    """Return a motion's frames in the range asked for, which is that of `read_frame_range`.
+
+    Raises:
+        SsilkError: as `read_frame_range` and `read_motion`.
+    """
+    found = read_frame_range(source, asked)
+    return read_motion(source, skeleton, within=(found.first, found.last) if found else None)
 
 
 def _whole(length: float, step: float) -> int:

@@ -11,7 +11,7 @@ from pxr import Usd, UsdGeom, UsdSkel
 from ssilk_core.assets import Floats, Ints
 from ssilk_core.errors import fail
 
-from .read_mesh import is_drawn, is_garment, read_mesh
+from .read_mesh import display_colour, is_drawn, is_garment, read_mesh
 from .read_stage import EARLIEST, PRIMS, StageLike, apply, column_matrix, open_stage, stage_name
 from .units import StageUnits
 
@@ -25,12 +25,14 @@ class ShotMesh:
         path: its prim's path.
         faces: triangles, shape (F, 3).
         is_garment: it is marked as a garment (see `read_mesh.is_garment`); what is not counts as body.
+        colour: the mean of its displayColor in sRGB, each from 0 to 1; None where it has none.
     """
 
     name: str
     path: str
     faces: Ints
     is_garment: bool
+    colour: tuple[float, float, float] | None = None
 
 
 class Shot:
@@ -166,7 +168,18 @@ class _PlainMesh:
 
 
 def _describe(prim: Usd.Prim) -> ShotMesh:
-    return ShotMesh(prim.GetName(), str(prim.GetPath()), read_mesh(prim, np.eye(4)).faces, is_garment(prim))
+    faces = read_mesh(prim, np.eye(4)).faces
+    return ShotMesh(prim.GetName(), str(prim.GetPath()), faces, is_garment(prim), _colour(prim))
+
+
+def _colour(prim: Usd.Prim) -> tuple[float, float, float] | None:
+    """Return a mesh's colour in sRGB (IEC 61966-2-1); None without one."""
+    found = display_colour(prim)
+    if found is None:
+        return None
+    linear = np.array(found)
+    red, green, blue = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055).tolist()
+    return red, green, blue
 
 
 def frame_times(stage: Usd.Stage, per_frame: int = 1) -> tuple[float, ...]:

@@ -12,7 +12,7 @@ from ssilk_core.errors import fail
 from .names import CLASS, LBS_SKIN, LEVEL, PIN, PROXIES
 from .read_carried import carried_by
 from .read_character import geom_to_core, is_skinned
-from .read_mesh import is_drawn, is_garment, read_mesh
+from .read_mesh import display_colour, is_drawn, is_garment, read_mesh
 from .read_skeleton import bound_skeleton, find_skeleton, skeletons
 from .read_skin import match_joints, read_influences, read_skin
 from .read_spaces import SkelSource
@@ -65,7 +65,7 @@ def read_garment(
     pins, levels = (_per_point(prim, name) for name in (PIN, LEVEL))
     pinned = None if pins is None else (pins >= 0.5).astype(np.int64)  # may be painted as weights
     surface = read_surface(prim, mesh)
-    return Garment(mesh, skin, _whole(prim, _per_point(prim, CLASS)), pinned, levels, surface)
+    return Garment(mesh, skin, _whole(prim, _per_point(prim, CLASS)), pinned, levels, surface, display_colour(prim))
 
 
 def find_garment(stage: Usd.Stage, garment: str | None = None) -> Usd.Prim:

@@ -26,6 +26,16 @@ def is_drawn(prim: Usd.Prim) -> bool:
     return not invisible and imageable.ComputePurpose() != UsdGeom.Tokens.guide
 
 
+def display_colour(prim: Usd.Prim) -> tuple[float, float, float] | None:
+    """Return the mean of a mesh's displayColor, of linear light, each from 0 to 1; None without a finite one."""
+    primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayColor")
+    found = primvar.Get(EARLIEST) if primvar and primvar.HasAuthoredValue() else None
+    if not found or not np.isfinite(found).all():
+        return None
+    red, green, blue = np.array(found, dtype=np.float64).reshape(-1, 3).mean(axis=0).clip(0, 1).tolist()
+    return red, green, blue
+
+
 def read_mesh(prim: Usd.Prim, to_core: Floats) -> Mesh:
     """Read a UsdGeom.Mesh; its earliest points are its rest shape.
 

@@ -44,18 +44,24 @@ def read_motions(paths: Iterable[str | Path], skeleton: Skeleton) -> list[Motion
     Raises:
         SsilkError: a folder has no USD files; also as `read_motion`.
     """
-    return [read_motion(path, skeleton) for path in _listed_folders(paths)]
+    return [read_motion(path, skeleton) for path in motion_sources(paths)]
 
 
 def motion_files(paths: Iterable[str | Path]) -> list[Path]:
     """Return the files that motions are read from, folders sorted by name."""
-    return [Path(split_location(str(path))[0]) for path in _listed_folders(paths)]
+    return [Path(split_location(str(path))[0]) for path in motion_sources(paths)]
 
 
-def _listed_folders(paths: Iterable[str | Path]) -> list[Path]:
-    """Return the paths, with each folder replaced by its USD files."""
+def motion_sources(paths: Iterable[str | Path]) -> list[Path]:
+    """Return the motions that paths name, "file[:/Prim/Path]" each; a folder stands for its USD files.
+
+    Raises:
+        SsilkError: there is no such file or folder, or a folder holds no USD file.
+    """
     files: list[Path] = []
     for path in map(Path, paths):
+        if not (path.is_dir() or Path(split_location(str(path))[0]).is_file()):
+            fail(str(path), "there is no such file or folder", "motions are USD files or folders of them")
         within = sorted(file for file in path.iterdir() if file.suffix in USD_SUFFIXES) if path.is_dir() else [path]
         if not within:
             fail(str(path), "the folder holds no USD files", f"motions are {', '.join(USD_SUFFIXES)} files")

@@ -9,12 +9,13 @@ from pathlib import Path
 from pxr import Usd, UsdGeom
 
 from ssilk_core.assets import Character, Garment, ProxyRig, Skeleton
+from ssilk_core.errors import fail
 from ssilk_core.events import Message, Reporter, silent
 
 from .names import PROXIES
 from .read_character import read_character
 from .read_garment import fitted_skeleton, read_garment
-from .read_skeleton import character_skeleton, find_skeleton
+from .read_skeleton import character_skeleton, find_skeleton, skeletons
 from .read_stage import (
     PRIMS,
     USD_SUFFIXES,
@@ -52,8 +53,9 @@ def read_scene(
     stage = open_stage(source)
     file, prim = split_location(garment) if garment else (None, None)
     if file and Path(file).suffix in USD_SUFFIXES:
-        character = read_character(stage, root=root, bodies=bodies, report=report)
         wardrobe, where = open_stage(file), {"garment": prim}
+        _need_order(stage, wardrobe)
+        character = read_character(stage, root=root, bodies=bodies, report=report)
     else:
         character = read_character(stage, root=root, bodies=bodies, garment=garment, report=report)
         wardrobe, where = stage, {"garment": garment, "root": root}
@@ -80,6 +82,17 @@ def read_rigged(source: StageLike) -> list[tuple[Skeleton, Garment, ProxyRig]]:
         assert rig is not None  # it lists proxies
         found.append((skeleton, read_garment(stage, skeleton, garment=name), rig))
     return found
+
+
+def _need_order(stage: Usd.Stage, wardrobe: Usd.Stage) -> None:
+    """Raise `SsilkError` where the garment's file holds the character, and the stage holds none."""
+    if skeletons(wardrobe) and not skeletons(stage):
+        fail(
+            stage_name(stage),
+            f"it holds no Skeleton, and {stage_name(wardrobe)} does",
+            "the stage is the character's, and --garment the garment's",
+            "stage and garment may have been swapped",
+        )
 
 
 def _announce_units(stage: Usd.Stage, report: Reporter) -> None:

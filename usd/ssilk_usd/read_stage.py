@@ -96,6 +96,8 @@ def open_stage(source: StageLike) -> Usd.Stage:
         return source
     if not Path(source).is_file():
         fail(str(source), "there is no such file", "a USD file is needed", "check the path")
+    if Path(source).suffix == ".safetensors":
+        fail(str(source), "this is a trained model", "a USD file is needed", "model and stage may have been swapped")
     quiet = UsdUtils.CoalescingDiagnosticDelegate()  # the errors below replace what USD would print
     stage = Usd.Stage.Open(str(source), Usd.Stage.LoadAll)
     stage.Reload()
