@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import inf, isfinite
 from typing import NoReturn
 
@@ -52,14 +52,14 @@ RECOVERY_PACE = 0.25  # factor on learning rates after divergence
 class TrainingResult:
     """Result of a run: `finished` is False if it was interrupted; `score` is that of the best model.
 
-    `seconds` is the wall time [s], with that before a resumption.
+    `seconds` is the wall time [s], with that before a resumption. It does not count in a comparison.
     """
 
     finished: bool
     iterations: int
     score: Score
     lbs: Score
-    seconds: float
+    seconds: float = field(compare=False)
 
 
 class TrainingRun:

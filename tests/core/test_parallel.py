@@ -257,11 +257,16 @@ def test_torchrun_gives_out_the_devices(monkeypatch):
 @pytest.mark.parametrize(("total", "code"), [(2.0, EXIT_WORSE), (0.5, EXIT_OK)])
 def test_each_process_of_a_group_tells_that_a_model_is_worse_than_none(tmp_path, monkeypatch, rank, total, code):
     trained = SimpleNamespace(
-        score=Score({"stretch": total}, 0.0), lbs=Score({"stretch": 1.0}, 0.0), iterations=1, finished=True
+        score=Score({"stretch": total}, 0.0),
+        lbs=Score({"stretch": 1.0}, 0.0),
+        iterations=1,
+        finished=True,
+        seconds=1.0,
     )
+    job = SimpleNamespace(train=SimpleNamespace(iterations=1), is_trainable=True)
     monkeypatch.setattr(parallel, "join_process_group", lambda device: nullcontext((ProcessGroup(rank, 2), "cpu")))
     monkeypatch.setattr("ssilk_core.training.run.train", lambda *_: trained)
-    monkeypatch.setattr("ssilk_core.cli.train.training_job", lambda *_: None)
+    monkeypatch.setattr("ssilk_core.cli.train.training_job", lambda *_: job)
     words = ["train", "stage.usda", "--motions", "clip.usda", "-o", str(tmp_path / "model.safetensors")]
     assert cli.main(words) == code
 

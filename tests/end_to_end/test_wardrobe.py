@@ -98,7 +98,7 @@ def test_bad_entries_are_told_in_one_sentence(tmp_path, text, says):
 BAD = {
     "setting": ("[cape]\nset = { speed = 3 }", "table 'cape': --set speed=3: no such setting; settings are latent"),
     "value": ("[cape]\nset = { batch = 0 }", "table 'cape': setting 'batch': 0; it must lie between 1 and"),
-    "file": ('[cape]\nmotions = "none.usda"', "there is no file"),
+    "file": ('[cape]\nmotions = "none.usda"', "there is no such file or folder; motions are"),
     "garment": ('[cape]\ngarment = "none.usda:/Cape"', "there is no file"),
 }
 
@@ -345,7 +345,7 @@ def test_an_interrupted_list_goes_on_and_a_failure_is_told(world, capsys):
     skirt, torn = events[-1]["detail"]["garments"]
     assert (skirt["state"], skirt["iterations"], torn["state"]) == ("finished", 240, "failed")
     said = [event["said"] for event in events if event["event"] == "garment" and event["name"] == "torn"]
-    assert [event["event"] for event in said] == ["failed"] and "torn.usda" in said[0]["error"]
+    assert [event["event"] for event in said] == ["message", "failed"] and "torn.usda" in said[-1]["error"]
     assert any("resumed at iteration" in line for line in Path("out/skirt.log").read_text().splitlines())
     assert load_model("out/skirt.safetensors").provenance["train"]["seed"] == 3
 
