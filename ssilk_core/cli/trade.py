@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measure what speed and size cost in accuracy, for everything that can be changed without training again.
 
-Blendshapes, proxies, influences, precision, frame rate, refinement and quality levels are varied one at a time.
-Several models of one garment can be compared. Costs are the time and memory of playing and the sizes of model and
-shot. Accuracy is energy, collisions, and the distance of vertices and velocities from the whole model. Times are of
-this machine and of the first clip. --output writes each point when it is measured; an interrupted sweep continues
-from there.
+Blendshapes, proxies, influences, precision, frame rate, refinement and quality levels are varied one at a time, and
+the simulator makes the shot without a network. Networks of several sizes and garments can be compared: further models
+of a garment are measured whole and at their levels. Costs are the times of playing and of the solver, memory, and the
+sizes of model and shot. Accuracy is energy, collisions, skin that shows, and the distance of vertices and velocities
+from the whole model. Times are of this machine and of the first clip. --output writes each point when it is measured;
+an interrupted sweep continues from there.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ CLIPS = 2  # are measured on where --clips names none
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
-    verb.add_argument("models", type=Path, nargs="+", metavar="MODEL", help="models of one garment")
+    verb.add_argument("models", type=Path, nargs="+", metavar="MODEL", help="models on one skeleton")
     verb.add_argument("--stage", type=Path, required=True, help="USD file with the character")
     verb.add_argument("--root", metavar="PRIM", help="SkelRoot of the character, where the stage has several")
     verb.add_argument("--motions", type=Path, required=True, metavar="FOLDER",
@@ -55,7 +56,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     from ..trade.plot import trade_panels
     from ..trade.sweep import Results, sweep
     from ..trade.table import collision_table, table
-    from ..trade.variants import variants
+    from ..trade.variants import other_network, variants
 
     if options.output:
         if options.output.suffix != ".json":
@@ -73,9 +74,10 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
             results.collision_costs = results.collision_costs or measure_collisions(
                 meter.dressed, meter.take_set, meter.whole
             )
-            sweep(
-                meter, variants(meter.reducer.whole, file.config.fps, refined=not options.no_refine), results, report
-            )
+            size, fps = meter.reducer.whole, file.config.fps
+            first = path in bench.first_of_garment
+            tried = variants(size, fps, solved=not options.no_refine) if first else other_network(size, fps)
+            sweep(meter, tried, results, report)
     finally:  # an interrupted sweep shows what it has
         if results.points and options.output:
             write_chart(options.output.with_suffix(".png"), trade_panels(results.points), size=(4.6, 3.6))
@@ -91,6 +93,7 @@ class Bench:
     Attributes:
         clips: motions to measure on, by name.
         others: motions that models are reduced for.
+        first_of_garment: the first model of each garment, with the garment's name.
         asked: what distinguishes one sweep from another.
     """
 
@@ -110,15 +113,9 @@ class Bench:
                 "points are identified by the model's file name",
                 "rename a file",
             )
+        self.first_of_garment: dict[Path, str] = {}
         for path, file in self.files.items():
-            same = file.scene.garment.mesh.points.tobytes() == first.scene.garment.mesh.points.tobytes()
-            if not (same and file.config.fps == first.config.fps):
-                fail(
-                    str(path),
-                    "a model of another garment, or rate",
-                    "models of one garment are compared",
-                    "measure it by itself",
-                )
+            self._check(path, file, first)
         self.paths, self.others = self._motions(first)
         self.clips = {name: self._read(path, first) for name, path in self.paths.items()}
         self.asked: dict[str, Any] = {
@@ -128,6 +125,26 @@ class Bench:
             "hardware": f"{platform.processor() or platform.machine()}, {self.device}",
             "ssilk": __version__,
         }
+
+    def _check(self, path: Path, file: ModelFile, first: ModelFile) -> None:
+        """Check that a model can be compared with the first, and note it if it is the first of its garment."""
+        if not (
+            file.scene.character.skeleton.joint_names == first.scene.character.skeleton.joint_names
+            and file.config.fps == first.config.fps
+        ):
+            fail(str(path), "a model of another skeleton, or rate", "one is allowed", "measure it by itself")
+        mesh = file.scene.garment.mesh
+        name = mesh.path.rpartition("/")[2]
+        same = [other for other, known in self.first_of_garment.items() if known == name]
+        if not same:
+            self.first_of_garment[path] = name
+        elif self.files[same[0]].scene.garment.mesh.points.tobytes() != mesh.points.tobytes():
+            fail(
+                str(path),
+                f"its garment is called {name}, as is another one of {same[0]}",
+                "names tell garments apart",
+                "rename a prim",
+            )
 
     def meter(self, path: Path, file: ModelFile, *, only: str | None = None) -> VariantMeter:
         """Return the meter of a model on all clips, reduced for other motions; or on `only` one, reduced for it."""

@@ -44,7 +44,7 @@ Weigh = Callable[[ModelFile, float, "StoredTake | None"], ShotBytes]
 
 @dataclass(frozen=True, eq=False)
 class StoredTake:
-    """A refined take as a bake stores it: joints, and blendshapes of its own."""
+    """A take of a solver as a bake stores it: joints, and blendshapes of its own."""
 
     motion: Motion
     shot: Decomposition
@@ -78,10 +78,12 @@ class VariantMeter:
         """Measure one variant."""
         cut = self._cut(variant.size)
         player = Player(variant.in_precision(cut))
-        method = ShotMethod(variant.name, player, self.dressed, self.take_set, fps=variant.fps, refine=variant.refine)
+        how = {"fps": variant.fps, "refine": variant.refine, "simulated": variant.simulated}
+        method = ShotMethod(variant.name, player, self.dressed, self.take_set, **how)
         tally = self._tally(method, self.whole)
         total = float(tally.totals().mean())
         return TradePoint(
+            garment=self.dressed.name,
             model=self.name,
             swept=variant.swept,
             variant=variant.name,
@@ -89,8 +91,8 @@ class VariantMeter:
             precision=variant.precision,
             fps=variant.fps,
             refine=variant.refine,
-            refining=float(np.median(method.refining)) if variant.refine else None,
-            torch=None if variant.refine else self._torch(variant.size),
+            solving=float(np.median(method.solving)) if variant.solved else None,
+            torch=None if variant.solved else self._torch(variant.size),
             model_bytes=_bytes(cut, variant.precision),
             **vars(self._played(variant, method, cut)),
             total=total,
@@ -114,7 +116,7 @@ class VariantMeter:
     def _played(self, variant: Variant, method: ShotMethod, cut: ModelFile) -> _Played:
         """Measure what playing and storing the shot of a variant costs.
 
-        A refined shot has as many blendshapes as its first take needs.
+        A shot of a solver has as many blendshapes as its first take needs.
         """
         frames = round(SECONDS * variant.fps)
         shot = method.shots.get(0)
@@ -125,7 +127,7 @@ class VariantMeter:
                 timed.median, timed.high, sum(used.values()), stored_memory(shot.deformer), size.of(frames)
             )
         timed, size = play_time(method.player, resample(self.motion, variant.fps)), self.weigh(cut, variant.fps, None)
-        if variant.refine:  # points, beside joints of the body
+        if variant.solved:  # points, beside joints of the body
             size = replace(size, frame=size.frame + POINT_BYTES * self.dressed.scene.garment.mesh.vertex_count)
         return _Played(
             timed.median, timed.high, sum(operations(cut).values()), memory(method.player), size.of(frames)

@@ -1,35 +1,47 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Charts of a trade-off: error and energy over each cost, with the Pareto front."""
+"""Charts of a trade-off: errors over costs, with the Pareto front."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from math import isfinite
 
 from ..charts import ChartPanel
 from .point import SECONDS, TradePoint, front
+from .variants import WHOLE
 
 COSTS = {
-    "milliseconds": ("time of a frame [ms]", 1.0),
+    "making": ("time to make a frame, solver included [ms]", 1.0),
     "shot_bytes": (f"shot of {SECONDS} s [MB]", 1e-6),
     "model_bytes": ("model [MB]", 1e-6),
 }
 # Label, factor to its unit, and the value below which the axis is linear, so that it can show zero.
 ERRORS = {
     "position": ("RMS distance from the whole model [mm]", 1e3, 0.1),
-    "excess": ("energy above the whole model [J]", 1.0, 1e-3),
+    "total": ("energy above the lowest [J]", 1.0, 1e-3),
     "mean_shown_skin": ("covered skin that shows [%]", 1e2, 1e-2),
 }
-NAMED = ("as trained", "level", "refinement")  # sweeps whose points are all labelled
+ACROSS_MODELS = ("total", "mean_shown_skin")  # errors that compare networks; a distance is from one's own whole model
+NAMED = (WHOLE, "level", "refinement", "simulator")  # sweeps whose points are all labelled
 
 
 def trade_panels(points: Sequence[TradePoint]) -> list[list[ChartPanel]]:
-    """Return a row of panels for each error, with a panel for each cost.
+    """Return a row of panels for each garment and error, with a panel for each cost.
 
-    Each sweep has a colour. The full model, levels, refined variants and points of the Pareto front are labelled.
+    Each sweep has a colour. Full models, levels, shots of a solver and points of the Pareto front are labelled.
     """
-    measured = [error for error in ERRORS if all(isfinite(getattr(point, error)) for point in points)]
-    return [[_panel(points, cost, error) for cost in COSTS] for error in measured]
+    garments = dict.fromkeys(point.garment for point in points)
+    return [row for name in garments for row in _rows([point for point in points if point.garment == name])]
+
+
+def _rows(points: Sequence[TradePoint]) -> list[list[ChartPanel]]:
+    """Return the rows of one garment."""
+    errors = ERRORS if len({point.model for point in points}) == 1 else ACROSS_MODELS
+    lowest = min(point.total for point in points)
+    above = [replace(point, total=point.total - lowest) for point in points]
+    measured = [error for error in errors if all(isfinite(getattr(point, error)) for point in above)]
+    return [[_panel(above, cost, error) for cost in COSTS] for error in measured]
 
 
 def _panel(points: Sequence[TradePoint], cost: str, error: str) -> ChartPanel:
@@ -39,7 +51,15 @@ def _panel(points: Sequence[TradePoint], cost: str, error: str) -> ChartPanel:
     groups: dict[str, list[tuple[float, float, str]]] = {}
     for index, (point, place) in enumerate(zip(points, places)):
         named = index in best or point.swept in NAMED
-        groups.setdefault(point.swept, []).append((*place, point.variant if named else ""))
+        groups.setdefault(point.swept, []).append((*place, _words(point, points[0].model) if named else ""))
+    title = points[0].garment if cost == next(iter(COSTS)) else ""
     return ChartPanel(
-        x=x, y=y, points=groups, front=[places[index] for index in best], log_x=True, linear_below=linear
+        title=title, x=x, y=y, points=groups, front=[places[index] for index in best], log_x=True, linear_below=linear
     )
+
+
+def _words(point: TradePoint, first: str) -> str:
+    """Return the words beside a point: networks are told by their names, and so are what others than the first do."""
+    if point.swept == WHOLE:
+        return point.model
+    return point.variant if point.model == first else f"{point.model}, {point.variant}"

@@ -18,12 +18,11 @@ class TradePoint:
     """One variant of one model, in SI units except for times.
 
     Attributes:
-        model, swept, variant: names of the model, of the sweep, and of the variant.
+        garment, model, swept, variant: names of the garment, of its model, of the sweep, and of the variant.
         shapes, joints, influences, precision, fps, refine: as in `variants.Variant`.
         milliseconds, high: median and 95 % quantile of the time to play a frame in the numpy runtime on the CPU [ms].
-            Refined variants are played as the joints and blendshapes that a bake stores.
-        refining: time of the solver for a frame [ms], which a bake takes once; None without it, or where an earlier
-            version told it as `milliseconds`.
+            Shots of a solver are played as the joints and blendshapes that a bake stores.
+        solving: time of the solver for a frame [ms], which a bake takes once; None without it.
         torch: time per frame of network and decoder in PyTorch on the device [ms]; None if not measured.
         operations: multiply-adds per frame.
         memory: memory used by playback [bytes].
@@ -59,7 +58,8 @@ class TradePoint:
     position: float
     velocity: float
     shown_skin: ShownSkin | None = None
-    refining: float | None = None
+    solving: float | None = None
+    garment: str = ""
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> TradePoint:
@@ -70,7 +70,13 @@ class TradePoint:
         """
         values = {item.name: document[item.name] for item in fields(cls) if item.default is MISSING}
         shown = document.get("shown_skin")
-        return cls(**values, shown_skin=ShownSkin(**shown) if shown else None, refining=document.get("refining"))
+        later = {name: document[name] for name in ("solving", "garment") if name in document}
+        return cls(**values, shown_skin=ShownSkin(**shown) if shown else None, **later)
+
+    @property
+    def making(self) -> float:
+        """Time to make a frame [ms]: that of playing it, and of the solver on the device."""
+        return self.milliseconds + (self.solving or 0.0)
 
     @property
     def mean_shown_skin(self) -> float:

@@ -22,6 +22,7 @@ from ..runtime import Player
 from ..runtime.character import character_matrices
 from ..runtime.skinning import skin_garment
 from ..sampling import sample_pose
+from ..simulate import SimulationOptions, simulate
 
 BLOCK_FRAMES = 64  # frames in each block of vertex computations
 
@@ -31,20 +32,29 @@ class ShotMethod:
 
     Args:
         fps: frame rate of the shot [1/s]. Poses of garment and character are interpolated between frames, as in USD.
-        refine: solver iterations per frame; 0 for no refinement. Refined frames are played as a bake stores them:
+        refine: solver iterations per frame; 0 for no refinement. Frames of a solver are played as a bake stores them:
             as joints and blendshapes of the shot's own, or as points where these cannot reach them.
+        simulated: let the simulator compute the frames.
 
     Attributes:
-        refining: time of the solver for a frame [ms], for each take that was computed.
-        shots: refined takes as joints and blendshapes.
+        solving: time of the solver for a frame [ms], for each take that was computed.
+        shots: takes of a solver as joints and blendshapes.
     """
 
     def __init__(
-        self, name: str, player: Player, dressed: EvaluationScene, take_set: TakeSet, *, fps: float, refine: int = 0
+        self,
+        name: str,
+        player: Player,
+        dressed: EvaluationScene,
+        take_set: TakeSet,
+        *,
+        fps: float,
+        refine: int = 0,
+        simulated: bool = False,
     ) -> None:
         self.name, self.player, self.dressed, self.take_set, self.fps = name, player, dressed, take_set, fps
-        self.options = RefineOptions(iterations=refine) if refine else None
-        self.refining: list[float] = []
+        self.options, self.simulated = RefineOptions(iterations=refine) if refine else None, simulated
+        self.solving: list[float] = []
         self.shots: dict[int, Decomposition] = {}
         self._points = lru_cache(1)(self._take)
 
@@ -59,19 +69,25 @@ class ShotMethod:
     def _take(self, take: int) -> Floats:
         """Return all frames of a take, shape (N, V, 3)."""
         motion = self.take_set.takes[take].motion
-        points = self.unrefined(motion)
-        if self.options is not None:
-            points = self._stored(take, self._refined(motion, points))
+        if self.simulated or self.options is not None:
+            begun = time.perf_counter()
+            points = self._simulated(motion) if self.options is None else self._refined(motion, self.options)
+            self.solving.append(1000 * (time.perf_counter() - begun) / len(points))
+            points = self._stored(take, points)
+        else:
+            points = self.unrefined(motion)
         return points - motion.translations[0, 0]
 
-    def _refined(self, motion: Motion, points: Floats) -> Floats:
+    def _refined(self, motion: Motion, options: RefineOptions) -> Floats:
         """Return refined vertices at the frames of a motion [m], shape (N, V, 3)."""
-        assert self.options is not None
-        dressed, begun = self.dressed, time.perf_counter()
-        refiner = Refiner(dressed.scene, dressed.fabric, self.options, fps=motion.fps, device=dressed.device)
-        found = np.stack([frame.points for frame in refiner.frames(motion, points)])
-        self.refining.append(1000 * (time.perf_counter() - begun) / len(found))
-        return found
+        dressed = self.dressed
+        refiner = Refiner(dressed.scene, dressed.fabric, options, fps=motion.fps, device=dressed.device)
+        return np.stack([frame.points for frame in refiner.frames(motion, self.unrefined(motion))])
+
+    def _simulated(self, motion: Motion) -> Floats:
+        """Return the simulator's vertices at the frames of a motion [m], shape (N, V, 3)."""
+        dressed, options = self.dressed, SimulationOptions(fps=motion.fps, precision="float32")
+        return simulate(dressed.scene, dressed.fabric, [motion], options, device=dressed.device)[0]
 
     def _stored(self, take: int, points: Floats) -> Floats:
         """Return vertices as a bake's joints and blendshapes have them [m], shape (N, V, 3)."""

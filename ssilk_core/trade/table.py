@@ -9,7 +9,7 @@ from ..evaluation.tables import aligned
 from .collision_cost import CollisionCost
 from .point import SECONDS, TradePoint, front
 
-HEADER = ("model", "swept", "variant", "size", "ms a frame", "95 %", "PyTorch", "refining", "memory [MB]",
+HEADER = ("model", "swept", "variant", "size", "ms a frame", "95 %", "PyTorch", "solver", "memory [MB]",
           "model [MB]", f"{SECONDS} s shot [MB]", "total [J]", "excess [J]", "inside", "skin shows", "worst", "bare",
           "RMS [mm]", "velocity [mm/s]", "best at")  # fmt: skip
 MARKS = {"milliseconds": "time", "shot_bytes": "shot", "model_bytes": "model"}
@@ -40,7 +40,7 @@ def _cells(p: TradePoint, best: list[str]) -> list[str]:
         f"{p.milliseconds:.3g}",
         f"{p.high:.3g}",
         "" if p.torch is None else f"{p.torch:.3g}",
-        "" if p.refining is None else f"{p.refining:.3g}",
+        "" if p.solving is None else f"{p.solving:.3g}",
         f"{p.memory / 1e6:.3g}",
         f"{p.model_bytes / 1e6:.3g}",
         f"{p.shot_bytes / 1e6:.3g}",

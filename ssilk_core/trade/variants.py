@@ -13,7 +13,7 @@ from ..packing import dequantize, quantize
 from ..quality import QUALITIES
 from ..reduction import ModelSize
 
-WHOLE = "as trained"
+WHOLE, SIMULATOR = "as trained", "simulator"
 SHAPES, JOINTS = (0.75, 0.5, 0.25, 0.125, 0.0), (0.75, 0.5, 0.25, 0.0)  # shares of the model's numbers
 INFLUENCES, RATES, REFINED = (6, 4, 3, 2, 1), (1 / 2, 1 / 3), (1, 2)
 
@@ -42,6 +42,7 @@ class Variant:
         precision: precision of the parameters, one of `PRECISIONS`.
         fps: frame rate of the shot [1/s].
         refine: solver iterations per frame.
+        simulated: the simulator computes the shot, without the network.
     """
 
     swept: str
@@ -50,6 +51,12 @@ class Variant:
     precision: str = "float32"
     fps: float
     refine: int = 0
+    simulated: bool = False
+
+    @property
+    def solved(self) -> bool:
+        """Whether a solver makes the shot, or refines it."""
+        return self.simulated or self.refine > 0
 
     def in_precision(self, file: ModelFile) -> ModelFile:
         """Return a model with its parameters rounded to this precision."""
@@ -57,13 +64,13 @@ class Variant:
         return replace(file, parameters=parameters)
 
 
-def variants(whole: ModelSize, fps: float, *, refined: bool = True) -> Iterator[Variant]:
+def variants(whole: ModelSize, fps: float, *, solved: bool = True) -> Iterator[Variant]:
     """Yield the whole model, then the variants of each sweep, then the quality levels.
 
     Args:
         whole: size of the model.
         fps: frame rate of the model.
-        refined: include the solver, which takes a thousand times as long as everything else.
+        solved: include the solver, which takes a thousand times as long as everything else.
     """
     base = Variant(swept=WHOLE, name=WHOLE, size=whole, fps=fps)
     yield base
@@ -79,14 +86,23 @@ def variants(whole: ModelSize, fps: float, *, refined: bool = True) -> Iterator[
         yield replace(base, swept="precision", name=name, precision=name)
     for share in RATES:
         yield replace(base, swept="frame rate", name=f"{share * fps:g} frames/s", fps=share * fps)
-    for count in REFINED if refined else ():
+    for count in REFINED if solved else ():
         yield replace(base, swept="refinement", name=f"{count} iterations", refine=count)
-    yield from _levels(base, refined)
+    yield from _levels(base, solved=solved)
+    if solved:
+        yield replace(base, swept=SIMULATOR, name=SIMULATOR, simulated=True)
 
 
-def _levels(base: Variant, refined: bool) -> Iterator[Variant]:
+def other_network(whole: ModelSize, fps: float) -> Iterator[Variant]:
+    """Yield another model of a garment whose variants were tried: the whole model, and the levels of the network."""
+    base = Variant(swept=WHOLE, name=WHOLE, size=whole, fps=fps)
+    yield base
+    yield from _levels(base, solved=False)
+
+
+def _levels(base: Variant, *, solved: bool) -> Iterator[Variant]:
     for level in QUALITIES.values():
-        if refined or not level.refine:
+        if solved or not level.refine:
             kept, fps = level.size.within(base.size), level.rate(base.fps)
             reduced = replace(base, swept="level", precision="int16")  # as 'ssilk reduce' writes models
             yield replace(reduced, name=level.name, size=kept, fps=fps, refine=level.refine)

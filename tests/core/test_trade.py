@@ -23,6 +23,7 @@ from ssilk_core.reduction import ModelSize, Reducer
 from ssilk_core.runtime import Player
 from ssilk_core.runtime.stored import StoredPlayer
 from ssilk_core.sampling import sample_pose
+from ssilk_core.simulate import SimulationOptions, simulate
 from ssilk_core.trade.collision_cost import measure_collisions
 from ssilk_core.trade.measure import VariantMeter
 from ssilk_core.trade.plot import trade_panels
@@ -30,7 +31,7 @@ from ssilk_core.trade.point import TradePoint, front
 from ssilk_core.trade.shot_method import ShotMethod
 from ssilk_core.trade.sweep import Results, sweep
 from ssilk_core.trade.table import collision_table, table
-from ssilk_core.trade.variants import PRECISIONS, variants
+from ssilk_core.trade.variants import PRECISIONS, other_network, variants
 
 FPS = 30.0
 
@@ -86,7 +87,9 @@ def test_one_thing_is_swept_at_a_time_and_levels_come_last():
         changed += [k for k, v in vars(variant.size).items() if v != vars(whole)[k]]
         assert len(changed) == 1 or variant.swept == "level", variant
     assert [v.name for v in tried if v.swept == "level"] == ["crowd", "game", "film", "hero"]
-    assert not any(v.refine for v in variants(whole, FPS, refined=False))
+    assert [v.name for v in tried if v.solved] == ["1 iterations", "2 iterations", "hero", "simulator"]
+    assert not any(v.solved for v in variants(whole, FPS, solved=False))
+    assert [v.name for v in other_network(whole, FPS)] == ["as trained", "crowd", "game", "film"]
 
 
 def test_precisions_round_as_they_should():
@@ -148,7 +151,7 @@ def test_what_costs_less_is_seen_to_cost_less(points):
 def test_refined_variants_are_counted_as_what_a_bake_stores(meter, bench, points):
     whole, found = points["as trained"], points["1 iterations"]
     assert found.total < whole.total and found.torch is None
-    assert whole.refining is None and found.refining > 0
+    assert whole.solving is None and found.solving > 0
     method = ShotMethod("refined", meter.reducer.player, *bench[1:], fps=FPS, refine=1)
     stored = method.vertices(0, range(50))
     shot = method.shots[0]
@@ -166,6 +169,16 @@ def test_refined_variants_are_counted_as_what_a_bake_stores(meter, bench, points
     np.testing.assert_allclose(stored[..., 0].numpy(), first, atol=1e-5)
 
 
+def test_the_simulator_makes_a_shot_without_the_network(meter, bench):
+    reducer, dressed, take_set = bench
+    method = ShotMethod("simulator", reducer.player, dressed, take_set, fps=FPS, simulated=True)
+    stored = method.vertices(1, range(20)).permute(2, 0, 1)
+    motion, options = take_set.takes[1].motion, SimulationOptions(fps=FPS, precision="float32")
+    (expected,) = simulate(dressed.scene, dressed.fabric, [motion], options)
+    np.testing.assert_allclose(stored, expected - motion.translations[0, 0], atol=5e-3)  # a bake's bound
+    assert len(method.solving) == 1 and method.shots[1].own_shapes > 0
+
+
 def test_points_that_joints_cannot_reach_are_counted_as_points(meter, bench, monkeypatch):
     def out_of_reach(*arguments, **options):
         raise SsilkError("the joints fold its skinning there")
@@ -173,7 +186,7 @@ def test_points_that_joints_cannot_reach_are_counted_as_points(meter, bench, mon
     monkeypatch.setattr("ssilk_core.trade.shot_method.decompose", out_of_reach)
     found = meter.point(chosen(meter, "1 iterations"))
     vertices = bench[1].scene.garment.mesh.vertex_count
-    assert found.shot_bytes == 6000 + 300 * (60 + 12 * vertices) and found.refining > 0
+    assert found.shot_bytes == 6000 + 300 * (60 + 12 * vertices) and found.solving > 0
 
 
 def test_refined_points_of_earlier_versions_are_measured_again(points, tmp_path):
@@ -182,7 +195,7 @@ def test_refined_points_of_earlier_versions_are_measured_again(points, tmp_path)
         results.add(points[name])
     document = json.loads((tmp_path / "t.json").read_text())
     for point in document["points"]:
-        del point["refining"]
+        del point["solving"]
     (tmp_path / "t.json").write_text(json.dumps(document))
     results.resume(lambda event: None)
     assert [point.variant for point in results.points] == ["int16"]
@@ -256,8 +269,22 @@ def test_tables_and_charts_show_every_point(points):
         for panel in row:
             shown = [point for group in panel.points.values() for point in group]
             assert len(shown) == len(points) and set(panel.front) <= {place[:2] for place in shown}
-            assert {"as trained", "1 iterations"} <= {words for _, _, words in shown}
+            assert {"toy", "1 iterations"} <= {words for _, _, words in shown}
             assert "[" in panel.x and "[" in panel.y
+    making = trade_panels(list(points.values()))[0][0].points["refinement"][0][0]
+    assert making == pytest.approx(points["1 iterations"].milliseconds + points["1 iterations"].solving)
+
+
+def test_garments_have_rows_of_their_own_and_networks_their_names(points):
+    cape = [replace(point, garment="Cape") for point in points.values()]
+    light = replace(points["as trained"], garment="Cape", model="light", total=points["as trained"].total + 1)
+    skirt = [replace(point, garment="Skirt", shown_skin=None) for point in cape]
+    rows = trade_panels([*cape, light, *skirt])
+    assert [row[0].title for row in rows] == ["Cape"] * 2 + ["Skirt"] * 2
+    assert "RMS" not in rows[0][0].y and "RMS" in rows[2][0].y  # distances are from one's own whole model
+    (_, first, _), (_, second, words) = rows[0][0].points["as trained"]
+    assert words == "light" and second - first == pytest.approx(1)
+    assert min(y for row in rows for group in row[0].points.values() for _, y, _ in group) == 0
 
 
 def test_points_survive_the_file_they_are_kept_in(points, tmp_path):

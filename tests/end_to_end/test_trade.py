@@ -6,9 +6,11 @@ from __future__ import annotations
 import json
 import shlex
 import shutil
+from dataclasses import replace
 
 import pytest
 
+from ssilk_core.checkpoint import load_model, save_model
 from ssilk_core.cli import main
 from ssilk_core.cost import Time
 from ssilk_core.errors import EXIT_WORSE
@@ -78,7 +80,22 @@ def test_what_cannot_be_is_said_in_one_sentence(world, capsys, options, message)
     assert message in error and "Traceback" not in error
 
 
-def test_garments_are_not_mixed(world, capsys):
+def test_garments_are_told_apart_by_their_names(world, capsys, no_clock):
+    file = load_model("model.safetensors")
+    garment = file.scene.garment
+    longer = replace(garment.mesh, points=1.1 * garment.mesh.points)
+    for name, mesh in (("apron", replace(longer, path="/Hero/Apron")), ("longer", longer)):
+        scene = replace(file.scene, garment=replace(garment, mesh=mesh))
+        save_model(f"{name}.safetensors", replace(file, scene=scene))
+    command = TRADE.replace("trade model", "trade apron.safetensors model", 1)
+    assert run(f"{command} --clips short --no-refine --json") == 0
+    points = json.loads(capsys.readouterr().out.splitlines()[-1])["detail"]["points"]
+    assert {(p["model"], p["garment"]) for p in points} == {("apron", "Apron"), ("model", "Skirt")}
+    assert run(TRADE.replace("trade model", "trade longer.safetensors model", 1)) == 2
+    assert "its garment is called Skirt, as is another one of longer" in capsys.readouterr().err
+
+
+def test_rates_are_not_mixed(world, capsys):
     assert (
         run(
             "train rigged.usda --garment Skirt --motions clip.usda -o other.safetensors --preset draft --set "
@@ -88,7 +105,7 @@ def test_garments_are_not_mixed(world, capsys):
     )
     capsys.readouterr()
     assert run(TRADE.replace("trade model", "trade other.safetensors model")) == 2
-    assert "a model of another garment, or rate" in capsys.readouterr().err
+    assert "a model of another skeleton, or rate" in capsys.readouterr().err
 
 
 def test_models_of_one_name_are_not_taken_for_each_other(world, capsys):
