@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 NO_DYNAMICS = 2e-3  # [m]
 # A total that is higher than linear blend skinning's by less than this share of it differs by rounding.
 WORSE = 1e-3
-FEW = 0.5  # share of the iterations that were asked for, below which a garment is hardly trained
+FEW = 0.5  # share of the iterations that were asked for, below which more minutes are advised
 ADVICE = "nothing dynamic is being learned: train longer, or check that the motions move"
 
 
@@ -56,7 +56,7 @@ def shortcomings(model: str, score: Score, done: int, asked: int, seconds: float
     """
     found, shown = [], score.shown_skin
     if done < FEW * asked:
-        found.append(f"only {done} of the preset's {asked} iterations fit into its minutes, so it is hardly trained")
+        found.append(f"its minutes sufficed for {done} of the preset's {asked} iterations")
     if shown and shown.is_seen:
         found.append(
             f"{shown.mean:.2%} of the covered skin shows, {shown.worst:.1%} in the worst frame, and more than "
