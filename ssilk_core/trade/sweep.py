@@ -36,7 +36,7 @@ class Results:
     def resume(self, report: Reporter) -> None:
         """Read the points that an earlier run of the same sweep measured.
 
-        Refined ones of earlier versions, which told the time of the solver otherwise, are measured again.
+        Points of earlier versions, which told no garment and the time of the solver otherwise, are measured again.
         """
         if self.path is None or not self.path.exists():
             return
@@ -46,7 +46,9 @@ class Results:
             same = document["asked"] == json.loads(json.dumps(self.asked))
         except (ValueError, TypeError, KeyError) as error:
             raise SsilkError(f"{self.path}: not results of 'ssilk trade' ({error}); name another file.") from error
-        self.points = [point for point in points if same and (point.solving is not None or not point.refine)]
+        self.points = [
+            point for point in points if same and point.garment and (point.solving is not None or not point.refine)
+        ]
         if self.points:
             report(Message(f"{len(self.points)} variants were measured before and are reused"))
 

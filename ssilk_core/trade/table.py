@@ -9,17 +9,23 @@ from ..evaluation.tables import aligned
 from .collision_cost import CollisionCost
 from .point import SECONDS, TradePoint, front
 
-HEADER = ("model", "swept", "variant", "size", "ms a frame", "95 %", "PyTorch", "solver", "memory [MB]",
+HEADER = ("garment", "model", "swept", "variant", "size", "ms a frame", "95 %", "PyTorch", "solver", "memory [MB]",
           "model [MB]", f"{SECONDS} s shot [MB]", "total [J]", "excess [J]", "inside", "skin shows", "worst", "bare",
           "RMS [mm]", "velocity [mm/s]", "best at")  # fmt: skip
-MARKS = {"milliseconds": "time", "shot_bytes": "shot", "model_bytes": "model"}
+MARKS = {"making": "time", "shot_bytes": "shot", "model_bytes": "model"}
 
 
 def table(points: Sequence[TradePoint]) -> str:
-    """Return a row for each point; "best at" lists the costs on whose Pareto front it is."""
-    best = {mark: front([(getattr(p, cost), p.position) for p in points]) for cost, mark in MARKS.items()}
-    rows = [_cells(point, [mark for mark, own in best.items() if row in own]) for row, point in enumerate(points)]
-    return aligned(HEADER, rows, 3)
+    """Return a row for each point; "best at" lists the costs on whose Pareto front of energy it is in its garment."""
+    garments = [[p for p in points if p.garment == name] for name in dict.fromkeys(p.garment for p in points)]
+    rows = [row for own in garments for row in _rows(own)]
+    return aligned(HEADER, rows, 4)
+
+
+def _rows(points: Sequence[TradePoint]) -> list[list[str]]:
+    """Return the rows of one garment."""
+    best = {mark: front([(getattr(p, cost), p.total) for p in points]) for cost, mark in MARKS.items()}
+    return [_cells(point, [mark for mark, own in best.items() if row in own]) for row, point in enumerate(points)]
 
 
 def collision_table(found: Sequence[CollisionCost]) -> str:
@@ -33,6 +39,7 @@ def collision_table(found: Sequence[CollisionCost]) -> str:
 
 def _cells(p: TradePoint, best: list[str]) -> list[str]:
     return [
+        p.garment,
         p.model,
         p.swept,
         p.variant,

@@ -61,7 +61,9 @@ def test_models_are_put_on_one_table(world, capsys, no_clock):
     assert run(f"{command} --clips short --no-refine --json") == 0
     points = json.loads(capsys.readouterr().out.splitlines()[-1])["detail"]["points"]
     first, second = ([p for p in points if p["model"] == name] for name in ("model", "again"))
-    assert [p["total"] for p in first] == pytest.approx([p["total"] for p in second])
+    totals = {p["variant"]: p["total"] for p in first}
+    assert [p["variant"] for p in second] == ["as trained", "crowd", "game", "film"]  # of another network
+    assert [totals[p["variant"]] for p in second] == pytest.approx([p["total"] for p in second])
     assert first[0]["excess"] == 0
 
 
