@@ -25,6 +25,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+from ..devices import default_preset
 from ..errors import EXIT_OK, EXIT_WORSE, SsilkError, fail
 from ..events import Failed, GarmentEvent, Message, Reporter, Result, Started, TaskEvent
 from ..files import need_writable, sha256
@@ -58,7 +59,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     device, slots = _slots(options.device, options.jobs)
     need_writable(options.output / "log")
     entries = read_list(options.list)
-    trainings = [GarmentTraining(entry, options.output, _request(entry, options.list)) for entry in entries]
+    trainings = [GarmentTraining(entry, options.output, _request(entry, options.list, device)) for entry in entries]
     options.output.mkdir(parents=True, exist_ok=True)
     show = report if options.json else ProgressTable([entry.name for entry in entries])
     show(Started("wardrobe", len(trainings), {"device": device, "at a time": len(slots)}))
@@ -117,8 +118,8 @@ def _visible_gpus() -> list[str]:
     return [name.strip() for name in visible.split(",")][:count] if visible else [str(n) for n in range(count)]
 
 
-def _request(entry: WardrobeEntry, path: Path) -> str:
-    """Return a hash of what is asked for a garment of the list at `path`.
+def _request(entry: WardrobeEntry, path: Path, device: str) -> str:
+    """Return a hash of what is asked for a garment of the list at `path`, with the preset that a device stands for.
 
     Raises:
         SsilkError: there is no such file, or 'ssilk train' would not take it.
@@ -135,7 +136,8 @@ def _request(entry: WardrobeEntry, path: Path) -> str:
     for file in files:
         if not file.is_file():
             fail(where, f"there is no file {file}", "paths are relative to the folder of the list")
-    return request_key(entry.words, [(file.name, sha256(file)) for file in files])
+    words = entry.words if options.preset else [*entry.words, "--preset", default_preset(device)]
+    return request_key(words, [(file.name, sha256(file)) for file in files])
 
 
 def _inputs(options: argparse.Namespace, folder: Path) -> list[Path]:

@@ -13,9 +13,10 @@ from ..events import format_seconds
 from ..kinematics import quaternion_from_matrix
 from .finding import Finding, Findings, format_joints, index_tuple
 
-# Seconds per contact sample and frame in a complete optimiser step: five garments of 7,300 to 10,000 samples on two
-# CPU threads ("draft"), four on an H200 that trained two at once ("preview"). Only measured devices are listed.
-SECONDS_PER_SAMPLE = {"cpu": 1.05e-6, "cuda": 0.9e-9}
+# Seconds per contact sample and frame in a complete optimiser step: a cape of 7,900 samples on two CPU threads beside
+# a window of Blender, validations included ("draft"), four garments of 7,300 to 10,000 on an H200 that trained two at
+# once ("preview"). Only measured devices are listed.
+SECONDS_PER_SAMPLE = {"cpu": 2.6e-6, "cuda": 0.9e-9}
 LONG = 3600.0  # [s], a training that is warned of
 
 
@@ -65,7 +66,7 @@ def memory(scene: Scene, preset: Preset, body_vertices: int) -> Findings:
         f"the time that preset '{preset.name}' takes is unknown: training has not been measured on {device}"
     )  # fmt: skip
     why = (
-        "scaled by contact samples and frames from garments on two CPU threads or a shared H200; "
+        "scaled by contact samples and frames from a garment on two CPU threads or several on a shared H200; "
         "the actual time may differ by half"
     )
     long = seconds is not None and seconds > LONG

@@ -78,8 +78,15 @@ class VariantMeter:
         """Measure one variant."""
         cut = self._cut(variant.size)
         player = Player(variant.in_precision(cut))
-        how = {"fps": variant.fps, "refine": variant.refine, "simulated": variant.simulated}
-        method = ShotMethod(variant.name, player, self.dressed, self.take_set, **how)
+        method = ShotMethod(
+            variant.name,
+            player,
+            self.dressed,
+            self.take_set,
+            fps=variant.fps,
+            refine=variant.refine,
+            simulated=variant.simulated,
+        )
         tally = self._tally(method, self.whole)
         total = float(tally.totals().mean())
         return TradePoint(

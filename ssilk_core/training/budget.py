@@ -22,7 +22,8 @@ PLANNED_SHARE = 0.98  # of the remaining time
 VALIDATION_SHARE = 0.1  # of the time that validations may take at most
 TIMED_STEPS = 3  # in each phase
 MIN_ITERATIONS = 20  # fewer do not train a usable model
-CAUTION = 0.5  # of an expected duration, which may be off by half: what is refused before it is measured
+CAUTION = 0.5  # of the expected duration of a phase that is not timed yet
+ESTIMATE_CAUTION = 0.25  # of the preflight's estimate, which was measured on another machine
 LONG_STEP = 5.0  # [s] of a first step on a processor, above which no other is timed: what first steps do takes less
 SMOOTHING = 0.3  # weight of a new measurement of the speed
 
@@ -51,7 +52,7 @@ def scale_schedule(config: TrainConfig, iterations: int, static: int = 0, valida
     factor = iterations / config.iterations
     every = config.validate_every * factor
     if validations:
-        every = (1 - config.static_fraction) * iterations / validations
+        every = iterations / validations
     return replace(
         config,
         iterations=iterations,
@@ -64,7 +65,7 @@ def scale_schedule(config: TrainConfig, iterations: int, static: int = 0, valida
 
 def affordable_validations(config: TrainConfig, seconds: float, scoring: float) -> int:
     """Return how many validations a run of so many seconds has, each of `scoring` seconds; at least one."""
-    asked = int((1 - config.static_fraction) * config.iterations / config.validate_every) + 1
+    asked = int(config.iterations / config.validate_every) + 1
     return max(1, min(asked, int(VALIDATION_SHARE * seconds / scoring))) if scoring > 0 else asked
 
 
@@ -106,8 +107,12 @@ def fitting_iterations(pace: Pace, config: TrainConfig, seconds: float, done: in
 
 
 def check_estimate(config: TrainConfig, samples: int, device: str, seconds: float, where: str) -> None:
-    """Raise `SsilkError` if the estimate of the preflight for so many contact samples leaves too little time [s]."""
-    if each := CAUTION * SECONDS_PER_SAMPLE.get(device, 0.0) * samples:
+    """Raise `SsilkError` if the estimate of the preflight for so many contact samples leaves too little time [s].
+
+    More threads than those of the estimate are expected to take less time in proportion.
+    """
+    threads = max(2, torch.get_num_threads()) / 2 if device == "cpu" else 1
+    if each := ESTIMATE_CAUTION * SECONDS_PER_SAMPLE.get(device, 0.0) * samples / threads:
         check_possible(Pace(each * config.pretraining_batch, each * trained_frames(config)), config, seconds, where)
 
 

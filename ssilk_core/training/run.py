@@ -330,7 +330,7 @@ class TrainingRun:
         config, iteration = self.config, self.state.iteration
         scheduled = iteration % config.validate_every == 0
         if self.state.validations:  # the plan changes, and with it the interval
-            last = self.state.curve[-1].iteration if self.state.curve else config.static_iterations
+            last = self.state.curve[-1].iteration if self.state.curve else 0
             scheduled = iteration - last >= config.validate_every
         scheduled |= iteration == config.iterations
         return scheduled and iteration > 0 and iteration != self.saved
@@ -343,7 +343,8 @@ class TrainingRun:
             if broken := non_finite_terms(score):
                 self._recover("validation is not finite", broken)
                 return
-            self.report(validation_message(state.iteration, score, self.lbs, self.job.scene.rig.proxy_count > 0))
+            dynamic = self.job.scene.rig.proxy_count > 0 and state.iteration > self.config.static_iterations
+            self.report(validation_message(state.iteration, score, self.lbs, dynamic))
             finite = {name: value for name, value in batch.items() if isfinite(value)}
             state.curve = append_point(state.curve, CurvePoint(state.iteration, state.seconds, finite, score))
             better = state.best is None or score.total < state.best.score.total
@@ -358,7 +359,7 @@ class TrainingRun:
         """End because the time is up, with a validation if there were steps since the last one."""
         self.report_progress(0.0)
         self.report(Message(f"time is up at iteration {self.state.iteration} of {self.config.iterations}"))
-        if self.state.iteration != self.saved and self.state.iteration >= self.config.static_iterations:
+        if self.state.iteration != self.saved:
             self.validate()
 
     def _score(self) -> Score:

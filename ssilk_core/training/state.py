@@ -267,7 +267,7 @@ def _need_same(path: Path, asked: dict[str, Any], before: dict[str, Any]) -> Non
             str(path),
             f"the run was started with another {', '.join(dict.fromkeys(differing))}",
             "a resumed run repeats the same command",
-            "use the same options or train without --resume",
+            "use the same options, --preset too if it was left to the device, or train without --resume",
         )
 
 

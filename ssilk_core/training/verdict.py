@@ -8,7 +8,7 @@ from math import ceil, isfinite
 from typing import TYPE_CHECKING, Any
 
 from ..events import Message
-from ..shown_skin import MOST_MEAN
+from ..shown_skin import MOST_MEAN, MOST_WORST
 
 if TYPE_CHECKING:
     from .validation import Score
@@ -51,21 +51,21 @@ def shortcomings(model: str, score: Score, done: int, asked: int, seconds: float
     """Return a warning where minutes sufficed for few of the iterations, or where the eye finds skin that shows.
 
     Args:
-        done, asked: iterations that were done, and those of the preset.
+        done, asked: iterations that were done, and those that were asked for.
         seconds: duration of the whole run [s].
     """
     found, shown = [], score.shown_skin
     if done < FEW * asked:
-        found.append(f"its minutes sufficed for {done} of the preset's {asked} iterations")
+        found.append(f"its minutes sufficed for {done} of {asked} iterations")
     if shown and shown.is_seen:
         found.append(
-            f"{shown.mean:.2%} of the covered skin shows, {shown.worst:.1%} in the worst frame, and more than "
-            f"{MOST_MEAN:.2%} meets the eye at once"
+            f"{shown.mean:.2%} of the covered skin shows, {shown.worst:.1%} in the worst frame; above "
+            f"{MOST_MEAN:.2%}, or {MOST_WORST:.1%} in a frame, it meets the eye at once"
         )
     if not found:
         return None
     more = ceil(seconds / 60 * max(2.0, asked / max(1, done)))
-    found.append(f"the same command with '--resume --minutes {more}' goes on")
+    found.append(f"'ssilk train' with the same options and '--resume --minutes {more}' goes on")
     return Message(f"{model}: " + "; ".join(found), "warning")
 
 
