@@ -20,6 +20,7 @@ from ssilk_core.preflight.finding import Finding, format_count
 
 HOLES = "body-not-watertight"
 PUSHED = "penetration"  # the finding that Push Out mends; all others are mended by Fix
+SETTLED = (PUSHED, "pierced")  # those that speak of what settling does
 OPTION = "--fix"  # which does so in a console
 
 
@@ -51,6 +52,7 @@ def read_findings(
     for document in documents:
         finding = _with_buttons(Finding(**{**document, "indices": tuple(document["indices"])}))
         file, _, prim = finding.prim.rpartition(":")
+        file = finding.prim if finding.prim in clips else file  # a motion that cannot be read has no prim
         finding = replace(finding, prim=names.get(prim, ""))
         if file in clips:
             found.append(_on_timeline(finding, clips[file]))
@@ -72,7 +74,7 @@ def polygons_of(counts: np.ndarray, triangles: Sequence[int]) -> tuple[int, ...]
 
 def _with_buttons(finding: Finding) -> Finding:
     """Return a finding that speaks of the button which mends it, and not of an option."""
-    button = "Push Out" if finding.code == PUSHED else "Fix"
+    button = "Push Out" if finding.code in SETTLED else "Fix"
     return replace(finding, found=finding.found.replace(OPTION, button), fix=finding.fix.replace(OPTION, button))
 
 

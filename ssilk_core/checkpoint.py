@@ -240,6 +240,11 @@ def _need_header(document: dict[str, Any]) -> None:
     seed = document["provenance"].get("seed", 0)
     if type(seed) is not int or not -(2**63) <= seed < 2**63:  # shots store it in 64 bits
         raise TypeError(f"the seed {str(seed)[:40]!r} is not a whole number of 64 bits")
+    colour = document.get("colour")
+    if colour is not None:
+        _need_types(dict(enumerate(colour)), dict.fromkeys(range(3), 0.0))
+        if not (isinstance(colour, list) and len(colour) == 3 and np.isfinite(colour).all()):
+            raise TypeError(f"the colour {str(colour)[:40]} is not three finite numbers")
     widths = document["config"].get("widths", [])
     _need_types(dict(enumerate(widths)), dict.fromkeys(range(len(widths)), 0))
 

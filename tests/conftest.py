@@ -8,8 +8,18 @@ import sys
 import pytest
 
 
-@pytest.fixture(autouse=True)
-def one_thread() -> None:
-    """Compute with one thread, whatever a benchmark set before: with more, workers wait for cores of each other."""
+def _one_thread() -> None:
     if torch := sys.modules.get("torch"):
         torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_thread() -> None:
+    """Compute fixtures of modules with one thread, too: with more, workers wait for cores of each other."""
+    _one_thread()
+
+
+@pytest.fixture(autouse=True)
+def one_thread_again() -> None:
+    """Compute a test with one thread, whatever a benchmark set before it."""
+    _one_thread()

@@ -234,5 +234,5 @@ def command_of(order, fields):
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # the training would inherit that it is ignored
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # the training would inherit that it is ignored
     main(Path(sys.argv[1]), Path(sys.argv[2]))

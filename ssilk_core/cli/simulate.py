@@ -86,6 +86,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     from ..simulate import SimulationOptions
     from ..simulate.newton import SolverOptions
 
+    frames = parse_range(options.range or "all")
     outputs = _outputs(options.output, list(map(str, options.motion)), options.shot_name)
     for output in outputs:
         shared.check_output(output, options.stage, *motion_files(options.motion))
@@ -100,7 +101,6 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         solver=SolverOptions(tolerance=options.tolerance, iterations=options.iterations),
         quasi_static_solver=SolverOptions(tolerance=options.tolerance, iterations=150),
     )
-    frames = parse_range(options.range or "all")
     motions = [read_in_range(str(path), scene.character.skeleton, frames) for path in options.motion]
     shots = [
         _Shot(output, motion, _provenance(options, path, fabric))

@@ -105,6 +105,9 @@ def covering_planes(
     """
     import igl
 
+    if not len(faces):
+        none = np.zeros((0, 3))
+        return HeldSamples(ClothSamples(np.zeros((0, 3), dtype=np.int64), none), none, np.zeros(0))
     body = surface.mesh
     squared, face, found = igl.point_mesh_squared_distance(
         body.points, np.ascontiguousarray(points), np.ascontiguousarray(faces)

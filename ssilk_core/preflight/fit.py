@@ -18,7 +18,7 @@ COLLISION_MARGIN = FABRICS["default"].contact_distance  # [m]
 TOO_DEEP = f"leaves a garment that is more than {1000 * DEEPEST:g} mm deep as it is, because it is not fitted"
 NOT_SETTLED = "leaves this garment as it is, because settling found no shape that is less deep in the body"
 PIERCED = (
-    "the body goes through the cloth there, and settling leaves that part as it is because it would have to move "
+    "the body goes through the cloth, and settling leaves that part as it is because it would have to move "
     f"cloth by more than {1000 * FARTHEST:g} mm"
 )
 MAX_INSIDE_SHARE = 0.25  # share of vertices inside the body above which penetration is an error
@@ -243,13 +243,15 @@ def _not_all(settled: Settled) -> str:
 
 
 def _why_left(settled: Settled) -> list[str]:
-    if len(settled.pierced):
-        return [PIERCED]
-    return [] if settled.moved else [_why_still(settled)]
+    if not len(settled.pierced):
+        return [] if settled.moved else [_why_still(settled)]
+    rest = np.setdiff1d(settled.after.vertices, settled.pierced)
+    part = f"at {len(settled.pierced)} of them " if len(rest) else ""
+    return [part + PIERCED]
 
 
 def _why_still(settled: Settled) -> str:
-    return NOT_SETTLED if settled.failed else TOO_DEEP
+    return TOO_DEEP if settled.before.depth > DEEPEST else NOT_SETTLED
 
 
 def signed_distance(points: Floats, body: Mesh) -> Floats:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..assets import Floats, Ints, Mesh
 from ..errors import fail
 from ..mesh.geodesic import farthest_points, nearest_sources, submesh
-from ..mesh.topology import components, edges, vertex_areas
+from ..mesh.topology import components, edges, vertex_areas, vertex_mask
 
 Mask = NDArray[np.bool_]
 
@@ -55,14 +55,23 @@ def find_seam(mesh: Mesh, loose: Mask) -> Seam:
     """Measure the distance of every vertex to those that are not `loose` (V,).
 
     Raises:
-        SsilkError: all vertices of an island are loose.
+        SsilkError: all vertices of an island are loose, or a loose vertex belongs to no face.
     """
     seam = Seam(*nearest_sources(mesh.points, mesh.faces, np.flatnonzero(~loose)))
-    adrift = int(np.count_nonzero(seam.nearest < 0))
-    if adrift != 0:
+    falling = seam.nearest < 0
+    lone = np.flatnonzero(falling & ~vertex_mask(mesh.faces, mesh.vertex_count))
+    if len(lone):
         fail(
             mesh.path,
-            f"{adrift} loose vertices lie on islands without a pinned or tight vertex",
+            f"{len(lone)} loose vertices belong to no face (the first is {lone[0]})",
+            "they have no mass, and nothing holds them",
+            "delete them, as 'ssilk inspect --fix' does",
+        )
+    if falling.any():
+        fail(
+            mesh.path,
+            f"{np.count_nonzero(falling)} loose vertices (the first is {np.flatnonzero(falling)[0]}) lie on islands "
+            "without a pinned or tight vertex",
             "every island needs one, or it falls off",
             "paint primvars:ssilk:class",
         )

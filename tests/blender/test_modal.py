@@ -82,6 +82,7 @@ def test_work_is_watched_and_its_result_taken(world):
     assert watch(run, world) == {"FINISHED"}
     assert (run.told, world.undone) == (({"INFO"}, "said hello"), ["Run"])
     assert (world.window_manager.timers, world.tasks.current) == ([], None)
+    assert world.told[:-1]
     assert all(said.startswith("Running") for said in world.told[:-1]) and world.told[-1] is None  # in the status bar
     assert not run.work.folder.exists()
 

@@ -8,6 +8,7 @@ import pytest
 
 from blender_addon.findings import Clip, polygons_of, read_findings
 from ssilk_core.assets import Mesh
+from ssilk_core.preflight.motion import unread_motion
 
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
@@ -71,6 +72,13 @@ def test_findings_on_motions_stand_on_the_timeline():
         ("Walk", "frames", (107, 109)),
         ("run.usdc", "", ()),  # its frames are nowhere to go to
     ]
+
+
+def test_a_motion_that_cannot_be_read_is_named():
+    clips = {"run.usdc": Clip("Run", 1)}
+    document = vars(unread_motion("run.usdc", "run.usdc: no skeletal animation."))
+    (said,) = read_findings([document], "Shirt", SHIRT, clips)
+    assert (said.prim, said.found) == ("Run", "no skeletal animation")
 
 
 def findings(bpy) -> dict[str, object]:

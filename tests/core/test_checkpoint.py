@@ -77,6 +77,13 @@ def test_a_model_knows_the_colour_of_its_garment(path, tmp_path):
     assert load_model(tmp_path / "dyed.safetensors").scene.garment.colour == (0.25, 0.5, 1.0)
 
 
+@pytest.mark.parametrize("colour", [[float("nan"), 0.0, 0.0], "123", [0.1, 0.2], {"0": 1.0, "1": 1.0, "2": 1.0}, 0.5])
+def test_a_damaged_colour_is_refused(path, colour):
+    rewrite(path, lambda tensors, document: document.update(colour=colour))
+    with pytest.raises(SsilkError, match="incomplete or inconsistent"):
+        load_model(path)
+
+
 @torch.no_grad()
 def test_a_read_model_computes_what_the_written_one_did(path, model):
     again = network(load_model(path))

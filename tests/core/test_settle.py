@@ -11,9 +11,10 @@ import pytest
 from ssilk_core.assets import Floats, Ints, Mesh
 from ssilk_core.mesh.topology import edges
 from ssilk_core.preflight.cloth_samples import sample_cloth
+from ssilk_core.preflight.contact_planes import covering_planes
 from ssilk_core.preflight.fit import _why_still, penetration
 from ssilk_core.preflight.settle import FARTHEST, GAP, _Cloth, _layer_ties, part_inside, settle
-from ssilk_core.preflight.sides import find_facing
+from ssilk_core.preflight.sides import OuterSurface, find_facing
 
 RADIUS, COLUMNS, ROWS = 0.1, 32, 27
 
@@ -125,6 +126,14 @@ def test_cloth_that_a_limb_pierces_stays_and_a_dent_beside_it_comes_out():
     pierced, inside, *_ = penetration(both, limb(thin))
     assert (pierced.severity, pierced.code, pierced.fixable) == ("error", "pierced", False)
     assert inside.code == "penetration" and inside.fixable and pierced.indices == tuple(found.pierced)
+
+
+def test_cloth_of_which_a_limb_pierces_every_triangle_settles_no_face():
+    """Free vertices of coarse cloth may all belong to faces with a held one."""
+    sheet, rod = tube(RADIUS + 0.006), OuterSurface(limb())
+    facing = find_facing(sheet.points, sheet.faces, rod)
+    assert len(covering_planes(rod, sheet.points, sheet.faces, facing, 0.01).offsets) > 0
+    assert len(covering_planes(rod, sheet.points, sheet.faces[:0], facing, 0.01).offsets) == 0
 
 
 def test_a_garment_whose_equations_are_singular_stays(monkeypatch):

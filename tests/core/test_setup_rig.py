@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Proxy rigs: placement, hierarchy, frames and weights, on sheets whose geodesics are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -225,8 +227,17 @@ def test_nothing_loose_or_no_proxies_is_plain_skinning(character):
 
 def test_loose_island_is_refused(character):
     garment = hanging()
-    with pytest.raises(SsilkError, match="441 loose vertices lie on islands without a pinned or tight vertex"):
+    with pytest.raises(SsilkError, match=r"441 loose vertices \(the first is 0\) lie on islands without a pinned"):
         build_rig(character, Garment(garment.mesh, garment.skin, np.full(441, LOOSE)))
+
+
+def test_a_loose_vertex_of_no_face_is_refused_as_such(character):
+    garment = hanging()
+    mesh = replace(garment.mesh, points=np.append(garment.mesh.points, [[0.0, 1, 0]], axis=0))
+    rows = garment.skin.indices, garment.skin.weights
+    skin = SkinWeights(mesh.path, *(np.append(row, row[:1], axis=0) for row in rows))
+    with pytest.raises(SsilkError, match=r"1 loose vertices belong to no face \(the first is 441\)"):
+        build_rig(character, Garment(mesh, skin, np.append(garment.classes, LOOSE)))
 
 
 @pytest.mark.parametrize(

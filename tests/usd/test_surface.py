@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
-from ssilk_usd.read_mesh import read_mesh
+from ssilk_usd.read_mesh import display_colour, read_mesh
 from ssilk_usd.read_surface import read_surface
 from ssilk_usd.units import StageUnits
 from ssilk_usd.write_surface import write_surface
@@ -163,3 +163,22 @@ def test_what_is_written_reads_back(meters, kilograms):
     assert read.density * read.thickness == pytest.approx(0.2)
     for name in ("thickness", "youngs_modulus", "poissons_ratio", "stretch", "shear", "bend"):
         assert np.allclose(getattr(read, name) or 0.0, getattr(told, name) or 0.0, rtol=1e-6), name
+
+
+@pytest.mark.parametrize(
+    ("authored", "found"),
+    [
+        ("color3f[] primvars:displayColor = [(1, 0, 0), (0, 1, 0)]", (0.5, 0.5, 0.0)),
+        ("color3f[] primvars:displayColor = [(1, 0, 0), (0, 1, 0)]\n"
+         "int[] primvars:displayColor:indices = [0, 0, 0, 1]", (0.75, 0.25, 0.0)),
+        ("color3f primvars:displayColor = (0, 0, 1)", None),
+        ("color4f[] primvars:displayColor = [(1, 0, 0, 1)]", None),
+        ("float[] primvars:displayColor = [1, 0, 0]", None),
+        ('string primvars:displayColor = "red"', None),
+        ("color3f[] primvars:displayColor = []", None),
+    ],
+)  # fmt: skip
+def test_a_colour_of_any_type_is_read_or_none(authored, found):
+    stage = Usd.Stage.CreateInMemory()
+    stage.GetRootLayer().ImportFromString(f'#usda 1.0\ndef Mesh "Cape"\n{{\n{authored}\n}}\n')
+    assert display_colour(stage.GetPrimAtPath("/Cape")) == found

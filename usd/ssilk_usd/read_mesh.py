@@ -27,12 +27,15 @@ def is_drawn(prim: Usd.Prim) -> bool:
 
 
 def display_colour(prim: Usd.Prim) -> tuple[float, float, float] | None:
-    """Return the mean of a mesh's displayColor, of linear light, each from 0 to 1; None without a finite one."""
+    """Return the mean of a mesh's displayColor, of linear light, each from 0 to 1; None without finite ones, (N, 3)."""
     primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayColor")
-    found = primvar.Get(EARLIEST) if primvar and primvar.HasAuthoredValue() else None
-    if not found or not np.isfinite(found).all():
+    found = np.asarray(primvar.ComputeFlattened(EARLIEST)) if primvar and primvar.HasAuthoredValue() else None
+    # Any type may be authored under this name.
+    if found is None or found.dtype.kind != "f" or not found.size or found.shape[1:] != (3,):
         return None
-    red, green, blue = np.array(found, dtype=np.float64).reshape(-1, 3).mean(axis=0).clip(0, 1).tolist()
+    if not np.isfinite(found).all():
+        return None
+    red, green, blue = found.astype(np.float64).mean(axis=0).clip(0, 1).tolist()
     return red, green, blue
 
 
