@@ -27,7 +27,7 @@ def is_drawn(prim: Usd.Prim) -> bool:
 
 
 def display_colour(prim: Usd.Prim) -> tuple[float, float, float] | None:
-    """Return the mean of a mesh's displayColor, of linear light, each from 0 to 1; None without finite ones, (N, 3)."""
+    """Return the mean of a mesh's displayColor, of linear light, each from 0 to 1; None without finite colours."""
     primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayColor")
     found = np.asarray(primvar.ComputeFlattened(EARLIEST)) if primvar and primvar.HasAuthoredValue() else None
     # Any type may be authored under this name.
