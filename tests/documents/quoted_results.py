@@ -132,7 +132,7 @@ def shown() -> Text:
 
 def conditions() -> Text:
     cape, held_out = shipped("cape"), evaluated("cape")
-    (body,) = {line["vertices"] for line in document("trade_cape")["judging"] if line["body"] == "triangles"}
+    (body,) = {line["vertices"] for line in document("trade")["judging"] if line["body"] == "triangles"}
     yield f"{body:,} vertices and {len(cape['joint_names'])} joints"
     uses = {
         "valid": "held out; chooses the checkpoint that is kept",
@@ -345,22 +345,30 @@ def sizes() -> Text:
 
 
 def levels() -> Text:
-    yield "10 s shot [MB]"  # as `trade` scales them
-    points = {point["variant"]: point for point in document("trade_cape")["points"]}
-    for level in ("as trained", "film", "game", "crowd"):
-        point, kept = points[level], QUALITIES.get(level)
-        assert not kept or (min(kept.shapes, 64), min(kept.influences, 8)) == (point["shapes"], point["influences"])
-        rate = f", {point['fps']:.0f} frames/s" if point["fps"] < points["as trained"]["fps"] else ""
-        times = result("runtime")["models"][f"cape, {level if kept else 'whole'}"]["numpy"][FULL]
+    yield "a shot of ten seconds"  # as `trade` scales them
+    shown = ("as trained", "film", "game", "crowd", "1 iterations", "2 iterations", "hero", "simulator")
+    for point in document("trade")["points"]:
+        light = point["model"] == "lcape"
+        if point["variant"] not in (shown[:1] if light else shown):
+            continue
+        skin, level = point["shown_skin"], QUALITIES.get(point["variant"])
+        rate = f", {point['fps']:.0f} frames/s" if point["fps"] < 30 else ""
+        own = point["refine"] or point["variant"] == "simulator"  # a shot has blendshapes of its own
         yield row(
-            f"`{level}`{rate}" if kept else level,
-            f"{point['shapes']} / {point['joints']} / {point['influences']}",
-            two_digits(1000 * point["position"]),
-            two_digits(point["excess"]),
-            fixed(times[0]),
+            {"Cape": "cape", "FringeSkirt": "fringe skirt"}[point["garment"]],
+            "`light`" if light else f"`{point['variant']}`{rate}" if level else point["variant"],
+            "" if own else f"{point['shapes']} / {point['joints']} / {point['influences']}",
+            two_digits(point["solving"]) if point["solving"] else "",
+            fixed(point["total"], 3),
+            fixed(skin["mean"], 3, 0.01),
+            fixed(skin["worst"], 2, 0.01),
+            "" if light else two_digits(1000 * point["position"]),
             fixed(point["shot_bytes"], 2, 1e6),
             fixed(point["model_bytes"], 1, 1e6),
         )
+    times = result("runtime")["models"]
+    whole, crowd = (times[f"cape, {level}"]["numpy"][FULL][0] for level in ("whole", "crowd"))
+    yield f"takes {fixed(whole)} µs on one processor thread, and {fixed(crowd)} µs in `crowd`"
 
 
 def refinement() -> Text:

@@ -64,7 +64,7 @@ def extremes() -> str:
 
 
 def model_size() -> str:
-    sizes = [point["model_bytes"] for point in document("trade_cape")["points"] if point["precision"] == "int16"]
+    sizes = [point["model_bytes"] for point in document("trade")["points"] if point["precision"] == "int16"]
     return f"{fixed(sizes[0], 1, 1e6)} MB"
 
 
