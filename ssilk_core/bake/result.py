@@ -56,11 +56,12 @@ class Verification:
                 "frames of lower energy than the network's": self.frames,
                 "mean energy [J]": f"{self.mean_energy_j:.4g}",
             }
-        rms = {} if self.rms_error_m is None else {"RMS error [m]": f"{self.rms_error_m:.3g}"}
+        assert self.largest_error_m is not None and self.allowed_error_m is not None
+        rms = {} if self.rms_error_m is None else {"RMS error [mm]": f"{1000 * self.rms_error_m:.3g}"}
         return {
             **rms,
-            "largest error [m]": f"{self.largest_error_m:.3g}",
-            "allowed [m]": f"{self.allowed_error_m:.3g}",
+            "largest error [mm]": f"{1000 * self.largest_error_m:.3g}",
+            "allowed [mm]": f"{1000 * self.allowed_error_m:.3g}",
         }
 
 

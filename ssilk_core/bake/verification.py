@@ -177,9 +177,9 @@ def compare_trajectories(
     rms = float(np.sqrt(squares / max(count, 1)))
     if not (rms <= tolerance.rms + slack and worst[0] <= worst[1]):
         raise VerificationError(
-            f"{shot.name}: joints and blendshapes are {rms:.3g} m RMS from the points that they stand for, and "
-            f"vertex {worst[3]} at time code {worst[2]:g} is {worst[0]:.3g} m off; {tolerance.rms:g} m and "
-            f"{tolerance.largest:g} m are allowed."
+            f"{shot.name}: joints and blendshapes are {1000 * rms:.3g} mm RMS from the points that they stand "
+            f"for, and vertex {worst[3]} at time code {worst[2]:g} is {1000 * worst[0]:.3g} mm off; "
+            f"{1000 * tolerance.rms:g} mm and {1000 * tolerance.largest:g} mm are allowed."
         )
     return Verification(frames=len(times), largest_error_m=worst[0], allowed_error_m=worst[1], rms_error_m=rms)
 

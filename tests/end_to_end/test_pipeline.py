@@ -68,7 +68,7 @@ def test_from_character_to_picture(toy, tmp_path, monkeypatch, capsys):
     assert run(f"{SHOT} -o shot.usdc --json") == 0
     assert events(capsys)[-1]["detail"]["frames"] == 40
     assert run("verify shot.usdc --json") == 0
-    assert float(events(capsys)[-1]["detail"]["largest error [m]"]) < 1e-5
+    assert float(events(capsys)[-1]["detail"]["largest error [mm]"]) < 1e-2
     assert run("view shot.usdc -o sheet.png --columns 2 --size 48x64 --json") == 0
     assert events(capsys)[-1] == {"event": "result", "task": "view", "detail": {"picture": "sheet.png", "frames": 2}}
     assert {path.name for path in tmp_path.iterdir()} == {

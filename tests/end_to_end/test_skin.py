@@ -76,7 +76,7 @@ def test_a_cache_becomes_joints_and_shapes_within_the_tolerance(world, copy, mor
     assert stated["joints lose, at most [mm]"] == pytest.approx(1000 * distance.max(), rel=0.01)
     assert stated["shapes of the shot"] > 0 and stated["bytes of the points alone"] == points.size * 4
     assert main(["verify", "shot.usda"]) == 0
-    assert "RMS error [m]" in capsys.readouterr().err
+    assert "RMS error [mm]" in capsys.readouterr().err
 
 
 def test_a_tighter_tolerance_is_kept_and_verified(world, copy, capsys):
