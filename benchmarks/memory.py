@@ -41,6 +41,7 @@ from ssilk_core.memory import StepMemory, decoded_frames
 from ssilk_core.model.network import GarmentModel
 from ssilk_core.motion_bank import build_bank
 from ssilk_core.training.objective import Objective
+from ssilk_core.training.shape_smoothing import ShapeSmoothing
 from ssilk_core.training.step import Stepper
 from ssilk_core.training.windows import WindowSampler
 
@@ -107,9 +108,8 @@ def stepper(whole: Scene, config: TrainConfig, device: torch.device) -> Stepper:
     body = CollisionBody(whole.character.merged_body(), JOINTS, device=device)
     generator = torch.Generator(device).manual_seed(0)
     sampler = WindowSampler(bank, config, model.latent, generator)
-    return Stepper(
-        network, Objective(network, energy, body, bank, config.closest_point == "triangles"), sampler, config
-    )
+    objective = Objective(network, energy, body, bank, config.closest_point == "triangles")
+    return Stepper(network, objective, sampler, config, smoothing=ShapeSmoothing.of(network, config.shape_smoothing))
 
 
 def measure(vertices: int, body_vertices: int, frames: int, surface: str, device: torch.device) -> dict[str, int]:

@@ -12,6 +12,7 @@ from .schemes import need_scheme
 CLOSEST_POINTS = ("triangles", "vertices")
 MAX_SIZE = 65_536  # of a part of the network; larger ones fit into no machine
 MOST_OF_ALL = 0.99999  # largest share of static training, and decay of an average
+MOST_SMOOTHED_VERTICES = 10_000  # by `training.shape_smoothing`, whose matrix then takes 0.4 GB
 NO_BOUND = 1e9  # upper limit of settings without a limit of their own
 
 # Constants of `model.integrators.SpringVerlet`, shared with the numpy runtime and explained there.
@@ -109,6 +110,8 @@ class TrainConfig:
         learning_rate_warmup: iterations over which the learning rate rises at the start of dynamic training.
         skin_learning_rate_scale: factor on the learning rate of skinning weights and of the integrator's parameters.
         shape_learning_rate_scale: factor on the learning rate of blendshapes, each of which moves many vertices.
+        shape_smoothing: length [m] below which waves of blendshapes change slowly (`training.shape_smoothing`); zero
+            for steps that differ from vertex to vertex, as in the paper.
         ema_decay: decay of the exponential moving average of the parameters, which is validated and saved; 0 for
             none. It is smaller at first: `training.step.averaging_decay`.
         closest_point: how the closest body point is found: on the "triangles" around the nearest vertex, or as the
@@ -142,6 +145,7 @@ class TrainConfig:
     learning_rate_warmup: int = 500
     skin_learning_rate_scale: float = 0.1
     shape_learning_rate_scale: float = 0.3
+    shape_smoothing: float = 0.06
     ema_decay: float = 0.998
     closest_point: str = "triangles"
     validate_every: int = 1000
@@ -168,6 +172,7 @@ class TrainConfig:
             "learning_rate_warmup",
             "skin_learning_rate_scale",
             "shape_learning_rate_scale",
+            "shape_smoothing",
             "outlier_energy",
             "newton_weight",
         )

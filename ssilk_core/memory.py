@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from .assets import Scene
-from .config import ModelConfig, TrainConfig
+from .config import MOST_SMOOTHED_VERTICES, ModelConfig, TrainConfig
 from .errors import fail
 
 PLANNED_SHARE = 0.8  # of the free memory
@@ -59,8 +59,8 @@ class StepMemory:
     """Predicts what a training step holds at its peak, from the sizes of its garment, body and network.
 
     Counts float32 numbers for each frame and vertex, contact sample, body vertex, joint and unit of the network, one
-    table of squared distances, and the search for the closest triangles on a CPU. The constants were fitted to
-    measured peaks, on the safe side (benchmarks/memory.py).
+    table of squared distances, the matrix that smooths blendshapes, and the search for the closest triangles on a
+    CPU. The constants were fitted to measured peaks, on the safe side (benchmarks/memory.py).
 
     Attributes:
         body_vertices: those of the body that the garment can touch.
@@ -81,7 +81,9 @@ class StepMemory:
         network = 12 * sum(self.model.widths) + 20 * self.model.latent
         searched = self.samples * self.body_vertices
         pairs = min(MAX_SEARCHED, 2 * frames * searched)  # a closed mesh has twice as many faces
-        return 4 * frames * (numbers + network) + 4 * searched + 8 * pairs + (40 << 20)
+        smoothed = self.scene.garment.mesh.vertex_count
+        smoothing = 4 * smoothed**2 if smoothed <= MOST_SMOOTHED_VERTICES else 0
+        return 4 * frames * (numbers + network) + 4 * searched + 8 * pairs + smoothing + (40 << 20)
 
     def fitting_batch(self, config: TrainConfig, available: int) -> tuple[int, int]:
         """Return the largest batch and pretraining batch, up to the configured ones, that fit into so many bytes."""

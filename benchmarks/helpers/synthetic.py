@@ -37,6 +37,7 @@ from ssilk_core.kinematics import local_transforms, rigid
 from ssilk_core.model.network import GarmentModel
 from ssilk_core.motion_bank import build_bank
 from ssilk_core.training.objective import Objective
+from ssilk_core.training.shape_smoothing import ShapeSmoothing
 from ssilk_core.training.step import Stepper
 from ssilk_core.training.windows import WindowSampler
 
@@ -173,4 +174,5 @@ def stepper(size: Size, device: torch.device) -> Stepper:
     energy = GarmentEnergy(whole.garment.mesh, Fabric("default"), whole.classes, device=device)
     body = CollisionBody(whole.character.merged_body(), JOINTS, device=device)
     sampler = WindowSampler(bank, config, model.latent, torch.Generator(device).manual_seed(0))
-    return Stepper(network, Objective(network, energy, body, bank), sampler, config)
+    smoothing = ShapeSmoothing.of(network, config.shape_smoothing)
+    return Stepper(network, Objective(network, energy, body, bank), sampler, config, smoothing=smoothing)

@@ -18,6 +18,7 @@ from ..preflight.finding import format_count
 from .job import TrainJob
 from .objective import Objective
 from .parallel import SINGLE_PROCESS, ProcessGroup
+from .shape_smoothing import ShapeSmoothing
 from .step import Stepper
 from .validation import Validator
 from .windows import WindowSampler
@@ -63,7 +64,8 @@ class TrainingParts:
         sampler = WindowSampler(self.bank, own, self.model.config.latent, generator)
         surface = config.closest_point == "triangles"
         objective = Objective(self.model, self.energy, self.body, self.bank, surface, config.newton_weight)
-        return Stepper(self.model, objective, sampler, own, group.average if group.size > 1 else None)
+        smoothing = ShapeSmoothing.of(self.model, config.shape_smoothing)
+        return Stepper(self.model, objective, sampler, own, group.average if group.size > 1 else None, smoothing)
 
 
 def build_parts(

@@ -15,7 +15,7 @@ from typing import NoReturn
 import torch
 from torch import Tensor
 
-from ..config import TrainConfig
+from ..config import MOST_SMOOTHED_VERTICES, TrainConfig
 from ..devices import select_device
 from ..errors import fail
 from ..events import Checkpoint, Message, Progress, Reporter, Started
@@ -288,6 +288,9 @@ class TrainingRun:
         elif self.job.model.scheme == "quasi_static":
             reason = "" if self.job.has_loose else "no vertex is loose; "
             self.report(Message(f"{path}: {reason}the garment is quasi-static and gets no stepper."))
+        elif self.config.shape_smoothing and len(self.parts.model.decoder.free) > MOST_SMOOTHED_VERTICES:
+            text = f"{path}: steps of blendshapes of more than {MOST_SMOOTHED_VERTICES:,} vertices are not smoothed."
+            self.report(Message(text))
         detail = {**self.parts.detail(), "memory predicted [MiB]": self._memory() >> 20}
         self.report(Started("train", self.config.iterations, detail))
 

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from ..config import TrainConfig
 from ..model.network import GarmentModel
 from .objective import Objective, total
+from .shape_smoothing import ShapeSmoothing
 from .skipped_steps import SkippedSteps
 from .windows import WindowSampler
 
@@ -54,6 +55,7 @@ class Stepper:
 
     Args:
         average_gradients: called with the gradients before they are used, to average them over processes.
+        smoothing: of the blendshapes' steps.
 
     Attributes:
         terms: energies of the last step [J], updated in place so that reading them needs no new launch.
@@ -68,9 +70,10 @@ class Stepper:
         sampler: WindowSampler,
         config: TrainConfig,
         average_gradients: GradientAverage | None = None,
+        smoothing: ShapeSmoothing | None = None,
     ) -> None:
         self.model, self.objective, self.sampler, self.config = model, objective, sampler, config
-        self.average_gradients = average_gradients
+        self.average_gradients, self.smoothing = average_gradients, smoothing
         self.device = sampler.first.device
         self.optimiser = _optimiser(model, self.device)
         self.rate_scales = [1.0, config.skin_learning_rate_scale, config.shape_learning_rate_scale]
@@ -125,7 +128,11 @@ class Stepper:
         torch._foreach_div_(gradients, norm.clamp_min(MIN_GRADIENT_NORM))
         # The fused optimiser skips the step where this is one.
         self.optimiser.found_inf = bad.float()  # type: ignore[attr-defined]
+        if self.smoothing:
+            self.smoothing.before_step()
         self.optimiser.step()
+        if self.smoothing:
+            self.smoothing.after_step()
         self._average()
         terms = {name: value.detach() for name, value in terms.items()}
         self.skipped.record(bad, self._iteration, terms | (beside or {}), window)

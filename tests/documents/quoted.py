@@ -63,6 +63,7 @@ PAPER = {
     "learning_rate": "not stated",
     "skin_learning_rate_scale": "not stated",
     "shape_learning_rate_scale": "not stated",
+    "shape_smoothing": 0,
     "ema_decay": "none",
     "latent_regularization": 0,
 }
@@ -84,7 +85,8 @@ def training() -> Text:
             f"{train.batch} of {train.window}", purpose,
         )  # fmt: skip
     for setting, paper in PAPER.items():
-        yield f"| `{setting}` | {default(setting):g} | {paper} |"
+        unit = " [m]" if setting == "shape_smoothing" else ""
+        yield f"| `{setting}`{unit} | {default(setting):g} | {paper} |"
     cloth, papers = Fabric("default"), FABRICS["paper"]
     yield f"| `drag` (material) [kg/(m² s)] | {cloth.drag:g} |"
     yield f"| `contact_model` (material) | {cloth.contact_model} | {papers.contact_model} |"
