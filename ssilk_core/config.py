@@ -110,8 +110,9 @@ class TrainConfig:
         learning_rate_warmup: iterations over which the learning rate rises at the start of dynamic training.
         skin_learning_rate_scale: factor on the learning rate of skinning weights and of the integrator's parameters.
         shape_learning_rate_scale: factor on the learning rate of blendshapes, each of which moves many vertices.
-        shape_smoothing: length [m] below which waves of blendshapes change slowly (`training.shape_smoothing`); zero
-            for steps that differ from vertex to vertex, as in the paper.
+        shape_smoothing: length below which waves of blendshapes change slowly (`training.shape_smoothing`), relative
+            to the diagonal of the garment's bounding box; zero for steps that differ from vertex to vertex, as in the
+            paper.
         ema_decay: decay of the exponential moving average of the parameters, which is validated and saved; 0 for
             none. It is smaller at first: `training.step.averaging_decay`.
         closest_point: how the closest body point is found: on the "triangles" around the nearest vertex, or as the
@@ -145,7 +146,7 @@ class TrainConfig:
     learning_rate_warmup: int = 500
     skin_learning_rate_scale: float = 0.1
     shape_learning_rate_scale: float = 0.3
-    shape_smoothing: float = 0.06
+    shape_smoothing: float = 0.03
     ema_decay: float = 0.998
     closest_point: str = "triangles"
     validate_every: int = 1000
@@ -160,6 +161,7 @@ class TrainConfig:
         _need_between(self, 1, NO_BOUND, "iterations", "batch", "pretraining_batch", "static_batch", "validate_every")
         _need_between(self, 3, NO_BOUND, "valid_frames")
         _need_between(self, 0, 1, "state_reuse", "rotated_fraction", "noise_correlation", "noise_probability")
+        _need_between(self, 0, 1, "shape_smoothing")
         _need_between(self, 0, MOST_OF_ALL, "static_fraction", "ema_decay")
         _need_between(
             self,
@@ -172,7 +174,6 @@ class TrainConfig:
             "learning_rate_warmup",
             "skin_learning_rate_scale",
             "shape_learning_rate_scale",
-            "shape_smoothing",
             "outlier_energy",
             "newton_weight",
         )

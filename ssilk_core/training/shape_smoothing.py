@@ -39,9 +39,13 @@ class ShapeSmoothing:
     """
 
     @classmethod
-    def of(cls, model: GarmentModel, length: float) -> ShapeSmoothing | None:
-        """Return that of a model, None for a length of zero, without blendshapes, or for more vertices than fit."""
+    def of(cls, model: GarmentModel, relative: float) -> ShapeSmoothing | None:
+        """Return that of a model, with l relative to the diagonal of the garment's bounding box.
+
+        None for a length of zero, without blendshapes, or for more vertices than fit.
+        """
         decoder = model.decoder
+        length = relative * float(np.linalg.norm(np.ptp(model.scene.garment.mesh.points, axis=0)))
         if not length or not decoder.shapes.numel() or len(decoder.free) > MOST_SMOOTHED_VERTICES:
             return None
         return cls(decoder.shapes, model.scene.garment.mesh, decoder.free, length)

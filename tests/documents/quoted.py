@@ -19,7 +19,7 @@ from ssilk_core.farm.openjd import CHUNK, CHUNK_SECONDS
 from ssilk_core.mesh import hidden_faces
 from ssilk_core.mesh.stitches import TOUCH
 
-from .measured import default, digits, fixed, micro, milli, percent, result, row, series
+from .measured import default, digits, duration, fixed, micro, milli, percent, result, row, series
 from .quoted_results import results
 from .shared import (
     Text,
@@ -85,8 +85,7 @@ def training() -> Text:
             f"{train.batch} of {train.window}", purpose,
         )  # fmt: skip
     for setting, paper in PAPER.items():
-        unit = " [m]" if setting == "shape_smoothing" else ""
-        yield f"| `{setting}`{unit} | {default(setting):g} | {paper} |"
+        yield f"| `{setting}` | {default(setting):g} | {paper} |"
     cloth, papers = Fabric("default"), FABRICS["paper"]
     yield f"| `drag` (material) [kg/(m² s)] | {cloth.drag:g} |"
     yield f"| `contact_model` (material) | {cloth.contact_model} | {papers.contact_model} |"
@@ -98,11 +97,22 @@ def training() -> Text:
     yield f"| `margin` (material) [mm] | {1000 * cloth.margin:g} | {1000 * papers.margin:g} |"
     yield f"| `thickness` (material) [mm] | {1000 * cloth.thickness:g} | none |"
     yield f"{default('fps'):g} times a second"
+    yield from shape_smoothing()
     yield f"`final` takes {PRESETS['final'].train.ema_decay:g}"
     yield default_step()
     preview, final = (preset_minutes(PRESETS[name]) for name in ("preview", "final"))
     yield f"`preview` takes {60 * preview:.0f} s and `final` {final:.0f} minutes"
     yield "(`recombinations={0.recombinations}`, `perturbations={0.perturbations}`)".format(PRESETS["final"].train)
+
+
+def shape_smoothing() -> Text:
+    runs = [result("shape_smoothing")[name] for name in ("smoothed", "unsmoothed")]
+    best = [run["total"].index(min(run["total"])) for run in runs]
+    yield f"sharing an H200 for {duration(runs[0]['seconds'][-1])}"
+    smooth, rough = (run["total"][at] for run, at in zip(runs, best))
+    yield f"reach {smooth:.2f} J with it and {rough:.2f} J without"
+    smooth, rough = (1000 * run["bending"][at] for run, at in zip(runs, best))
+    yield f"is {smooth:.1f} and {rough:.1f} mJ"
 
 
 # docs/farm.md
