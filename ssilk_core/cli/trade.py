@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .. import __version__
-from ..errors import EXIT_OK, fail
+from ..errors import EXIT_OK, EXIT_TASKS, fail
 from ..events import Reporter, Result, Started
 from . import options as shared
 
@@ -50,7 +50,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
-    """Sweep; return 0."""
+    """Sweep; return 0, or 4 where variants could not be measured."""
     from ..charts import write_chart
     from ..trade.collision_cost import measure_collisions
     from ..trade.plot import trade_panels
@@ -68,6 +68,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     results = Results(options.output, bench.asked)
     results.resume(report)
     report(Started("trade", 0, {"clips": list(bench.clips)}))
+    failed = 0
     try:
         for path, file in bench.files.items():
             meter = bench.meter(path, file)
@@ -77,14 +78,14 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
             size, fps = meter.reducer.whole, file.config.fps
             first = path in bench.first_of_garment
             tried = variants(size, fps, solved=not options.no_refine) if first else other_network(size, fps)
-            sweep(meter, tried, results, report)
+            failed += sweep(meter, tried, results, report)
     finally:  # an interrupted sweep shows what it has
         if results.points and options.output:
             write_chart(options.output.with_suffix(".png"), trade_panels(results.points), size=(4.6, 3.6))
         if not options.json:
             print(table(results.points), collision_table(results.collision_costs), sep="\n")
     report(Result("trade", {"points": [asdict(point) for point in results.points]} if options.json else {}))
-    return EXIT_OK
+    return EXIT_TASKS if failed else EXIT_OK
 
 
 class Bench:

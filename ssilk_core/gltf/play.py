@@ -13,8 +13,9 @@ import numpy as np
 
 from ..assets import Floats, Ints
 from ..errors import fail
-from ..kinematics import matrix_from_quaternion, rigid, slerp
+from ..kinematics import slerp
 from .container import GlbFile, understood
+from .nodes import node_transform
 from .shot import ARMATURE, GARMENT
 
 WRITTEN = "a .glb that 'ssilk bake' wrote is needed"
@@ -114,21 +115,10 @@ class GlbShot:
             position = (time - self._start) * self._per_frame
             values = {(channel.node, channel.path): channel.at(position) for channel in self._channels}
             world: dict[int, Floats] = {}
-            for joint in self._joints:
-                self._place(joint, values, world)
-            matrices = np.stack([world[joint] for joint in self._joints]) @ self._binds
+            placed = [node_transform(joint, self._nodes, self._parents, values, world) for joint in self._joints]
+            matrices = np.stack(placed) @ self._binds
             weights = values.get((surface.node, "weights"), surface.weights)
             return surface.posed(weights, matrices)
-
-    def _place(self, node: int, values: Mapping[tuple[int, str], Floats], world: dict[int, Floats]) -> Floats:
-        """Return the transform of a node to the world, and add those of it and of the nodes above to `world`."""
-        if node not in world:
-            item, above = self._nodes[node], self._parents.get(node)
-            turn = values.get((node, "rotation"), np.array(item.get("rotation", (0, 0, 0, 1)), dtype=np.float64))
-            place = values.get((node, "translation"), np.array(item.get("translation", (0, 0, 0)), dtype=np.float64))
-            own = rigid(matrix_from_quaternion(turn[[3, 0, 1, 2]]), place)
-            world[node] = own if above is None else self._place(above, values, world) @ own
-        return world[node]
 
     def _understood(self) -> AbstractContextManager[None]:
         """Raise `SsilkError` for a document of another shape than `write_glb` writes."""

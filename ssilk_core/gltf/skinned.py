@@ -12,10 +12,9 @@ import numpy as np
 
 from ..assets import Floats
 from ..errors import fail
-from ..kinematics import matrix_from_quaternion, slerp
+from ..kinematics import slerp
 from .container import GlbFile, understood
-
-Values = Mapping[tuple[int, str], Floats]
+from .nodes import node_transform
 
 
 class SkinnedGlb:
@@ -97,7 +96,8 @@ class SkinnedGlb:
                 for what, times, values, steps in self._channels
             }
             world: dict[int, Floats] = {}
-            matrices = np.stack([self._place(joint, moved, world) for joint in self._skin]) @ self._binds
+            placed = [node_transform(joint, self._nodes, self._parents, moved, world) for joint in self._skin]
+            matrices = np.stack(placed) @ self._binds
             weights = moved.get((self._node, "weights"), self._weights)
             points = self.rest + np.tensordot(weights, self._shapes, 1)
             posed = np.zeros_like(points)
@@ -105,22 +105,6 @@ class SkinnedGlb:
                 each = matrices[joint]
                 posed += share[:, None] * (np.einsum("vab,vb->va", each[:, :3, :3], points) + each[:, :3, 3])
             return posed
-
-    def _place(self, node: int, moved: Values, world: dict[int, Floats]) -> Floats:
-        """Return the transform of a node to the world, shape (4, 4)."""
-        if node not in world:
-            item, above = self._nodes[node], self._parents.get(node)
-            own = np.array(item.get("matrix", np.eye(4)), dtype=np.float64).reshape(4, 4).T
-            if "matrix" not in item:
-                turn, place, scale = (
-                    moved.get((node, name), np.array(item.get(name, usual), dtype=np.float64))
-                    for name, usual in (
-                        ("rotation", (0, 0, 0, 1)), ("translation", (0, 0, 0)), ("scale", (1, 1, 1)),
-                    )
-                )  # fmt: skip
-                own[:3, :3], own[:3, 3] = matrix_from_quaternion(turn[[3, 0, 1, 2]]) * scale, place
-            world[node] = own if above is None else self._place(above, moved, world) @ own
-        return world[node]
 
     def _understood(self) -> AbstractContextManager[None]:
         """Raise `SsilkError` for a document that is not what the specification says."""

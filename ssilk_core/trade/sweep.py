@@ -70,11 +70,19 @@ class Results:
                 temporary.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
-def sweep(meter: VariantMeter, variants: Iterable[Variant], results: Results, report: Reporter = silent) -> None:
-    """Measure the variants of a model that `results` lacks, and add each after its measurement."""
-    tried = list(variants)
+def sweep(meter: VariantMeter, variants: Iterable[Variant], results: Results, report: Reporter = silent) -> int:
+    """Measure the variants of a model that `results` lacks, and add each after its measurement.
+
+    Return how many failed; each is warned of, and the others go on.
+    """
+    tried, failed = list(variants), 0
     missing = [variant for variant in tried if not results.found(meter.name, variant)]
     told = Countdown(len(tried), report, done=len(tried) - len(missing))
     for variant in missing:
-        results.add(meter.point(variant))
+        try:
+            results.add(meter.point(variant))
+        except SsilkError as error:
+            failed += 1
+            report(Message(f"{meter.name}, {variant.name}: not measured, {error}", "warning"))
         told()
+    return failed

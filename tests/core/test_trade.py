@@ -17,6 +17,7 @@ from ssilk_core.errors import SsilkError
 from ssilk_core.evaluation.methods import EvaluationScene, Network, build_take_set
 from ssilk_core.evaluation.record import recorded
 from ssilk_core.evaluation.takes import takes_of
+from ssilk_core.events import Message
 from ssilk_core.fabrics import FABRICS
 from ssilk_core.kinematics import deform, resample, sample_motion
 from ssilk_core.reduction import ModelSize, Reducer
@@ -252,6 +253,22 @@ def test_a_sweep_that_was_stopped_goes_on(meter, points, tmp_path, monkeypatch):
     other = Results(path, {"clips": ["b"]})
     other.resume(said.append)
     assert not other.points
+
+
+def test_a_variant_that_fails_is_told_and_the_others_are_measured(meter, points, monkeypatch):
+    tried, said = [chosen(meter, name) for name in ("as trained", "int16", "float16")], []
+
+    def broken(variant):
+        if variant.name == "int16":
+            raise SsilkError("frame 3: the energy is not finite.")
+        return points[variant.name]
+
+    monkeypatch.setattr(meter, "point", broken)
+    results = Results(None, {})
+    assert sweep(meter, tried, results, said.append) == 1
+    assert [point.variant for point in results.points] == ["as trained", "float16"]
+    (warning,) = [event for event in said if isinstance(event, Message)]
+    assert warning.level == "warning" and "int16: not measured, frame 3" in warning.text
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"asked": 1}', '{"asked": {}, "points": [{"model": "m"}]}'])
