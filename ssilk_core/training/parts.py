@@ -41,6 +41,7 @@ class TrainingParts:
     reached: int
     device: torch.device
     group: ProcessGroup = SINGLE_PROCESS
+    smoothing: ShapeSmoothing | None = None
 
     def detail(self) -> dict[str, object]:
         """Return figures about the run, for messages."""
@@ -64,8 +65,8 @@ class TrainingParts:
         sampler = WindowSampler(self.bank, own, self.model.config.latent, generator)
         surface = config.closest_point == "triangles"
         objective = Objective(self.model, self.energy, self.body, self.bank, surface, config.newton_weight)
-        smoothing = ShapeSmoothing.of(self.model, config.shape_smoothing)
-        return Stepper(self.model, objective, sampler, own, group.average if group.size > 1 else None, smoothing)
+        average = group.average if group.size > 1 else None
+        return Stepper(self.model, objective, sampler, own, average, self.smoothing)
 
 
 def build_parts(
@@ -94,4 +95,5 @@ def build_parts(
     rest, frames = model.decoder.rest, job.train.valid_frames
     spans = usable_spans(job.held_out, fps)
     validator = Validator(held, energy, whole, scene, rest, fps, frames, group, spans)
-    return TrainingParts(model, bank, energy, touched, validator, len(reach.vertices), device, group)
+    smoothing = ShapeSmoothing.of(model, job.train.shape_smoothing)
+    return TrainingParts(model, bank, energy, touched, validator, len(reach.vertices), device, group, smoothing)
