@@ -11,7 +11,7 @@ from pathlib import Path
 
 import torch
 
-from .assets import Scene
+from .assets import PINNED, Scene
 from .config import MOST_SMOOTHED_VERTICES, ModelConfig, TrainConfig
 from .errors import fail
 
@@ -66,6 +66,7 @@ class StepMemory:
         body_vertices: those of the body that the garment can touch.
         samples: at which the garment meets the body (`collision.samples`), its vertices among them.
         stitches: that hold its islands on one another.
+        smoothed: vertices whose blendshapes are smoothed by a matrix that is still to be built.
     """
 
     scene: Scene
@@ -73,6 +74,7 @@ class StepMemory:
     body_vertices: int
     samples: int
     stitches: int = 0
+    smoothed: int = 0
 
     def needed(self, frames: int) -> int:
         """Predict the bytes of a step that decodes so many frames at once."""
@@ -81,9 +83,7 @@ class StepMemory:
         network = 12 * sum(self.model.widths) + 20 * self.model.latent
         searched = self.samples * self.body_vertices
         pairs = min(MAX_SEARCHED, 2 * frames * searched)  # a closed mesh has twice as many faces
-        smoothed = self.scene.garment.mesh.vertex_count
-        smoothing = 4 * smoothed**2 if smoothed <= MOST_SMOOTHED_VERTICES else 0
-        return 4 * frames * (numbers + network) + 4 * searched + 8 * pairs + smoothing + (40 << 20)
+        return 4 * frames * (numbers + network) + 4 * searched + 8 * pairs + 4 * self.smoothed**2 + (40 << 20)
 
     def fitting_batch(self, config: TrainConfig, available: int) -> tuple[int, int]:
         """Return the largest batch and pretraining batch, up to the configured ones, that fit into so many bytes."""
@@ -103,6 +103,12 @@ class StepMemory:
                 f"{available / 2**30:.2g} GiB are free",
                 "free some, take another device (--device), or shorter windows (--set window=...)",
             )
+
+
+def smoothed_vertices(scene: Scene, model: ModelConfig, config: TrainConfig) -> int:
+    """Return how many vertices `training.shape_smoothing` smooths."""
+    free = int((scene.classes != PINNED).sum())
+    return free if config.shape_smoothing and model.shapes and free <= MOST_SMOOTHED_VERTICES else 0
 
 
 def decoded_frames(config: TrainConfig, batch: int) -> int:

@@ -67,7 +67,7 @@ class BaselineRun:
         device = select_device(base.device)
         self.files = RunFiles(base, device)
         self.files.remove_unfinished()
-        parts = build_parts(base, device)
+        parts = build_parts(replace(base, train=replace(base.train, shape_smoothing=0.0)), device)
         joints = parts.model.joints
         inner = torch.as_tensor(base.scene.character.skeleton.parents[joints] >= 0, device=device)
         bank, held = (joint_bank(bank, inner, job.config.fps) for bank in (parts.bank, parts.validator.bank))

@@ -38,13 +38,14 @@ def memory(scene: Scene, preset: Preset, body_vertices: int) -> Findings:
     from ..devices import select_device
     from ..energy.stitching import held_stitches
     from ..fabrics import FABRICS
-    from ..memory import StepMemory, decoded_frames, free_memory
+    from ..memory import StepMemory, decoded_frames, free_memory, smoothed_vertices
 
     model, train, device = preset.model, preset.train, select_device("auto")
     free = free_memory(device)
     samples = len(contact_samples(scene.garment.mesh, FABRICS["default"]).area)
     stitches = len(held_stitches(scene.garment.mesh, FABRICS["default"], scene.classes))
-    step = StepMemory(scene, model, body_vertices, samples, stitches)
+    smoothed = smoothed_vertices(scene, model, train)
+    step = StepMemory(scene, model, body_vertices, samples, stitches, smoothed)
     needed = step.needed(decoded_frames(train, train.batch))
     batch, pretraining_batch = step.fitting_batch(train, free)
     lowered = (batch, pretraining_batch) != (train.batch, train.pretraining_batch)

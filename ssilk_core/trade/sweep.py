@@ -80,9 +80,11 @@ def sweep(meter: VariantMeter, variants: Iterable[Variant], results: Results, re
     told = Countdown(len(tried), report, done=len(tried) - len(missing))
     for variant in missing:
         try:
-            results.add(meter.point(variant))
+            point = meter.point(variant)
         except SsilkError as error:
             failed += 1
             report(Message(f"{meter.name}, {variant.name}: not measured, {error}", "warning"))
+        else:
+            results.add(point)
         told()
     return failed

@@ -96,4 +96,6 @@ def build_parts(
     spans = usable_spans(job.held_out, fps)
     validator = Validator(held, energy, whole, scene, rest, fps, frames, group, spans)
     smoothing = ShapeSmoothing.of(model, job.train.shape_smoothing)
+    if smoothing:
+        smoothing.smooth_start()  # a resumed run replaces it by what it has learned
     return TrainingParts(model, bank, energy, touched, validator, len(reach.vertices), device, group, smoothing)

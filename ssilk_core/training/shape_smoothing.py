@@ -25,7 +25,8 @@ from ..config import MOST_SMOOTHED_VERTICES
 from ..mesh import topology
 from ..model.network import GarmentModel
 
-EDGE_WEIGHT = 1 / np.sqrt(3)  # cotangent weight of an edge between equilateral triangles
+MOST_COTANGENT = 5.0  # of an angle of 11 degrees
+TINY = np.finfo(float).tiny
 LEAST_AREA = 1e-6  # of a vertex, relative to the mean: one without faces has none, and moves by itself
 
 
@@ -34,15 +35,29 @@ class ShapeSmoothing:
 
     Args:
         shapes: the blendshapes B [m], shape (V', 3, K).
-        mesh: garment; `free`: its V' vertices that B moves, shape (V',). The others stay where they are.
+        mesh: garment.
+        free: its V' vertices that B moves, shape (V',). The others stay where they are.
         length: l [m].
     """
+
+    def __init__(self, shapes: nn.Parameter, mesh: Mesh, free: Tensor, length: float) -> None:
+        self.shapes = shapes
+        stiffness, area = laplacian(mesh)
+        chosen = free.cpu().numpy()
+        areas = torch.as_tensor(area[chosen], device=shapes.device)
+        system = torch.as_tensor(length**2 * stiffness[chosen][:, chosen].toarray(), device=shapes.device)
+        system.diagonal().add_(areas)
+        self.matrix = (torch.linalg.inv(system) * areas).to(shapes.dtype)
+        self._before = torch.empty_like(shapes)
+        if shapes.is_cuda:  # what is cached counts as taken where the batch is fitted to the free memory
+            del system
+            torch.cuda.empty_cache()
 
     @classmethod
     def of(cls, model: GarmentModel, relative: float) -> ShapeSmoothing | None:
         """Return that of a model, with l relative to the diagonal of the garment's bounding box.
 
-        None for a length of zero, without blendshapes, or for more vertices than fit.
+        None for a length of zero, without blendshapes, or for more than `MOST_SMOOTHED_VERTICES` free vertices.
         """
         decoder = model.decoder
         length = relative * float(np.linalg.norm(np.ptp(model.scene.garment.mesh.points, axis=0)))
@@ -50,18 +65,14 @@ class ShapeSmoothing:
             return None
         return cls(decoder.shapes, model.scene.garment.mesh, decoder.free, length)
 
-    def __init__(self, shapes: nn.Parameter, mesh: Mesh, free: Tensor, length: float) -> None:
-        self.shapes = shapes
-        stiffness, area = laplacian(mesh)
-        chosen = free.cpu().numpy()
+    @torch.no_grad()
+    def smooth_start(self) -> None:
+        """Smooth the random blendshapes that training starts with, and keep their RMS.
 
-        def tensor(values: Floats) -> Tensor:
-            return torch.as_tensor(values, dtype=torch.float64, device=shapes.device)
-
-        areas = tensor(area[chosen]).diag()
-        system = areas + length**2 * tensor(stiffness[chosen][:, chosen].toarray())
-        self.matrix = torch.linalg.solve(system, areas).to(shapes.dtype)
-        self._before = torch.empty_like(shapes)
+        No smoothed step could take their shortest waves away again.
+        """
+        smooth = (self.matrix @ self.shapes.flatten(1)).view_as(self.shapes)
+        self.shapes.copy_(smooth * (self.shapes.norm() / smooth.norm()))
 
     @torch.no_grad()
     def before_step(self) -> None:
@@ -78,14 +89,22 @@ class ShapeSmoothing:
 
 
 def laplacian(mesh: Mesh) -> tuple[Any, Floats]:
-    """Return the stiffness K, sparse (V, V), and the areas [m2] of the vertices (V,).
+    """Return the cotangent stiffness K, sparse (V, V), and the areas [m2] of the vertices (V,).
 
-    All edges have the weight of equilateral triangles: slivers then weigh no more than others.
+    Cotangents of obtuse angles count as zero and those of slivers as `MOST_COTANGENT`, so that S never overshoots.
     """
     from scipy.sparse import coo_array, diags_array
 
-    pairs = topology.edges(mesh.faces)
+    corners = mesh.points[mesh.faces]
+    cotangents = []
+    for corner in range(3):
+        one, other = (corners[:, (corner + step) % 3] - corners[:, corner] for step in (1, 2))
+        doubled = np.linalg.norm(np.cross(one, other), axis=1)
+        along = np.einsum("fc,fc->f", one, other)
+        cotangents.append(np.minimum(along, MOST_COTANGENT * doubled).clip(0) / np.maximum(doubled, TINY))
+    pairs = np.concatenate([mesh.faces[:, [(corner + 1) % 3, (corner + 2) % 3]] for corner in range(3)])
     rows, columns = np.concatenate([pairs, pairs[:, ::-1]]).T
-    joined = coo_array((np.full(len(rows), EDGE_WEIGHT), (rows, columns)), shape=(mesh.vertex_count,) * 2).tocsr()
+    weights = np.tile(np.concatenate(cotangents) / 2, 2)
+    joined = coo_array((weights, (rows, columns)), shape=(mesh.vertex_count,) * 2).tocsr()
     area = topology.vertex_areas(mesh.points, mesh.faces)
     return diags_array(joined.sum(axis=1)).tocsr() - joined, np.maximum(area, LEAST_AREA * area.mean())

@@ -129,16 +129,16 @@ def test_sides_that_face_each_other_hold_nothing_unless_a_piece_lies_wholly_on_t
 
     square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
 
-    def falling(size: float, shift: float, sides: list[int]) -> bool:
+    def falling(size: float, shift: float, sides: list[int], held: int = 0) -> bool:
         points = np.concatenate([square, size * square + [shift, 0, 0.004]])
-        name = f"Legs{size}{shift}{sides}"
+        name = f"Legs{size}{shift}{sides}{held}"
         legs = add_mesh(bpy, name, points, np.array([[0, 1, 2, 3], sides]))
-        write_classes(legs.data, np.where(np.arange(8) == 0, 1, 2).astype(np.int32))
+        write_classes(legs.data, np.where(np.arange(8) == held, 1, 2).astype(np.int32))
         return "fall off" in adrift_line(legs)
 
     along, opposed = [4, 5, 6, 7], [7, 6, 5, 4]
     assert [falling(1, 1.5, sides) for sides in (along, opposed)] == [False, True]
-    assert [falling(0.1, 0.0, sides) for sides in (along, opposed)] == [False, False]
+    assert [falling(0.1, 0.0, sides, held) for sides in (along, opposed) for held in (0, 4)] == [False] * 4
 
 
 def test_broken_classes_are_told_and_drawn_around(bpy, skirt):

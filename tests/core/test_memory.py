@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from ssilk_core import memory
+from ssilk_core.assets import PINNED
 from ssilk_core.config import ModelConfig, TrainConfig
 from ssilk_core.energy import GarmentEnergy
 from ssilk_core.errors import SsilkError
@@ -19,6 +20,7 @@ from ssilk_core.memory import (
     decoded_frames,
     fits_in_memory,
     free_memory,
+    smoothed_vertices,
 )
 
 MODEL, CONFIG = ModelConfig(), TrainConfig(batch=32, window=16, static_batch=32, pretraining_batch=700)
@@ -29,8 +31,15 @@ def test_more_of_anything_needs_more(scene):
     base = step.needed(64)
     wider = replace(MODEL, widths=(256, 512, 513))
     assert step.needed(65) > base
-    for change in ({"body_vertices": 1001}, {"samples": 201}, {"stitches": 1}, {"model": wider}):
+    for change in ({"body_vertices": 1001}, {"samples": 201}, {"stitches": 1}, {"smoothed": 1}, {"model": wider}):
         assert replace(step, **change).needed(64) > base
+
+
+def test_the_matrix_that_smooths_is_counted_where_there_is_one(scene):
+    free = int((scene.classes != PINNED).sum())
+    assert 0 < smoothed_vertices(scene, MODEL, CONFIG) == free < len(scene.classes)
+    for model, config in ((replace(MODEL, shapes=0), CONFIG), (MODEL, replace(CONFIG, shape_smoothing=0))):
+        assert smoothed_vertices(scene, model, config) == 0
 
 
 def test_what_a_step_keeps_of_its_contact_samples_is_counted(scene):
