@@ -37,7 +37,7 @@ def write_results(options: argparse.Namespace, markdown: str, measured: Mapping[
 
 def save_results(options: argparse.Namespace, measured: Mapping[str, Any]) -> None:
     """Write figures with command, hardware and versions; the hardware is `options.device`'s where none is named."""
-    command = "python benchmarks/" + shlex.join([Path(word).name if "/" in word else word for word in sys.argv])
+    command = "python benchmarks/" + shlex.join(map(_without_folders, sys.argv))
     document = {
         "command": command,
         "hardware": getattr(options, "hardware", None) or _hardware(options),
@@ -46,6 +46,12 @@ def save_results(options: argparse.Namespace, measured: Mapping[str, Any]) -> No
     }
     with replacing(RESULTS / f"{options.name}.json") as temporary:
         temporary.write_text(indented(document) + "\n")
+
+
+def _without_folders(word: str) -> str:
+    """Return "name=file" from "name=folder/file"."""
+    name, mark, path = word.rpartition("=")
+    return name + mark + Path(path).name if "/" in path else word
 
 
 def rounded(value: Any) -> Any:
