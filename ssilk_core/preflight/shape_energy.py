@@ -3,15 +3,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from ..assets import Floats, Ints
+from ..mesh.laplacian import cotangent_weights, laplacian
 from ..mesh.topology import edges, vertex_areas
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_matrix
 
 BEND_LENGTH = 0.005  # [m] wavelength below which bending resists more than stretching
 PULL_LENGTH = 0.1  # [m] over which the pull towards the authored places outweighs stretching
@@ -32,11 +28,11 @@ class ShapeEnergy:
 
         count = len(points)
         self.authored, self.pairs = points, edges(faces)
-        self.weights = _edge_weights(points, faces, self.pairs)
+        self.weights = cotangent_weights(points, faces, self.pairs, COTANGENTS)
         area = np.maximum(vertex_areas(points, faces), 1e-8)
-        self.laplacian = _laplacian(self.pairs, self.weights, count)
+        self.laplacian = laplacian(self.pairs, self.weights, count)
         self.smoother = BEND_LENGTH**2 * (self.laplacian @ sparse.diags(1 / area)).tocsr()
-        self.fixed = (sparse.diags(area / PULL_LENGTH**2) + _laplacian(ties, LAYER_STIFFNESS, count)).tocsr()
+        self.fixed = (sparse.diags(area / PULL_LENGTH**2) + laplacian(ties, LAYER_STIFFNESS, count)).tocsr()
         self.matrix = (self.laplacian + self.smoother @ self.laplacian + self.fixed).tocsr()
         self.curvature = self.laplacian @ points
         self.pulled = self.fixed @ points
@@ -60,31 +56,6 @@ class ShapeEnergy:
         left, _, right = np.linalg.svd(total.reshape(-1, 3, 3))
         left[:, :, 2] *= np.sign(np.linalg.det(left @ right))[:, None]
         return np.asarray(left @ right)
-
-
-def _edge_weights(points: Floats, faces: Ints, pairs: Ints) -> Floats:
-    """Return half the sum of the cotangents opposite each edge, within `COTANGENTS`, shape (E,)."""
-    import scipy.sparse as sparse
-
-    count = len(points)
-    total = sparse.csr_matrix((count, count))
-    for corner in range(3):
-        apex, one, other = (faces[:, (corner + step) % 3] for step in range(3))
-        u, v = points[one] - points[apex], points[other] - points[apex]
-        sine = np.linalg.norm(np.cross(u, v), axis=1)
-        cotangent = 0.5 * np.einsum("fc,fc->f", u, v) / np.maximum(sine, 1e-12)
-        low, high = np.minimum(one, other), np.maximum(one, other)
-        total = total + sparse.coo_matrix((cotangent, (low, high)), shape=(count, count)).tocsr()
-    return np.clip(np.asarray(total[pairs[:, 0], pairs[:, 1]]).reshape(-1), *COTANGENTS)
-
-
-def _laplacian(pairs: Ints, weights: Floats | float, count: int) -> csr_matrix:
-    import scipy.sparse as sparse
-
-    values = np.broadcast_to(np.asarray(weights, dtype=np.float64), len(pairs))
-    links = sparse.coo_matrix((values, (pairs[:, 0], pairs[:, 1])), shape=(count, count)).tocsr()
-    links = links + links.T
-    return (sparse.diags(np.asarray(links.sum(axis=1)).reshape(-1)) - links).tocsr()
 
 
 def _scattered(index: Ints, rows: Floats, count: int) -> Floats:

@@ -14,19 +14,17 @@ Geometry" (2021), take the same parametrisation for meshes.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..assets import Floats, Mesh
+from ..assets import Mesh
 from ..config import MOST_SMOOTHED_VERTICES
-from ..mesh import topology
+from ..mesh.laplacian import cotangent_weights, laplacian
+from ..mesh.topology import edges, vertex_areas
 from ..model.network import GarmentModel
 
-MOST_COTANGENT = 5.0  # of an angle of 11 degrees
-TINY = np.finfo(float).tiny
+COTANGENTS = (0.0, 5.0)  # bounds of the edge weights: S must not overshoot, and slivers must not weigh more
 LEAST_AREA = 1e-6  # of a vertex, relative to the mean: one without faces has none, and moves by itself
 
 
@@ -42,8 +40,11 @@ class ShapeSmoothing:
 
     def __init__(self, shapes: nn.Parameter, mesh: Mesh, free: Tensor, length: float) -> None:
         self.shapes = shapes
-        stiffness, area = laplacian(mesh)
-        chosen = free.cpu().numpy()
+        pairs, chosen = edges(mesh.faces), free.cpu().numpy()
+        weights = cotangent_weights(mesh.points, mesh.faces, pairs, COTANGENTS)
+        stiffness = laplacian(pairs, weights, mesh.vertex_count)
+        area = vertex_areas(mesh.points, mesh.faces)
+        area = np.maximum(area, LEAST_AREA * area.mean())
         areas = torch.as_tensor(area[chosen], device=shapes.device)
         system = torch.as_tensor(length**2 * stiffness[chosen][:, chosen].toarray(), device=shapes.device)
         system.diagonal().add_(areas)
@@ -86,25 +87,3 @@ class ShapeSmoothing:
         """Turn the optimiser's change of B, which was meant for U, into that of B."""
         change = (self.shapes - self._before).flatten(1)
         self.shapes.copy_(self._before + (self.matrix @ change).view_as(self.shapes))
-
-
-def laplacian(mesh: Mesh) -> tuple[Any, Floats]:
-    """Return the cotangent stiffness K, sparse (V, V), and the areas [m2] of the vertices (V,).
-
-    Cotangents of obtuse angles count as zero and those of slivers as `MOST_COTANGENT`, so that S never overshoots.
-    """
-    from scipy.sparse import coo_array, diags_array
-
-    corners = mesh.points[mesh.faces]
-    cotangents = []
-    for corner in range(3):
-        one, other = (corners[:, (corner + step) % 3] - corners[:, corner] for step in (1, 2))
-        doubled = np.linalg.norm(np.cross(one, other), axis=1)
-        along = np.einsum("fc,fc->f", one, other)
-        cotangents.append(np.minimum(along, MOST_COTANGENT * doubled).clip(0) / np.maximum(doubled, TINY))
-    pairs = np.concatenate([mesh.faces[:, [(corner + 1) % 3, (corner + 2) % 3]] for corner in range(3)])
-    rows, columns = np.concatenate([pairs, pairs[:, ::-1]]).T
-    weights = np.tile(np.concatenate(cotangents) / 2, 2)
-    joined = coo_array((weights, (rows, columns)), shape=(mesh.vertex_count,) * 2).tocsr()
-    area = topology.vertex_areas(mesh.points, mesh.faces)
-    return diags_array(joined.sum(axis=1)).tocsr() - joined, np.maximum(area, LEAST_AREA * area.mean())
