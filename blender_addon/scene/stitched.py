@@ -9,7 +9,7 @@ import numpy as np
 from mathutils.bvhtree import BVHTree
 
 from ssilk_core.mesh.stitches import ABOVE, LEAST_COSINE, SAGITTA, SAME_PLACE, TOUCH
-from ssilk_core.mesh.topology import vertex_normals
+from ssilk_core.mesh.topology import face_areas, vertex_normals
 
 
 class _Feet(NamedTuple):
@@ -36,9 +36,7 @@ def unstitched(points: np.ndarray, triangles: np.ndarray, island: np.ndarray, ad
         island: number of the island of each vertex, shape (V,).
         adrift: whether each vertex is on an island without a pinned or tight vertex, shape (V,).
     """
-    sides = np.diff(points[triangles], axis=1)
-    areas = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
-    area = np.bincount(island[triangles[:, 0]], areas, len(points))
+    area = np.bincount(island[triangles[:, 0]], face_areas(points, triangles), len(points))
     used = np.bincount(island[np.unique(triangles)], minlength=len(points))
     normals, held = vertex_normals(points, triangles), ~adrift
     while held.any() and adrift.any():

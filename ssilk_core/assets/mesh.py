@@ -75,5 +75,10 @@ class Mesh:
         return self.polygon_indices
 
     @property
+    def diagonal(self) -> float:
+        """Length of the diagonal of the bounding box [m]."""
+        return float(np.linalg.norm(np.ptp(self.points, axis=0)))
+
+    @property
     def vertex_count(self) -> int:
         return len(self.points)

@@ -6,8 +6,7 @@ the simulator makes the shot without a network. Networks of several sizes and ga
 of a garment are measured whole and at their levels. Costs are the times of playing and of the solver, memory, and the
 sizes of model and shot. Accuracy is energy, collisions, skin that shows, and the distance of vertices and velocities
 from the whole model. Times are of this machine and of the first clip. --output writes each point when it is measured;
-an interrupted sweep continues from there. A variant
-that fails is told, and the exit code is 4 then.
+an interrupted sweep continues from there. A variant that fails is told, and the exit code is 4 then.
 """
 
 from __future__ import annotations

@@ -178,7 +178,7 @@ def _patches(body: Mesh, chosen: Ints, anchors: Ints) -> Ints:
     pairs = np.unique(np.concatenate([topology.edges(body.faces), joined]), axis=0)
     graph = edge_graph(body.points, pairs)
     normals = topology.vertex_normals(body.points, body.faces)[chosen]
-    extent = PATCH_RADIUS * float(np.linalg.norm(np.ptp(body.points, axis=0)))
+    extent = PATCH_RADIUS * body.diagonal
     patches = []
     for start in range(0, len(anchors), SOURCES_PER_BATCH):
         part = anchors[start : start + SOURCES_PER_BATCH]

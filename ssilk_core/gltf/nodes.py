@@ -21,7 +21,8 @@ def node_transform(
     """Return the transform of a node to the world, shape (4, 4).
 
     Args:
-        nodes: as the document lists them; parents: of those that have one.
+        nodes: as the document lists them.
+        parents: of the nodes that have one.
         moved: animated values in place of the nodes' own.
         world: transforms that are known, to which this one and those of the nodes above are added.
     """

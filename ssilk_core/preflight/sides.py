@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..assets import Floats, Ints, Mesh
+from ..mesh.laplacian import laplacian
 from ..mesh.topology import components, edges, is_inside_out, islands, smooth, vertex_areas, vertex_normals
 from ..setup.surface import closest_on_surface, is_enclosed
 from .winding import consistent_flips
@@ -140,10 +141,8 @@ def find_facing(points: Floats, faces: Ints, surface: OuterSurface) -> Facing:
     open_edge = ~side.inside[pairs].any(axis=1) & ~(middle.inside & (middle.distance < -CROSSING))
     share = _share_of_island(components(pairs[open_edge], count), points, faces)
     weight = np.where(side.inside, INSIDE_WEIGHT, share) * np.exp(-np.abs(side.distance) / REACH) + 1e-9
-    links = sparse.coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    links = (links + links.T).tocsr()
-    laplacian = sparse.diags(np.asarray(links.sum(axis=1)).reshape(-1)) - links
-    vote = spsolve((sparse.diags(weight) + VOTE_COUPLING * laplacian).tocsc(), weight * agreement)
+    coupling = VOTE_COUPLING * laplacian(pairs, 1.0, count)
+    vote = spsolve((sparse.diags(weight) + coupling).tocsc(), weight * agreement)
     sign = np.where(vote < 0, -1.0, 1.0)
     crossed = ~side.inside & (share < MINOR) & (sign * agreement < -FACING) & (side.distance < REACH)
     return Facing(sign[:, None] * normals, side.inside | crossed, crossed)

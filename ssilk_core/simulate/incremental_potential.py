@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -79,7 +78,7 @@ class IncrementalPotential:
         self.mass: Tensor = energy.mass[:, None]
         self.tether = torch.zeros_like(self.mass)
         self.tether[energy.tethered, 0] = energy.tether_stiffness
-        self.size = float(np.linalg.norm(np.ptp(mesh.points, axis=0)))
+        self.size = mesh.diagonal
         self.cloth, self.law, self.stitching = energy.cloth, energy.law, energy.stitching
         self.contacts = Contacts(scene, self.cloth.samples, device=device)
         self._hessian = Hessian.of(scene, energy)

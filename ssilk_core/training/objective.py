@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -60,8 +59,7 @@ class Objective:
             self.tethered_rest = torch.tensor(rest, dtype=torch.float32, device=device)
         self.dt = 1 / model.config.fps
         self.newton = NewtonDistance(model.scene, energy, self.dt, newton_weight) if newton_weight else None
-        size = float(np.linalg.norm(np.ptp(model.scene.garment.mesh.points, axis=0)))
-        self.scale = GRAVITY * float(energy.mass.sum()) * size
+        self.scale = GRAVITY * float(energy.mass.sum()) * model.scene.garment.mesh.diagonal
 
     def quasi_static_terms(self, x: Tensor, direction: Tensor, character: Tensor) -> Terms:
         """Return all terms but inertia and drag of positions x (V, 3, N) under gravity directions (N, 3)."""

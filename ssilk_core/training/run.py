@@ -288,7 +288,8 @@ class TrainingRun:
         elif self.job.model.scheme == "quasi_static":
             reason = "" if self.job.has_loose else "no vertex is loose; "
             self.report(Message(f"{path}: {reason}the garment is quasi-static and gets no stepper."))
-        if self.config.shape_smoothing and len(self.parts.model.decoder.free) > MOST_SMOOTHED_VERTICES:
+        rough = self.parts.smoothing is None and self.parts.model.decoder.shapes.numel() > 0
+        if self.config.shape_smoothing and rough:
             text = f"{path}: steps of blendshapes of more than {MOST_SMOOTHED_VERTICES:,} vertices are not smoothed."
             self.report(Message(text))
         detail = {**self.parts.detail(), "memory predicted [MiB]": self._memory() >> 20}

@@ -61,10 +61,10 @@ class ShapeSmoothing:
         None for a length of zero, without blendshapes, or for more than `MOST_SMOOTHED_VERTICES` free vertices.
         """
         decoder = model.decoder
-        length = relative * float(np.linalg.norm(np.ptp(model.scene.garment.mesh.points, axis=0)))
-        if not length or not decoder.shapes.numel() or len(decoder.free) > MOST_SMOOTHED_VERTICES:
+        if not relative or not decoder.shapes.numel() or len(decoder.free) > MOST_SMOOTHED_VERTICES:
             return None
-        return cls(decoder.shapes, model.scene.garment.mesh, decoder.free, length)
+        mesh = model.scene.garment.mesh
+        return cls(decoder.shapes, mesh, decoder.free, relative * mesh.diagonal)
 
     @torch.no_grad()
     def smooth_start(self) -> None:
