@@ -21,6 +21,8 @@ from .one_ring import closest_in_triangle
 MAX_PAIRS = 1 << 25  # pairs of a vertex and a triangle in memory at once, on a CPU
 GPU_FACTOR = 8  # times as many pairs on a GPU: 2 GB, in few launches
 PATCH_SIZE = 8  # triangles that the kernel processes together
+QUERY_BLOCK = 64  # queries with one bounding sphere, on a CPU
+ROUNDING = 1e-6  # relative, by which spheres are larger than what they hold
 
 
 def triangle_patches(points: Floats, faces: Ints) -> Ints:
@@ -104,18 +106,19 @@ def candidate_pairs(
 
     Arguments are those of `closest_on_faces`. All frames are processed at once.
     """
-    if candidates is None:
-        return _all_pairs(x, search_radius, points, faces)
-    return _listed_pairs(x, search_radius, points, faces, candidates)
+    if candidates is not None:
+        return _listed_pairs(x, search_radius, points, faces, candidates)
+    found = all_pairs if x.is_cuda else blocked_pairs  # a GPU multiplies faster than it selects
+    return found(x, search_radius, points, faces)
 
 
 def _listed_pairs(
     x: Tensor, search_radius: Tensor, points: Tensor, faces: Tensor, candidates: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the result of `_all_pairs` among the candidates of each query, shape (V, L)."""
+    """Return the result of `all_pairs` among the candidates of each query, shape (V, L)."""
     centre, radius = bounding_spheres(points, faces)
     apart = sum((x[:, None, axis] - centre[:, axis][candidates]).square() for axis in range(3))  # (V, L, N)
-    within = apart <= ((radius[:, 0][candidates] + search_radius[:, None]) * (1 + 1e-6)).square()
+    within = apart <= ((radius[:, 0][candidates] + search_radius[:, None]) * (1 + ROUNDING)).square()
     asked = (search_radius >= 0)[:, None] & (candidates >= 0)[..., None]
     row, place, frame = (within & asked).nonzero(as_tuple=True)
     return row, frame, candidates[row, place]
@@ -128,7 +131,7 @@ def bounding_spheres(points: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
     return centre, (corners - centre[:, None]).norm(dim=2).amax(1)[:, None]
 
 
-def _all_pairs(x: Tensor, search_radius: Tensor, points: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def all_pairs(x: Tensor, search_radius: Tensor, points: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return row, frame and face of all pairs whose triangle's bounding sphere is within reach, (M,) each.
 
     The condition |x - c| <= r + u, squared and expanded, is one matrix product: [-2 x, -2 u, |x|^2 - u^2, 1] times
@@ -148,3 +151,29 @@ def _all_pairs(x: Tensor, search_radius: Tensor, points: Tensor, faces: Tensor) 
     rounding = 16 * torch.finfo(x.dtype).eps * about.amax()
     frame, row, face = (scores <= rounding).nonzero(as_tuple=True)
     return row, frame, face
+
+
+def blocked_pairs(x: Tensor, search_radius: Tensor, points: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the result of `all_pairs`, but for rounding: triangles meet compact blocks of queries first.
+
+    The sphere of a block holds those that its queries search.
+    """
+    centre, radius = bounding_spheres(points, faces)
+    blocks = torch.from_numpy(compact_blocks(x[..., 0].detach().numpy(), QUERY_BLOCK)).long()
+    asked = (search_radius >= 0)[blocks]
+    asked.flatten(0, 1)[len(x) :] = False  # the last block is padded
+    middle = x[blocks].mean(1)
+    reach = (x[blocks] - middle[:, None]).norm(dim=2) + search_radius[blocks]
+    reach = reach.where(asked, -torch.inf).amax(1)[:, None] + radius[:, 0]
+    apart = (middle[:, None, 0] - centre[:, 0]).square()
+    for axis in (1, 2):
+        apart += (middle[:, None, axis] - centre[:, axis]).square()
+    near = (apart <= (reach * (1 + ROUNDING)).square()) & (reach >= 0)
+    block, face, frame = near.nonzero(as_tuple=True)
+    row, at = blocks[block], frame[:, None]
+    limit = (radius[face, 0, frame][:, None] + search_radius[row, at]) * (1 + ROUNDING)
+    apart = torch.zeros_like(limit)
+    for axis in range(3):
+        apart += (x[row, axis, at] - centre[face, axis, frame][:, None]).square()
+    pair, place = ((apart <= limit.square()) & asked[block, :, frame]).nonzero(as_tuple=True)
+    return row[pair, place], frame[pair], face[pair]

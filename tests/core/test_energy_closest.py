@@ -12,7 +12,7 @@ import torch
 import trimesh
 
 from ssilk_core.collision import PosedBody, closest_point, distance, nearest_planes
-from ssilk_core.collision.closest_point import closest_on_faces, triangle_patches
+from ssilk_core.collision.closest_point import all_pairs, blocked_pairs, closest_on_faces, triangle_patches
 from ssilk_core.collision.one_ring import triangle_rings
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -60,6 +60,22 @@ def test_only_what_is_asked_for_is_sought() -> None:
     reach[10:] = -1
     row, *_ = closest_on_faces(x, reach, body.points, body.faces)
     assert sorted(row.tolist()) == list(range(10))
+
+
+@pytest.mark.parametrize("search", [all_pairs, blocked_pairs])
+@pytest.mark.parametrize("count", [1, 64, 150])  # less than a block of queries, a whole one, and padded ones
+def test_no_pair_within_reach_is_missed_and_few_others_are_found(search, count) -> None:
+    x, body = scattered(count, 3), body_of(slab(), slab(1.1), slab(0.9))
+    reach = 0.3 * torch.rand(count, 3, generator=torch.Generator().manual_seed(1)) - 0.02  # some ask for nothing
+    found = search(x, reach, body.points.cpu(), body.faces.cpu())
+    corners = body.points.cpu().double()[body.faces.cpu()]
+    centre = corners.mean(1)
+    gap = (x.double()[:, None] - centre).norm(dim=2) - (corners - centre[:, None]).norm(dim=2).amax(1)
+    pairs = torch.zeros_like(gap, dtype=torch.int64)
+    pairs.index_put_((found[0], found[2], found[1]), torch.tensor(1), accumulate=True)
+    asked = (reach >= 0)[:, None]
+    assert pairs.max() == 1 and (pairs[asked & (gap < reach[:, None] - 1e-5)] == 1).all()
+    assert not pairs[~asked | (gap > reach[:, None] + 1e-4)].any()
 
 
 def distances(x: torch.Tensor, body: PosedBody) -> torch.Tensor:
