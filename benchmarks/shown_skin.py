@@ -68,7 +68,7 @@ def solved(
     """Yield the same of the first frames of a clip: the network, refined, and the simulator."""
     take = NetworkTake.of(subject, clip_of(options, clip, subject), options.frames)
     dressed, motion = subject.dressed, take.motion
-    refined = np.stack([frame.points for frame in take.refiner(ITERATIONS, True).frames(motion, take.points)])
+    refined = np.stack([frame.points for frame in take.refiner(ITERATIONS, False).frames(motion, take.points)])
     simulation = SimulationOptions(fps=motion.fps, precision="float32")
     (simulated,) = simulate(dressed.scene, dressed.fabric, [motion], simulation, device=subject.device)
     skeleton = dressed.scene.character.skeleton
