@@ -267,6 +267,11 @@ def long_training() -> Text:
     yield "cape {}; cape, seed 1, {}; hooded dress {}; fringe skirt {}".format(*moved)
     risen = cape["gravity"][-1] - cape["gravity"][cape["total"].index(min(cape["total"]))]
     yield f"its gravity grows by {risen:.3f} J"
+    slow = result("long_training_cape")["cape"]
+    best = slow["total"].index(min(slow["total"]))
+    ends_at = [f"{slow['total'][at]:.3f} J at {slow['iterations'][at]:,}" for at in (best, -1)]
+    yield f"from {ends_at[0]} iterations to {ends_at[1]}"
+    yield "from {:.1f} to {:.1f} mJ".format(*(1000 * slow["inertia"][at] for at in (best, -1)))
     ends = {name: run["total"][-1] - min(run["total"]) <= 0.1 * abs(min(run["total"])) for name, run in runs.items()}
     assert ends["hooded_dress"] and ends["fringe_skirt"] and not (ends["cape"] or ends["cape_seed_1"])
 
