@@ -159,11 +159,13 @@ def blocked_pairs(x: Tensor, search_radius: Tensor, points: Tensor, faces: Tenso
     The sphere of a block holds those that its queries search.
     """
     centre, radius = bounding_spheres(points, faces)
-    blocks = torch.from_numpy(compact_blocks(x[..., 0].detach().numpy(), QUERY_BLOCK)).long()
-    asked = (search_radius >= 0)[blocks]
-    asked.flatten(0, 1)[len(x) :] = False  # the last block is padded
-    middle = x[blocks].mean(1)
-    reach = (x[blocks] - middle[:, None]).norm(dim=2) + search_radius[blocks]
+    size = max(1, min(QUERY_BLOCK, len(x)))
+    blocks = torch.from_numpy(compact_blocks(np.nan_to_num(x[..., 0].detach().numpy()), size)).long()
+    padded = (torch.arange(blocks.numel()) >= len(x)).reshape(blocks.shape)[..., None]
+    asked = (search_radius >= 0)[blocks] & ~padded & x[blocks].isfinite().all(2)
+    queries = x[blocks].where(asked[:, :, None], 0)  # NaN in one must not hide the others
+    middle = queries.sum(1) / asked.sum(1)[:, None].clamp_min(1)
+    reach = (queries - middle[:, None]).norm(dim=2) + search_radius[blocks]
     reach = reach.where(asked, -torch.inf).amax(1)[:, None] + radius[:, 0]
     apart = (middle[:, None, 0] - centre[:, 0]).square()
     for axis in (1, 2):

@@ -66,11 +66,13 @@ def test_only_what_is_asked_for_is_sought() -> None:
 @pytest.mark.parametrize("count", [1, 64, 150])  # less than a block of queries, a whole one, and padded ones
 def test_no_pair_within_reach_is_missed_and_few_others_are_found(search, count) -> None:
     x, body = scattered(count, 3), body_of(slab(), slab(1.1), slab(0.9))
-    reach = 0.3 * torch.rand(count, 3, generator=torch.Generator().manual_seed(1)) - 0.02  # some ask for nothing
+    reach = 0.3 * torch.rand(3, count, generator=torch.Generator().manual_seed(1)).T - 0.02  # some ask for nothing
+    x[0, :, 1], reach[0, 1] = torch.nan, -1
     found = search(x, reach, body.points.cpu(), body.faces.cpu())
     corners = body.points.cpu().double()[body.faces.cpu()]
     centre = corners.mean(1)
     gap = (x.double()[:, None] - centre).norm(dim=2) - (corners - centre[:, None]).norm(dim=2).amax(1)
+    gap = gap.nan_to_num(torch.inf)
     pairs = torch.zeros_like(gap, dtype=torch.int64)
     pairs.index_put_((found[0], found[2], found[1]), torch.tensor(1), accumulate=True)
     asked = (reach >= 0)[:, None]

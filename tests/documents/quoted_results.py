@@ -132,10 +132,16 @@ def shown() -> Text:
     best = run["total"].index(min(run["total"]))
     yield f"the best was at {run['iterations'][best]:,}"
     yield f"the last has {run['total'][-1] / run['total'][best]:.2f} times its energy"
-    yield f"showed {share_3(before['valid']['network']['mean'])} % on `valid`"
-    yield f"{share_3(before['test']['network']['mean'])} % on `test`. But"
-    stretched = (f"{own['valid']['network']['stretch']:.2f} J" for own in (before, dress))
-    yield "stretched by {} instead of {}".format(*stretched)
+    yield f"{share_3(before['valid']['network']['mean'])} % on `valid`, "
+    yield f"{share_3(before['test']['network']['mean'])} % on `test` and"
+    yield f"{share_3(before['flips']['network']['mean'])} % on flips. But"
+    for split in ("valid", "test"):
+        stretched = (f"{own[split]['network']['stretch']:.2f} J" for own in (before, dress))
+        yield "by {} instead of {}".format(*stretched) + f" on `{split}`"
+    lbs = (share_3(own["flips"][SKINNING]["mean"]) for own in (dress, before))
+    yield "LBS, which shows {} % on flips, showed {} % with the earlier weights".format(*lbs)
+    less = [name for name, own in found.items() if own["test"][SKINNING]["worst"] < own["test"]["network"]["worst"]]
+    assert sorted(less) == ["fringe_skirt", "tshirt"], "the document names them"
 
 
 def conditions() -> Text:
