@@ -75,14 +75,12 @@ def stored_time(
 ) -> Time:
     """Measure the time to play a frame of stored poses on the CPU: character, joints, blendshapes, all vertices."""
     player = StoredPlayer(deformer)
-    rotations, weights = (
-        np.concatenate([getattr(pose, name) for pose in poses]) for name in ("rotations", "weights")
-    )
+    whole = GarmentPose.joined(poses)
 
     def frames(block: range) -> None:
         for start in range(block.start, block.stop, VERTEX_BLOCK):
             part = slice(start, min(start + VERTEX_BLOCK, block.stop))
-            player.vertices(motion, GarmentPose(start, rotations[part], weights[part]))
+            player.vertices(motion, whole.part(part))
 
     return _timed(lambda: frames, motion.frame_count, seconds)
 

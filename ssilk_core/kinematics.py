@@ -264,8 +264,10 @@ def combined_transforms(deformer: Deformer, motion: Motion, pose: GarmentPose) -
     skeleton, rig = scene.character.skeleton, scene.rig
     frames = slice(pose.start, pose.start + pose.frame_count)
     character = rigid(matrix_from_quaternion(motion.rotations[frames]), motion.translations[frames])
-    rest = local_transforms(scene.bind_transforms, scene.parents)[skeleton.joint_count :]
-    translations = np.broadcast_to(rest[:, :3, 3], (pose.frame_count, rig.proxy_count, 3))
+    translations = pose.translations
+    if translations is None:
+        rest = local_transforms(scene.bind_transforms, scene.parents)[skeleton.joint_count :]
+        translations = np.broadcast_to(rest[:, :3, 3], (pose.frame_count, rig.proxy_count, 3))
     proxies = rigid(matrix_from_quaternion(pose.rotations), translations)
     return world_transforms(np.concatenate([character, proxies], axis=1), scene.parents)
 

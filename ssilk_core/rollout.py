@@ -218,18 +218,14 @@ def resample_poses(
     """
     done, tail = 0, None
     for pose in poses:
-        joined = pose if tail is None else _join_poses(tail, pose)
+        joined = pose if tail is None else GarmentPose.joined([tail, pose])
         last = joined.start + joined.frame_count - 1
         reached = min(int(np.floor((last - shift) * target / source + 1e-6)) + 1, count)
         position = (done + np.arange(max(reached - done, 0))) * source / target + shift
         if len(position):
             yield sample_pose(joined, position.clip(joined.start, last) - float(joined.start), done)
         done = max(reached, done)
-        tail = GarmentPose(last, joined.rotations[-1:], joined.weights[-1:])
-
-
-def _join_poses(a: GarmentPose, b: GarmentPose) -> GarmentPose:
-    return GarmentPose(a.start, np.concatenate([a.rotations, b.rotations]), np.concatenate([a.weights, b.weights]))
+        tail = joined.part(slice(-1, None))
 
 
 @torch.no_grad()

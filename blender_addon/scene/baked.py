@@ -9,7 +9,12 @@ import bpy
 import numpy as np
 from ssilk_usd.skinned import BakedGarment, SkinnedGarment
 
-from ssilk_core.kinematics import local_transforms, multiply_quaternions, quaternion_from_matrix
+from ssilk_core.kinematics import (
+    local_transforms,
+    matrix_from_quaternion,
+    multiply_quaternions,
+    quaternion_from_matrix,
+)
 
 from ..errors import SetupError
 from ..joints import Joints, joint_order
@@ -75,8 +80,15 @@ def apply_bake(garment: bpy.types.Object, armature: bpy.types.Object, joints: Jo
     there = proxies >= 0
     rotations = np.tile(rest_rotations(joints), (baked.pose.frame_count, 1, 1))
     rotations[:, there] = baked.pose.rotations[:, proxies[there]]
+    channels = _channels(joints.proxies, "rotation_quaternion", turns_from_rest(joints, rotations))
+    if baked.pose.translations is not None:
+        moving = np.flatnonzero(there)
+        _need_movable(armature, [joints.proxies[index] for index in moving])
+        places = np.tile(_rest_places(joints), (baked.pose.frame_count, 1, 1))
+        places[:, moving] = baked.pose.translations[:, proxies[moving]]
+        channels += _channels(joints.proxies, "location", _shifts_from_rest(armature, joints, places))
     moved = [
-        (armature, _turn_channels(joints.proxies, turns_from_rest(joints, rotations))),
+        (armature, channels),
         (garment.data.shape_keys, _weight_channels(shapes, baked.pose.weights)),
     ]
     bake_keys(garment, round(baked.start), [(thing, channels) for thing, channels in moved if thing])
@@ -119,6 +131,23 @@ def rest_rotations(joints: Joints) -> np.ndarray:
     """Return the rotations of the proxies to their parents at rest, unit quaternions (w, x, y, z), shape (P, 4)."""
     local = local_transforms(joints.binds, joints.parents)[joints.character_count :]
     return quaternion_from_matrix(local[:, :3, :3])
+
+
+def _rest_places(joints: Joints) -> np.ndarray:
+    """Return the places of the proxies in their parents' axes at rest [m], shape (P, 3)."""
+    return local_transforms(joints.binds, joints.parents)[joints.character_count :, :3, 3]
+
+
+def _shifts_from_rest(armature: bpy.types.Object, joints: Joints, places: np.ndarray) -> np.ndarray:
+    """Return how far the proxies are from rest, in their own axes at rest and units of the armature, as pose bones
+    hold it, shape (F, P, 3).
+
+    Args:
+        places: of each proxy in its parent's axes [m], shape (F, P, 3).
+    """
+    own = matrix_from_quaternion(rest_rotations(joints)).swapaxes(-1, -2)
+    unit = scene_units().meters_per_unit * armature.matrix_world.median_scale
+    return (own @ (places - _rest_places(joints))[..., None])[..., 0] / unit
 
 
 def remove_bake(garment: bpy.types.Object, armature: bpy.types.Object) -> None:
@@ -196,11 +225,22 @@ def _free(armature: bpy.types.Object, proxies: Sequence[str]) -> None:
         bone.location, bone.scale, bone.rotation_quaternion = (0, 0, 0), (1, 1, 1), (1, 0, 0, 0)
 
 
-def _turn_channels(names: Sequence[str], turns: np.ndarray) -> list[Channel]:
+def _need_movable(armature: bpy.types.Object, names: Sequence[str]) -> None:
+    """Check that Blender moves bones by their own locations."""
+    for name in names:
+        bone = armature.data.bones[name]
+        if bone.use_connect or not bone.use_local_location:
+            raise SetupError(
+                f"The proxy '{name}' cannot move by itself; switch off Connected and switch on Local Location."
+            )
+
+
+def _channels(names: Sequence[str], what: str, values: np.ndarray) -> list[Channel]:
+    """Return the channels of a property of pose bones, shape (F, P, components)."""
     return [
-        Channel(f'pose.bones["{bpy.utils.escape_identifier(name)}"].rotation_quaternion', index, name, values)
-        for name, turn in zip(names, turns.swapaxes(0, 1))
-        for index, values in enumerate(turn.T)
+        Channel(f'pose.bones["{bpy.utils.escape_identifier(name)}"].{what}', index, name, each)
+        for name, rows in zip(names, values.swapaxes(0, 1))
+        for index, each in enumerate(rows.T)
     ]
 
 

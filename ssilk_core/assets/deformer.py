@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,19 +48,42 @@ class Deformer:
 class GarmentPose:
     """Poses of a garment in consecutive frames, as the network predicts and a shot stores them (Eq. 7).
 
+    The network turns its proxies; those of a shot that was fitted to vertices move as well.
+
     Attributes:
         start: index of the first frame within the shot.
         rotations: local rotations of the proxies, (w, x, y, z), relative to their parents, shape (F, P, 4).
         weights: blendshape weights in [0, 1], shape (F, K).
+        translations: local translations of the proxies [m], shape (F, P, 3); None for those of the bind pose.
     """
 
     start: int
     rotations: Floats
     weights: Floats
+    translations: Floats | None = None
 
     def __post_init__(self) -> None:
         assign(self, rotations=frozen(self.rotations, np.float64), weights=frozen(self.weights, np.float32))
+        if self.translations is not None:
+            assign(self, translations=frozen(self.translations, np.float64))
 
     @property
     def frame_count(self) -> int:
         return len(self.weights)
+
+    def part(self, frames: slice) -> GarmentPose:
+        """Return consecutive frames of these, counted from the first; all if there are fewer."""
+        first = frames.indices(self.frame_count)[0]
+        moved = None if self.translations is None else self.translations[frames]
+        return GarmentPose(self.start + first, self.rotations[frames], self.weights[frames], moved)
+
+    @classmethod
+    def joined(cls, poses: Sequence[GarmentPose]) -> GarmentPose:
+        """Return consecutive poses as one; all of them have translations, or none."""
+        moved = [pose.translations for pose in poses if pose.translations is not None]
+        return cls(
+            poses[0].start,
+            np.concatenate([pose.rotations for pose in poses]),
+            np.concatenate([pose.weights for pose in poses]),
+            np.concatenate(moved) if moved else None,
+        )

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -111,9 +111,9 @@ class BakeRollout:
         stop = self.lead + self.motion.frame_count
         for pose in garment_poses(self.model, driver, rate, CHUNK, self._note, pre_roll=pre_roll):
             shown = slice(max(self.lead - pose.start, 0), max(stop - pose.start, 0))
-            rotations, weights = pose.rotations[shown], pose.weights[shown]
-            if len(rotations):
-                yield GarmentPose(pose.start + shown.start - self.lead, rotations, weights)
+            part = pose.part(shown)
+            if part.frame_count:
+                yield replace(part, start=part.start - self.lead)
 
     def _source_frame(self, sample: int) -> float:
         """Return the frame of `source` at a sample of the shot, a fraction where the grids differ."""

@@ -45,7 +45,7 @@ class ShownSkinMeter:
         for pose in self.rollout.poses():
             for frame in self._among(range(pose.start, pose.start + pose.frame_count)):
                 row = slice(frame - pose.start, frame - pose.start + 1)
-                self._add(frame, self.rollout.decode(GarmentPose(frame, pose.rotations[row], pose.weights[row]))[0])
+                self._add(frame, self.rollout.decode(pose.part(row))[0])
             self._state()
             yield pose
 

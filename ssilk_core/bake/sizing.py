@@ -141,6 +141,6 @@ def _first(poses: Iterator[GarmentPose], frames: int) -> Iterator[GarmentPose]:
     """Yield the first frames of consecutive poses."""
     for pose in poses:
         count = min(pose.frame_count, frames - pose.start)
-        yield GarmentPose(pose.start, pose.rotations[:count], pose.weights[:count])
+        yield pose.part(slice(count))
         if pose.start + count == frames:
             return

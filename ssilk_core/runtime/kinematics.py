@@ -42,16 +42,19 @@ class ProxyKinematics:
             for proxies in (np.flatnonzero(own == level) for level in range(1, own.max(initial=0) + 1))
         ]
 
-    def matrices(self, rotations: NDArray, character: NDArray) -> NDArray:
+    def matrices(self, rotations: NDArray, character: NDArray, shifts: NDArray | None = None) -> NDArray:
         """Return skinning matrices of all joints (J + P, 3, 4, F).
 
         Args:
             rotations: of the proxies in the axes of the bind pose (P, 3, 3, F).
             character: skinning matrices of the character's joints (J, 3, 4, F).
+            shifts: of the proxies from their places in the bind pose, in its axes [m], shape (P, 3, F), if any.
         """
         moved = self.pivots[:, :, None] - sum(
             rotations[:, :, axis] * self.pivots[:, None, axis, None] for axis in range(3)
         )
+        if shifts is not None:
+            moved = moved + shifts
         whole = np.empty((self.joints + self.count, *character.shape[1:]), dtype=np.float32)
         whole[: self.joints] = character
         for proxies, parents in self.generations:

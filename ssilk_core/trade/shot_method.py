@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
 from dataclasses import replace
 from functools import lru_cache
 
@@ -108,7 +107,7 @@ class ShotMethod:
         shot = resample(motion, self.fps, cover=True)
         steps, last = motion.fps / self.fps, motion.frame_count - 1
         frames = np.minimum(np.arange(shot.frame_count) * steps, last)
-        stored = sample_pose(_joined(self.player.play(motion).poses()), frames)
+        stored = sample_pose(GarmentPose.joined(list(self.player.play(motion).poses())), frames)
         at = np.arange(motion.frame_count) / steps
         starts = range(0, motion.frame_count, BLOCK_FRAMES)
         return np.concatenate([self._between(shot, stored, at[start : start + BLOCK_FRAMES]) for start in starts])
@@ -121,8 +120,3 @@ class ShotMethod:
         return skin_garment(
             self.player.tiles, activations, self.player.kinematics.matrices(rotations, character), origins
         )
-
-
-def _joined(poses: Iterable[GarmentPose]) -> GarmentPose:
-    parts = list(poses)
-    return GarmentPose(0, *(np.concatenate([getattr(part, n) for part in parts]) for n in ("rotations", "weights")))

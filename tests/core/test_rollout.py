@@ -33,7 +33,7 @@ def gathered(poses) -> GarmentPose:
     poses = list(poses)
     starts = np.cumsum([0] + [pose.frame_count for pose in poses])
     assert [pose.start for pose in poses] == starts[:-1].tolist() and all(pose.frame_count for pose in poses)
-    return GarmentPose(0, np.concatenate([p.rotations for p in poses]), np.concatenate([p.weights for p in poses]))
+    return GarmentPose.joined(poses)
 
 
 @torch.no_grad()
@@ -109,7 +109,8 @@ def test_resampled_poses_lie_on_the_arcs_between_steps(chunk, target):
     rng = np.random.default_rng(0)
     rotations = Rotation.from_rotvec(np.cumsum(0.1 * rng.normal(size=(20, 3)), axis=0))
     quaternions, weights = np.roll(rotations.as_quat(), 1, axis=1)[:, None], rng.random((20, 2))
-    pieces = (GarmentPose(s, quaternions[s : s + chunk], weights[s : s + chunk]) for s in range(0, 20, chunk))
+    whole = GarmentPose(0, quaternions, weights, rng.normal(size=(20, 1, 3)))
+    pieces = (whole.part(slice(s, s + chunk)) for s in range(0, 20, chunk))
     count = int(19 / 30 * target + 1e-6) + 1
     found = gathered(resample_poses(pieces, 30.0, target, count=count))
     assert found.frame_count == count
@@ -121,6 +122,9 @@ def test_resampled_poses_lie_on_the_arcs_between_steps(chunk, target):
         np.testing.assert_allclose(
             found.weights[:, shape], np.interp(time, np.arange(20) / 30, weights[:, shape]), atol=1e-6
         )
+    for axis in range(3):
+        between = np.interp(time, np.arange(20) / 30, whole.translations[:, 0, axis])
+        np.testing.assert_allclose(found.translations[:, 0, axis], between, atol=1e-9)
 
 
 def test_after_a_cut_the_garment_starts_from_the_initialiser(model, scene, toy_motion):

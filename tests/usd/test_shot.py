@@ -343,6 +343,33 @@ def test_a_baked_garment_is_read_as_it_was_written(tmp_path, units, proxies, sha
     np.testing.assert_allclose(found.pose.weights, weights, atol=1e-7)
     cosines = np.abs((found.pose.rotations * rotations).sum(axis=-1))
     np.testing.assert_allclose(cosines, 1, atol=1e-6)
+    assert found.pose.translations is None
+
+
+@pytest.mark.parametrize("units", [METRES_Y, CENTIMETRES_Z], ids=["metres_y", "centimetres_z"])
+def test_proxies_that_move_are_read_as_they_were_written(tmp_path, units):
+    """Also where no joint of the character leaves its place."""
+    rng = np.random.default_rng(4)
+    deformer, motion = make_deformer(rng), make_motion(rng)
+    motion = replace(motion, translations=np.tile(motion.translations[:1], (FRAMES, 1, 1)))
+    poses = [
+        replace(pose, translations=rng.normal(size=(pose.frame_count, 2, 3))) for pose in make_poses(rng, deformer)
+    ]
+    write_shot(tmp_path / "shot.usdc", deformer, motion, poses, units=units)
+    expected = np.concatenate([deform(deformer, motion, pose) for pose in poses])
+    assert compare_points(Shot(tmp_path / "shot.usdc"), expected).worst < 2e-6
+    found = read_baked(tmp_path / "shot.usdc").pose
+    np.testing.assert_allclose(found.translations, GarmentPose.joined(poses).translations, atol=1e-6)
+
+
+def test_proxies_that_move_to_nowhere_are_refused(tmp_path):
+    rng = np.random.default_rng(4)
+    deformer, motion = make_deformer(rng), make_motion(rng)
+    (pose,) = make_poses(rng, deformer, (FRAMES,))
+    for moved in (np.full((FRAMES, 2, 3), np.nan), np.zeros((FRAMES, 1, 3))):
+        with pytest.raises(SsilkError, match="proxy translations of shape"):
+            poses = [replace(pose, translations=moved)]
+            write_shot(tmp_path / "shot.usdc", deformer, motion, poses, units=METRES_Y)
 
 
 def unskin(stage: Usd.Stage) -> None:

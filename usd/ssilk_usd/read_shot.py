@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pxr import Usd, UsdGeom, UsdSkel
 
-from ssilk_core.assets import Floats, GarmentPose, Mesh
+from ssilk_core.assets import Floats, GarmentPose, Mesh, ProxyRig, Skeleton
 from ssilk_core.errors import fail
+from ssilk_core.kinematics import local_transforms
 
 from .garment_api import GarmentRecord, read_garment_record
 from .play import Shot, frame_times
@@ -21,6 +22,8 @@ from .read_skin import match_joints
 from .read_stage import StageLike, apply, location, needs_whole_files, open_stage
 from .rig_io import read_proxy_rig
 from .skinned import BakedGarment, SkinnedGarment
+
+AT_REST = 1e-6  # [m] from the bind pose, of places within a metre, that count as rounded
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +68,9 @@ def read_baked(source: StageLike) -> BakedGarment:
         fail(location(prim), "no joint moves it", "a baked garment needs weights", "bake to joints, not to points")
     names, shapes = _read_blendshapes(prim, garment_to_core(prim, skel)[:3, :3], garment.mesh.vertex_count)
     times = frame_times(stage)
-    pose = _read_pose(find_animation(stage, None, None)[0], joints[skeleton.joint_count :], names, times)
+    proxies = joints[skeleton.joint_count :]
+    pose = _read_pose(find_animation(stage, None, None)[0], proxies, names, times, skel.joint_scale)
+    pose = replace(pose, translations=None) if rig is None else _without_rest(pose, skeleton, rig)
     return BakedGarment(SkinnedGarment(joints, binds, garment.mesh.points, skin, names, shapes), pose, times[0])
 
 
@@ -82,9 +87,13 @@ def _read_blendshapes(prim: Usd.Prim, to_core: Floats, point_count: int) -> tupl
 
 
 def _read_pose(
-    prim: Usd.Prim, proxies: tuple[str, ...], shapes: tuple[str, ...], times: tuple[float, ...]
+    prim: Usd.Prim, proxies: tuple[str, ...], shapes: tuple[str, ...], times: tuple[float, ...], scale: float
 ) -> GarmentPose:
-    """Return rotations of the proxies and weights of the blendshapes at time codes."""
+    """Return rotations and translations of the proxies and weights of the blendshapes at time codes.
+
+    Args:
+        scale: of the animation's unit of length [m].
+    """
     animation, where = UsdSkel.Animation(prim), location(prim)
     joints = tuple(str(name) for name in animation.GetJointsAttr().Get() or ())
     found = match_joints(proxies, joints)
@@ -93,8 +102,19 @@ def _read_pose(
     lost += [name for name in shapes if name not in names]
     if lost:
         fail(where, f"it does not animate '{lost[0]}'", "proxies and blendshapes are animated", "bake the shot again")
-    rotations, _ = read_samples(prim, np.array(times), len(joints), where)
+    rotations, translations = read_samples(prim, np.array(times), len(joints), where)
     weights = animation.GetBlendShapeWeightsAttr()
     columns = [names.index(name) for name in shapes]
     rows = [np.array(weights.Get(time))[columns] for time in times] if shapes else np.zeros((len(times), 0))
-    return GarmentPose(0, rotations[:, found], np.array(rows))
+    return GarmentPose(0, rotations[:, found], np.array(rows), scale * translations[:, found])
+
+
+def _without_rest(pose: GarmentPose, skeleton: Skeleton, rig: ProxyRig) -> GarmentPose:
+    """Return a pose without translations where the proxies have those of the bind pose, as those of networks do."""
+    binds, parents = (
+        np.concatenate([getattr(of, name) for of in (skeleton, rig)]) for name in ("bind_transforms", "parents")
+    )
+    places = local_transforms(binds, parents)[skeleton.joint_count :, :3, 3]
+    assert pose.translations is not None
+    moves = np.abs(pose.translations - places).max(initial=0) > AT_REST * max(np.abs(places).max(initial=0), 1.0)
+    return pose if moves else replace(pose, translations=None)

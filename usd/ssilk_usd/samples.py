@@ -67,6 +67,7 @@ class Samples:
             origins = self.path[pose.start : pose.start + pose.frame_count]
             world[..., :3, 3] -= origins[:, None]
             self._write(self.asset.root, PATH_OP, times, _vectors(self.units.points_from_core(origins)))
+        self.moves |= pose.translations is not None
         self._write_joints(times, world)
         if len(self.asset.shapes):
             weights = np.ascontiguousarray(pose.weights[:, self.asset.shapes])

@@ -209,6 +209,13 @@ def _check_pose(pose: GarmentPose, deformer: Deformer) -> None:
             "rotations are unit quaternions",
             "train the model again, or for longer",
         )
+    moved = pose.translations
+    if moved is not None and not (moved.shape == (frames, proxies, 3) and np.isfinite(moved).all()):
+        fail(
+            where,
+            f"proxy translations of shape {moved.shape}, or NaN or infinity among them, from frame {pose.start}",
+            f"finite ones of shape ({frames}, {proxies}, 3) are needed",
+        )
     wrong = np.argwhere(~((pose.weights >= 0) & (pose.weights <= 1)))
     if wrong.size:
         frame, shape = wrong[0]
