@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Vertex trajectories as joints and blendshapes [cf. Le, Deng 2012].
 
-Whoever made the vertices, the character's joints move as they do, so proxy rotations and shapes are what is left to
-find. Shapes alone would be more, and so would shapes of what rotations alone miss. Therefore rotations are fitted
-together with a few principal components, in turns with the components of what then is left. The final shapes are
-those that the tolerance needs (`shapes.OffsetShapes`). What they reach is measured in the world, with the reference
-implementation of skinning.
+Whoever made the vertices, the character's joints move as they do, so proxies and shapes are what is left to find.
+Proxies turn and move: a frame of a proxy takes as many bytes as two vertices of a shape. Shapes alone would be more,
+and so would shapes of what proxies alone miss. Therefore proxies are fitted together with a few principal components,
+in turns with the components of what then is left. The final shapes are those that the tolerance needs
+(`shapes.OffsetShapes`). What they reach is measured in the world, with the reference implementation of skinning.
 """
 
 from __future__ import annotations
@@ -22,19 +22,18 @@ from ..errors import fail
 from ..kinematics import deform, local_transforms, quaternion_from_matrix
 from .poses import MAX_STEPS, PoseFitter, model_bounds
 from .rest import FRAMES_PER_BLOCK, rest_residuals
-from .shapes import BASIS_FRAMES, FitTolerance, OffsetShapes, components, evenly, regions_of
+from .shapes import BASIS_FRAMES, FitTolerance, OffsetShapes, components, evenly
 
 if TYPE_CHECKING:
     import torch
 
 SAMPLE = 512  # vertices that poses are fitted to; their weights are known, and shapes take the rest
-COMPONENTS, FRAMES_EACH = 12, 8  # fitted together with the rotations, at most, and frames for each of them
+COMPONENTS, FRAMES_EACH = 2, 8  # fitted together with the proxies, at most, and frames for each of them
 ROUNDS, STEPS = 3, 1  # of fitting poses with components, and iterations in each
 FIRST_STEPS = 6  # before them, where there are blendshapes to fit
 SPREAD = 0.1  # [m] RMS of these components, which makes them as stiff as rotations
 IN_MEMORY = 256 * 2**20  # bytes of offsets; more of them lie in a temporary file
 LOCAL = 0.3  # of the vertices: a shape that moves fewer is local
-REGIONS = 4  # of the garment, for shapes of parts of it
 ROUNDED = 1e-5  # [m] by which float32 may exceed the tolerance
 
 
@@ -67,7 +66,7 @@ def decompose(
     tolerance: FitTolerance | None = None,
     device: torch.device | str = "cpu",
 ) -> Decomposition:
-    """Find proxy rotations, weights of the given blendshapes, and further blendshapes.
+    """Find rotations and translations of proxies, weights of the given blendshapes, and further blendshapes.
 
     Args:
         deformer: the garment. The last of its blendshapes, if it has any, keeps its constant weight.
@@ -85,12 +84,12 @@ def decompose(
     _need_points(deformer, motion, points)
     pose = _PoseSearch(deformer, motion, points, tolerance, device).found(_whole(deformer, motion, poses))
     left = _offsets(deformer, motion, pose, points)
-    own = OffsetShapes(left, tolerance, regions_of(deformer.scene.garment.mesh.points, REGIONS))
+    own = OffsetShapes(left, tolerance)
     own.find()
     del left
     shapes, weights = own.all_shapes()
     found = replace(deformer, shapes=np.concatenate([deformer.shapes, shapes]))
-    whole = GarmentPose(0, pose.rotations, np.concatenate([pose.weights, weights], axis=1))
+    whole = GarmentPose(0, pose.rotations, np.concatenate([pose.weights, weights], axis=1), pose.translations)
     rms, largest, frame = _distance(found, motion, whole, points)
     if not (rms <= tolerance.rms + ROUNDED and largest <= tolerance.largest + ROUNDED):
         fail(
@@ -120,20 +119,18 @@ def _whole(deformer: Deformer, motion: Motion, poses: Sequence[GarmentPose] | No
     """Return consecutive poses as one, with weights of the deformer's blendshapes."""
     if poses is None:
         return None
-    rotations = np.concatenate([pose.rotations for pose in poses])
-    weights = np.concatenate([pose.weights for pose in poses])[:, : deformer.shape_count]
-    assert len(rotations) == motion.frame_count
-    return GarmentPose(0, rotations, weights)
+    whole = GarmentPose.joined(poses)
+    assert whole.frame_count == motion.frame_count
+    return replace(whole, weights=whole.weights[:, : deformer.shape_count])
 
 
 def _blocks(pose: GarmentPose) -> Iterator[GarmentPose]:
     for start in range(0, pose.frame_count, FRAMES_PER_BLOCK):
-        part = slice(start, start + FRAMES_PER_BLOCK)
-        yield GarmentPose(start, pose.rotations[part], pose.weights[part])
+        yield pose.part(slice(start, start + FRAMES_PER_BLOCK))
 
 
 class _PoseSearch:
-    """Proxy rotations, and weights of the given blendshapes, that leave as few further shapes as possible."""
+    """Poses of proxies, and weights of the given blendshapes, that leave as few further shapes as possible."""
 
     def __init__(
         self,
@@ -145,20 +142,27 @@ class _PoseSearch:
     ) -> None:
         self.deformer, self.motion, self.points, self.tolerance = deformer, motion, points, tolerance
         self.device, self.proxies = device, deformer.scene.rig.proxy_count
-        count = deformer.scene.garment.mesh.vertex_count
+        scene, count = deformer.scene, deformer.scene.garment.mesh.vertex_count
+        self.rest = local_transforms(scene.bind_transforms, scene.parents)[scene.character.skeleton.joint_count :]
         drawn = np.random.default_rng(0).permutation(count)[:SAMPLE]
         self.sample, self.mass = np.sort(drawn), np.ones(count)
 
     def found(self, start: GarmentPose | None) -> GarmentPose:
-        """Return the poses of all frames, from where to start or from proxies at rest."""
+        """Return the poses of all frames, from where to start or from proxies at rest.
+
+        Given blendshapes are fitted with rotations alone, so that proxies do not run after what shapes hold.
+        """
         bounds = model_bounds(self.deformer.shape_count)
         pose = self._at_rest() if start is None else start
         if not self.proxies and not (bounds[0] < bounds[1]).any():
             return pose
         count = min(COMPONENTS, self.motion.frame_count // FRAMES_EACH)
-        if self.deformer.shape_count or not count:
-            pose = self._fitted(self.deformer, pose, *bounds, steps=FIRST_STEPS if count else MAX_STEPS)
-        for _ in range(ROUNDS if count else 0):
+        if self.deformer.shape_count and count:
+            pose = self._fitted(self.deformer, pose, *bounds, steps=FIRST_STEPS)
+        pose = self._free_to_move(pose)
+        if not count:
+            return self._fitted(self.deformer, pose, *bounds)
+        for _ in range(ROUNDS):
             left = self._left(pose)
             distance = np.linalg.norm(left, axis=-1)
             if np.sqrt((distance**2).mean()) < self.tolerance.rms and distance.max() < self.tolerance.largest:
@@ -167,11 +171,15 @@ class _PoseSearch:
         return pose
 
     def _at_rest(self) -> GarmentPose:
-        scene, frames = self.deformer.scene, self.motion.frame_count
-        local = local_transforms(scene.bind_transforms, scene.parents)[scene.character.skeleton.joint_count :]
-        rotations = quaternion_from_matrix(local[:, :3, :3])
+        rotations, frames = quaternion_from_matrix(self.rest[:, :3, :3]), self.motion.frame_count
         weights = np.mean(model_bounds(self.deformer.shape_count), axis=0)
         return GarmentPose(0, np.tile(rotations, (frames, 1, 1)), np.tile(weights, (frames, 1)))
+
+    def _free_to_move(self, pose: GarmentPose) -> GarmentPose:
+        """Return a pose whose proxies have translations, where there are proxies."""
+        if not self.proxies or pose.translations is not None:
+            return pose
+        return replace(pose, translations=np.tile(self.rest[:, :3, 3], (pose.frame_count, 1, 1)))
 
     def _left(self, pose: GarmentPose) -> Floats:
         """Return what the sample lacks in the rest pose [m], shape (F, S, 3), float32."""
@@ -192,13 +200,12 @@ class _PoseSearch:
         shapes = np.zeros((len(basis) + 1, len(self.mass), 3))
         shapes[:, self.sample] = [*(scale * flat).reshape(len(basis), -1, 3), mean]
         extended = replace(self.deformer, shapes=np.concatenate([self.deformer.shapes, shapes]))
-        started = GarmentPose(0, pose.rotations,
-                              np.concatenate([pose.weights, weights, np.ones((frames, 1))], axis=1))  # fmt: skip
+        started = replace(pose, weights=np.concatenate([pose.weights, weights, np.ones((frames, 1))], axis=1))
         free = np.full(len(basis), np.inf)
         lower, upper = model_bounds(given)
         fitted = self._fitted(extended, started, np.concatenate([lower, -free, [1.0]]),
                               np.concatenate([upper, free, [1.0]]), steps=STEPS)  # fmt: skip
-        return GarmentPose(0, fitted.rotations, fitted.weights[:, :given])
+        return replace(fitted, weights=fitted.weights[:, :given])
 
     def _fitted(
         self, deformer: Deformer, pose: GarmentPose, lower: Floats, upper: Floats, steps: int = MAX_STEPS
@@ -206,10 +213,7 @@ class _PoseSearch:
         fitter = PoseFitter(
             deformer, self.mass, vertices=self.sample, lower=lower, upper=upper, steps=steps, device=self.device
         )
-        fits = [fit.pose for fit in fitter.fit(self.motion, _blocks(pose), self.points)]
-        return GarmentPose(
-            0, np.concatenate([fit.rotations for fit in fits]), np.concatenate([fit.weights for fit in fits])
-        )
+        return GarmentPose.joined([fit.pose for fit in fitter.fit(self.motion, _blocks(pose), self.points)])
 
 
 def _offsets(deformer: Deformer, motion: Motion, pose: GarmentPose, points: Sequence[Floats]) -> Floats:

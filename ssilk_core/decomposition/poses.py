@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fit blendshape weights and proxy rotations to garment vertices: mass-weighted least squares for each frame.
+"""Fit blendshape weights and proxies to garment vertices: mass-weighted least squares for each frame.
 
-Levenberg-Marquardt [Marquardt 1963] on what a shot stores, blendshape weights and proxy rotations, several frames at
-once. Rotating a proxy by a small w about its position c moves a vertex by w x (q - W c), where W is the sum
-of the vertex's weights of the proxy and its descendants, and q the sum of its positions under each, weighted alike. A
-step is accepted only where it reduces a frame's error.
+Levenberg-Marquardt [Marquardt 1963] on what a shot stores, several frames at once: blendshape weights, rotations of
+proxies, and their translations where the poses to start from have any. Rotating a proxy by a small w about its
+position c moves a vertex by w x (q - W c), where W is the sum of the vertex's weights of the proxy and its
+descendants, and q the sum of its positions under each, weighted alike. Moving the proxy by t moves the vertex by W t.
+A step is accepted only where it reduces a frame's error.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from ..assets import PINNED, Deformer, Floats, GarmentPose, Ints, Motion
 from ..errors import fail
 from ..kinematics import combined_transforms, matrix_from_quaternion, quaternion_from_matrix, skinning_matrices
 
-MAX_STEPS = 15
+MAX_STEPS = 25
 MIN_GAIN = 1e-3  # relative reduction of a frame's squared error below which its fit stops
 DAMPING = 1e-4, 1e-9, 1e3  # relative to the mean diagonal: initial, minimum, and where the fit of a frame stops
 FRAMES_PER_BLOCK = 16  # frames; the Jacobian of one takes 4 MB for 2,700 vertices, 64 shapes and 20 proxies
@@ -94,7 +95,7 @@ class PoseFitter:
         for pose in poses:
             for at in range(0, pose.frame_count, FRAMES_PER_BLOCK):
                 part = slice(at, at + FRAMES_PER_BLOCK)
-                some = GarmentPose(pose.start + at, pose.rotations[part], pose.weights[part])
+                some = pose.part(part)
                 yield self.fit_block(motion, some, np.stack([next(wanted) for _ in range(some.frame_count)]))
 
     def fit_block(self, motion: Motion, pose: GarmentPose, vertices: Floats) -> PoseFit:
@@ -154,10 +155,14 @@ class _Posed:
 
 
 class _Search:
-    """The iterative fit of a block of frames."""
+    """The iterative fit of a block of frames.
+
+    Its unknowns are M weights, then rotations about the world's axes, then translations along these [m] if any: N.
+    """
 
     def __init__(self, fitter: PoseFitter, motion: Motion, pose: GarmentPose, wanted: Tensor) -> None:
         self.fitter, self.motion, self.pose, self.wanted = fitter, motion, pose, wanted
+        self.unknowns = len(fitter.moving) + (3 if pose.translations is None else 6) * fitter.proxies
         self.posed = self._at(pose)
         self.damping = torch.full_like(self.posed.error, DAMPING[0])
         self.active = torch.ones_like(self.posed.error, dtype=torch.bool)
@@ -187,16 +192,21 @@ class _Search:
         def chosen(new: Tensor, old: Tensor) -> Tensor:
             return torch.where(nearer.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
+        def stored(new: Floats, old: Floats | None) -> Floats:
+            assert old is not None
+            return np.where(rows.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
         rows, own = nearer.cpu().numpy(), self.pose
         self.pose = GarmentPose(
             own.start,
-            np.where(rows[:, None, None], pose.rotations, own.rotations),
-            np.where(rows[:, None], pose.weights, own.weights),
+            stored(pose.rotations, own.rotations),
+            stored(pose.weights, own.weights),
+            None if pose.translations is None else stored(pose.translations, own.translations),
         )
         self.posed = _Posed(*(chosen(new, old) for new, old in zip(vars(posed).values(), vars(self.posed).values())))
 
     def _step(self) -> Tensor:
-        """Return changes of the M moving weights, then of rotations about the world's axes, shape (F, M + 3 P)."""
+        """Return changes of the unknowns, shape (F, N)."""
         fitter, posed = self.fitter, self.posed
         root = fitter.share.sqrt()[..., None]
         jacobian = (root * self._jacobian()).float().flatten(1, 2)
@@ -212,7 +222,7 @@ class _Search:
         return torch.linalg.solve(normal, slope)[..., 0]
 
     def _jacobian(self) -> Tensor:
-        """Return derivatives of the vertices, shape (F, V, 3, M + 3 P)."""
+        """Return derivatives of the vertices, shape (F, V, 3, N)."""
         fitter, posed = self.fitter, self.posed
         by_weight = torch.einsum("fvij,kvj->fvik", posed.blended, fitter.shapes[fitter.moving])
         centre = posed.world[:, fitter.joints :, :3, 3]
@@ -221,15 +231,19 @@ class _Search:
         zero = torch.zeros_like(x)
         turns = [torch.stack(axis, dim=2) for axis in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
         by_turn = torch.stack(turns, dim=-1).flatten(3)
-        return torch.cat([by_weight, by_turn], dim=-1)
+        if self.pose.translations is None:
+            return torch.cat([by_weight, by_turn], dim=-1)
+        along = torch.eye(3, dtype=q.dtype, device=q.device)
+        by_move = torch.einsum("vp,cd->vcpd", fitter.bound, along).flatten(2)
+        return torch.cat([by_weight, by_turn, by_move.expand(len(q), -1, -1, -1)], dim=-1)
 
     def _stuck(self, slope: Tensor) -> Tensor:
-        """Return which unknowns are weights at an active bound of their range, shape (F, M + 3 P)."""
+        """Return which unknowns are weights at an active bound of their range, shape (F, N)."""
         fitter, moving = self.fitter, self.fitter.moving
         weights, slope = fitter._tensor(self.pose.weights[:, moving]), slope[:, : len(moving)]
         low, high = (fitter._tensor(bound[moving]) for bound in (fitter.lower, fitter.upper))
         ends = ((weights <= low) & (slope < 0)) | ((weights >= high) & (slope > 0))
-        return torch.cat([ends, ends.new_zeros(len(ends), 3 * self.fitter.proxies)], dim=1)
+        return torch.cat([ends, ends.new_zeros(len(ends), self.unknowns - len(moving))], dim=1)
 
     def _stepped(self, step: Tensor) -> GarmentPose:
         """Return the pose after a step."""
@@ -238,10 +252,15 @@ class _Search:
         weights = pose.weights.copy()
         moved = weights[:, moving] + step[:, :shapes].cpu().numpy()
         weights[:, moving] = moved.clip(fitter.lower[moving], fitter.upper[moving])
-        turn = torch.matrix_exp(_cross(step[:, shapes:].reshape(len(step), -1, 3))).cpu().numpy()
+        unknown = step[:, shapes:].reshape(len(step), -1, 3)  # a vector of each proxy's turn, then of each one's move
+        turn = torch.matrix_exp(_cross(unknown[:, : fitter.proxies])).cpu().numpy()
         above = self.posed.world[:, fitter.above, :3, :3].cpu().numpy()
-        turned = np.swapaxes(above, -1, -2) @ turn @ above @ matrix_from_quaternion(pose.rotations)
-        return GarmentPose(pose.start, quaternion_from_matrix(turned), weights)
+        back = np.swapaxes(above, -1, -2)
+        turned = quaternion_from_matrix(back @ turn @ above @ matrix_from_quaternion(pose.rotations))
+        if pose.translations is None:
+            return GarmentPose(pose.start, turned, weights)
+        moved = (back @ unknown[:, fitter.proxies :, :, None].cpu().numpy())[..., 0]
+        return GarmentPose(pose.start, turned, weights, pose.translations + moved)
 
     def found(self) -> PoseFit:
         """Return the current poses."""

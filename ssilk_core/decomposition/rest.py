@@ -40,7 +40,7 @@ def rest_residuals(
     rest, shapes = deformer.scene.garment.mesh.points[chosen], deformer.shapes[:, chosen].astype(np.float64)
     for start in range(0, pose.frame_count, FRAMES_PER_BLOCK):
         part = slice(start, min(start + FRAMES_PER_BLOCK, pose.frame_count))
-        some = GarmentPose(start, pose.rotations[part], pose.weights[part])
+        some = pose.part(part)
         world = combined_transforms(deformer, motion, some)
         origin = motion.translations[part, :1]  # so that nothing is lost far from the origin
         world[..., :3, 3] -= origin

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """As many blendshapes as a tolerance needs for offsets that change over the frames of a shot.
 
-Principal components [Eckart, Young 1936] bring the RMS within its bound: of all vertices together, or where a long
-shot makes that pay, of a few regions, each as often as it moves. What then leaves the bound of
-single vertices lies in few places, so shapes of these places alone bring it back at little cost. Weights lie in
-[0, 1], because importers clamp them: each weight runs over the range of its component, and one shape of constant
-weight holds where the ranges begin.
+Principal components [Eckart, Young 1936], without the vertices to which they matter least, bring the RMS within its
+bound. What then leaves the bound of single vertices lies in few places, so shapes of these places alone bring it back
+at little cost. Weights lie in [0, 1], because importers clamp them: each weight runs over the range of its component,
+and one shape of constant weight holds where the ranges begin.
 """
 
 from __future__ import annotations
@@ -18,18 +17,14 @@ import numpy as np
 from ..assets import Floats, Ints
 
 BASIS_FRAMES = 512  # that components are found from, at most; their Gram matrix takes 2 MB
-FIRST_SHARE = 1.25  # of the tolerance that is left to local shapes, which lower the RMS too
-SHARE = 0.97  # of the tolerance that components use; the rest is for what is left out of shapes as too small
-# Of the RMS tolerance: the most by which R shapes may move a vertex and leave it out, times the square root of R.
-NEGLIGIBLE = 0.3
+SHARE = 0.97  # of the RMS tolerance: the bound of components that are added to earlier ones
 TIGHTER = 0.7  # of the RMS at hand: the next bound where local shapes are too many
 NEAR = 0.8  # of the largest distance: vertices that come so near to it are in a local shape
-PAYS = 0.8  # of the bytes of shapes of all vertices: shapes of regions have to take less, because they have borders
-OVERHEAD = 300  # bytes of a blendshape's prim
+VERTEX, WEIGHT, SHAPE = 12, 4, 300  # bytes of a vertex of a blendshape, of its weight in a frame, and of its prim
 MAX_LOCAL = 64  # local shapes after which components are cheaper
 MAX_LOCAL_OFFSETS = 2_000_000  # vertices times frames that a local search holds, 24 MB
 POWER_STEPS = 30
-ROUNDING = 1e-9  # [m] below which offsets are rounding
+ROUNDING = 1e-7  # [m] below which offsets are rounding
 
 
 @dataclass(frozen=True)
@@ -52,7 +47,6 @@ class OffsetShapes:
     Attributes:
         left: offsets that no shape reproduces yet [m], shape (F, V, 3), float32; reduced in place.
         tolerance: to be met in the rest pose.
-        regions: parts of the vertices, which get shapes of their own where these take far fewer bytes.
         shapes: offsets [m], shape (V, 3) each, float32.
         weights: in [0, 1], shape (F,) each, float32.
         constant: where the ranges of the weights begin [m], shape (V, 3).
@@ -60,7 +54,6 @@ class OffsetShapes:
 
     left: Floats
     tolerance: FitTolerance
-    regions: Sequence[Ints]
     shapes: list[Floats] = field(default_factory=list)
     weights: list[Floats] = field(default_factory=list)
     constant: Floats = field(init=False)
@@ -71,14 +64,13 @@ class OffsetShapes:
     def find(self) -> None:
         """Add shapes until what is left is within the tolerance."""
         if self._rms() > self.tolerance.rms:
-            self._add_components(FIRST_SHARE * self.tolerance.rms)
-            self._add_local()  # which may bring the RMS down as well
+            self._add_components(self.tolerance.rms, evenly(len(self.left), BASIS_FRAMES))
         while not self._is_done():
             rms = self._rms()
             if rms > self.tolerance.rms:
-                self._add_components(SHARE * self.tolerance.rms)
+                self._add_components(SHARE * self.tolerance.rms, self._worst_frames())
             elif not self._add_local():
-                self._add_components(TIGHTER * rms)
+                self._add_components(TIGHTER * rms, self._worst_frames())
 
     def all_shapes(self) -> tuple[Floats, Floats]:
         """Return shapes (K, V, 3) and weights (F, K), where any is needed; the last has a constant weight of one."""
@@ -102,54 +94,37 @@ class OffsetShapes:
         reduce = np.maximum.reduce(found) if axis == 0 else np.array([row.max() for row in found])
         return np.sqrt(reduce)
 
-    def _add_components(self, rms: float) -> None:
-        """Add principal components until the RMS of the frames that they are found from is at most `rms` [m]."""
-        negligible = 0.0 if self.shapes else NEGLIGIBLE * self.tolerance.rms
-        chosen = self._basis_frames()
+    def _add_components(self, rms: float, chosen: Ints) -> None:
+        """Add principal components of some frames until the RMS of these is at most `rms` [m]."""
         sample = self.left[chosen].astype(np.float64)
-        mean = sample.mean(axis=0)
-        sample -= mean
+        mean = np.zeros_like(self.constant) if self.shapes else sample.mean(axis=0)  # some frames' is not all frames'
         self.constant += mean
         self.left -= mean.astype(np.float32)
-        whole = regional_components(sample, [np.arange(len(self.constant))], rms)
-        parts = regional_components(sample, self.regions, rms)
-        pays = _bytes(parts, len(self.left)) < PAYS * _bytes(whole, len(self.left))
-        found = parts if pays else whole
-        if not found:  # all frames are the same, and the mean was all that they lacked
-            return
-        each = (len(self.regions) / len(found)) ** 0.5 if pays else len(found) ** -0.5
-        for rows, component in found:
-            self._add(component, rows if pays else None, negligible * min(each, 1.0))
+        found = sparse_components(sample - mean, rms, len(self.left))
+        flat = found.reshape(len(found), 3 * len(mean))  # of no component where all frames are the same
+        products = self.left.reshape(len(self.left), -1) @ flat.T.astype(np.float32)
+        weights = np.linalg.lstsq(flat @ flat.T, products.T.astype(np.float64), rcond=None)[0]
+        for component, each in zip(found, weights):
+            self._add(component, each)
 
-    def _basis_frames(self) -> Ints:
-        """Return all frames; of many, as many evenly spread ones, and later those that are furthest off."""
-        if len(self.left) <= BASIS_FRAMES or not self.shapes:
-            return evenly(len(self.left), BASIS_FRAMES)
+    def _worst_frames(self) -> Ints:
+        """Return the frames that are furthest off, as many as components are found from."""
         return np.sort(np.argsort(-self._largest(1), kind="stable")[:BASIS_FRAMES])
 
-    def _add(self, component: Floats, rows: Ints | None, negligible: float) -> None:
-        """Add a shape (R, 3) of some or all vertices, weighted in each frame by least squares.
-
-        Vertices that it moves by no more than `negligible` [m] are left out.
-        """
-        some = self.left if rows is None else self.left[:, rows]
-        direction = (component / (component**2).sum()).reshape(-1).astype(np.float32)
-        weights = (some.reshape(len(some), -1) @ direction).astype(np.float64)
+    def _add(self, component: Floats, weights: Floats) -> None:
+        """Add a component [m], shape (V, 3), that has a weight in each frame, shape (F,)."""
         low, high = float(weights.min()), float(weights.max())
         stored = ((high - low) * component).astype(np.float32)
-        kept = np.linalg.norm(stored, axis=1) > negligible
-        if not kept.any():  # as where all frames are the same
+        rows = np.flatnonzero(stored.any(axis=1))
+        if not len(rows):  # as where all frames are the same
             return
-        rows, stored = (np.arange(len(kept)) if rows is None else rows)[kept], stored[kept]
         share = ((weights - low) / (high - low)).clip(0, 1).astype(np.float32)
         offset = low / (high - low)
-        shape = np.zeros(self.constant.shape, np.float32)
-        shape[rows] = stored
-        self.shapes.append(shape)
+        self.shapes.append(stored)
         self.weights.append(share)
-        self.constant[rows] += offset * stored
+        self.constant[rows] += offset * stored[rows]
         for frame, weight in zip(self.left, share):
-            frame[rows] -= np.float32(weight + offset) * stored
+            frame[rows] -= np.float32(weight + offset) * stored[rows]
 
     def _add_local(self) -> bool:
         """Add shapes of the places that are too far off; return whether that was enough."""
@@ -160,7 +135,10 @@ class OffsetShapes:
             rows = np.flatnonzero(largest > NEAR * self.tolerance.largest)
             if len(rows) * len(self.left) > MAX_LOCAL_OFFSETS:
                 return False
-            self._add(local_component(self.left[:, rows], self.tolerance.largest), rows, 0.0)
+            some = self.left[:, rows]
+            component = np.zeros(self.constant.shape)
+            component[rows] = local = local_component(some, self.tolerance.largest)
+            self._add(component, np.einsum("fvc,vc->f", some, local) / (local**2).sum())
         return False
 
 
@@ -174,58 +152,46 @@ def components(sample: Floats, tolerance: float, vertices: int) -> Sequence[Floa
 
     At least one, unless there is nothing; shape (3 V,) each, of unit length.
     """
-    values, turn = np.linalg.eigh(sample @ sample.T)
-    values, turn = values[::-1].clip(min=0), turn[:, ::-1]
-    left = np.sqrt((values.sum() - np.cumsum(values)).clip(min=0) / (len(sample) * vertices))
-    count = min(int(np.count_nonzero(left > tolerance)) + 1, int(np.count_nonzero(values > ROUNDING**2)))
+    values, turn = _principal(sample)
+    count = _needed(values, len(sample) * vertices * tolerance**2)
     return [turn[:, index] @ sample / np.sqrt(values[index]) for index in range(count)]
 
 
-def _bytes(found: Sequence[tuple[Ints, Floats]], frames: int) -> int:
-    """Return what shapes of these components take."""
-    return sum(_bytes_of(len(rows), frames) for rows, _ in found)
+def _principal(sample: Floats) -> tuple[Floats, Floats]:
+    """Return squared lengths of principal components of rows (N, D), largest first, and their weights (N, K)."""
+    values, turn = np.linalg.eigh(sample @ sample.T)
+    count = int(np.count_nonzero(values > ROUNDING**2 * sample.size))
+    return values[::-1][:count], turn[:, ::-1][:, :count]
 
 
-def _bytes_of(vertices: int, frames: int) -> int:
-    return 12 * vertices + 4 * frames + OVERHEAD
+def _needed(values: Floats, squares: float) -> int:
+    """Return how many components leave at most this sum of squares; all if none do."""
+    left = values.sum() - np.cumsum(values)
+    return min(int(np.count_nonzero(left > squares)) + 1, len(values))
 
 
-def regional_components(sample: Floats, regions: Sequence[Ints], tolerance: float) -> list[tuple[Ints, Floats]]:
-    """Return the principal components of regions that reduce the error of centred offsets (N, V, 3) most per byte.
+def sparse_components(sample: Floats, rms: float, frames: int) -> Floats:
+    """Return principal components of centred offsets (N, V, 3), each without some vertices, shape (K, V, 3).
 
-    As many as leave an RMS within the tolerance [m], at least one unless there is nothing; the vertices of each, and
-    its offsets of unit length, shape (R, 3).
+    The squared error of what components leave out adds up, because their weights are orthogonal. So the vertices that
+    add least are left out until the RMS reaches its bound [m]. More components than that needs let more vertices be
+    left out of each: as many are taken as make the fewest bytes in a shot of so many frames.
     """
-    squares = float((sample**2).sum())
-    bound, offered = tolerance**2 * sample.shape[0] * sample.shape[1], []
-    for number, rows in enumerate(regions):
-        flat = sample[:, rows].reshape(len(sample), -1)
-        values, turn = np.linalg.eigh(flat @ flat.T)
-        cost = _bytes_of(len(rows), len(sample))
-        for rank in range(1, 1 + int(np.count_nonzero(values > ROUNDING**2))):
-            offered.append((values[-rank] / cost, number, float(values[-rank]), turn[:, -rank]))
-    found: list[tuple[Ints, Floats]] = []
-    for _, number, value, direction in sorted(offered, key=lambda each: -each[0]):
-        if found and squares <= bound:
-            break
-        rows = regions[number]
-        flat = sample[:, rows].reshape(len(sample), -1)
-        found.append((rows, (direction @ flat / np.sqrt(value)).reshape(-1, 3)))
-        squares -= value
-    return found
-
-
-def regions_of(points: Floats, count: int) -> list[Ints]:
-    """Divide points (V, 3) among as many that are far apart, each to the nearest."""
-    seeds = [int(np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
-    nearest = np.linalg.norm(points - points[seeds[0]], axis=1)
-    label = np.zeros(len(points), dtype=int)
-    while len(seeds) < count and nearest.max() > 0:
-        seeds.append(int(nearest.argmax()))
-        away = np.linalg.norm(points - points[seeds[-1]], axis=1)
-        label[away < nearest] = len(seeds) - 1
-        nearest = np.minimum(nearest, away)
-    return [np.flatnonzero(label == number) for number in range(len(seeds))]
+    flat, bound = sample.reshape(len(sample), -1), rms**2 * sample.shape[0] * sample.shape[1]
+    values, turn = _principal(flat)
+    least = _needed(values, bound)
+    if not least:
+        return np.zeros((0, *sample.shape[1:]))
+    fields = (turn[:, : 2 * least].T @ flat).reshape(-1, *sample.shape[1:])
+    squares, missed = (fields**2).sum(axis=-1), values.sum() - np.cumsum(values)
+    found, fewest = fields, np.inf
+    for count in range(least, len(fields) + 1, max(least // 4, 1)):
+        ranked = np.sort(squares[:count], axis=None)
+        first = min(int(np.searchsorted(np.cumsum(ranked), bound - missed[count - 1])), len(ranked) - 1)
+        size = VERTEX * (len(ranked) - first) + count * (WEIGHT * frames + SHAPE)
+        if size < fewest:
+            found, fewest = np.where((squares[:count] >= ranked[first])[..., None], fields[:count], 0), size
+    return found[found.any(axis=(1, 2))]
 
 
 def local_component(left: Floats, largest: float) -> Floats:

@@ -59,6 +59,16 @@ def test_bones_show_what_the_simulation_showed(ready, simulated):
     away = np.linalg.norm(vertices(ready, simulated) - wanted, axis=-1)
     assert np.sqrt((away**2).mean()) <= 1.01e-3 and away.max() <= 5.05e-3
     assert any(key.name.startswith("SSILK ") for key in simulated.data.shape_keys.key_blocks)
+    bones = ready.data.objects["Rig"].pose.bones
+    assert max(bone.location.length for bone in bones if "proxy" in bone.name.lower()) > 1e-4  # proxies move, too
+
+
+def test_a_proxy_that_cannot_move_by_itself_is_named(ready, simulated):
+    bake_cloth(ready, simulated)
+    proxy = next(bone for bone in ready.data.objects["Rig"].data.bones if "proxy" in bone.name.lower())
+    proxy.use_local_location = False
+    with pytest.raises(RuntimeError, match=f"'{proxy.name}' cannot move by itself"):
+        ready.ops.ssilk.to_bones()
 
 
 def test_what_is_not_simulated_or_not_baked_is_refused(ready, simulated):

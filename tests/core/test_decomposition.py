@@ -12,9 +12,9 @@ import pytest
 from ssilk_core.assets import GarmentPose
 from ssilk_core.decomposition import FitTolerance, decompose
 from ssilk_core.decomposition.rest import rest_residuals
-from ssilk_core.decomposition.shapes import OffsetShapes, regions_of
+from ssilk_core.decomposition.shapes import OffsetShapes, sparse_components
 from ssilk_core.errors import SsilkError
-from ssilk_core.kinematics import deform, lbs_deformer
+from ssilk_core.kinematics import deform, lbs_deformer, local_transforms
 from ssilk_core.rollout import garment_poses
 
 FRAMES = 24
@@ -55,6 +55,20 @@ def test_joints_alone_are_recovered_from_rest(played):
     assert found.own_shapes == 0 and found.largest < 5e-4
 
 
+def test_proxies_that_turn_and_move_are_recovered_from_rest_without_shapes(played):
+    deformer, motion, pose = played
+    bones, few, rng = replace(deformer, shapes=deformer.shapes[:0]), motion.clip(0, 6), np.random.default_rng(4)
+    scene = deformer.scene
+    rest = local_transforms(scene.bind_transforms, scene.parents)[scene.character.skeleton.joint_count :, :3, 3]
+    moved = rest + rng.uniform(-0.05, 0.05, (6, *rest.shape))
+    points = deform(bones, few, GarmentPose(0, pose.rotations[:6], np.zeros((6, 0)), moved))
+    still = deform(bones, few, GarmentPose(0, pose.rotations[:6], np.zeros((6, 0))))
+    assert np.linalg.norm(points - still, axis=-1).max() > 0.02
+    found = decompose(bones, few, points)
+    assert found.own_shapes == 0 and found.largest < 1e-6
+    np.testing.assert_allclose(GarmentPose.joined(found.poses).translations, moved, atol=1e-6)
+
+
 @pytest.mark.parametrize("rig", ["model", "joints", "no proxies"])
 def test_anything_else_meets_its_tolerance(played, rig):
     deformer, motion, pose = played
@@ -91,7 +105,7 @@ def test_a_tighter_tolerance_needs_more_shapes(played):
 def test_what_moves_few_vertices_becomes_a_local_shape():
     offsets = np.zeros((30, 400, 3), np.float32)
     offsets[10:14, 5:9, 1] = 0.02
-    own = OffsetShapes(offsets, FitTolerance(), [np.arange(400)])
+    own = OffsetShapes(offsets, FitTolerance())
     own.find()
     shapes, weights = own.all_shapes()
     assert np.abs(np.einsum("fk,kvc->fvc", weights, shapes)[12, 6] - [0, 0.02, 0]).max() < 5e-3
@@ -107,28 +121,21 @@ def test_another_shape_that_stays_is_one_blendshape(played):
     assert found.own_shapes == 1 and found.largest < 1e-6
 
 
-@pytest.mark.parametrize("apart", [False, True])
-def test_regions_get_shapes_of_their_own_where_that_pays(apart):
-    """Two halves that wave each in its own way take half of the bytes; where they wave together they take more."""
-    rng, halves = np.random.default_rng(0), [np.arange(200), np.arange(200, 400)]
-    ways = [rng.standard_normal((80, 4)) for _ in halves]
-    fields = [rng.standard_normal((4, 600)) for _ in halves]
-    waves = [way @ field for way, field in zip(ways if apart else ways[:1] * 2, fields)]
-    own = OffsetShapes(
-        (0.01 * np.concatenate(waves, axis=1)).reshape(80, 400, 3).astype(np.float32), FitTolerance(), halves
-    )
-    own.find()
-    moved = [shape.any(axis=1) for shape in own.shapes]
-    assert len(own.shapes) == (8 if apart else 4)
-    assert all((each[:200].any() != each[200:].any()) == apart for each in moved)
-
-
-def test_regions_cover_all_points_once():
-    points = np.random.default_rng(0).standard_normal((300, 3))
-    regions = regions_of(points, 4)
-    assert sorted(np.concatenate(regions).tolist()) == list(range(300)) and len(regions) == 4
-    assert min(map(len, regions)) > 20
-    assert [len(each) for each in regions_of(np.zeros((5, 3)), 4)] == [5]
+def test_components_leave_out_the_vertices_to_which_they_matter_least():
+    """Two halves that wave each in its own way need no vertex of the other half, and the RMS is used up."""
+    rng = np.random.default_rng(0)
+    sample, ways = np.zeros((80, 400, 3)), rng.standard_normal((80, 8))
+    ways = np.sqrt(80) * np.linalg.qr(ways - ways.mean(axis=0))[0]
+    for half, size, own in ((slice(0, 200), 0.02, ways[:, :4]), (slice(200, 400), 0.005, ways[:, 4:])):
+        sample[:, half] = size * np.einsum("fk,kvc->fvc", own, rng.standard_normal((4, 200, 3)))
+    found = sparse_components(sample, 1e-3, 80)
+    moved = found.any(axis=-1)
+    assert len(found) >= 8 and moved.sum() < 1.1 * 8 * 200
+    flat = found.reshape(len(found), -1)
+    weights = np.linalg.lstsq(flat.T, sample.reshape(80, -1).T, rcond=None)[0]
+    left = sample - np.einsum("kf,kvc->fvc", weights, found)
+    assert np.sqrt((left**2).sum(-1).mean()) <= 1e-3
+    assert not len(sparse_components(np.zeros((4, 10, 3)), 1e-3, 4))
 
 
 def test_offsets_in_the_rest_pose_give_the_vertices_back(played):
@@ -157,7 +164,7 @@ def test_many_frames_are_fitted_from_some_of_them(monkeypatch):
     offsets = (np.sin(np.outer(np.arange(96), [0.1, 0.3, 0.7])) @ rng.standard_normal((3, 180))).reshape(96, 60, 3)
     offsets[40:44] += rng.standard_normal((60, 3))  # which frames that are evenly spread do not tell of
     monkeypatch.setattr("ssilk_core.decomposition.shapes.BASIS_FRAMES", 6)
-    own = OffsetShapes((0.01 * offsets).astype(np.float32), FitTolerance(), [np.arange(30), np.arange(30, 60)])
+    own = OffsetShapes((0.01 * offsets).astype(np.float32), FitTolerance())
     own.find()
     shapes, weights = own.all_shapes()
     away = np.linalg.norm(np.einsum("fk,kvc->fvc", weights, shapes) - 0.01 * offsets, axis=-1)
@@ -180,7 +187,7 @@ def test_points_of_another_garment_and_broken_ones_are_refused(played):
 def test_frames_that_are_all_the_same_need_one_constant_shape(frames):
     left = np.zeros((frames, 20, 3), np.float32)
     left[:, :10, 1] = 0.05
-    found = OffsetShapes(left, FitTolerance(), [np.arange(20)])
+    found = OffsetShapes(left, FitTolerance())
     found.find()
     shapes, weights = found.all_shapes()
     assert shapes.shape == (1, 20, 3) and (weights == 1).all()

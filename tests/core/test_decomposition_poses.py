@@ -11,7 +11,7 @@ import pytest
 from ssilk_core.assets import GarmentPose
 from ssilk_core.decomposition.poses import PoseFitter, _Search
 from ssilk_core.errors import SsilkError
-from ssilk_core.kinematics import deform
+from ssilk_core.kinematics import deform, local_transforms
 from ssilk_core.rollout import garment_poses
 
 FRAMES = 5
@@ -51,12 +51,22 @@ def test_vertices_of_a_pose_are_found_again(played, mass):
     np.testing.assert_allclose(fit.rms, np.sqrt(after**2 @ mass / mass.sum()), atol=1e-6)
 
 
-def test_the_jacobian_is_that_of_differences(played, mass):
+def moving(deformer, pose: GarmentPose, size: float) -> GarmentPose:
+    """The pose with proxies that are up to `size` [m] from their places along each axis."""
+    scene, away = deformer.scene, np.random.default_rng(5).uniform(-size, size, (*pose.rotations.shape[:2], 3))
+    rest = local_transforms(scene.bind_transforms, scene.parents)[scene.character.skeleton.joint_count :, :3, 3]
+    return replace(pose, translations=rest + away)
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_the_jacobian_is_that_of_differences(played, mass, moves):
     deformer, motion, pose = played
     fitter = PoseFitter(deformer, mass)
     wanted = fitter._tensor(deform(deformer, motion, pose)[:, fitter.free])
-    search = _Search(fitter, motion, disturbed(pose, 0.05), wanted)
+    start = disturbed(pose, 0.05)
+    search = _Search(fitter, motion, moving(deformer, start, 0.05) if moves else start, wanted)
     jacobian, base = search._jacobian().numpy(), search.posed.away.numpy()
+    assert jacobian.shape[-1] == len(fitter.moving) + (6 if moves else 3) * fitter.proxies
     for column in range(jacobian.shape[-1]):
         step = np.zeros((FRAMES, jacobian.shape[-1]))
         step[:, column] = 1e-3
