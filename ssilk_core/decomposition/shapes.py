@@ -17,7 +17,7 @@ import numpy as np
 from ..assets import Floats, Ints
 
 BASIS_FRAMES = 512  # that components are found from, at most; their Gram matrix takes 2 MB
-SHARE = 0.97  # of the RMS tolerance: the bound of components that are added to earlier ones
+SHARE = 0.97  # of the RMS tolerance: the bound of components that are added later, which few frames are found from
 TIGHTER = 0.7  # of the RMS at hand: the next bound where local shapes are too many
 NEAR = 0.8  # of the largest distance: vertices that come so near to it are in a local shape
 VERTEX, WEIGHT, SHAPE = 12, 4, 300  # bytes of a vertex of a blendshape, of its weight in a frame, and of its prim
@@ -64,7 +64,9 @@ class OffsetShapes:
     def find(self) -> None:
         """Add shapes until what is left is within the tolerance."""
         if self._rms() > self.tolerance.rms:
-            self._add_components(self.tolerance.rms, evenly(len(self.left), BASIS_FRAMES))
+            chosen = evenly(len(self.left), BASIS_FRAMES)
+            self._take_mean(chosen)
+            self._add_components(self.tolerance.rms, chosen)
         while not self._is_done():
             rms = self._rms()
             if rms > self.tolerance.rms:
@@ -94,14 +96,16 @@ class OffsetShapes:
         reduce = np.maximum.reduce(found) if axis == 0 else np.array([row.max() for row in found])
         return np.sqrt(reduce)
 
-    def _add_components(self, rms: float, chosen: Ints) -> None:
-        """Add principal components of some frames until the RMS of these is at most `rms` [m]."""
-        sample = self.left[chosen].astype(np.float64)
-        mean = np.zeros_like(self.constant) if self.shapes else sample.mean(axis=0)  # some frames' is not all frames'
+    def _take_mean(self, chosen: Ints) -> None:
+        """Put the mean of some frames into the shape of constant weight."""
+        mean = self.left[chosen].mean(axis=0, dtype=np.float64)
         self.constant += mean
         self.left -= mean.astype(np.float32)
-        found = sparse_components(sample - mean, rms, len(self.left))
-        flat = found.reshape(len(found), 3 * len(mean))  # of no component where all frames are the same
+
+    def _add_components(self, rms: float, chosen: Ints) -> None:
+        """Add principal components of some frames until the RMS of these is at most `rms` [m]."""
+        found = sparse_components(self.left[chosen].astype(np.float64), rms, len(self.left))
+        flat = found.reshape(len(found), self.constant.size)  # of no component where all frames are the same
         products = self.left.reshape(len(self.left), -1) @ flat.T.astype(np.float32)
         weights = np.linalg.lstsq(flat @ flat.T, products.T.astype(np.float64), rcond=None)[0]
         for component, each in zip(found, weights):
@@ -148,7 +152,7 @@ def evenly(count: int, most: int) -> Ints:
 
 
 def components(sample: Floats, tolerance: float, vertices: int) -> Sequence[Floats]:
-    """Return as many principal components of centred offsets (N, 3 V) as leave an RMS within the tolerance [m].
+    """Return as many principal components of offsets (N, 3 V) as leave an RMS within the tolerance [m].
 
     At least one, unless there is nothing; shape (3 V,) each, of unit length.
     """
@@ -171,7 +175,7 @@ def _needed(values: Floats, squares: float) -> int:
 
 
 def sparse_components(sample: Floats, rms: float, frames: int) -> Floats:
-    """Return principal components of centred offsets (N, V, 3), each without some vertices, shape (K, V, 3).
+    """Return principal components of offsets (N, V, 3), each without some vertices, shape (K, V, 3).
 
     The squared error of what components leave out adds up, because their weights are orthogonal. So the vertices that
     add least are left out until the RMS reaches its bound [m]. More components than that needs let more vertices be
