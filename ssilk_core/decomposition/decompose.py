@@ -13,6 +13,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from math import ceil
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,7 +29,8 @@ if TYPE_CHECKING:
     import torch
 
 SAMPLE = 512  # vertices that poses are fitted to; their weights are known, and shapes take the rest
-COMPONENTS, FRAMES_EACH = 2, 8  # fitted together with the proxies, at most, and frames for each of them
+COMPONENTS, FRAMES_EACH = 8, 48  # fitted together with the proxies, at most, and frames for each of them
+FEW = 8  # frames, of which fewer get no components
 ROUNDS, STEPS = 3, 1  # of fitting poses with components, and iterations in each
 FIRST_STEPS = 6  # before them, where there are blendshapes to fit
 SPREAD = 0.1  # [m] RMS of these components, which makes them as stiff as rotations
@@ -156,18 +158,18 @@ class _PoseSearch:
         pose = self._at_rest() if start is None else start
         if not self.proxies and not (bounds[0] < bounds[1]).any():
             return pose
-        count = min(COMPONENTS, self.motion.frame_count // FRAMES_EACH)
+        frames = self.motion.frame_count
+        count = min(COMPONENTS, ceil(frames / FRAMES_EACH)) if frames >= FEW else 0
         if self.deformer.shape_count and count:
             pose = self._fitted(self.deformer, pose, *bounds, steps=FIRST_STEPS)
-        pose = self._free_to_move(pose)
         if not count:
-            return self._fitted(self.deformer, pose, *bounds)
+            return self._fitted(self.deformer, self._free_to_move(pose), *bounds)
         for _ in range(ROUNDS):
             left = self._left(pose)
             distance = np.linalg.norm(left, axis=-1)
             if np.sqrt((distance**2).mean()) < self.tolerance.rms and distance.max() < self.tolerance.largest:
                 break
-            pose = self._with_components(pose, left, count)
+            pose = self._with_components(self._free_to_move(pose), left, count)
         return pose
 
     def _at_rest(self) -> GarmentPose:
