@@ -15,6 +15,7 @@ import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from helpers.reports import RESULTS, table, write_results
@@ -26,8 +27,9 @@ from ssilk_core.events import format_seconds
 from ssilk_core.training.curve import curve_path
 from ssilk_core.training.verdict import curve_lbs
 
-PANELS = ("total", *TERMS, "collisions", "dynamics")
-UNITS = {"collisions": "share of vertices", "dynamics": "m"}  # of others: J
+SHOWS = "shows"
+PANELS = ("total", *TERMS, "collisions", "dynamics", SHOWS)
+UNITS = {"collisions": "share of vertices", "dynamics": "m", SHOWS: "share of covered skin"}  # of others: J
 SHOWN = 0.9  # share of the values that a panel shows: the first ones would flatten all others
 
 
@@ -74,9 +76,14 @@ def read_run(text: str) -> Run:
     points = document["points"]
     if not points:
         fail(str(path), "the curve has no point yet", "one validation at least is needed", "train longer")
-    values = {key: np.array([point["validation"].get(key, 0.0) for point in points]) for key in PANELS}
+    found = [{SHOWS: _shown(point["validation"]), **point["validation"]} for point in points]
+    values = {key: np.array([each.get(key, 0.0) for each in found]) for key in PANELS}
     iterations, seconds = (np.array([point[key] for point in points]) for key in ("iteration", "seconds"))
     return Run(name or Path(model).stem, iterations, seconds, values, curve_lbs(document)["total"])
+
+
+def _shown(validation: dict[str, Any]) -> float:
+    return float((validation.get("shown_skin") or {"mean": 0.0})["mean"])
 
 
 def bounds(values: Iterable[np.ndarray]) -> tuple[float, float]:

@@ -32,6 +32,7 @@ class Objective:
         body: the part of the body that the garment can touch, None for nothing. Pinned vertices do not collide,
             because training cannot move them.
         newton_weight: see `NewtonDistance`; zero for the energy alone.
+        clearance: see `config.TrainConfig` [m].
     """
 
     def __init__(
@@ -42,9 +43,10 @@ class Objective:
         bank: MotionBank,
         surface: bool = True,
         newton_weight: float = 0.0,
+        clearance: float = 0.0,
     ) -> None:
         self.model, self.energy, self.bank = model, energy, bank
-        self.surface = surface
+        self.surface, self.clearance = surface, clearance
         self.body, device = body, bank.static.device
         if body:
             self.contacts = Contacts(
@@ -78,10 +80,15 @@ class Objective:
         return terms
 
     def _planes(self, x: Tensor, character: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the plane that each sample x (S, 3, N) can touch: normals (S, 3, N) and offsets (S, N)."""
+        """Return the plane that each sample x (S, 3, N) can touch, moved outwards by the clearance.
+
+        Returns:
+            Normals (S, 3, N) and offsets (S, N).
+        """
         if self.body is None:
             return no_planes(x)
-        return self.contacts.planes(x, self.body.pose(character, surface=self.surface))
+        normal, offset = self.contacts.planes(x, self.body.pose(character, surface=self.surface))
+        return normal, offset + self.clearance
 
     def static(self, frames: Tensor, direction: Tensor) -> Terms:
         """Return the terms of the initialiser's quasi-static states on single poses (Section 3.1)."""

@@ -64,7 +64,9 @@ class TrainingParts:
         generator = torch.Generator(self.device).manual_seed(group.seed(seed))
         sampler = WindowSampler(self.bank, own, self.model.config.latent, generator)
         surface = config.closest_point == "triangles"
-        objective = Objective(self.model, self.energy, self.body, self.bank, surface, config.newton_weight)
+        objective = Objective(
+            self.model, self.energy, self.body, self.bank, surface, config.newton_weight, config.clearance
+        )
         average = group.average if group.size > 1 else None
         return Stepper(self.model, objective, sampler, own, average, self.smoothing)
 

@@ -56,6 +56,7 @@ PAPER = {
     "perturbations": 0,
     "outlier_energy": 0,
     "newton_weight": 0,
+    "clearance": 0,
     "noise_correlation": 0,
     "noise_probability": "not stated",
     "static_fraction": 0,
@@ -85,7 +86,8 @@ def training() -> Text:
             f"{train.batch} of {train.window}", purpose,
         )  # fmt: skip
     for setting, paper in PAPER.items():
-        yield f"| `{setting}` | {default(setting):g} | {paper} |"
+        unit = " [m]" if setting == "clearance" else ""
+        yield f"| `{setting}`{unit} | {default(setting):g} | {paper} |"
     cloth, papers = Fabric("default"), FABRICS["paper"]
     yield f"| `drag` (material) [kg/(m² s)] | {cloth.drag:g} |"
     yield f"| `contact_model` (material) | {cloth.contact_model} | {papers.contact_model} |"
