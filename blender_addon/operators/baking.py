@@ -26,7 +26,7 @@ from ..preferences import interpreter, preferences, unready
 from ..scene import playing
 from ..scene.armature import read_joints
 from ..scene.attributes import current_classes
-from ..scene.baked import animated, apply_bake, need_bakeable, remove_bake
+from ..scene.baked import animated, apply_bake, need_bakeable, need_movable, remove_bake
 from ..scene.garment import armature_of, unusable_here
 from ..scene.gather import ROOT, gather
 from ..scene.handover import STAGE, hand_over, loading_usd
@@ -153,6 +153,8 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         joints = read_joints(armature, garment)
         need_bakeable(garment, armature, joints)
         need_tracks(animated(garment, armature))
+        if self.to_timeline and self.quality != WHOLE and QUALITIES[self.quality].refine:
+            need_movable(armature, joints.proxies)
         (self.take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
         self.scene = None if (self.model.parent / STAGE).exists() else gather(garment)
         self.pair = Pair.of(garment, armature)

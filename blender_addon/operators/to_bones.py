@@ -13,7 +13,7 @@ from ..errors import SetupError
 from ..outside.work import Work
 from ..preferences import interpreter, preferences, unready
 from ..scene.armature import read_joints
-from ..scene.baked import animated, need_bakeable
+from ..scene.baked import animated, need_bakeable, need_movable
 from ..scene.garment import armature_of, unusable_here
 from ..scene.gather import ROOT, gather
 from ..scene.handover import STAGE, hand_over, loading_usd
@@ -55,6 +55,7 @@ class SimulationToBones(TimelineOperator, bpy.types.Operator):
             raise SetupError(f"'{garment.name}' has no proxies; generate its rig.")
         need_bakeable(garment, armature, joints, simulated=True)
         need_tracks(animated(garment, armature))
+        need_movable(armature, joints.proxies)
         need_simulated(garment)
         (self.take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
         self.scene, self.pair = gather(garment, simulated=True), Pair.of(garment, armature)

@@ -75,17 +75,17 @@ def apply_bake(garment: bpy.types.Object, armature: bpy.types.Object, joints: Jo
         SetupError: garment or bones are not those that it was trained with.
     """
     order = joint_order(joints, baked.garment.joint_names, fewer_proxies=True)
-    shapes = apply_deformation(garment, armature, joints, baked.garment, order)
     proxies = order[joints.character_count :] - joints.character_count
     there = proxies >= 0
+    if baked.pose.translations is not None:  # before anything changes
+        need_movable(armature, [joints.proxies[index] for index in np.flatnonzero(there)])
+    shapes = apply_deformation(garment, armature, joints, baked.garment, order)
     rotations = np.tile(rest_rotations(joints), (baked.pose.frame_count, 1, 1))
     rotations[:, there] = baked.pose.rotations[:, proxies[there]]
     channels = _channels(joints.proxies, "rotation_quaternion", turns_from_rest(joints, rotations))
     if baked.pose.translations is not None:
-        moving = np.flatnonzero(there)
-        _need_movable(armature, [joints.proxies[index] for index in moving])
         places = np.tile(_rest_places(joints), (baked.pose.frame_count, 1, 1))
-        places[:, moving] = baked.pose.translations[:, proxies[moving]]
+        places[:, there] = baked.pose.translations[:, proxies[there]]
         channels += _channels(joints.proxies, "location", _shifts_from_rest(armature, joints, places))
     moved = [
         (armature, channels),
@@ -225,8 +225,12 @@ def _free(armature: bpy.types.Object, proxies: Sequence[str]) -> None:
         bone.location, bone.scale, bone.rotation_quaternion = (0, 0, 0), (1, 1, 1), (1, 0, 0, 0)
 
 
-def _need_movable(armature: bpy.types.Object, names: Sequence[str]) -> None:
-    """Check that Blender moves bones by their own locations."""
+def need_movable(armature: bpy.types.Object, names: Sequence[str]) -> None:
+    """Check that Blender moves proxies by their own locations, as refined and simulated shots do.
+
+    Raises:
+        SetupError: one cannot move.
+    """
     for name in names:
         bone = armature.data.bones[name]
         if bone.use_connect or not bone.use_local_location:

@@ -79,8 +79,14 @@ class GarmentPose:
 
     @classmethod
     def joined(cls, poses: Sequence[GarmentPose]) -> GarmentPose:
-        """Return consecutive poses as one; all of them have translations, or none."""
+        """Return consecutive poses as one.
+
+        Raises:
+            ValueError: some of them have translations, and others have none.
+        """
         moved = [pose.translations for pose in poses if pose.translations is not None]
+        if len(moved) not in (0, len(poses)):
+            raise ValueError("some poses have translations of the proxies, and others have none")
         return cls(
             poses[0].start,
             np.concatenate([pose.rotations for pose in poses]),

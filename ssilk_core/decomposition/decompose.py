@@ -162,14 +162,14 @@ class _PoseSearch:
         count = min(COMPONENTS, ceil(frames / FRAMES_EACH)) if frames >= FEW else 0
         if self.deformer.shape_count and count:
             pose = self._fitted(self.deformer, pose, *bounds, steps=FIRST_STEPS)
-        if not count:
-            return self._fitted(self.deformer, self._free_to_move(pose), *bounds)
         for _ in range(ROUNDS):
             left = self._left(pose)
             distance = np.linalg.norm(left, axis=-1)
             if np.sqrt((distance**2).mean()) < self.tolerance.rms and distance.max() < self.tolerance.largest:
                 break
-            pose = self._with_components(self._free_to_move(pose), left, count)
+            if not count:
+                return self._fitted(self.deformer, self._free_to_move(pose), *bounds)
+            pose = self._with_components(pose, left, count)
         return pose
 
     def _at_rest(self) -> GarmentPose:
@@ -189,13 +189,14 @@ class _PoseSearch:
         return np.concatenate([offsets.astype(np.float32) for _, offsets in found])
 
     def _with_components(self, pose: GarmentPose, left: Floats, count: int) -> GarmentPose:
-        """Return poses fitted together with components of what they have left."""
+        """Return poses, whose proxies may move, fitted together with components of what they have left."""
         given, frames = self.deformer.shape_count, len(left)
         mean = left.mean(axis=0, dtype=np.float64)
         chosen = evenly(frames, BASIS_FRAMES)
         basis = components((left[chosen] - mean).reshape(len(chosen), -1), 0.0, len(self.sample))[:count]
         if not basis:  # what is left stays the same
             return pose
+        pose = self._free_to_move(pose)
         scale = SPREAD * np.sqrt(len(self.sample))
         flat = np.stack(basis)
         weights = (left - mean.astype(np.float32)).reshape(frames, -1) @ (flat.T / scale).astype(np.float32)

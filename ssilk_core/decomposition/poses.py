@@ -19,11 +19,20 @@ from torch import Tensor
 
 from ..assets import PINNED, Deformer, Floats, GarmentPose, Ints, Motion
 from ..errors import fail
-from ..kinematics import combined_transforms, matrix_from_quaternion, quaternion_from_matrix, skinning_matrices
+from ..kinematics import (
+    combined_transforms,
+    local_transforms,
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    skinning_matrices,
+)
 
 MAX_STEPS = 25
 MIN_GAIN = 1e-3  # relative reduction of a frame's squared error below which its fit stops
 DAMPING = 1e-4, 1e-9, 1e3  # relative to the mean diagonal: initial, minimum, and where the fit of a frame stops
+# Of proxies at their places at rest: 30 mm of all cost as much as a millimetre of all vertices. Each frame is fitted
+# by itself, and without it proxies jump from frame to frame, which is seen between frames.
+STIFFNESS = 1e-3
 FRAMES_PER_BLOCK = 16  # frames; the Jacobian of one takes 4 MB for 2,700 vertices, 64 shapes and 20 proxies
 
 
@@ -72,6 +81,7 @@ class PoseFitter:
         self.joints, self.proxies = scene.character.skeleton.joint_count, scene.rig.proxy_count
         self.free = np.flatnonzero(scene.classes != PINNED) if vertices is None else vertices
         self.above = scene.rig.parents.tolist()
+        self.places = local_transforms(scene.bind_transforms, scene.parents)[self.joints :, :3, 3]
         self.indices = self._tensor(skin.indices[self.free], torch.int64)
         self.weights = self._tensor(skin.weights[self.free])
         self.rest = self._tensor(scene.garment.mesh.points[self.free])
@@ -145,6 +155,7 @@ class _Posed:
         moved: weighted position of a vertex under each influence, shape (F, V, I, 3).
         away: target minus posed vertices, shape (F, V, 3).
         error: mean squared distance, weighted by mass [m2], shape (F,).
+        cost: what is minimised, the error and `STIFFNESS` times the proxies' mean squared distance from rest [m2].
     """
 
     world: Tensor
@@ -152,6 +163,7 @@ class _Posed:
     moved: Tensor
     away: Tensor
     error: Tensor
+    cost: Tensor
 
 
 class _Search:
@@ -164,8 +176,8 @@ class _Search:
         self.fitter, self.motion, self.pose, self.wanted = fitter, motion, pose, wanted
         self.unknowns = len(fitter.moving) + (3 if pose.translations is None else 6) * fitter.proxies
         self.posed = self._at(pose)
-        self.damping = torch.full_like(self.posed.error, DAMPING[0])
-        self.active = torch.ones_like(self.posed.error, dtype=torch.bool)
+        self.damping = torch.full_like(self.posed.cost, DAMPING[0])
+        self.active = torch.ones_like(self.posed.cost, dtype=torch.bool)
 
     def _at(self, pose: GarmentPose) -> _Posed:
         fitter = self.fitter
@@ -175,14 +187,21 @@ class _Search:
         each = matrices[:, fitter.indices] * fitter.weights[..., None, None]
         moved = (each[..., :3] @ points[:, :, None, :, None])[..., 0] + each[..., 3]
         away = self.wanted - moved.sum(2)
-        return _Posed(fitter._tensor(world), each[..., :3].sum(2), moved, away, (fitter.share * away**2).sum((1, 2)))
+        error = (fitter.share * away**2).sum((1, 2))
+        cost = error if pose.translations is None else error + STIFFNESS * (self._strayed(pose) ** 2).sum(2).mean(1)
+        return _Posed(fitter._tensor(world), each[..., :3].sum(2), moved, away, error, cost)
+
+    def _strayed(self, pose: GarmentPose) -> Tensor:
+        """Return where proxies are from their places at rest, in their parents' axes [m], shape (F, P, 3)."""
+        assert pose.translations is not None
+        return self.fitter._tensor(pose.translations - self.fitter.places)
 
     def advance(self) -> bool:
         """Make one step; return whether any frame can still improve."""
         trial = self._stepped(self._step())
         posed, before = self._at(trial), self.posed
-        nearer = (posed.error < before.error) & self.active
-        gain = 1 - posed.error / before.error.clamp_min(torch.finfo(before.error.dtype).tiny)
+        nearer = (posed.cost < before.cost) & self.active
+        gain = 1 - posed.cost / before.cost.clamp_min(torch.finfo(before.cost.dtype).tiny)
         self.damping = torch.where(nearer, self.damping / 10, self.damping * 10).clamp_min(DAMPING[1])
         self.active &= torch.where(nearer, gain > MIN_GAIN, self.damping < DAMPING[2])
         self._accept(nearer, trial, posed)
@@ -214,6 +233,11 @@ class _Search:
         slope = (jacobian.transpose(1, 2) @ residual[..., None]).double()
         stuck = self._stuck(slope[..., 0])
         normal = (jacobian.transpose(1, 2) @ jacobian).double()
+        if self.pose.translations is not None:
+            moves, stiffness = slice(-3 * fitter.proxies, None), STIFFNESS / fitter.proxies
+            above = posed.world[:, fitter.above, :3, :3]
+            slope[:, moves] -= stiffness * (above @ self._strayed(self.pose)[..., None]).flatten(1)[..., None]
+            normal.diagonal(dim1=1, dim2=2)[:, moves] += stiffness
         normal = normal * ~(stuck[:, :, None] | stuck[:, None])
         slope = slope.masked_fill(stuck[..., None], 0)
         diagonal = normal.diagonal(dim1=1, dim2=2)

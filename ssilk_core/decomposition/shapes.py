@@ -62,17 +62,19 @@ class OffsetShapes:
         self.constant = np.zeros(self.left.shape[1:])
 
     def find(self) -> None:
-        """Add shapes until what is left is within the tolerance."""
+        """Add shapes until what is left is within the tolerance, or is rounding, of which no shape is made."""
         if self._rms() > self.tolerance.rms:
             chosen = evenly(len(self.left), BASIS_FRAMES)
             self._take_mean(chosen)
             self._add_components(self.tolerance.rms, chosen)
-        while not self._is_done():
-            rms = self._rms()
+        count = -1
+        while not self._is_done() and len(self.shapes) > count:
+            rms, count = self._rms(), len(self.shapes)
             if rms > self.tolerance.rms:
-                self._add_components(SHARE * self.tolerance.rms, self._worst_frames())
+                squares = np.array([np.dot(row, row) for row in self.left.reshape(len(self.left), -1)])
+                self._add_components(SHARE * self.tolerance.rms, self._worst_frames(squares))
             elif not self._add_local():
-                self._add_components(TIGHTER * rms, self._worst_frames())
+                self._add_components(TIGHTER * rms, self._worst_frames(self._largest(1)))
 
     def all_shapes(self) -> tuple[Floats, Floats]:
         """Return shapes (K, V, 3) and weights (F, K), where any is needed; the last has a constant weight of one."""
@@ -111,9 +113,9 @@ class OffsetShapes:
         for component, each in zip(found, weights):
             self._add(component, each)
 
-    def _worst_frames(self) -> Ints:
-        """Return the frames that are furthest off, as many as components are found from."""
-        return np.sort(np.argsort(-self._largest(1), kind="stable")[:BASIS_FRAMES])
+    def _worst_frames(self, error: Floats) -> Ints:
+        """Return the frames with the largest error (F,), as many as components are found from."""
+        return np.sort(np.argsort(-error, kind="stable")[:BASIS_FRAMES])
 
     def _add(self, component: Floats, weights: Floats) -> None:
         """Add a component [m], shape (V, 3), that has a weight in each frame, shape (F,)."""
@@ -188,7 +190,7 @@ def sparse_components(sample: Floats, rms: float, frames: int) -> Floats:
         return np.zeros((0, *sample.shape[1:]))
     fields = (turn[:, : 2 * least].T @ flat).reshape(-1, *sample.shape[1:])
     squares, missed = (fields**2).sum(axis=-1), values.sum() - np.cumsum(values)
-    found, fewest = fields, np.inf
+    found, fewest = fields[:least], np.inf
     for count in range(least, len(fields) + 1, max(least // 4, 1)):
         ranked = np.sort(squares[:count], axis=None)
         first = min(int(np.searchsorted(np.cumsum(ranked), bound - missed[count - 1])), len(ranked) - 1)

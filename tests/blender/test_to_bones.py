@@ -66,9 +66,10 @@ def test_bones_show_what_the_simulation_showed(ready, simulated):
 def test_a_proxy_that_cannot_move_by_itself_is_named(ready, simulated):
     bake_cloth(ready, simulated)
     proxy = next(bone for bone in ready.data.objects["Rig"].data.bones if "proxy" in bone.name.lower())
-    proxy.use_local_location = False
+    proxy.use_local_location, keys = False, simulated.data.shape_keys
     with pytest.raises(RuntimeError, match=f"'{proxy.name}' cannot move by itself"):
         ready.ops.ssilk.to_bones()
+    assert simulated.data.shape_keys == keys
 
 
 def test_what_is_not_simulated_or_not_baked_is_refused(ready, simulated):

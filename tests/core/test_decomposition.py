@@ -65,8 +65,18 @@ def test_proxies_that_turn_and_move_are_recovered_from_rest_without_shapes(playe
     still = deform(bones, few, GarmentPose(0, pose.rotations[:6], np.zeros((6, 0))))
     assert np.linalg.norm(points - still, axis=-1).max() > 0.02
     found = decompose(bones, few, points)
-    assert found.own_shapes == 0 and found.largest < 1e-6
-    np.testing.assert_allclose(GarmentPose.joined(found.poses).translations, moved, atol=1e-6)
+    assert found.own_shapes == 0 and found.largest < 1e-3
+    away = np.linalg.norm(GarmentPose.joined(found.poses).translations - moved, axis=-1)
+    assert np.median(away) < 1e-3 and away.max() < 0.01  # a stiffness holds them near rest
+
+
+@pytest.mark.parametrize("frames", [5, FRAMES])
+def test_proxies_that_need_not_move_get_no_translations(played, frames):
+    deformer, motion, pose = played
+    bones, some = replace(deformer, shapes=deformer.shapes[:0]), motion.clip(0, frames)
+    turning = GarmentPose(0, pose.rotations[:frames], np.zeros((frames, 0)))
+    found = decompose(bones, some, deform(bones, some, turning), [turning])
+    assert found.own_shapes == 0 and found.poses[0].translations is None
 
 
 @pytest.mark.parametrize("rig", ["model", "joints", "no proxies"])
@@ -112,13 +122,21 @@ def test_what_moves_few_vertices_becomes_a_local_shape():
     assert shapes.any(axis=-1).sum() <= 8 and not shapes[:, 20:].any()
 
 
+def test_rounding_ends_the_search():
+    """No component of noise this small counts, though its RMS exceeds the tolerance."""
+    noise = 5e-7 * np.random.default_rng(0).standard_normal((512, 300, 3))
+    own = OffsetShapes(noise.astype(np.float32), FitTolerance(2e-7, 1e-6))
+    own.find()
+    assert len(own.shapes) <= 1
+
+
 def test_another_shape_that_stays_is_one_blendshape(played):
     deformer, motion, pose = played
     bones = replace(deformer, shapes=deformer.shapes[:0])
     held = replace(deformer, shapes=np.random.default_rng(0).uniform(0.01, 0.02, (1, 60, 3)))
     points = deform(held, motion, GarmentPose(0, pose.rotations, np.ones((FRAMES, 1))))
     found = decompose(bones, motion, points, [GarmentPose(0, pose.rotations, np.zeros((FRAMES, 0)))])
-    assert found.own_shapes == 1 and found.largest < 1e-6
+    assert found.own_shapes == 1 and found.largest < 1e-6 and found.poses[0].translations is None
 
 
 def test_components_leave_out_the_vertices_to_which_they_matter_least():

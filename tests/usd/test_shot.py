@@ -372,6 +372,21 @@ def test_proxies_that_move_to_nowhere_are_refused(tmp_path):
             write_shot(tmp_path / "shot.usdc", deformer, motion, poses, units=METRES_Y)
 
 
+@pytest.mark.parametrize("later", [False, True])
+def test_proxies_that_move_in_some_chunks_only_are_refused(tmp_path, later):
+    """USD would hold the first sample over all frames before it."""
+    rng = np.random.default_rng(4)
+    deformer, motion = make_deformer(rng), make_motion(rng)
+    poses = [
+        replace(pose, translations=rng.normal(size=(pose.frame_count, 2, 3))) if (number > 0) == later else pose
+        for number, pose in enumerate(make_poses(rng, deformer))
+    ]
+    with pytest.raises(SsilkError, match="proxies that move in some chunks"):
+        write_shot(tmp_path / "shot.usdc", deformer, motion, poses, units=METRES_Y)
+    with pytest.raises(ValueError, match="some poses have translations"):
+        GarmentPose.joined(poses)
+
+
 def unskin(stage: Usd.Stage) -> None:
     for name in ("jointIndices", "jointWeights"):
         stage.GetPrimAtPath("/Hero/cape").RemoveProperty(f"primvars:skel:{name}")

@@ -173,10 +173,13 @@ def _metadata(value: object) -> object:
 
 def checked_poses(poses: Iterable[GarmentPose], deformer: Deformer, motion: Motion) -> Iterator[GarmentPose]:
     """Yield the chunks; raise `SsilkError` unless they belong to this garment and cover the motion in order."""
-    where, count = deformer.scene.garment.mesh.path, 0
+    where, count, moves = deformer.scene.garment.mesh.path, 0, False
     for pose in poses:
         if pose.start != count:
             fail(where, f"a chunk that starts at frame {pose.start}", f"frame {count} comes next")
+        if count and moves != (pose.translations is not None):
+            fail(where, f"proxies that move in some chunks, up to frame {count} or from there on", "all do, or none")
+        moves = pose.translations is not None
         _check_pose(pose, deformer)
         count += pose.frame_count
         _need_frames(count <= motion.frame_count, count, deformer, motion)
