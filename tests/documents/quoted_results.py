@@ -148,6 +148,10 @@ def clearance() -> Text:
         for name in ("cape", "fringe_skirt", "tshirt", "hooded_dress")
     ]
     yield f"by {share(min(more))} to {share(max(more))} % on `valid`"
+    for name, form in {"cape": ".4f", "fringe_skirt": ".4f", "tshirt": ".3f"}.items():
+        ends = [f"{min(runs[run]['total']):{form}}" for run in (name, f"{name}_clearance")]
+        garment = GARMENTS.get(name) or name.replace("_", " ")
+        yield f"{ends[0]} to {ends[1]} J for the {garment}"
 
 
 def conditions() -> Text:
