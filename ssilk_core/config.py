@@ -40,6 +40,7 @@ class ModelConfig:
         widths: widths of the hidden layers of the initialiser P, the stepper S and the decoder D.
         shapes: number K of blendshapes; with zero only proxies deform the garment.
         activations: number of activations that D outputs, if it differs from K ("ssilk reduce"); zero for K.
+        translations: whether proxies move as well as turn; in the paper they only turn.
         scheme: name of the integration scheme in `schemes.SCHEMES`: "spring_verlet" is Eq. 3 with a spring to the
             quasi-static state, "quasi_static" is that state itself.
         latent_bound: soft bound on each latent dimension; zero for none, as in the paper.
@@ -52,6 +53,7 @@ class ModelConfig:
     widths: tuple[int, ...] = (256, 512, 512)
     shapes: int = 64
     activations: int = 0
+    translations: bool = False
     scheme: str = "spring_verlet"
     latent_bound: float = 4.0
     max_latent_step: float = 0.3
@@ -73,6 +75,11 @@ class ModelConfig:
     def activation_count(self) -> int:
         """Return the number of activations that D outputs."""
         return self.activations or self.shapes
+
+    @property
+    def proxy_outputs(self) -> int:
+        """Return the number of outputs of D for each proxy: a 6D rotation and, where proxies move, a displacement."""
+        return 9 if self.translations else 6
 
 
 @dataclass(frozen=True, kw_only=True)

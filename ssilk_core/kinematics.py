@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -270,6 +270,39 @@ def combined_transforms(deformer: Deformer, motion: Motion, pose: GarmentPose) -
         translations = np.broadcast_to(rest[:, :3, 3], (pose.frame_count, rig.proxy_count, 3))
     proxies = rigid(matrix_from_quaternion(pose.rotations), translations)
     return world_transforms(np.concatenate([character, proxies], axis=1), scene.parents)
+
+
+@dataclass(frozen=True, eq=False)
+class ProxyAxes:
+    """Converts proxy transforms between the axes of the bind pose, as networks use them, and those of files.
+
+    Attributes:
+        above, own: bind rotations of the parents and of the proxies, shape (P, 3, 3).
+        places: local translations of the proxies in the bind pose [m], shape (P, 3).
+    """
+
+    above: Floats
+    own: Floats
+    places: Floats
+
+    @classmethod
+    def of(cls, scene: Scene) -> ProxyAxes:
+        binds, joints = scene.bind_transforms, scene.character.skeleton.joint_count
+        places = local_transforms(binds, scene.parents)[joints:, :3, 3]
+        return cls(binds[scene.rig.parents][:, :3, :3], binds[joints:, :3, :3], places)
+
+    def to_local(self, transforms: Floats) -> tuple[Floats, Floats]:
+        """Return local rotations (F, P, 4) and translations (F, P, 3) [m] of transforms (F, P, 3, 4)."""
+        to_parent = np.swapaxes(self.above, -1, -2)
+        turned = to_parent @ transforms[..., :3].astype(np.float64) @ self.own
+        moved = (to_parent @ transforms[..., 3:].astype(np.float64))[..., 0]
+        return quaternion_from_matrix(turned), self.places + moved
+
+    def to_bind(self, rotations: Floats, translations: Floats | None) -> Floats:
+        """Invert `to_local`; without translations the proxies stay at their places."""
+        turned = self.above @ matrix_from_quaternion(rotations) @ np.swapaxes(self.own, -1, -2)
+        away = np.zeros((*rotations.shape[:2], 3)) if translations is None else translations - self.places
+        return np.concatenate([turned, self.above @ away[..., None]], axis=-1)
 
 
 def deform(deformer: Deformer, motion: Motion, pose: GarmentPose) -> Floats:

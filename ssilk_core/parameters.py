@@ -5,11 +5,18 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+import numpy as np
+
 from .assets import PINNED, Ints, Scene
 from .config import ModelConfig
 from .schemes import SCHEMES
 
 Shapes = dict[str, tuple[int, ...]]
+
+# Outputs of D for a proxy at rest, a 6D rotation and a displacement, and their units: displacements in decimetres, so
+# that outputs of one size turn and move a proxy about as far.
+IDENTITY = np.array([1, 0, 0, 0, 1, 0, 0, 0, 0], dtype=np.float32)
+OUTPUT_SCALE = np.array([1, 1, 1, 1, 1, 1, 0.1, 0.1, 0.1], dtype=np.float32)
 
 
 def parameter_shapes(scene: Scene, config: ModelConfig, joints: Ints) -> Shapes:
@@ -29,7 +36,7 @@ def parameter_shapes(scene: Scene, config: ModelConfig, joints: Ints) -> Shapes:
             if scheme.states
             else {}
         ),
-        **_layers("output", (z, *widths, config.activation_count + 6 * proxies)),
+        **_layers("output", (z, *widths, config.activation_count + config.proxy_outputs * proxies)),
     }
 
 

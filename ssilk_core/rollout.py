@@ -38,7 +38,7 @@ class RolloutBlock:
 
     start: int
     activation: Tensor
-    rotations: Tensor
+    transforms: Tensor
     recovered: Tensor
 
 
@@ -145,17 +145,17 @@ def _roll_and_recover(
 
 
 def _decode(model: GarmentModel, z: Tensor, diverged: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return activations, rotations and which frames were diverged.
+    """Return activations, transforms and which frames were diverged.
 
     A pose that is not finite becomes the rig's own.
     """
-    activation, rotations = model.pose(z)
-    bad = ~(activation.isfinite().all(dim=0) & rotations.isfinite().flatten(0, 2).all(dim=0))
+    activation, transforms = model.pose(z)
+    bad = ~(activation.isfinite().all(dim=0) & transforms.isfinite().flatten(0, 2).all(dim=0))
     if bad.any():
-        unturned = torch.eye(3, dtype=z.dtype, device=z.device)[:, :, None]
+        at_rest = torch.eye(3, 4, dtype=z.dtype, device=z.device)[:, :, None]
         activation = torch.where(bad, torch.zeros_like(activation), activation)
-        rotations = torch.where(bad, unturned, rotations)
-    return activation, rotations, diverged | bad
+        transforms = torch.where(bad, at_rest, transforms)
+    return activation, transforms, diverged | bad
 
 
 def ignore_recovery(frames: range) -> None:
@@ -206,7 +206,7 @@ def _file_poses(
             high = int(np.ceil((stop - shift) * rate - 1e-6))
             if seen := shot[max(low, 0) : max(high, 0)]:
                 on_recovery(seen)
-        yield GarmentPose(step.start, *model.file_pose(step.activation, step.rotations))
+        yield GarmentPose(step.start, *model.file_pose(step.activation, step.transforms))
 
 
 def resample_poses(
@@ -242,6 +242,6 @@ def decode(model: GarmentModel, motion: Motion, pose: GarmentPose) -> Floats:
     parameter = next(model.parameters())
     matrices = skinning_matrices(world, skeleton.bind_transforms)[:, :, :3]
     character = torch.as_tensor(matrices.transpose(1, 2, 3, 0)).to(parameter)
-    activation, rotations = (values.to(parameter) for values in model.network_pose(pose))
-    x = model.decoder(activation, rotations, character)
+    activation, transforms = (values.to(parameter) for values in model.network_pose(pose))
+    x = model.decoder(activation, transforms, character)
     return x.permute(2, 0, 1).double().cpu().numpy() + origin

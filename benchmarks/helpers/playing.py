@@ -71,9 +71,9 @@ def with_numpy(player: Player, motion: Motion) -> Laps:
         states = player.stepper.roll(course)
         before = states[-2:]
         monitor.lap(LATENTS)
-        activations, rotations = player.decoder.decode(states)
+        activations, transforms = player.decoder.decode(states)
         monitor.lap(DECODER)
-        matrices = player.kinematics.matrices(rotations, given.matrices)
+        matrices = player.kinematics.matrices(transforms, given.matrices)
         monitor.lap(KINEMATICS)
         for part in spans(len(states), VERTEX_BLOCK):
             skin_garment(player.tiles, activations[:, part], matrices[..., part], given.origins[part])
@@ -114,10 +114,10 @@ def with_torch(model: GarmentModel, skinner: Skinner, motion: Motion, chunk: int
         starting = max(0, min(2 - frames.start, len(rest)))
         states = model.roll([*states[-2:], *rest[:starting]], rest[starting:], pose[starting:])
         monitor.lap(LATENTS)
-        activations, rotations = model.pose(torch.cat(states[-len(rest) :]))
+        activations, transforms = model.pose(torch.cat(states[-len(rest) :]))
         monitor.lap(DECODER)
         character = given.character[frames, ..., 0].permute(1, 2, 3, 0)
-        matrices = model.decoder.proxy_matrices(rotations, character)
+        matrices = model.decoder.proxy_matrices(transforms, character)
         monitor.lap(KINEMATICS)
         for part in spans(len(rest), VERTEX_BLOCK):
             skinner(activations[:, part], matrices[..., part])

@@ -3,8 +3,8 @@
 
 One call computes one frame of any number of characters. Inputs are the latents of the two previous frames, the
 descriptors of the pose (static ones and rates, see ssilk_core/descriptors.py) and a flag for the first frame. Outputs
-are the new latents, the weights of the blendshapes and the local rotations of the proxy joints, as in a shot.
-Blendshapes and skinning weights are those of any baked shot.
+are the new latents, the weights of the blendshapes and the local rotations of the proxy joints, as in a shot. Where
+proxies move, their local translations follow. Blendshapes and skinning weights are those of any baked shot.
 """
 
 from __future__ import annotations

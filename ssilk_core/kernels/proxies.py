@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Forward kinematics of proxies from 6D rotations, and its gradient; reference: `model.decoder`.
+"""Forward kinematics of proxies from what a network outputs, and its gradient; reference: `model.decoder`.
 
 A program is one warp that owns a block of frames and iterates over the proxies, parents first. For the gradient it
 iterates backwards and accumulates each proxy's gradient into its parent's. Programs share no frames: there are no
@@ -21,39 +21,40 @@ BLOCK = 32  # frames of one program: few, since the loop over proxies is sequent
 MIN_LENGTH = tl.constexpr(1e-8)  # floor for the length that a vector is divided by
 
 
-def proxies_kernel(six_d: Tensor, pivots: Tensor, parents: Tensor, character: Tensor) -> Tensor:
+def proxies_kernel(values: Tensor, pivots: Tensor, parents: Tensor, character: Tensor) -> Tensor:
     """Return skinning matrices of the character's joints, then of the proxies (J + P, 3, 4, N).
 
     Args:
-        six_d: 6D rotations in bind-pose axes (P, 6, N), the only argument with a gradient.
+        values: 6D rotations in bind-pose axes (P, 6, N), or these and displacements (P, 9, N) [m], the only argument
+            with a gradient.
         pivots: bind positions (P, 3); parents: combined index of each proxy's parent, before its own (P,), int32.
         character: skinning matrices of the character's joints (J, 3, 4, N).
     """
-    return _Proxies.apply(six_d.contiguous(), pivots, parents, character.detach())
+    return _Proxies.apply(values.contiguous(), pivots, parents, character.detach())
 
 
 class _Proxies(Function):
     @staticmethod
-    def forward(ctx, six_d, pivots, parents, character):
-        proxies, _, frames = six_d.shape
+    def forward(ctx, values, pivots, parents, character):
+        proxies, size, frames = values.shape
         matrices = character.new_empty(len(character) + proxies, *character.shape[1:])
         matrices[: len(character)] = character
         _compose[(triton.cdiv(frames, BLOCK),)](
-            six_d, pivots, parents, matrices, len(character), proxies, frames, BLOCK, num_warps=1
+            values, pivots, parents, matrices, len(character), proxies, frames, size, BLOCK, num_warps=1
         )
-        ctx.save_for_backward(six_d, pivots, parents, matrices)
+        ctx.save_for_backward(values, pivots, parents, matrices)
         return matrices
 
     @staticmethod
     @once_differentiable
     def backward(ctx, upstream):
-        six_d, pivots, parents, matrices = ctx.saved_tensors
-        proxies, _, frames = six_d.shape
+        values, pivots, parents, matrices = ctx.saved_tensors
+        proxies, size, frames = values.shape
         joints = len(matrices) - proxies
         total = upstream[joints:].clone(memory_format=torch.contiguous_format)
-        grad = torch.empty_like(six_d)
+        grad = torch.empty_like(values)
         _compose_gradient[(triton.cdiv(frames, BLOCK),)](
-            six_d, pivots, parents, matrices, total, grad, joints, proxies, frames, BLOCK, num_warps=1
+            values, pivots, parents, matrices, total, grad, joints, proxies, frames, size, BLOCK, num_warps=1
         )
         return grad, None, None, None
 
@@ -113,12 +114,23 @@ def _kept(pivot, ax, ay, az, bx, by, bz, cx, cy, cz):
 
 
 @triton.jit
-def _compose(six_d, pivots, parents, matrices, joints, proxies, frames, block: tl.constexpr):
+def _shift(own, pivot, frames, n, inside, ax, ay, az, bx, by, bz, cx, cy, cz, size: tl.constexpr):
+    """The translation p - R p + t of a proxy in its parent's frame; t is zero where it does not move."""
+    ox, oy, oz = _kept(pivot, ax, ay, az, bx, by, bz, cx, cy, cz)
+    if size == 9:
+        tx, ty, tz = load3(own + 6 * frames, frames, n, inside)
+        ox, oy, oz = ox + tx, oy + ty, oz + tz
+    return ox, oy, oz
+
+
+@triton.jit
+def _compose(values, pivots, parents, matrices, joints, proxies, frames, size: tl.constexpr, block: tl.constexpr):
     n = tl.program_id(0) * block + tl.arange(0, block)
     inside = n < frames
     for p in range(proxies):
-        ax, ay, az, bx, by, bz, cx, cy, cz = _axes(six_d + p * 6 * frames, frames, n, inside)
-        ox, oy, oz = _kept(pivots + p * 3, ax, ay, az, bx, by, bz, cx, cy, cz)
+        own = values + p * size * frames
+        ax, ay, az, bx, by, bz, cx, cy, cz = _axes(own, frames, n, inside)
+        ox, oy, oz = _shift(own, pivots + p * 3, frames, n, inside, ax, ay, az, bx, by, bz, cx, cy, cz, size)
         above = matrices + tl.load(parents + p) * 12 * frames
         made = matrices + (joints + p) * 12 * frames
         for row in tl.static_range(3):
@@ -131,14 +143,17 @@ def _compose(six_d, pivots, parents, matrices, joints, proxies, frames, block: t
 
 
 @triton.jit
-def _compose_gradient(six_d, pivots, parents, matrices, total, grad, joints, proxies, frames, block: tl.constexpr):
+def _compose_gradient(
+    values, pivots, parents, matrices, total, grad, joints, proxies, frames, size: tl.constexpr, block: tl.constexpr
+):
     n = tl.program_id(0) * block + tl.arange(0, block)
     inside = n < frames
     for done in range(proxies):
         p = proxies - 1 - done
         parent = tl.load(parents + p)
-        ax, ay, az, bx, by, bz, cx, cy, cz = _axes(six_d + p * 6 * frames, frames, n, inside)
-        ox, oy, oz = _kept(pivots + p * 3, ax, ay, az, bx, by, bz, cx, cy, cz)
+        own = values + p * size * frames
+        ax, ay, az, bx, by, bz, cx, cy, cz = _axes(own, frames, n, inside)
+        ox, oy, oz = _shift(own, pivots + p * 3, frames, n, inside, ax, ay, az, bx, by, bz, cx, cy, cz, size)
         gax = tl.zeros((block,), tl.float32)
         gay, gaz, gbx, gby, gbz, gcx, gcy, gcz, gox, goy, goz = gax, gax, gax, gax, gax, gax, gax, gax, gax, gax, gax
         for row in tl.static_range(3):
@@ -164,8 +179,10 @@ def _compose_gradient(six_d, pivots, parents, matrices, total, grad, joints, pro
         gbx, gby, gbz = gbx - py * gox, gby - py * goy, gbz - py * goz
         gcx, gcy, gcz = gcx - pz * gox, gcy - pz * goy, gcz - pz * goz
         gax, gay, gaz, gbx, gby, gbz = _axes_gradient(
-            six_d + p * 6 * frames, frames, n, inside, gax, gay, gaz, gbx, gby, gbz, gcx, gcy, gcz
+            own, frames, n, inside, gax, gay, gaz, gbx, gby, gbz, gcx, gcy, gcz
         )
-        store3(grad + p * 6 * frames, frames, n, inside, gax, gay, gaz)
-        store3(grad + (p * 6 + 3) * frames, frames, n, inside, gbx, gby, gbz)
+        store3(grad + p * size * frames, frames, n, inside, gax, gay, gaz)
+        store3(grad + (p * size + 3) * frames, frames, n, inside, gbx, gby, gbz)
+        if size == 9:
+            store3(grad + (p * size + 6) * frames, frames, n, inside, gox, goy, goz)
         tl.debug_barrier()  # a parent reads what its children added

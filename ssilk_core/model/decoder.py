@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Differentiable decoder: from blendshape weights and proxy rotations to vertices (paper, Sections 3.3 and 3.4).
+"""Differentiable decoder: from blendshape weights and proxy transforms to vertices (paper, Sections 3.3 and 3.4).
 
 Layouts keep frames last: transforms (joints, 3, 4, N), positions (V, 3, N).
 
 A skinning matrix S_j maps the bind pose to the posed world. A proxy rotates about its bind position p in its parent's
-frame: S_p = S_parent [R', p - R' p], with R' the network's rotation in the axes of the bind pose. A file stores the
-local rotation P^T R' B, with B and P the bind rotations of the proxy and its parent.
+frame and moves by t: S_p = S_parent [R', p - R' p + t]. The network's transform [R', t] has the bind pose's axes; in
+the paper t is zero. A file stores the local rotation P^T R' B and translation P^T (p + t - q): B and P are the bind
+rotations of the proxy and its parent, q the parent's bind position.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ from torch import Tensor, nn
 
 from .. import kernels
 from ..assets import PINNED, Scene
+from ..config import ModelConfig
+from ..parameters import IDENTITY, OUTPUT_SCALE
 from ..skinning import Skinning
 
 
@@ -26,6 +29,14 @@ def rotation_from_six_d(values: Tensor) -> Tensor:
     b = b - (x * b).sum(-2, keepdim=True) * x
     y = b / b.norm(dim=-2, keepdim=True).clamp_min(1e-8)
     return torch.stack([x, y, torch.linalg.cross(x, y, dim=-2)], dim=-2)
+
+
+def transform_of(values: Tensor) -> Tensor:
+    """Return transforms (P, 3, 4, N): of 6D rotations (P, 6, N), or of these and displacements (P, 9, N) [m]."""
+    turned, moved = rotation_from_six_d(values[:, :6]), values[:, 6:]
+    if not moved.shape[1]:
+        moved = torch.zeros_like(values[:, :3])
+    return torch.cat([turned, moved[:, :, None]], dim=2)
 
 
 def compose(left: Tensor, right: Tensor) -> Tensor:
@@ -40,11 +51,11 @@ class Decoder(nn.Module):
 
     Args:
         scene: garment, rig and character.
-        shapes: blendshapes K.
+        config: number of blendshapes K; whether proxies move; and the number of activations that the network
+            outputs, where it is more than K. Fixed linear combinations of these, `readout` (K, activations) with rows
+            whose absolute values sum to one, then weight the blendshapes, relative to the mean displacement `offset`
+            (V', 3) [m] of vertices that are not pinned.
         generator: source of the initial blendshapes.
-        activations: number of activations that the network outputs, where it is more than K. Fixed linear
-            combinations of these, `readout` (K, activations) with rows whose absolute values sum to one, then weight
-            the blendshapes, relative to the mean displacement `offset` (V', 3) [m] of vertices that are not pinned.
     """
 
     rest: Tensor
@@ -53,14 +64,15 @@ class Decoder(nn.Module):
     free: Tensor
     logits: Tensor
     identity: Tensor
+    scale: Tensor
     readout: Tensor
     offset: Tensor
 
-    def __init__(self, scene: Scene, shapes: int, generator: torch.Generator, activations: int = 0) -> None:
+    def __init__(self, scene: Scene, config: ModelConfig, generator: torch.Generator) -> None:
         super().__init__()
-        rig = scene.rig
-        self.proxy_count, self.shape_count, self.activation_count = rig.proxy_count, shapes, activations or shapes
-        self.is_reduced = activations > 0
+        rig, shapes = scene.rig, config.shapes
+        self.proxy_count, self.shape_count, self.activation_count = rig.proxy_count, shapes, config.activation_count
+        self.proxy_outputs, self.is_reduced = config.proxy_outputs, config.activations > 0
         self.parent_indices = tuple(rig.parents.tolist())  # as Python numbers, without a copy from the GPU
         self.skin = Skinning(rig.skin, range(scene.character.skeleton.joint_count, len(scene.joint_names)))
         free = np.flatnonzero(scene.classes != PINNED)
@@ -71,7 +83,8 @@ class Decoder(nn.Module):
         # Minus infinity never changes: training adds no joints to a vertex.
         weights = rig.skin.weights
         self._constant("logits", np.log(weights, out=np.full_like(weights, -np.inf), where=weights > 0))
-        self._constant("identity", np.array([1.0, 0, 0, 0, 1, 0]))
+        self._constant("identity", IDENTITY[: self.proxy_outputs, None])
+        self._constant("scale", OUTPUT_SCALE[: self.proxy_outputs, None])
         self.skin_offset = nn.Parameter(torch.zeros(len(free), weights.shape[1]))
         self.shapes = nn.Parameter(1e-3 * torch.randn(len(free), 3, shapes, generator=generator))
         self.register_buffer("readout", torch.eye(shapes, self.activation_count), persistent=self.is_reduced)
@@ -89,8 +102,8 @@ class Decoder(nn.Module):
 
     @property
     def output_count(self) -> int:
-        """Outputs of the network for each frame: blendshape activations, and 6 for each of P proxies."""
-        return self.activation_count + 6 * self.proxy_count
+        """Outputs of the network for each frame: blendshape activations, and C = 6 or 9 for each of P proxies."""
+        return self.activation_count + self.proxy_outputs * self.proxy_count
 
     @property
     def has_constant(self) -> bool:
@@ -98,14 +111,14 @@ class Decoder(nn.Module):
         return self.activation_count > 0
 
     def activations(self, output: Tensor) -> tuple[Tensor, Tensor]:
-        """Split network output (N, K + 6 P) into activations (K, N) in [-1, 1] and rotations (P, 3, 3, N)."""
-        activation, six_d = self._split(output)
-        return activation, rotation_from_six_d(six_d)
+        """Split network output (N, K + C P) into activations (K, N) in [-1, 1] and transforms (P, 3, 4, N)."""
+        activation, values = self._split(output)
+        return activation, transform_of(values)
 
     def _split(self, output: Tensor) -> tuple[Tensor, Tensor]:
-        delta = output[:, self.activation_count :].T.reshape(self.proxy_count, 6, output.shape[0])
+        delta = output[:, self.activation_count :].T.reshape(self.proxy_count, self.proxy_outputs, output.shape[0])
         activation = torch.tanh(output[:, : self.activation_count].T)
-        return self.readout @ activation if self.is_reduced else activation, self.identity[:, None] + delta
+        return self.readout @ activation if self.is_reduced else activation, self.identity + self.scale * delta
 
     def _influence_weights(self) -> Tensor:
         """Return weights (V, I): a softmax over each vertex's support, pinned rows frozen."""
@@ -115,27 +128,28 @@ class Decoder(nn.Module):
         """Return the weights as a matrix (V, used joints)."""
         return self.skin.dense(self._influence_weights())
 
-    def proxy_matrices(self, rotations: Tensor, character: Tensor) -> Tensor:
+    def proxy_matrices(self, transforms: Tensor, character: Tensor) -> Tensor:
         """Forward kinematics: skinning matrices of all joints, (J + P, 3, 4, N).
 
         Args:
-            rotations: proxy rotations R' in bind-pose axes, (P, 3, 3, N).
+            transforms: of the proxies, [R', t] in the axes of the bind pose, (P, 3, 4, N).
             character: skinning matrices of the character's joints, (J, 3, 4, N).
         """
-        offset = self.pivots[:, :, None] - torch.einsum("pabn,pb->pan", rotations, self.pivots)
+        rotations, moved = transforms[:, :, :3], transforms[:, :, 3]
+        offset = self.pivots[:, :, None] - torch.einsum("pabn,pb->pan", rotations, self.pivots) + moved
         own = torch.cat([rotations, offset[:, :, None]], dim=2)
         matrices = [*character]
         for parent, turn in zip(self.parent_indices, own):
             matrices.append(compose(matrices[parent], turn))
         return torch.stack(matrices)
 
-    def _matrices(self, six_d: Tensor, character: Tensor) -> Tensor:
-        """Return skinning matrices of all joints (J + P, 3, 4, N) from 6D rotations (P, 6, N)."""
+    def _matrices(self, values: Tensor, character: Tensor) -> Tensor:
+        """Return skinning matrices of all joints (J + P, 3, 4, N) from the values (P, C, N) of `transform_of`."""
         if kernels.available(character.device):
             from ..kernels.proxies import proxies_kernel
 
-            return proxies_kernel(six_d, self.pivots, self.parents, character)
-        return self.proxy_matrices(rotation_from_six_d(six_d), character)
+            return proxies_kernel(values, self.pivots, self.parents, character)
+        return self.proxy_matrices(transform_of(values), character)
 
     def _offsets(self, activation: Tensor) -> Tensor | None:
         """Return the displacements by blendshapes (V, 3, N), zero for pinned vertices."""
@@ -150,10 +164,10 @@ class Decoder(nn.Module):
         return self.skin(rest, self._offsets(activation), self._influence_weights(), matrices)
 
     def vertices(self, output: Tensor, character: Tensor) -> Tensor:
-        """Return vertices (V, 3, N) [m] from network output (N, K + 6 P) and character (J, 3, 4, N)."""
-        activation, six_d = self._split(output)
-        return self._skinned(activation, self._matrices(six_d, character))
+        """Return vertices (V, 3, N) [m] from network output (N, K + C P) and character (J, 3, 4, N)."""
+        activation, values = self._split(output)
+        return self._skinned(activation, self._matrices(values, character))
 
-    def forward(self, activation: Tensor, rotations: Tensor, character: Tensor) -> Tensor:
-        """Return vertices (V, 3, N) [m] from activations (K, N), rotations (P, 3, 3, N), character (J, 3, 4, N)."""
-        return self._skinned(activation, self.proxy_matrices(rotations, character))
+    def forward(self, activation: Tensor, transforms: Tensor, character: Tensor) -> Tensor:
+        """Return vertices (V, 3, N) [m] from activations (K, N), transforms (P, 3, 4, N), character (J, 3, 4, N)."""
+        return self._skinned(activation, self.proxy_matrices(transforms, character))

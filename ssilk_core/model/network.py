@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from ..assets import Deformer, Floats, GarmentPose, Scene, SkinWeights
 from ..config import ModelConfig
 from ..descriptors import descriptor_joints
-from ..kinematics import matrix_from_quaternion, quaternion_from_matrix
+from ..kinematics import ProxyAxes
 from ..parameters import descriptor_sizes
 from .decoder import Decoder
 from .integrators import integrator
@@ -49,8 +49,9 @@ class GarmentModel(nn.Module):
     def __init__(self, scene: Scene, config: ModelConfig, joints: np.ndarray, seed: int = 0) -> None:
         super().__init__()
         self.scene, self.config, self.joints = scene, config, np.asarray(joints, dtype=np.int64)
+        self.axes = ProxyAxes.of(scene)
         generator = torch.Generator().manual_seed(seed)
-        self.decoder = Decoder(scene, config.shapes, generator, config.activations)
+        self.decoder = Decoder(scene, config, generator)
         static, dynamic = descriptor_sizes(scene, self.joints)
         z = config.latent
         self.initialiser = mlp(static, config.widths, z, generator, 1.0)
@@ -85,7 +86,7 @@ class GarmentModel(nn.Module):
         return states
 
     def pose(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Return activations (K, N) in [-1, 1] and proxy rotations (P, 3, 3, N) of latents (N, latent) (Eq. 7)."""
+        """Return activations (K, N) in [-1, 1] and proxy transforms (P, 3, 4, N) of latents (N, latent) (Eq. 7)."""
         return self.decoder.activations(self.output(z))
 
     def vertices(self, z: Tensor, character: Tensor) -> Tensor:
@@ -114,30 +115,28 @@ class GarmentModel(nn.Module):
         return Deformer(scene, skin, shapes)
 
     @torch.no_grad()
-    def file_pose(self, activation: Tensor, rotations: Tensor) -> tuple[Floats, Floats]:
-        """Return the values that a file stores: local proxy quaternions (N, P, 4), weights (N, K + 1) in [0, 1]."""
-        scene = self.scene
-        bind = scene.bind_transforms[:, :3, :3]
-        joints = scene.character.skeleton.joint_count
-        above = np.swapaxes(bind[scene.rig.parents], -1, -2)
-        turned = rotations.double().permute(3, 0, 1, 2).cpu().numpy()
-        local = quaternion_from_matrix(above @ turned @ bind[joints:])
+    def file_pose(self, activation: Tensor, transforms: Tensor) -> tuple[Floats, Floats, Floats | None]:
+        """Return the values that a file stores, as `GarmentPose` has them.
+
+        Returns:
+            Local proxy quaternions (N, P, 4), weights (N, K + 1) in [0, 1], and local translations (N, P, 3) [m],
+            None where proxies do not move.
+        """
+        turned, moved = self.axes.to_local(transforms.double().permute(3, 0, 1, 2).cpu().numpy())
         weights = (activation.double().T.cpu().numpy() + 1) / 2
         if self.decoder.has_constant:
             weights = np.concatenate([weights, np.ones((len(weights), 1))], axis=1)
-        return local, weights.clip(0, 1)
+        return turned, weights.clip(0, 1), moved if self.config.translations else None
 
+    @torch.no_grad()
     def network_pose(self, pose: GarmentPose) -> tuple[Tensor, Tensor]:
-        """Invert `file_pose`: activations (K, N) and rotations (P, 3, 3, N), on the model's device."""
-        scene, parameter = self.scene, self.decoder.shapes
-        bind = scene.bind_transforms[:, :3, :3]
-        joints = scene.character.skeleton.joint_count
-        own = np.swapaxes(bind[joints:], -1, -2)
-        turned = bind[scene.rig.parents] @ matrix_from_quaternion(pose.rotations) @ own
+        """Invert `file_pose`: activations (K, N) and transforms (P, 3, 4, N), on the model's device."""
+        parameter = self.decoder.shapes
+        transforms = self.axes.to_bind(pose.rotations, pose.translations)
         activation = 2 * pose.weights[:, : self.decoder.shape_count].astype(np.float64).T - 1
         return (
             torch.as_tensor(activation, dtype=torch.float32, device=parameter.device),
-            torch.as_tensor(turned.transpose(1, 2, 3, 0), dtype=torch.float32, device=parameter.device),
+            torch.as_tensor(transforms.transpose(1, 2, 3, 0), dtype=torch.float32, device=parameter.device),
         )
 
 

@@ -32,8 +32,8 @@ class ObservedFrames:
 
     def decode(self, player: Player) -> tuple[NDArray, NDArray]:
         """Return a model's activations (K, F) and skinning matrices of all its joints (J + P, 3, 4, F)."""
-        activations, rotations = player.decoder.decode(self.states)
-        return activations, player.kinematics.matrices(rotations, self.character)
+        activations, transforms = player.decoder.decode(self.states)
+        return activations, player.kinematics.matrices(transforms, self.character)
 
     def vertices(self, player: Player) -> Iterator[Floats]:
         """Yield a model's vertices relative to the root [m], one block of frames at a time, shape (F', V, 3)."""

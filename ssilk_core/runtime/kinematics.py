@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Proxy rotations and skinning matrices of many frames at once, frames last, as `model.decoder` defines them."""
+"""Proxy transforms and skinning matrices of many frames at once, frames last, as `model.decoder` defines them."""
 
 from __future__ import annotations
 
@@ -16,6 +16,12 @@ def rotation_from_six_d(values: NDArray) -> NDArray:
     y = _unit(b - (x * b).sum(1, keepdims=True) * x)
     z = x[:, [1, 2, 0]] * y[:, [2, 0, 1]] - x[:, [2, 0, 1]] * y[:, [1, 2, 0]]
     return np.stack([x, y, z], axis=2)
+
+
+def transform_of(values: NDArray) -> NDArray:
+    """Return transforms (P, 3, 4, F) of 6D rotations (P, 6, F), or of these and displacements (P, 9, F) [m]."""
+    moved = values[:, 6:] if values.shape[1] > 6 else np.zeros_like(values[:, :3])
+    return np.concatenate([rotation_from_six_d(values[:, :6]), moved[:, :, None]], axis=2)
 
 
 def _unit(vectors: NDArray) -> NDArray:
@@ -42,24 +48,21 @@ class ProxyKinematics:
             for proxies in (np.flatnonzero(own == level) for level in range(1, own.max(initial=0) + 1))
         ]
 
-    def matrices(self, rotations: NDArray, character: NDArray, shifts: NDArray | None = None) -> NDArray:
+    def matrices(self, transforms: NDArray, character: NDArray) -> NDArray:
         """Return skinning matrices of all joints (J + P, 3, 4, F).
 
         Args:
-            rotations: of the proxies in the axes of the bind pose (P, 3, 3, F).
+            transforms: of the proxies, [R', t] in the axes of the bind pose (P, 3, 4, F).
             character: skinning matrices of the character's joints (J, 3, 4, F).
-            shifts: of the proxies from their places in the bind pose, in its axes [m], shape (P, 3, F), if any.
         """
-        moved = self.pivots[:, :, None] - sum(
-            rotations[:, :, axis] * self.pivots[:, None, axis, None] for axis in range(3)
+        kept = self.pivots[:, :, None] - sum(
+            transforms[:, :, axis] * self.pivots[:, None, axis, None] for axis in range(3)
         )
-        if shifts is not None:
-            moved = moved + shifts
+        placed = np.concatenate([transforms[:, :, :3], (kept + transforms[:, :, 3])[:, :, None]], axis=2)
         whole = np.empty((self.joints + self.count, *character.shape[1:]), dtype=np.float32)
         whole[: self.joints] = character
         for proxies, parents in self.generations:
-            above, turn, place = whole[parents], rotations[proxies], moved[proxies]
-            own = np.concatenate([turn, place[:, :, None]], axis=2)
+            above, own = whole[parents], placed[proxies]
             product = sum(above[:, :, axis, None] * own[:, None, axis] for axis in range(3))
             product[:, :, 3] += above[:, :, 3]
             whole[self.joints + proxies] = product

@@ -31,7 +31,7 @@ class Block:
     """F consecutive frames of a shot, from `first` on.
 
     Attributes:
-        decoded: blendshape activations and proxy rotations.
+        decoded: blendshape activations and proxy transforms.
         matrices: skinning matrices of all joints relative to the root, shape (J + P, 3, 4, F).
         origins: positions of the root [m], shape (F, 3).
     """
@@ -89,9 +89,9 @@ class Playback:
     def pose(self, frame: int) -> GarmentPose:
         """Return the pose of one frame, as a shot stores it."""
         block, within = self._at(frame)
-        activations, rotations = block.decoded.activations, block.decoded.rotations
+        activations, transforms = block.decoded.activations, block.decoded.transforms
         own = slice(within, within + 1)
-        stored = self.player.decoder.file_pose(activations[:, own], rotations[..., own])
+        stored = self.player.decoder.file_pose(activations[:, own], transforms[..., own])
         return GarmentPose(block.first + within, *stored)
 
     def matrices(self, frame: int) -> tuple[NDArray, Floats]:
@@ -109,7 +109,7 @@ class Playback:
         for first, span in zip(self.firsts, self.spans):
             for start in range(first, first + span.frame_count, self.block):
                 decoded = self._at(start)[0].decoded
-                yield GarmentPose(start, *self.player.decoder.file_pose(decoded.activations, decoded.rotations))
+                yield GarmentPose(start, *self.player.decoder.file_pose(decoded.activations, decoded.transforms))
 
     def _at(self, frame: int) -> tuple[Block, int]:
         """Return the block that holds a frame, and the frame's index in it."""
@@ -127,7 +127,7 @@ class Playback:
         else:
             decoded = self._interpolate(rolled, np.arange(start, stop) * self.rate)
             character, origins = character_matrices(self.spans[span].clip(start, stop), self.player.skeleton)
-        matrices = self.player.kinematics.matrices(decoded.rotations, character)
+        matrices = self.player.kinematics.matrices(decoded.transforms, character)
         return Block(self.firsts[span] + start, decoded, matrices, origins)
 
     def _interpolate(self, rolled: RolledSpan, positions: Floats) -> DecodedFrames:

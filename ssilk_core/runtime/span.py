@@ -22,10 +22,10 @@ HISTORY = 2  # frames before a block that its descriptors look back on
 
 @dataclass(frozen=True, eq=False)
 class DecodedFrames:
-    """Output of the decoder for F frames: activations (K, F), and rotations (P, 3, 3, F) in bind-pose axes."""
+    """Output of the decoder for F frames: activations (K, F), and transforms (P, 3, 4, F) in bind-pose axes."""
 
     activations: NDArray
-    rotations: NDArray
+    transforms: NDArray
 
 
 class RolledSpan:
@@ -68,11 +68,12 @@ class RolledSpan:
     def file_pose(self, first: int, stop: int) -> GarmentPose:
         """Return the span's frames `first` to `stop` as a file stores them."""
         blocks = [self.decoded(number) for number in range(first // self.block, -(-stop // self.block))]
-        activations, rotations = (
-            np.concatenate([getattr(each, name) for each in blocks], axis=-1) for name in ("activations", "rotations")
+        activations, transforms = (
+            np.concatenate([getattr(each, name) for each in blocks], axis=-1)
+            for name in ("activations", "transforms")
         )
         own = slice(first % self.block, first % self.block + stop - first)
-        return GarmentPose(first, *self.player.decoder.file_pose(activations[:, own], rotations[..., own]))
+        return GarmentPose(first, *self.player.decoder.file_pose(activations[:, own], transforms[..., own]))
 
     def _frames(self, number: int) -> slice:
         """Return the frames of a block, counted from the first frame of the pre-roll."""

@@ -155,7 +155,7 @@ class StressRollout:
         for block, step in zip(self.drive.blocks(), roll_blocks(self.model, self.drive.blocks())):
             frames = step.recovered.nonzero().flatten().tolist()
             self.recovered += [range(step.start + frame, step.start + frame + 1) for frame in frames]
-            yield block, GarmentPose(0, *self.model.file_pose(step.activation, step.rotations))
+            yield block, GarmentPose(0, *self.model.file_pose(step.activation, step.transforms))
 
 
 def extent(model: GarmentModel, fabric: Fabric, drive: ProceduralMotion) -> Extent:

@@ -114,9 +114,9 @@ class ShotMethod:
 
     def _between(self, shot: Motion, stored: GarmentPose, at: Floats) -> Floats:
         """Return the vertices at fractional frames (N,) of a shot."""
-        activations, rotations = self.player.decoder.network_pose(sample_pose(stored, at))
+        activations, transforms = self.player.decoder.network_pose(sample_pose(stored, at))
         moved = Motion(shot.path, shot.fps, *sample_motion(shot, at))
         character, origins = character_matrices(moved, self.player.skeleton)
         return skin_garment(
-            self.player.tiles, activations, self.player.kinematics.matrices(rotations, character), origins
+            self.player.tiles, activations, self.player.kinematics.matrices(transforms, character), origins
         )

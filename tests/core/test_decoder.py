@@ -66,14 +66,18 @@ def test_compose_is_the_product_of_affine_transforms():
     np.testing.assert_allclose(compose(left, right), expected, atol=1e-5)
 
 
+@pytest.mark.parametrize("translations", [False, True], ids=["turning", "moving"])
 @pytest.mark.parametrize("shuffled", [False, True], ids=["chain", "side by side"])
-def test_forward_kinematics_equals_local_transforms_composed(toy_scene, toy_motion, toy_model, shuffled):
+def test_forward_kinematics_equals_local_transforms_composed(
+    toy_scene, toy_motion, toy_model, shuffled, translations
+):
     scene = toy_scene(shuffled=shuffled)
-    model, motion = toy_model(scene), toy_motion(scene, 6)
-    activation, rotations = model.pose(latents(model, 6))
+    model, motion = toy_model(scene, translations=translations), toy_motion(scene, 6)
+    activation, transforms = model.pose(latents(model, 6))
+    assert bool(transforms[:, :, 3].abs().max() > 0.01) == translations
     with torch.no_grad():
-        found = model.decoder.proxy_matrices(rotations, as_tensor(skinning(scene, motion)))
-    pose = GarmentPose(0, *model.file_pose(activation, rotations))
+        found = model.decoder.proxy_matrices(transforms, as_tensor(skinning(scene, motion)))
+    pose = GarmentPose(0, *model.file_pose(activation, transforms))
     world = combined_transforms(model.deformer(), motion, pose)
     expected = skinning_matrices(world, scene.bind_transforms)[:, :, :3].transpose(1, 2, 3, 0)
     np.testing.assert_allclose(found, expected, atol=2e-6)
@@ -95,20 +99,22 @@ def test_a_reordered_rig_is_decoded_parents_first(toy_scene, toy_model):
     scene = replace(scene, rig=twice)
     model = toy_model(scene)
     turns = Rotation.random(4, random_state=3).as_matrix()
-    rotations = torch.tensor(turns, dtype=torch.float32)[..., None]
+    moved = np.random.default_rng(4).normal(size=(4, 3))
+    transforms = torch.tensor(np.concatenate([turns, moved[:, :, None]], axis=2), dtype=torch.float32)[..., None]
     still = torch.eye(4)[None, :3, :, None].expand(3, 3, 4, 1)
-    found = model.decoder.proxy_matrices(rotations, still)[3:, :, :, 0].numpy()
+    found = model.decoder.proxy_matrices(transforms, still)[3:, :, :, 0].numpy()
     pivots = twice.bind_transforms[:, :3, 3]
     own = np.tile(np.eye(4), (4, 1, 1))
-    own[:, :3, :3], own[:, :3, 3] = turns, pivots - np.einsum("pab,pb->pa", turns, pivots)
+    own[:, :3, :3], own[:, :3, 3] = turns, pivots - np.einsum("pab,pb->pa", turns, pivots) + moved
     expected = np.stack([own[0], own[0] @ own[1], own[2], own[2] @ own[3]])
     np.testing.assert_allclose(found, expected[:, :3], atol=1e-6)
 
 
 @SHAPES_AND_PROXIES
-def test_vertices_equal_what_a_file_reader_deforms(toy_scene, toy_motion, toy_model, shapes, proxies):
+@pytest.mark.parametrize("translations", [False, True], ids=["turning", "moving"])
+def test_vertices_equal_what_a_file_reader_deforms(toy_scene, toy_motion, toy_model, shapes, proxies, translations):
     scene = toy_scene(proxies=proxies)
-    model, motion = toy_model(scene, shapes=shapes), toy_motion(scene, 9)
+    model, motion = toy_model(scene, shapes=shapes, translations=translations), toy_motion(scene, 9)
     z = latents(model, 9)
     with torch.no_grad():
         found = model.vertices(z, as_tensor(skinning(scene, motion))).permute(2, 0, 1)
@@ -120,8 +126,8 @@ def test_vertices_equal_what_a_file_reader_deforms(toy_scene, toy_motion, toy_mo
 
 def test_rest_is_the_middle_of_the_range_of_every_shape(scene, toy_motion, toy_model):
     model = toy_model(scene)
-    turns = torch.eye(3)[None, ..., None].expand(2, 3, 3, 1)
-    rotations, weights = model.file_pose(torch.zeros(4, 1), turns)
+    at_rest = torch.eye(3, 4)[None, ..., None].expand(2, 3, 4, 1)
+    rotations, weights, _ = model.file_pose(torch.zeros(4, 1), at_rest)
     np.testing.assert_allclose(weights, [[0.5, 0.5, 0.5, 0.5, 1.0]])
     shapes = model.deformer().shapes
     np.testing.assert_allclose(np.einsum("fk,kvc->fvc", weights, shapes), 0, atol=1e-7)

@@ -31,7 +31,7 @@ FRAMES = 20
 
 @pytest.fixture(scope="module")
 def model(scene, toy_model):
-    return toy_model(scene, scale=0.1).eval()
+    return toy_model(scene, scale=0.1, translations=True).eval()
 
 
 @pytest.fixture(scope="module")
@@ -46,11 +46,12 @@ def exported(model, tmp_path_factory):
     return session, json.loads(told.getvalue().splitlines()[-1])["detail"]
 
 
-def played(session, model, shots) -> tuple[np.ndarray, np.ndarray]:
-    """Play all shots at once; return weights (F, N, K + 1) and rotations (F, N, P, 3, 3)."""
+def played(session, model, shots) -> list[np.ndarray]:
+    """Play all shots at once; return weights (F, N, K + 1), rotations (F, N, P, 3, 3), translations (F, N, P, 3)."""
     static = descriptor_sizes(model.scene, model.joints)[0]
     before = now = np.zeros((shots.pose.shape[1], model.config.latent), np.float32)
-    weights, rotations = [], []
+    names = [each.name for each in session.get_outputs()]
+    frames = []
     for frame, pose in enumerate(shots.pose.numpy()):
         begins = np.full((len(pose), 1), frame < 2)
         given = {
@@ -60,21 +61,22 @@ def played(session, model, shots) -> tuple[np.ndarray, np.ndarray]:
             "rates": pose[:, static:],
             "begins": begins,
         }
-        state, *found = session.run(["state", "weights", "rotations"], given)
+        state, *found = session.run(names, given)
         before, now = now, state
-        weights.append(found[0])
-        rotations.append(found[1])
-    return np.array(weights), np.array(rotations)
+        frames.append(found)
+    assert names == ["state", "weights", "rotations", "translations"][: len(names)]
+    return [np.array(values) for values in zip(*frames)]
 
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_every_frame_is_what_a_shot_stores(exported, model, scene, toy_motion, count):
     motions = [toy_motion(scene, 2 * FRAMES).clip(4 * shot, 4 * shot + FRAMES) for shot in range(count)]
-    weights, rotations = played(exported[0], model, motion_inputs(model, motions))
+    weights, rotations, translations = played(exported[0], model, motion_inputs(model, motions))
     for shot, motion in enumerate(motions):
         (expected,) = garment_poses(model, motion, motion.fps)
         np.testing.assert_allclose(weights[:, shot], expected.weights, atol=2e-5)
         np.testing.assert_allclose(rotations[:, shot], matrix_from_quaternion(expected.rotations), atol=2e-5)
+        np.testing.assert_allclose(translations[:, shot], expected.translations, atol=2e-5)
     assert np.ptp(weights, axis=0).max() > 0.01
 
 

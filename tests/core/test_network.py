@@ -33,9 +33,9 @@ def test_training_starts_from_the_spring_alone_and_almost_from_lbs(scene):
         forward = now + own.beta * (now - before)
         spring = model.config.stiffness * torch.sigmoid(own.share) * (rest - forward)
         np.testing.assert_allclose(stepped, forward + spring, atol=1e-6)
-        activation, rotations = model.pose(now)
+        activation, transforms = model.pose(now)
     assert activation.abs().max() < 0.1
-    np.testing.assert_allclose(rotations, torch.eye(3)[None, ..., None].expand(2, 3, 3, 6), atol=0.1)
+    np.testing.assert_allclose(transforms, torch.eye(3, 4)[None, ..., None].expand(2, 3, 4, 6), atol=0.1)
 
 
 def test_the_seed_alone_decides_the_parameters(scene):
@@ -69,32 +69,34 @@ def test_rolling_windows_is_stepping_one_frame_after_the_other(scene, toy_model,
     torch.testing.assert_close(torch.stack(rolled), torch.stack(states), rtol=1e-4, atol=1e-5)
 
 
-def test_network_pose_inverts_file_pose(scene, toy_model):
-    model = toy_model(scene)
+@pytest.mark.parametrize("translations", [False, True])
+def test_network_pose_inverts_file_pose(scene, toy_model, translations):
+    model = toy_model(scene, translations=translations)
     with torch.no_grad():
-        activation, rotations = model.pose(torch.randn(20, 8, generator=torch.Generator().manual_seed(2)))
-        back = model.network_pose(GarmentPose(0, *model.file_pose(activation, rotations)))
+        activation, transforms = model.pose(torch.randn(20, 8, generator=torch.Generator().manual_seed(2)))
+        back = model.network_pose(GarmentPose(0, *model.file_pose(activation, transforms)))
     np.testing.assert_allclose(back[0], activation, atol=1e-6)
-    np.testing.assert_allclose(back[1], rotations, atol=1e-6)
+    np.testing.assert_allclose(back[1], transforms, atol=1e-6)
 
 
 @pytest.mark.parametrize("shapes, proxies", [(0, 2), (4, 0), (0, 0)])
 def test_network_pose_inverts_file_pose_without_shapes_or_proxies(toy_scene, toy_model, shapes, proxies):
     model = toy_model(toy_scene(proxies=proxies), shapes=shapes)
     with torch.no_grad():
-        activation, rotations = model.pose(torch.randn(3, 8))
-        back = model.network_pose(GarmentPose(0, *model.file_pose(activation, rotations)))
-    assert back[0].shape == (shapes, 3) and back[1].shape == (proxies, 3, 3, 3)
+        activation, transforms = model.pose(torch.randn(3, 8))
+        back = model.network_pose(GarmentPose(0, *model.file_pose(activation, transforms)))
+    assert back[0].shape == (shapes, 3) and back[1].shape == (proxies, 3, 4, 3)
     np.testing.assert_allclose(back[0], activation, atol=1e-6)
 
 
 def test_file_weights_and_quaternions_are_valid_even_when_saturated(scene, toy_model):
     model = toy_model(scene, scale=5.0)
     with torch.no_grad():
-        rotations, weights = model.file_pose(*model.pose(100 * torch.randn(50, 8)))
+        rotations, weights, moved = model.file_pose(*model.pose(100 * torch.randn(50, 8)))
     assert weights.min() >= 0 and weights.max() <= 1 and (weights[:, -1] == 1).all()
     assert weights[:, :-1].min() < 1e-6 and weights[:, :-1].max() > 1 - 1e-6
     np.testing.assert_allclose(np.linalg.norm(rotations, axis=-1), 1, atol=1e-12)
+    assert moved is None
 
 
 def test_the_network_sees_joints_that_carry_cloth_proxies_or_body_in_reach(toy_scene):
@@ -111,8 +113,8 @@ def test_the_network_sees_joints_that_carry_cloth_proxies_or_body_in_reach(toy_s
     assert model_joints(hung, nothing).tolist() == [0, 1]
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_the_parameters_are_known_from_sizes_alone(scene, toy_model, scheme):
-    model = toy_model(scene, scheme=scheme)
+@pytest.mark.parametrize("options", [*({"scheme": scheme} for scheme in SCHEMES), {"translations": True}])
+def test_the_parameters_are_known_from_sizes_alone(scene, toy_model, options):
+    model = toy_model(scene, **options)
     found = {name: tuple(value.shape) for name, value in model.state_dict().items()}
     assert parameter_shapes(scene, model.config, model.joints) == found

@@ -64,7 +64,7 @@ def test_a_decoder_that_fails_leaves_the_rig_as_it_is(model, scene, toy_motion):
         model.output[-1].bias.fill_(torch.nan)
     (step,) = roll(model, toy_motion(scene, 10), 100)
     assert step.recovered.all() and not step.activation.any()
-    torch.testing.assert_close(step.rotations, torch.eye(3)[None, :, :, None].expand_as(step.rotations))
+    torch.testing.assert_close(step.transforms, torch.eye(3, 4)[None, :, :, None].expand_as(step.transforms))
 
 
 def test_a_free_latent_that_runs_away_is_caught(scene, toy_model, toy_motion):

@@ -26,7 +26,7 @@ def joined(steps) -> tuple[torch.Tensor, torch.Tensor]:
     steps = list(steps)
     starts = np.cumsum([0] + [step.activation.shape[-1] for step in steps])
     assert [step.start for step in steps] == starts[:-1].tolist()
-    return torch.cat([s.activation for s in steps], -1), torch.cat([s.rotations for s in steps], -1)
+    return torch.cat([s.activation for s in steps], -1), torch.cat([s.transforms for s in steps], -1)
 
 
 def gathered(poses) -> GarmentPose:

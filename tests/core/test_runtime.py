@@ -60,7 +60,14 @@ def playback(model, motion):
 
 
 @pytest.mark.parametrize(
-    "options", [{}, {"widths": (16, 24, 12)}, {"latent_bound": 0.0, "max_latent_step": 0.0}, {"shapes": 0}]
+    "options",
+    [
+        {},
+        {"widths": (16, 24, 12)},
+        {"latent_bound": 0.0, "max_latent_step": 0.0},
+        {"shapes": 0},
+        {"translations": True},
+    ],
 )
 @pytest.mark.parametrize("proxies, shuffled", [(2, False), (2, True), (0, False)])
 def test_vertices_are_those_of_the_network(toy_scene, toy_model, toy_motion, options, proxies, shuffled):
@@ -91,10 +98,13 @@ def test_a_limit_is_that_of_the_integrators(bound):
         np.testing.assert_allclose(values, expected, rtol=1e-6, atol=1e-7)
 
 
-def test_poses_are_what_a_file_stores(model, motion, playback):
+@pytest.mark.parametrize("translations", [False, True], ids=["turning", "moving"])
+def test_poses_are_what_a_file_stores(scene, toy_model, motion, translations):
+    model = toy_model(scene, scale=0.1, translations=translations).eval()
+    playback = player_of(model).play(motion)
     mine, theirs = list(playback.poses()), list(garment_poses(model, motion, motion.fps))
     assert [pose.start for pose in mine] == [0, 64, 128] and sum(pose.frame_count for pose in mine) == FRAMES
-    for name in ("rotations", "weights"):
+    for name in ("rotations", "weights", *(["translations"] if translations else [])):
         found, expected = (np.concatenate([getattr(pose, name) for pose in poses]) for poses in (mine, theirs))
         np.testing.assert_allclose(found, expected, atol=5e-5)
         assert np.ptp(found, axis=0).max() > 0.01  # it moves
@@ -117,7 +127,7 @@ def test_what_hosts_are_given_is_what_files_hold(scene, toy_model, options):
 def test_matrices_are_those_of_forward_kinematics(model, motion, playback):
     character = torch.from_numpy(character_matrices(motion, model.scene.character.skeleton)[0])
     step = next(roll(model, motion, FRAMES))
-    expected = model.decoder.proxy_matrices(step.rotations, character).detach().numpy()
+    expected = model.decoder.proxy_matrices(step.transforms, character).detach().numpy()
     for frame in (0, 63, 64, FRAMES - 1):
         matrices, origin = playback.matrices(frame)
         np.testing.assert_allclose(matrices, expected[..., frame], atol=1e-5)

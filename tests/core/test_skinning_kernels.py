@@ -133,10 +133,12 @@ def test_parts_hold_each_influence_of_a_trainable_joint_once():
         np.testing.assert_array_equal(entries[start:stop], expected)
 
 
-def plain_proxies(six_d: Tensor, pivots: Tensor, parents: list[int], character: Tensor) -> Tensor:
+def plain_proxies(values: Tensor, pivots: Tensor, parents: list[int], character: Tensor) -> Tensor:
     matrices = list(character)
-    for turn, pivot, parent in zip(rotation_from_six_d(six_d), pivots, parents):
+    for turn, pivot, moved, parent in zip(rotation_from_six_d(values[:, :6]), pivots, values[:, 6:], parents):
         shift = pivot[:, None, None] - torch.einsum("abn,b->an", turn, pivot)[:, None]
+        if len(moved):
+            shift = shift + moved[:, None]
         matrices.append(compose(matrices[parent], torch.cat([turn, shift], dim=1)))
     return torch.stack(matrices)
 
@@ -149,30 +151,31 @@ TREES = {
 }
 
 
-def proxies_on_device(tree: list[int], six_d: Tensor, character: Tensor, upstream: Tensor) -> list[Tensor]:
+def proxies_on_device(tree: list[int], values: Tensor, character: Tensor, upstream: Tensor) -> list[Tensor]:
     """Return the kernel's matrices and gradient."""
     from ssilk_core.kernels.proxies import proxies_kernel
 
-    pivots, six_d, character, upstream = on_device(random_numbers(len(tree), 3), six_d, character, upstream)
+    pivots, values, character, upstream = on_device(random_numbers(len(tree), 3), values, character, upstream)
     parents = torch.tensor(tree, dtype=torch.int32, device=DEVICE)
-    found = proxies_kernel(six_d.requires_grad_(), pivots, parents, character)
+    found = proxies_kernel(values.requires_grad_(), pivots, parents, character)
     found.backward(upstream)
-    return [found, six_d.grad]
+    return [found, values.grad]
 
 
+@pytest.mark.parametrize("size", [6, 9], ids=["turning", "moving"])
 @pytest.mark.parametrize("tree, frames", [("chain", 3), ("star", 3), ("tree", 35), ("none", 3)])
-def test_proxies_and_their_gradient_equal_the_composed_transforms(tree, frames):
+def test_proxies_and_their_gradient_equal_the_composed_transforms(tree, frames, size):
     parents = TREES[tree]
-    six_d = random_numbers(len(parents), 6, frames, seed=1).requires_grad_()
+    values = random_numbers(len(parents), size, frames, seed=1).requires_grad_()
     character = random_matrices(frames)
     upstream = random_numbers(JOINTS + len(parents), 3, 4, frames, seed=2)
-    expected = plain_proxies(six_d, random_numbers(len(parents), 3), parents, character)
+    expected = plain_proxies(values, random_numbers(len(parents), 3), parents, character)
     if parents:
         expected.backward(upstream)
-    found = proxies_on_device(parents, six_d, character, upstream)
+    found = proxies_on_device(parents, values, character, upstream)
     assert_agree(found[0], expected.detach())
-    assert_agree(found[1], six_d.grad if parents else torch.zeros_like(six_d), tolerance=2e-5)
-    again = proxies_on_device(parents, six_d, character, upstream)
+    assert_agree(found[1], values.grad if parents else torch.zeros_like(values), tolerance=2e-5)
+    again = proxies_on_device(parents, values, character, upstream)
     assert all(torch.equal(a, b) for a, b in zip(found, again))
 
 
@@ -191,20 +194,20 @@ def test_degenerate_six_d_rotations_are_clamped_as_the_reference_clamps_them(zer
     assert_agree(found[1], six_d.grad)
 
 
-@pytest.mark.parametrize("shapes, proxies", [(4, 2), (0, 2), (4, 0)])
+@pytest.mark.parametrize("shapes, proxies, translations", [(4, 2, False), (4, 2, True), (0, 2, False), (4, 0, True)])
 def test_a_decoder_trains_by_kernels_as_it_does_without(
-    toy_scene, toy_motion, toy_model, monkeypatch, shapes, proxies
+    toy_scene, toy_motion, toy_model, monkeypatch, shapes, proxies, translations
 ):
     from ssilk_core.motion_bank import centred_matrices
 
     scene = toy_scene(proxies=proxies)
     matrices, _ = centred_matrices(toy_motion(scene, 3), scene.character.skeleton)
     character = torch.tensor(matrices[:, :, :3].transpose(1, 2, 3, 0))
-    output = 0.5 * random_numbers(3, shapes + 6 * proxies)
+    output = 0.5 * random_numbers(3, shapes + (9 if translations else 6) * proxies)
     results = []
     for device, dtype, served in ((torch.device("cpu"), torch.float64, False), (DEVICE, torch.float32, True)):
         monkeypatch.setattr(kernels, "available", lambda device, served=served: served)
-        decoder = toy_model(scene, shapes=shapes).decoder.to(device, dtype)
+        decoder = toy_model(scene, shapes=shapes, translations=translations).decoder.to(device, dtype)
         given = output.clone().to(device, dtype).requires_grad_()
         x = decoder.vertices(given, character.to(device, dtype))
         (x**2).sum().backward()
