@@ -145,7 +145,7 @@ class TrainConfig:
     clearance: float = 5e-3
     static_batch: int = 256
     noise_probability: float = 0.03
-    noise: float = 0.1
+    noise: float = 0.03
     noise_correlation: float = 0.99
     latent_regularization: float = 0.0
     latent_regularization_scale: float = 0.03
@@ -212,7 +212,7 @@ PRESETS = {
     for preset in (
         Preset(
             name="draft",
-            model=ModelConfig(latent=32, widths=(128, 128), shapes=24),
+            model=ModelConfig(latent=32, widths=(128, 128), shapes=24, translations=True),
             train=TrainConfig(
                 iterations=500,
                 static_fraction=0.55,
@@ -237,7 +237,7 @@ PRESETS = {
         ),
         Preset(
             name="preview",
-            model=ModelConfig(),
+            model=ModelConfig(translations=True),
             train=TrainConfig(
                 iterations=8_000, static_fraction=0.3, shape_learning_rate_scale=1.0, validate_every=800
             ),
@@ -251,7 +251,7 @@ PRESETS = {
         ),
         Preset(
             name="final",
-            model=ModelConfig(),
+            model=ModelConfig(translations=True),
             train=TrainConfig(
                 iterations=20_000,
                 static_fraction=0.3,

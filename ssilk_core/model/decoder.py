@@ -39,6 +39,11 @@ def transform_of(values: Tensor) -> Tensor:
     return torch.cat([turned, moved[:, :, None]], dim=2)
 
 
+def limited(displacements: Tensor, reach: float) -> Tensor:
+    """Return displacements (P, 3, N) no longer than `reach`, unchanged where they are not."""
+    return displacements * (reach / displacements.norm(dim=1, keepdim=True).clamp_min(reach))
+
+
 def compose(left: Tensor, right: Tensor) -> Tensor:
     """Multiply affine transforms (..., 3, 4, N): first `right`, then `left`."""
     linear, moved = left[..., :3, :], left[..., 3:, :]
@@ -73,6 +78,7 @@ class Decoder(nn.Module):
         rig, shapes = scene.rig, config.shapes
         self.proxy_count, self.shape_count, self.activation_count = rig.proxy_count, shapes, config.activation_count
         self.proxy_outputs, self.is_reduced = config.proxy_outputs, config.activations > 0
+        self.reach = scene.garment.mesh.diagonal  # several times what trained models use
         self.parent_indices = tuple(rig.parents.tolist())  # as Python numbers, without a copy from the GPU
         self.skin = Skinning(rig.skin, range(scene.character.skeleton.joint_count, len(scene.joint_names)))
         free = np.flatnonzero(scene.classes != PINNED)
@@ -118,7 +124,10 @@ class Decoder(nn.Module):
     def _split(self, output: Tensor) -> tuple[Tensor, Tensor]:
         delta = output[:, self.activation_count :].T.reshape(self.proxy_count, self.proxy_outputs, output.shape[0])
         activation = torch.tanh(output[:, : self.activation_count].T)
-        return self.readout @ activation if self.is_reduced else activation, self.identity + self.scale * delta
+        values = self.identity + self.scale * delta
+        if values.shape[1] > 6:
+            values = torch.cat([values[:, :6], limited(values[:, 6:], self.reach)], dim=1)
+        return self.readout @ activation if self.is_reduced else activation, values
 
     def _influence_weights(self) -> Tensor:
         """Return weights (V, I): a softmax over each vertex's support, pinned rows frozen."""

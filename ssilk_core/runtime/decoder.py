@@ -10,7 +10,7 @@ from ..assets import Floats, GarmentPose, Scene
 from ..config import ModelConfig
 from ..kinematics import ProxyAxes
 from ..parameters import IDENTITY, OUTPUT_SCALE
-from .kinematics import transform_of
+from .kinematics import limited, transform_of
 from .networks import Parameters, evaluate, layers
 
 
@@ -30,6 +30,7 @@ class NumpyDecoder:
         self.proxies = scene.rig.proxy_count
         self.readout = parameters.get("decoder.readout")
         self.axes, self.moves, size = ProxyAxes.of(scene), config.translations, config.proxy_outputs
+        self.reach = np.float32(scene.garment.mesh.diagonal)
         self.identity, self.scale = IDENTITY[:size, None], OUTPUT_SCALE[:size, None]
 
     def decode(self, z: NDArray) -> tuple[NDArray, NDArray]:
@@ -39,7 +40,10 @@ class NumpyDecoder:
         activations = np.tanh(output[: self.activation_count])
         if self.readout is not None:
             activations = self.readout @ activations
-        return activations, transform_of(self.identity + self.scale * delta)
+        values = self.identity + self.scale * delta
+        if self.moves:
+            values[:, 6:] = limited(values[:, 6:], self.reach)
+        return activations, transform_of(values)
 
     def file_pose(self, activations: NDArray, transforms: NDArray) -> tuple[Floats, Floats, Floats | None]:
         """Return quaternions (F, P, 4), weights (F, K + 1) and translations, as `GarmentModel.file_pose`."""

@@ -24,6 +24,12 @@ def transform_of(values: NDArray) -> NDArray:
     return np.concatenate([rotation_from_six_d(values[:, :6]), moved[:, :, None]], axis=2)
 
 
+def limited(displacements: NDArray, reach: np.float32) -> NDArray:
+    """Return displacements (P, 3, F) no longer than `reach`, as `model.decoder.limited`."""
+    length = np.sqrt((displacements * displacements).sum(1, keepdims=True))
+    return displacements * (reach / np.maximum(length, reach))
+
+
 def _unit(vectors: NDArray) -> NDArray:
     length = np.sqrt((vectors * vectors).sum(1, keepdims=True))
     return vectors / np.maximum(length, np.float32(1e-8))

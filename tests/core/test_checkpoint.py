@@ -264,10 +264,10 @@ def configure(**changes: object) -> Callable[[dict, dict], None]:
 
 
 DAMAGE = {
-    "another format": (set_header("format", 99), "model format 99; this version reads formats 3 and 4"),
+    "another format": (set_header("format", 99), "model format 99; this version reads formats 3 to 5"),
     "an older format": (
         set_header("format", 2),
-        "model format 2; this version reads formats 3 and 4; train it again",
+        "model format 2; this version reads formats 3 to 5; train it again",
     ),
     "header is a list": (lambda tensors, document: document.clear(), "model format None"),
     "integers without their scale": (

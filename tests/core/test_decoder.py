@@ -16,7 +16,8 @@ from ssilk_core.kinematics import (
     skinning_matrices,
     world_transforms,
 )
-from ssilk_core.model.decoder import compose, rotation_from_six_d
+from ssilk_core.model.decoder import compose, limited, rotation_from_six_d
+from ssilk_core.runtime import kinematics
 
 SHAPES_AND_PROXIES = pytest.mark.parametrize("shapes, proxies", [(4, 2), (0, 2), (4, 0), (0, 0)])
 
@@ -50,6 +51,15 @@ def test_any_six_numbers_become_a_rotation_with_the_first_axis_kept():
     second = values[:, 3:].numpy()
     assert (np.sum(matrices[:, :, 1] * second, axis=1) > 0).all()
     assert np.abs(np.sum(matrices[:, :, 2] * second, axis=1)).max() < 1e-12
+
+
+def test_a_proxy_moves_no_further_than_the_garment_is_long(scene, toy_model):
+    model = toy_model(scene, scale=5.0, translations=True)
+    far = model.pose(100 * torch.randn(50, 8))[1][:, :, 3].norm(dim=1)
+    assert far.max() <= 1.0001 * scene.garment.mesh.diagonal < 1.001 * far.max()
+    near, any_size = 0.1 * torch.rand(2, 3, 5), 3 * torch.rand(2, 3, 5)
+    assert torch.equal(limited(near, 1.0), near)
+    np.testing.assert_allclose(limited(any_size, 1.0), kinematics.limited(any_size.numpy(), np.float32(1)), atol=1e-6)
 
 
 def test_six_d_of_zeros_has_a_finite_gradient():

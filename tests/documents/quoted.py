@@ -57,6 +57,7 @@ PAPER = {
     "outlier_energy": 0,
     "newton_weight": 0,
     "clearance": 0,
+    "noise": 0.1,
     "noise_correlation": 0,
     "noise_probability": "not stated",
     "static_fraction": 0,
@@ -258,7 +259,7 @@ def fitted(over: str = "", where: str = "") -> str:
 
 
 def changelog() -> Text:
-    yield f"Model files have format {checkpoint.FORMAT}; those of format 3 still load"
+    yield f"Model files have format {checkpoint.FORMAT}; those of formats 3 and 4 still load"
     yield extremes()
     yield f"{frame_time():.2f} ms a frame"
     yield default_step()
