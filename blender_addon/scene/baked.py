@@ -86,7 +86,7 @@ def apply_bake(garment: bpy.types.Object, armature: bpy.types.Object, joints: Jo
     if baked.pose.translations is not None:
         places = np.tile(_rest_places(joints), (baked.pose.frame_count, 1, 1))
         places[:, there] = baked.pose.translations[:, proxies[there]]
-        channels += _channels(joints.proxies, "location", _shifts_from_rest(armature, joints, places))
+        channels += _channels(joints.proxies, "location", shifts_from_rest(armature, joints, places))
     moved = [
         (armature, channels),
         (garment.data.shape_keys, _weight_channels(shapes, baked.pose.weights)),
@@ -127,18 +127,7 @@ def turns_from_rest(joints: Joints, rotations: np.ndarray) -> np.ndarray:
     return multiply_quaternions(rest_rotations(joints) * [1, -1, -1, -1], rotations)
 
 
-def rest_rotations(joints: Joints) -> np.ndarray:
-    """Return the rotations of the proxies to their parents at rest, unit quaternions (w, x, y, z), shape (P, 4)."""
-    local = local_transforms(joints.binds, joints.parents)[joints.character_count :]
-    return quaternion_from_matrix(local[:, :3, :3])
-
-
-def _rest_places(joints: Joints) -> np.ndarray:
-    """Return the places of the proxies in their parents' axes at rest [m], shape (P, 3)."""
-    return local_transforms(joints.binds, joints.parents)[joints.character_count :, :3, 3]
-
-
-def _shifts_from_rest(armature: bpy.types.Object, joints: Joints, places: np.ndarray) -> np.ndarray:
+def shifts_from_rest(armature: bpy.types.Object, joints: Joints, places: np.ndarray) -> np.ndarray:
     """Return how far the proxies are from rest, in their own axes at rest and units of the armature, as pose bones
     hold it, shape (F, P, 3).
 
@@ -148,6 +137,17 @@ def _shifts_from_rest(armature: bpy.types.Object, joints: Joints, places: np.nda
     own = matrix_from_quaternion(rest_rotations(joints)).swapaxes(-1, -2)
     unit = scene_units().meters_per_unit * armature.matrix_world.median_scale
     return (own @ (places - _rest_places(joints))[..., None])[..., 0] / unit
+
+
+def rest_rotations(joints: Joints) -> np.ndarray:
+    """Return the rotations of the proxies to their parents at rest, unit quaternions (w, x, y, z), shape (P, 4)."""
+    local = local_transforms(joints.binds, joints.parents)[joints.character_count :]
+    return quaternion_from_matrix(local[:, :3, :3])
+
+
+def _rest_places(joints: Joints) -> np.ndarray:
+    """Return the places of the proxies in their parents' axes at rest [m], shape (P, 3)."""
+    return local_transforms(joints.binds, joints.parents)[joints.character_count :, :3, 3]
 
 
 def remove_bake(garment: bpy.types.Object, armature: bpy.types.Object) -> None:
@@ -226,7 +226,7 @@ def _free(armature: bpy.types.Object, proxies: Sequence[str]) -> None:
 
 
 def need_movable(armature: bpy.types.Object, names: Sequence[str]) -> None:
-    """Check that Blender moves proxies by their own locations, as refined and simulated shots do.
+    """Check that Blender moves proxies by their own locations, as most networks and all solver's shots do.
 
     Raises:
         SetupError: one cannot move.

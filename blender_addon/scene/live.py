@@ -20,7 +20,7 @@ from ssilk_core.runtime import Playback
 
 from ..errors import SetupError
 from .armature import read_joints
-from .baked import apply_deformation, need_bakeable, turns_from_rest
+from .baked import apply_deformation, need_bakeable, need_movable, shifts_from_rest, turns_from_rest
 from .garment import armature_of
 from .motions import TIMELINE, Source
 from .objects import found_again
@@ -112,6 +112,10 @@ class Live:
         turns = turns_from_rest(self.joints, pose.rotations[:, self.trained.proxies])[0]
         for name, turn in zip(self.joints.proxies, turns.tolist()):
             armature.pose.bones[name].rotation_quaternion = turn
+        if pose.translations is not None:
+            shifts = shifts_from_rest(armature, self.joints, pose.translations[:, self.trained.proxies])[0]
+            for name, shift in zip(self.joints.proxies, shifts.tolist()):
+                armature.pose.bones[name].location = shift
         blocks = garment.data.shape_keys.key_blocks if self.shapes else ()
         for name, weight in zip(self.shapes, pose.weights[0].tolist()):
             blocks[name].value = weight
@@ -143,9 +147,16 @@ class Live:
             yield done + (1 - done) * frame / len(placed)
         return playback
 
+    def _trained(self) -> TrainedGarment:
+        """Read the model, and check that the bones move as it says."""
+        trained = TrainedGarment(self.model, self.joints)
+        if trained.player.file.config.translations:
+            need_movable(self.objects()[1], self.joints.proxies)
+        return trained
+
     def _taking_up(self) -> Iterator[float]:
         """Read the model and roll it out, then give the garment its shapes and weights and play it at once."""
-        written, trained, placed = _written(self.model), TrainedGarment(self.model, self.joints), self.placed.copy()
+        written, trained, placed = _written(self.model), self._trained(), self.placed.copy()
         yield 0.0
         skinned = SkinnedGarment.of(trained.player.deformer())
         playback = yield from self._rolling(trained, placed, 0.0)
@@ -161,7 +172,7 @@ class Live:
     def _dressing(self) -> Iterator[float]:
         """Read the model and give the garment its shapes and weights; it is held until it is played by them."""
         self._written = _written(self.model)
-        trained = TrainedGarment(self.model, self.joints)
+        trained = self._trained()
         yield 0.0
         skinned = SkinnedGarment.of(trained.player.deformer())
         yield 0.0

@@ -50,7 +50,8 @@ def _rig(scene: Scene, proxies: np.ndarray, skin: SkinWeights) -> ProxyRig:
 
 def _last_layer(file: ModelFile, proxies: np.ndarray) -> dict[str, np.ndarray]:
     """Return the decoder's last layer with the rows of activations and of these proxies."""
-    given = file.config.activation_count
-    rows = np.concatenate([np.arange(given), (given + 6 * proxies[:, None] + np.arange(6)).reshape(-1)]).astype(int)
+    given, size = file.config.activation_count, file.config.proxy_outputs
+    own = given + size * proxies[:, None] + np.arange(size)
+    rows = np.concatenate([np.arange(given), own.reshape(-1)]).astype(int)
     last = 2 * len(file.config.widths)
     return {name: file.parameters[name][rows] for name in (f"output.{last}.weight", f"output.{last}.bias")}

@@ -177,7 +177,7 @@ def test_only_ends_of_chains_are_taken_off(scene, toy_scene):
 
 @pytest.fixture(scope="module")
 def file(scene, toy_model):
-    return model_file(toy_model(scene, scale=0.1, shapes=6).eval(), FABRICS["silk"], {"seed": 3})
+    return model_file(toy_model(scene, scale=0.1, shapes=6, translations=True).eval(), FABRICS["silk"], {"seed": 3})
 
 
 @pytest.fixture(scope="module")
