@@ -101,6 +101,13 @@ class CoveredPoints:
         points, normals = ((values[self._corners] * self._weights).sum(1) for values in (points, normals))
         return points, normals / normals.norm(dim=1, keepdim=True).clamp_min(1e-8)
 
+    def outermost(self, x: Tensor, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the signed distance of the outermost cloth at points placed so [m], and its triangle, both (P, N).
+
+        The distance is minus infinity where no cloth is within reach, above or beneath.
+        """
+        return self._caster.outermost(points, normals, x, above=COVER_REACH, beneath=SHOW_DEPTH)
+
     def states(self, x: Tensor, points: Tensor, normals: Tensor) -> SkinStates:
         """Tell which points show, and which are bare; all show in a frame where the cloth is not finite.
 

@@ -7,8 +7,10 @@ the patches that a ray can meet are intersected exactly.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -32,13 +34,18 @@ class RayHits:
 class RayCaster:
     """Finds the triangles of a mesh along short rays, in any pose.
 
+    Attributes:
+        faces: the triangles, shape (F, 3).
+
     Args:
         mesh: at rest, which tells only which triangles lie close together.
     """
 
     def __init__(self, mesh: Mesh, *, device: torch.device) -> None:
-        patches = compact_blocks(mesh.points[mesh.faces].mean(axis=1), RAY_PATCH)
-        self.patches = torch.as_tensor(mesh.faces[patches], device=device)  # (patches, triangles, corners)
+        numbers = compact_blocks(mesh.points[mesh.faces].mean(axis=1), RAY_PATCH)
+        self.faces = torch.as_tensor(np.array(mesh.faces), device=device)
+        self.numbers = torch.as_tensor(numbers, dtype=torch.int64, device=device)  # triangles of each patch
+        self.patches = self.faces[self.numbers]  # (patches, triangles, corners)
 
     @torch.no_grad()
     def cast(self, points: Tensor, directions: Tensor, x: Tensor, *, above: float, beneath: float) -> RayHits:
@@ -49,9 +56,49 @@ class RayCaster:
             x: vertices of the mesh in the same frames [m], shape (V, 3, N).
             above, beneath: reach along the directions and against them [m].
         """
-        shape, limit = (len(points), x.shape[2]), MAX_RAY_PAIRS[x.is_cuda]
+        shape = len(points), x.shape[2]
         hits = RayHits(*(torch.zeros(shape, dtype=torch.bool, device=x.device) for _ in range(2)))
-        patches = max(1, len(self.patches))
+        for ray, frame, _, distance in self._meetings(points, directions, x, above, beneath):
+            upward = ((distance >= 0) & (distance <= above)).any(1)
+            downward = ((distance < 0) & (distance >= -beneath)).any(1)
+            hits.above[ray[upward], frame[upward]] = True
+            hits.beneath[ray[downward], frame[downward]] = True
+        return hits
+
+    @torch.no_grad()
+    def outermost(
+        self, points: Tensor, directions: Tensor, x: Tensor, *, above: float, beneath: float
+    ) -> tuple[Tensor, Tensor]:
+        """Return how far along its direction each point meets the outermost triangle, and which that is.
+
+        Arguments are those of `cast`.
+
+        Returns:
+            Signed distances [m], minus infinity without a triangle within reach, and indices of triangles, both
+            (P, N).
+        """
+        frames = x.shape[2]
+        farthest = x.new_full((len(points) * frames,), -torch.inf)
+        found = torch.full_like(farthest, len(self.faces), dtype=torch.int64)
+        for ray, frame, patch, distance in self._meetings(points, directions, x, above, beneath):
+            reached = distance.where((distance <= above) & (distance >= -beneath), -torch.inf)
+            here = (ray * frames + frame)[:, None].expand_as(reached).reshape(-1)
+            reached, number = reached.reshape(-1), self.numbers[patch].reshape(-1)
+            before = farthest.clone()
+            farthest.scatter_reduce_(0, here, reached, "amax")
+            found[farthest > before] = len(self.faces)
+            best = (reached == farthest[here]) & (reached > -torch.inf)
+            found.scatter_reduce_(0, here[best], number[best], "amin")  # of equally far ones always the same
+        return farthest.reshape(-1, frames), found.reshape(-1, frames)
+
+    def _meetings(
+        self, points: Tensor, directions: Tensor, x: Tensor, above: float, beneath: float
+    ) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
+        """Yield rays, frames and patches (M,) of pairs that can meet, and where the patch's triangles meet the line.
+
+        Distances (M, `RAY_PATCH`) are along the directions [m], infinite where a triangle does not meet the line.
+        """
+        limit, patches = MAX_RAY_PAIRS[x.is_cuda], max(1, len(self.patches))
         frames, rays = max(1, limit // max(1, len(points) * patches)), max(1, limit // patches)
         for chosen in torch.arange(x.shape[2], device=x.device).split(frames):
             # Products lose fewer digits about the middle of the cloth.
@@ -68,12 +115,7 @@ class RayCaster:
                 pairs[:, 1] += first
                 for frame, ray, patch in (some.unbind(1) for some in pairs.split(max(1, limit // RAY_PATCH))):
                     lines = start[frame, ray][:, None], direction[frame, ray][:, None]
-                    distance = ray_distances(*lines, triangles[frame, patch])
-                    upward = ((distance >= 0) & (distance <= above)).any(1)
-                    downward = ((distance < 0) & (distance >= -beneath)).any(1)
-                    hits.above[ray[upward], chosen[frame[upward]]] = True
-                    hits.beneath[ray[downward], chosen[frame[downward]]] = True
-        return hits
+                    yield ray, chosen[frame], patch, ray_distances(*lines, triangles[frame, patch])
 
 
 def _bounding_spheres(corners: Tensor) -> tuple[Tensor, Tensor]:

@@ -2,7 +2,8 @@
 """Refine a rollout: iterations of the reference solver in each frame, starting from the network's state.
 
 Each frame minimises the incremental potential of the simulator, implicit Euler on the training energy. Every
-iteration lowers it, so a refined frame never has more energy than the network's. The previous states for inertia are
+iteration lowers it. Cloth is then lifted off skin that still shows (`clearing`), as far as the frame's energy stays
+below the network's. The previous states for inertia are
 
 - without feedback, the network's two previous frames. Frames do not depend on earlier refinements: many are refined
 at
@@ -33,6 +34,7 @@ from ..simulate.characters import PosedCharacters
 from ..simulate.incremental_potential import StepInputs
 from ..simulate.newton import SolverOptions, State, minimise_from
 from ..simulate.simulator import StepHistory
+from .clearing import SkinClearing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,6 +123,7 @@ class Refiner:
         self.options = options
         self.simulator = Simulator(scene, fabric, SimulationOptions(fps=fps, solver=options.solver), device=device)
         self.potential = self.simulator.potential
+        self.clearing = SkinClearing(scene, self.potential)
 
     def frames(self, motion: Motion, network: Iterable[Floats]) -> Iterator[RefinedFrame]:
         """Yield the refined frames of a shot.
@@ -179,7 +182,8 @@ class Refiner:
         if tail and self.options.feedback:
             corrected = self.simulator.apply_pins(world + tail.correction - poses.root, poses)
             start = self.simulator.best_start([start, corrected], inputs)
-        return minimise_from(self.potential, start, inputs, self.options.solver).x.double()
+        found = minimise_from(self.potential, start, inputs, self.options.solver).x
+        return self.clearing.lift(found, inputs, before.energy).double()
 
     def _history(self, tail: _Tail | None, world: Tensor, poses: PosedCharacters) -> StepHistory | None:
         """Return the previous states of consecutive frames."""

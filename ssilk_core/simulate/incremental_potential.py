@@ -23,7 +23,7 @@ from ..collision import Contacts, PosedBody, SmoothedDistance
 from ..constants import GRAVITY
 from ..energy import GarmentEnergy
 from ..fabrics import Fabric
-from .blocks import BlockMatrix
+from .blocks import BlockMatrix, BlockPattern
 from .hessian import Hessian
 from .membrane import outer
 from .stitches import stitch_gradient
@@ -83,6 +83,11 @@ class IncrementalPotential:
         self.contacts = Contacts(scene, self.cloth.samples, device=device)
         self._hessian = Hessian.of(scene, energy)
         self.membrane, self.hinges, self.free = self._hessian.membrane, self._hessian.hinges, self._hessian.free
+
+    @property
+    def block_pattern(self) -> BlockPattern:
+        """The sparsity pattern of its Hessian."""
+        return self._hessian.pattern
 
     def body_distance(self, x: Tensor, inputs: StepInputs) -> SmoothedDistance | None:
         """Return the distances of the samples of x to the body, to second order."""

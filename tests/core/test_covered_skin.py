@@ -146,8 +146,9 @@ def test_rays_meet_what_a_slow_search_finds(monkeypatch, limit):
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     points += [[[0.0, 1.0, 5.0]]]
     caster = RayCaster(Mesh("/sheet", sheet.vertices, sheet.faces), device=DEVICE)
-    asked = (torch.as_tensor(values, dtype=torch.float32, device=DEVICE) for values in (points, directions, x))
+    asked = [torch.as_tensor(values, dtype=torch.float32, device=DEVICE) for values in (points, directions, x)]
     found = caster.cast(*asked, above=0.08, beneath=0.03)
+    outermost, triangle = (each.cpu().numpy() for each in caster.outermost(*asked, above=0.08, beneath=0.03))
     assert max(compared) <= max(limit, len(caster.patches))
     for frame in range(3):
         distance = distances_by_solving(points[..., frame], directions[..., frame], x[sheet.faces, :, frame])
@@ -155,6 +156,11 @@ def test_rays_meet_what_a_slow_search_finds(monkeypatch, limit):
         np.testing.assert_array_equal(found.above[:, frame].cpu(), above.any(axis=1))
         np.testing.assert_array_equal(found.beneath[:, frame].cpu(), beneath.any(axis=1))
         assert 10 < above.any(axis=1).sum() < 180 and 10 < beneath.any(axis=1).sum() < 180
+        met = (above | beneath).any(axis=1)
+        within = np.where(above | beneath, distance, -np.inf)
+        np.testing.assert_allclose(outermost[met, frame], within.max(axis=1)[met], atol=1e-5)
+        np.testing.assert_array_equal(triangle[met, frame], within.argmax(axis=1)[met])
+        assert np.isneginf(outermost[~met, frame]).all()
 
 
 def distances_by_solving(points: np.ndarray, directions: np.ndarray, triangles: np.ndarray) -> np.ndarray:

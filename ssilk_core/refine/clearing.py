@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lift refined cloth off the skin that still shows.
+
+Contact pushes each sample of the cloth out of the part of the body that it can touch. Skin shows all the same where
+the body comes through between samples, where tight cloth lies in a part that is not beneath it at rest, and where few
+iterations were made. So the body has its say: of each covered point of the skin (`collision.covered_skin`), the
+outermost cloth along the normal has to lie `HEIGHT` above it. Where it lies beneath, the cloth moves by the u with
+
+    min u' H u / 2   subject to   n . sum_k w_k (x_k + u_k) = n . p + HEIGHT,
+
+the least energy to second order. H is the Hessian of the incremental potential, and w are the barycentric coordinates
+at which the cloth meets the line through the point p along its normal n. Stiff springs stand in for the constraints.
+Pinned cloth does not move, and skin inside another part of the body asks for nothing: it is not seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..assets import Scene
+from ..collision import CoveredPoints, PosedBody
+from ..simulate.incremental_potential import IncrementalPotential, StepInputs
+from ..simulate.newton import State
+
+ROUNDS = 4  # at most; each finds anew where skin shows
+HEIGHT = 2e-3  # [m] above the points, since skin between them is not asked
+STIFFER = 30.0  # springs, relative to the Hessian at the cloth that they lift
+DEEPEST = 0.012  # [m] beneath the skin; deeper cloth could only be lifted as a spike
+MAX_STEP = 0.02  # [m] of a vertex in a round
+REDUCTION, CG_ITERATIONS = 1e-4, 300  # of the residual by each linear solve, and its longest
+MOST_FREE = 0.5  # share of the cloth's weights at free corners from which on it is lifted
+ENCLOSED = 0.5  # winding number from which on a point lies inside
+SIDES = list(combinations_with_replacement(range(3), 2))  # pairs of a triangle's corners
+PAIRS_AT_ONCE = 1 << 22  # of a point and a triangle
+
+
+@dataclass(frozen=True, eq=False)
+class Lifts:
+    """Where M points of the skin ask cloth to rise, in any of N frames.
+
+    Attributes:
+        frame, face: frame and triangle of each, both (M,).
+        weights: barycentric coordinates on the triangle (M, 3); normal: of the skin (M, 3).
+        gap: how far to rise along the normal [m], shape (M,).
+        shown: points that show in each frame, asking or not, shape (N,).
+    """
+
+    frame: Tensor
+    face: Tensor
+    weights: Tensor
+    normal: Tensor
+    gap: Tensor
+    shown: Tensor
+
+    @property
+    def asking(self) -> Tensor:
+        """Frames in which skin shows and cloth can rise, in ascending order (K,)."""
+        asked = self.frame.unique()
+        return asked[self.shown[asked] > 0]
+
+    def select(self, frames: Tensor) -> Lifts:
+        """Return what is asked in the frames with indices (K,), in ascending order."""
+        place = torch.full_like(self.shown, -1)
+        place[frames] = torch.arange(len(frames), device=frames.device)
+        kept = place[self.frame] >= 0
+        face, weights, normal, gap = (each[kept] for each in (self.face, self.weights, self.normal, self.gap))
+        return Lifts(place[self.frame[kept]], face, weights, normal, gap, self.shown[frames])
+
+
+class SkinClearing:
+    """Lifts one garment off the skin.
+
+    Args:
+        potential: whose Hessian says which way of moving costs least.
+    """
+
+    def __init__(self, scene: Scene, potential: IncrementalPotential) -> None:
+        device, mesh, body = potential.free.device, scene.garment.mesh, scene.character.merged_body().mesh
+        self.potential = potential
+        self.points = CoveredPoints(body, mesh, device=device)
+        self.faces, self.body_faces = (torch.as_tensor(np.array(each.faces), device=device) for each in (mesh, body))
+        self.vertices = torch.as_tensor(self.points.vertices, device=device)
+        pattern = potential.block_pattern
+        slots = np.stack([pattern.slots(mesh.faces[:, side]) for side in SIDES], axis=1)
+        self.slots = torch.as_tensor(slots, device=device)  # of the blocks of each triangle, -1 where one is pinned
+        self.places = torch.as_tensor(pattern.place[mesh.faces], device=device)
+
+    @torch.no_grad()
+    def lift(self, x: Tensor, inputs: StepInputs, most: Tensor) -> Tensor:
+        """Return positions (V, 3, N) at which less skin shows; frames that cannot gain stay as they are.
+
+        Args:
+            most: energy that no frame may exceed [J], shape (N,).
+        """
+        if inputs.body is None or not len(self.points):
+            return x
+        found, lifts = x, self._lifts(x, inputs.body)
+        left = lifts.asking
+        lifts, inputs = lifts.select(left), inputs.select(left)
+        state = State.at(self.potential, x[..., left], inputs) if len(left) else None
+        for _ in range(ROUNDS):
+            if not len(left):
+                break
+            assert inputs.body and state
+            trial = State.at(self.potential, state.x + self._step(state, inputs, lifts), inputs)
+            after = self._lifts(trial.x, inputs.body)
+            better = (after.shown < lifts.shown) & (trial.energy <= most[left])
+            found = found.index_copy(-1, left[better], trial.x[..., better])
+            kept = after.asking[better[after.asking]]
+            left, lifts, inputs, state = left[kept], after.select(kept), inputs.select(kept), trial.select(kept)
+        return found
+
+    def _lifts(self, x: Tensor, body: PosedBody) -> Lifts:
+        """Find where cloth lies beneath covered skin, or less than `HEIGHT` above it."""
+        single = x.float()
+        points, normals = self.points.place(body.points[self.vertices], body.normals[self.vertices])
+        distance, face = self.points.outermost(single, points, normals)
+        point, frame = ((distance > -torch.inf) & (distance < HEIGHT)).nonzero().unbind(1)
+        start, normal = points[point, :, frame], normals[point, :, frame]
+        distance, face = distance[point, frame], face[point, frame]
+        seen = distance >= 0
+        seen[~seen] = ~self._enclosed((start + HEIGHT / 2 * normal)[~seen], frame[~seen], body)
+        frame, face, start, normal, distance = (each[seen] for each in (frame, face, start, normal, distance))
+        corners = single.permute(2, 0, 1)[frame[:, None], self.faces[face]]
+        weights = _barycentric(start + distance[:, None] * normal, corners)
+        movable = (weights * (self.places[face] >= 0)).sum(1) > MOST_FREE
+        asked = movable & (distance >= -DEEPEST)
+        shown = torch.bincount(frame[distance < 0], minlength=x.shape[-1])
+        return Lifts(frame[asked], face[asked], weights[asked], normal[asked], HEIGHT - distance[asked], shown)
+
+    def _enclosed(self, points: Tensor, frame: Tensor, body: PosedBody) -> Tensor:
+        """Tell which points (M, 3) lie inside a part of the body, in the frames (M,)."""
+        inside = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+        whole, at_once = body.points.permute(2, 0, 1), max(1, PAIRS_AT_ONCE // len(self.body_faces))
+        for some in torch.arange(len(points), device=points.device).split(at_once):
+            corners = whole[frame[some]][:, self.body_faces] - points[some, None, None]
+            inside[some] = winding_number(corners) > ENCLOSED
+        return inside
+
+    def _step(self, state: State, inputs: StepInputs, lifts: Lifts) -> Tensor:
+        """Return the displacement (V, 3, N) of least energy that lifts the cloth of a state."""
+        potential, x = self.potential, state.x
+        matrix = potential.hessian(x, inputs, state.body_distance)
+        places, frames = self.places[lifts.face], lifts.frame[:, None]
+        diagonal = matrix.blocks[: len(potential.free)].diagonal(dim1=1, dim2=2).mean(-1)  # (U, N)
+        stiffness = STIFFER * diagonal[places.clamp_min(0), frames].where(places >= 0, 0).amax(1)
+        springs = stiffness[:, None, None] * lifts.normal[:, :, None] * lifts.normal[:, None]
+        blocks = matrix.blocks.permute(0, 3, 1, 2)
+        for side, (i, j) in enumerate(SIDES):
+            slot = self.slots[lifts.face, side]
+            free = slot >= 0
+            share = (lifts.weights[:, i] * lifts.weights[:, j])[free, None, None]
+            blocks.index_put_((slot[free], lifts.frame[free]), share * springs[free], accumulate=True)
+        pull = (stiffness * lifts.gap)[:, None, None] * lifts.weights[:, :, None] * lifts.normal[:, None]
+        right, free = matrix.blocks.new_zeros(len(potential.free), x.shape[-1], 3), places >= 0
+        right.index_put_((places[free], frames.expand_as(places)[free]), pull[free], accumulate=True)
+        right = right.transpose(1, 2).contiguous()
+        z, _ = matrix.solve(right, REDUCTION, CG_ITERATIONS)
+        step = torch.zeros_like(x)
+        step[potential.free] = z.to(x.dtype)
+        longest = step.norm(dim=1).amax(0).clamp_min(torch.finfo(step.dtype).tiny)
+        return step * (MAX_STEP / longest).clamp(max=1)
+
+
+def _barycentric(points: Tensor, triangles: Tensor) -> Tensor:
+    """Return barycentric coordinates (M, 3) of points (M, 3) in triangles (M, corners, 3)."""
+    first, second = (triangles[:, corner] - triangles[:, 0] for corner in (1, 2))
+    away, normal = points - triangles[:, 0], torch.linalg.cross(first, second)
+    square = (normal * normal).sum(1).clamp_min(torch.finfo(points.dtype).tiny)
+    u = (torch.linalg.cross(away, second) * normal).sum(1) / square
+    v = (torch.linalg.cross(first, away) * normal).sum(1) / square
+    return torch.stack([1 - u - v, u, v], dim=1).clamp(0, 1)
+
+
+def winding_number(corners: Tensor) -> Tensor:
+    """Return how often surfaces wind around the origin, shape (M,), from the corners of triangles (M, F, 3, 3).
+
+    The sum of the triangles' solid angles over 4 pi, each by van Oosterom and Strackee (1983):
+    tan(angle / 2) = a . (b x c) / (|a||b||c| + (a . b)|c| + (b . c)|a| + (c . a)|b|).
+    """
+    a, b, c = corners.unbind(2)
+    la, lb, lc = (each.norm(dim=-1) for each in (a, b, c))
+    volume = (a * torch.linalg.cross(b, c)).sum(-1)
+    rest = la * lb * lc + (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
+    return torch.atan2(volume, rest).sum(-1) / (2 * torch.pi)

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cloth that is lifted off the skin: against a dense solution, and on a ball in a shell."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from ssilk_core.assets import LOOSE, PINNED, Body, Garment, Mesh, ProxyRig, Scene, SkinWeights
+from ssilk_core.collision import CollisionBody
+from ssilk_core.fabrics import Fabric
+from ssilk_core.refine import clearing as module
+from ssilk_core.refine.clearing import DEEPEST, HEIGHT, SIDES, STIFFER, SkinClearing, winding_number
+from ssilk_core.simulate.incremental_potential import IncrementalPotential, StepInputs
+from ssilk_core.simulate.newton import State
+
+RADIUS, GAP, DEPTH = 0.2, 0.02, 0.006  # of a ball and the shell around it, and of a dent in the shell [m]
+CAP = 0.9  # cosine of the angle of the dent
+
+
+def skin_of(path: str, count: int) -> SkinWeights:
+    return SkinWeights(path, np.zeros((count, 1), dtype=int), np.ones((count, 1)))
+
+
+@pytest.fixture(scope="module")
+def shell(scene) -> Scene:
+    """A ball in a loose shell; the lower half of the shell is pinned."""
+    ball, cloth = (trimesh.creation.icosphere(subdivisions=3, radius=radius) for radius in (RADIUS, RADIUS + GAP))
+    count = len(cloth.vertices)
+    garment = Garment(
+        Mesh("/shell", cloth.vertices, cloth.faces),
+        skin_of("/shell", count),
+        np.where(cloth.vertices[:, 2] < 0, PINNED, LOOSE),
+    )
+    body = Body(Mesh("/ball", ball.vertices, ball.faces), skin_of("/ball", len(ball.vertices)))
+    rig = ProxyRig("/rig", (), [], np.zeros((0, 4, 4)), skin_of("/rig", count))
+    return Scene(replace(scene.character, bodies=(body,)), garment, rig)
+
+
+def dented(shell: Scene, axis: int, depth: float = DEPTH) -> torch.Tensor:
+    """The shell with a cap around an axis beneath the skin, shape (V, 3, 1)."""
+    points = shell.garment.mesh.points
+    sunk = points * ((RADIUS - depth) / (RADIUS + GAP))
+    return torch.tensor(np.where(points[:, axis, None] > CAP * (RADIUS + GAP), sunk, points))[:, :, None]
+
+
+def at_rest(shell: Scene) -> tuple[IncrementalPotential, StepInputs]:
+    potential = IncrementalPotential(shell, Fabric("toy"), device=torch.device("cpu"))
+    joints = shell.character.skeleton.joint_count
+    body = CollisionBody(shell.character.merged_body(), joints, device="cpu")
+    still = torch.eye(3, 4)[None, :, :, None].repeat(joints, 1, 1, 1)
+    return potential, StepInputs(body.pose(still, exact=True), torch.zeros(3, 1, dtype=torch.float64))
+
+
+def test_a_dent_is_lifted_and_the_rest_stays(shell):
+    potential, inputs = at_rest(shell)
+    clearing, x = SkinClearing(shell, potential), dented(shell, 2)
+    before = clearing._lifts(x, inputs.body)
+    assert 50 < before.shown.item() <= len(before.frame)  # the slopes of the dent ask, too
+    assert before.gap.max().item() == pytest.approx(DEPTH + HEIGHT, abs=5e-4)
+    unbounded = torch.full((1,), torch.inf)
+    found = clearing.lift(x, inputs, unbounded)
+    after = clearing._lifts(found, inputs.body)
+    assert after.shown.item() == 0
+    moved = (found - x).norm(dim=1)[:, 0]
+    assert 0.8 * (DEPTH + HEIGHT) < moved.max() < 3 * (DEPTH + HEIGHT)
+    dent = (x[:, :, 0] != torch.tensor(shell.garment.mesh.points)).any(1)
+    assert moved[~dent].mean() < 0.3 * moved[dent].mean() and not moved[shell.classes == PINNED].any()
+    assert torch.equal(clearing.lift(found, inputs, unbounded), found)
+
+
+def test_no_frame_gets_more_energy_than_it_may(shell):
+    potential, inputs = at_rest(shell)
+    clearing, x = SkinClearing(shell, potential), dented(shell, 2)
+    assert torch.equal(clearing.lift(x, inputs, torch.full((1,), -torch.inf)), x)
+    most = State.at(potential, x, inputs).energy
+    found = clearing.lift(x, inputs, most)
+    assert (State.at(potential, found, inputs).energy <= most).all()
+
+
+def test_pinned_and_deep_cloth_is_left(shell):
+    potential, inputs = at_rest(shell)
+    clearing, points = SkinClearing(shell, potential), shell.garment.mesh.points
+    pinned = torch.tensor(np.where(points[:, 2:] < -CAP * (RADIUS + GAP), 0.9, 1.0) * points)[:, :, None]
+    lifts = clearing._lifts(pinned, inputs.body)
+    assert lifts.shown.item() > 50 and not len(lifts.asking)
+    assert torch.equal(clearing.lift(pinned, inputs, torch.full((1,), torch.inf)), pinned)
+    deep = clearing._lifts(dented(shell, 2, depth=2 * DEEPEST), inputs.body)
+    assert len(deep.frame) < 0.5 * deep.shown.item() and deep.gap.max() <= DEEPEST + HEIGHT
+
+
+def test_skin_inside_another_part_asks_for_nothing(shell):
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=RADIUS)
+    other = Body(
+        Mesh("/other", ball.vertices + [0, 0, 1.5 * RADIUS], ball.faces), skin_of("/other", len(ball.vertices))
+    )
+    shown = []
+    for more in ((), (other,)):
+        two = replace(shell, character=replace(shell.character, bodies=(*shell.character.bodies, *more)))
+        potential, inputs = at_rest(two)
+        shown.append(SkinClearing(two, potential)._lifts(dented(shell, 2), inputs.body).shown.item())
+    assert shown[1] < 0.2 * shown[0]
+
+
+def test_a_step_is_that_of_a_dense_solution(monkeypatch, shell):
+    monkeypatch.setattr(module, "REDUCTION", 1e-6)  # soft modes, which cost little, converge last
+    potential, inputs = at_rest(shell)
+    clearing, x = SkinClearing(shell, potential), dented(shell, 2)
+    lifts, state = clearing._lifts(x, inputs.body), State.at(potential, x, inputs)
+    matrix = potential.hessian(x, inputs, state.body_distance)
+    dense = matrix.rows.to_dense().double().numpy()
+    right, place = np.zeros(len(dense)), potential.block_pattern.place
+    diagonal = dense.diagonal().reshape(-1, 3).mean(axis=1)
+    for face, weights, normal, gap in zip(lifts.face, lifts.weights, lifts.normal, lifts.gap):
+        corners = place[shell.garment.mesh.faces[face]]
+        row = np.zeros(len(dense))
+        for corner, weight in zip(corners, weights.tolist()):
+            if corner >= 0:
+                row[3 * corner : 3 * corner + 3] = weight * normal.double().numpy()
+        spring = STIFFER * diagonal[corners[corners >= 0]].max()
+        dense += spring * np.outer(row, row)
+        right += spring * gap.item() * row
+    expected = np.zeros(x.shape[:2])
+    expected[potential.free] = np.linalg.solve(dense, right).reshape(-1, 3)
+    np.testing.assert_allclose(clearing._step(state, inputs, lifts)[:, :, 0], expected, atol=1e-5)
+    assert np.abs(expected).max() > DEPTH and len(SIDES) == 6
+
+
+def test_surfaces_wind_around_what_they_enclose():
+    cube = trimesh.creation.box((1.0, 1.0, 1.0))
+    corners = cube.vertices[cube.faces]
+    places = np.array([[0, 0, 0], [0.4, 0.3, -0.4], [0.7, 0, 0], [3, 2, 1]])
+    found = winding_number(torch.tensor(corners[None] - places[:, None, None]))
+    np.testing.assert_allclose(found, [1, 1, 0, 0], atol=1e-12)
+    twice = torch.tensor(np.concatenate([corners, 2 * corners])[None])
+    assert winding_number(twice).item() == pytest.approx(2)
