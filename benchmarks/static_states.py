@@ -21,8 +21,7 @@ from torch import Tensor
 
 from ssilk_core.evaluation.splits import read_index
 from ssilk_core.kinematics import resample
-from ssilk_core.simulate import SimulationOptions
-from ssilk_core.simulate.simulator import Simulator
+from ssilk_core.simulate import SimulationOptions, Simulator
 from ssilk_core.training.objective import Objective
 
 TERMS = ("stretch", "gravity", "collision", "tether")

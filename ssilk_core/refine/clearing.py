@@ -3,14 +3,15 @@
 
 Contact pushes each sample of the cloth out of the part of the body that it can touch. Skin shows all the same where
 the body comes through between samples, where tight cloth lies in a part that is not beneath it at rest, and where few
-iterations were made. So the body has its say: of each covered point of the skin (`collision.covered_skin`), the
-outermost cloth along the normal has to lie `HEIGHT` above it. Where it lies beneath, the cloth moves by the u with
+iterations were made. So covered points of the skin (`collision.covered_skin`) ask. Where the outermost cloth along
+the normal n lies beneath such a point p, the cloth moves by the u with
 
     min u' H u / 2   subject to   n . sum_k w_k (x_k + u_k) = n . p + HEIGHT,
 
-the least energy to second order. H is the Hessian of the incremental potential, and w are the barycentric coordinates
-at which the cloth meets the line through the point p along its normal n. Stiff springs stand in for the constraints.
-Pinned cloth does not move, and skin inside another part of the body asks for nothing: it is not seen.
+the smallest step in the metric of the Hessian H of the incremental potential, so that stiff ways of moving are
+avoided. The w are the barycentric coordinates at which the cloth meets the line through p along n. Stiff springs
+stand in for the constraints. Pinned cloth does not move, and skin inside another part of the body asks for nothing:
+it is not seen.
 """
 
 from __future__ import annotations
@@ -27,16 +28,17 @@ from ..collision import CoveredPoints, PosedBody
 from ..simulate.incremental_potential import IncrementalPotential, StepInputs
 from ..simulate.newton import State
 
+POINTS = 9001  # on the body: others than those at which skin that shows is measured
 ROUNDS = 4  # at most; each finds anew where skin shows
 HEIGHT = 2e-3  # [m] above the points, since skin between them is not asked
 STIFFER = 30.0  # springs, relative to the Hessian at the cloth that they lift
 DEEPEST = 0.012  # [m] beneath the skin; deeper cloth could only be lifted as a spike
-MAX_STEP = 0.02  # [m] of a vertex in a round
+FARTHEST = 0.02  # [m] that a vertex moves in all rounds
 REDUCTION, CG_ITERATIONS = 1e-4, 300  # of the residual by each linear solve, and its longest
 MOST_FREE = 0.5  # share of the cloth's weights at free corners from which on it is lifted
 ENCLOSED = 0.5  # winding number from which on a point lies inside
-SIDES = list(combinations_with_replacement(range(3), 2))  # pairs of a triangle's corners
-PAIRS_AT_ONCE = 1 << 22  # of a point and a triangle
+CORNERS = list(combinations_with_replacement(range(3), 2))  # pairs of them in a triangle
+PAIRS_AT_ONCE = 1 << 20  # of a point and a triangle
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,9 +61,8 @@ class Lifts:
 
     @property
     def asking(self) -> Tensor:
-        """Frames in which skin shows and cloth can rise, in ascending order (K,)."""
-        asked = self.frame.unique()
-        return asked[self.shown[asked] > 0]
+        """Frames in which cloth can rise, in ascending order (K,)."""
+        return self.frame.unique()
 
     def select(self, frames: Tensor) -> Lifts:
         """Return what is asked in the frames with indices (K,), in ascending order."""
@@ -82,11 +83,11 @@ class SkinClearing:
     def __init__(self, scene: Scene, potential: IncrementalPotential) -> None:
         device, mesh, body = potential.free.device, scene.garment.mesh, scene.character.merged_body().mesh
         self.potential = potential
-        self.points = CoveredPoints(body, mesh, device=device)
+        self.points = CoveredPoints(body, mesh, count=POINTS, device=device)
         self.faces, self.body_faces = (torch.as_tensor(np.array(each.faces), device=device) for each in (mesh, body))
         self.vertices = torch.as_tensor(self.points.vertices, device=device)
         pattern = potential.block_pattern
-        slots = np.stack([pattern.slots(mesh.faces[:, side]) for side in SIDES], axis=1)
+        slots = np.stack([pattern.slots(mesh.faces[:, side]) for side in CORNERS], axis=1)
         self.slots = torch.as_tensor(slots, device=device)  # of the blocks of each triangle, -1 where one is pinned
         self.places = torch.as_tensor(pattern.place[mesh.faces], device=device)
 
@@ -107,7 +108,9 @@ class SkinClearing:
             if not len(left):
                 break
             assert inputs.body and state
-            trial = State.at(self.potential, state.x + self._step(state, inputs, lifts), inputs)
+            moved = state.x + self._step(state, inputs, lifts) - x[..., left]
+            moved = moved * (FARTHEST / moved.norm(dim=1).amax(0).clamp_min(FARTHEST))
+            trial = State.at(self.potential, x[..., left] + moved, inputs)
             after = self._lifts(trial.x, inputs.body)
             better = (after.shown < lifts.shown) & (trial.energy <= most[left])
             found = found.index_copy(-1, left[better], trial.x[..., better])
@@ -116,21 +119,20 @@ class SkinClearing:
         return found
 
     def _lifts(self, x: Tensor, body: PosedBody) -> Lifts:
-        """Find where cloth lies beneath covered skin, or less than `HEIGHT` above it."""
+        """Find where cloth lies beneath covered skin."""
         single = x.float()
         points, normals = self.points.place(body.points[self.vertices], body.normals[self.vertices])
         distance, face = self.points.outermost(single, points, normals)
-        point, frame = ((distance > -torch.inf) & (distance < HEIGHT)).nonzero().unbind(1)
+        point, frame = ((distance > -torch.inf) & (distance < 0)).nonzero().unbind(1)
         start, normal = points[point, :, frame], normals[point, :, frame]
         distance, face = distance[point, frame], face[point, frame]
-        seen = distance >= 0
-        seen[~seen] = ~self._enclosed((start + HEIGHT / 2 * normal)[~seen], frame[~seen], body)
+        seen = ~self._enclosed(start + HEIGHT / 2 * normal, frame, body)
         frame, face, start, normal, distance = (each[seen] for each in (frame, face, start, normal, distance))
         corners = single.permute(2, 0, 1)[frame[:, None], self.faces[face]]
         weights = _barycentric(start + distance[:, None] * normal, corners)
         movable = (weights * (self.places[face] >= 0)).sum(1) > MOST_FREE
         asked = movable & (distance >= -DEEPEST)
-        shown = torch.bincount(frame[distance < 0], minlength=x.shape[-1])
+        shown = torch.bincount(frame, minlength=x.shape[-1])
         return Lifts(frame[asked], face[asked], weights[asked], normal[asked], HEIGHT - distance[asked], shown)
 
     def _enclosed(self, points: Tensor, frame: Tensor, body: PosedBody) -> Tensor:
@@ -143,7 +145,7 @@ class SkinClearing:
         return inside
 
     def _step(self, state: State, inputs: StepInputs, lifts: Lifts) -> Tensor:
-        """Return the displacement (V, 3, N) of least energy that lifts the cloth of a state."""
+        """Return the displacement (V, 3, N) that lifts the cloth of a state."""
         potential, x = self.potential, state.x
         matrix = potential.hessian(x, inputs, state.body_distance)
         places, frames = self.places[lifts.face], lifts.frame[:, None]
@@ -151,20 +153,26 @@ class SkinClearing:
         stiffness = STIFFER * diagonal[places.clamp_min(0), frames].where(places >= 0, 0).amax(1)
         springs = stiffness[:, None, None] * lifts.normal[:, :, None] * lifts.normal[:, None]
         blocks = matrix.blocks.permute(0, 3, 1, 2)
-        for side, (i, j) in enumerate(SIDES):
+        for side, (i, j) in enumerate(CORNERS):
             slot = self.slots[lifts.face, side]
             free = slot >= 0
             share = (lifts.weights[:, i] * lifts.weights[:, j])[free, None, None]
-            blocks.index_put_((slot[free], lifts.frame[free]), share * springs[free], accumulate=True)
+            _add(blocks, slot[free], lifts.frame[free], share * springs[free])
         pull = (stiffness * lifts.gap)[:, None, None] * lifts.weights[:, :, None] * lifts.normal[:, None]
         right, free = matrix.blocks.new_zeros(len(potential.free), x.shape[-1], 3), places >= 0
-        right.index_put_((places[free], frames.expand_as(places)[free]), pull[free], accumulate=True)
+        _add(right, places[free], frames.expand_as(places)[free], pull[free])
         right = right.transpose(1, 2).contiguous()
         z, _ = matrix.solve(right, REDUCTION, CG_ITERATIONS)
         step = torch.zeros_like(x)
         step[potential.free] = z.to(x.dtype)
-        longest = step.norm(dim=1).amax(0).clamp_min(torch.finfo(step.dtype).tiny)
-        return step * (MAX_STEP / longest).clamp(max=1)
+        return step
+
+
+def _add(target: Tensor, rows: Tensor, frames: Tensor, values: Tensor) -> None:
+    """Add values (M, ...) to rows and frames (M,) of a tensor, those of the same place always in the same order."""
+    summed = torch.sparse_coo_tensor(torch.stack([rows, frames]), values, target.shape, check_invariants=False)
+    summed = summed.coalesce()
+    target[tuple(summed.indices())] += summed.values()
 
 
 def _barycentric(points: Tensor, triangles: Tensor) -> Tensor:

@@ -6,10 +6,10 @@ iteration lowers it. Cloth is then lifted off skin that still shows (`clearing`)
 below the network's. The previous states for inertia are
 
 - without feedback, the network's two previous frames. Frames do not depend on earlier refinements: many are refined
-at
-  once, any part of a shot can be refined by itself, and errors do not accumulate.
-- with feedback, the two previous refined frames, one frame after the other. Each starts from the network's state, or
-  from that plus the last correction, whichever has less energy. With enough iterations this is the simulator.
+  at once, any part of a shot can be refined by itself, and errors do not accumulate.
+- with feedback, the two previous refined frames as they were before they were lifted, one frame after the other. Each
+  starts from the network's state, or from that plus the last correction, whichever has less energy. With enough
+  iterations this is the simulator.
 
 The first frame of a shot, and after a cut, is quasi-static with feedback. Without feedback its previous states are
 itself at rest: without any inertia the next frame would jump back.
@@ -163,11 +163,13 @@ class Refiner:
             inputs = self.simulator.inputs(poses, self._history(tail, world, poses))
             before = State.at(self.potential, self.simulator.apply_pins(world - poses.root, poses), inputs)
             if refined_points is None:
-                refined = self._refine(before, tail, world, poses, inputs) + poses.root
+                solved = self._refine(before, tail, world, poses, inputs)
+                refined = self.clearing.lift(solved, inputs, before.energy).double() + poses.root
+                seen = solved.double() + poses.root  # what is lifted has no speed
             else:
-                refined = self._next_frames(refined_points, stop - start)
+                seen = refined = self._next_frames(refined_points, stop - start)
             yield from self._describe(before, inputs, refined, poses.root)
-            tail = self._tail(tail, world, refined, poses)
+            tail = self._tail(tail, world, seen, poses)
 
     def _next_frames(self, vertices: Iterator[Floats], count: int) -> Tensor:
         """Return the next frames' positions (V, 3, N)."""
@@ -177,13 +179,12 @@ class Refiner:
     def _refine(
         self, before: State, tail: _Tail | None, world: Tensor, poses: PosedCharacters, inputs: StepInputs
     ) -> Tensor:
-        """Return refined positions relative to the roots (V, 3, N)."""
+        """Return the solver's positions relative to the roots (V, 3, N)."""
         start = before.x
         if tail and self.options.feedback:
             corrected = self.simulator.apply_pins(world + tail.correction - poses.root, poses)
             start = self.simulator.best_start([start, corrected], inputs)
-        found = minimise_from(self.potential, start, inputs, self.options.solver).x
-        return self.clearing.lift(found, inputs, before.energy).double()
+        return minimise_from(self.potential, start, inputs, self.options.solver).x
 
     def _history(self, tail: _Tail | None, world: Tensor, poses: PosedCharacters) -> StepHistory | None:
         """Return the previous states of consecutive frames."""

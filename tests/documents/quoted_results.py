@@ -154,6 +154,29 @@ def clearance() -> Text:
         yield f"{ends[0]} to {ends[1]} J for the {garment}"
 
 
+def moving() -> Text:
+    runs, skins = result("moving_training"), (result("shown_skin_shipped"), result("shown_skin_turning"))
+    garments = ("cape", "fringe_skirt", "hooded_dress")
+    for name in garments:
+        for skin, ending, words in ((skins[1], "_turning", "turn"), (skins[0], "", "turn and move")):
+            run, own = runs[name + ending], [skin[name][split]["network"] for split in HELD_OUT]
+            best = run["total"].index(min(run["total"]))
+            kept = f"{run['iterations'][best]:,} of {run['iterations'][-1]:,}"
+            pairs = (f"{share_3(at['mean'])}, {share_1(at['worst'])}" for at in own)
+            yield row(name.replace("_", " ") if ending else "", words, kept, f"{run['total'][best]:.4f}", *pairs)
+    cells_of = list(product(garments, HELD_OUT))
+    for figure, words in (("mean", "the mean"), ("worst", "the worst frame")):
+        less = sum(skins[0][n][s]["network"][figure] < skins[1][n][s]["network"][figure] for n, s in cells_of)
+        yield f"{words} is lower in {less} of {len(cells_of)} cells"
+
+
+def static_states() -> Text:
+    for garment, states in result("static_states").items():
+        for number, (state, at) in enumerate(states.items()):
+            energies = (fixed(at[name], 3) for name in ("energy", "stretch", "gravity", "collision"))
+            yield row("" if number else garment.replace("_", " "), state, *energies, milli(at["distance"]))
+
+
 def conditions() -> Text:
     cape, held_out = shipped("cape"), evaluated("cape")
     (body,) = {line["vertices"] for line in document("trade")["judging"] if line["body"] == "triangles"}
@@ -522,10 +545,9 @@ def scenes() -> Text:
 
 
 PARTS = (
-    opening, conditions, shown, clearance, table1, findings, dynamics, ablations, wardrobe, long_training,
-    short_training, rest, playing, sizes,
-    levels, refinement,
-    inside_the_body, stress, training_speed, scenes,
+    opening, conditions, shown, clearance, moving, static_states, table1, findings, dynamics, ablations, wardrobe,
+    long_training, short_training, rest, playing, sizes, levels, refinement, inside_the_body, stress,
+    training_speed, scenes,
 )  # fmt: skip
 """The parts of the document, in its order."""
 

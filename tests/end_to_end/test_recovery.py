@@ -51,7 +51,8 @@ def test_a_bake_tells_how_much_skin_shows(toy, tmp_path):
         found = read_provenance(shot)["shown_skin"]
         assert found["covered"] > 1000 and found["frames"] == 6 and found["clip"] == "clip"
         assert main(["report", str(shot), "-o", str(page)]) == 0
-        assert 0.001 < found["mean"] <= found["worst"] < 0.9
+        least = 0 if options else 0.001  # refined cloth is lifted off the skin
+        assert least <= found["mean"] <= found["worst"] < 0.9
         shown = re.search(r"covered skin that shows \[%\]</td>(?:<td[^>]*>([^<]*)</td>){4}", page.read_text())
         assert float(shown[1]) == pytest.approx(100 * found["worst"], rel=0.02, abs=0.05)
 
