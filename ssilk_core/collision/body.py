@@ -57,10 +57,10 @@ class CollisionBody:
         """Pose the body with skinning matrices (J, 3, 4, N); normals rotate with the blended matrices.
 
         Args:
-            surface: whether the nearest body point lies on the triangles around the nearest vertex, or is that
-                vertex.
-            exact: whether it is the exact nearest point of the whole surface.
+            surface: whether the nearest body point lies on the surface, or is the nearest vertex.
+            exact: whether that of cloth with a patch of its own is the exact one too, not one around the nearest
+                vertex (`PosedBody.rings`).
         """
         points, normals = self.skin.surface(self.points[:, :, 0], self.normals[:, :, 0], character)
-        rings, exactly = self.rings if surface else None, (self.faces, self.patches) if exact else (None, None)
-        return PosedBody(points, normals, rings, self.groups, *exactly)
+        rings = self.rings if surface and not exact else None
+        return PosedBody(points, normals, rings, self.groups, *((self.faces, self.patches) if surface else ()))

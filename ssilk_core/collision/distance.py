@@ -14,8 +14,15 @@ from .nearest_vertex import BODY_GROUP, GARMENT_BLOCK, consecutive_blocks, neare
 from .one_ring import nearest_on_rings
 from .smoothed_distance import EDGE_EPSILON, SEARCH_MARGIN, SMOOTHING_EXPONENT, SmoothedDistance, smoothed_distance
 
-# Vertices further than this from every body vertex [m] use the tangent plane at the nearest vertex.
+# Cloth further than this from every body vertex [m] is searched for on the surface only if it may lie inside: behind
+# the tangent plane at the nearest vertex, and no deeper than `MAX_DEPTH`. All other cloth this far away touches
+# nothing. The tangent plane itself must not decide: it extends beyond the body, and far cloth that met it would be
+# pushed about by planes that jump from vertex to vertex, which adds energy without end.
 MAX_QUERY_DISTANCE = 0.08
+MAX_DEPTH = 0.25
+# Deeper than `MAX_QUERY_DISTANCE`, cloth lies inside only where the direction to the nearest point is within 60
+# degrees of the normal there. At the border of an open body it is not.
+DEEP_COSINE = 0.5
 SMOOTHING_MEMORY_FACTOR = 4  # memory of a candidate pair for the smoothed distance, relative to the exact one
 SURFACE_EPSILON = 1e-5  # [m]; closer to the surface, float32 no longer resolves the direction to it
 
@@ -25,14 +32,14 @@ class PosedBody:
     """Body vertices [m] and unit vertex normals for each frame, both (B, 3, N).
 
     Attributes:
-        rings: neighbours around each vertex (`one_ring.triangle_rings`); without them the nearest body point is the
-            nearest vertex.
+        rings: neighbours around each vertex (`one_ring.triangle_rings`). With them cloth with a patch of its own, in
+            training, finds its nearest body point on the triangles around the nearest vertex. Its normal is
+            interpolated, so that it varies smoothly up to the edge of the patch.
         groups: the vertices in compact groups (`nearest_vertex.compact_blocks` of `BODY_GROUP`), int32. They speed up
             the search on a GPU; only the choice among equally near vertices depends on them.
         faces: triangles (F, 3). With them the nearest body point is that of the whole surface (`closest_point`); the
-            distance is Euclidean for measuring, and smoothed for simulation. The distance of training differs where a
-            triangle away from the nearest vertex is nearer than those around it, and by the cosine between the
-            interpolated normal and the direction to the surface.
+            distance is Euclidean in training and for measuring, and smoothed for simulation. Without faces and rings
+            it is the nearest vertex.
         patches: the triangles in compact patches (`closest_point.triangle_patches`), int32, for the search on a GPU.
     """
 
@@ -82,8 +89,9 @@ def nearest_planes(
 ) -> tuple[Tensor, Tensor]:
     """Return unit normals n_b (V, 3, N) and offsets n_b . b (V, N) of the nearest body points b, without gradients.
 
-    Normals are interpolated. With `body.faces` they are the directions from b to x instead, which are the gradient of
-    the distance.
+    With `body.faces` normals are the directions from b to x, which are the gradient of the distance; otherwise they
+    are interpolated. Without `patches`, cloth that is far away (`MAX_QUERY_DISTANCE`) has the direction from the
+    nearest vertex.
 
     Args:
         x: garment positions (V, 3, N).
@@ -92,6 +100,8 @@ def nearest_planes(
             speed up the search on a GPU and change no result.
         patches: the part of the body that each garment vertex can touch; all of it by default.
     """
+    if patches is not None and body.rings is not None:
+        body = replace(body, faces=None)
     if kernels.supports(x) and _have_kernel(body, patches):
         return _by_kernels(x, body, blocks, patches)
     index, normal, offset, search_radius = _at_vertices(x, body, blocks, patches)
@@ -126,7 +136,7 @@ def smoothed_planes(
     many = max(1, frames_at_once(x, body.faces, candidates) // SMOOTHING_MEMORY_FACTOR)
     for frames in torch.arange(x.shape[2], device=x.device).split(many):
         part = x[..., frames], search_radius[:, frames], body.points[..., frames], body.normals[..., frames]
-        found, smoothed = smoothed_distance(*part, body.faces, SURFACE_EPSILON, candidates)
+        found, smoothed = smoothed_distance(*part, body.faces, SURFACE_EPSILON, lies_inside, candidates)
         plane.normal[..., frames] = smoothed.normal.where(found[:, None], plane.normal[..., frames])
         plane.offset[..., frames] = smoothed.offset.where(found, plane.offset[..., frames])
         plane.curvature[..., frames] = smoothed.curvature
@@ -147,8 +157,9 @@ def _smoothed_by_kernel(
     surface = body.points, body.normals, body.faces, torch.cat(bounding_spheres(body.points, body.faces), dim=1)
     normal, distance, curvature = smoothed_distance_kernel(
         x, index, *surface, patches.faces if patches else None,
-        max_distance=MAX_QUERY_DISTANCE, surface_epsilon=SURFACE_EPSILON, exponent=SMOOTHING_EXPONENT,
-        search_margin=SEARCH_MARGIN, edge_epsilon=EDGE_EPSILON,
+        max_distance=MAX_QUERY_DISTANCE, max_depth=MAX_DEPTH, deep_cosine=DEEP_COSINE,
+        surface_epsilon=SURFACE_EPSILON, exponent=SMOOTHING_EXPONENT, search_margin=SEARCH_MARGIN,
+        edge_epsilon=EDGE_EPSILON,
     )  # fmt: skip
     return SmoothedDistance(normal, (normal.double() * x.double()).sum(1) - distance.double(), curvature)
 
@@ -156,14 +167,21 @@ def _smoothed_by_kernel(
 def _at_vertices(
     x: Tensor, body: PosedBody, blocks: Tensor | None, patches: Patches | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return indices (V, N), normals and offsets of the nearest body vertices, and distances to them [m] (V, N).
+    """Return indices (V, N), normals and offsets of planes at the nearest body vertices, and distances to them [m].
 
-    Distances from `MAX_QUERY_DISTANCE` on are -1.
+    Distances (V, N) are -1 where nothing nearer is to be searched for. Planes are tangent planes, but for cloth that
+    is far away, without `patches`.
     """
     index = _nearest_vertex(x, body, blocks, patches).long()
     normal, point = gather_frames(body.normals, index), gather_frames(body.points, index)
-    square = ((x - point) ** 2).sum(1)
-    return index, normal, (normal * point).sum(1), square.sqrt().where(square < MAX_QUERY_DISTANCE**2, -1)
+    away = x - point
+    length = away.norm(dim=1)
+    searched = length < MAX_QUERY_DISTANCE
+    if patches is None:
+        if body.faces is not None:
+            searched |= ((normal * away).sum(1) < 0) & (length < MAX_DEPTH)
+        normal = torch.where(searched[:, None], normal, away / length[:, None].clamp_min(SURFACE_EPSILON))
+    return index, normal, (normal * point).sum(1), length.where(searched, -1)
 
 
 def _have_kernel(body: PosedBody, patches: Patches | None) -> bool:
@@ -197,12 +215,11 @@ def _by_kernels(
 
     index = _nearest_vertex(x, body, blocks, patches)
     if body.faces is not None and body.patches is not None:
-        search_radius = MAX_QUERY_DISTANCE, SURFACE_EPSILON
-        return closest_point_kernel(
-            x, index, body.points, body.normals, _in_blocks(x, blocks), body.patches, *search_radius
-        )
+        limits = MAX_QUERY_DISTANCE, MAX_DEPTH, DEEP_COSINE, SURFACE_EPSILON
+        return closest_point_kernel(x, index, body.points, body.normals, _in_blocks(x, blocks), body.patches, *limits)
     rings = index.new_zeros(len(body.points), 1) if body.rings is None else body.rings
-    return one_ring_kernel(x, index, body.points, body.normals, rings, MAX_QUERY_DISTANCE)
+    straight = patches is None
+    return one_ring_kernel(x, index, body.points, body.normals, rings, MAX_QUERY_DISTANCE, straight)
 
 
 def _around(x: Tensor, index: Tensor, near: Tensor, body: PosedBody) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -239,8 +256,13 @@ def _on_triangles(
     return normal, offset
 
 
+def lies_inside(distance: Tensor, height: Tensor) -> Tensor:
+    """Return whether queries lie inside the body, from their distances and heights over the nearest points [m]."""
+    return height < -DEEP_COSINE * distance * (distance > MAX_QUERY_DISTANCE)
+
+
 def _outward(away: Tensor, normal: Tensor) -> Tensor:
     """Return unit directions of vectors (3, M) away from the surface, on the side of its normals (3, M)."""
     length = away.norm(dim=0)
-    side = torch.where((away * normal).sum(0) < 0, -1.0, 1.0)
+    side = torch.where(lies_inside(length, (away * normal).sum(0)), -1.0, 1.0)
     return torch.where(length > SURFACE_EPSILON, away * (side / length.clamp_min(SURFACE_EPSILON)), normal)

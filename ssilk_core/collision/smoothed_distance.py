@@ -14,6 +14,7 @@ too the distance dips at every edge and corner; the gradient is tilted there by 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -77,6 +78,7 @@ def smoothed_distance(
     normals: Tensor,
     faces: Tensor,
     surface_epsilon: float,
+    lies_inside: Callable[[Tensor, Tensor], Tensor],
     candidates: Tensor | None = None,
 ) -> tuple[Tensor, SmoothedDistance]:
     """Return which queries have a triangle within reach (V, N), and their distances, zero for the others.
@@ -87,6 +89,7 @@ def smoothed_distance(
         points, normals: of the body, shape (B, 3, N).
         faces: triangles, shape (F, 3).
         surface_epsilon: nearer than this [m], the interpolated normal is the gradient.
+        lies_inside: from distances to the nearest points and heights over them, both [m] (M,).
         candidates: triangles that each row of queries may find, padded with -1, shape (V, L); all by default.
     """
     rows, frames = search_radius.shape
@@ -102,7 +105,8 @@ def smoothed_distance(
 
     normal = (normals[corners[:, best], :, frame[best]].permute(2, 0, 1) * weights[:, best]).sum(1)
     normal = normal / normal.norm(dim=0).clamp_min(1e-8)
-    inside, touches = (away[:, best] * normal).sum(0) < 0, nearest <= surface_epsilon
+    inside = lies_inside(nearest, nearest * (away[:, best] * normal).sum(0))
+    touches = nearest <= surface_epsilon
     sign = torch.where(inside, -1.0, 1.0)
     distance = sign * torch.where(touches, nearest, distance)
     gradient = torch.where(touches, normal, sign * gradient)

@@ -28,6 +28,8 @@ def closest_point_kernel(
     blocks: Tensor,
     patches: Tensor,
     max_distance: float,
+    max_depth: float,
+    deep_cosine: float,
     surface_epsilon: float,
 ) -> tuple[Tensor, Tensor]:
     """Return unit normals (V, 3, N) and offsets n . b (V, N) of the nearest body points b, as `nearest_planes` does.
@@ -37,7 +39,9 @@ def closest_point_kernel(
         points, normals: of the body (B, 3, N).
         blocks: the queries in compact blocks (`collision.nearest_vertex.compact_blocks`), int32.
         patches: corners of triangles in compact patches (`collision.closest_point.triangle_patches`), int32.
-        max_distance: queries further than this from their nearest vertex [m] use it as the nearest point.
+        max_distance, max_depth: queries further than the first from their nearest vertex [m] use it as the nearest
+            point, and the direction from there; unless they lie behind its tangent plane, and within the second.
+        deep_cosine: see `collision.distance.DEEP_COSINE`.
         surface_epsilon: queries nearer than this to their nearest point [m] use the interpolated normal.
     """
     vertices, _, frames = x.shape
@@ -46,15 +50,16 @@ def closest_point_kernel(
     garment, body = by_frame(x, blocks), by_frame(points, patches)
     grid = (frames, triton.cdiv(len(blocks), RUN))
     _search[grid](*garment, *body, blocks, patches, index, points, normals, normal, offset, frames, len(blocks),
-                  len(patches), max_distance * max_distance, surface_epsilon, blocks.shape[1], CHUNK, RUN,
+                  len(patches), max_distance * max_distance, max_depth * max_depth, max_distance, deep_cosine,
+                  surface_epsilon, blocks.shape[1], CHUNK, RUN,
                   num_warps=WARPS)  # fmt: skip
     return normal, offset
 
 
 @triton.jit
 def _search(garment, garment_boxes, body, body_boxes, blocks, patches, index, points, normals, normal, offset,
-            frames, block_count, patch_count, max_square, surface_epsilon, block_v: tl.constexpr, chunk: tl.constexpr,
-            run: tl.constexpr):  # fmt: skip
+            frames, block_count, patch_count, max_square, deepest, max_distance, deep_cosine, surface_epsilon,
+            block_v: tl.constexpr, chunk: tl.constexpr, run: tl.constexpr):  # fmt: skip
     frame = tl.program_id(0).to(tl.int64)
     garment += frame * 3 * block_count * block_v
     garment_boxes += frame * 6 * block_count
@@ -67,7 +72,9 @@ def _search(garment, garment_boxes, body, body_boxes, blocks, patches, index, po
         first = tl.load(index + vertex * frames + frame).to(tl.int64)
         ox, oy, oz = _three(points + first * 3 * frames + frame, frames)
         square = dot(x - ox, y - oy, z - oz, x - ox, y - oy, z - oz)
-        near = square < max_square
+        mx, my, mz = _three(normals + first * 3 * frames + frame, frames)
+        behind = dot(mx, my, mz, x - ox, y - oy, z - oz) < 0
+        near = (square < max_square) | (behind & (square < deepest))
         bound = tl.max(tl.where(near, square, 0.0), axis=0)
         winner, s, t = _nearest(x, y, z, garment_boxes + block, block_count, body, body_boxes, patch_count, bound,
                                 block_v, chunk)  # fmt: skip
@@ -82,8 +89,9 @@ def _search(garment, garment_boxes, body, body_boxes, blocks, patches, index, po
         nx, ny, nz = nx / length, ny / length, nz / length
         ax, ay, az = x - bx, y - by, z - bz
         away = tl.sqrt(dot(ax, ay, az, ax, ay, az))
-        side = tl.where(dot(ax, ay, az, nx, ny, nz) < 0, -1.0, 1.0) / tl.maximum(away, surface_epsilon)
-        outward = near & (away > surface_epsilon)
+        level = tl.where(away > max_distance, -deep_cosine * away, 0.0)
+        side = tl.where(near & (dot(ax, ay, az, nx, ny, nz) < level), -1.0, 1.0) / tl.maximum(away, surface_epsilon)
+        outward = away > surface_epsilon
         nx, ny, nz = (
             tl.where(outward, side * ax, nx),
             tl.where(outward, side * ay, ny),

@@ -19,7 +19,7 @@ TINY = tl.constexpr(1e-30)
 
 
 def one_ring_kernel(
-    x: Tensor, index: Tensor, points: Tensor, normals: Tensor, rings: Tensor, max_distance: float
+    x: Tensor, index: Tensor, points: Tensor, normals: Tensor, rings: Tensor, max_distance: float, straight: bool
 ) -> tuple[Tensor, Tensor]:
     """Return unit normals (V, 3, N) and offsets n . b (V, N) of the nearest body points b.
 
@@ -28,6 +28,7 @@ def one_ring_kernel(
         points, normals: of the body (B, 3, N).
         rings: neighbours around each vertex (`collision.one_ring.triangle_rings`), int32.
         max_distance: queries further than this from their nearest vertex [m] use it as the nearest point.
+        straight: whether the normals of these are the directions from there, not those of the vertices.
     """
     x, points, normals = x.contiguous(), points.contiguous(), normals.contiguous()
     vertices, _, frames = x.shape
@@ -35,13 +36,26 @@ def one_ring_kernel(
     normal, offset = torch.empty_like(x), x.new_empty(vertices, frames)
     grid = (vertices, triton.cdiv(frames, BLOCK))
     _surface[grid](x, index, points, normals, rings, normal, offset, frames, rings.shape[1],
-                   max_distance * max_distance, BLOCK,
+                   max_distance * max_distance, straight, BLOCK,
                    num_warps=1)  # fmt: skip
     return normal, offset
 
 
 @triton.jit
-def _surface(x, index, points, normals, rings, normal, offset, frames, width, max_square, block: tl.constexpr):
+def _surface(
+    x,
+    index,
+    points,
+    normals,
+    rings,
+    normal,
+    offset,
+    frames,
+    width,
+    max_square,
+    straight: tl.constexpr,
+    block: tl.constexpr,
+):
     v = tl.program_id(0).to(tl.int64)
     n = tl.program_id(1) * block + tl.arange(0, block)
     inside = n < frames
@@ -67,6 +81,9 @@ def _surface(x, index, points, normals, rings, normal, offset, frames, width, ma
     nx, ny, nz = _mixed(normals, frames, first, j_best, k_best, s_best, t_best, n, inside, near)
     length = tl.maximum(tl.sqrt(dot(nx, ny, nz, nx, ny, nz)), 1e-8)
     nx, ny, nz = nx / length, ny / length, nz / length
+    if straight:
+        length = tl.sqrt(tl.maximum(dot(px, py, pz, px, py, pz), TINY))
+        nx, ny, nz = tl.where(near, nx, px / length), tl.where(near, ny, py / length), tl.where(near, nz, pz / length)
     store3(normal + v * 3 * frames, frames, n, inside, nx, ny, nz)
     tl.store(offset + v * frames + n, dot(nx, ny, nz, bx, by, bz), mask=inside)
 

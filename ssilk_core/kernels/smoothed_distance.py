@@ -30,6 +30,8 @@ def smoothed_distance_kernel(
     candidates: Tensor | None,
     *,
     max_distance: float,
+    max_depth: float,
+    deep_cosine: float,
     surface_epsilon: float,
     exponent: float,
     search_margin: float,
@@ -37,8 +39,9 @@ def smoothed_distance_kernel(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return gradients (V, 3, N), smoothed distances (V, N) and their curvature (V, 3, 3, N).
 
-    The values are those of `collision.smoothed_distance.smoothed_distance`; for queries further than `max_distance`
-    from the nearest vertex, those of its tangent plane.
+    The values are those of `collision.smoothed_distance.smoothed_distance`. For queries further than `max_distance`
+    from the nearest vertex they are those of its tangent plane. Without `candidates` they are those of the vertex
+    itself instead, unless queries lie behind that plane and within `max_depth`.
 
     Args:
         x: queries (V, 3, N); index: their nearest body vertices (V, N), int32.
@@ -56,15 +59,16 @@ def smoothed_distance_kernel(
     curvature = x.new_empty(vertices, 3, 3, frames)
     grid = (vertices, triton.cdiv(frames, BLOCK))
     _smoothed[grid](x, index, points, normals, faces, spheres, table, normal, distance, curvature, frames, width,
-                    max_distance * max_distance, surface_epsilon, exponent, edge_epsilon, 1 + search_margin,
+                    max_distance * max_distance, max_depth * max_depth, max_distance, deep_cosine, surface_epsilon,
+                    exponent, edge_epsilon, 1 + search_margin,
                     candidates is not None, BLOCK, num_warps=1)  # fmt: skip
     return normal, distance, curvature
 
 
 @triton.jit
 def _smoothed(x, index, points, normals, faces, spheres, table, normal, distances, curvature, frames, width,
-              max_square, surface_epsilon, exponent, edge_epsilon, search_margin, candidates: tl.constexpr,
-              block: tl.constexpr):  # fmt: skip
+              max_square, deepest, max_distance, deep_cosine, surface_epsilon, exponent, edge_epsilon,
+              search_margin, candidates: tl.constexpr, block: tl.constexpr):  # fmt: skip
     v = tl.program_id(0).to(tl.int64)
     n = tl.program_id(1) * block + tl.arange(0, block)
     inside = n < frames
@@ -74,6 +78,14 @@ def _smoothed(x, index, points, normals, faces, spheres, table, normal, distance
     mx, my, mz = load3(normals + first * 3 * frames, frames, n, inside)
     square = dot(qx - ox, qy - oy, qz - oz, qx - ox, qy - oy, qz - oz)
     near = inside & (square < max_square)
+    if not candidates:
+        near = near | (inside & (square < deepest) & (dot(mx, my, mz, qx - ox, qy - oy, qz - oz) < 0))
+        length = tl.sqrt(tl.maximum(square, TINY))
+        mx, my, mz = (
+            tl.where(near, mx, (qx - ox) / length),
+            tl.where(near, my, (qy - oy) / length),
+            tl.where(near, mz, (qz - oz) / length),
+        )
     radius = tl.sqrt(square) * search_margin * 1.000001  # the nearest vertex is not nearer than the nearest point
     zero = tl.zeros_like(qx)
     best = zero + 1e30
@@ -131,7 +143,7 @@ def _smoothed(x, index, points, normals, faces, spheres, table, normal, distance
     nx, ny, nz = _mixed(normals, frames, i_best, j_best, k_best, s_best, t_best, n, inside, inside)
     length = tl.maximum(tl.sqrt(dot(nx, ny, nz, nx, ny, nz)), 1e-8)
     nx, ny, nz = nx / length, ny / length, nz / length
-    within = found & (dot(wx, wy, wz, nx, ny, nz) < 0)
+    within = found & (dot(wx, wy, wz, nx, ny, nz) < tl.where(best > max_distance, -deep_cosine, 0.0))
     sign = tl.where(within, -1.0, 1.0)
     touches = found & (best <= surface_epsilon)
     gx, gy, gz = tl.where(touches, nx, sign * gx), tl.where(touches, ny, sign * gy), tl.where(touches, nz, sign * gz)

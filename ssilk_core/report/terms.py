@@ -11,7 +11,6 @@ import numpy as np
 from ..assets import Floats, Mesh
 from ..collision import CoveredPoints, PosedBody, ShownCounts, signed_distance
 from ..collision.covered_skin import shown_skin
-from ..collision.one_ring import triangle_rings
 from ..constants import GRAVITY
 from ..energy import TERMS, GarmentEnergy
 from ..energy.stretch import deformation_gradient_operator
@@ -59,11 +58,11 @@ class TermsMeter:
         self.past: deque = deque(maxlen=2)
         import torch
 
-        self.rings, self.covered = None, None
+        self.faces, self.covered = None, None
         if self.body:
             covered = CoveredPoints(self.body, self.garment, device=torch.device("cpu"))
             self.covered = covered if len(covered) else None
-            self.rings = torch.as_tensor(triangle_rings(self.body.faces, self.body.vertex_count))
+            self.faces = torch.as_tensor(np.array(self.body.faces))
         self.rest = self._height(self.garment.points, None if self.body is None else self.body.points)
 
     def add(self, points: Floats, body: Floats | None, time: float) -> None:
@@ -114,7 +113,7 @@ class TermsMeter:
             return {"collision": 0.0, SHARE: 0.0, SHOWN: 0.0, BARE: 0.0}
         normals = vertex_normals(body, self.body.faces)
         at, towards = (torch.as_tensor(values, dtype=torch.float32)[:, :, None] for values in (body, normals))
-        distance = signed_distance(self.energy.cloth.positions(x), PosedBody(at, towards, self.rings))
+        distance = signed_distance(self.energy.cloth.positions(x), PosedBody(at, towards, faces=self.faces))
         inside = 100 * float((distance[: len(x)] < 0).double().mean())
         found = {"collision": float(self.energy.collision_at(distance)), SHARE: inside, SHOWN: 0.0, BARE: 0.0}
         if self.covered:

@@ -107,6 +107,54 @@ def test_planes_held_still_are_the_true_gradient_of_the_distance() -> None:
     assert away.median() < 1e-3 and away.quantile(0.9) < 0.1  # the others lie within a step of a crease's two sides
 
 
+def test_far_cloth_is_inside_only_where_it_is() -> None:
+    """The tangent planes of a coarse ball's vertices extend beyond it, and cut through all that is around it."""
+    ball = trimesh.creation.icosphere(subdivisions=1, radius=0.3)  # edges of 16 to 19 cm
+    body, x = body_of(ball), scattered(4000, 1)
+    x = x / x.norm(dim=1, keepdim=True) * torch.linspace(0.06, 1.2, 4000)[:, None, None]
+    expected, *_ = igl.signed_distance(x[..., 0].double().numpy(), ball.vertices, ball.faces)
+    expected = torch.tensor(expected[:, None], dtype=torch.float32)
+    found = distances(x.to(DEVICE), body).cpu()
+    assert ((found < 0) == (expected < 0)).all()
+    near = expected < 0.02  # a vertex is nowhere further than 12 cm from the surface that far out
+    torch.testing.assert_close(found[near], expected[near], rtol=0, atol=3e-6)
+    assert (found[~near] > 0.019).all()
+
+
+def test_no_border_of_an_open_body_is_its_inside() -> None:
+    """Cloth 20 cm beside a sheet and a little behind it is not 20 cm deep."""
+    points, faces = np.mgrid[0:0.4:9j, 0:0.4:9j].reshape(2, -1), []
+    for i in range(8):
+        for j in range(8):
+            a = 9 * i + j
+            faces += [[a, a + 1, a + 10], [a, a + 10, a + 9]]
+    sheet = trimesh.Trimesh(np.stack([points[0], np.zeros(81), points[1]], axis=1), faces, process=False)
+    below, beside = torch.tensor([[0.2, -0.1, 0.2], [0.6, -0.02, 0.2]])[:, None, :, None]
+    up = np.sign(sheet.face_normals[0, 1])
+    assert up * distances(below.to(DEVICE), body_of(sheet)).cpu() == pytest.approx(-0.1, abs=1e-5)
+    assert distances(beside.to(DEVICE), body_of(sheet)).cpu() == pytest.approx(0.201, abs=1e-3)
+
+
+def test_contact_adds_no_energy() -> None:
+    """Along any path the distance changes as the held plane says: forces that follow it do no net work in a loop."""
+    body, step = body_of(trimesh.creation.icosphere(subdivisions=1, radius=0.3)), 1e-3
+    start, way = scattered(400, 1).chunk(2)
+    start = start / start.norm(dim=1, keepdim=True) * torch.linspace(0.16, 0.9, 200)[:, None, None]
+    path = start + step * way / way.norm(dim=1, keepdim=True) * torch.arange(200)
+    normal, offset = (values.cpu() for values in nearest_planes(path.to(DEVICE), still_for(body, 200)))
+    height = (normal * path).sum(1) - offset
+    held = (normal[..., :-1] * path[..., 1:]).sum(1) - offset[..., :-1]
+    reach = 0.02  # contact begins nearer than this
+    assert ((height[:, 1:].clamp_max(reach) - held.clamp_max(reach)).abs() < 2.1 * step).all()
+
+
+def still_for(body: PosedBody, frames: int) -> PosedBody:
+    """Return a body that does not move for so many frames."""
+    return replace(
+        body, **{name: getattr(body, name).expand(-1, -1, frames).contiguous() for name in ("points", "normals")}
+    )
+
+
 def test_the_kernel_finds_what_its_reference_does() -> None:
     meshes = [slab(), slab(1.1)]
     body, x = body_of(*meshes), scattered(90, 2).to(DEVICE)

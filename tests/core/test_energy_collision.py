@@ -32,7 +32,8 @@ def plane() -> PosedBody:
 
 
 def test_distance_to_a_plane_is_the_height_over_it():
-    x = torch.tensor(np.random.default_rng(0).uniform(-0.9, 0.9, size=(50, 3, 1)), requires_grad=True)
+    x = np.random.default_rng(0).uniform(-0.9, 0.9, size=(50, 3, 1)) * [[1], [0.03], [1]] + [[0], [0.5], [0]]
+    x = torch.tensor(x, requires_grad=True)
     distance = signed_distance(x, plane())
     np.testing.assert_allclose(distance.detach(), x.detach()[:, 1] - 0.5, atol=1e-12)
     distance.sum().backward()
