@@ -98,7 +98,9 @@ def test_turning_the_character_is_turning_gravity_back(sheet):
     rng = np.random.default_rng(4)
     energy = GarmentEnergy(sheet, FABRIC, dtype=torch.float64)
     path = torch.tensor(sheet.points[:, :, None] + 0.02 * rng.normal(size=(sheet.vertex_count, 3, 3)))
-    body = torch.tensor(rng.normal(scale=0.3, size=(40, 3, 1)))
+    body = torch.tensor(
+        sheet.points[rng.integers(sheet.vertex_count, size=40), :, None] + 0.02 * rng.normal(size=(40, 3, 1))
+    )
     normals = torch.nn.functional.normalize(torch.tensor(rng.normal(size=(40, 3, 1))), dim=1)
     turn = torch.tensor(Rotation.random(random_state=1).as_matrix())
 

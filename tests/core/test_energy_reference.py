@@ -196,7 +196,9 @@ def drag(case: Case, x: np.ndarray, frame: int) -> tuple[float, np.ndarray]:
 def contact_of_a_point(case: Case, point: np.ndarray, frame: int) -> tuple[float, np.ndarray]:
     """Energy and gradient for each area, by the pressure integrated over the depth."""
     nearest = np.argmin(np.linalg.norm(case.points[..., frame] - point, axis=1))
-    normal, m = case.normals[nearest, :, frame], STVK.margin
+    away, m = point - case.points[nearest, :, frame], STVK.margin
+    length = np.linalg.norm(away)
+    normal = case.normals[nearest, :, frame] if length < 0.08 else away / length  # further away, nothing is touched
     depth = max(m + STVK.thickness / 2 - normal @ (point - case.points[nearest, :, frame]), 0)
     soft, deep = min(depth, m), max(depth - m, 0)
     energy = STVK.contact * (soft**3 / (6 * m) + m * deep / 2 + deep**2 / 2)

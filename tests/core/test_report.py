@@ -50,11 +50,11 @@ def test_a_sheet_that_falls_freely_has_the_energies_of_one(sheet):
 
 def test_what_is_inside_the_body_is_counted_and_costs_its_depth(sheet):
     """Far from the origin: points are taken about the garment, where single precision is fine."""
-    body, far = ball(), np.array([4000.0, 0, -9000])
+    body, far = ball(0.24), np.array([4000.0, 0, -9000])
     meter = TermsMeter(sheet, body, CLOTH, 30.0)
     points = sheet.points + [0, 0.275, 0]  # its middle in the ball's
     meter.add(points + far, body.points + far, 1.0)
-    depth = 0.3 - np.linalg.norm(points, axis=1)
+    depth = 0.24 - np.linalg.norm(points, axis=1)
     assert meter.values[SHARE] == [pytest.approx(100 * np.mean(depth > 0), abs=2)]
     assert meter.values["collision"][0] == pytest.approx(7.0 * (depth.clip(0) ** 2).sum(), rel=0.03)
     assert meter.values["gravity"][0] == pytest.approx(9.81 * 0.022 * 0.275, rel=1e-6)
