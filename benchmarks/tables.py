@@ -183,7 +183,7 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--clips", nargs="+", default=[], metavar="NAME", help="only these clips")
     parser.add_argument("--index", type=Path, help="JSON list of clips with their splits and tags")
     parser.add_argument("--reference", type=Path, metavar="SHOTS", help="folder of the simulator's shots")
-    parser.add_argument("--exact", action="store_true", help="collide with the whole body, as the simulator does")
+    parser.add_argument("--exact", action="store_true", help="tight cloth collides as in the simulator")
     parser.add_argument("--loop", type=int, default=2000, help="of evaluate: frames to loop (default 2000)")
     parser.add_argument("--minimum", action="store_true", help="of evaluate: minimise the energy of held poses")
     parser.add_argument("--simulate-stops", action="store_true", help="of evaluate: simulate the stops too")

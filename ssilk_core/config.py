@@ -124,8 +124,8 @@ class TrainConfig:
             paper.
         ema_decay: decay of the exponential moving average of the parameters, which is validated and saved; 0 for
             none. It is smaller at first: `training.step.averaging_decay`.
-        closest_point: how the closest body point is found: on the "triangles" around the nearest vertex, or as the
-            nearest of the "vertices", which is faster and coarser.
+        closest_point: how the closest body point is found: on the "triangles" of the body, for tight cloth those
+            around the nearest vertex, or as the nearest of the "vertices", which is faster and coarser.
         validate_every: iterations between validations.
         valid_frames: frames of each clip that are validated.
         seed: seed of all random numbers.

@@ -108,7 +108,7 @@ def evaluated(
     """Evaluate the models that options name; return the rows, and the same as files hold them.
 
     Args:
-        exact: collide with the whole body, as the simulator does (slow on a CPU).
+        exact: see `evaluation.methods.EvaluationScene`.
     """
     from ..devices import select_device
     from ..evaluation.run import evaluate

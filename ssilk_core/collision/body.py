@@ -63,4 +63,5 @@ class CollisionBody:
         """
         points, normals = self.skin.surface(self.points[:, :, 0], self.normals[:, :, 0], character)
         rings = self.rings if surface and not exact else None
-        return PosedBody(points, normals, rings, self.groups, *((self.faces, self.patches) if surface else ()))
+        exactly = (self.faces, self.patches) if surface and len(self.faces) else ()
+        return PosedBody(points, normals, rings, self.groups, *exactly)

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The exact nearest point of a body's whole surface.
 
-The nearest point may lie on a triangle that does not touch the nearest vertex. Training ignores that
-(`nearest_vertex`, `one_ring`): there the distance is too large, by millimetres on a coarse body, and discontinuous.
-A solver does not converge across such discontinuities. This module therefore checks every triangle that can hold the
-nearest point. The result is the Euclidean distance, which is continuous, and smooth where the nearest point is
-unique.
+The nearest point may lie on a triangle that does not touch the nearest vertex. A search around that vertex
+(`nearest_vertex`, `one_ring`) ignores this: there the distance is too large, by millimetres on a coarse body, and
+discontinuous. A solver does not converge across such discontinuities, and in training loose cloth gains energy from
+them. This module therefore checks every triangle that can hold the nearest point. The result is the Euclidean
+distance, which is continuous, and smooth where the nearest point is unique.
 """
 
 from __future__ import annotations

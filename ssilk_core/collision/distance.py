@@ -16,12 +16,12 @@ from .smoothed_distance import EDGE_EPSILON, SEARCH_MARGIN, SMOOTHING_EXPONENT, 
 
 # Cloth further than this from every body vertex [m] is searched for on the surface only if it may lie inside: behind
 # the tangent plane at the nearest vertex, and no deeper than `MAX_DEPTH`. All other cloth this far away touches
-# nothing. The tangent plane itself must not decide: it extends beyond the body, and far cloth that met it would be
-# pushed about by planes that jump from vertex to vertex, which adds energy without end.
+# nothing. The tangent plane alone must not decide: it extends beyond the body, and differs from vertex to vertex. In
+# training these jumps added energy to cloth that the body never touched.
 MAX_QUERY_DISTANCE = 0.08
 MAX_DEPTH = 0.25
-# Deeper than `MAX_QUERY_DISTANCE`, cloth lies inside only where the direction to the nearest point is within 60
-# degrees of the normal there. At the border of an open body it is not.
+# At the border of an open body the direction to the nearest point is across the normal there, and inside it is along
+# it. `MAX_QUERY_DISTANCE` deep or deeper, the two may differ by 60 degrees; the cosine grows from zero to that.
 DEEP_COSINE = 0.5
 SMOOTHING_MEMORY_FACTOR = 4  # memory of a candidate pair for the smoothed distance, relative to the exact one
 SURFACE_EPSILON = 1e-5  # [m]; closer to the surface, float32 no longer resolves the direction to it
@@ -180,7 +180,8 @@ def _at_vertices(
     if patches is None:
         if body.faces is not None:
             searched |= ((normal * away).sum(1) < 0) & (length < MAX_DEPTH)
-        normal = torch.where(searched[:, None], normal, away / length[:, None].clamp_min(SURFACE_EPSILON))
+        tangent = searched[:, None] & (body.faces is None)  # with faces, what is searched is found there
+        normal = torch.where(tangent, normal, away / length[:, None].clamp_min(SURFACE_EPSILON))
     return index, normal, (normal * point).sum(1), length.where(searched, -1)
 
 
@@ -258,7 +259,7 @@ def _on_triangles(
 
 def lies_inside(distance: Tensor, height: Tensor) -> Tensor:
     """Return whether queries lie inside the body, from their distances and heights over the nearest points [m]."""
-    return height < -DEEP_COSINE * distance * (distance > MAX_QUERY_DISTANCE)
+    return height < -DEEP_COSINE * distance * (distance / MAX_QUERY_DISTANCE).clamp_max(1)
 
 
 def _outward(away: Tensor, normal: Tensor) -> Tensor:

@@ -63,8 +63,8 @@ class EvaluationScene:
     Args:
         scene: with every body mesh, reachable or not.
         fps: of every method.
-        exact: collide with the nearest point of the whole body, as the simulator does, rather than of the triangles
-            around the nearest vertex, as training does.
+        exact: tight cloth collides with the nearest point of the body beneath it, as in the simulator, rather than
+            of the triangles around the nearest vertex, as in training.
 
     Attributes:
         columns: maps positions to both columns of all deformation gradients.

@@ -76,8 +76,9 @@ def _search(garment, garment_boxes, body, body_boxes, blocks, patches, index, po
         behind = dot(mx, my, mz, x - ox, y - oy, z - oz) < 0
         near = (square < max_square) | (behind & (square < deepest))
         bound = tl.max(tl.where(near, square, 0.0), axis=0)
-        winner, s, t = _nearest(x, y, z, garment_boxes + block, block_count, body, body_boxes, patch_count, bound,
-                                block_v, chunk)  # fmt: skip
+        winner, s, t, least = _nearest(x, y, z, garment_boxes + block, block_count, body, body_boxes, patch_count,
+                                       bound, block_v, chunk)  # fmt: skip
+        near = near & (least < float("inf"))
         corner = patches + winner // LANES * 4 * LANES + winner % LANES
         i = tl.where(near, tl.load(corner), first)
         j = tl.where(near, tl.load(corner + LANES), first)
@@ -89,7 +90,7 @@ def _search(garment, garment_boxes, body, body_boxes, blocks, patches, index, po
         nx, ny, nz = nx / length, ny / length, nz / length
         ax, ay, az = x - bx, y - by, z - bz
         away = tl.sqrt(dot(ax, ay, az, ax, ay, az))
-        level = tl.where(away > max_distance, -deep_cosine * away, 0.0)
+        level = -deep_cosine * away * tl.minimum(away / max_distance, 1.0)
         side = tl.where(near & (dot(ax, ay, az, nx, ny, nz) < level), -1.0, 1.0) / tl.maximum(away, surface_epsilon)
         outward = away > surface_epsilon
         nx, ny, nz = (
@@ -107,7 +108,7 @@ def _search(garment, garment_boxes, body, body_boxes, blocks, patches, index, po
 @triton.jit
 def _nearest(x, y, z, box, block_count, body, body_boxes, patch_count, bound, block_v: tl.constexpr,
              chunk: tl.constexpr):  # fmt: skip
-    """For each vertex of a block: the nearest triangle within reach, and the nearest point on it."""
+    """For each vertex of a block: the nearest triangle within reach, the nearest point and its squared distance."""
     lx, ly, lz = _three(box, block_count)
     hx, hy, hz = _three(box + 3 * block_count, block_count)
     lane = tl.arange(0, LANES)[None, :]
@@ -130,7 +131,7 @@ def _nearest(x, y, z, box, block_count, body, body_boxes, patch_count, bound, bl
     winner = tl.min(tl.where(best == least[:, None], place, 2147483647), axis=1)
     chosen = (place == winner[:, None]) & (best == least[:, None])
     s, t = tl.sum(tl.where(chosen, s_best, 0.0), axis=1), tl.sum(tl.where(chosen, t_best, 0.0), axis=1)
-    return winner, s, t
+    return winner, s, t, least
 
 
 @triton.jit

@@ -81,11 +81,7 @@ def _smoothed(x, index, points, normals, faces, spheres, table, normal, distance
     if not candidates:
         near = near | (inside & (square < deepest) & (dot(mx, my, mz, qx - ox, qy - oy, qz - oz) < 0))
         length = tl.sqrt(tl.maximum(square, TINY))
-        mx, my, mz = (
-            tl.where(near, mx, (qx - ox) / length),
-            tl.where(near, my, (qy - oy) / length),
-            tl.where(near, mz, (qz - oz) / length),
-        )
+        mx, my, mz = (qx - ox) / length, (qy - oy) / length, (qz - oz) / length
     radius = tl.sqrt(square) * search_margin * 1.000001  # the nearest vertex is not nearer than the nearest point
     zero = tl.zeros_like(qx)
     best = zero + 1e30
@@ -143,7 +139,7 @@ def _smoothed(x, index, points, normals, faces, spheres, table, normal, distance
     nx, ny, nz = _mixed(normals, frames, i_best, j_best, k_best, s_best, t_best, n, inside, inside)
     length = tl.maximum(tl.sqrt(dot(nx, ny, nz, nx, ny, nz)), 1e-8)
     nx, ny, nz = nx / length, ny / length, nz / length
-    within = found & (dot(wx, wy, wz, nx, ny, nz) < tl.where(best > max_distance, -deep_cosine, 0.0))
+    within = found & (dot(wx, wy, wz, nx, ny, nz) < -deep_cosine * tl.minimum(best / max_distance, 1.0))
     sign = tl.where(within, -1.0, 1.0)
     touches = found & (best <= surface_epsilon)
     gx, gy, gz = tl.where(touches, nx, sign * gx), tl.where(touches, ny, sign * gy), tl.where(touches, nz, sign * gz)

@@ -7,7 +7,7 @@ Implicit Euler with time step dt is the minimum of
     + m/(2 dt^2) |x - (2 x' - x'')|^2 + drag a/(2 dt) |x - advected|^2
 
 (`energy.GarmentEnergy`); a quasi-static state has none of the last two terms. The distance to the body is that to the
-whole surface that a vertex can touch. Training uses only the triangles around the nearest vertex. The distance is
+whole surface that a vertex can touch. In training tight cloth has only the triangles around the nearest vertex. It is
 smoothed on its creases (`collision.smoothed_distance`), so that the gradient vanishes at minima there.
 """
 

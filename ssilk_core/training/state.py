@@ -29,7 +29,7 @@ from .validation import Score
 
 Tensors = dict[str, Tensor]
 
-FORMAT = 3  # of training states; settings had other names in format 1, fabrics no contact on surfaces in format 2
+FORMAT = 4  # of training states; 1: other names of settings, 2: no contact on surfaces, 3: contact far from the body
 HEADER_NAME = "ssilk_state"  # of the JSON document in the metadata
 SAMPLER_PREFIX = "sampler."  # of the sampler's tensors; all others are parameters or optimiser state
 

@@ -121,22 +121,53 @@ def test_far_cloth_is_inside_only_where_it_is() -> None:
     assert (found[~near] > 0.019).all()
 
 
-def test_no_border_of_an_open_body_is_its_inside() -> None:
-    """Cloth 20 cm beside a sheet and a little behind it is not 20 cm deep."""
+def sheet() -> trimesh.Trimesh:
+    """A square of 40 cm in the plane y = 0, in quads of 5 cm."""
     points, faces = np.mgrid[0:0.4:9j, 0:0.4:9j].reshape(2, -1), []
     for i in range(8):
         for j in range(8):
             a = 9 * i + j
             faces += [[a, a + 1, a + 10], [a, a + 10, a + 9]]
-    sheet = trimesh.Trimesh(np.stack([points[0], np.zeros(81), points[1]], axis=1), faces, process=False)
-    below, beside = torch.tensor([[0.2, -0.1, 0.2], [0.6, -0.02, 0.2]])[:, None, :, None]
-    up = np.sign(sheet.face_normals[0, 1])
-    assert up * distances(below.to(DEVICE), body_of(sheet)).cpu() == pytest.approx(-0.1, abs=1e-5)
-    assert distances(beside.to(DEVICE), body_of(sheet)).cpu() == pytest.approx(0.201, abs=1e-3)
+    return trimesh.Trimesh(np.stack([points[0], np.zeros(81), points[1]], axis=1), faces, process=False)
 
 
-def test_contact_adds_no_energy() -> None:
-    """Along any path the distance changes as the held plane says: forces that follow it do no net work in a loop."""
+def test_no_border_of_an_open_body_is_its_inside() -> None:
+    """Cloth beside a sheet and a little behind it is not as deep as it is far away."""
+    body = body_of(sheet())
+    up = float(body.normals[0, 1, 0])
+    x = torch.tensor([[0.2, -0.1 * up, 0.2], [0.6, -0.02 * up, 0.2], [0.44, -0.001 * up, 0.2]])[:, :, None]
+    found = distances(x.to(DEVICE), body).cpu()[:, 0]
+    np.testing.assert_allclose(found, [-0.1, np.hypot(0.2, 0.02), np.hypot(0.04, 0.001)], atol=1e-6)
+
+
+def test_a_vertex_without_triangles_is_no_surface() -> None:
+    """Where a body is cut, vertices may be left over; nothing lies inside them."""
+    body, x = body_of(sheet()), torch.tensor([[1.0, -0.05, 1.0], [1.0, -0.2, 1.0]])[:, :, None]
+    left, up = torch.tensor([[[1.0], [0.0], [1.0]]]), torch.tensor([[[0.0], [1.0], [0.0]]])
+    body = replace(
+        body,
+        points=torch.cat([body.points, left.to(DEVICE)]),
+        normals=torch.cat([body.normals, up.to(DEVICE)]),
+        patches=torch.as_tensor(triangle_patches(np.array(sheet().vertices), np.array(sheet().faces)), device=DEVICE),
+    )
+    for normal, offset in (nearest_planes(x.to(DEVICE), body), distance._by_kernels(x.to(DEVICE), body, None)):
+        np.testing.assert_allclose(((normal * x.to(DEVICE)).sum(1) - offset).cpu()[:, 0], [0.05, 0.2], atol=1e-6)
+
+
+@pytest.mark.parametrize("shape", ["ball", "sheet"])
+def test_the_kernel_tells_the_inside_of_far_cloth_as_its_reference_does(shape) -> None:
+    mesh = trimesh.creation.icosphere(subdivisions=1, radius=0.3) if shape == "ball" else sheet()
+    body, x = body_of(mesh), scattered(300, 1)
+    x = x + torch.tensor([[0.4], [0.0], [0.2]]) if shape == "sheet" else x
+    patches = torch.as_tensor(triangle_patches(np.array(mesh.vertices), np.array(mesh.faces)), device=DEVICE)
+    normal, offset = distance._by_kernels(x.to(DEVICE), replace(body, patches=patches), None)
+    expected = distances(x.to(DEVICE), body)
+    assert (expected < -0.08).any() and (expected > 0.08).any()
+    torch.testing.assert_close((normal * x.to(DEVICE)).sum(1) - offset, expected, rtol=0, atol=1e-5)
+
+
+def test_the_distance_to_a_closed_body_does_not_jump() -> None:
+    """Along any path it changes as the held plane says, so that forces which follow that plane add no energy."""
     body, step = body_of(trimesh.creation.icosphere(subdivisions=1, radius=0.3)), 1e-3
     start, way = scattered(400, 1).chunk(2)
     start = start / start.norm(dim=1, keepdim=True) * torch.linspace(0.16, 0.9, 200)[:, None, None]

@@ -155,7 +155,7 @@ def clearance() -> Text:
 
 
 def moving() -> Text:
-    runs, skins = result("moving_training"), (result("shown_skin_shipped"), result("shown_skin_turning"))
+    runs, skins = result("moving_training"), (result("shown_skin_moving"), result("shown_skin_turning"))
     garments = ("cape", "fringe_skirt", "hooded_dress")
     for name in garments:
         for skin, ending, words in ((skins[1], "_turning", "turn"), (skins[0], "", "turn and move")):
@@ -168,6 +168,27 @@ def moving() -> Text:
     for figure, words in (("mean", "the mean"), ("worst", "the worst frame")):
         less = sum(skins[0][n][s]["network"][figure] < skins[1][n][s]["network"][figure] for n, s in cells_of)
         yield f"{words} is lower in {less} of {len(cells_of)} cells"
+
+
+def contact() -> Text:
+    trainings = result("moving_training"), result("contact_training")
+    skins = result("shown_skin_moving"), result("shown_skin_shipped")
+    garments = ("cape", "fringe_skirt", "hooded_dress")
+    for name in garments:
+        for words, runs, skin in zip(("before", "now"), trainings, skins):
+            run, own = runs[name], [skin[name][split]["network"] for split in HELD_OUT]
+            best = run["total"].index(min(run["total"]))
+            kept = f"{run['iterations'][best]:,} of {run['iterations'][-1]:,}"
+            pairs = (f"{share_3(at['mean'])}, {share_1(at['worst'])}" for at in own)
+            figures = (f"{run[term][best]:.3f}".replace("-", "−") for term in ("total", "stretch", "gravity"))
+            yield row("" if words == "now" else name.replace("_", " "), words, kept, *figures, *pairs)
+    cells_of = list(product(garments, HELD_OUT))
+    for figure, words in (("mean", "the mean"), ("worst", "the worst frame")):
+        less = sum(skins[1][n][s]["network"][figure] < skins[0][n][s]["network"][figure] for n, s in cells_of)
+        yield f"{words} is lower in {less} of {len(cells_of)} cells"
+    for name in garments:
+        run = trainings[1][name]
+        yield f"{name.replace('_', ' ')} {run['total'][-1] / min(run['total']):.2f}"
 
 
 def static_states() -> Text:
@@ -545,7 +566,8 @@ def scenes() -> Text:
 
 
 PARTS = (
-    opening, conditions, shown, clearance, moving, static_states, table1, findings, dynamics, ablations, wardrobe,
+    opening, conditions, shown, clearance, moving, contact, static_states, table1, findings, dynamics, ablations,
+    wardrobe,
     long_training, short_training, rest, playing, sizes, levels, refinement, inside_the_body, stress,
     training_speed, scenes,
 )  # fmt: skip
