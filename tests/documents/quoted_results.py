@@ -154,39 +154,46 @@ def clearance() -> Text:
         yield f"{ends[0]} to {ends[1]} J for the {garment}"
 
 
+LOOSE = ("cape", "fringe_skirt", "hooded_dress")
+
+
+def kept_at(run: dict) -> tuple[int, str]:
+    """Return the best validation of a training, and at which of its iterations that was."""
+    best = run["total"].index(min(run["total"]))
+    return best, f"{run['iterations'][best]:,} of {run['iterations'][-1]:,}"
+
+
+def less_skin(now: dict, before: dict) -> Text:
+    """Yield in how many cells, of a loose garment and a split, less skin shows under the network."""
+    cells_of = list(product(LOOSE, HELD_OUT))
+    for figure, words in (("mean", "the mean"), ("worst", "the worst frame")):
+        less = sum(now[n][s]["network"][figure] < before[n][s]["network"][figure] for n, s in cells_of)
+        yield f"{words} is lower in {less} of {len(cells_of)} cells"
+
+
 def moving() -> Text:
     runs, skins = result("moving_training"), (result("shown_skin_moving"), result("shown_skin_turning"))
-    garments = ("cape", "fringe_skirt", "hooded_dress")
-    for name in garments:
+    for name in LOOSE:
         for skin, ending, words in ((skins[1], "_turning", "turn"), (skins[0], "", "turn and move")):
             run, own = runs[name + ending], [skin[name][split]["network"] for split in HELD_OUT]
-            best = run["total"].index(min(run["total"]))
-            kept = f"{run['iterations'][best]:,} of {run['iterations'][-1]:,}"
+            best, kept = kept_at(run)
             pairs = (f"{share_3(at['mean'])}, {share_1(at['worst'])}" for at in own)
             yield row(name.replace("_", " ") if ending else "", words, kept, f"{run['total'][best]:.4f}", *pairs)
-    cells_of = list(product(garments, HELD_OUT))
-    for figure, words in (("mean", "the mean"), ("worst", "the worst frame")):
-        less = sum(skins[0][n][s]["network"][figure] < skins[1][n][s]["network"][figure] for n, s in cells_of)
-        yield f"{words} is lower in {less} of {len(cells_of)} cells"
+    yield from less_skin(*skins)
 
 
 def contact() -> Text:
     trainings = result("moving_training"), result("contact_training")
     skins = result("shown_skin_moving"), result("shown_skin_shipped")
-    garments = ("cape", "fringe_skirt", "hooded_dress")
-    for name in garments:
+    for name in LOOSE:
         for words, runs, skin in zip(("before", "now"), trainings, skins):
             run, own = runs[name], [skin[name][split]["network"] for split in HELD_OUT]
-            best = run["total"].index(min(run["total"]))
-            kept = f"{run['iterations'][best]:,} of {run['iterations'][-1]:,}"
+            best, kept = kept_at(run)
             pairs = (f"{share_3(at['mean'])}, {share_1(at['worst'])}" for at in own)
             figures = (f"{run[term][best]:.3f}".replace("-", "−") for term in ("total", "stretch", "gravity"))
             yield row("" if words == "now" else name.replace("_", " "), words, kept, *figures, *pairs)
-    cells_of = list(product(garments, HELD_OUT))
-    for figure, words in (("mean", "the mean"), ("worst", "the worst frame")):
-        less = sum(skins[1][n][s]["network"][figure] < skins[0][n][s]["network"][figure] for n, s in cells_of)
-        yield f"{words} is lower in {less} of {len(cells_of)} cells"
-    for name in garments:
+    yield from less_skin(skins[1], skins[0])
+    for name in LOOSE:
         run = trainings[1][name]
         yield f"{name.replace('_', ' ')} {run['total'][-1] / min(run['total']):.2f}"
 
@@ -304,8 +311,7 @@ def wardrobe() -> Text:
     for garment in GARMENTS.values():
         name = garment.replace("T-", "t").replace(" ", "_")
         run = result("curves")[name]
-        best = run["iterations"][run["total"].index(min(run["total"]))]
-        kept = f"{best:,} of {run['iterations'][-1]:,}"
+        _, kept = kept_at(run)
         yield row(garment, kept, duration(run["seconds"][-1]), *fields(evaluated(name), columns))
     yield f"{two_digits(evaluated('hooded_dress')['valid']['clip_totals'][1])} J"
 
@@ -314,9 +320,8 @@ def long_training() -> Text:
     runs = result("long_training")
     for name, run in runs.items():
         words = name.replace("_light", ", `light`").replace("_seed", ", seed").replace("_", " ")
-        best = min(run["total"])
-        kept = f"{run['iterations'][run['total'].index(best)]:,} of {run['iterations'][-1]:,}"
-        totals = (f"{value:.4f}".replace("-", "−") for value in (best, run["total"][-1]))
+        best, kept = kept_at(run)
+        totals = (f"{run['total'][at]:.4f}".replace("-", "−") for at in (best, -1))
         yield row(words, kept, duration(run["seconds"][-1]), *totals)
     cape = runs["cape"]
     yield f"{cape['iterations'][1] - cape['iterations'][0]:,} iterations after it most is won"
@@ -567,8 +572,7 @@ def scenes() -> Text:
 
 PARTS = (
     opening, conditions, shown, clearance, moving, contact, static_states, table1, findings, dynamics, ablations,
-    wardrobe,
-    long_training, short_training, rest, playing, sizes, levels, refinement, inside_the_body, stress,
+    wardrobe, long_training, short_training, rest, playing, sizes, levels, refinement, inside_the_body, stress,
     training_speed, scenes,
 )  # fmt: skip
 """The parts of the document, in its order."""
