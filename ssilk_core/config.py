@@ -150,7 +150,7 @@ class TrainConfig:
     latent_regularization: float = 0.0
     latent_regularization_scale: float = 0.03
     bptt: bool = False
-    static_learning_rate: float = 1e-3
+    static_learning_rate: float = 2e-3
     learning_rate: float = 3e-4
     final_learning_rate: float = 2e-5
     learning_rate_warmup: int = 500
@@ -217,7 +217,6 @@ PRESETS = {
                 iterations=500,
                 static_fraction=0.55,
                 pretraining_batch=48,
-                static_learning_rate=2e-3,
                 batch=4,
                 window=16,
                 state_reuse=0.7,

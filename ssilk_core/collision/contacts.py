@@ -3,8 +3,8 @@
 
 The nearest body point does not tell which side the cloth came from. A sleeve that one bad step takes through the arm
 would be pushed out on the far side and stay there. Loose cloth can touch any part of the body. Tight cloth can touch
-only the patch of the body that lies beneath it in the bind pose: it is always pushed back to its own side, and is not
-caught where a body intersects itself, as in an armpit.
+only the patch of the body that lies beneath it in the bind pose, within `distance.TIGHT_REACH`: it is pushed back to
+its own side, and is not caught where a body intersects itself, as in an armpit.
 """
 
 from __future__ import annotations
@@ -93,7 +93,8 @@ class Contacts:
         """Return unit normals (S, 3, N) and offsets (S, N) of the planes that x (S, 3, N) can touch, without
         gradients.
 
-        Samples that can touch nothing get planes far below them.
+        Samples that can touch nothing get planes far below them. Those far from their patch get planes across the
+        direction from its nearest vertex.
         """
         normal, offset = self._query_groups(x, body, nearest_planes, no_planes)
         return normal, offset

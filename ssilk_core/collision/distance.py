@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -20,6 +21,10 @@ from .smoothed_distance import EDGE_EPSILON, SEARCH_MARGIN, SMOOTHING_EXPONENT, 
 # training these jumps added energy to cloth that the body never touched.
 MAX_QUERY_DISTANCE = 0.08
 MAX_DEPTH = 0.25
+# Tight cloth further than this from its patch touches nothing; only a tether moves it back. A patch is open: beyond
+# its border and across its folds, the side of the nearest point does not tell where the cloth is. Far away such an
+# error is a large force at random. The price is a jump at this depth, where the energy of contact falls to zero.
+TIGHT_REACH = 0.02
 # At the border of an open body the direction to the nearest point is across the normal there, and inside it is along
 # it. `MAX_QUERY_DISTANCE` deep or deeper, the two may differ by 60 degrees; the cosine grows from zero to that.
 DEEP_COSINE = 0.5
@@ -90,8 +95,8 @@ def nearest_planes(
     """Return unit normals n_b (V, 3, N) and offsets n_b . b (V, N) of the nearest body points b, without gradients.
 
     With `body.faces` normals are the directions from b to x, which are the gradient of the distance; otherwise they
-    are interpolated. Without `patches`, cloth that is far away (`MAX_QUERY_DISTANCE`) has the direction from the
-    nearest vertex.
+    are interpolated. Cloth that is far away (`MAX_QUERY_DISTANCE`, and `TIGHT_REACH` with `patches`) has the
+    direction from the nearest vertex.
 
     Args:
         x: garment positions (V, 3, N).
@@ -108,10 +113,11 @@ def nearest_planes(
     if body.faces is not None:
         candidates = patches.faces if patches else None
         found = closest_on_faces(x, search_radius, body.points, body.faces, candidates)
-        return _on_triangles(normal, offset, body, *found, x)
+        return _on_triangles(normal, offset, x, body, _reach(patches), *found)
     if body.rings is None:
         return normal, offset
-    return _on_triangles(normal, offset, body, *_around(x, index, search_radius >= 0, body))
+    around = _around(x, index, search_radius >= 0, body)
+    return _on_triangles(normal, offset, x, body, _reach(patches), *around)
 
 
 @torch.no_grad()
@@ -121,7 +127,7 @@ def smoothed_planes(
     """Return the smoothed distances of x to the body's surface, in the precision of x.
 
     Arguments are those of `nearest_planes`. Nothing is smoothed for a body without `faces`, or beyond
-    `MAX_QUERY_DISTANCE`.
+    `MAX_QUERY_DISTANCE`, or `TIGHT_REACH` with `patches`.
     """
     single = x.float()
     flat = single.new_zeros(len(x), 3, *x.shape[1:])
@@ -133,10 +139,11 @@ def smoothed_planes(
         return _smoothed_by_kernel(single, body, blocks, patches).to(x.dtype)
     _, normal, offset, search_radius = _at_vertices(single, body, blocks, patches)
     plane, candidates = SmoothedDistance(normal, offset, flat).to(x.dtype), patches.faces if patches else None
+    reach = _reach(patches)
     many = max(1, frames_at_once(x, body.faces, candidates) // SMOOTHING_MEMORY_FACTOR)
     for frames in torch.arange(x.shape[2], device=x.device).split(many):
         part = x[..., frames], search_radius[:, frames], body.points[..., frames], body.normals[..., frames]
-        found, smoothed = smoothed_distance(*part, body.faces, SURFACE_EPSILON, lies_inside, candidates)
+        found, smoothed = smoothed_distance(*part, body.faces, SURFACE_EPSILON, lies_inside, reach, candidates)
         plane.normal[..., frames] = smoothed.normal.where(found[:, None], plane.normal[..., frames])
         plane.offset[..., frames] = smoothed.offset.where(found, plane.offset[..., frames])
         plane.curvature[..., frames] = smoothed.curvature
@@ -157,7 +164,7 @@ def _smoothed_by_kernel(
     surface = body.points, body.normals, body.faces, torch.cat(bounding_spheres(body.points, body.faces), dim=1)
     normal, distance, curvature = smoothed_distance_kernel(
         x, index, *surface, patches.faces if patches else None,
-        max_distance=MAX_QUERY_DISTANCE, max_depth=MAX_DEPTH, deep_cosine=DEEP_COSINE,
+        max_distance=MAX_QUERY_DISTANCE, max_depth=MAX_DEPTH, reach=_reach(patches), deep_cosine=DEEP_COSINE,
         surface_epsilon=SURFACE_EPSILON, exponent=SMOOTHING_EXPONENT, search_margin=SEARCH_MARGIN,
         edge_epsilon=EDGE_EPSILON,
     )  # fmt: skip
@@ -169,20 +176,19 @@ def _at_vertices(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return indices (V, N), normals and offsets of planes at the nearest body vertices, and distances to them [m].
 
-    Distances (V, N) are -1 where nothing nearer is to be searched for. Planes are tangent planes, but for cloth that
-    is far away, without `patches`.
+    Distances (V, N) are -1 where nothing nearer is to be searched for. Planes are tangent planes only where vertices
+    are the surface, near enough to touch; all others are across the direction from the vertex.
     """
     index = _nearest_vertex(x, body, blocks, patches).long()
     normal, point = gather_frames(body.normals, index), gather_frames(body.points, index)
     away = x - point
     length = away.norm(dim=1)
-    searched = length < MAX_QUERY_DISTANCE
-    if patches is None:
-        if body.faces is not None:
-            searched |= ((normal * away).sum(1) < 0) & (length < MAX_DEPTH)
-        tangent = searched[:, None] & (body.faces is None)  # with faces, what is searched is found there
-        normal = torch.where(tangent, normal, away / length[:, None].clamp_min(SURFACE_EPSILON))
-    return index, normal, (normal * point).sum(1), length.where(searched, -1)
+    searched, height = length < MAX_QUERY_DISTANCE, (normal * away).sum(1)
+    if patches is None and body.faces is not None:
+        searched |= (height < 0) & (length < MAX_DEPTH)
+    tangent = searched & (height.abs() < _reach(patches)) & (body.faces is None and body.rings is None)
+    normal = torch.where(tangent[:, None], normal, away / length[:, None].clamp_min(SURFACE_EPSILON))
+    return index, normal, (normal * point).sum(1), length.clamp_max(_reach(patches)).where(searched, -1)
 
 
 def _have_kernel(body: PosedBody, patches: Patches | None) -> bool:
@@ -219,8 +225,16 @@ def _by_kernels(
         limits = MAX_QUERY_DISTANCE, MAX_DEPTH, DEEP_COSINE, SURFACE_EPSILON
         return closest_point_kernel(x, index, body.points, body.normals, _in_blocks(x, blocks), body.patches, *limits)
     rings = index.new_zeros(len(body.points), 1) if body.rings is None else body.rings
-    straight = patches is None
-    return one_ring_kernel(x, index, body.points, body.normals, rings, MAX_QUERY_DISTANCE, straight)
+    limits = MAX_QUERY_DISTANCE, _reach(patches)
+    return one_ring_kernel(x, index, body.points, body.normals, rings, *limits, body.rings is not None)
+
+
+def _reach(patches: Patches | None) -> float:
+    """Return how far from its nearest point cloth can touch the body [m]; `MAX_QUERY_DISTANCE` bounds the search.
+
+    Where vertices are the surface it bounds the height over the tangent plane: vertices may be far apart.
+    """
+    return math.inf if patches is None else TIGHT_REACH
 
 
 def _around(x: Tensor, index: Tensor, near: Tensor, body: PosedBody) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -235,23 +249,28 @@ def _around(x: Tensor, index: Tensor, near: Tensor, body: PosedBody) -> tuple[Te
 def _on_triangles(
     normal: Tensor,
     offset: Tensor,
+    x: Tensor,
     body: PosedBody,
+    reach: float,
     row: Tensor,
     frame: Tensor,
     corners: Tensor,
     weights: Tensor,
-    x: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Replace normals (V, 3, N) and offsets (V, N) by those at points on triangles, the result of `closest_on_faces`.
 
-    With queries x (V, 3, N), normals are the directions from these points to the queries.
+    Points further than `reach` from their queries x (V, 3, N) are left out. With `body.faces` normals are the
+    directions from these points to the queries.
     """
     points, normals = body.points.transpose(0, 1).contiguous(), body.normals.transpose(0, 1).contiguous()
     point = (points[:, corners, frame] * weights).sum(1)
     found = (normals[:, corners, frame] * weights).sum(1)
     found = found / found.norm(dim=0).clamp_min(1e-8)
-    if x is not None:
-        found = _outward(x[row, :, frame].T - point, found)
+    away = x[row, :, frame].T - point
+    if body.faces is not None:
+        found = _outward(away, found)
+    near = away.norm(dim=0) < reach
+    row, frame, found, point = row[near], frame[near], found[:, near], point[:, near]
     normal[row, :, frame] = found.T
     offset[row, frame] = (found * point).sum(0)
     return normal, offset

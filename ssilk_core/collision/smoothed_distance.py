@@ -79,6 +79,7 @@ def smoothed_distance(
     faces: Tensor,
     surface_epsilon: float,
     lies_inside: Callable[[Tensor, Tensor], Tensor],
+    reach: float,
     candidates: Tensor | None = None,
 ) -> tuple[Tensor, SmoothedDistance]:
     """Return which queries have a triangle within reach (V, N), and their distances, zero for the others.
@@ -90,6 +91,7 @@ def smoothed_distance(
         faces: triangles, shape (F, 3).
         surface_epsilon: nearer than this [m], the interpolated normal is the gradient.
         lies_inside: from distances to the nearest points and heights over them, both [m] (M,).
+        reach: queries whose nearest triangle is further away than this have none [m].
         candidates: triangles that each row of queries may find, padded with -1, shape (V, L); all by default.
     """
     rows, frames = search_radius.shape
@@ -98,8 +100,11 @@ def smoothed_distance(
     positions = torch.stack([points[corner, :, frame].T.to(x.dtype) for corner in corners])
     r, away, weights = _nearest_points(x[row, :, frame].T, positions)
     nearest, best = segment_min(query, r, rows * frames)
-    found = best < len(query)
-    best, nearest = best[found], nearest[found]
+    found = nearest < reach  # infinite where there is none
+    kept = found[query]
+    best, nearest = (torch.cumsum(kept, 0) - 1)[best[found]], nearest[found]
+    query, frame, r = query[kept], frame[kept], r[kept]
+    corners, positions, away, weights = (values[..., kept] for values in (corners, positions, away, weights))
     place = torch.cumsum(found, 0)[query] - 1  # index of each pair's query among those found
     distance, gradient, closing = _norm(r, away, place, nearest)
 

@@ -19,7 +19,14 @@ TINY = tl.constexpr(1e-30)
 
 
 def one_ring_kernel(
-    x: Tensor, index: Tensor, points: Tensor, normals: Tensor, rings: Tensor, max_distance: float, straight: bool
+    x: Tensor,
+    index: Tensor,
+    points: Tensor,
+    normals: Tensor,
+    rings: Tensor,
+    max_distance: float,
+    reach: float,
+    on_triangles: bool,
 ) -> tuple[Tensor, Tensor]:
     """Return unit normals (V, 3, N) and offsets n . b (V, N) of the nearest body points b.
 
@@ -27,8 +34,10 @@ def one_ring_kernel(
         x: queries (V, 3, N); index: their nearest body vertices (V, N), int32.
         points, normals: of the body (B, 3, N).
         rings: neighbours around each vertex (`collision.one_ring.triangle_rings`), int32.
-        max_distance: queries further than this from their nearest vertex [m] use it as the nearest point.
-        straight: whether the normals of these are the directions from there, not those of the vertices.
+        max_distance: queries further than this from their nearest vertex [m], or further than `reach` from the
+            nearest point, use that vertex as the nearest point, with the direction from there.
+        on_triangles: whether triangles are the surface, or vertices, over whose tangent planes `reach` bounds the
+            height.
     """
     x, points, normals = x.contiguous(), points.contiguous(), normals.contiguous()
     vertices, _, frames = x.shape
@@ -36,7 +45,7 @@ def one_ring_kernel(
     normal, offset = torch.empty_like(x), x.new_empty(vertices, frames)
     grid = (vertices, triton.cdiv(frames, BLOCK))
     _surface[grid](x, index, points, normals, rings, normal, offset, frames, rings.shape[1],
-                   max_distance * max_distance, straight, BLOCK,
+                   max_distance * max_distance, reach * reach, on_triangles, BLOCK,
                    num_warps=1)  # fmt: skip
     return normal, offset
 
@@ -53,7 +62,8 @@ def _surface(
     frames,
     width,
     max_square,
-    straight: tl.constexpr,
+    reach_square,
+    on_triangles: tl.constexpr,
     block: tl.constexpr,
 ):
     v = tl.program_id(0).to(tl.int64)
@@ -77,13 +87,19 @@ def _surface(
         closer = near & (e < best)
         best, s_best, t_best = tl.where(closer, e, best), tl.where(closer, s, s_best), tl.where(closer, t, t_best)
         j_best, k_best = tl.where(closer, j, j_best), tl.where(closer, k, k_best)
+    away = dot(px, py, pz, px, py, pz) + best
+    if not on_triangles:
+        nx, ny, nz = load3(normals + first * 3 * frames, frames, n, inside)
+        height = dot(nx, ny, nz, px, py, pz)
+        away = height * height
+    near = near & (away < reach_square)
+    s_best, t_best = tl.where(near, s_best, 0.0), tl.where(near, t_best, 0.0)
     bx, by, bz = _mixed(points, frames, first, j_best, k_best, s_best, t_best, n, inside, near)
     nx, ny, nz = _mixed(normals, frames, first, j_best, k_best, s_best, t_best, n, inside, near)
     length = tl.maximum(tl.sqrt(dot(nx, ny, nz, nx, ny, nz)), 1e-8)
     nx, ny, nz = nx / length, ny / length, nz / length
-    if straight:
-        length = tl.sqrt(tl.maximum(dot(px, py, pz, px, py, pz), TINY))
-        nx, ny, nz = tl.where(near, nx, px / length), tl.where(near, ny, py / length), tl.where(near, nz, pz / length)
+    length = tl.sqrt(tl.maximum(dot(px, py, pz, px, py, pz), TINY))
+    nx, ny, nz = tl.where(near, nx, px / length), tl.where(near, ny, py / length), tl.where(near, nz, pz / length)
     store3(normal + v * 3 * frames, frames, n, inside, nx, ny, nz)
     tl.store(offset + v * frames + n, dot(nx, ny, nz, bx, by, bz), mask=inside)
 

@@ -31,6 +31,7 @@ def smoothed_distance_kernel(
     *,
     max_distance: float,
     max_depth: float,
+    reach: float,
     deep_cosine: float,
     surface_epsilon: float,
     exponent: float,
@@ -40,8 +41,8 @@ def smoothed_distance_kernel(
     """Return gradients (V, 3, N), smoothed distances (V, N) and their curvature (V, 3, 3, N).
 
     The values are those of `collision.smoothed_distance.smoothed_distance`. For queries further than `max_distance`
-    from the nearest vertex they are those of its tangent plane. Without `candidates` they are those of the vertex
-    itself instead, unless queries lie behind that plane and within `max_depth`.
+    from the nearest vertex, or than `reach` from every triangle, they are those of the vertex itself. Without
+    `candidates`, queries behind its tangent plane and within `max_depth` are searched for, too.
 
     Args:
         x: queries (V, 3, N); index: their nearest body vertices (V, N), int32.
@@ -59,15 +60,15 @@ def smoothed_distance_kernel(
     curvature = x.new_empty(vertices, 3, 3, frames)
     grid = (vertices, triton.cdiv(frames, BLOCK))
     _smoothed[grid](x, index, points, normals, faces, spheres, table, normal, distance, curvature, frames, width,
-                    max_distance * max_distance, max_depth * max_depth, max_distance, deep_cosine, surface_epsilon,
-                    exponent, edge_epsilon, 1 + search_margin,
+                    max_distance * max_distance, max_depth * max_depth, max_distance, min(reach, 1e29), deep_cosine,
+                    surface_epsilon, exponent, edge_epsilon, 1 + search_margin,
                     candidates is not None, BLOCK, num_warps=1)  # fmt: skip
     return normal, distance, curvature
 
 
 @triton.jit
 def _smoothed(x, index, points, normals, faces, spheres, table, normal, distances, curvature, frames, width,
-              max_square, deepest, max_distance, deep_cosine, surface_epsilon, exponent, edge_epsilon,
+              max_square, deepest, max_distance, reach, deep_cosine, surface_epsilon, exponent, edge_epsilon,
               search_margin, candidates: tl.constexpr, block: tl.constexpr):  # fmt: skip
     v = tl.program_id(0).to(tl.int64)
     n = tl.program_id(1) * block + tl.arange(0, block)
@@ -80,8 +81,8 @@ def _smoothed(x, index, points, normals, faces, spheres, table, normal, distance
     near = inside & (square < max_square)
     if not candidates:
         near = near | (inside & (square < deepest) & (dot(mx, my, mz, qx - ox, qy - oy, qz - oz) < 0))
-        length = tl.sqrt(tl.maximum(square, TINY))
-        mx, my, mz = (qx - ox) / length, (qy - oy) / length, (qz - oz) / length
+    length = tl.sqrt(tl.maximum(square, TINY))
+    mx, my, mz = (qx - ox) / length, (qy - oy) / length, (qz - oz) / length
     radius = tl.sqrt(square) * search_margin * 1.000001  # the nearest vertex is not nearer than the nearest point
     zero = tl.zeros_like(qx)
     best = zero + 1e30
@@ -126,7 +127,7 @@ def _smoothed(x, index, points, normals, faces, spheres, table, normal, distance
             yz, zz = yz * shrink + weight * py * pz, zz * shrink + weight * pz * pz
             weight = weight / r
             gx, gy, gz = gx * shrink + weight * px, gy * shrink + weight * py, gz * shrink + weight * pz
-    found = near & (best < 1e29)
+    found = near & (best < reach)
     total = tl.where(found, total, 1.0)
     distance = best * tl.exp2(-tl.log2(total) / exponent)
     hx, hy, hz = hx / total, hy / total, hz / total

@@ -28,6 +28,7 @@ CPU = torch.device("cpu")
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"  # on a CPU kernels run in Triton's interpreter
 KERNELS = pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="kernels need Triton")
 RADIUS, LENGTH = 0.05, 0.6  # of a limb along z [m]
+THIN = 0.008  # half the thickness along x of a plate, which tight cloth can go through and still meet [m]
 
 
 def limb() -> trimesh.Trimesh:
@@ -35,9 +36,15 @@ def limb() -> trimesh.Trimesh:
     return found.subdivide_to_size(0.03)
 
 
-def on_limb(scene: Scene, at: np.ndarray, kind: int) -> tuple[Scene, CollisionBody]:
-    """The scene with a limb for a body that no joint but the first moves, and garment vertices `at` of one class."""
-    shape = limb()
+def plate() -> trimesh.Trimesh:
+    return trimesh.creation.box((2 * THIN, 0.2, LENGTH)).subdivide_to_size(0.02)
+
+
+def on_limb(
+    scene: Scene, at: np.ndarray, kind: int, shape: trimesh.Trimesh | None = None
+) -> tuple[Scene, CollisionBody]:
+    """The scene with a limb or another body, moved by the first joint, and garment vertices `at` of one class."""
+    shape = shape or limb()
     weights = np.ones((len(shape.vertices), 1))
     body = Body(
         Mesh("/limb", shape.vertices, shape.faces), SkinWeights("/limb", weights.astype(np.int32) * 0, weights)
@@ -58,19 +65,17 @@ def still(body: CollisionBody, **options: bool) -> PosedBody:
 
 @pytest.mark.parametrize("options", [{}, {"exact": True}, {"surface": False}])
 @pytest.mark.parametrize("kind", [TIGHT, LOOSE])
-def test_tight_cloth_that_went_through_a_limb_is_sent_back(scene, kind, options):
-    """Pulled 7 cm through a limb of 5 cm radius, the far side is nearer; only what is loose goes there."""
-    dressed, body = on_limb(scene, np.array([RADIUS + 0.005, 0, 0.01]), kind)
+def test_tight_cloth_that_went_almost_through_is_sent_back(scene, kind, options):
+    """Pulled 12 mm into a plate of 16 mm, the far side is nearer; only what is loose goes there."""
+    dressed, body = on_limb(scene, np.array([THIN + 0.005, 0, 0.01]), kind, plate())
     x = torch.tensor(dressed.garment.mesh.points, dtype=torch.float32)[..., None]
-    pulled = x - torch.tensor([RADIUS + 0.025, 0, 0])[:, None]
+    pulled = x - torch.tensor([THIN + 0.009, 0, 0])[:, None]
     contacts = Contacts(dressed, vertex_samples(len(dressed.classes)), device=CPU)
     normal, offset = contacts.planes(pulled, still(body, **options))
     side = 1 if kind == TIGHT else -1
     assert (side * normal[:, 0] > 0.5).all()
-    # The limb has 16 sides, so that its surface is up to 1 mm nearer to the axis than its radius.
-    expected = -(RADIUS + 0.02) if kind == TIGHT else -(RADIUS - 0.02)
     distance = signed_distance_to_planes(pulled, normal, offset)
-    assert ((distance - expected).abs() < 0.03 if options.get("surface") is False else (distance < 0)).all()
+    np.testing.assert_allclose(distance, -(THIN + side * 0.004), atol=1e-6)
     met, whole = contacts.distances(pulled, still(body, **options))
     assert torch.equal(met, distance)
     np.testing.assert_allclose(
@@ -97,12 +102,12 @@ def test_where_cloth_is_near_its_own_side_nothing_changes(scene):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_rounded_distances_are_those_of_the_planes_that_tight_and_loose_cloth_meet(scene, dtype):
-    """Pulled through the limb, every other vertex tight: each by its own side, to the two per cent of rounding."""
-    dressed, body = on_limb(scene, np.array([RADIUS + 0.005, 0, 0.01]), TIGHT)
+    """Pulled into the plate, every other vertex tight: each by its own side, to the two per cent of rounding."""
+    dressed, body = on_limb(scene, np.array([THIN + 0.005, 0, 0.01]), TIGHT, plate())
     classes = np.where(np.arange(len(dressed.classes)) % 2, TIGHT, LOOSE).astype(dressed.classes.dtype)
     dressed = replace(dressed, garment=replace(dressed.garment, classes=classes))
     x = torch.tensor(dressed.garment.mesh.points, dtype=dtype)[..., None]
-    pulled = x - torch.tensor([RADIUS + 0.025, 0, 0])[:, None].to(dtype)
+    pulled = x - torch.tensor([THIN + 0.009, 0, 0])[:, None].to(dtype)
     contacts, posed = Contacts(dressed, vertex_samples(len(dressed.classes)), device=CPU), still(body, exact=True)
     found, met = (
         contacts.smoothed(pulled, posed),
@@ -110,10 +115,32 @@ def test_rounded_distances_are_those_of_the_planes_that_tight_and_loose_cloth_me
     )
     assert found.normal.dtype == found.offset.dtype == dtype and found.curvature.dtype == torch.float32
     torch.testing.assert_close(found.distance(pulled).float(), met, rtol=0.03, atol=1e-6)
-    assert (met[1::2] < -RADIUS).all() and (met[::2] > -RADIUS).all()
+    assert (met[1::2] < -THIN).all() and (met[::2] > -THIN).all()
     pinned = replace(dressed, garment=replace(dressed.garment, classes=np.full_like(classes, PINNED)))
     nowhere = Contacts(pinned, vertex_samples(len(pinned.classes)), pinned=False, device=CPU).smoothed(pulled, posed)
     assert (nowhere.distance(pulled) > 1e5).all() and nowhere.curvature.abs().max() == 0
+
+
+@pytest.mark.parametrize("options", [{}, {"exact": True}, {"surface": False}])
+def test_tight_cloth_far_from_its_patch_touches_nothing(scene, options):
+    """From 3 cm off a limb of 5 cm radius to its axis: outside and beyond `TIGHT_REACH` nothing pushes the cloth."""
+    dressed, body = on_limb(scene, np.array([RADIUS + 0.005, 0, 0.0]), TIGHT)
+    count = len(dressed.classes)
+    heights = torch.linspace(0.03, -RADIUS, count)
+    x = torch.zeros(count, 3, 1)
+    x[:, 0, 0] = RADIUS + heights
+    contacts, posed = Contacts(dressed, vertex_samples(count), device=CPU), still(body, **options)
+    normal, offset = contacts.planes(x, posed)
+    touched = signed_distance_to_planes(x, normal, offset)[:, 0] < 0
+    slack = 0.003 if options.get("surface") is False else 0.001  # 16 sides, and vertices 3 cm apart
+    inner = heights < -slack
+    assert touched[inner & (heights > -(distance.TIGHT_REACH - slack))].all()
+    assert not touched[(heights > slack) | (heights < -(distance.TIGHT_REACH + slack))].any()
+    if options.get("exact"):
+        smoothed = contacts.smoothed(x, posed)
+        torch.testing.assert_close(smoothed.distance(x), signed_distance_to_planes(x, normal, offset), rtol=0.03,
+                                   atol=1e-6)  # fmt: skip
+        assert not smoothed.curvature[heights < -(distance.TIGHT_REACH + slack)].any()
 
 
 def test_pinned_cloth_meets_nothing_unless_it_is_measured(scene):
@@ -231,18 +258,20 @@ def test_the_kernel_finds_the_nearest_of_a_list():
 
 
 @KERNELS
-def test_kernels_find_the_planes_of_a_list_that_their_references_find():
+@pytest.mark.parametrize("surface", [True, False])
+def test_kernels_find_the_planes_of_a_list_that_their_references_find(surface):
     rng = np.random.default_rng(5)
     mesh = trimesh.creation.icosphere(subdivisions=1, radius=0.1)
     around = mesh.vertices + 0.003 * rng.normal(size=(3, *mesh.vertices.shape))
     points, normals = (torch.tensor(v, dtype=torch.float32) for v in (around.transpose(1, 2, 0), mesh.vertex_normals))
-    body = PosedBody(points, normals[:, :, None].expand(-1, -1, 3), torch.as_tensor(triangle_rings(mesh.faces, 42)))
+    rings = torch.as_tensor(triangle_rings(mesh.faces, 42)) if surface else None
+    body = PosedBody(points, normals[:, :, None].expand(-1, -1, 3).contiguous(), rings)
     x = torch.tensor(mesh.sample(9, seed=1)[:, :, None] + 0.02 * rng.normal(size=(9, 3, 3)), dtype=torch.float32)
     table = lists(rng, 9, 42)
     patches = Patches(table, torch.zeros(0))
     expected = nearest_planes(x, body, patches=patches)
     assert not torch.allclose(expected[0], nearest_planes(x, body)[0])
-    on_device = PosedBody(*(v.to(DEVICE) for v in (body.points, body.normals, body.rings)))
+    on_device = PosedBody(points.to(DEVICE), body.normals.to(DEVICE), None if rings is None else rings.to(DEVICE))
     for value, reference in zip(
         distance._by_kernels(x.to(DEVICE), on_device, None, Patches(table.to(DEVICE), patches.faces)), expected
     ):

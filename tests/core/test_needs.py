@@ -89,7 +89,7 @@ def test_a_body_out_of_reach_costs_no_collisions_and_no_posing(scene, toy_motion
 
 def test_only_what_is_not_pinned_meets_the_body(scene, toy_motion):
     """The others stand where they stand: their planes are far away, and their collisions have no gradient."""
-    classes, clearance = np.where(np.arange(len(scene.classes)) % 2, PINNED, TIGHT), 0.004
+    classes, clearance = np.where(np.arange(len(scene.classes)) % 2, PINNED, LOOSE), 0.004
     parts = build_parts(job_of(classed(scene, classes), toy_motion(scene, 30)), CPU)
     config = TrainConfig(batch=2, window=4, static_batch=2, clearance=clearance)
     objective = parts.stepper(config, 0).objective
@@ -98,16 +98,16 @@ def test_only_what_is_not_pinned_meets_the_body(scene, toy_motion):
     cloth = objective.energy.cloth
     x = cloth.positions(x)
     normal, offset = objective._planes(x, character)
-    posed = replace(parts.body.pose(character), faces=None)  # tight cloth meets the triangles around a vertex
+    posed = parts.body.pose(character)
     expected = nearest_planes(x, posed)
-    free = torch.tensor(cloth.samples.classes(classes) != PINNED)
+    kinds = torch.tensor(cloth.samples.classes(classes))
     distance = (normal * x).sum(1) - offset + clearance
-    near = free & (distance.abs() < 0.07).all(dim=1)
-    assert near.sum() > 200
+    near = (kinds == LOOSE) & (distance.abs() < 0.07).all(dim=1)
+    assert near.sum() > 100
     torch.testing.assert_close(normal[near], expected[0][near])
     torch.testing.assert_close(offset[near], expected[1][near] + clearance)
     torch.testing.assert_close(distance[near], signed_distance(x, posed)[near])
-    assert distance[~free].min() > 1e5
+    assert distance[kinds == PINNED].min() > 1e5
 
 
 def test_the_body_is_reached_by_what_is_free_alone(scene, toy_motion):

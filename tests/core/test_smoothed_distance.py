@@ -185,7 +185,8 @@ def test_the_kernel_finds_what_its_reference_does(monkeypatch, listed: bool) -> 
     walls = fold(1.2)
     ball = trimesh.util.concatenate([walls, trimesh.creation.icosahedron().apply_scale(0.05)])
     far_off, within = torch.tensor([[0.0, 0.0, 0.9]]).double(), in_the_fold(5)[..., 0]
-    x = torch.cat([near(ball, 0.01, 4), near(walls, 0.004, 4), within, far_off])
+    beyond = 1.7 * near(ball, 0.004, 5)  # what tight cloth can touch
+    x = torch.cat([near(ball, 0.01, 4), near(walls, 0.004, 4), within, far_off, beyond])
     x = torch.stack([x, 1.01 * x], dim=-1).float().to(DEVICE)
     body = body_of(ball, ball.copy().apply_scale([1.0, 1.05, 0.95]))
     patches = None
