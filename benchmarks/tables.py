@@ -64,8 +64,9 @@ DYNAMICS: Columns = {
 }
 
 
-def methods_table(found: Mapping[tuple[str, str, str], Cell], splits: Sequence[str], shown: Columns = COLUMNS) -> str:
-    """Return a line for each garment and method, with columns for each split."""
+def methods_table(found: Mapping[tuple[str, str, str], Cell], shown: Columns = COLUMNS) -> str:
+    """Return a line for each garment and method, with columns for each split that was measured."""
+    splits = [split for split in SPLITS if any(split == own for _, _, own in found)]
     names = [name for name, (path, _) in shown.items() if any(cell.values(path) for cell in found.values())]
     columns = [(split, name) for split in splits for name in names]
     rows = []
@@ -122,7 +123,7 @@ def table1(options: argparse.Namespace) -> tuple[str, Any]:
             )
         )
     ]
-    return methods_table(found, SPLITS) + notes + "\n", {"figures": figures_of(found), "trainings": trainings}
+    return methods_table(found) + notes + "\n", {"figures": figures_of(found), "trainings": trainings}
 
 
 def table2(options: argparse.Namespace) -> tuple[str, Any]:
@@ -131,7 +132,7 @@ def table2(options: argparse.Namespace) -> tuple[str, Any]:
     if not rows:
         fail("table2", "no simulator among the figures", "its shots are needed", "give --reference, or records of it")
     found = cells(rows)
-    return methods_table(found, SPLITS[1:], DYNAMICS), {
+    return methods_table(found, DYNAMICS), {
         "frames of a sequence": rows[0]["sequence"],
         "figures": figures_of(found, DYNAMICS),
     }

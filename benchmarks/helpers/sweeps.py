@@ -70,10 +70,11 @@ def ablations(options: argparse.Namespace) -> tuple[str, Any]:
                 split: Cell([row for row in own if row["split"] == split]).values(["total"]) for split in SPLITS
             }
             found.append({"setting": name, "value": str(value), **{s: each for s, each in totals.items() if each}})
+    splits = [split for split in SPLITS if any(split in row for row in found)]
     lines = [
-        [row["setting"], row["value"], *(f"{mean(row[s]):.4g}" if s in row else "" for s in SPLITS)] for row in found
+        [row["setting"], row["value"], *(f"{mean(row[s]):.4g}" if s in row else "" for s in splits)] for row in found
     ]
     (garment,) = {settings["garment"] for settings in models.values()}
     iterations = mode(settings["trained"]["iterations"] for settings in models.values())
-    text = table(("setting", "value", *(f"{split}: L_tot [J]" for split in SPLITS)), lines)
+    text = table(("setting", "value", *(f"{split}: L_tot [J]" for split in splits)), lines)
     return text, {"garment": garment, "iterations": iterations, "total": found}

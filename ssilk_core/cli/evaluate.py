@@ -183,7 +183,7 @@ def _splits(options: argparse.Namespace) -> tuple[dict[str, list[str]], dict[str
     """Return the names of clips by split, their files, and the motions of the training."""
     from ssilk_usd.read_motion import motion_files
 
-    from ..evaluation.splits import chosen, read_index, splits_of
+    from ..evaluation.splits import SPLITS, chosen, read_index, splits_of
 
     folder: Path = options.motions
     if not folder.is_dir():
@@ -192,7 +192,7 @@ def _splits(options: argparse.Namespace) -> tuple[dict[str, list[str]], dict[str
     index = read_index(options.index) if options.index else []
     splits = splits_of(index, options.clips) if options.index else {"all": options.clips or list(files)}
     if not splits:
-        fail(str(options.index), "no clip of valid, inertia or flips is chosen", "one at least is needed")
+        fail(str(options.index), f"no clip of {', '.join(SPLITS)} is chosen", "one at least is needed")
     missing = sorted({name for names in splits.values() for name in names} - files.keys())
     if missing:
         fail(

@@ -11,7 +11,7 @@ from typing import Any
 
 from ..errors import fail
 
-SPLITS = ("valid", "inertia", "flips")
+SPLITS = ("valid", "test", "inertia", "flips")
 ALLOWED = 'an index is a JSON list of {"clip": name, "split": name, "tags": [names]}'
 
 

@@ -403,11 +403,11 @@ def test_an_index_says_which_clips_are_in_which_split(tmp_path):
     path = tmp_path / "index.json"
     path.write_text(json.dumps([
         {"clip": "a", "split": "train", "tags": ["inertia"]}, {"clip": "b", "split": "valid", "tags": ["inertia"]},
-        {"clip": "c", "split": "valid", "tags": []}, {"clip": "d", "split": "flips"},
+        {"clip": "c", "split": "valid", "tags": []}, {"clip": "d", "split": "flips"}, {"clip": "e", "split": "test"},
     ]))  # fmt: skip
     index = read_index(path)
     assert chosen(index, "train") == ["a"] and chosen(index, "inertia") == ["b"]
-    assert splits_of(index) == {"valid": ["b", "c"], "inertia": ["b"], "flips": ["d"]}
+    assert splits_of(index) == {"valid": ["b", "c"], "test": ["e"], "inertia": ["b"], "flips": ["d"]}
     assert splits_of(index, ["c", "d"]) == {"valid": ["c"], "flips": ["d"]}
 
 

@@ -112,7 +112,7 @@ def test_several_models_of_a_garment_share_its_table(world, capsys):
     [
         ("--stage rigged.usda --motions nowhere", "nowhere: there is no such folder"),
         (f"{QUICK} --clips brief walk", "1 clips are missing (walk)"),
-        (f"{QUICK} --index index.json --clips walk", "no clip of valid, inertia or flips is chosen"),
+        (f"{QUICK} --index index.json --clips walk", "no clip of valid, test, inertia, flips is chosen"),
         (f"{QUICK} --index model.safetensors", "no index of clips"),
         (f"{QUICK} --reference nowhere", "nowhere: there is no such folder"),
         (f"{QUICK} --reference wrong", "brief.usda: 60 frames per second; the model steps at 30"),
