@@ -12,7 +12,7 @@ from collections.abc import Callable
 from ssilk_usd import memory, trial
 
 from ssilk_core import checkpoint
-from ssilk_core.collision.distance import MAX_DEPTH, MAX_QUERY_DISTANCE
+from ssilk_core.collision.distance import MAX_DEPTH, MAX_QUERY_DISTANCE, TIGHT_REACH
 from ssilk_core.config import PRESETS
 from ssilk_core.decomposition import FitTolerance
 from ssilk_core.fabrics import FABRICS, Fabric
@@ -76,6 +76,7 @@ PAPER = {
 def training() -> Text:
     yield f"Further than {milli(MAX_QUERY_DISTANCE)} mm\nfrom every vertex it touches nothing"
     yield f"at most {milli(MAX_DEPTH)} mm deep"
+    yield f"further than {milli(TIGHT_REACH)} mm from it they touch nothing"
     sizes = {
         "draft": "a first look, on a CPU",
         "preview": "a look on a GPU",

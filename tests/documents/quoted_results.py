@@ -9,6 +9,8 @@ from itertools import product
 from statistics import mean
 
 from ssilk_core.config import PRESETS
+from ssilk_core.demo.shipped import shipped_path
+from ssilk_core.evaluation.solver_errors import AFTER
 from ssilk_core.fabrics import FABRICS
 from ssilk_core.quality import QUALITIES
 
@@ -41,7 +43,6 @@ from .shared import (
     cache_share,
     extremes,
     frame_time,
-    model_size,
     shot_row,
     step_time,
     two_gpus,
@@ -83,7 +84,8 @@ def opening() -> Text:
     yield f"{duration(min(times))} to {duration(max(times))} on one H200"
     yield f"{frame_time():.2f} ms a frame"
     yield f"{cache_share()} of its point cache"
-    yield f"The cape's model is {model_size()}"
+    yield f"The cape that ships is {shipped_path('cape').stat().st_size / 1e6:.1f} MB"
+    yield f"A cape of {document('trade')['points'][0]['shapes']} blendshapes takes {frame_time():.2f} ms"
     settling = evaluated("cape")["valid"]["settling"]
     hold = document("evaluate_cape")["options"]["hold"]
     yield f"{share(settling['settled_share'])} % of the stops within {hold:g} s"
@@ -95,7 +97,7 @@ def opening() -> Text:
 
 
 def shown() -> Text:
-    found = {**result("shown_skin"), **result("shown_skin_shipped")}
+    found = {**result("shown_skin_tight"), **result("shown_skin_shipped")}
     for garment in GARMENTS.values():
         own = found[garment.lower().replace("-", "").replace(" ", "_")]
         pairs = [own[split]["network"] for split in HELD_OUT]
@@ -116,6 +118,14 @@ def shown() -> Text:
             for split, goal in goals.items()
         )
         yield f"{valid} of {len(found)} reach it on `valid`, {test} on `test` and {flips} on flips"
+    missing = [name for name, own in found.items() if own["test"]["network"]["mean"] > goals["test"][0]]
+    assert missing == ["tshirt", "long_sleeve"], "the document names them"
+    hardest, clips = "01_14", [found[name]["test"]["network"]["clips"] for name in missing]
+    others = [mean(share for clip, share in own.items() if clip != hardest) for own in clips]
+    yield f"One clip ({hardest}) makes most"
+    yield f"over the other six clips are at most {share_3(max(others))} %"
+    (shapes,) = {shipped(name)["config"]["shapes"] for name in LOOSE}
+    yield f"and {shapes} blendshapes"
     clips = [len(found["cape"][split]["network"]["clips"]) for split in goals]
     training = len(shipped("cape")["provenance"]["motions"])
     yield f"has {clips[0]} clips, `test` {clips[1]} and flips {clips[2]}, and training had {training} motions"
@@ -123,8 +133,13 @@ def shown() -> Text:
     yield f"{min(ratios):.1f} to {max(ratios):.1f} times the simulator's"
     bare = result("shown_skin")["tshirt"]["first 12 frames"]["simulator"]["bare"]
     yield f"bares {share_1(bare)} % of the skin"
-    less = [name for name, own in found.items() if own["test"][SKINNING]["worst"] < own["test"]["network"]["worst"]]
-    assert sorted(less) == ["fringe_skirt", "tshirt"], "the document names them"
+    less = [
+        (name, split)
+        for name, own in found.items()
+        for split in ("test", "flips")
+        if own[split][SKINNING]["worst"] < own[split]["network"]["worst"]
+    ]
+    assert less == [("fringe_skirt", "test"), ("fringe_skirt", "flips")], "the document names them"
 
 
 def clearance() -> Text:
@@ -183,19 +198,45 @@ def moving() -> Text:
 
 
 def contact() -> Text:
-    trainings = result("moving_training"), result("contact_training")
-    skins = result("shown_skin_moving"), result("shown_skin_shipped")
+    trainings = result("moving_training"), result("contact_training"), result("tight_training")
+    skins = result("shown_skin_moving"), result("shown_skin_loose"), result("shown_skin_shipped")
     for name in LOOSE:
-        for words, runs, skin in zip(("before", "now"), trainings, skins):
+        for words, runs, skin in zip(("neither", "loose cloth", "both"), trainings, skins):
             run, own = runs[name], [skin[name][split]["network"] for split in HELD_OUT]
             best, kept = kept_at(run)
             pairs = (f"{share_3(at['mean'])}, {share_1(at['worst'])}" for at in own)
             figures = (f"{run[term][best]:.3f}".replace("-", "−") for term in ("total", "stretch", "gravity"))
-            yield row("" if words == "now" else name.replace("_", " "), words, kept, *figures, *pairs)
-    yield from less_skin(skins[1], skins[0])
-    for name in LOOSE:
-        run = trainings[1][name]
-        yield f"{name.replace('_', ' ')} {run['total'][-1] / min(run['total']):.2f}"
+            yield row(name.replace("_", " ") if words == "neither" else "", words, kept, *figures, *pairs)
+    for before in skins[:2]:
+        yield from less_skin(skins[2], before)
+    dress = trainings[2]["hooded_dress"]
+    best = kept_at(dress)[0]
+    yield f"falls to {dress['stretch'][best]:.3f} J with both, and the total to {dress['total'][best]:.3f} J"
+    ends = [{n: run["total"][-1] / min(run["total"]) for n, run in runs.items()} for runs in trainings[1:]]
+    yield ", ".join(f"{name.replace('_', ' ')} {ends[0][name]:.2f}" for name in LOOSE)
+    yield f"at most {max(ends[1].values()):.2f} times the best in all {len(ends[1])} garments"
+
+
+def from_own_start() -> Text:
+    goals, reached = (0.01, 0.06, 0.2), {}
+    shots = ("after 5 [mm]", *AFTER[1:])
+    yield row("garment", "clips", "windows", "step [mJ]", "step [mm]", *shots, "velocity [m/s]", "LBS")
+    yield f"for {AFTER[-1]} frames. *Step*"
+    for garment, split in product(LOOSE, ("test", "flips")):
+        rows = document(f"evaluate_solver_{garment}")["figures"]
+        (at,) = (line["figures"]["solver"] for line in rows if (line["method"], line["split"]) == ("ssilk", split))
+        step = milli(at["step_energy"]), f"{1000 * at['step_distance']:.1f}"
+        away = [milli(value) for value in at["position_error"]]
+        speeds = (f"{at[name]:.2f}" for name in ("velocity_error", "lbs_velocity_error"))
+        name = garment.replace("_", " ") if split == "test" else ""
+        yield row(name, "flips" if split == "flips" else "`test`", at["windows"], *step, *away, *speeds)
+        if split == "test":
+            found = at["position_error"][0], at["position_error"][2], at["velocity_error"]
+            reached[garment] = [value <= goal for value, goal in zip(found, goals)]
+            if garment == "cape":
+                yield f"the cape is {away[0]} mm (RMS) from the simulator's after five frames"
+    yield f"10 mm after {AFTER[0]} frames, {milli(goals[1])} mm after {AFTER[2]}, and {goals[2]:g} m/s"
+    assert sum(map(sum, reached.values())) == reached["fringe_skirt"][1] == 1, "the document says so"
 
 
 def static_states() -> Text:
@@ -387,7 +428,7 @@ def rest() -> Text:
 def playing() -> Text:
     models, cape = result("runtime")["models"], shipped("cape")
     yield (
-        f"({cape['vertices']:,} vertices, {cape['config']['shapes']} blendshapes, "
+        f"({cape['vertices']:,} vertices, {document('trade')['points'][0]['shapes']} blendshapes, "
         f"{len(cape['proxy_names'])} proxy joints, {len(cape['joint_names'])} joints)"
     )
     ways = ("numpy", "PyTorch, in chunks", "NCS, in chunks", "PyTorch, frame by frame", "NCS, frame by frame")
@@ -571,7 +612,8 @@ def scenes() -> Text:
 
 
 PARTS = (
-    opening, conditions, shown, clearance, moving, contact, static_states, table1, findings, dynamics, ablations,
+    opening, conditions, shown, clearance, moving, contact, from_own_start, static_states, table1, findings, dynamics,
+    ablations,
     wardrobe, long_training, short_training, rest, playing, sizes, levels, refinement, inside_the_body, stress,
     training_speed, scenes,
 )  # fmt: skip

@@ -9,7 +9,7 @@ from typing import Any
 
 from ssilk_core.config import Preset
 
-from .measured import default, document, fixed, result
+from .measured import default, document, result
 
 Text = Iterator[str]
 
@@ -61,11 +61,6 @@ def two_gpus(window: int, batch: int) -> float:
 
 def extremes() -> str:
     return f"{len(document('stress_cape')['outcomes'])} extremes"
-
-
-def model_size() -> str:
-    sizes = [point["model_bytes"] for point in document("trade")["points"] if point["precision"] == "int16"]
-    return f"{fixed(sizes[0], 1, 1e6)} MB"
 
 
 def default_step() -> str:
