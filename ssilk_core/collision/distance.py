@@ -225,8 +225,10 @@ def _by_kernels(
         limits = MAX_QUERY_DISTANCE, MAX_DEPTH, DEEP_COSINE, SURFACE_EPSILON
         return closest_point_kernel(x, index, body.points, body.normals, _in_blocks(x, blocks), body.patches, *limits)
     rings = index.new_zeros(len(body.points), 1) if body.rings is None else body.rings
-    limits = MAX_QUERY_DISTANCE, _reach(patches)
-    return one_ring_kernel(x, index, body.points, body.normals, rings, *limits, body.rings is not None)
+    on_triangles = body.rings is not None
+    return one_ring_kernel(
+        x, index, body.points, body.normals, rings, MAX_QUERY_DISTANCE, _reach(patches), on_triangles
+    )
 
 
 def _reach(patches: Patches | None) -> float:
