@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..assets import Motion
 from ..errors import fail
-from ..events import Countdown, Reporter, silent
+from ..events import Countdown, Message, Reporter, silent
 from ..motion_bank import MotionBank, build_bank
 from .figures import Figures, LoopDrift, MinimumErrors, Settling, SolverErrors
 from .methods import (
@@ -142,7 +142,7 @@ class _Run:
         options: EvaluationOptions,
         report: Reporter,
     ) -> None:
-        self.dressed, self.playlist, self.options = dressed, playlist, options
+        self.dressed, self.playlist, self.options, self.report = dressed, playlist, options, report
         cut = [takes_of(name, motion, dressed.fps, options.sequence) for name, motion in playlist.clips.items()]
         self.takes = [take for takes in cut for take in takes]
         self.clips = {number: take.clip for number, take in enumerate(self.takes)}
@@ -204,7 +204,10 @@ class _Run:
     def _solver_errors(self, take_set: TakeSet, method: Method, takes: Sequence[int]) -> SolverErrors | None:
         """Return how far a method is from the solver on some takes; None unless asked for, or for short takes."""
         windows = windows_of(self.dressed, take_set, takes) if self.options.solver else []
-        return solver_errors(self.dressed, take_set, method, windows) if windows else None
+        if not windows:
+            return None
+        self.report(Message(f"the solver plays {len(windows)} windows and single steps from the method's own states"))
+        return solver_errors(self.dressed, take_set, method, windows, self.report)
 
     def _distances(self, take_set: TakeSet, joints: np.ndarray) -> dict[int, Tensor]:
         """Return the distances of each take's poses from the training's [rad], (N,); empty if those are not known."""

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ..assets import Motion
+from ..events import Countdown, Reporter, silent
 from ..simulate import Simulator
 from ..simulate.characters import PosedCharacters
 from ..simulate.simulator import StepHistory
@@ -43,7 +44,11 @@ def windows_of(dressed: EvaluationScene, take_set: TakeSet, takes: Iterable[int]
 
 @torch.no_grad()
 def solver_errors(
-    dressed: EvaluationScene, take_set: TakeSet, method: Method, windows: Sequence[Window]
+    dressed: EvaluationScene,
+    take_set: TakeSet,
+    method: Method,
+    windows: Sequence[Window],
+    report: Reporter = silent,
 ) -> SolverErrors | None:
     """Measure single steps from the method's own past, and simulations from its own first two states.
 
@@ -57,12 +62,14 @@ def solver_errors(
     played = [world for world in played if bool(world.x.isfinite().all())]
     if not played:
         return None
+    singles = [(world, frame) for world in played for frame in range(2, len(world.x), STEP_EVERY)]
+    told = Countdown(sum(len(world.x) - 2 for world in played) + len(singles), report)
     steps, shots = [], []
     for start in range(0, len(played), BATCH):
-        shots.append(_shots(simulator, played[start : start + BATCH], dressed.energy.mass))
-    singles = [(world, frame) for world in played for frame in range(2, len(world.x), STEP_EVERY)]
+        shots.append(_shots(simulator, played[start : start + BATCH], dressed.energy.mass, told))
     for start in range(0, len(singles), BATCH):
         steps.append(_single_steps(simulator, singles[start : start + BATCH], dressed.energy.mass))
+        told(len(steps[-1][0]))
     energy, square = (torch.cat(values) for values in zip(*steps))
     distance, velocity, lbs = (torch.cat([found[part] for found in shots], dim=1) for part in range(3))
     return SolverErrors(
@@ -118,8 +125,8 @@ def _single_steps(simulator: Simulator, places: Sequence[tuple[_World, int]], ma
     return (energy - found.energy).cpu(), mean_square((own - found.x).double(), mass.double()).cpu()
 
 
-def _shots(simulator: Simulator, windows: Sequence[_World], mass: Tensor) -> Tensor:
-    """Simulate from the first two states of windows, by decreasing length.
+def _shots(simulator: Simulator, windows: Sequence[_World], mass: Tensor, told: Countdown) -> Tensor:
+    """Simulate from the first two states of windows, by decreasing length; count each frame of a window.
 
     Returns:
         Squared distances [m2], and squared differences of the displacements in a frame, of the method and of linear
@@ -137,4 +144,5 @@ def _shots(simulator: Simulator, windows: Sequence[_World], mass: Tensor) -> Ten
         missed = [away, _stacked(places, 0) - _stacked(places, 1) - moved, lbs - moved]
         found[:, frame - 2, : len(places)] = torch.stack([mean_square(each, mass.double()) for each in missed]).cpu()
         past = StepHistory(world, past.last, poses.root, poses.lbs)
+        told(len(places))
     return found

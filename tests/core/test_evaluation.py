@@ -48,6 +48,7 @@ from ssilk_core.evaluation.splits import chosen, read_index, splits_of
 from ssilk_core.evaluation.tables import aligned, tables
 from ssilk_core.evaluation.takes import Take, back_and_forth, stopped, takes_of
 from ssilk_core.evaluation.tally import Tally, figures, reference_errors
+from ssilk_core.events import Progress
 from ssilk_core.fabrics import Fabric
 from ssilk_core.kinematics import motion_transforms, skin_points, skinning_matrices
 from ssilk_core.training.validation import Validator
@@ -453,7 +454,10 @@ def test_a_simulation_is_where_the_solver_goes_from_its_own_states(scene, dresse
     take_set = build_take_set(takes_of("sway", toy_motion(scene, 9), FPS), dressed, JOINTS)
     simulated = Simulated(dressed, take_set)
     (window, *_) = windows_of(dressed, take_set, [0])
-    found = solver_errors(dressed, take_set, simulated, [window])
+    events: list[Progress] = []
+    found = solver_errors(dressed, take_set, simulated, [window], events.append)
+    assert [event.done for event in events] == [1, 2, 3, 4, 5, 6, 7, 9]  # seven frames, then two single steps
+    assert {event.total for event in events} == {9}
     assert found.windows == 1
     assert found.step_energy < 1e-6
     assert found.step_distance < 1e-4
