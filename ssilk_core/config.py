@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from .errors import fail
 from .schemes import need_scheme
 
-CLOSEST_POINTS = ("triangles", "vertices")
+CLOSEST_POINTS, OPTIMISERS = ("triangles", "vertices"), ("muon", "adam")
 MAX_SIZE = 65_536  # of a part of the network; larger ones fit into no machine
 MOST_OF_ALL = 0.99999  # largest share of static training, and decay of an average
 MOST_SMOOTHED_VERTICES = 10_000  # by `training.shape_smoothing`, whose matrix then takes 0.4 GB
@@ -113,8 +113,9 @@ class TrainConfig:
         latent_regularization_scale: RMS distance between garments per unit of distance between their latents, for
             Eq. 13 [m].
         bptt: back-propagate through the whole window, as the paper does, instead of through each step by itself.
-        static_learning_rate: initial learning rate of Adam in static training; it decays to a tenth.
-        learning_rate, final_learning_rate: learning rate of Adam in dynamic training after the warm-up, and at the
+        optimiser: of the networks' matrices: "muon" (`training.muon`), or "adam" as for all other parameters.
+        static_learning_rate: initial learning rate in static training; it decays to a tenth.
+        learning_rate, final_learning_rate: learning rate in dynamic training after the warm-up, and at the
             end of the cosine schedule.
         learning_rate_warmup: iterations over which the learning rate rises at the start of dynamic training.
         skin_learning_rate_scale: factor on the learning rate of skinning weights and of the integrator's parameters.
@@ -150,6 +151,7 @@ class TrainConfig:
     latent_regularization: float = 0.0
     latent_regularization_scale: float = 0.03
     bptt: bool = False
+    optimiser: str = "muon"
     static_learning_rate: float = 2e-3
     learning_rate: float = 3e-4
     final_learning_rate: float = 2e-5
@@ -166,6 +168,8 @@ class TrainConfig:
     def __post_init__(self) -> None:
         if self.closest_point not in CLOSEST_POINTS:
             fail("training", f"closest_point '{self.closest_point}'", f"it is one of {', '.join(CLOSEST_POINTS)}")
+        if self.optimiser not in OPTIMISERS:
+            fail("training", f"optimiser '{self.optimiser}'", f"it is one of {', '.join(OPTIMISERS)}")
         if not self.window >= 3:
             fail("training", f"a window of {self.window} poses", "inertia needs at least 3")
         _need_between(self, 1, NO_BOUND, "iterations", "batch", "pretraining_batch", "static_batch", "validate_every")

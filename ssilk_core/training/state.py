@@ -156,8 +156,9 @@ def learned_tensors(stepper: Stepper) -> Tensors:
     """Return copies on the CPU of all that training changes: parameters, their average and the optimiser state."""
     tensors = {f"model.{name}": value for name, value in stepper.model.state_dict().items()}
     tensors |= {f"averaged.{name}": value for name, value in stepper.ema_model.state_dict().items()}
-    for index, moments in stepper.optimiser.state_dict()["state"].items():
-        tensors |= {f"adam.{index}.{name}": torch.as_tensor(value) for name, value in moments.items()}
+    for optimiser, used in stepper.optimisers.items():
+        for index, moments in used.state_dict()["state"].items():
+            tensors |= {f"{optimiser}.{index}.{name}": torch.as_tensor(value) for name, value in moments.items()}
     return copy_to_cpu(tensors)
 
 
@@ -165,12 +166,12 @@ def restore_learned(stepper: Stepper, tensors: Tensors) -> None:
     """Load the result of `learned_tensors` into a newly built `stepper`, which may have another batch."""
     stepper.model.load_state_dict(_group(tensors, "model."))
     stepper.ema_model.load_state_dict(_group(tensors, "averaged."))
-    moments: dict[int, Tensors] = {}
-    for name, value in _group(tensors, "adam.").items():
-        index, _, key = name.partition(".")
-        moments.setdefault(int(index), {})[key] = value
-    document = stepper.optimiser.state_dict()
-    stepper.optimiser.load_state_dict({"state": moments, "param_groups": document["param_groups"]})
+    for optimiser, used in stepper.optimisers.items():
+        moments: dict[int, Tensors] = {}
+        for name, value in _group(tensors, f"{optimiser}.").items():
+            index, _, key = name.partition(".")
+            moments.setdefault(int(index), {})[key] = value
+        used.load_state_dict({"state": moments, "param_groups": used.state_dict()["param_groups"]})
 
 
 def copy_to_cpu(tensors: Tensors) -> Tensors:

@@ -6,12 +6,14 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from ..config import TrainConfig
 from ..model.network import GarmentModel
+from .muon import Muon
 from .objective import Objective, total
 from .shape_smoothing import ShapeSmoothing
 from .skipped_steps import SkippedSteps
@@ -75,8 +77,7 @@ class Stepper:
         self.model, self.objective, self.sampler, self.config = model, objective, sampler, config
         self.average_gradients, self.smoothing = average_gradients, smoothing
         self.device = sampler.first.device
-        self.optimiser = _optimiser(model, self.device)
-        self.rate_scales = [1.0, config.skin_learning_rate_scale, config.shape_learning_rate_scale]
+        self.optimisers = _optimisers(model, config, self.device)
         self.ema_model = copy.deepcopy(model).requires_grad_(False)
         self.terms: dict[str, Tensor] = {}
         self.skipped = SkippedSteps(self.device)
@@ -115,7 +116,7 @@ class Stepper:
         beside: dict[str, Tensor] | None = None,
     ) -> None:
         """Do an optimiser step on a loss, which consists of `terms` and those in `beside`."""
-        self.optimiser.zero_grad(set_to_none=True)
+        self.model.zero_grad(set_to_none=True)
         loss.backward()
         gradients = [value.grad for value in self.model.parameters() if value.grad is not None]
         judged = loss.detach().clone()
@@ -126,11 +127,11 @@ class Stepper:
         # Normalise the gradient: one a hundred times larger than usual, from a single torn garment, would otherwise
         # dominate Adam's update of all parameters.
         torch._foreach_div_(gradients, norm.clamp_min(MIN_GRADIENT_NORM))
-        # The fused optimiser skips the step where this is one.
-        self.optimiser.found_inf = bad.float()  # type: ignore[attr-defined]
         if self.smoothing:
             self.smoothing.before_step()
-        self.optimiser.step()
+        for optimiser in self.optimisers.values():
+            optimiser.found_inf = bad.float()  # type: ignore[attr-defined]  # they skip the step where this is one
+            optimiser.step()
         if self.smoothing:
             self.smoothing.after_step()
         self._average()
@@ -152,11 +153,11 @@ class Stepper:
         rate = learning_rate(self.config, iteration)
         self._iteration.fill_(iteration)
         self._decay.fill_(averaging_decay(self.config, iteration))
-        for group, factor in zip(self.optimiser.param_groups, self.rate_scales):
+        for group in (group for optimiser in self.optimisers.values() for group in optimiser.param_groups):
             if self.device.type == "cuda":
-                group["lr"].fill_(rate * factor)
+                group["lr"].fill_(rate * group["scale"])
             else:
-                group["lr"] = rate * factor
+                group["lr"] = rate * group["scale"]
         name = "static" if iteration < self.config.static_iterations else "dynamic"
         body = self.static_step if name == "static" else self.dynamic_step
         if self.device.type == "cuda":
@@ -185,13 +186,27 @@ class Stepper:
         self._graph.replay()
 
 
-def _optimiser(model: GarmentModel, device: torch.device) -> torch.optim.Adam:
-    """Return Adam with parameter groups for networks, for integrator and skinning, and for blendshapes."""
-    groups: list[list[nn.Parameter]] = [[], [], []]
+def _optimisers(model: GarmentModel, config: TrainConfig, device: torch.device) -> dict[str, torch.optim.Optimizer]:
+    """Return the optimisers by name: Muon for the networks' matrices, if asked for, and Adam for all else.
+
+    Groups of parameters have a "scale", a factor on the learning rate.
+    """
+    scales = 1.0, config.skin_learning_rate_scale, config.shape_learning_rate_scale
+    matrices: list[nn.Parameter] = []
+    others: tuple[list[nn.Parameter], ...] = [], [], []  # of networks, of integrator and skinning, and blendshapes
     for name, value in model.named_parameters():
-        slow = name.startswith("integrator.") or "skin_offset" in name
-        groups[1 if slow else 2 if name == "decoder.shapes" else 0].append(value)
+        if name.startswith("integrator.") or "skin_offset" in name:
+            others[1].append(value)
+        elif name == "decoder.shapes":
+            others[2].append(value)
+        else:
+            (matrices if value.ndim == 2 and config.optimiser == "muon" else others[0]).append(value)
     on_gpu = device.type == "cuda"
-    # A captured graph reads the learning rate from a tensor; elsewhere a number is faster.
-    rated = [{"params": group, "lr": torch.tensor(0.0, device=device) if on_gpu else 0.0} for group in groups]
-    return torch.optim.Adam(rated, capturable=on_gpu, fused=True)
+
+    def group(parameters: list[nn.Parameter], scale: float) -> dict[str, Any]:
+        # A captured graph reads the learning rate from a tensor; elsewhere a number is faster.
+        return {"params": parameters, "lr": torch.tensor(0.0, device=device) if on_gpu else 0.0, "scale": scale}
+
+    rated = [group(parameters, scale) for parameters, scale in zip(others, scales)]
+    found: dict[str, torch.optim.Optimizer] = {"adam": torch.optim.Adam(rated, capturable=on_gpu, fused=True)}
+    return found | ({"muon": Muon([group(matrices, 1.0)])} if matrices else {})

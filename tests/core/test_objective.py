@@ -190,8 +190,9 @@ def test_only_the_direction_of_a_gradient_counts(objective, scale):
         other = copy.copy(objective)
         other.model = copy.deepcopy(objective.model)
         stepper = Stepper(other.model, other, sampler_of(objective, CONFIG), CONFIG)
-        for group in stepper.optimiser.param_groups:
-            group["lr"] = 0.01
+        for optimiser in stepper.optimisers.values():
+            for group in optimiser.param_groups:
+                group["lr"] = 0.01
         loss = factor * sum((value**2).sum() for value in other.model.parameters())
         stepper._descend(loss, {"loss": loss}, {})
         moved.append(dict(other.model.named_parameters()))

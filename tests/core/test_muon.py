@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Steps along orthogonalised momentum, against singular value decompositions in float64."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from ssilk_core.config import TrainConfig
+from ssilk_core.errors import SsilkError
+from ssilk_core.training.muon import ADAM_SIZE, MOMENTUM, Muon, orthogonalised
+
+
+def matrix_of(singular: list[float], rows: int, columns: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return U diag(singular) V', U and V with random orthonormal columns, float64."""
+    generator = torch.Generator().manual_seed(3)
+    u, v = (
+        torch.linalg.qr(torch.randn(size, len(singular), generator=generator, dtype=torch.float64))[0]
+        for size in (rows, columns)
+    )
+    return (u * torch.tensor(singular, dtype=torch.float64)) @ v.T, u, v
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(40, 12), (12, 40), (12, 12)])
+def test_singular_vectors_stay_and_singular_values_become_about_one(rows, columns):
+    spread = np.geomspace(3e-5, 1e-3, 12).tolist()
+    matrix, u, v = matrix_of(spread, rows, columns)
+    found = u.T @ orthogonalised(matrix) @ v
+    np.testing.assert_allclose(found - torch.diag(found.diagonal()), 0, atol=1e-6)
+    assert 0.5 < float(found.diagonal().min()) and float(found.diagonal().max()) < 1.5
+
+
+def test_nothing_is_made_of_nothing():
+    assert orthogonalised(torch.zeros(4, 3)).abs().max() == 0
+
+
+def stepped(optimiser: Muon, matrix: nn.Parameter, gradient: Tensor, skip: float = 0.0) -> None:
+    matrix.grad, optimiser.found_inf = gradient, torch.tensor(skip)
+    optimiser.step()
+
+
+def test_steps_are_as_long_as_adam_s_and_follow_the_momentum():
+    matrix = nn.Parameter(torch.zeros(6, 24, dtype=torch.float64))
+    optimiser = Muon([{"params": [matrix], "lr": 0.01}])
+    first, second = (torch.randn(6, 24, generator=torch.Generator().manual_seed(n)).double() for n in (1, 2))
+    stepped(optimiser, matrix, first)
+    moved = -matrix.detach().clone()
+    np.testing.assert_allclose(moved, 0.01 * ADAM_SIZE * math.sqrt(24) * orthogonalised(first), atol=1e-9)
+    assert float(moved.square().mean().sqrt()) == pytest.approx(0.01 * ADAM_SIZE, rel=0.3)
+    stepped(optimiser, matrix, second)
+    momentum = MOMENTUM * (1 - MOMENTUM) * first + (1 - MOMENTUM) * second
+    ahead = MOMENTUM * momentum + (1 - MOMENTUM) * second
+    change = 0.01 * ADAM_SIZE * math.sqrt(24) * orthogonalised(ahead)
+    np.testing.assert_allclose(-matrix.detach() - moved, change, atol=1e-9)
+
+
+def test_a_skipped_step_changes_nothing_whatever_its_gradient():
+    matrix = nn.Parameter(torch.ones(3, 5))
+    optimiser = Muon([{"params": [matrix], "lr": 0.1}])
+    stepped(optimiser, matrix, torch.ones(3, 5))
+    before, momentum = matrix.detach().clone(), optimiser.state[matrix]["momentum"].clone()
+    stepped(optimiser, matrix, torch.full((3, 5), math.nan), skip=1.0)
+    assert torch.equal(matrix, before) and torch.equal(optimiser.state[matrix]["momentum"], momentum)
+
+
+def test_soft_directions_converge_as_fast_as_stiff_ones():
+    """The gradient of 1/2 |H (X - Y)|^2 with stiffnesses from 1 to 1,000, which is what a garment's energy is like."""
+    stiffness, u, _ = matrix_of(np.geomspace(1, 1000, 12).tolist(), 12, 12)
+    stiffness = stiffness @ stiffness.T
+    target = torch.randn(12, 12, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    left = {}
+    for name, build in (
+        ("muon", lambda value: Muon([{"params": [value], "lr": 0.0}])),
+        ("adam", lambda value: torch.optim.Adam([value], 0.0)),
+    ):
+        matrix = nn.Parameter(torch.zeros(12, 12, dtype=torch.float64))
+        optimiser = build(matrix)
+        for step in range(300):
+            matrix.grad = stiffness @ (matrix.detach() - target)
+            optimiser.param_groups[0]["lr"] = 0.1 * (1 - step / 300)
+            optimiser.step()
+        left[name] = float((u.T @ (matrix.detach() - target))[0].norm())  # along the softest direction
+    assert left["muon"] < 0.5 * left["adam"]
+
+
+def test_another_optimiser_is_refused():
+    with pytest.raises(SsilkError, match="optimiser 'sgd'; it is one of muon, adam"):
+        TrainConfig(optimiser="sgd")
