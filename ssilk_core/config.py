@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from .errors import fail
 from .schemes import need_scheme
 
-CLOSEST_POINTS, OPTIMISERS = ("triangles", "vertices"), ("muon", "adam")
+CLOSEST_POINTS, OPTIMISERS = ("triangles", "vertices"), ("adam", "muon")
 MAX_SIZE = 65_536  # of a part of the network; larger ones fit into no machine
 MOST_OF_ALL = 0.99999  # largest share of static training, and decay of an average
 MOST_SMOOTHED_VERTICES = 10_000  # by `training.shape_smoothing`, whose matrix then takes 0.4 GB
@@ -113,7 +113,7 @@ class TrainConfig:
         latent_regularization_scale: RMS distance between garments per unit of distance between their latents, for
             Eq. 13 [m].
         bptt: back-propagate through the whole window, as the paper does, instead of through each step by itself.
-        optimiser: of the networks' matrices: "muon" (`training.muon`), or "adam" as for all other parameters.
+        optimiser: of the networks' matrices: "adam", as for all other parameters, or "muon" (`training.muon`).
         static_learning_rate: initial learning rate in static training; it decays to a tenth.
         learning_rate, final_learning_rate: learning rate in dynamic training after the warm-up, and at the
             end of the cosine schedule.
@@ -151,7 +151,7 @@ class TrainConfig:
     latent_regularization: float = 0.0
     latent_regularization_scale: float = 0.03
     bptt: bool = False
-    optimiser: str = "muon"
+    optimiser: str = "adam"
     static_learning_rate: float = 2e-3
     learning_rate: float = 3e-4
     final_learning_rate: float = 2e-5
@@ -231,6 +231,7 @@ PRESETS = {
                 learning_rate=6e-4,
                 final_learning_rate=1e-4,
                 shape_learning_rate_scale=1.0,
+                optimiser="muon",
                 learning_rate_warmup=20,
                 ema_decay=0.98,
                 closest_point="vertices",

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Muon: steps of matrices along orthogonalised momentum (Jordan et al., "Muon", 2024).
 
-The energy is a thousand times stiffer in some directions of a network's output than in others. Adam scales each entry
-of a matrix by itself, and so fits the stiff directions first and the others hardly ever. An orthogonalised step is as
-long in all directions: with the momentum M = U diag(s) V', it is U V'. A Newton-Schulz iteration makes it of products
-of matrices alone. PyTorch's `torch.optim.Muon` is not used because it reads the learning rate on the host, which a
-captured graph must not, and does not know how to skip a step.
+The energy is far stiffer in some directions of a network's output than in others. Adam scales each entry of a matrix
+by itself, and comes to the soft directions late. An orthogonalised step is as long in all directions: with the
+momentum M = U diag(s) V', it is U V'. A Newton-Schulz iteration makes it of products of matrices alone. PyTorch's
+`torch.optim.Muon` is not used because it reads the learning rate on the host, which a captured graph must not, and
+cannot skip a step.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torch import Tensor
 MOMENTUM = 0.95
 ITERATIONS = 5
 QUINTIC = (3.4445, -4.7750, 2.0315)  # brings singular values from 0.01 to 1 near 1 in few iterations
-ADAM_SIZE = 0.5  # RMS of a change, in learning rates of Adam; so one rate serves both
+STEP_SIZE = 0.5  # RMS of the changes of a matrix, in learning rates; Adam's is at most about 1
 LEAST_NORM = 1e-30
 
 
@@ -65,7 +65,7 @@ class Muon(torch.optim.Optimizer):
                 if not state:
                     state["momentum"] = torch.zeros_like(matrix)
                 momentum, gradient = state["momentum"], matrix.grad
-                rate = group["lr"] * ADAM_SIZE * max(matrix.shape) ** 0.5
+                rate = group["lr"] * STEP_SIZE * max(matrix.shape) ** 0.5
                 if self.found_inf is not None:
                     gradient = torch.where(self.found_inf > 0, momentum, gradient)
                     rate = rate * (1 - self.found_inf)

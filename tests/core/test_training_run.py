@@ -48,6 +48,7 @@ SHORT = TrainConfig(
     iterations=14,
     static_fraction=0.3,
     perturbations=0,
+    optimiser="muon",  # beside Adam
     pretraining_batch=6,
     batch=3,
     static_batch=4,
