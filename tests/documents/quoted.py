@@ -105,11 +105,22 @@ def training() -> Text:
     yield f"| `thickness` (material) [mm] | {1000 * cloth.thickness:g} | none |"
     yield f"{default('fps'):g} times a second"
     yield from shape_smoothing()
+    yield from optimiser()
     yield f"`final` takes {PRESETS['final'].train.ema_decay:g}"
     yield default_step()
     preview, final = (preset_minutes(PRESETS[name]) for name in ("preview", "final"))
     yield f"`preview` takes {60 * preview:.0f} s and `final` {final:.0f} minutes"
     yield "(`recombinations={0.recombinations}`, `perturbations={0.perturbations}`)".format(PRESETS["final"].train)
+
+
+def optimiser() -> Text:
+    yield f"| `optimiser` | {default('optimiser')} | not stated |"
+    runs = result("optimiser_training")
+    for garment in ("cape", "fringe_skirt", "hooded_dress"):
+        least = (f"{min(runs[f'{garment}_{name}']['total']):.3f}" for name in ("muon", "adam"))
+        yield row(garment.replace("_", " "), *least)
+    (draft,) = (name for name, preset in PRESETS.items() if preset.train.optimiser == "muon")
+    yield f"`{draft}`\ntakes it"
 
 
 def shape_smoothing() -> Text:

@@ -239,6 +239,21 @@ def from_own_start() -> Text:
     assert sum(map(sum, reached.values())) == reached["fringe_skirt"][1] == 1, "the document says so"
 
 
+def moving_states() -> Text:
+    at = result("moving_states")["cape"]
+    for words, *names in (
+        ("step: energy above the next better way [mJ]", "lost by the network [mJ]", "lost by the decoder [mJ]"),
+        ("step: distance from the solver [mm]", "network from solver [mm]", "best outputs from solver [mm]"),
+        ("from the solver after 5 frames [mm]", "network, after 5 [mm]", "best outputs, after 5 [mm]"),
+        ("after 10", "network, after 10 [mm]", "best outputs, after 10 [mm]"),
+        ("after 30", "network, after 30 [mm]", "best outputs, after 30 [mm]"),
+    ):
+        yield row(words, *(f"{at[name]:.1f}" for name in names))
+    yield f"These are {at['steps']} steps and {at['shots']} shots."
+    assert at["best outputs, after 5 [mm]"] > 10 and at["best outputs, after 30 [mm]"] > 60, "the document says so"
+    assert at["lost by the network [mJ]"] > 0.8 * sum(at[f"lost by the {who} [mJ]"] for who in ("network", "decoder"))
+
+
 def static_states() -> Text:
     for garment, states in result("static_states").items():
         for number, (state, at) in enumerate(states.items()):
@@ -612,7 +627,8 @@ def scenes() -> Text:
 
 
 PARTS = (
-    opening, conditions, shown, clearance, moving, contact, from_own_start, static_states, table1, findings, dynamics,
+    opening, conditions, shown, clearance, moving, contact, from_own_start, moving_states, static_states, table1,
+    findings, dynamics,
     ablations,
     wardrobe, long_training, short_training, rest, playing, sizes, levels, refinement, inside_the_body, stress,
     training_speed, scenes,
