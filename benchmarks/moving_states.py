@@ -98,7 +98,7 @@ class BestOutputs:
         return torch.cat(parts, dim=-1)
 
 
-class Shot:
+class PlayedWindow:
     """A window of a network's take, in the solver's terms.
 
     Attributes:
@@ -170,9 +170,9 @@ def measure(subject: Subject, options: Namespace) -> dict[str, float]:
     played = Network(subject.model, take_set)
     steps, drifts, begun = [], [], time.perf_counter()
     for take, frames in windows_of(subject.dressed, take_set, range(len(takes))):
-        shot = Shot(subject, take_set, played, take, frames)
-        steps += [shot.single_step(frame) for frame in range(2, len(frames), STEP_EVERY)]
-        drifts.append(shot.drift())
+        window = PlayedWindow(subject, take_set, played, take, frames)
+        steps += [window.single_step(frame) for frame in range(2, len(frames), STEP_EVERY)]
+        drifts.append(window.drift())
         print(f"{subject.name}: {takes[take].clip}, {time.perf_counter() - begun:.0f} s", flush=True)
     found = torch.tensor(steps)
     energy, square = found[:, :2].mean(0), found[:, 2:].mean(0).sqrt()
