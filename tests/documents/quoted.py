@@ -116,7 +116,7 @@ def training() -> Text:
 def optimiser() -> Text:
     yield f"| `optimiser` | {default('optimiser')} | not stated |"
     runs = result("optimiser_training")
-    for garment in ("cape", "fringe_skirt"):
+    for garment in ("cape", "fringe_skirt", "hooded_dress"):
         least = (f"{min(runs[f'{garment}_{name}']['total']):.3f}" for name in ("muon", "adam"))
         yield row(garment.replace("_", " "), *least)
     (draft,) = (name for name, preset in PRESETS.items() if preset.train.optimiser == "muon")
