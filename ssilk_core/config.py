@@ -113,7 +113,8 @@ class TrainConfig:
         latent_regularization_scale: RMS distance between garments per unit of distance between their latents, for
             Eq. 13 [m].
         bptt: back-propagate through the whole window, as the paper does, instead of through each step by itself.
-        optimiser: of the networks' matrices: "adam", as for all other parameters, or "muon" (`training.muon`).
+        optimiser: of the networks' matrices: "muon" (`training.muon`), or "adam", as for all other parameters and in the
+            paper's recipe.
         static_learning_rate: initial learning rate in static training; it decays to a tenth.
         learning_rate, final_learning_rate: learning rate in dynamic training after the warm-up, and at the
             end of the cosine schedule.
@@ -151,7 +152,7 @@ class TrainConfig:
     latent_regularization: float = 0.0
     latent_regularization_scale: float = 0.03
     bptt: bool = False
-    optimiser: str = "adam"
+    optimiser: str = "muon"
     static_learning_rate: float = 2e-3
     learning_rate: float = 3e-4
     final_learning_rate: float = 2e-5
@@ -231,7 +232,6 @@ PRESETS = {
                 learning_rate=6e-4,
                 final_learning_rate=1e-4,
                 shape_learning_rate_scale=1.0,
-                optimiser="muon",
                 learning_rate_warmup=20,
                 ema_decay=0.98,
                 closest_point="vertices",

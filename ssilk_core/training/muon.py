@@ -23,24 +23,25 @@ STEP_SIZE = 0.5  # RMS of the changes of a matrix, in learning rates; Adam's is 
 LEAST_NORM = 1e-30
 
 
-def orthogonalised(matrix: Tensor) -> Tensor:
-    """Return about U V' of a matrix U diag(s) V', shape (rows, columns); its singular values lie in [0.5, 1.5].
+def orthogonalised(matrices: Tensor) -> Tensor:
+    """Return about U V' of each matrix U diag(s) V', (N, rows, columns); their singular values lie in [0.5, 1.5].
 
-    Those of less than about 0.01 of the matrix's norm become smaller. On a GPU products are in bfloat16.
+    Those of less than about 0.01 of a matrix's norm become smaller. On a GPU products are in bfloat16.
     """
     a, b, c = QUINTIC
-    wide = matrix.T if matrix.shape[0] > matrix.shape[1] else matrix
-    x = wide / wide.norm().clamp_min(LEAST_NORM)  # so that no singular value exceeds one
+    is_tall = matrices.shape[1] > matrices.shape[2]
+    wide = matrices.mT if is_tall else matrices
+    x = wide / wide.norm(dim=(1, 2), keepdim=True).clamp_min(LEAST_NORM)  # so that no singular value exceeds one
     x = x.bfloat16() if x.is_cuda else x
     for _ in range(ITERATIONS):
-        square = x @ x.T
-        x = a * x + (b * square + c * square @ square) @ x
-    x = x.to(matrix.dtype)
-    return x.T if matrix.shape[0] > matrix.shape[1] else x
+        square = x @ x.mT
+        x = torch.baddbmm(x, torch.baddbmm(square, square, square, beta=b, alpha=c), x, beta=a)
+    x = x.to(matrices.dtype)
+    return x.mT if is_tall else x
 
 
 class Muon(torch.optim.Optimizer):
-    """Steps of matrices along their orthogonalised momentum.
+    """Steps of matrices along their orthogonalised momentum; those of one shape are taken together.
 
     Attributes:
         found_inf: one where the next step is to be skipped, else zero, as PyTorch's fused optimisers have it.
@@ -58,16 +59,26 @@ class Muon(torch.optim.Optimizer):
     def step(self, closure: None = None) -> None:  # type: ignore[override]
         """Move each matrix W of n rows or columns, whichever are more, by 0.5 sqrt(n) of the learning rate."""
         for group in self.param_groups:
+            alike: dict[torch.Size, list[Tensor]] = {}
             for matrix in group["params"]:
-                if matrix.grad is None:
-                    continue
-                state = self.state[matrix]
-                if not state:
-                    state["momentum"] = torch.zeros_like(matrix)
-                momentum, gradient = state["momentum"], matrix.grad
-                rate = group["lr"] * STEP_SIZE * max(matrix.shape) ** 0.5
+                if matrix.grad is not None:
+                    alike.setdefault(matrix.shape, []).append(matrix)
+            for shape, matrices in alike.items():
+                rate = group["lr"] * STEP_SIZE * max(shape) ** 0.5
                 if self.found_inf is not None:
-                    gradient = torch.where(self.found_inf > 0, momentum, gradient)
                     rate = rate * (1 - self.found_inf)
-                momentum.lerp_(gradient, 1 - MOMENTUM)
-                matrix.sub_(rate * orthogonalised(gradient.lerp(momentum, MOMENTUM)))
+                directions = orthogonalised(torch.stack([self._ahead(matrix) for matrix in matrices]))
+                for matrix, direction in zip(matrices, directions):
+                    matrix.sub_(rate * direction)
+
+    def _ahead(self, matrix: Tensor) -> Tensor:
+        """Update a matrix's momentum; return what the next one would be with the same gradient (Nesterov)."""
+        state, gradient = self.state[matrix], matrix.grad
+        assert gradient is not None
+        if not state:
+            state["momentum"] = torch.zeros_like(matrix)
+        momentum = state["momentum"]
+        if self.found_inf is not None:
+            gradient = torch.where(self.found_inf > 0, momentum, gradient)
+        momentum.lerp_(gradient, 1 - MOMENTUM)
+        return gradient.lerp(momentum, MOMENTUM)

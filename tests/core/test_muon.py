@@ -29,13 +29,13 @@ def matrix_of(singular: list[float], rows: int, columns: int) -> tuple[Tensor, T
 def test_singular_vectors_stay_and_singular_values_become_about_one(rows, columns):
     spread = np.geomspace(3e-5, 1e-3, 12).tolist()
     matrix, u, v = matrix_of(spread, rows, columns)
-    found = u.T @ orthogonalised(matrix) @ v
+    found = u.T @ orthogonalised(matrix[None])[0] @ v
     np.testing.assert_allclose(found - torch.diag(found.diagonal()), 0, atol=1e-6)
     assert float(found.diagonal().min()) > 0.5 and float(found.diagonal().max()) < 1.5
 
 
 def test_nothing_is_made_of_nothing():
-    assert orthogonalised(torch.zeros(4, 3)).abs().max() == 0
+    assert orthogonalised(torch.zeros(2, 4, 3)).abs().max() == 0
 
 
 def stepped(optimiser: Muon, matrix: nn.Parameter, gradient: Tensor, skip: float = 0.0) -> None:
@@ -49,12 +49,12 @@ def test_steps_are_as_long_as_adam_s_and_follow_the_momentum():
     first, second = (torch.randn(6, 24, generator=torch.Generator().manual_seed(n)).double() for n in (1, 2))
     stepped(optimiser, matrix, first)
     moved = -matrix.detach().clone()
-    np.testing.assert_allclose(moved, 0.01 * STEP_SIZE * math.sqrt(24) * orthogonalised(first), atol=1e-9)
+    np.testing.assert_allclose(moved, 0.01 * STEP_SIZE * math.sqrt(24) * orthogonalised(first[None])[0], atol=1e-9)
     assert float(moved.square().mean().sqrt()) == pytest.approx(0.01 * STEP_SIZE, rel=0.3)
     stepped(optimiser, matrix, second)
     momentum = MOMENTUM * (1 - MOMENTUM) * first + (1 - MOMENTUM) * second
     ahead = MOMENTUM * momentum + (1 - MOMENTUM) * second
-    change = 0.01 * STEP_SIZE * math.sqrt(24) * orthogonalised(ahead)
+    change = 0.01 * STEP_SIZE * math.sqrt(24) * orthogonalised(ahead[None])[0]
     np.testing.assert_allclose(-matrix.detach() - moved, change, atol=1e-9)
 
 
@@ -65,6 +65,19 @@ def test_a_skipped_step_changes_nothing_whatever_its_gradient():
     before, momentum = matrix.detach().clone(), optimiser.state[matrix]["momentum"].clone()
     stepped(optimiser, matrix, torch.full((3, 5), math.nan), skip=1.0)
     assert torch.equal(matrix, before) and torch.equal(optimiser.state[matrix]["momentum"], momentum)
+
+
+def test_matrices_of_one_shape_are_stepped_each_by_itself():
+    gradients = [torch.randn(*shape, generator=torch.Generator().manual_seed(7)) for shape in ((5, 3), (3, 5), (5, 3))]
+    gradients[2] *= 100
+    together = [nn.Parameter(torch.zeros_like(gradient)) for gradient in gradients]
+    for matrix, gradient in zip(together, gradients):
+        matrix.grad = gradient.clone()
+    Muon([{"params": together, "lr": 0.1}]).step()
+    for matrix, gradient in zip(together, gradients):
+        alone = nn.Parameter(torch.zeros_like(gradient))
+        stepped(Muon([{"params": [alone], "lr": 0.1}]), alone, gradient)
+        np.testing.assert_allclose(matrix.detach(), alone.detach(), atol=1e-6)
 
 
 def test_soft_directions_converge_as_fast_as_stiff_ones():
