@@ -113,8 +113,8 @@ class TrainConfig:
         latent_regularization_scale: RMS distance between garments per unit of distance between their latents, for
             Eq. 13 [m].
         bptt: back-propagate through the whole window, as the paper does, instead of through each step by itself.
-        optimiser: of the networks' matrices: "muon" (`training.muon`), or "adam", as for all other parameters and in the
-            paper's recipe.
+        optimiser: of the networks' matrices: "muon" (`training.muon`), or "adam", as for all other parameters and in
+            the paper's recipe.
         static_learning_rate: initial learning rate in static training; it decays to a tenth.
         learning_rate, final_learning_rate: learning rate in dynamic training after the warm-up, and at the
             end of the cosine schedule.

@@ -68,7 +68,9 @@ def test_a_skipped_step_changes_nothing_whatever_its_gradient():
 
 
 def test_matrices_of_one_shape_are_stepped_each_by_itself():
-    gradients = [torch.randn(*shape, generator=torch.Generator().manual_seed(7)) for shape in ((5, 3), (3, 5), (5, 3))]
+    gradients = [
+        torch.randn(*shape, generator=torch.Generator().manual_seed(7)) for shape in ((5, 3), (3, 5), (5, 3))
+    ]
     gradients[2] *= 100
     together = [nn.Parameter(torch.zeros_like(gradient)) for gradient in gradients]
     for matrix, gradient in zip(together, gradients):
