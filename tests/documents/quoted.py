@@ -8,6 +8,7 @@ no figure outside of them. After a new measurement the failing test shows the li
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 from ssilk_usd import memory, trial
 
@@ -116,11 +117,21 @@ def training() -> Text:
 def optimiser() -> Text:
     yield f"| `optimiser` | {default('optimiser')} | not stated |"
     runs = result("optimiser_training")
+    muon, adam = result("muon_training"), result("tight_training")
     for garment in ("cape", "fringe_skirt", "hooded_dress"):
         least = (f"{min(runs[f'{garment}_{name}']['total']):.3f}" for name in ("muon", "adam"))
-        yield row(garment.replace("_", " "), *least)
-    (draft,) = (name for name, preset in PRESETS.items() if preset.train.optimiser == "muon")
-    yield f"`{draft}`\ntakes it"
+        yield row(garment.replace("_", " "), *least, *(least_at(each[garment]) for each in (muon, adam)))
+    first, other = muon["cape"], muon["cape_seed_1"]
+    longer = percent(other["seconds"][-1] / first["seconds"][-1] - 1)
+    yield f"Another seed of the cape has {fixed(min(other['total']), 4)} J, with {longer} % more time"
+    cape, skirt, dress = (muon[name]["total"][-1] for name in ("cape", "fringe_skirt", "hooded_dress"))
+    yield f"to {cape:.4f} J for the cape, {skirt:.4f} J for the fringe skirt and {dress:.4f} J for the dress"
+
+
+def least_at(run: dict[str, Any]) -> str:
+    """Return the lowest total of a training [J] and its iteration, of how many."""
+    at = run["total"].index(min(run["total"]))
+    return f"{run['total'][at]:.4f} at {run['iterations'][at]:,} of {run['iterations'][-1]:,}"
 
 
 def shape_smoothing() -> Text:
