@@ -36,6 +36,7 @@ SCHEDULE = (
     "state_reuse=0",
     "learning_rate=1e-3",
     "final_learning_rate=4e-5",
+    "optimiser=adam",
 )
 
 

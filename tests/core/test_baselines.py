@@ -45,6 +45,7 @@ CONFIG = TrainConfig(
     rotated_fraction=0.0,
     learning_rate=1e-3,
     learning_rate_warmup=5,
+    optimiser="adam",
 )
 
 
