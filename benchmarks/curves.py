@@ -27,9 +27,11 @@ from ssilk_core.events import format_seconds
 from ssilk_core.training.curve import curve_path
 from ssilk_core.training.verdict import curve_lbs
 
-SHOWS = "shows"
-PANELS = ("total", *TERMS, "collisions", "dynamics", SHOWS)
-UNITS = {"collisions": "share of vertices", "dynamics": "m", SHOWS: "share of covered skin"}  # of others: J
+NESTED = {"shows": ("shown_skin", "mean"), "step energy": ("steps", "energy"), "step distance": ("steps", "distance")}
+PANELS = ("total", *TERMS, "collisions", "dynamics", *NESTED)
+UNITS = {
+    "collisions": "share of vertices", "dynamics": "m", "shows": "share of covered skin", "step distance": "m"
+}  # of others: J  # fmt: skip
 SHOWN = 0.9  # share of the values that a panel shows: the first ones would flatten all others
 
 
@@ -76,14 +78,15 @@ def read_run(text: str) -> Run:
     points = document["points"]
     if not points:
         fail(str(path), "the curve has no point yet", "one validation at least is needed", "train longer")
-    found = [{SHOWS: _shown(point["validation"]), **point["validation"]} for point in points]
-    values = {key: np.array([each.get(key, 0.0) for each in found]) for key in PANELS}
+    values = {key: np.array([_value(point["validation"], key) for point in points]) for key in PANELS}
     iterations, seconds = (np.array([point[key] for point in points]) for key in ("iteration", "seconds"))
     return Run(name or Path(model).stem, iterations, seconds, values, curve_lbs(document)["total"])
 
 
-def _shown(validation: dict[str, Any]) -> float:
-    return float((validation.get("shown_skin") or {"mean": 0.0})["mean"])
+def _value(validation: dict[str, Any], key: str) -> float:
+    """Return a value of a validation; zero where it was not measured."""
+    part, name = NESTED.get(key, ("", key))
+    return float((validation.get(part, {}) if part else validation).get(name, 0.0))
 
 
 def bounds(values: Iterable[np.ndarray]) -> tuple[float, float]:

@@ -14,9 +14,12 @@ from ..shown_skin import ShownSkin
 from ..stress.outcome import HEADER, CaseOutcome
 from ..trade.plot import trade_panels
 from ..trade.point import TradePoint
+from ..training.step_errors import StepErrors
 from ..training.verdict import curve_lbs
 from .page import Section, facts, flattened, table
 from .terms import SHARE, SHOWN
+
+MISSED = "energy that steps miss"
 
 MAX_COLUMNS = 12  # of a table of records; a page is not wider
 
@@ -111,6 +114,9 @@ def learning(document: Mapping[str, Any]) -> Section:
     found = [point["validation"].get("shown_skin") for point in points]
     if all(found):
         shown[SHOWN] = ("%", [100 * each["mean"] for each in found])
+    steps = [point["validation"].get("steps") for point in points]
+    if all(steps):
+        shown[MISSED] = ("mJ", [1000 * each["energy"] for each in steps])
     rows = [
         [ChartPanel(title=title, x="training time [s]", y=unit, curves={"": (times, values)},
                     marks={"best": (times[best], values[best])})]
@@ -122,4 +128,6 @@ def learning(document: Mapping[str, Any]) -> Section:
     )
     if found[best]:
         words += f" At the best, {ShownSkin(**found[best])}."
+    if steps[best]:
+        words += f" Its {StepErrors(**steps[best])}."
     return Section("Training", svg_chart("validations during training", rows) + f'<p class="note">{words}</p>')

@@ -53,8 +53,9 @@ def write_curve(path: Path, curve: list[CurvePoint], lbs: Score) -> None:
 
 
 def summary(score: Score) -> dict[str, Any]:
-    """Return a score by name: each term and the total [J], collisions, dynamics [m], the skin that shows if any."""
-    shown = {"shown_skin": asdict(score.shown_skin)} if score.shown_skin else {}
+    """Return a score by name: terms and total [J], collisions, dynamics [m], and skin and steps, where measured."""
+    parts = {"shown_skin": score.shown_skin, "steps": score.steps}
+    measured = {name: asdict(part) for name, part in parts.items() if part}
     return {
-        **score.terms, "total": score.total, "collisions": score.collisions, "dynamics": score.dynamics, **shown
+        **score.terms, "total": score.total, "collisions": score.collisions, "dynamics": score.dynamics, **measured
     }  # fmt: skip

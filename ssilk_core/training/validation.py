@@ -20,9 +20,13 @@ from ..energy.frames import FRAMES_PER_CHUNK, energy_terms
 from ..motion_bank import LatentModel, MotionBank, roll_states
 from ..shown_skin import ShownSkin
 from ..skinning import Skinning
+from .newton_steps import NewtonSteps
 from .parallel import SINGLE_PROCESS, ProcessGroup
+from .step_errors import StepErrors
 
-SHOWN_FRAMES = 32, 256  # in which the skin that shows is counted, on a CPU and on a GPU; rays take long on a CPU
+# On a CPU and on a GPU. Rays and Hessians take long on a CPU.
+SHOWN_FRAMES = 32, 256  # in which the skin that shows is counted
+STEPS = 16, 64  # whose errors are measured
 
 
 @dataclass(frozen=True)
@@ -35,18 +39,21 @@ class Score:
         dynamics: RMS distance between the rollout and the quasi-static states of the same poses [m].
         shown_skin: share of the covered skin that shows, in `SHOWN_FRAMES` spread evenly over all clips; None where
             the garment covers nothing.
+        steps: what `STEPS` single steps miss, spread likewise; None for linear blend skinning.
     """
 
     terms: dict[str, float]
     collisions: float
     dynamics: float = 0.0
     shown_skin: ShownSkin | None = None
+    steps: StepErrors | None = None
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> Score:
-        """Return a score from its JSON document; earlier versions did not measure the skin that shows."""
-        shown = document.get("shown_skin")
-        return cls(**{**document, "shown_skin": ShownSkin(**shown) if shown else None})
+        """Return a score from its JSON document; earlier versions measured neither skin nor steps."""
+        shown, steps = document.get("shown_skin"), document.get("steps")
+        parts = {"shown_skin": shown and ShownSkin(**shown), "steps": steps and StepErrors(**steps)}
+        return cls(**{**document, **parts})
 
     @property
     def total(self) -> float:
@@ -78,7 +85,7 @@ class Validator:
         self.lbs = Skinning(scene.lbs_skin).to(rest.device)
         self.contacts = Contacts(scene, energy.cloth.samples, vertices=body.vertices, device=rest.device)
         self.covered = CoveredSkin(scene, device=rest.device)
-        self.rest = rest
+        self.rest, self.scene = rest, scene
         self.clips = [
             range(int(start), min(int(stop), int(start) + frames)) for start, stop in zip(bank.starts, bank.stops)
         ]
@@ -109,15 +116,16 @@ class Validator:
         dealt = self.group.gather([{name: value.cpu() for name, value in terms.items()} for terms in own])
         scores = [dealt[index % self.group.size][index // self.group.size] for index in range(len(self.clips))]
         joined = {name: float(torch.cat([score[name] for score in scores]).mean()) for name in scores[0]}
-        shown = self._shown(model, states)
-        return Score({name: joined[name] for name in TERMS}, joined["collisions"], joined["dynamics"] ** 0.5, shown)
+        terms = {name: joined[name] for name in TERMS}
+        shown, steps = self._shown(model, states), self._step_errors(model, states)
+        return Score(terms, joined["collisions"], joined["dynamics"] ** 0.5, shown, steps)
 
     @torch.no_grad()
     def _shown(self, model: LatentModel | None, states: Sequence[Tensor | None]) -> ShownSkin | None:
         """Return how much of the covered skin shows; all processes of the group get the same."""
         own, counts = range(self.group.rank, len(self.clips), self.group.size), {}
         for number, latents in zip(own, states):
-            clip, chosen = self.clips[number], self._sampled[number]
+            clip, chosen = self.clips[number], self._spread(SHOWN_FRAMES)[number]
             if not chosen:
                 continue
             frames = torch.tensor(chosen, device=self.rest.device)
@@ -130,11 +138,38 @@ class Validator:
         joined = {number: found for part in self.group.gather(counts) for number, found in part.items()}
         return self.covered.figures([(self.names[number], joined[number]) for number in sorted(joined)])
 
+    @torch.no_grad()
+    def _step_errors(self, model: LatentModel | None, states: Sequence[Tensor | None]) -> StepErrors | None:
+        """Return what single steps of a model miss; all processes of the group get the same."""
+        if model is None:
+            return None
+        own, parts = range(self.group.rank, len(self.clips), self.group.size), []
+        for number, latents in zip(own, states):
+            clip, chosen = self.clips[number], self._spread(STEPS)[number]
+            if not chosen or latents is None:
+                continue
+            frames = torch.tensor(chosen, device=self.rest.device).clamp_min(2)
+            path = [
+                model.vertices(latents[at], self.bank.character(clip.start + at)) for at in (frames - 2, frames - 1)
+            ]
+            character, root = self.bank.character(clip.start + frames), self.bank.root[clip.start + frames]
+            shift = (root - self.bank.root[clip.start + frames - 1]).T
+            path.append(model.vertices(latents[frames], character))
+            body, lbs = self.body.pose(character, exact=True), self.lbs_vertices(character)
+            parts.append([values.cpu() for values in self._newton.measure(path, lbs, body, shift)])
+        energy, square = (
+            torch.cat(values) for values in zip(*(part for dealt in self.group.gather(parts) for part in dealt))
+        )
+        return StepErrors(len(energy), float(energy.mean()), float(square.mean().sqrt()))
+
     @cached_property
-    def _sampled(self) -> list[list[int]]:
-        """Frames of each clip, spread evenly over all clips."""
+    def _newton(self) -> NewtonSteps:
+        return NewtonSteps(self.scene, self.energy.fabric, self.fps, self.rest.device)
+
+    def _spread(self, counts: tuple[int, int]) -> list[list[int]]:
+        """Return so many frames, on a CPU and on a GPU, spread evenly over all clips, by clip."""
         ends = list(accumulate(map(len, self.clips), initial=0))
-        count = min(SHOWN_FRAMES[self.rest.is_cuda], ends[-1])
+        count = min(counts[self.rest.is_cuda], ends[-1])
         spread = [(2 * number + 1) * ends[-1] // (2 * count) for number in range(count)]
         return [[frame - first for frame in spread if first <= frame < end] for first, end in pairwise(ends)]
 
