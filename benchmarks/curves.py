@@ -15,7 +15,6 @@ import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from helpers.reports import RESULTS, table, write_results
@@ -27,17 +26,24 @@ from ssilk_core.events import format_seconds
 from ssilk_core.training.curve import curve_path
 from ssilk_core.training.verdict import curve_lbs
 
-NESTED = {"shows": ("shown_skin", "mean"), "step energy": ("steps", "energy"), "step distance": ("steps", "distance")}
+NESTED = {
+    "shows": ("shown_skin", "mean"),
+    "step energy": ("step_errors", "energy"),
+    "step distance": ("step_errors", "distance"),
+}  # parts of a validation, which earlier versions did not have
 PANELS = ("total", *TERMS, "collisions", "dynamics", *NESTED)
 UNITS = {
-    "collisions": "share of vertices", "dynamics": "m", "shows": "share of covered skin", "step distance": "m"
-}  # of others: J  # fmt: skip
+    "collisions": "share of vertices",
+    "dynamics": "m",
+    "shows": "share of covered skin",
+    "step distance": "m",
+}  # of others: J
 SHOWN = 0.9  # share of the values that a panel shows: the first ones would flatten all others
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """The validations of one training: iterations, seconds and values, shape (points,).
+    """The validations of one training: iterations, seconds and values, shape (points,), or (0,) if not measured.
 
     Linear blend skinning's total.
     """
@@ -78,15 +84,12 @@ def read_run(text: str) -> Run:
     points = document["points"]
     if not points:
         fail(str(path), "the curve has no point yet", "one validation at least is needed", "train longer")
-    values = {key: np.array([_value(point["validation"], key) for point in points]) for key in PANELS}
+    values = {key: np.array([point["validation"].get(key, 0.0) for point in points]) for key in PANELS}
+    for key, (part, figure) in NESTED.items():
+        measured = [point["validation"].get(part) for point in points]
+        values[key] = np.array([each[figure] for each in measured]) if all(measured) else np.zeros(0)
     iterations, seconds = (np.array([point[key] for point in points]) for key in ("iteration", "seconds"))
     return Run(name or Path(model).stem, iterations, seconds, values, curve_lbs(document)["total"])
-
-
-def _value(validation: dict[str, Any], key: str) -> float:
-    """Return a value of a validation; zero where it was not measured."""
-    part, name = NESTED.get(key, ("", key))
-    return float((validation.get(part, {}) if part else validation).get(name, 0.0))
 
 
 def bounds(values: Iterable[np.ndarray]) -> tuple[float, float]:
@@ -99,13 +102,14 @@ def draw(path: Path, runs: list[Run]) -> None:
     """Draw each value of all runs, over iterations on the left and over minutes on the right, as a PNG."""
     rows = []
     for key in PANELS:
-        if not any(run.values[key].any() for run in runs):
-            continue  # a term that none of them has
-        unit, span = UNITS.get(key, "J"), bounds(run.values[key] for run in runs)
-        along = {"iterations": [run.iterations for run in runs], "minutes": [run.seconds / 60 for run in runs]}
+        having = [run for run in runs if run.values[key].any()]
+        if not having:
+            continue
+        unit, span = UNITS.get(key, "J"), bounds(run.values[key] for run in having)
+        along = {"iterations": [run.iterations for run in having], "minutes": [run.seconds / 60 for run in having]}
         rows.append([
             ChartPanel(title=key, x=x, y=unit, span=span,
-                       curves={run.name: (place, run.values[key]) for run, place in zip(runs, places)})
+                       curves={run.name: (place, run.values[key]) for run, place in zip(having, places)})
             for x, places in along.items()
         ])  # fmt: skip
     write_chart(path, rows, size=(4.2, 1.6))
@@ -152,7 +156,7 @@ def main() -> None:
             "iterations": run.iterations.tolist(),
             "seconds": run.seconds.tolist(),
             "linear blend skinning": run.lbs,
-            **{key: values.tolist() for key, values in run.values.items()},
+            **{key: values.tolist() for key, values in run.values.items() if len(values)},
         }
         for run in runs
     }

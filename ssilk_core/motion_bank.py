@@ -103,7 +103,7 @@ def usable_spans(motions: Sequence[Motion], fps: float, max_joint_speed: float =
     Motions are cut where the root jumps, and where a joint turns faster than `max_joint_speed` [rad/s].
     """
     spans = [span for motion in motions for span in split_at_cuts(motion, max_joint_speed=max_joint_speed)]
-    return [span for span in spans if span.frame_count > span.fps / fps * 3]
+    return [span for span in spans if (span.frame_count - 1) * fps >= 3 * span.fps]
 
 
 def centred_matrices(motion: Motion, skeleton: Skeleton) -> tuple[Floats, Floats]:

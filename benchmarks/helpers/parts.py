@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from ssilk_core import kernels
 from ssilk_core.constants import GRAVITY
+from ssilk_core.training.muon import ITERATIONS
 
 from .floors import WARM, WINDOWS, Part, Tensors
 from .moment import Moment
@@ -158,7 +159,20 @@ def single_energy_parts(at: Moment) -> list[Part]:
 
 
 def optimiser_part(at: Moment) -> Part:
-    """Gradients are read for their norm, then with parameters, moments and average; all but gradients are written."""
+    """Gradients are read for their norm, then with parameters, moments and average; all but gradients are written.
+
+    Matrices that Muon steps have one moment, the others two; the difference is small.
+    """
     parameters = tuple(at.model.parameters())
-    update, count = at.update(), sum(value.numel() for value in parameters)
-    return Part(name="optimiser", run=lambda: 4 * update(), reads=6 * parameters, operations=ADAM * count)
+    muon = at.stepper.optimisers.get("muon")
+    matrices = [value for group in muon.param_groups for value in group["params"]] if muon else []
+    count = sum(value.numel() for value in parameters) - sum(value.numel() for value in matrices)
+    operations = ADAM * count + sum(muon_operations(*matrix.shape) for matrix in matrices)
+    update = at.update()
+    return Part(name="optimiser", run=lambda: 4 * update(), reads=6 * parameters, operations=operations)
+
+
+def muon_operations(rows: int, columns: int) -> int:
+    """Return the operations of the products of one of Muon's steps of a matrix (`training.muon`)."""
+    least, most = sorted((rows, columns))
+    return ITERATIONS * (4 * least**2 * most + 2 * least**3)

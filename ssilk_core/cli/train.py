@@ -75,7 +75,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         report = report if group.is_first else silent
         job = training_job(options, device, report)
         trained = train(job, report, stop, group)
-    share, shown, steps = lower_by(trained.score, trained.lbs), trained.score.shown_skin, trained.score.steps
+    share, shown = lower_by(trained.score, trained.lbs), trained.score.shown_skin
+    missed = trained.score.step_errors
     worse = is_worse(trained.score, trained.lbs)
     if worse:
         report(worse_message(str(options.output), trained.score, trained.lbs))
@@ -91,7 +92,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
                 **({WORSE_FIGURE: True} if worse else {}),
                 "collisions": f"{trained.score.collisions:.2%}",
                 **(shown.summary() if shown else {}),
-                **(steps.summary() if steps else {}),
+                **(missed.summary() if missed else {}),
                 **{f"{k} [J]": round(v, 5) for k, v in trained.score.terms.items()},
             },
         )

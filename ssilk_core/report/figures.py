@@ -114,7 +114,7 @@ def learning(document: Mapping[str, Any]) -> Section:
     found = [point["validation"].get("shown_skin") for point in points]
     if all(found):
         shown[SHOWN] = ("%", [100 * each["mean"] for each in found])
-    steps = [point["validation"].get("steps") for point in points]
+    steps = [point["validation"].get("step_errors") for point in points]
     if all(steps):
         shown[MISSED] = ("mJ", [1000 * each["energy"] for each in steps])
     rows = [
@@ -129,5 +129,5 @@ def learning(document: Mapping[str, Any]) -> Section:
     if found[best]:
         words += f" At the best, {ShownSkin(**found[best])}."
     if steps[best]:
-        words += f" Its {StepErrors(**steps[best])}."
+        words += f" At the best, {StepErrors(**steps[best])}."
     return Section("Training", svg_chart("validations during training", rows) + f'<p class="note">{words}</p>')

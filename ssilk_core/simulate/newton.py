@@ -242,14 +242,16 @@ def newton_step(
     cg_iterations: int,
     fixed: Tensor | None = None,
     exact_hessian: Tensor | None = None,
+    reduction: float = REDUCTION,
 ) -> tuple[Tensor, int]:
     """Return a direction (V, 3, N), zero at pinned and `fixed` (V, N) vertices, and the iterations of the solve.
 
-    It is a descent direction, except possibly in frames that use the `exact_hessian` (N,).
+    It is a descent direction, except possibly in frames that use the `exact_hessian` (N,). The linear system is
+    solved until its residual has fallen to `reduction`.
     """
     right = -gradient[potential.free].float()
     z, count = potential.hessian(state.x, inputs, state.body_distance, fixed, exact_hessian).solve(
-        right, REDUCTION, cg_iterations
+        right, reduction, cg_iterations
     )
     step = torch.zeros_like(state.x)
     step[potential.free] = z.to(step.dtype)

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate, pairwise
+from math import isfinite
 from pathlib import PurePath
 from typing import Any
 
@@ -26,7 +27,7 @@ from .step_errors import StepErrors
 
 # On a CPU and on a GPU. Rays and Hessians take long on a CPU.
 SHOWN_FRAMES = 32, 256  # in which the skin that shows is counted
-STEPS = 16, 64  # whose errors are measured
+MEASURED_STEPS = 16, 64
 
 
 @dataclass(frozen=True)
@@ -39,20 +40,20 @@ class Score:
         dynamics: RMS distance between the rollout and the quasi-static states of the same poses [m].
         shown_skin: share of the covered skin that shows, in `SHOWN_FRAMES` spread evenly over all clips; None where
             the garment covers nothing.
-        steps: what `STEPS` single steps miss, spread likewise; None for linear blend skinning.
+        step_errors: what `MEASURED_STEPS` single steps miss, spread likewise; None for linear blend skinning.
     """
 
     terms: dict[str, float]
     collisions: float
     dynamics: float = 0.0
     shown_skin: ShownSkin | None = None
-    steps: StepErrors | None = None
+    step_errors: StepErrors | None = None
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> Score:
         """Return a score from its JSON document; earlier versions measured neither skin nor steps."""
-        shown, steps = document.get("shown_skin"), document.get("steps")
-        parts = {"shown_skin": shown and ShownSkin(**shown), "steps": steps and StepErrors(**steps)}
+        shown, steps = document.get("shown_skin"), document.get("step_errors")
+        parts = {"shown_skin": shown and ShownSkin(**shown), "step_errors": steps and StepErrors(**steps)}
         return cls(**{**document, **parts})
 
     @property
@@ -125,7 +126,7 @@ class Validator:
         """Return how much of the covered skin shows; all processes of the group get the same."""
         own, counts = range(self.group.rank, len(self.clips), self.group.size), {}
         for number, latents in zip(own, states):
-            clip, chosen = self.clips[number], self._spread(SHOWN_FRAMES)[number]
+            clip, chosen = self.clips[number], self._spread(*SHOWN_FRAMES)[number]
             if not chosen:
                 continue
             frames = torch.tensor(chosen, device=self.rest.device)
@@ -145,10 +146,10 @@ class Validator:
             return None
         own, parts = range(self.group.rank, len(self.clips), self.group.size), []
         for number, latents in zip(own, states):
-            clip, chosen = self.clips[number], self._spread(STEPS)[number]
+            clip, chosen = self.clips[number], self._spread(*MEASURED_STEPS, first=2)[number]
             if not chosen or latents is None:
                 continue
-            frames = torch.tensor(chosen, device=self.rest.device).clamp_min(2)
+            frames = torch.tensor(chosen, device=self.rest.device)
             path = [
                 model.vertices(latents[at], self.bank.character(clip.start + at)) for at in (frames - 2, frames - 1)
             ]
@@ -157,21 +158,23 @@ class Validator:
             path.append(model.vertices(latents[frames], character))
             body, lbs = self.body.pose(character, exact=True), self.lbs_vertices(character)
             parts.append([values.cpu() for values in self._newton.measure(path, lbs, body, shift)])
-        energy, square = (
-            torch.cat(values) for values in zip(*(part for dealt in self.group.gather(parts) for part in dealt))
-        )
-        return StepErrors(len(energy), float(energy.mean()), float(square.mean().sqrt()))
+        joined = [part for dealt in self.group.gather(parts) for part in dealt]
+        if not joined:
+            return None
+        energy, square = (torch.cat(values) for values in zip(*joined))
+        found = StepErrors(len(energy), float(energy.mean()), float(square.mean().sqrt()))
+        return found if isfinite(found.energy) and isfinite(found.distance) else None
 
     @cached_property
     def _newton(self) -> NewtonSteps:
         return NewtonSteps(self.scene, self.energy.fabric, self.fps, self.rest.device)
 
-    def _spread(self, counts: tuple[int, int]) -> list[list[int]]:
-        """Return so many frames, on a CPU and on a GPU, spread evenly over all clips, by clip."""
-        ends = list(accumulate(map(len, self.clips), initial=0))
-        count = min(counts[self.rest.is_cuda], ends[-1])
+    def _spread(self, on_cpu: int, on_gpu: int, first: int = 0) -> list[list[int]]:
+        """Return so many frames of each clip, spread evenly over those of all clips from the frame `first` on."""
+        ends = list(accumulate((max(0, len(clip) - first) for clip in self.clips), initial=0))
+        count = min(on_gpu if self.rest.is_cuda else on_cpu, ends[-1])
         spread = [(2 * number + 1) * ends[-1] // (2 * count) for number in range(count)]
-        return [[frame - first for frame in spread if first <= frame < end] for first, end in pairwise(ends)]
+        return [[frame - start + first for frame in spread if start <= frame < end] for start, end in pairwise(ends)]
 
     def frame_terms(self, clip: range, model: LatentModel | None) -> dict[str, Tensor]:
         """Return the values that `Score` averages for each frame of a range of the bank, shape (N,).

@@ -82,7 +82,7 @@ def validation_message(iteration: int, score: Score, lbs: Score, moves: bool) ->
         f"validation at {iteration}: total {score.total:.4g} J, "
         f"{abs(share):.1%} {'under' if share >= 0 else 'above'} linear blend skinning's {lbs.total:.4g} J "
         f"({terms}), collisions {score.collisions:.2%}, motion of its own {score.dynamics * 1000:.0f} mm"
-        f"{f', {score.shown_skin}' if score.shown_skin else ''}{f', {score.steps}' if score.steps else ''}"
+        + "".join(f", {part}" for part in (score.shown_skin, score.step_errors) if part)
     )
     if score.dynamics < NO_DYNAMICS and moves:
         return Message(f"{text}; {ADVICE}", "warning")

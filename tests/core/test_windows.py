@@ -68,9 +68,12 @@ def test_motions_of_another_rate_are_resampled_and_cuts_split(scene, toy_motion)
     assert cut.stops.tolist() == [10, 20]  # 20 frames, then 19; the last two are too few to learn from
 
 
-@pytest.mark.parametrize("frames, words", [(None, "none given"), (3, "shorter than four frames")])
-def test_too_little_motion_is_refused(scene, toy_motion, frames, words):
-    motions = [] if frames is None else [toy_motion(scene, frames)]
+@pytest.mark.parametrize(
+    "frames, fps, words",
+    [(None, 30.0, "none given"), (3, 30.0, "shorter than four frames"), (1, 8.0, "shorter than four frames")],
+)
+def test_too_little_motion_is_refused(scene, toy_motion, frames, fps, words):
+    motions = [] if frames is None else [toy_motion(scene, frames, fps)]
     with pytest.raises(SsilkError, match=words):
         build_bank(motions, scene.character.skeleton, JOINTS, 30.0, CPU)
 

@@ -121,9 +121,11 @@ def optimiser() -> Text:
     for garment in ("cape", "fringe_skirt", "hooded_dress"):
         least = (f"{min(runs[f'{garment}_{name}']['total']):.3f}" for name in ("muon", "adam"))
         yield row(garment.replace("_", " "), *least, *(least_at(each[garment]) for each in (muon, adam)))
-    first, other = muon["cape"], muon["cape_seed_1"]
-    longer = percent(other["seconds"][-1] / first["seconds"][-1] - 1)
-    yield f"Another seed of the cape has {fixed(min(other['total']), 4)} J, with {longer} % more time"
+    others = {name: muon[f"{name}_seed_1"] for name in ("cape", "hooded_dress")}
+    least = (fixed(min(other["total"]), 4) for other in others.values())
+    yield "{} J for the cape and {} J for the dress".format(*least)
+    longer = (percent(other["seconds"][-1] / muon[name]["seconds"][-1] - 1) for name, other in others.items())
+    yield "with {} % and {} % more time".format(*longer)
     cape, skirt, dress = (muon[name]["total"][-1] for name in ("cape", "fringe_skirt", "hooded_dress"))
     yield f"to {cape:.4f} J for the cape, {skirt:.4f} J for the fringe skirt and {dress:.4f} J for the dress"
 
