@@ -85,7 +85,7 @@ def opening() -> Text:
     yield f"{frame_time():.2f} ms a frame"
     yield f"{cache_share()} of its point cache"
     yield f"The cape that ships is {shipped_path('cape').stat().st_size / 1e6:.1f} MB"
-    yield f"A cape of {document('trade')['points'][0]['shapes']} blendshapes takes {frame_time():.2f} ms"
+    yield f"An earlier cape takes {frame_time():.2f} ms"
     settling = evaluated("cape")["valid"]["settling"]
     hold = document("evaluate_cape")["options"]["hold"]
     yield f"{share(settling['settled_share'])} % of the stops within {hold:g} s"
@@ -443,8 +443,7 @@ def rest() -> Text:
 def playing() -> Text:
     models, cape = result("runtime")["models"], shipped("cape")
     yield (
-        f"({cape['vertices']:,} vertices, {document('trade')['points'][0]['shapes']} blendshapes, "
-        f"{len(cape['proxy_names'])} proxy joints, {len(cape['joint_names'])} joints)"
+        f"({cape['vertices']:,} vertices, {len(cape['proxy_names'])} proxy joints, {len(cape['joint_names'])} joints)"
     )
     ways = ("numpy", "PyTorch, in chunks", "NCS, in chunks", "PyTorch, frame by frame", "NCS, frame by frame")
     parts = {
@@ -489,18 +488,21 @@ def sizes() -> Text:
 
 def levels() -> Text:
     yield "a shot of ten seconds"  # as `trade` scales them
+    times = result("runtime_networks")["models"]
     shown = ("as trained", "film", "game", "crowd", "1 iterations", "2 iterations", "hero", "simulator")
     for point in document("trade")["points"]:
-        light = point["model"] == "lcape"
+        light, whole = point["model"].endswith("_light"), point["variant"] == "as trained"
         if point["variant"] not in (shown[:1] if light else shown):
             continue
         skin, level = point["shown_skin"], QUALITIES.get(point["variant"])
         rate = f", {point['fps']:.0f} frames/s" if point["fps"] < 30 else ""
         own = point["refine"] or point["variant"] == "simulator"  # a shot has blendshapes of its own
+        played = times[point["model"]]["numpy"] if whole else {}
         yield row(
-            {"Cape": "cape", "FringeSkirt": "fringe skirt"}[point["garment"]],
+            {"Cape": "cape", "FringeSkirt": "fringe skirt", "HoodedDress": "hooded dress"}[point["garment"]],
             "`light`" if light else f"`{point['variant']}`{rate}" if level else point["variant"],
             "" if own else f"{point['shapes']} / {point['joints']} / {point['influences']}",
+            fixed(played["+ kinematics"][0]) if whole else "",
             two_digits(point["solving"]) if point["solving"] else "",
             fixed(point["total"], 3),
             fixed(skin["mean"], 3, 0.01),
@@ -509,9 +511,15 @@ def levels() -> Text:
             fixed(point["shot_bytes"], 2, 1e6),
             fixed(point["model_bytes"], 1, 1e6),
         )
-    times = result("runtime")["models"]
     whole, crowd = (times[f"cape, {level}"]["numpy"][FULL][0] for level in ("whole", "crowd"))
     yield f"takes {fixed(whole)} µs on one processor thread, and {fixed(crowd)} µs in `crowd`"
+    light, large = (min(result(file)[name]["total"]) for file, name in LIGHT_AND_LARGE)
+    yield f"has more energy: {light:.3f} J on `valid`, where the large one has {large:.4f} J"
+    energies = {point["variant"]: point["total"] for point in document("trade")["points"] if point["model"] == "cape"}
+    yield f"`crowd` multiplies the cape's energy by {energies['crowd'] / energies['as trained']:.1f}"
+
+
+LIGHT_AND_LARGE = ("muon_training", "cape_light"), ("tight_training", "cape")
 
 
 def refinement() -> Text:
