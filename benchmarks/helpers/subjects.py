@@ -51,10 +51,10 @@ class Subject:
     def device(self) -> torch.device:
         return self.dressed.device
 
-    def validator(self, motion: Motion) -> Validator:
-        """Return a validator of this garment that holds one whole motion at the model's rate."""
+    def validator(self, *motions: Motion) -> Validator:
+        """Return a validator of this garment that holds whole motions at the model's rate."""
         skeleton, fps = self.scene.character.skeleton, self.file.config.fps
-        bank = build_bank([motion], skeleton, self.model.joints, fps, self.device)
+        bank = build_bank(motions, skeleton, self.model.joints, fps, self.device)
         return Validator(bank, self.energy, self.body, self.scene, self.model.decoder.rest, fps, bank.frame_count)
 
     def frame_terms(self, motion: Motion, *, lbs: bool = False) -> dict[str, Tensor]:

@@ -126,7 +126,7 @@ class Validator:
         """Return how much of the covered skin shows; all processes of the group get the same."""
         own, counts = range(self.group.rank, len(self.clips), self.group.size), {}
         for number, latents in zip(own, states):
-            clip, chosen = self.clips[number], self._spread(*SHOWN_FRAMES)[number]
+            clip, chosen = self.clips[number], self._spread(SHOWN_FRAMES[self.rest.is_cuda])[number]
             if not chosen:
                 continue
             frames = torch.tensor(chosen, device=self.rest.device)
@@ -139,14 +139,28 @@ class Validator:
         joined = {number: found for part in self.group.gather(counts) for number, found in part.items()}
         return self.covered.figures([(self.names[number], joined[number]) for number in sorted(joined)])
 
-    @torch.no_grad()
     def _step_errors(self, model: LatentModel | None, states: Sequence[Tensor | None]) -> StepErrors | None:
         """Return what single steps of a model miss; all processes of the group get the same."""
         if model is None:
             return None
+        energy, square = self.missed_by_steps(model, states, MEASURED_STEPS[self.rest.is_cuda])
+        if not len(energy):
+            return None
+        found = StepErrors(len(energy), float(energy.mean()), float(square.mean().sqrt()))
+        return found if isfinite(found.energy) and isfinite(found.distance) else None
+
+    @torch.no_grad()
+    def missed_by_steps(
+        self, model: LatentModel, states: Sequence[Tensor | None], count: int
+    ) -> tuple[Tensor, Tensor]:
+        """Return what `NewtonSteps` measures in so many steps, spread evenly over all clips, (N,) each.
+
+        Args:
+            states: of this process's clips; all processes of the group get the same.
+        """
         own, parts = range(self.group.rank, len(self.clips), self.group.size), []
         for number, latents in zip(own, states):
-            clip, chosen = self.clips[number], self._spread(*MEASURED_STEPS, first=2)[number]
+            clip, chosen = self.clips[number], self._spread(count, first=2)[number]
             if not chosen or latents is None:
                 continue
             frames = torch.tensor(chosen, device=self.rest.device)
@@ -159,22 +173,23 @@ class Validator:
             body, lbs = self.body.pose(character, exact=True), self.lbs_vertices(character)
             parts.append([values.cpu() for values in self._newton.measure(path, lbs, body, shift)])
         joined = [part for dealt in self.group.gather(parts) for part in dealt]
-        if not joined:
-            return None
-        energy, square = (torch.cat(values) for values in zip(*joined))
-        found = StepErrors(len(energy), float(energy.mean()), float(square.mean().sqrt()))
-        return found if isfinite(found.energy) and isfinite(found.distance) else None
+        energy, square = (torch.cat([part[side] for part in joined] or [torch.zeros(0)]) for side in range(2))
+        return energy, square
 
     @cached_property
     def _newton(self) -> NewtonSteps:
         return NewtonSteps(self.scene, self.energy.fabric, self.fps, self.rest.device)
 
-    def _spread(self, on_cpu: int, on_gpu: int, first: int = 0) -> list[list[int]]:
+    def _spread(self, count: int, first: int = 0) -> list[list[int]]:
         """Return so many frames of each clip, spread evenly over those of all clips from the frame `first` on."""
         ends = list(accumulate((max(0, len(clip) - first) for clip in self.clips), initial=0))
-        count = min(on_gpu if self.rest.is_cuda else on_cpu, ends[-1])
+        count = min(count, ends[-1])
         spread = [(2 * number + 1) * ends[-1] // (2 * count) for number in range(count)]
         return [[frame - start + first for frame in spread if start <= frame < end] for start, end in pairwise(ends)]
+
+    def states(self, model: LatentModel) -> Sequence[Tensor | None]:
+        """Return the states of a model in this process's clips, each (frames, S)."""
+        return self._states(self.clips[self.group.rank :: self.group.size], model)
 
     def frame_terms(self, clip: range, model: LatentModel | None) -> dict[str, Tensor]:
         """Return the values that `Score` averages for each frame of a range of the bank, shape (N,).

@@ -254,6 +254,19 @@ def moving_states() -> Text:
     assert at["lost by the network [mJ]"] > 0.8 * sum(at[f"lost by the {who} [mJ]"] for who in ("network", "decoder"))
 
 
+def missed_steps() -> Text:
+    for garment, splits in result("step_errors").items():
+        for number, (split, at) in enumerate(splits.items()):
+            energies = (fixed(at[name], 1, 0.001) for name in ("mean", "median", "p95"))
+            name = split if split == "flips" else f"`{split}`"
+            yield row("" if number else garment.replace("_", " "), name, *energies, milli_1(at["distance"]))
+    yield "95 % below [mJ]"
+    dress = result("step_errors")["hooded_dress"]
+    yield f"that of the dress is by {percent(dress['test']['median'] / dress['train']['median'] - 1)} %"
+    (steps,) = {at["steps"] for splits in result("step_errors").values() for at in splits.values()}
+    yield f"{steps} steps of each split"
+
+
 def static_states() -> Text:
     for garment, states in result("static_states").items():
         for number, (state, at) in enumerate(states.items()):
@@ -635,7 +648,8 @@ def scenes() -> Text:
 
 
 PARTS = (
-    opening, conditions, shown, clearance, moving, contact, from_own_start, moving_states, static_states, table1,
+    opening, conditions, shown, clearance, moving, contact, from_own_start, moving_states,
+    missed_steps, static_states, table1,
     findings, dynamics,
     ablations,
     wardrobe, long_training, short_training, rest, playing, sizes, levels, refinement, inside_the_body, stress,
