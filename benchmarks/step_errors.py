@@ -17,17 +17,19 @@ import torch
 from helpers.reports import table, write_results
 from helpers.subjects import Subject, arguments, clip_of, open_subject, parsed
 
-from ssilk_core.evaluation.splits import read_index
+from ssilk_core.evaluation.splits import chosen, read_index
+from ssilk_core.motion_bank import roll_states
 
 HEADER = ("garment", "split", "steps", "mean [mJ]", "median [mJ]", "95 % below [mJ]", "RMS [mm]")
 
 
 def measure(subject: Subject, options: Namespace) -> dict[str, dict[str, float]]:
     """Return the figures of each split, energies in J and distances in m."""
-    found = {}
-    for split, clips in by_split(options).items():
-        validator = subject.validator(*(clip_of(options, clip, subject) for clip in clips))
-        energy, square = validator.missed_by_steps(subject.model, validator.states(subject.model), options.steps)
+    found, model, index = {}, subject.model, read_index(options.index)
+    for split in dict.fromkeys(entry.split for entry in index):
+        validator = subject.validator(*(clip_of(options, clip, subject) for clip in chosen(index, split)))
+        states = roll_states(model, validator.bank, validator.clips, validator.down)
+        energy, square = validator.missed_by_steps(model, states, options.steps)
         found[split] = {
             "steps": len(energy),
             "mean": float(energy.mean()),
@@ -35,14 +37,6 @@ def measure(subject: Subject, options: Namespace) -> dict[str, dict[str, float]]
             "p95": float(energy.quantile(0.95)),
             "distance": float(square.mean().sqrt()),
         }
-    return found
-
-
-def by_split(options: Namespace) -> dict[str, list[str]]:
-    """Return the clips of each split."""
-    found: dict[str, list[str]] = {}
-    for entry in read_index(options.index):
-        found.setdefault(entry.split, []).append(entry.clip)
     return found
 
 

@@ -125,8 +125,9 @@ class Validator:
     def _shown(self, model: LatentModel | None, states: Sequence[Tensor | None]) -> ShownSkin | None:
         """Return how much of the covered skin shows; all processes of the group get the same."""
         own, counts = range(self.group.rank, len(self.clips), self.group.size), {}
+        spread = self._spread(SHOWN_FRAMES[self.rest.is_cuda])
         for number, latents in zip(own, states):
-            clip, chosen = self.clips[number], self._spread(SHOWN_FRAMES[self.rest.is_cuda])[number]
+            clip, chosen = self.clips[number], spread[number]
             if not chosen:
                 continue
             frames = torch.tensor(chosen, device=self.rest.device)
@@ -159,8 +160,9 @@ class Validator:
             states: of this process's clips; all processes of the group get the same.
         """
         own, parts = range(self.group.rank, len(self.clips), self.group.size), []
+        spread = self._spread(count, first=2)
         for number, latents in zip(own, states):
-            clip, chosen = self.clips[number], self._spread(count, first=2)[number]
+            clip, chosen = self.clips[number], spread[number]
             if not chosen or latents is None:
                 continue
             frames = torch.tensor(chosen, device=self.rest.device)
@@ -186,10 +188,6 @@ class Validator:
         count = min(count, ends[-1])
         spread = [(2 * number + 1) * ends[-1] // (2 * count) for number in range(count)]
         return [[frame - start + first for frame in spread if start <= frame < end] for start, end in pairwise(ends)]
-
-    def states(self, model: LatentModel) -> Sequence[Tensor | None]:
-        """Return the states of a model in this process's clips, each (frames, S)."""
-        return self._states(self.clips[self.group.rank :: self.group.size], model)
 
     def frame_terms(self, clip: range, model: LatentModel | None) -> dict[str, Tensor]:
         """Return the values that `Score` averages for each frame of a range of the bank, shape (N,).

@@ -526,13 +526,10 @@ def levels() -> Text:
         )
     whole, crowd = (times[f"cape, {level}"]["numpy"][FULL][0] for level in ("whole", "crowd"))
     yield f"takes {fixed(whole)} µs on one processor thread, and {fixed(crowd)} µs in `crowd`"
-    light, large = (min(result(file)[name]["total"]) for file, name in LIGHT_AND_LARGE)
+    light, large = min(result("muon_training")["cape_light"]["total"]), min(result("tight_training")["cape"]["total"])
     yield f"has more energy: {light:.3f} J on `valid`, where the large one has {large:.4f} J"
     energies = {point["variant"]: point["total"] for point in document("trade")["points"] if point["model"] == "cape"}
     yield f"`crowd` multiplies the cape's energy by {energies['crowd'] / energies['as trained']:.1f}"
-
-
-LIGHT_AND_LARGE = ("muon_training", "cape_light"), ("tight_training", "cape")
 
 
 def refinement() -> Text:
@@ -648,8 +645,8 @@ def scenes() -> Text:
 
 
 PARTS = (
-    opening, conditions, shown, clearance, moving, contact, from_own_start, moving_states,
-    missed_steps, static_states, table1,
+    opening, conditions, shown, clearance, moving, contact, from_own_start, missed_steps, moving_states,
+    static_states, table1,
     findings, dynamics,
     ablations,
     wardrobe, long_training, short_training, rest, playing, sizes, levels, refinement, inside_the_body, stress,
