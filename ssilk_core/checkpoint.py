@@ -30,7 +30,7 @@ from .tensors import pack_tensors, read_tensors
 if TYPE_CHECKING:
     from .model.network import GarmentModel
 
-FORMAT = 5  # proxies of format 4 only turn
+FORMAT = 6  # models of format 5 have no `velocity_allowance`, and proxies of format 4 only turn
 HEADER_NAME = "ssilk"  # of the JSON document in the metadata
 # Settings that format 3 stores under other names. Formats before 3 hold networks of another architecture.
 RENAMED_SINCE_3 = {
@@ -208,10 +208,12 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     except (TypeError, ValueError, RecursionError) as error:
         raise SsilkError(f"{path}: the model's header is damaged ({error}); train again.") from error
     found = document.get("format") if isinstance(document, dict) else None
-    if found not in (3, 4, FORMAT):
+    if found not in (3, 4, 5, FORMAT):
         fail(str(path), f"model format {found}", f"this version reads formats 3 to {FORMAT}", "train it again")
     if found == 3:
         document = _from_format_3(document)
+    if found < 6 and isinstance(document.get("config"), dict):
+        document = {**document, "config": {"velocity_allowance": 0.5, **document["config"]}}
     return tensors, document
 
 

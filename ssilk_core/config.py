@@ -18,7 +18,7 @@ NO_BOUND = 1e9  # upper limit of settings without a limit of their own
 # Constants of `model.integrators.SpringVerlet`, shared with the numpy runtime and explained there.
 VELOCITY_SCALE, DISTANCE_SCALE, OUTPUT_SCALE = 10.0, 3.0, 0.1
 MAX_OUTPUT = 100.0  # limit of each output of S: finite, and far above `max_latent_step`
-STATE_ALLOWANCE, RATE_ALLOWANCE = 0.5, 0.05
+SPRING_ALLOWANCE, RATE_ALLOWANCE = 0.5, 0.05
 DIVERGENCE_BOUND = 1e3  # a latent beyond this has diverged; those of trained models stay below ten
 RECOVERY_FRAMES = 15  # frames at rest after a diverged state, half a second at 30 frames per second
 
@@ -46,6 +46,7 @@ class ModelConfig:
         latent_bound: soft bound on each latent dimension; zero for none, as in the paper.
         max_latent_step: soft bound on the sum of S and the spring in each dimension in one step; zero for none.
         stiffness: largest spring constant of "spring_verlet", in (0, 1].
+        velocity_allowance: what S may give for each unit of the state's velocity, in [0, 1].
         fps: steps of the model per second [1/s].
     """
 
@@ -56,8 +57,9 @@ class ModelConfig:
     translations: bool = False
     scheme: str = "spring_verlet"
     latent_bound: float = 4.0
-    max_latent_step: float = 0.3
+    max_latent_step: float = 1.0
     stiffness: float = 0.2
+    velocity_allowance: float = 0.9
     fps: float = 30.0
 
     def __post_init__(self) -> None:
@@ -70,6 +72,7 @@ class ModelConfig:
         _need_between(self, 0, MAX_SIZE, "shapes", "activations")
         _need_between(self, 0, NO_BOUND, "latent_bound", "max_latent_step")
         _need_between(self, 1e-6, 1, "stiffness")
+        _need_between(self, 0, 1, "velocity_allowance")
 
     @property
     def activation_count(self) -> int:
@@ -119,7 +122,8 @@ class TrainConfig:
         learning_rate, final_learning_rate: learning rate in dynamic training after the warm-up, and at the
             end of the cosine schedule.
         learning_rate_warmup: iterations over which the learning rate rises at the start of dynamic training.
-        skin_learning_rate_scale: factor on the learning rate of skinning weights and of the integrator's parameters.
+        skin_learning_rate_scale: factor on the learning rate of skinning weights.
+        integrator_learning_rate_scale: factor on the learning rate of the integrator's own parameters.
         shape_learning_rate_scale: factor on the learning rate of blendshapes, each of which moves many vertices.
         shape_smoothing: length below which waves of blendshapes change slowly (`training.shape_smoothing`), relative
             to the diagonal of the garment's bounding box; zero for steps that differ from vertex to vertex, as in the
@@ -136,16 +140,16 @@ class TrainConfig:
     iterations: int = 250_000
     static_fraction: float = 0.1
     pretraining_batch: int = 1024
-    batch: int = 256
+    batch: int = 64
     window: int = 6
     state_reuse: float = 0.97
-    rotated_fraction: float = 0.5
+    rotated_fraction: float = 0.2
     recombinations: int = 3
     perturbations: int = 1
     outlier_energy: float = 0.1
     newton_weight: float = 0.0
     clearance: float = 5e-3
-    static_batch: int = 256
+    static_batch: int = 64
     noise_probability: float = 0.03
     noise: float = 0.03
     noise_correlation: float = 0.99
@@ -158,6 +162,7 @@ class TrainConfig:
     final_learning_rate: float = 2e-5
     learning_rate_warmup: int = 500
     skin_learning_rate_scale: float = 0.1
+    integrator_learning_rate_scale: float = 3.0
     shape_learning_rate_scale: float = 0.3
     shape_smoothing: float = 0.03
     ema_decay: float = 0.998
@@ -188,6 +193,7 @@ class TrainConfig:
             "final_learning_rate",
             "learning_rate_warmup",
             "skin_learning_rate_scale",
+            "integrator_learning_rate_scale",
             "shape_learning_rate_scale",
             "outlier_energy",
             "newton_weight",
@@ -243,14 +249,14 @@ PRESETS = {
             name="preview",
             model=ModelConfig(translations=True),
             train=TrainConfig(
-                iterations=8_000, static_fraction=0.3, shape_learning_rate_scale=1.0, validate_every=800
+                iterations=16_000, static_fraction=0.2, shape_learning_rate_scale=1.0, validate_every=1600
             ),
         ),
         Preset(
             name="light",
             model=ModelConfig(latent=32, widths=(64, 64), shapes=16),
             train=TrainConfig(
-                iterations=8_000, static_fraction=0.3, shape_learning_rate_scale=1.0, validate_every=800
+                iterations=16_000, static_fraction=0.2, shape_learning_rate_scale=1.0, validate_every=1600
             ),
         ),
         Preset(

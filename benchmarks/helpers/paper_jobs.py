@@ -38,6 +38,9 @@ MOTION_AND_RATES = (
     "recombinations=3",
     "perturbations=1",
     "shape_learning_rate_scale=0.3",
+    "rotated_fraction=0.5",
+    "batch=256",
+    "static_batch=256",
 )
 RECIPES = {
     "cape": ("shape_learning_rate_scale=1",),

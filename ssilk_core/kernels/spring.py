@@ -44,7 +44,7 @@ def next_state_kernel(
         outputs: the output of S for this frame, and at rest.
         rate_allowance: what the rates of the pose allow S to add, (rows, 1).
         springs: beta, and s (latent,) in k = stiffness / (1 + exp(-s)).
-        limits: stiffness, max_output, output_scale, state_allowance, max_step and bound.
+        limits: stiffness, max_output, output_scale, spring_allowance, velocity_allowance, max_step and bound.
     """
     rows, latent = rest.shape
     tensors = (values.contiguous() for values in (*past, rest, *outputs, rate_allowance, *springs))
@@ -74,7 +74,8 @@ def _stepper_input(before, now, rest, pose, beta, inputs, of_velocity, of_distan
 
 @triton.jit
 def _next_state(before, now, rest, output, output_at_rest, rate_allowance, beta, share, state, stiffness, max_output,
-                output_scale, state_allowance, max_step, bound, latent, block: tl.constexpr):  # fmt: skip
+                output_scale, spring_allowance, velocity_allowance, max_step, bound, latent,
+                block: tl.constexpr):  # fmt: skip
     row = tl.program_id(0).to(tl.int64)
     at = tl.arange(0, block)
     here = at < latent
@@ -85,7 +86,8 @@ def _next_state(before, now, rest, output, output_at_rest, rate_allowance, beta,
     spring = constant * (_rows(rest, row, latent, at, here) - forward)
     clamped = _clamped(_rows(output, row, latent, at, here), max_output)
     added = output_scale * (clamped - _rows(output_at_rest, row, latent, at, here))
-    allowed = state_allowance * (_length(spring) + _length(velocity)) + tl.load(rate_allowance + row)
+    of_state = spring_allowance * _length(spring) + velocity_allowance * _length(velocity)
+    allowed = of_state + tl.load(rate_allowance + row)
     size = _length(added)
     longest = allowed / tl.where(size < 1e-12, 1e-12, size)
     added *= tl.where(longest > 1, 1.0, longest)  # unlike a maximum and a minimum these propagate NaN

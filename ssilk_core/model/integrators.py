@@ -17,7 +17,7 @@ from ..config import (
     MAX_OUTPUT,
     OUTPUT_SCALE,
     RATE_ALLOWANCE,
-    STATE_ALLOWANCE,
+    SPRING_ALLOWANCE,
     VELOCITY_SCALE,
     ModelConfig,
 )
@@ -107,9 +107,9 @@ class SpringVerlet(Integrator):
     `config.max_latent_step` limits spring and S together.
 
     p is the only equilibrium, whatever S has learned, because S gives at most half of what the spring gives, and
-    more only while something moves:
+    more only while something moves, with a = `config.velocity_allowance`:
 
-        |u| <= (|f| + |v|) / 2 + |rates of the pose| / 20
+        |u| <= |f| / 2 + a |v| + |rates of the pose| / 20
 
     Motion seldom reaches this limit. Eq. 2's alpha is one: a larger one would undo the spring.
 
@@ -143,7 +143,8 @@ class SpringVerlet(Integrator):
         scales = VELOCITY_SCALE, DISTANCE_SCALE
         output = stepper(stepper_input_kernel(before, now, rest, pose, self.beta, scales))
         stiffness, max_step, bound = self.config.stiffness, self.config.max_latent_step, self.config.latent_bound
-        limits = stiffness, MAX_OUTPUT, OUTPUT_SCALE, STATE_ALLOWANCE, max_step, bound
+        shares = SPRING_ALLOWANCE, self.config.velocity_allowance
+        limits = stiffness, MAX_OUTPUT, OUTPUT_SCALE, *shares, max_step, bound
         outputs, springs = (output, at_rest), (self.beta, self.share)
         return next_state_kernel((before, now), rest, outputs, rate_allowance, springs, limits)
 
@@ -154,8 +155,8 @@ class SpringVerlet(Integrator):
         away = rest - forward
         output = self._evaluate(stepper, now, VELOCITY_SCALE * velocity, DISTANCE_SCALE * away, pose)
         spring = self.config.stiffness * torch.sigmoid(self.share) * away
-        allowance = STATE_ALLOWANCE * (length(spring) + length(velocity)) + rate_allowance
-        learned = clip_norm(OUTPUT_SCALE * (output - at_rest), allowance)
+        allowance = SPRING_ALLOWANCE * length(spring) + self.config.velocity_allowance * length(velocity)
+        learned = clip_norm(OUTPUT_SCALE * (output - at_rest), allowance + rate_allowance)
         return forward + soft_clamp(spring + learned, self.config.max_latent_step)
 
     def _evaluate(self, stepper: nn.Module, *inputs: Tensor) -> Tensor:

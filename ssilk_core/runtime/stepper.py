@@ -24,7 +24,7 @@ from ..config import (
     OUTPUT_SCALE,
     RATE_ALLOWANCE,
     RECOVERY_FRAMES,
-    STATE_ALLOWANCE,
+    SPRING_ALLOWANCE,
     VELOCITY_SCALE,
     ModelConfig,
 )
@@ -160,7 +160,7 @@ class SpringStepper:
         return z
 
     def _advance(self, inputs: StepperInputs, start: int) -> None:
-        z, history = self.config.latent, inputs.history[start:]
+        z, of_velocity, history = self.config.latent, self.config.velocity_allowance, inputs.history[start:]
         buffers = [LayerBuffers(rows) for rows in (self.first, *(layer.rows for layer in self.later[:-1]))]
         differences = np.empty((2, z), np.float32)
         along, pull, own = (np.empty(z, np.float32) for _ in range(3))
@@ -188,7 +188,9 @@ class SpringStepper:
                 np.add(along, away, along)
                 np.multiply(self.stiffness, along, pull)
                 np.subtract(own, at_rest, own)
-                limit = STATE_ALLOWANCE * (sqrt(pull.dot(pull)) + sqrt(velocity.dot(velocity))) + rate_limit
+                limit = (
+                    SPRING_ALLOWANCE * sqrt(pull.dot(pull)) + of_velocity * sqrt(velocity.dot(velocity)) + rate_limit
+                )
                 size = sqrt(own.dot(own))
                 if size > limit:
                     np.multiply(own, limit / size, own)

@@ -191,14 +191,21 @@ def _optimisers(model: GarmentModel, config: TrainConfig, device: torch.device) 
 
     Groups of parameters have a "scale", a factor on the learning rate.
     """
-    scales = 1.0, config.skin_learning_rate_scale, config.shape_learning_rate_scale
+    scales = (
+        1.0,
+        config.integrator_learning_rate_scale,
+        config.skin_learning_rate_scale,
+        config.shape_learning_rate_scale,
+    )
     matrices: list[nn.Parameter] = []
-    others: tuple[list[nn.Parameter], ...] = [], [], []  # of networks, of integrator and skinning, and blendshapes
+    others: tuple[list[nn.Parameter], ...] = [], [], [], []  # of networks, integrator, skinning and blendshapes
     for name, value in model.named_parameters():
-        if name.startswith("integrator.") or "skin_offset" in name:
+        if name.startswith("integrator."):
             others[1].append(value)
-        elif name == "decoder.shapes":
+        elif "skin_offset" in name:
             others[2].append(value)
+        elif name == "decoder.shapes":
+            others[3].append(value)
         else:
             (matrices if value.ndim == 2 and config.optimiser == "muon" else others[0]).append(value)
     on_gpu = device.type == "cuda"
@@ -207,6 +214,6 @@ def _optimisers(model: GarmentModel, config: TrainConfig, device: torch.device) 
         # A captured graph reads the learning rate from a tensor; elsewhere a number is faster.
         return {"params": parameters, "lr": torch.tensor(0.0, device=device) if on_gpu else 0.0, "scale": scale}
 
-    rated = [group(parameters, scale) for parameters, scale in zip(others, scales)]
+    rated = [group(parameters, scale) for parameters, scale in zip(others, scales) if parameters]
     found: dict[str, torch.optim.Optimizer] = {"adam": torch.optim.Adam(rated, capturable=on_gpu, fused=True)}
     return found | ({"muon": Muon([group(matrices, 1.0)])} if matrices else {})

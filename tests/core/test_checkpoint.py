@@ -117,6 +117,17 @@ def test_a_model_of_an_earlier_version_has_no_checksum_and_is_read(path):
     assert load_model(path).provenance["seed"] == 3
 
 
+@pytest.mark.parametrize("number, expected", [(5, 0.5), (6, 0.9)])
+def test_the_stepper_of_an_older_model_keeps_its_limits(path, number, expected):
+    def older(tensors, document):
+        document["format"] = number
+        if number < 6:
+            del document["config"]["velocity_allowance"]
+
+    rewrite(path, older)
+    assert load_model(path).config.velocity_allowance == expected
+
+
 @pytest.mark.parametrize("shapes, proxies", [(0, 2), (4, 0)])
 def test_models_without_shapes_or_proxies_round_trip(toy_scene, toy_model, tmp_path, shapes, proxies):
     model = toy_model(toy_scene(proxies=proxies), shapes=shapes)
@@ -264,10 +275,10 @@ def configure(**changes: object) -> Callable[[dict, dict], None]:
 
 
 DAMAGE = {
-    "another format": (set_header("format", 99), "model format 99; this version reads formats 3 to 5"),
+    "another format": (set_header("format", 99), "model format 99; this version reads formats 3 to 6"),
     "an older format": (
         set_header("format", 2),
-        "model format 2; this version reads formats 3 to 5; train it again",
+        "model format 2; this version reads formats 3 to 6; train it again",
     ),
     "header is a list": (lambda tensors, document: document.clear(), "model format None"),
     "integers without their scale": (

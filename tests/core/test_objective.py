@@ -198,3 +198,25 @@ def test_only_the_direction_of_a_gradient_counts(objective, scale):
         moved.append(dict(other.model.named_parameters()))
     for name, value in moved[0].items():
         np.testing.assert_allclose(moved[1][name].detach(), value.detach(), atol=1e-6)
+
+
+def test_each_part_of_a_model_moves_at_its_own_rate(objective):
+    config = replace(
+        CONFIG,
+        optimiser="adam",
+        integrator_learning_rate_scale=3.0,
+        skin_learning_rate_scale=0.1,
+        shape_learning_rate_scale=0.5,
+    )
+    other = copy.copy(objective)
+    other.model = copy.deepcopy(objective.model)
+    stepper = Stepper(other.model, other, sampler_of(objective, config), config)
+    for group in stepper.optimisers["adam"].param_groups:
+        group["lr"] = 0.01 * group["scale"]
+    before = {name: value.detach().clone() for name, value in other.model.named_parameters()}
+    loss = sum(value.sum() for value in other.model.parameters())
+    stepper._descend(loss, {"loss": loss}, {})
+    rates = {"integrator.beta": 3.0, "integrator.share": 3.0, "decoder.skin_offset": 0.1, "decoder.shapes": 0.5}
+    for name, value in other.model.named_parameters():  # Adam's first step is one learning rate
+        moved = (before[name] - value.detach()).numpy()
+        np.testing.assert_allclose(moved, np.full(moved.shape, 0.01 * rates.get(name, 1.0)), rtol=1e-3)
