@@ -40,7 +40,7 @@ from .shared import (
 
 def readme() -> Text:
     preview, final = (preset_minutes(PRESETS[name]) for name in ("preview", "final"))
-    yield f"about {60 * preview:.0f} seconds on a shared H200 and `--preset final` about {final:.0f} minutes"
+    yield f"about {60 * preview:.0f} seconds on a shared H100 and `--preset final` about {final:.0f} minutes"
     yield f"{two_gpus(32, 1024):.1f} times as fast with 1,024 windows of 32 poses in a batch"
     yield f"{two_gpus(32, 64):.2f} times as fast with 64 windows"
 
@@ -50,6 +50,7 @@ def readme() -> Text:
 PAPER = {
     "latent_bound": "none",
     "max_latent_step": "none",
+    "velocity_allowance": "none",
     "window": 32,
     "batch": 32,
     "state_reuse": 0,
@@ -66,6 +67,7 @@ PAPER = {
     "static_batch": 0,
     "learning_rate": "not stated",
     "skin_learning_rate_scale": "not stated",
+    "integrator_learning_rate_scale": "not stated",
     "shape_learning_rate_scale": "not stated",
     "shape_smoothing": 0,
     "ema_decay": "none",
@@ -287,7 +289,7 @@ def fitted(over: str = "", where: str = "") -> str:
 
 
 def changelog() -> Text:
-    yield f"Model files have format {checkpoint.FORMAT}; those of formats 3 and 4 still load"
+    yield f"Model files have format {checkpoint.FORMAT}; those of formats 3 to 5 still load"
     yield extremes()
     yield f"{frame_time():.2f} ms a frame"
     yield default_step()

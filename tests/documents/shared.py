@@ -9,12 +9,12 @@ from typing import Any
 
 from ssilk_core.config import Preset
 
-from .measured import default, document, result
+from .measured import document, result
 
 Text = Iterator[str]
 
 DEFAULT_STEP = "batch 256, window 6, static_batch 256"
-"""The case of `training.py` with the default windows."""
+"""The case of `training.py` with as many windows as training had by default."""
 
 SCALING = {32: "scaling_32", 6: "scaling"}
 """Results of `scaling.py` by the poses in a window."""
@@ -41,8 +41,8 @@ def cache_share() -> str:
 
 
 def preset_minutes(preset: Preset) -> float:
-    """Return how long a preset's iterations take, at the pace of the shipped cape on a shared H200 [min]."""
-    cape = result("long_training")["cape"]
+    """Return how long a preset's iterations take, at the pace of the shipped cape on a shared H100 [min]."""
+    cape = result("limits_training")["cape"]
     return preset.train.iterations * cape["seconds"][-1] / cape["iterations"][-1] / 60
 
 
@@ -64,9 +64,8 @@ def extremes() -> str:
 
 
 def default_step() -> str:
-    """Return the time of one training step with the default windows."""
+    """Return the time of one training step with 256 windows."""
     case = result("training")["cases"][DEFAULT_STEP]
     size = case["size"]
-    assert all(size[name] == default(name) for name in ("batch", "window", "static_batch"))
     poses = size["batch"] * (size["window"] - 2)
     return f"{case['kernels']['steps [ms]']['windows']:.1f} ms for {poses:,} new poses"
