@@ -3,8 +3,8 @@
 
     python benchmarks/train_baseline.py ncs STAGE --motions FOLDER --valid FOLDER -o ncs.safetensors --minutes 30
 
-`ncs*` is NCS with the rotation augmentation of SSILK. It takes all options of 'ssilk train'; `--set` changes the
-schedule below. A step computes energies of as many poses as a model's does by default: it has 640 windows of 18
+`ncs*` is NCS with the rotation augmentation that SSILK has in the tables. It takes all options of 'ssilk train';
+`--set` changes the schedule below. A step computes energies of as many poses as a model's in the tables: it has 640 windows of 18
 poses, of which the last two have energies and those before fill the memory (NCS: half a second and at least 512
 windows).
 --resume continues from the last validation.
@@ -19,14 +19,13 @@ from baselines.networks import BaselineConfig
 from baselines.run import BaselineJob, train_baseline
 
 from ssilk_core.cli import train
-from ssilk_core.config import TrainConfig
 from ssilk_core.devices import select_device
 from ssilk_core.errors import SsilkError
 from ssilk_core.events import Failed, Result, TextReporter
 
 METHODS = {
     "ncs": ("ncs", 0.0),
-    "ncs*": ("ncs", TrainConfig.rotated_fraction),
+    "ncs*": ("ncs", 0.5),
     "snug": ("snug", 0.0),
 }  # network, and share of windows that are rotated
 SCHEDULE = (

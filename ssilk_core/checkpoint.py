@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from .model.network import GarmentModel
 
 FORMAT = 6  # models of format 5 have no `velocity_allowance`, and proxies of format 4 only turn
+OLDER_LIMITS = {"velocity_allowance": 0.5, "max_latent_step": 0.3}  # of models before format 6
 HEADER_NAME = "ssilk"  # of the JSON document in the metadata
 # Settings that format 3 stores under other names. Formats before 3 hold networks of another architecture.
 RENAMED_SINCE_3 = {
@@ -212,8 +213,8 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         fail(str(path), f"model format {found}", f"this version reads formats 3 to {FORMAT}", "train it again")
     if found == 3:
         document = _from_format_3(document)
-    if found < 6 and isinstance(document.get("config"), dict):
-        document = {**document, "config": {"velocity_allowance": 0.5, **document["config"]}}
+    if found != FORMAT and isinstance(document.get("config"), dict):
+        document = {**document, "config": OLDER_LIMITS | document["config"]}
     return tensors, document
 
 

@@ -46,7 +46,8 @@ class ModelConfig:
         latent_bound: soft bound on each latent dimension; zero for none, as in the paper.
         max_latent_step: soft bound on the sum of S and the spring in each dimension in one step; zero for none.
         stiffness: largest spring constant of "spring_verlet", in (0, 1].
-        velocity_allowance: what S may give for each unit of the state's velocity, in [0, 1].
+        velocity_allowance: what S may give for each unit of the state's velocity, in [0, 1], beside what the spring
+            and the rates of the pose allow (`model.integrators.SpringVerlet`).
         fps: steps of the model per second [1/s].
     """
 

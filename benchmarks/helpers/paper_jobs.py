@@ -38,10 +38,16 @@ MOTION_AND_RATES = (
     "recombinations=3",
     "perturbations=1",
     "shape_learning_rate_scale=0.3",
+)
+OWN_SETTINGS = (
     "rotated_fraction=0.5",
     "batch=256",
     "static_batch=256",
-)
+    "max_latent_step=0.3",
+    "velocity_allowance=0.5",
+    "integrator_learning_rate_scale=0.1",
+)  # of SSILK, not of the baselines, when the tables were made
+
 RECIPES = {
     "cape": ("shape_learning_rate_scale=1",),
     "hooded_dress": ("shape_learning_rate_scale=1",),
@@ -159,7 +165,7 @@ class Training:
         step = (STEP[self.garment] if own else BASELINE_STEP) / 1000
         steps = max(100, round(seconds / step))
         rates = (f"iterations={steps}", f"validate_every={max(1, steps // VALIDATIONS)}")
-        recipe = RECIPES[self.garment] if own else ()
+        recipe = (*OWN_SETTINGS, *RECIPES[self.garment]) if own else ()
         settings = [f"seed={self.seed}", *MOTION_AND_RATES, *recipe, *rates, *self.settings]
         settings += [*REHEARSED, *(() if self._sets("batch") else ("batch=2",))] if plan.rehearse else []
         script = "train_baseline" if not own else "train_scheme" if self._sets("scheme") else ""

@@ -111,6 +111,7 @@ class SpringVerlet(Integrator):
 
         |u| <= |f| / 2 + a |v| + |rates of the pose| / 20
 
+    So nothing rests elsewhere. A swing is not bounded by this: S may add energy while something moves, as learned.
     Motion seldom reaches this limit. Eq. 2's alpha is one: a larger one would undo the spring.
 
     S sees velocities and distances, scaled to order one. Given as states side by side they would be small

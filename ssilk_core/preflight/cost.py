@@ -13,10 +13,11 @@ from ..events import format_seconds
 from ..kinematics import quaternion_from_matrix
 from .finding import Finding, Findings, format_joints, index_tuple
 
-# Seconds per contact sample and frame in a complete optimiser step: a cape of 7,900 samples on two CPU threads beside
-# a window of Blender, validations included ("draft"), four garments of 7,300 to 10,000 on an H200 that trained two at
-# once ("preview"). Only measured devices are listed.
+# Seconds per contact sample and frame in a complete optimiser step, and per step: a cape of 7,900 samples on two CPU
+# threads beside a window of Blender, validations included ("draft"), four garments of 7,300 to 10,000 on a GPU that
+# trained two at once. A GPU's small steps take as long as their launches. Only measured devices are listed.
 SECONDS_PER_SAMPLE = {"cpu": 2.6e-6, "cuda": 0.9e-9}
+SECONDS_PER_STEP = {"cpu": 0.0, "cuda": 8e-3}
 LONG = 3600.0  # [s], a training that is warned of
 
 
@@ -67,7 +68,7 @@ def memory(scene: Scene, preset: Preset, body_vertices: int) -> Findings:
         f"the time that preset '{preset.name}' takes is unknown: training has not been measured on {device}"
     )  # fmt: skip
     why = (
-        "scaled by contact samples and frames from a garment on two CPU threads or several on a shared H200; "
+        "scaled by contact samples and frames from a garment on two CPU threads or several on a shared GPU; "
         "the actual time may differ by half"
     )
     long = seconds is not None and seconds > LONG
@@ -90,7 +91,8 @@ def training_seconds(samples: int, train: TrainConfig, device: str) -> float | N
     if device not in SECONDS_PER_SAMPLE:
         return None
     proper = (train.iterations - train.static_iterations) * trained_frames(train)
-    return SECONDS_PER_SAMPLE[device] * samples * (train.static_iterations * train.pretraining_batch + proper)
+    frames = train.static_iterations * train.pretraining_batch + proper
+    return SECONDS_PER_SAMPLE[device] * samples * frames + SECONDS_PER_STEP[device] * train.iterations
 
 
 def trained_frames(train: TrainConfig) -> int:

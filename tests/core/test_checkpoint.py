@@ -15,6 +15,7 @@ import torch
 from safetensors.numpy import load_file, save_file
 
 from ssilk_core.checkpoint import load_model, model_file, network, save_model
+from ssilk_core.config import ModelConfig
 from ssilk_core.errors import SsilkError
 from ssilk_core.fabrics import FABRICS
 from ssilk_core.packing import MAX_INTEGER, narrowest
@@ -117,15 +118,16 @@ def test_a_model_of_an_earlier_version_has_no_checksum_and_is_read(path):
     assert load_model(path).provenance["seed"] == 3
 
 
-@pytest.mark.parametrize("number, expected", [(5, 0.5), (6, 0.9)])
-def test_the_stepper_of_an_older_model_keeps_its_limits(path, number, expected):
+@pytest.mark.parametrize("number", [3, 4, 5])
+def test_the_stepper_of_an_older_model_keeps_its_limits(path, number):
     def older(tensors, document):
         document["format"] = number
-        if number < 6:
-            del document["config"]["velocity_allowance"]
+        del document["config"]["velocity_allowance"], document["config"]["max_latent_step"]
 
     rewrite(path, older)
-    assert load_model(path).config.velocity_allowance == expected
+    config = load_model(path).config
+    assert (config.velocity_allowance, config.max_latent_step) == (0.5, 0.3)
+    assert ModelConfig().velocity_allowance != 0.5 and ModelConfig().max_latent_step != 0.3
 
 
 @pytest.mark.parametrize("shapes, proxies", [(0, 2), (4, 0)])

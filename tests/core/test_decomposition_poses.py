@@ -72,6 +72,7 @@ def test_the_jacobian_is_that_of_differences(played, mass, moves):
         step[:, column] = 1e-3
         trial = search._stepped(fitter._tensor(step))
         used = np.abs(trial.weights - search.pose.weights).sum(1) / 1e-3 if column < 4 else np.ones(FRAMES)
+        assert used.max() > 0.5
         moved = (base - search._at(trial).away.numpy()) / 1e-3
         expected = jacobian[..., column] * used[:, None, None]  # a weight near its end moves less
         np.testing.assert_allclose(moved, expected, atol=2e-3)

@@ -2,6 +2,7 @@
 """Integration schemes by hand numbers, and the bounds that hold by design."""
 
 import importlib.util
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -199,7 +200,15 @@ def test_decoded_cloth_stays_within_reach_of_what_holds_it(scene, toy_motion, to
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="kernels need Triton")
 @pytest.mark.parametrize(
-    "size, options", [(1.0, {}), (30.0, {}), (1.0, {"latent_bound": 0.0, "max_latent_step": 0.0}), (0.0, {})]
+    "size, options",
+    [
+        (1.0, {}),
+        (30.0, {}),
+        (1.0, {"latent_bound": 0.0, "max_latent_step": 0.0}),
+        (0.0, {}),
+        (1.0, {"velocity_allowance": 0.0} | FREE),
+        (1.0, {"velocity_allowance": 0.1} | FREE),
+    ],
 )
 @torch.no_grad()
 def test_the_kernels_step_as_their_reference_does(size, options, monkeypatch):
@@ -210,12 +219,18 @@ def test_the_kernels_step_as_their_reference_does(size, options, monkeypatch):
     scheme.rates = 2
     scheme.beta.add_(0.1 * torch.randn(5, generator=generator))
     stepper = nn.Linear(15 + 6, 5, bias=False)
+    torch.nn.init.normal_(stepper.weight, generator=generator)
     before, now, rest = size * torch.randn(3, 9, 5, generator=generator)
     now[4, 2] = torch.nan
     pose = torch.randn(9, 6, generator=generator)
     pose[:3, -2:] = 0
     expected = scheme(stepper, before, now, rest, pose)
     assert expected[4].isnan().any() and expected[:4].isfinite().all()
+    if "velocity_allowance" in options:
+        free = replace(scheme.config, velocity_allowance=1.0)
+        more = integrator(free, 2)
+        more.load_state_dict(scheme.state_dict())
+        assert (more(stepper, before, now, rest, pose) - expected)[:4].abs().max() > 0.1  # the limit is met
     monkeypatch.setattr("ssilk_core.kernels.available", lambda device: True)
     found = scheme.to(device)(stepper.to(device), *(v.to(device) for v in (before, now, rest, pose)))
     lost = scheme(

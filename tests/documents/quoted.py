@@ -13,6 +13,7 @@ from typing import Any
 from ssilk_usd import memory, trial
 
 from ssilk_core import checkpoint
+from ssilk_core.checkpoint import OLDER_LIMITS
 from ssilk_core.collision.distance import MAX_DEPTH, MAX_QUERY_DISTANCE, TIGHT_REACH
 from ssilk_core.config import PRESETS
 from ssilk_core.decomposition import FitTolerance
@@ -24,12 +25,13 @@ from ssilk_core.mesh.stitches import TOUCH
 from .measured import default, digits, duration, fixed, micro, milli, percent, result, row, series
 from .quoted_results import results
 from .shared import (
+    LARGE_STEP,
     Text,
     cache_share,
     compact_row,
-    default_step,
     extremes,
     frame_time,
+    large_step,
     preset_minutes,
     shot_row,
     two_gpus,
@@ -110,7 +112,7 @@ def training() -> Text:
     yield from shape_smoothing()
     yield from optimiser()
     yield f"`final` takes {PRESETS['final'].train.ema_decay:g}"
-    yield default_step()
+    yield large_step()
     preview, final = (preset_minutes(PRESETS[name]) for name in ("preview", "final"))
     yield f"`preview` takes {60 * preview:.0f} s and `final` {final:.0f} minutes"
     yield "(`recombinations={0.recombinations}`, `perturbations={0.perturbations}`)".format(PRESETS["final"].train)
@@ -118,6 +120,9 @@ def training() -> Text:
 
 def optimiser() -> Text:
     yield f"| `optimiser` | {default('optimiser')} | not stated |"
+    yield f"with {LARGE_STEP.split()[1].rstrip(',')} windows in a batch"
+    allowed = default("velocity_allowance"), OLDER_LIMITS["velocity_allowance"]
+    yield "{:g} is `velocity_allowance`; older models have {:g}".format(*allowed)
     runs = result("optimiser_training")
     muon, adam = result("muon_training"), result("tight_training")
     for garment in ("cape", "fringe_skirt", "hooded_dress"):
@@ -292,7 +297,7 @@ def changelog() -> Text:
     yield f"Model files have format {checkpoint.FORMAT}; those of formats 3 to 5 still load"
     yield extremes()
     yield f"{frame_time():.2f} ms a frame"
-    yield default_step()
+    yield large_step()
     yield f"at most {memory.USUAL:g} GiB"
     yield fitted()
 

@@ -37,7 +37,7 @@ from .measured import (
     spread,
 )
 from .shared import (
-    DEFAULT_STEP,
+    LARGE_STEP,
     SCALING,
     Text,
     cache_share,
@@ -421,8 +421,14 @@ def limits_training() -> Text:
     times = [run["seconds"][-1] / 60 for run in runs.values()]
     yield f"for {min(times):.0f} to {max(times):.0f} minutes of steps"
     yield f"`final` has {PRESETS['final'].train.iterations:,} iterations"
+    counts = [len(run["iterations"]) for run in runs.values()]
+    yield f"has {min(counts)} to {max(counts)} validations"
+    muon = result("muon_training")
+    yield f"(−{-min(muon['cape_seed_1']['total']):.4f} J for another seed"
+    yield f"{min(muon['hooded_dress']['total']):.4f} J for the dress"
+    yield f"with {LARGE_STEP.split()[1].rstrip(',')} windows in a batch"
     yield f"whose best is\n  {min(result('tight_training')['hooded_dress']['total']):.4f} J"
-    yield f"skirt and dress rise by {share(risen['fringe_skirt'])} and {share(risen['hooded_dress'])} % of their best"
+    yield f"skirt and dress rise by {share(risen['fringe_skirt'])} and {share(risen['hooded_dress'])} % of it"
     assert all(run["step energy"][-1] > run["step energy"][kept_at(run)[0]] for n, run in runs.items() if "cape" in n)
     ends = [result("step_errors")[name]["train"] for name in ("cape", "cape_last")]
     mean_step, median, most = ([fixed(at[name], 1, 0.001) for at in ends] for name in ("mean", "median", "p95"))
@@ -615,7 +621,7 @@ def training_speed() -> Text:
     steps = {
         "step on windows": ("base", "windows"),
         f"step of pretraining, {poses:,} poses": ("base", "warm"),
-        "step on 256 windows of 6": (DEFAULT_STEP, "windows"),
+        "step on 256 windows of 6": (LARGE_STEP, "windows"),
     }
     for text, (case, phase) in steps.items():
         columns = {f"{kind}/steps [ms]/{phase}": digits for kind in ("reference", "kernels")}

@@ -13,8 +13,8 @@ from .measured import document, result
 
 Text = Iterator[str]
 
-DEFAULT_STEP = "batch 256, window 6, static_batch 256"
-"""The case of `training.py` with as many windows as training had by default."""
+LARGE_STEP = "batch 256, window 6, static_batch 256"
+"""The case of `training.py` with the most windows."""
 
 SCALING = {32: "scaling_32", 6: "scaling"}
 """Results of `scaling.py` by the poses in a window."""
@@ -41,8 +41,8 @@ def cache_share() -> str:
 
 
 def preset_minutes(preset: Preset) -> float:
-    """Return how long a preset's iterations take, at the pace of the shipped cape on a shared H100 [min]."""
-    cape = result("limits_training")["cape"]
+    """Return how long a preset's iterations take, at the pace of a cape on an H100 that two trainings share [min]."""
+    cape = result("limits_training")["cape_no_bound"]
     return preset.train.iterations * cape["seconds"][-1] / cape["iterations"][-1] / 60
 
 
@@ -63,9 +63,9 @@ def extremes() -> str:
     return f"{len(document('stress_cape')['outcomes'])} extremes"
 
 
-def default_step() -> str:
+def large_step() -> str:
     """Return the time of one training step with 256 windows."""
-    case = result("training")["cases"][DEFAULT_STEP]
+    case = result("training")["cases"][LARGE_STEP]
     size = case["size"]
     poses = size["batch"] * (size["window"] - 2)
-    return f"{case['kernels']['steps [ms]']['windows']:.1f} ms for {poses:,} new poses"
+    return f"{case['kernels']['steps [ms]']['windows']:.1f} ms for {poses:,} new poses in {size['batch']} windows"
