@@ -4,9 +4,9 @@
     python benchmarks/train_baseline.py ncs STAGE --motions FOLDER --valid FOLDER -o ncs.safetensors --minutes 30
 
 `ncs*` is NCS with the rotation augmentation that SSILK has in the tables. It takes all options of 'ssilk train';
-`--set` changes the schedule below. A step computes energies of as many poses as a model's in the tables: it has 640 windows of 18
-poses, of which the last two have energies and those before fill the memory (NCS: half a second and at least 512
-windows).
+`--set` changes the schedule below. A step computes energies of as many poses as a model's in the tables: it has 640
+windows of 18 poses, of which the last two have energies and those before fill the memory (NCS: half a second and at
+least 512 windows).
 --resume continues from the last validation.
 """
 
