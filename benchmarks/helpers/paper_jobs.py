@@ -39,15 +39,14 @@ MOTION_AND_RATES = (
     "perturbations=1",
     "shape_learning_rate_scale=0.3",
 )
+USUAL = {"batch": 256, "window": 6, "static_batch": 256}
 OWN_SETTINGS = (
+    *(f"{name}={value}" for name, value in USUAL.items()),
     "rotated_fraction=0.5",
-    "batch=256",
-    "static_batch=256",
     "max_latent_step=0.3",
     "velocity_allowance=0.5",
     "integrator_learning_rate_scale=0.1",
 )  # of SSILK, not of the baselines, when the tables were made
-
 RECIPES = {
     "cape": ("shape_learning_rate_scale=1",),
     "hooded_dress": ("shape_learning_rate_scale=1",),
@@ -63,7 +62,6 @@ SWEEPS: dict[str, dict[str, tuple[str, ...]]] = {
     "figure12": {"shapes": ("0", "8", "16", "32", "128", "256", "512"), "proxies": ("0", "4", "8", "32", "64")},
 }
 """Settings of the cape that are changed, one at a time; Figure 8 takes the zeros of Figure 12."""
-USUAL = {"batch": 256, "window": 6, "static_batch": 256}
 REHEARSED = (
     "iterations=4",
     "validate_every=2",

@@ -143,9 +143,15 @@ class SpringVerlet(Integrator):
         rest, pose, at_rest, rate_allowance = precomputed
         scales = VELOCITY_SCALE, DISTANCE_SCALE
         output = stepper(stepper_input_kernel(before, now, rest, pose, self.beta, scales))
-        stiffness, max_step, bound = self.config.stiffness, self.config.max_latent_step, self.config.latent_bound
-        shares = SPRING_ALLOWANCE, self.config.velocity_allowance
-        limits = stiffness, MAX_OUTPUT, OUTPUT_SCALE, *shares, max_step, bound
+        limits = (
+            self.config.stiffness,
+            MAX_OUTPUT,
+            OUTPUT_SCALE,
+            SPRING_ALLOWANCE,
+            self.config.velocity_allowance,
+            self.config.max_latent_step,
+            self.config.latent_bound,
+        )
         outputs, springs = (output, at_rest), (self.beta, self.share)
         return next_state_kernel((before, now), rest, outputs, rate_allowance, springs, limits)
 

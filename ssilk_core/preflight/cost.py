@@ -90,9 +90,14 @@ def training_seconds(samples: int, train: TrainConfig, device: str) -> float | N
     """
     if device not in SECONDS_PER_SAMPLE:
         return None
-    proper = (train.iterations - train.static_iterations) * trained_frames(train)
-    frames = train.static_iterations * train.pretraining_batch + proper
-    return SECONDS_PER_SAMPLE[device] * samples * frames + SECONDS_PER_STEP[device] * train.iterations
+    static = step_seconds(samples, train.pretraining_batch, device)
+    dynamic = step_seconds(samples, trained_frames(train), device)
+    return train.static_iterations * static + (train.iterations - train.static_iterations) * dynamic
+
+
+def step_seconds(samples: int, frames: int, device: str) -> float:
+    """Return the estimated duration of a step on so many frames [s], on a device that has been measured."""
+    return SECONDS_PER_SAMPLE[device] * samples * frames + SECONDS_PER_STEP[device]
 
 
 def trained_frames(train: TrainConfig) -> int:

@@ -15,7 +15,7 @@ import torch
 
 from ..config import MOST_OF_ALL, TrainConfig
 from ..errors import fail
-from ..preflight.cost import SECONDS_PER_SAMPLE, trained_frames
+from ..preflight.cost import SECONDS_PER_SAMPLE, step_seconds, trained_frames
 from .step import EAGER_STEPS, Stepper
 
 PLANNED_SHARE = 0.98  # of the remaining time
@@ -111,9 +111,11 @@ def check_estimate(config: TrainConfig, samples: int, device: str, seconds: floa
 
     More threads than those of the estimate are expected to take less time in proportion.
     """
-    threads = max(2, torch.get_num_threads()) / 2 if device == "cpu" else 1
-    if each := ESTIMATE_CAUTION * SECONDS_PER_SAMPLE.get(device, 0.0) * samples / threads:
-        check_possible(Pace(each * config.pretraining_batch, each * trained_frames(config)), config, seconds, where)
+    if device in SECONDS_PER_SAMPLE:
+        threads = max(2, torch.get_num_threads()) / 2 if device == "cpu" else 1
+        frames = config.pretraining_batch, trained_frames(config)
+        each = (ESTIMATE_CAUTION * step_seconds(samples, count, device) / threads for count in frames)
+        check_possible(Pace(*each), config, seconds, where)
 
 
 def check_enough(iterations: int, where: str) -> None:

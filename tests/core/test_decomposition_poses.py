@@ -20,7 +20,9 @@ FRAMES = 5
 @pytest.fixture(scope="module", params=[False, True], ids=["chain", "both from the character"])
 def played(request, toy_scene, toy_model, toy_motion):
     scene = toy_scene(shuffled=request.param)
-    model, motion = toy_model(scene), toy_motion(scene, FRAMES)
+    # Small steps keep weights away from their ends.
+    model = toy_model(scene, max_latent_step=0.3, velocity_allowance=0.5)
+    motion = toy_motion(scene, FRAMES)
     (pose,) = garment_poses(model, motion, 30.0)
     return model.deformer(), motion, pose
 
@@ -71,10 +73,9 @@ def test_the_jacobian_is_that_of_differences(played, mass, moves):
         step = np.zeros((FRAMES, jacobian.shape[-1]))
         step[:, column] = 1e-3
         trial = search._stepped(fitter._tensor(step))
-        used = np.abs(trial.weights - search.pose.weights).sum(1) / 1e-3 if column < 4 else np.ones(FRAMES)
-        assert used.max() > 0.5
+        used = np.where(trial.weights != search.pose.weights, 1, 0).sum(1) if column < 4 else np.ones(FRAMES)
         moved = (base - search._at(trial).away.numpy()) / 1e-3
-        expected = jacobian[..., column] * used[:, None, None]  # a weight near its end moves less
+        expected = jacobian[..., column] * used[:, None, None]  # a weight at its end cannot move
         np.testing.assert_allclose(moved, expected, atol=2e-3)
 
 

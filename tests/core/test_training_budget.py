@@ -67,11 +67,13 @@ def test_steps_of_both_phases_are_timed(monkeypatch):
     assert (pace.static, pace.dynamic) == (pytest.approx(0.1), pytest.approx(0.4))
 
 
-@pytest.mark.parametrize(("static", "dynamic", "ends"), [(65.0, 80.0, 65.0), (1.0, 90.0, 94.0)])
-def test_timing_ends_with_the_step_that_shows_that_the_minutes_are_not_enough(monkeypatch, static, dynamic, ends):
+@pytest.mark.parametrize(("static", "dynamic", "ends", "count"), [(65.0, 80.0, 65.0, 10), (1.0, 90.0, 94.0, 4)])
+def test_timing_ends_with_the_step_that_shows_that_the_minutes_are_not_enough(
+    monkeypatch, static, dynamic, ends, count
+):
     stepper = Clocked(static, dynamic)
     monkeypatch.setattr(budget, "_clock", lambda device: stepper.now)
-    with pytest.raises(SsilkError, match=r"^cape: at most \d+ iterations fit into the remaining minutes"):
+    with pytest.raises(SsilkError, match=f"^cape: at most {count} iterations fit into the remaining minutes"):
         timed_pace(stepper, PLAN, lambda: 360.0 - stepper.now, "cape")  # type: ignore[arg-type]
     assert stepper.now == ends
 

@@ -13,7 +13,6 @@ from typing import Any
 from ssilk_usd import memory, trial
 
 from ssilk_core import checkpoint
-from ssilk_core.checkpoint import OLDER_LIMITS
 from ssilk_core.collision.distance import MAX_DEPTH, MAX_QUERY_DISTANCE, TIGHT_REACH
 from ssilk_core.config import PRESETS
 from ssilk_core.decomposition import FitTolerance
@@ -25,13 +24,13 @@ from ssilk_core.mesh.stitches import TOUCH
 from .measured import default, digits, duration, fixed, micro, milli, percent, result, row, series
 from .quoted_results import results
 from .shared import (
-    LARGE_STEP,
     Text,
     cache_share,
     compact_row,
     extremes,
     frame_time,
     large_step,
+    large_step_size,
     preset_minutes,
     shot_row,
     two_gpus,
@@ -120,8 +119,8 @@ def training() -> Text:
 
 def optimiser() -> Text:
     yield f"| `optimiser` | {default('optimiser')} | not stated |"
-    yield f"with {LARGE_STEP.split()[1].rstrip(',')} windows in a batch"
-    allowed = default("velocity_allowance"), OLDER_LIMITS["velocity_allowance"]
+    yield f"with {large_step_size()['batch']} windows in a batch"
+    allowed = default("velocity_allowance"), checkpoint.OLDER_LIMITS["velocity_allowance"]
     yield "{:g} is `velocity_allowance`; older models have {:g}".format(*allowed)
     runs = result("optimiser_training")
     muon, adam = result("muon_training"), result("tight_training")

@@ -43,6 +43,7 @@ from .shared import (
     cache_share,
     extremes,
     frame_time,
+    large_step_size,
     shot_row,
     step_time,
     two_gpus,
@@ -431,7 +432,7 @@ def limits_training() -> Text:
     muon = result("muon_training")
     yield f"(−{-min(muon['cape_seed_1']['total']):.4f} J for another seed"
     yield f"{min(muon['hooded_dress']['total']):.4f} J for the dress"
-    yield f"with {LARGE_STEP.split()[1].rstrip(',')} windows in a batch"
+    yield f"with {large_step_size()['batch']} windows in a batch"
     yield f"whose best is\n  {min(result('tight_training')['hooded_dress']['total']):.4f} J"
     yield f"skirt and dress rise by {share(risen['fringe_skirt'])} and {share(risen['hooded_dress'])} % of it"
     assert all(run["step energy"][-1] > run["step energy"][kept_at(run)[0]] for n, run in runs.items() if "cape" in n)
@@ -626,7 +627,7 @@ def training_speed() -> Text:
     steps = {
         "step on windows": ("base", "windows"),
         f"step of pretraining, {poses:,} poses": ("base", "warm"),
-        "step on 256 windows of 6": (LARGE_STEP, "windows"),
+        "step on {batch} windows of {window}".format_map(large_step_size()): (LARGE_STEP, "windows"),
     }
     for text, (case, phase) in steps.items():
         columns = {f"{kind}/steps [ms]/{phase}": digits for kind in ("reference", "kernels")}

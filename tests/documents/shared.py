@@ -63,9 +63,13 @@ def extremes() -> str:
     return f"{len(document('stress_cape')['outcomes'])} extremes"
 
 
+def large_step_size() -> dict[str, int]:
+    size: dict[str, int] = result("training")["cases"][LARGE_STEP]["size"]
+    return size
+
+
 def large_step() -> str:
-    """Return the time of one training step with 256 windows."""
-    case = result("training")["cases"][LARGE_STEP]
-    size = case["size"]
+    """Return the time of one training step of that size."""
+    size, case = large_step_size(), result("training")["cases"][LARGE_STEP]
     poses = size["batch"] * (size["window"] - 2)
     return f"{case['kernels']['steps [ms]']['windows']:.1f} ms for {poses:,} new poses in {size['batch']} windows"
