@@ -129,6 +129,8 @@ class TrainConfig:
         shape_smoothing: length below which waves of blendshapes change slowly (`training.shape_smoothing`), relative
             to the diagonal of the garment's bounding box; zero for steps that differ from vertex to vertex, as in the
             paper.
+        weight_decay: by which the networks' matrices shrink in each step, relative to the learning rate [1]; zero for
+            none, as in the paper. It keeps steps large beside the weights, which Muon alone lets grow.
         ema_decay: decay of the exponential moving average of the parameters, which is validated and saved; 0 for
             none. It is smaller at first: `training.step.averaging_decay`.
         closest_point: how the closest body point is found: on the "triangles" of the body, for tight cloth those
@@ -166,6 +168,7 @@ class TrainConfig:
     integrator_learning_rate_scale: float = 3.0
     shape_learning_rate_scale: float = 0.3
     shape_smoothing: float = 0.03
+    weight_decay: float = 0.5
     ema_decay: float = 0.998
     closest_point: str = "triangles"
     validate_every: int = 1000
@@ -199,6 +202,7 @@ class TrainConfig:
             "outlier_energy",
             "newton_weight",
             "clearance",
+            "weight_decay",
         )
         _need_between(self, 0, NO_BOUND, "latent_regularization")
         _need_between(self, 1e-9, NO_BOUND, "latent_regularization_scale")

@@ -48,28 +48,30 @@ class Muon(torch.optim.Optimizer):
 
     Args:
         groups: of parameters (rows, columns), each with its learning rate "lr", a tensor where steps are captured as
-            a graph.
+            a graph, and its "weight_decay", relative to that rate (Loshchilov and Hutter, 2019).
     """
 
     def __init__(self, groups: Iterable[dict[str, Any]]) -> None:
-        super().__init__(groups, {"lr": 0.0})
+        super().__init__(groups, {"lr": 0.0, "weight_decay": 0.0})
         self.found_inf: Tensor | None = None
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
-        """Move each matrix W of n rows or columns, whichever are more, by 0.5 sqrt(n) of the learning rate."""
+        """Move each matrix W of n rows or columns, whichever are more, by 0.5 sqrt(n) of the learning rate.
+
+        Before that W shrinks to (1 - rate * decay) W.
+        """
         for group in self.param_groups:
             alike: dict[torch.Size, list[Tensor]] = {}
             for matrix in group["params"]:
                 if matrix.grad is not None:
                     alike.setdefault(matrix.shape, []).append(matrix)
             for shape, matrices in alike.items():
-                rate = group["lr"] * STEP_SIZE * max(shape) ** 0.5
-                if self.found_inf is not None:
-                    rate = rate * (1 - self.found_inf)
+                rate = group["lr"] if self.found_inf is None else group["lr"] * (1 - self.found_inf)
+                kept, length = 1 - rate * group["weight_decay"], rate * STEP_SIZE * max(shape) ** 0.5
                 directions = orthogonalised(torch.stack([self._ahead(matrix) for matrix in matrices]))
                 for matrix, direction in zip(matrices, directions):
-                    matrix.sub_(rate * direction)
+                    matrix.mul_(kept).sub_(length * direction)
 
     def _ahead(self, matrix: Tensor) -> Tensor:
         """Update a matrix's momentum; return what the next one would be with the same gradient (Nesterov)."""

@@ -189,31 +189,35 @@ class Stepper:
 def _optimisers(model: GarmentModel, config: TrainConfig, device: torch.device) -> dict[str, torch.optim.Optimizer]:
     """Return the optimisers by name: Muon for the networks' matrices, if asked for, and Adam for all else.
 
-    Groups of parameters have a "scale", a factor on the learning rate.
+    Groups of parameters have a "scale", a factor on the learning rate. Only matrices have a weight decay.
     """
-    scales = (
-        1.0,
-        config.integrator_learning_rate_scale,
-        config.skin_learning_rate_scale,
-        config.shape_learning_rate_scale,
-    )
-    matrices: list[nn.Parameter] = []
-    others: tuple[list[nn.Parameter], ...] = [], [], [], []  # of networks, integrator, skinning and blendshapes
+    scales = {
+        "matrices": 1.0,
+        "biases": 1.0,
+        "integrator": config.integrator_learning_rate_scale,
+        "skinning": config.skin_learning_rate_scale,
+        "shapes": config.shape_learning_rate_scale,
+    }
+    parts: dict[str, list[nn.Parameter]] = {name: [] for name in scales}
     for name, value in model.named_parameters():
         if name.startswith("integrator."):
-            others[1].append(value)
+            parts["integrator"].append(value)
         elif "skin_offset" in name:
-            others[2].append(value)
+            parts["skinning"].append(value)
         elif name == "decoder.shapes":
-            others[3].append(value)
+            parts["shapes"].append(value)
         else:
-            (matrices if value.ndim == 2 and config.optimiser == "muon" else others[0]).append(value)
+            parts["matrices" if value.ndim == 2 else "biases"].append(value)
     on_gpu = device.type == "cuda"
 
-    def group(parameters: list[nn.Parameter], scale: float) -> dict[str, Any]:
+    def group(name: str) -> dict[str, Any]:
         # A captured graph reads the learning rate from a tensor; elsewhere a number is faster.
-        return {"params": parameters, "lr": torch.tensor(0.0, device=device) if on_gpu else 0.0, "scale": scale}
+        rate = torch.tensor(0.0, device=device) if on_gpu else 0.0
+        decay = config.weight_decay if name == "matrices" else 0.0
+        return {"params": parts[name], "lr": rate, "scale": scales[name], "weight_decay": decay}
 
-    rated = [group(parameters, scale) for parameters, scale in zip(others, scales) if parameters]
-    found: dict[str, torch.optim.Optimizer] = {"adam": torch.optim.Adam(rated, capturable=on_gpu, fused=True)}
-    return found | ({"muon": Muon([group(matrices, 1.0)])} if matrices else {})
+    groups = {name: group(name) for name, parameters in parts.items() if parameters}
+    found: dict[str, torch.optim.Optimizer] = {}
+    if config.optimiser == "muon":
+        found["muon"] = Muon([groups.pop("matrices")])
+    return {"adam": torch.optim.AdamW(list(groups.values()), capturable=on_gpu, fused=True), **found}

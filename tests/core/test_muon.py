@@ -58,9 +58,17 @@ def test_steps_are_as_long_as_adam_s_and_follow_the_momentum():
     np.testing.assert_allclose(-matrix.detach() - moved, change, atol=1e-9)
 
 
+def test_weights_decay_by_the_learning_rate_before_each_step():
+    decaying, plain = (nn.Parameter(torch.full((4, 6), 2.0)) for _ in range(2))
+    gradient = torch.randn(4, 6, generator=torch.Generator().manual_seed(3))
+    stepped(Muon([{"params": [decaying], "lr": 0.1, "weight_decay": 0.5}]), decaying, gradient.clone())
+    stepped(Muon([{"params": [plain], "lr": 0.1}]), plain, gradient)
+    np.testing.assert_allclose(decaying.detach(), plain.detach() - 0.1 * 0.5 * 2.0, atol=1e-6)
+
+
 def test_a_skipped_step_changes_nothing_whatever_its_gradient():
     matrix = nn.Parameter(torch.ones(3, 5))
-    optimiser = Muon([{"params": [matrix], "lr": 0.1}])
+    optimiser = Muon([{"params": [matrix], "lr": 0.1, "weight_decay": 0.5}])
     stepped(optimiser, matrix, torch.ones(3, 5))
     before, momentum = matrix.detach().clone(), optimiser.state[matrix]["momentum"].clone()
     stepped(optimiser, matrix, torch.full((3, 5), math.nan), skip=1.0)

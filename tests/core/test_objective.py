@@ -200,10 +200,32 @@ def test_only_the_direction_of_a_gradient_counts(objective, scale):
         np.testing.assert_allclose(moved[1][name].detach(), value.detach(), atol=1e-6)
 
 
+@pytest.mark.parametrize("optimiser", ["muon", "adam"])
+def test_only_the_matrices_of_networks_decay(objective, optimiser):
+    config = replace(CONFIG, optimiser=optimiser)
+    moved = []
+    for decay in (0.0, 0.5):
+        other = copy.copy(objective)
+        other.model = copy.deepcopy(objective.model)
+        stepper = Stepper(other.model, other, sampler_of(objective, config), replace(config, weight_decay=decay))
+        for group in (group for each in stepper.optimisers.values() for group in each.param_groups):
+            group["lr"] = 0.01
+        before = {name: value.detach().clone() for name, value in other.model.named_parameters()}
+        loss = sum(value.sum() for value in other.model.parameters())
+        stepper._descend(loss, {"loss": loss}, {})
+        moved.append({name: value.detach() for name, value in other.model.named_parameters()})
+    networks = ("initialiser.", "stepper.", "output.")
+    for name, value in moved[1].items():
+        decays = value.ndim == 2 and name.startswith(networks)
+        expected = moved[0][name] - (0.01 * 0.5 * before[name] if decays else 0)
+        np.testing.assert_allclose(value, expected, atol=1e-6, err_msg=name)
+
+
 def test_each_part_of_a_model_moves_at_its_own_rate(objective):
     config = replace(
         CONFIG,
         optimiser="adam",
+        weight_decay=0.0,
         integrator_learning_rate_scale=3.0,
         skin_learning_rate_scale=0.1,
         shape_learning_rate_scale=0.5,

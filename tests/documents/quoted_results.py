@@ -426,7 +426,6 @@ def limits_training() -> Text:
         risen[name] = run["total"][-1] / run["total"][best] - 1
     times = [run["seconds"][-1] / 60 for run in runs.values()]
     yield f"for {min(times):.0f} to {max(times):.0f} minutes of steps"
-    yield f"`final` has {PRESETS['final'].train.iterations:,} iterations"
     counts = [len(run["iterations"]) for run in runs.values()]
     yield f"has {min(counts)} to {max(counts)} validations"
     muon = result("muon_training")
@@ -436,11 +435,33 @@ def limits_training() -> Text:
     yield f"whose best is\n  {min(result('tight_training')['hooded_dress']['total']):.4f} J"
     yield f"skirt and dress rise by {share(risen['fringe_skirt'])} and {share(risen['hooded_dress'])} % of it"
     assert all(run["step energy"][-1] > run["step energy"][kept_at(run)[0]] for n, run in runs.items() if "cape" in n)
-    ends = [result("step_errors")[name]["train"] for name in ("cape", "cape_last")]
+    ends = [result("step_errors_before")[name]["train"] for name in ("cape", "cape_last")]
     mean_step, median, most = ([fixed(at[name], 1, 0.001) for at in ends] for name in ("mean", "median", "p95"))
     yield f"the mean step misses {mean_step[0]} mJ at the best and {mean_step[1]} mJ at the end"
     yield f"the median {' and '.join(median)} mJ"
     yield f"the 95th percentile {' and '.join(most)} mJ"
+
+
+def decay_training() -> Text:
+    runs, before = result("decay_training"), result("limits_training")
+    rise, price = {}, {}
+    for name, run in runs.items():
+        words, _, decay = name.rpartition("_")
+        best, kept = kept_at(run)
+        ends = (f"{run['total'][at]:.4f}".replace("-", "−") for at in (best, -1))
+        away, missed = ([fixed(1000 * run[key][at]) for at in (best, -1)] for key in ("dynamics", "step energy"))
+        yield row(words.replace("_stepper", ", S alone").replace("_", " "), decay, kept, *ends, *away, *missed)
+        rise[name] = run["total"][-1] - run["total"][best]
+        price[name] = run["total"][best], min(before.get(words, run)["total"])
+    assert all(rise[name] < 0.1 * price[name][0] for name in rise if name.endswith("1.5") and "stepper" not in name)
+    yield f"{price['cape_1.5'][0] - price['cape_1.5'][1]:.4f} J in the cape"
+    shares = [share(now / once - 1) for now, once in (price["fringe_skirt_1.5"], price["hooded_dress_1.5"])]
+    yield f"{' and '.join(shares)} % in skirt and dress"
+    assert abs(price["cape_0.5"][0] - price["cape_0.5"][1]) < 0.001
+    assert runs["cape_0.5"]["total"][-1] < 0.2 * before["cape"]["total"][-1], "a fifth, the document says"
+    assert max(runs["cape_stepper_1.5"]["total"]) > 1, "thrown about"
+    yield f"With {default('weight_decay'):g}, the default"
+    yield f"`final` has {PRESETS['final'].train.iterations:,} iterations"
 
 
 def rest() -> Text:
@@ -668,7 +689,8 @@ PARTS = (
     static_states, table1,
     findings, dynamics,
     ablations,
-    wardrobe, long_training, limits_training, rest, playing, sizes, levels, refinement, inside_the_body, stress,
+    wardrobe, long_training, limits_training, decay_training, rest, playing, sizes, levels, refinement,
+    inside_the_body, stress,
     training_speed, scenes,
 )  # fmt: skip
 """The parts of the document, in its order."""
