@@ -119,6 +119,7 @@ def training() -> Text:
 
 def optimiser() -> Text:
     yield f"| `optimiser` | {default('optimiser')} | not stated |"
+    yield f"| `weight_decay` | {default('weight_decay'):g} | not stated |"
     yield f"with {large_step_size()['batch']} windows in a batch"
     allowed = default("velocity_allowance"), checkpoint.OLDER_LIMITS["velocity_allowance"]
     yield "{:g} is `velocity_allowance`; older models have {:g}".format(*allowed)
