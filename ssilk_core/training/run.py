@@ -6,8 +6,7 @@ from __future__ import annotations
 import gc
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from math import inf, isfinite
 from typing import NoReturn
@@ -22,15 +21,8 @@ from ..events import Checkpoint, Message, Progress, Reporter, Started
 from ..kinematics import MAX_JOINT_SPEED, split_at_cuts
 from ..memory import StepMemory, decoded_frames, fits_in_memory, free_memory
 from ..preflight.finding import format_count
-from .budget import (
-    Pace,
-    affordable_validations,
-    check_enough,
-    check_estimate,
-    fitting_iterations,
-    scale_schedule,
-    timed_pace,
-)
+from .budget import check_estimate, timed_pace
+from .clock import RunClock
 from .curve import CurvePoint, append_point
 from .divergence import CHECK_INTERVAL, DIVERGENCE_WINDOW, DivergenceMonitor
 from .job import TrainJob
@@ -42,8 +34,6 @@ from .validation import Score
 from .verdict import non_finite_terms, validation_message
 
 SAVE_INTERVAL = 60.0  # [s] between saved states
-MORE_TIME = 0.1  # of the minutes: what has to be left for a run that is done to go on
-PACE_INTERVAL = 5.0  # [s] between measurements of the speed on a processor
 REPORT_INTERVAL = 10.0  # [s] between reports of progress there, where steps are long
 RECOVERY_PACE = 0.25  # factor on learning rates after divergence
 
@@ -69,13 +59,13 @@ class TrainingRun:
 
     Attributes:
         state: progress of the run.
+        clock: the run's times, and its plan where it has minutes.
         lbs: score of linear blend skinning.
-        validation_seconds: approximate duration of a validation [s].
         saved: iteration of the state on disk.
     """
 
     def __init__(self, job: TrainJob, report: Reporter, group: ProcessGroup = SINGLE_PROCESS) -> None:
-        self._began = time.monotonic()
+        began = time.monotonic()
         if not (group.size == 1 or job.minutes is None):
             fail(
                 str(job.output),
@@ -86,20 +76,19 @@ class TrainingRun:
         self.job, self.report, self.device, self.group = job, report, select_device(job.device), group
         self.files, identity = RunFiles(job, self.device, group), {**job.identity(), "processes": group.size}
         self.state, tensors = load_state(self.files.state, identity) if job.resume else (RunState(identity), None)
-        self._began -= max(self.state.wall, self.state.seconds)
+        self.clock = RunClock(job, self.state, began)
         self.parts = build_parts(job, self.device, group, report)
         if not job.resume:
             self._fit_batch()
             if job.minutes and job.is_trainable:
                 samples = len(self.parts.energy.cloth.samples.area)
                 check_estimate(self.config, samples, self.device.type, 60 * job.minutes, str(job.output))
-        self.lbs, self.validation_seconds = self._score_lbs()
-        self.pace: Pace | None = None
+        self.lbs = self._score_lbs()
         if job.minutes and job.is_trainable:
             if job.resume:
-                self._continue_plan()
+                self.clock.plan_rest(job.minutes)
             else:
-                self._plan(60 * job.minutes)
+                self._plan(job.minutes)
         self._build_stepper()
         self._announce()
         self.files.remove_unfinished()
@@ -108,80 +97,40 @@ class TrainingRun:
         else:
             self._resume(tensors)
         self.files.save_curve(self.state, self.lbs)
-        self._since = self._saved_at = self._measured_at = self._reported_at = time.monotonic()
-        self._timed = self.state.iteration, self.state.seconds
+        self._saved_at = self._reported_at = time.monotonic()
+        self.clock.start()
 
     @property
     def config(self) -> TrainConfig:
-        """The schedule in use: as requested, scaled to the minutes of the job, with reduced settings."""
-        asked, state = self.job.train, self.state
-        config = asked
-        if state.planned:
-            config = scale_schedule(asked, state.planned, state.static, state.validations)
-        return state.lowered[-1].apply_to(config) if state.lowered else config
+        """The schedule in use."""
+        return self.clock.schedule
 
-    def _score_lbs(self) -> tuple[Score, float]:
-        """Return the score of linear blend skinning, and the duration of the validation [s]."""
+    def _score_lbs(self) -> Score:
+        """Return the score of linear blend skinning, whose validation is the first to be timed."""
         began = time.monotonic()
         count = format_count(len(self.job.held_out), "motions")
         self.report(Message(f"linear blend skinning is scored on {count} to validate on, to compare with"))
-        return self.parts.validator.lbs_score(), time.monotonic() - began
+        score = self.parts.validator.lbs_score()
+        self.clock.validation_seconds = time.monotonic() - began
+        return score
 
-    def _plan(self, seconds: float) -> None:
+    def _plan(self, minutes: float) -> None:
         """Choose the number of iterations by timing a few steps; the model is restored afterwards."""
         model, config, where = self.parts.model, self.config, str(self.job.output)
         self.report(Message("a few steps are timed, to plan as many as fit into the minutes"))
         before = {name: value.clone() for name, value in model.state_dict().items()}
         stepper = self.parts.stepper(config, self.job.train.seed)
-        self.pace = timed_pace(stepper, config, self._training_time_left, where)
+        pace = timed_pace(stepper, config, self.clock.training_time_left, where)
         del stepper
         self._empty_memory()
         model.load_state_dict(before)
-        self.state.validations = affordable_validations(config, seconds, self.validation_seconds)
-        planned = fitting_iterations(self.pace, config, self._training_time_left())
-        check_enough(planned, where)
-        self.state.planned = planned
-        self.report(Message(f"about {planned} iterations are planned for {seconds / 60:g} minutes"))
-
-    def _continue_plan(self) -> None:
-        """Plan the rest of a resumed run; one that is done goes on where much more time is left."""
-        state = self.state
-        if not (state.seconds and state.iteration):
-            return
-        each = state.seconds / state.iteration
-        self.pace = Pace(*(state.pace or [each, each]))
-        left, asked = self._training_time_left(), 60 * (self.job.minutes or 0)
-        if not state.validations:
-            state.validations = affordable_validations(self.job.train, asked, self.validation_seconds)
-        if state.iteration != state.planned or left > MORE_TIME * asked:
-            self._follow_clock()
-
-    def _training_time_left(self) -> float:
-        """Return the time left for steps [s], after the validations that are still to come."""
-        to_come = max(0, self.state.validations - len(self.state.curve) - 1)  # the last is left out of `time_left`
-        return max(0.0, self.time_left - to_come * self.validation_seconds)
-
-    def _follow_clock(self) -> None:
-        """Plan as many iterations as fit into the time that is left."""
-        assert self.pace
-        state, config = self.state, self.config
-        if state.iteration >= config.static_iterations:
-            state.static = config.static_iterations
-        found = fitting_iterations(self.pace, config, self._training_time_left(), state.iteration)
-        state.planned = max(found, state.iteration, 1)
+        self.clock.plan(pace, minutes)
+        self.report(Message(f"about {self.state.planned} iterations are planned for {minutes:g} minutes"))
 
     def _measure_pace(self) -> None:
         """Measure the speed since the last check, and plan again."""
-        if self.pace is None:
-            return
-        iteration, seconds = self.state.iteration, self.state.seconds + time.monotonic() - self._since
-        steps, took = iteration - self._timed[0], seconds - self._timed[1]
-        self._timed, self._measured_at = (iteration, seconds), time.monotonic()
-        if steps > 0 and took > 0:
-            self.pace = self.pace.updated(took / steps, iteration <= self.config.static_iterations)
-            self.state.pace = [self.pace.static, self.pace.dynamic]
-            self._follow_clock()
-            self.stepper.config = self.config
+        self.clock.measure()
+        self.stepper.config = self.config
 
     def _build_stepper(self) -> None:
         seed = self.job.train.seed + len(self.state.lowered)  # draws other windows than before
@@ -300,7 +249,7 @@ class TrainingRun:
         self._within_memory(lambda: self.stepper.run(self.state.iteration))
         self.state.iteration += 1
         # On a processor steps are long, and those launched are done.
-        if self.device.type == "cpu" and time.monotonic() - self._measured_at >= PACE_INTERVAL:
+        if self.device.type == "cpu" and self.clock.measurement_due:
             self._measure_pace()
 
     def check(self, seconds_left: float) -> None:
@@ -342,7 +291,7 @@ class TrainingRun:
     def validate(self) -> None:
         """Score the model on the held-out clips and save it if it is the best so far."""
         state, batch = self.state, self._batch_terms()
-        with self._not_timed():
+        with self.clock.paused():
             score = self._score()
             if broken := non_finite_terms(score):
                 self._recover("validation is not finite", broken)
@@ -371,7 +320,8 @@ class TrainingRun:
         began = time.monotonic()
         self._within_memory(lambda: found.append(self.parts.validator.score(self.stepper.ema_model)))
         # More is measured of a model than of linear blend skinning.
-        self.validation_seconds = max(self.validation_seconds, time.monotonic() - began)
+        clock = self.clock
+        clock.validation_seconds = max(clock.validation_seconds, time.monotonic() - began)
         return found[0]
 
     def _recover(self, found: str, broken: list[str]) -> None:
@@ -387,7 +337,7 @@ class TrainingRun:
         before, tensors = load_state(self.files.state, self.state.asked)
         slower = ReducedSettings(before.iteration, config.batch, config.pretraining_batch, RECOVERY_PACE)
         skipped, seconds = int(self.stepper.skipped.count), self.state.seconds
-        self.state = replace(before, lowered=[*lowered, slower], skipped=skipped, seconds=seconds)
+        self.state = self.clock.state = replace(before, lowered=[*lowered, slower], skipped=skipped, seconds=seconds)
         self._rebuild_stepper(tensors)
         text = (
             f"{found}; back to iteration {before.iteration} with {RECOVERY_PACE:.0%} of the learning rate, see "
@@ -413,23 +363,13 @@ class TrainingRun:
         """Write the state, unless it is already on disk."""
         if self.saved != self.state.iteration:
             self._batch_terms()
-            with self._not_timed():
+            with self.clock.paused():
                 self._write_state()
 
     @property
     def save_due(self) -> bool:
         """Whether it is time to save the state again."""
         return self._any_process(time.monotonic() - self._saved_at >= SAVE_INTERVAL)
-
-    @property
-    def wall(self) -> float:
-        """Wall time of the run [s]; training before a resumption counts."""
-        return time.monotonic() - self._began
-
-    @property
-    def time_left(self) -> float:
-        """Time left before a last validation [s]."""
-        return inf if self.job.minutes is None else 60 * self.job.minutes - self.wall - self.validation_seconds
 
     def should_stop(self, stop: threading.Event) -> bool:
         """Return whether to stop after this iteration."""
@@ -442,22 +382,13 @@ class TrainingRun:
         return self.state.iteration % CHECK_INTERVAL == 0 and self.group.any(wish)
 
     def _write_state(self) -> None:
-        self.state.skipped, self.state.wall = int(self.stepper.skipped.count), self.wall
+        self.state.skipped, self.state.wall = int(self.stepper.skipped.count), self.clock.wall
         self.files.save_state(self.stepper, self.state)
         self.saved, self._saved_at = self.state.iteration, time.monotonic()
 
     def _write_model(self, score: Score) -> None:
         self.files.save_model(self.stepper.ema_model, self.state, score, self.lbs)
         self.report(Checkpoint(str(self.job.output), self.state.iteration, True))
-
-    @contextmanager
-    def _not_timed(self) -> Iterator[None]:
-        """Exclude the time within from the seconds of training."""
-        self.state.seconds += time.monotonic() - self._since
-        try:
-            yield
-        finally:
-            self._since = time.monotonic()
 
     def final_score(self) -> Score:
         """Return the score of the model on disk; before the first validation, write the current model.
@@ -493,19 +424,19 @@ def train(
     if run.state.skipped:
         report(Message(f"{run.state.skipped} steps in total were skipped.", "warning"))
     score = run.final_score()
-    return TrainingResult(finished, run.state.iteration, score, run.lbs, run.wall)
+    return TrainingResult(finished, run.state.iteration, score, run.lbs, run.clock.wall)
 
 
 def _loop(run: TrainingRun, stop: threading.Event) -> bool:
     """Iterate until all iterations are done, the time is up or `stop` is set; return False in the last case."""
     began, steps = time.monotonic(), 0
     while run.state.iteration < (total := run.config.iterations) and not run.should_stop(stop):
-        if run.time_left <= 0:
+        if run.clock.time_left <= 0:
             run.end_early()
             return True
         run.step()
         steps += 1
-        left = min((time.monotonic() - began) / steps * (total - run.state.iteration), max(0.0, run.time_left))
+        left = min((time.monotonic() - began) / steps * (total - run.state.iteration), max(0.0, run.clock.time_left))
         if run.state.iteration % CHECK_INTERVAL == 0 or run.state.iteration == total or steps == 1:
             run.check(left)
         elif run.report_due:

@@ -15,7 +15,7 @@ from ssilk_core.config import PRESETS, TrainConfig
 from ssilk_core.devices import default_preset
 from ssilk_core.errors import SsilkError
 from ssilk_core.events import Message, Progress, Started, silent
-from ssilk_core.training import budget
+from ssilk_core.training import budget, clock
 from ssilk_core.training import run as training
 from ssilk_core.training.budget import (
     Pace,
@@ -25,6 +25,7 @@ from ssilk_core.training.budget import (
     scale_schedule,
     timed_pace,
 )
+from ssilk_core.training.clock import RunClock
 from ssilk_core.training.parallel import ProcessGroup
 from ssilk_core.training.run import TrainingRun, train
 from ssilk_core.training.state import load_state, state_path
@@ -148,7 +149,7 @@ def test_a_run_with_minutes_is_one_of_as_many_iterations(job, monkeypatch):  # n
     """Timing its steps leaves no trace in what is learned."""
     said: list = []
     monkeypatch.setattr(budget, "MIN_ITERATIONS", 1)
-    monkeypatch.setattr(training, "fitting_iterations", lambda *_: 11)
+    monkeypatch.setattr(clock, "fitting_iterations", lambda *_: 11)
     trained = train(job("minutes", minutes=5.0), said.append)
     assert trained.finished and trained.iterations == 11
     assert [event.total for event in said if isinstance(event, Started)] == [11]
@@ -164,10 +165,10 @@ def test_a_run_with_minutes_is_one_of_as_many_iterations(job, monkeypatch):  # n
 
 
 def test_a_run_ends_with_its_time_and_goes_on_with_more(job, monkeypatch):  # noqa: F811
-    monkeypatch.setattr(training, "fitting_iterations", lambda *_: 13)
+    monkeypatch.setattr(clock, "fitting_iterations", lambda *_: 13)
     monkeypatch.setattr(budget, "MIN_ITERATIONS", 1)
     with monkeypatch.context() as patch:
-        patch.setattr(TrainingRun, "time_left", property(lambda run: 8.0 - run.state.iteration))
+        patch.setattr(RunClock, "time_left", property(lambda clock: 8.0 - clock.state.iteration))
         said: list = []
         trained = train(job("early", minutes=1.0), said.append)
     assert trained.finished and trained.iterations == 8
@@ -187,16 +188,16 @@ def test_a_process_group_has_no_minutes(job, resume):  # noqa: F811
 
 
 def test_time_is_up_when_no_validation_fits_any_more(job, monkeypatch):  # noqa: F811
-    monkeypatch.setattr(training, "fitting_iterations", lambda *_: 13)
+    monkeypatch.setattr(clock, "fitting_iterations", lambda *_: 13)
     monkeypatch.setattr(budget, "MIN_ITERATIONS", 1)
     run = TrainingRun(job("clock", minutes=1.0), silent)
-    now = run._began
+    now = run.clock.began
     monkeypatch.setattr(training.time, "monotonic", lambda: now)
-    run.validation_seconds = 10.0
+    run.clock.validation_seconds = 10.0
     for spent in (49.0, 51.0):
-        now = run._began + spent
-        assert run.time_left == pytest.approx(50.0 - spent)
-    assert TrainingRun(job("endless"), silent).time_left == inf
+        now = run.clock.began + spent
+        assert run.clock.time_left == pytest.approx(50.0 - spent)
+    assert TrainingRun(job("endless"), silent).clock.time_left == inf
 
 
 def test_a_run_that_is_done_goes_on_with_more_minutes_alone(job, monkeypatch):  # noqa: F811

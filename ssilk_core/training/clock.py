@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The wall time of a training run, and the plan of its iterations that follows it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from math import inf
+
+from ..config import TrainConfig
+from .budget import Pace, affordable_validations, check_enough, fitting_iterations, scale_schedule
+from .job import TrainJob
+from .state import RunState
+
+PACE_INTERVAL = 5.0  # [s] between measurements of the speed on a processor
+MORE_TIME = 0.1  # of the minutes: what has to be left for a run that is done to go on
+
+
+class RunClock:
+    """Measures a run and, where it has minutes, plans as many iterations as fit.
+
+    Args:
+        job: whose minutes and schedule count.
+        state: of the run; its times and its plan are kept up to date.
+        began: when the process began, as `time.monotonic` tells it [s]. A resumed run began earlier.
+
+    Attributes:
+        validation_seconds: approximate duration of a validation [s].
+        pace: None until there is a plan.
+    """
+
+    def __init__(self, job: TrainJob, state: RunState, began: float) -> None:
+        self.job, self.state = job, state
+        self.began = began - max(state.wall, state.seconds)
+        self.validation_seconds = 0.0
+        self.pace: Pace | None = None
+
+    @property
+    def schedule(self) -> TrainConfig:
+        """The schedule in use: as requested, scaled to the plan, with reduced settings."""
+        state, config = self.state, self.job.train
+        if state.planned:
+            config = scale_schedule(config, state.planned, state.static, state.validations)
+        return state.lowered[-1].apply_to(config) if state.lowered else config
+
+    @property
+    def wall(self) -> float:
+        """Wall time of the run [s]; training before a resumption counts."""
+        return time.monotonic() - self.began
+
+    @property
+    def time_left(self) -> float:
+        """Time left before a last validation [s]."""
+        return inf if self.job.minutes is None else 60 * self.job.minutes - self.wall - self.validation_seconds
+
+    def training_time_left(self) -> float:
+        """Return the time left for steps [s], after the validations that are still to come."""
+        to_come = max(0, self.state.validations - len(self.state.curve) - 1)  # the last is left out of `time_left`
+        return max(0.0, self.time_left - to_come * self.validation_seconds)
+
+    def plan(self, pace: Pace, minutes: float) -> None:
+        """Plan a new run of so many minutes at a pace.
+
+        Raises:
+            SsilkError: too few iterations fit.
+        """
+        state, config = self.state, self.schedule
+        self.pace = pace
+        state.validations = affordable_validations(config, 60 * minutes, self.validation_seconds)
+        planned = fitting_iterations(pace, config, self.training_time_left())
+        check_enough(planned, str(self.job.output))
+        state.planned = planned
+
+    def plan_rest(self, minutes: float) -> None:
+        """Plan the rest of a resumed run; one that is done goes on where much more time is left."""
+        state = self.state
+        if not (state.seconds and state.iteration):
+            return
+        each = state.seconds / state.iteration
+        self.pace = Pace(*(state.pace or [each, each]))
+        left = self.training_time_left()
+        if not state.validations:
+            state.validations = affordable_validations(self.job.train, 60 * minutes, self.validation_seconds)
+        if state.iteration != state.planned or left > MORE_TIME * 60 * minutes:
+            self._follow(self.pace)
+
+    def start(self) -> None:
+        """Start to measure steps."""
+        self._since = self._measured_at = time.monotonic()
+        self._measured = self.state.iteration, self.state.seconds
+
+    @property
+    def measurement_due(self) -> bool:
+        """Whether the speed was not measured for long."""
+        return time.monotonic() - self._measured_at >= PACE_INTERVAL
+
+    def measure(self) -> None:
+        """Measure the speed since the last measurement, and plan again."""
+        if self.pace is None:
+            return
+        iteration, seconds = self.state.iteration, self.state.seconds + time.monotonic() - self._since
+        steps, took = iteration - self._measured[0], seconds - self._measured[1]
+        self._measured, self._measured_at = (iteration, seconds), time.monotonic()
+        if steps > 0 and took > 0:
+            self.pace = self.pace.updated(took / steps, iteration <= self.schedule.static_iterations)
+            self.state.pace = [self.pace.static, self.pace.dynamic]
+            self._follow(self.pace)
+
+    def _follow(self, pace: Pace) -> None:
+        """Plan as many iterations as fit into the time that is left."""
+        state, config = self.state, self.schedule
+        if state.iteration >= config.static_iterations:
+            state.static = config.static_iterations
+        found = fitting_iterations(pace, config, self.training_time_left(), state.iteration)
+        state.planned = max(found, state.iteration, 1)
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Exclude the time within from the seconds of training."""
+        self.state.seconds += time.monotonic() - self._since
+        try:
+            yield
+        finally:
+            self._since = time.monotonic()
