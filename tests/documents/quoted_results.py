@@ -239,7 +239,7 @@ def from_own_start() -> Text:
     yield f"10 mm after {AFTER[0]} frames, {milli(goals[1])} mm after {AFTER[2]}, and {goals[2]:g} m/s"
     rows = document("evaluate_solver_cape_jump")["figures"]
     (now,) = (line["figures"]["solver"]["position_error"] for line in rows if line["method"] == "ssilk")
-    yield "{}, {} and {} mm away after 5, 10 and 30".format(*(milli(value) for value in now[:3]))
+    yield "{}, {} and {} mm away after 5, 10 and\n  30 frames".format(*(milli(value) for value in now[:3]))
     before = [result("moving_states")["cape"][f"network, after {count} [mm]"] for count in AFTER[:3]]
     yield "{:.1f}, {:.1f} and {:.1f} mm away there".format(*before)
     assert sum(map(sum, reached.values())) == reached["fringe_skirt"][1] == 1, "the document says so"
