@@ -240,6 +240,13 @@ def from_own_start() -> Text:
     rows = document("evaluate_solver_cape_jump")["figures"]
     (now,) = (line["figures"]["solver"]["position_error"] for line in rows if line["method"] == "ssilk")
     yield "{}, {} and {} mm away after 5, 10 and\n  30 frames".format(*(milli(value) for value in now[:3]))
+    (held,) = (line["figures"] for line in document("evaluate_solver_cape_held")["figures"])
+    yield f"were held for {held['frames'] // held['clips']} frames"
+    yield f"stays where it is, {milli_1(held['static_distance'])} mm from its own"
+    away = [milli(value) for value in held["solver"]["position_error"][:3]]
+    yield "it is {}, {} and {} mm away after 5, 10 and 30 frames".format(*away)
+    yield f"its velocities are {held['solver']['velocity_error']:.2f} m/s off"
+    assert held["solver"]["position_error"][0] > goals[0], "the document says so"
     before = [result("moving_states")["cape"][f"network, after {count} [mm]"] for count in AFTER[:3]]
     yield "{:.1f}, {:.1f} and {:.1f} mm away there".format(*before)
     assert sum(map(sum, reached.values())) == reached["fringe_skirt"][1] == 1, "the document says so"
