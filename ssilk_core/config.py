@@ -12,6 +12,7 @@ from .schemes import need_scheme
 CLOSEST_POINTS, OPTIMISERS = ("triangles", "vertices"), ("adam", "muon")
 MAX_SIZE = 65_536  # of a part of the network; larger ones fit into no machine
 MOST_OF_ALL = 0.99999  # largest share of static training, and decay of an average
+MOST_DECAY = 100.0  # of weights; no step then takes more than a part of them
 MOST_SMOOTHED_VERTICES = 10_000  # by `training.shape_smoothing`, whose matrix then takes 0.4 GB
 NO_BOUND = 1e9  # upper limit of settings without a limit of their own
 
@@ -129,7 +130,7 @@ class TrainConfig:
         shape_smoothing: length below which waves of blendshapes change slowly (`training.shape_smoothing`), relative
             to the diagonal of the garment's bounding box; zero for steps that differ from vertex to vertex, as in the
             paper.
-        weight_decay: by which the networks' matrices shrink in each step, relative to the learning rate [1]; zero for
+        weight_decay: by which the networks' matrices shrink in each step, relative to the learning rate; zero for
             none, as in the paper. It keeps steps large beside the weights, which Muon alone lets grow.
         ema_decay: decay of the exponential moving average of the parameters, which is validated and saved; 0 for
             none. It is smaller at first: `training.step.averaging_decay`.
@@ -202,8 +203,8 @@ class TrainConfig:
             "outlier_energy",
             "newton_weight",
             "clearance",
-            "weight_decay",
         )
+        _need_between(self, 0, MOST_DECAY, "weight_decay")
         _need_between(self, 0, NO_BOUND, "latent_regularization")
         _need_between(self, 1e-9, NO_BOUND, "latent_regularization_scale")
         _need_between(self, 0, 1000, "recombinations", "perturbations")
