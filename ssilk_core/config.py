@@ -12,7 +12,6 @@ from .schemes import need_scheme
 CLOSEST_POINTS, OPTIMISERS = ("triangles", "vertices"), ("adam", "muon")
 MAX_SIZE = 65_536  # of a part of the network; larger ones fit into no machine
 MOST_OF_ALL = 0.99999  # largest share of static training, and decay of an average
-MOST_DECAY = 100.0  # of weights; no step then takes more than a part of them
 MOST_SMOOTHED_VERTICES = 10_000  # by `training.shape_smoothing`, whose matrix then takes 0.4 GB
 NO_BOUND = 1e9  # upper limit of settings without a limit of their own
 
@@ -131,7 +130,7 @@ class TrainConfig:
             to the diagonal of the garment's bounding box; zero for steps that differ from vertex to vertex, as in the
             paper.
         weight_decay: by which the networks' matrices shrink in each step, relative to the learning rate; zero for
-            none, as in the paper. It keeps steps large beside the weights, which Muon alone lets grow.
+            none, as in the paper.
         ema_decay: decay of the exponential moving average of the parameters, which is validated and saved; 0 for
             none. It is smaller at first: `training.step.averaging_decay`.
         closest_point: how the closest body point is found: on the "triangles" of the body, for tight cloth those
@@ -169,7 +168,7 @@ class TrainConfig:
     integrator_learning_rate_scale: float = 3.0
     shape_learning_rate_scale: float = 0.3
     shape_smoothing: float = 0.03
-    weight_decay: float = 0.5
+    weight_decay: float = 0.0
     ema_decay: float = 0.998
     closest_point: str = "triangles"
     validate_every: int = 1000
@@ -203,8 +202,15 @@ class TrainConfig:
             "outlier_energy",
             "newton_weight",
             "clearance",
+            "weight_decay",
         )
-        _need_between(self, 0, MOST_DECAY, "weight_decay")
+        fastest = max(self.static_learning_rate, self.learning_rate, self.final_learning_rate)
+        if not self.weight_decay * fastest < 1:
+            fail(
+                "training",
+                f"weight_decay {self.weight_decay:g} at a learning rate of {fastest:g}",
+                "their product must be less than 1",
+            )
         _need_between(self, 0, NO_BOUND, "latent_regularization")
         _need_between(self, 1e-9, NO_BOUND, "latent_regularization_scale")
         _need_between(self, 0, 1000, "recombinations", "perturbations")

@@ -46,7 +46,6 @@ OWN_SETTINGS = (
     "max_latent_step=0.3",
     "velocity_allowance=0.5",
     "integrator_learning_rate_scale=0.1",
-    "weight_decay=0",
 )  # of SSILK, not of the baselines, when the tables were made
 RECIPES = {
     "cape": ("shape_learning_rate_scale=1",),

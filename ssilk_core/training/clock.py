@@ -21,11 +21,12 @@ class RunClock:
     """Measures a run and, where it has minutes, plans as many iterations as fit.
 
     Args:
-        job: whose minutes and schedule count.
-        state: of the run; its times and its plan are kept up to date.
-        began: when the process began, as `time.monotonic` tells it [s]. A resumed run began earlier.
+        began: when the process began, as `time.monotonic` tells it [s].
 
     Attributes:
+        job: whose minutes and schedule count.
+        state: of the run; its times and its plan are kept up to date.
+        began: when the run began, as if it had not been interrupted [s].
         validation_seconds: approximate duration of a validation [s].
         pace: None until there is a plan.
     """
@@ -35,6 +36,7 @@ class RunClock:
         self.began = began - max(state.wall, state.seconds)
         self.validation_seconds = 0.0
         self.pace: Pace | None = None
+        self.start()
 
     @property
     def schedule(self) -> TrainConfig:
@@ -86,7 +88,7 @@ class RunClock:
             self._follow(self.pace)
 
     def start(self) -> None:
-        """Start to measure steps."""
+        """Measure steps from now on."""
         self._since = self._measured_at = time.monotonic()
         self._measured = self.state.iteration, self.state.seconds
 

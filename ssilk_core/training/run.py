@@ -58,8 +58,7 @@ class TrainingRun:
     In data-parallel training each process holds one; the first process writes the files.
 
     Attributes:
-        state: progress of the run.
-        clock: the run's times, and its plan where it has minutes.
+        clock: the run's progress and times, and its plan where it has minutes.
         lbs: score of linear blend skinning.
         saved: iteration of the state on disk.
     """
@@ -75,8 +74,8 @@ class TrainingRun:
             )
         self.job, self.report, self.device, self.group = job, report, select_device(job.device), group
         self.files, identity = RunFiles(job, self.device, group), {**job.identity(), "processes": group.size}
-        self.state, tensors = load_state(self.files.state, identity) if job.resume else (RunState(identity), None)
-        self.clock = RunClock(job, self.state, began)
+        state, tensors = load_state(self.files.state, identity) if job.resume else (RunState(identity), None)
+        self.clock = RunClock(job, state, began)
         self.parts = build_parts(job, self.device, group, report)
         if not job.resume:
             self._fit_batch()
@@ -99,6 +98,11 @@ class TrainingRun:
         self.files.save_curve(self.state, self.lbs)
         self._saved_at = self._reported_at = time.monotonic()
         self.clock.start()
+
+    @property
+    def state(self) -> RunState:
+        """Progress of the run."""
+        return self.clock.state
 
     @property
     def config(self) -> TrainConfig:
@@ -337,7 +341,7 @@ class TrainingRun:
         before, tensors = load_state(self.files.state, self.state.asked)
         slower = ReducedSettings(before.iteration, config.batch, config.pretraining_batch, RECOVERY_PACE)
         skipped, seconds = int(self.stepper.skipped.count), self.state.seconds
-        self.state = self.clock.state = replace(before, lowered=[*lowered, slower], skipped=skipped, seconds=seconds)
+        self.clock.state = replace(before, lowered=[*lowered, slower], skipped=skipped, seconds=seconds)
         self._rebuild_stepper(tensors)
         text = (
             f"{found}; back to iteration {before.iteration} with {RECOVERY_PACE:.0%} of the learning rate, see "

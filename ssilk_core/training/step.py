@@ -187,9 +187,9 @@ class Stepper:
 
 
 def _optimisers(model: GarmentModel, config: TrainConfig, device: torch.device) -> dict[str, torch.optim.Optimizer]:
-    """Return the optimisers by name: Muon for the networks' matrices, if asked for, and Adam for all else.
+    """Return the optimisers by name: Muon for the networks' matrices, if asked for, and AdamW for all else.
 
-    Groups of parameters have a "scale", a factor on the learning rate. Only matrices have a weight decay.
+    Groups of parameters have a "scale", a factor on the learning rate. Only the matrices have a weight decay.
     """
     scales = {
         "matrices": 1.0,

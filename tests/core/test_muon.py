@@ -113,3 +113,11 @@ def test_soft_directions_converge_as_fast_as_stiff_ones():
 def test_another_optimiser_is_refused():
     with pytest.raises(SsilkError, match="optimiser 'sgd'; it is one of adam, muon"):
         TrainConfig(optimiser="sgd")
+
+
+def test_a_decay_that_would_turn_weights_over_is_refused():
+    assert TrainConfig(weight_decay=499, static_learning_rate=2e-3).weight_decay == 499
+    with pytest.raises(
+        SsilkError, match=r"weight_decay 500 at a learning rate of 0\.002; their product must be less"
+    ):
+        TrainConfig(weight_decay=500, static_learning_rate=2e-3)

@@ -225,7 +225,6 @@ def test_each_part_of_a_model_moves_at_its_own_rate(objective):
     config = replace(
         CONFIG,
         optimiser="adam",
-        weight_decay=0.0,
         integrator_learning_rate_scale=3.0,
         skin_learning_rate_scale=0.1,
         shape_learning_rate_scale=0.5,
