@@ -99,7 +99,7 @@ def test_a_validation_measures_steps_spread_over_its_clips(rolled, monkeypatch):
         found.append([float(v) for v in steps.measure(x.split(1, dim=-1), lbs[..., 2:], body, shift)])
     energy, square = np.array(found).T
     # Frames are decoded in other batches here, so that float32 rounds otherwise, as it does on each processor.
-    close = [pytest.approx(value, rel=1e-5) for value in (energy.mean(), square.mean() ** 0.5)]
+    close = [pytest.approx(value, rel=1e-4) for value in (energy.mean(), square.mean() ** 0.5)]
     expected = StepErrors(3, *close)
     assert score.step_errors == expected
     again = Score.of(json.loads(json.dumps(asdict(score))))
