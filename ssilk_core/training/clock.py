@@ -97,13 +97,15 @@ class RunClock:
         """Whether the speed was not measured for long."""
         return time.monotonic() - self._measured_at >= PACE_INTERVAL
 
-    def measure(self, pace: Pace) -> None:
-        """Measure the speed since the last measurement, and plan again; `pace` is the one until now."""
+    def measure(self) -> None:
+        """Measure the speed since the last measurement, and plan again, where there is a plan."""
+        if self.pace is None:
+            return
         iteration, seconds = self.state.iteration, self.state.seconds + time.monotonic() - self._since
         steps, took = iteration - self._measured[0], seconds - self._measured[1]
         self._measured, self._measured_at = (iteration, seconds), time.monotonic()
         if steps > 0 and took > 0:
-            self.pace = pace.updated(took / steps, iteration <= self.schedule.static_iterations)
+            self.pace = self.pace.updated(took / steps, iteration <= self.schedule.static_iterations)
             self.state.pace = [self.pace.static, self.pace.dynamic]
             self._follow(self.pace)
 

@@ -133,9 +133,8 @@ class TrainingRun:
 
     def _measure_pace(self) -> None:
         """Measure the speed since the last check, and plan again."""
-        if self.clock.pace is not None:  # in a group, which has no minutes, the stepper has a part of the batch
-            self.clock.measure(self.clock.pace)
-            self.stepper.config = self.config
+        self.clock.measure()
+        self.stepper.config = self.group.local_config(self.config)
 
     def _build_stepper(self) -> None:
         seed = self.job.train.seed + len(self.state.lowered)  # draws other windows than before
