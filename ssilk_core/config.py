@@ -109,7 +109,10 @@ class TrainConfig:
             for the energy alone, as in the paper.
         clearance: by which contact begins further from the body in training than in the fabric's own law [m]. A
             network misses the minimum by millimetres; this keeps them off the skin. Zero in the paper.
-        static_batch: single poses in each step of dynamic training, to which P is still fitted.
+        static_batch: single poses in each step of dynamic training, to which P is still fitted, beside the last pose
+            of each window.
+        distillation: weight of what draws P's states to those that S has reached with less energy
+            (`training.objective.distillation`); zero for none, as in the paper.
         noise_probability: probability per frame of noise on a reused state. A new window always starts with noise.
         noise: standard deviation of the noise on the first two latents of a window.
         noise_correlation: correlation between the noise on the first and on the second latent; 0 in the paper.
@@ -152,7 +155,8 @@ class TrainConfig:
     outlier_energy: float = 0.1
     newton_weight: float = 0.0
     clearance: float = 5e-3
-    static_batch: int = 64
+    static_batch: int = 512
+    distillation: float = 1.0
     noise_probability: float = 0.03
     noise: float = 0.03
     noise_correlation: float = 0.99
@@ -202,6 +206,7 @@ class TrainConfig:
             "outlier_energy",
             "newton_weight",
             "clearance",
+            "distillation",
             "weight_decay",
         )
         fastest = max(self.static_learning_rate, self.learning_rate, self.final_learning_rate)
@@ -275,8 +280,8 @@ PRESETS = {
             name="final",
             model=ModelConfig(translations=True),
             train=TrainConfig(
-                iterations=20_000,
-                static_fraction=0.3,
+                iterations=14_000,
+                static_fraction=0.64,
                 recombinations=8,
                 perturbations=3,
                 shape_learning_rate_scale=1.0,

@@ -13,7 +13,7 @@ from ssilk_core.config import TrainConfig
 from ssilk_core.constants import GRAVITY
 from ssilk_core.schemes import SCHEMES
 from ssilk_core.skinning import Skinning
-from ssilk_core.training.objective import Objective, total
+from ssilk_core.training.objective import Objective, distillation, total
 from ssilk_core.training.step import Stepper
 from ssilk_core.training.windows import WindowSampler
 
@@ -62,7 +62,7 @@ def reference(objective: Objective, sampler: WindowSampler, noise: torch.Tensor,
     """The windows of all slots, one state at a time; time-major lists of terms, and the last two latents."""
     model, bank, length = objective.model, objective.bank, sampler.config.window
     dynamic = [[{} for _ in sampler.first] for _ in range(length - 2)]
-    static_batch = [[{}] for _ in POSES[0]]
+    static_batch = [[{}] for _ in [*POSES[0], *sampler.first]]
     latents = []
     for slot, first in enumerate(sampler.first):
         down = sampler.direction[slot : slot + 1]
@@ -81,8 +81,14 @@ def reference(objective: Objective, sampler: WindowSampler, noise: torch.Tensor,
             dynamic[t - 2][slot] = terms
             x.append(now.detach())
         latents.append(torch.stack(z[-2:])[:, 0].detach())
+        ending = static_batch[len(POSES[0]) + slot][0]
+        ending.update(at_frame(objective, rest[-1], frames[-1], down)[1])
+        won = sum(value - dynamic[-1][slot][name] for name, value in ending.items()).detach().clamp_min(0)
+        away = (rest[-1] - z[-1].detach()).square().sum(1)
+        ending["distillation"] = sampler.config.distillation * won * away / away.detach()
     for row, frame, down in zip(static_batch, POSES[0].split(1), POSES[1].split(1)):
         row[0] = at_frame(objective, model.initial(bank.static_descriptor(frame, down)), frame, down)[1]
+        row[0]["distillation"] = torch.zeros(1)
     return flat(dynamic), flat(static_batch), torch.stack(latents, dim=1)
 
 
@@ -104,9 +110,9 @@ def test_a_window_equals_a_plain_loop(objective, bptt, clearance):
     for mine, theirs in zip(found[:2], expected[:2]):
         assert mine.keys() == theirs.keys()
         for name, value in mine.items():
-            assert value.abs().min() > 0 or name == "collision"
+            assert value.abs().min() > 0 or name in ("collision", "distillation")
             np.testing.assert_allclose(value.detach(), theirs[name].detach(), rtol=2e-3, atol=1e-6, err_msg=name)
-    assert found[0]["collision"].max() > 0
+    assert found[0]["collision"].max() > 0 and found[1]["distillation"].max() > 0
     np.testing.assert_allclose(found[2], expected[2], atol=1e-5)
     mine, theirs = (
         gradients(objective, total(dynamic) + total(static_batch)) for dynamic, static_batch, _ in (found, expected)
@@ -157,6 +163,34 @@ def test_static_terms_are_those_of_the_initialisers_states(objective):
             assert terms[name][i].item() == pytest.approx(expected[name].item(), rel=2e-3, abs=1e-6), name
 
 
+def test_a_state_of_less_energy_draws_the_initialiser_to_it():
+    rest, state = torch.tensor([[3.0, 0.0], [0.0, 1.0], [2.0, 2.0]]), torch.tensor([[0.0, 4.0], [0.0, 0.0], [2.0, 2.0]])
+    rest.requires_grad_()
+    state.requires_grad_()
+    value = distillation(rest, state, torch.tensor([0.7, 0.1, 0.5]), torch.tensor([0.2, 0.3, 0.2]))
+    torch.testing.assert_close(value, torch.tensor([0.5, 0.0, 0.0]))  # what there is to win, if z is elsewhere
+    value.sum().backward()
+    torch.testing.assert_close(rest.grad, torch.tensor([[0.12, -0.16], [0.0, 0.0], [0.0, 0.0]]))  # 2 dE (p - z) / d^2
+    assert state.grad is None
+
+
+@pytest.mark.parametrize("weight", [0.0, 1.0])
+def test_distillation_leaves_a_minimum_that_descent_cannot(weight):
+    """In the double well (x^2 - 1)^2 + x the left one is lower; the gradient of the energy alone stays in the right."""
+
+    def energy(x: torch.Tensor) -> torch.Tensor:
+        return ((x**2 - 1) ** 2 + x).sum(1)
+
+    rest, state = torch.tensor([[1.0]], requires_grad=True), torch.tensor([[-1.0]])
+    for _ in range(500):
+        (slope,) = torch.autograd.grad(
+            (energy(rest) + weight * distillation(rest, state, energy(rest), energy(state))).sum(), rest
+        )
+        rest = (rest - 0.01 * slope).detach().requires_grad_()
+    right, left = np.sort(np.roots([4, 0, -4, 1]))[[2, 0]]
+    assert rest.item() == pytest.approx(left if weight else right, abs=1e-3)
+
+
 def test_total_is_the_mean_over_frames_of_the_sum_of_terms():
     assert total({"a": torch.tensor([1.0, 3.0]), "b": torch.tensor([10.0])}).item() == 12
 
@@ -165,11 +199,9 @@ def test_a_step_weighs_every_frame_the_same(objective):
     """Those the initialiser answers for included, and the gradient of exactly that reaches the optimiser."""
     sampler = sampler_of(objective, replace(CONFIG, noise=0.0, learning_rate=0.0))
     dynamic, static_batch, _ = objective.window(sampler, torch.zeros(2, 3, 8), *POSES)
-    frames = sum(
-        torch.cat([dynamic[name], static_batch[name]]).mean() for name in static_batch
-    )  # terms that all frames have
-    rest = sum(dynamic[name].mean() for name in ("inertia", "drag")) * 4 / 5
-    expected = gradients(objective, frames + rest)
+    decoded = len(dynamic["gravity"]) + len(static_batch["gravity"])
+    frames = sum(value.sum() for terms in (dynamic, static_batch) for value in terms.values()) / decoded
+    expected = gradients(objective, frames)
     length = torch.cat([value.flatten() for value in expected.values()]).norm()  # only directions count
     stepper = Stepper(objective.model, objective, sampler, sampler.config)
     sampler.poses = lambda count: POSES

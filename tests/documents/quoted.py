@@ -41,7 +41,7 @@ from .shared import (
 
 def readme() -> Text:
     preview, final = (preset_minutes(PRESETS[name]) for name in ("preview", "final"))
-    yield f"about {60 * preview:.0f} seconds on a shared H100 and `--preset final` about {final:.0f} minutes"
+    yield f"about {60 * preview:.0f} seconds on a shared H200 and `--preset final` about {final:.0f} minutes"
     yield f"{two_gpus(32, 1024):.1f} times as fast with 1,024 windows of 32 poses in a batch"
     yield f"{two_gpus(32, 64):.2f} times as fast with 64 windows"
 
@@ -66,6 +66,7 @@ PAPER = {
     "noise_probability": "not stated",
     "static_fraction": 0,
     "static_batch": 0,
+    "distillation": 0,
     "learning_rate": "not stated",
     "skin_learning_rate_scale": "not stated",
     "integrator_learning_rate_scale": "not stated",

@@ -54,6 +54,14 @@ CELLS = list(product(GARMENTS, SPLITS))
 TIGHT = ("tshirt", "long_sleeve", "pants")
 HELD_OUT = ("valid", "test", "flips")
 FULL = "full, poses included"
+OFF_REST = ("cape", "cape_seed_1", "cape_allowance", "cape_short")
+REST_NAMES = {
+    "cape": "cape that ships",
+    "cape_short": "cape, shorter",
+    "cape_spoiled": "cape",
+    "fringe_skirt": "fringe skirt",
+    "hooded_dress": "hooded dress",
+}
 SKINNING = "linear blend skinning"
 one_digit, two_digits, four_digits = (partial(digits, count=count) for count in (1, 2, 4))
 share, share_1, share_2, share_3 = (partial(percent, places=places) for places in range(4))
@@ -499,7 +507,52 @@ def decay_training() -> Text:
     yield f"With {decays[2]:g} the quasi-static states get worse, most in gravity"
     risen = {term: max(runs["cape_4"][term]) - runs["cape_4"][term][0] for term in TERMS}
     assert max(risen, key=risen.__getitem__) == "gravity"
-    yield f"`final` has {PRESETS['final'].train.iterations:,} iterations"
+
+
+def static_training() -> Text:
+    names = {
+        "cape_seed_1": "cape, seed 1",
+        "cape_allowance": "cape, `velocity_allowance=0.3`",
+        "cape_64": "cape, 64 proxies, 256 blendshapes",
+        "cape_short": "cape, shorter",
+        "cape_short_64": "cape, shorter, 64 proxies, 256 blendshapes",
+    }
+    runs, rises = result("static_training"), {}
+    for name, run in runs.items():
+        best, kept = kept_at(run)
+        ends = (f"{run['total'][at]:.4f}".replace("-", "−") for at in (best, -1))
+        away, missed = ([fixed(1000 * run[key][at]) for at in (best, -1)] for key in ("dynamics", "step energy"))
+        yield row(names.get(name, name.replace("_", " ")), kept, *ends, *away, *missed)
+        rises[name] = run["total"][-1] / run["total"][best] - 1
+    assert set(names) < set(runs)
+    away = {name: run["dynamics"][-1] for name, run in runs.items()}
+    yield f"end over {milli(min(away[name] for name in OFF_REST) // 0.1 / 10)} mm away"
+    assert max(away[name] for name in ("cape_64", "cape_short_64")) < min(away[name] for name in OFF_REST)
+    yield f"rise by {share(rises['fringe_skirt'])} and {share(rises['hooded_dress'])} % of their best"
+    skirt, dress = (runs[name] for name in ("fringe_skirt", "hooded_dress"))
+    before = result("limits_training")
+    yield "{:.4f} J instead of {:.4f} J for the skirt".format(
+        min(skirt["total"]), min(before["fringe_skirt"]["total"])
+    )
+    yield "{:.4f} J instead of {:.4f} J for the dress".format(
+        min(dress["total"]), min(result("tight_training")["hooded_dress"]["total"])
+    )
+
+
+def rest_states() -> Text:
+    found = result("rest_states")
+    worst = {}
+    for name, clips in found.items():
+        count = sum(at["frames"] for at in clips.values())
+        worst[name] = max(clips, key=lambda clip: clips[clip]["lower"])
+        mean = {key: sum(at["frames"] * at[key] for at in clips.values()) / count for key in clips[worst[name]]}
+        energies = (fixed(mean[key], 3) for key in ("P", "P gravity", "network", "network gravity"))
+        yield row(REST_NAMES[name], *energies, share(mean["lower"]), share(clips[worst[name]]["lower"]))
+    at = found["cape_spoiled"][clip := worst["cape_spoiled"]]
+    yield f"In clip {clip} that is so in {share(at['lower'])} % of the frames"
+    yield "gravity of {} J, where the network's own states have {} J".format(
+        *(fixed(at[key], 2) for key in ("P gravity", "network gravity"))
+    )
 
 
 def rest() -> Text:
@@ -727,7 +780,7 @@ PARTS = (
     static_states, table1,
     findings, dynamics,
     ablations,
-    wardrobe, long_training, limits_training, decay_training, rest, playing, sizes, levels, refinement,
+    wardrobe, long_training, limits_training, decay_training, static_training, rest_states, rest, playing, sizes, levels, refinement,
     inside_the_body, stress,
     training_speed, scenes,
 )  # fmt: skip

@@ -41,8 +41,8 @@ def cache_share() -> str:
 
 
 def preset_minutes(preset: Preset) -> float:
-    """Return how long a preset's iterations take, at the pace of a cape on an H100 that two trainings share [min]."""
-    cape = result("limits_training")["cape_no_bound"]
+    """Return how long a preset's iterations take, at the pace of a cape on an H200 that two trainings share [min]."""
+    cape = result("static_training")["cape_short"]
     return preset.train.iterations * cape["seconds"][-1] / cape["iterations"][-1] / 60
 
 
