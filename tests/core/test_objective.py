@@ -164,9 +164,8 @@ def test_static_terms_are_those_of_the_initialisers_states(objective):
 
 
 def test_a_state_of_less_energy_draws_the_initialiser_to_it():
-    rest, state = torch.tensor([[3.0, 0.0], [0.0, 1.0], [2.0, 2.0]]), torch.tensor([[0.0, 4.0], [0.0, 0.0], [2.0, 2.0]])
-    rest.requires_grad_()
-    state.requires_grad_()
+    rest = torch.tensor([[3.0, 0.0], [0.0, 1.0], [2.0, 2.0]], requires_grad=True)
+    state = torch.tensor([[0.0, 4.0], [0.0, 0.0], [2.0, 2.0]], requires_grad=True)
     value = distillation(rest, state, torch.tensor([0.7, 0.1, 0.5]), torch.tensor([0.2, 0.3, 0.2]))
     torch.testing.assert_close(value, torch.tensor([0.5, 0.0, 0.0]))  # what there is to win, if z is elsewhere
     value.sum().backward()
@@ -176,7 +175,7 @@ def test_a_state_of_less_energy_draws_the_initialiser_to_it():
 
 @pytest.mark.parametrize("weight", [0.0, 1.0])
 def test_distillation_leaves_a_minimum_that_descent_cannot(weight):
-    """In the double well (x^2 - 1)^2 + x the left one is lower; the gradient of the energy alone stays in the right."""
+    """In the double well (x^2 - 1)^2 + x the left one is lower; the energy's gradient alone stays right."""
 
     def energy(x: torch.Tensor) -> torch.Tensor:
         return ((x**2 - 1) ** 2 + x).sum(1)

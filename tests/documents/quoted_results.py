@@ -780,7 +780,8 @@ PARTS = (
     static_states, table1,
     findings, dynamics,
     ablations,
-    wardrobe, long_training, limits_training, decay_training, static_training, rest_states, rest, playing, sizes, levels, refinement,
+    wardrobe, long_training, limits_training, decay_training, static_training, rest_states,
+    rest, playing, sizes, levels, refinement,
     inside_the_body, stress,
     training_speed, scenes,
 )  # fmt: skip
