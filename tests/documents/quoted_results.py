@@ -446,6 +446,14 @@ def long_training() -> Text:
     assert ends["hooded_dress"] and ends["fringe_skirt"] and not (ends["cape"] or ends["cape_seed_1"])
 
 
+def training_row(run: dict, *cells: str) -> str:
+    """Return the line of a training: where its best was kept, then totals, distances from P and step errors."""
+    best, kept = kept_at(run)
+    ends = (f"{run['total'][at]:.4f}".replace("-", "−") for at in (best, -1))
+    away, missed = ([fixed(1000 * run[key][at]) for at in (best, -1)] for key in ("dynamics", "step energy"))
+    return row(*cells, kept, *ends, *away, *missed)
+
+
 def limits_training() -> Text:
     names = {
         "tshirt": "T-shirt",
@@ -454,11 +462,8 @@ def limits_training() -> Text:
     }
     runs, risen = result("limits_training"), {}
     for name, run in runs.items():
-        best, kept = kept_at(run)
-        ends = (f"{run['total'][at]:.4f}".replace("-", "−") for at in (best, -1))
-        away, missed = ([fixed(1000 * run[key][at]) for at in (best, -1)] for key in ("dynamics", "step energy"))
-        yield row(names.get(name, name.replace("_", " ")), kept, *ends, *away, *missed)
-        risen[name] = run["total"][-1] / run["total"][best] - 1
+        yield training_row(run, names.get(name, name.replace("_", " ")))
+        risen[name] = run["total"][-1] / min(run["total"]) - 1
     times = [run["seconds"][-1] / 60 for run in runs.values()]
     yield f"for {min(times):.0f} to {max(times):.0f} minutes of steps"
     counts = [len(run["iterations"]) for run in runs.values()]
@@ -482,12 +487,9 @@ def decay_training() -> Text:
     rise, price = {}, {}
     for name, run in runs.items():
         words, _, decay = name.rpartition("_")
-        best, kept = kept_at(run)
-        ends = (f"{run['total'][at]:.4f}".replace("-", "−") for at in (best, -1))
-        away, missed = ([fixed(1000 * run[key][at]) for at in (best, -1)] for key in ("dynamics", "step energy"))
-        yield row(words.replace("_stepper", ", S alone").replace("_", " "), decay, kept, *ends, *away, *missed)
-        rise[name] = run["total"][-1] - run["total"][best]
-        price[name] = run["total"][best], min(before.get(words, run)["total"])
+        yield training_row(run, words.replace("_stepper", ", S alone").replace("_", " "), decay)
+        rise[name] = run["total"][-1] - min(run["total"])
+        price[name] = min(run["total"]), min(before.get(words, run)["total"])
     assert all(rise[name] < 0.1 * price[name][0] for name in rise if name.endswith("1.5") and "stepper" not in name)
     yield f"{price['cape_1.5'][0] - price['cape_1.5'][1]:.4f} J in the cape"
     shares = [share(now / once - 1) for now, once in (price["fringe_skirt_1.5"], price["hooded_dress_1.5"])]
@@ -519,11 +521,8 @@ def static_training() -> Text:
     }
     runs, rises = result("static_training"), {}
     for name, run in runs.items():
-        best, kept = kept_at(run)
-        ends = (f"{run['total'][at]:.4f}".replace("-", "−") for at in (best, -1))
-        away, missed = ([fixed(1000 * run[key][at]) for at in (best, -1)] for key in ("dynamics", "step energy"))
-        yield row(names.get(name, name.replace("_", " ")), kept, *ends, *away, *missed)
-        rises[name] = run["total"][-1] / run["total"][best] - 1
+        yield training_row(run, names.get(name, name.replace("_", " ")))
+        rises[name] = run["total"][-1] / min(run["total"]) - 1
     assert set(names) < set(runs)
     away = {name: run["dynamics"][-1] for name, run in runs.items()}
     yield f"end over {milli(min(away[name] for name in OFF_REST) // 0.1 / 10)} mm away"
