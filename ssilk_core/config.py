@@ -280,8 +280,8 @@ PRESETS = {
             name="final",
             model=ModelConfig(translations=True),
             train=TrainConfig(
-                iterations=14_000,
-                static_fraction=0.64,
+                iterations=20_000,
+                static_fraction=0.3,
                 recombinations=8,
                 perturbations=3,
                 shape_learning_rate_scale=1.0,
