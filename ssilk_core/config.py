@@ -156,7 +156,7 @@ class TrainConfig:
     newton_weight: float = 0.0
     clearance: float = 5e-3
     static_batch: int = 512
-    distillation: float = 1.0
+    distillation: float = 0.0
     noise_probability: float = 0.03
     noise: float = 0.03
     noise_correlation: float = 0.99
