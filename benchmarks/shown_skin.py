@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from helpers.reports import table, write_results
-from helpers.subjects import Subject, arguments, clip_of, open_subject, parsed
+from helpers.subjects import Subject, arguments, clip_of, measure_each, parsed
 from refine import NetworkTake
 from torch import Tensor
 
@@ -122,13 +121,7 @@ def main() -> None:
     parser.add_argument("--index", type=Path, required=True, help="JSON list of clips and their splits")
     parser.add_argument("--refined", nargs="*", default=[], metavar="CLIP", help="clips to refine and to simulate")
     parser.add_argument("--frames", type=int, default=60, help="frames of these (default 60)")
-    options = parsed(parser)
-    lines, measured = [], {}
-    for path in options.models:
-        subject = open_subject(path, options.stage, options.device)
-        measured[subject.name] = found = measure(subject, options)
-        lines += rows(subject.name, found)
-        write_results(options, table(HEADER, lines), measured)
+    measure_each(parsed(parser), HEADER, measure, rows)
 
 
 if __name__ == "__main__":

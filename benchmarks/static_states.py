@@ -12,21 +12,65 @@ from __future__ import annotations
 
 from argparse import Namespace
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import torch
-from helpers.reports import table, write_results
-from helpers.subjects import Subject, arguments, clip_of, open_subject, parsed
+from helpers.subjects import Subject, arguments, clip_of, measure_each, parsed
 from torch import Tensor
 
 from ssilk_core.evaluation.splits import read_index
 from ssilk_core.kinematics import resample
 from ssilk_core.simulate import SimulationOptions, Simulator
-from ssilk_core.training.objective import Objective
+from ssilk_core.training.objective import Objective, Terms
+from ssilk_core.training.validation import Validator
 
 TERMS = ("stretch", "gravity", "collision", "tether")
 HEADER = ("garment", "state", "energy [J]", *(f"{name} [J]" for name in TERMS), "from P [mm]")
 STEPS = 300  # of L-BFGS
+
+
+@dataclass(frozen=True, eq=False)
+class StillFrames:
+    """Frames without inertia and drag.
+
+    Attributes:
+        objective: the energies.
+        direction: of gravity (N, 3); descriptor: the static one, P's input (N, D).
+        character: its skinning matrices (J, 3, 4, N).
+        lbs: the garment under linear blend skinning (V, 3, N), from which heights count.
+    """
+
+    objective: Objective
+    direction: Tensor
+    descriptor: Tensor
+    character: Tensor
+    lbs: Tensor
+
+    @classmethod
+    def of(cls, subject: Subject, validator: Validator, frames: Tensor) -> StillFrames:
+        """Return those of a validator's bank with indices (N,)."""
+        bank = validator.bank
+        direction, character = validator.down.expand(len(frames), 3), bank.character(frames)
+        objective = Objective(subject.model, subject.energy, subject.body, bank)
+        descriptor = bank.static_descriptor(frames, direction)
+        return cls(objective, direction, descriptor, character, validator.lbs_vertices(character))
+
+    @cached_property
+    def height(self) -> Tensor:
+        """Gravity under linear blend skinning [J], shape (N,)."""
+        return self.objective.quasi_static_terms(self.lbs, self.direction, self.character)["gravity"]
+
+    def terms(self, x: Tensor) -> Terms:
+        """Return the energies of positions (V, 3, N), each (N,) [J]."""
+        found = self.objective.quasi_static_terms(x, self.direction, self.character)
+        return found | {"gravity": found["gravity"] - self.height}
+
+
+def energy_of(terms: Terms) -> Tensor:
+    """Return the sum of all terms in each frame [J], shape (N,)."""
+    return torch.stack([*terms.values()]).sum(0)
 
 
 def least(start: Tensor, energy: Callable[[Tensor], Tensor]) -> Tensor:
@@ -55,22 +99,15 @@ def measure(subject: Subject, options: Namespace) -> dict[str, dict[str, float]]
 
 
 def _pose(subject: Subject, options: Namespace, clip: str) -> dict[str, dict[str, float]]:
-    motion, model, energy = clip_of(options, clip, subject), subject.model, subject.energy
-    validator = subject.validator(motion)
-    bank, direction, frame = validator.bank, validator.down[None], torch.zeros(1, dtype=torch.int64)
-    objective, character = Objective(model, energy, subject.body, bank), bank.character(frame)
-    lbs = validator.lbs_vertices(character)
-    height = {"gravity": objective.quasi_static_terms(lbs, direction, character)["gravity"]}
-
-    def terms(x: Tensor) -> dict[str, Tensor]:
-        values = objective.quasi_static_terms(x, direction, character)
-        return {name: value - height.get(name, 0.0) for name, value in values.items()}
+    motion, model = clip_of(options, clip, subject), subject.model
+    still = StillFrames.of(subject, subject.validator(motion), torch.zeros(1, dtype=torch.int64))
+    character, terms = still.character, still.terms
 
     def total(x: Tensor) -> Tensor:
-        return torch.stack([*terms(x).values()]).sum(0)
+        return energy_of(terms(x))
 
     with torch.no_grad():
-        z = model.initial(bank.static_descriptor(frame, direction))
+        z = model.initial(still.descriptor)
         states = {"P": model.vertices(z, character)}
     z = least(z, lambda latent: total(model.vertices(latent, character)))
     with torch.no_grad():
@@ -87,7 +124,7 @@ def _pose(subject: Subject, options: Namespace, clip: str) -> dict[str, dict[str
         )
         first = resample(motion, fps).clip(0, 1)
         poses = simulator.poser.pose(first.rotations, first.translations)
-        for name, start in (("solver, from P", states["P"]), ("solver, from LBS", lbs)):
+        for name, start in (("solver, from P", states["P"]), ("solver, from LBS", still.lbs)):
             states[name] = simulator.quasi_static(poses, simulator.apply_pins(start, poses)).x
         return {
             name: {
@@ -99,19 +136,19 @@ def _pose(subject: Subject, options: Namespace, clip: str) -> dict[str, dict[str
         }
 
 
+def rows(garment: str, found: dict[str, dict[str, float]]) -> list[list[str]]:
+    """Return the lines of a garment."""
+    return [
+        [garment, state, *(f"{at[name]:.3f}" for name in ("energy", *TERMS)), f"{1000 * at['distance']:.0f}"]
+        for state, at in found.items()
+    ]
+
+
 def main() -> None:
     parser = arguments(__doc__.splitlines()[0])
     parser.add_argument("--index", type=Path, required=True, help="JSON list of clips and their splits")
     parser.add_argument("--poses", type=int, default=4, help="clips whose first pose is measured (default 4)")
-    options = parsed(parser)
-    lines, measured = [], {}
-    for path in options.models:
-        subject = open_subject(path, options.stage, options.device)
-        measured[subject.name] = found = measure(subject, options)
-        for state, at in found.items():
-            figures = (f"{at[name]:.3f}" for name in ("energy", *TERMS))
-            lines.append([subject.name, state, *figures, f"{1000 * at['distance']:.0f}"])
-        write_results(options, table(HEADER, lines), measured)
+    measure_each(parsed(parser), HEADER, measure, rows)
 
 
 if __name__ == "__main__":

@@ -109,10 +109,9 @@ class TrainConfig:
             for the energy alone, as in the paper.
         clearance: by which contact begins further from the body in training than in the fabric's own law [m]. A
             network misses the minimum by millimetres; this keeps them off the skin. Zero in the paper.
-        static_batch: single poses in each step of dynamic training, to which P is still fitted, beside the last pose
-            of each window.
-        distillation: weight of what draws P's states to those that S has reached with less energy
-            (`training.objective.distillation`); zero for none, as in the paper.
+        static_batch: single poses in each step of dynamic training, to which P is still fitted.
+        distillation: weight of what draws P's states at the windows' ends to those that S has reached with less
+            energy (`training.objective.distillation`); zero for none, as in the paper.
         noise_probability: probability per frame of noise on a reused state. A new window always starts with noise.
         noise: standard deviation of the noise on the first two latents of a window.
         noise_correlation: correlation between the noise on the first and on the second latent; 0 in the paper.

@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from ssilk_usd.read_character import read_character
@@ -14,6 +16,7 @@ from ssilk_usd.read_motion import read_motion
 from ssilk_usd.read_stage import open_stage
 from torch import Tensor
 
+from helpers.reports import table, write_results
 from ssilk_core.assets import Motion, Scene
 from ssilk_core.checkpoint import ModelFile, load_model, network
 from ssilk_core.collision import CollisionBody
@@ -99,6 +102,25 @@ def parsed(parser: argparse.ArgumentParser) -> argparse.Namespace:
     options.name = options.name or Path(sys.argv[0]).stem
     torch.set_num_threads(options.threads)
     return options
+
+
+def measure_each(
+    options: argparse.Namespace,
+    header: Sequence[str],
+    measure: Callable[[Subject, argparse.Namespace], dict[str, Any]],
+    rows: Callable[[str, dict[str, Any]], list[list[str]]],
+) -> None:
+    """Measure one model after the other; after each, print the table so far and write the figures.
+
+    Args:
+        rows: returns the lines of a model from its name and figures.
+    """
+    lines, measured = [], {}
+    for path in options.models:
+        subject = open_subject(path, options.stage, options.device)
+        measured[subject.name] = found = measure(subject, options)
+        lines += rows(subject.name, found)
+        write_results(options, table(header, lines), measured)
 
 
 def clip_of(options: argparse.Namespace, name: str, subject: Subject) -> Motion:

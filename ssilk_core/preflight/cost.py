@@ -102,7 +102,8 @@ def step_seconds(samples: int, frames: int, device: str) -> float:
 
 def trained_frames(train: TrainConfig) -> int:
     """Return the frames of a step of dynamic training: of windows without the two given ones, and of single poses."""
-    return train.batch * (train.window - 2) + train.static_batch + train.batch
+    ends = train.batch if train.distillation else 0
+    return train.batch * (train.window - 2) + train.static_batch + ends
 
 
 def irrelevant_joints(scene: Scene, colliding: np.ndarray) -> Findings:

@@ -114,9 +114,9 @@ class Objective:
             frames, direction: single poses for the initialiser (M,), and their gravity directions (M, 3).
 
         Returns:
-            Terms of the frames from the third on, terms of the quasi-static states of the single poses and, beside a
-            stepper, of the poses that the windows end with, and the last two latents (2, batch, latent) for the next
-            window.
+            Terms of the frames from the third on, terms of the quasi-static states of the single poses and, with
+            distillation, of the poses that the windows end with, and the last two latents (2, batch, latent) for the
+            next window.
         """
         model, bank, length = self.model, self.bank, sampler.config.window
         batch = len(sampler.first)
@@ -137,7 +137,7 @@ class Objective:
             rolled = model.step(
                 states[: -2 * batch], states[batch:-batch], *(v[2:].flatten(0, 1) for v in (target, pose))
             )
-        if model.integrator.scheme.states:  # the single poses, then those that the windows end with
+        if weight := sampler.config.distillation:  # beside the single poses those that the windows end with
             frames, direction = torch.cat([frames, times[-batch:]]), torch.cat([direction, down[-batch:]])
         quiet = model.initial(bank.static_descriptor(frames, direction))
         with torch.no_grad():
@@ -149,18 +149,18 @@ class Objective:
         count = (length - 2) * batch
         dynamic = {name: value[:count] for name, value in terms.items()}
         single = {name: value[count:] for name, value in terms.items()}
-        if model.integrator.scheme.states:
+        if weight:
             energies = [torch.stack([*each.values()]).sum(0)[-batch:] for each in (single, dynamic)]
-            ends = sampler.config.distillation * distillation(quiet[-batch:], rolled[-batch:], *energies)
+            ends = weight * distillation(quiet[-batch:], rolled[-batch:], *energies)
             single[DISTILLATION] = torch.cat([ends.new_zeros(len(quiet) - batch), ends])
         path = torch.cat([past, x[..., : count - batch].detach()], dim=-1)
         root = bank.root[times].T
         dynamic["inertia"], dynamic["drag"] = self.energy.inertia_and_drag(
             x, path[..., batch:], path[..., :-batch], root[:, 2 * batch :] - root[:, batch:-batch], self.dt
         )
-        if weight := sampler.config.latent_regularization:
+        if regularization := sampler.config.latent_regularization:
             drawn, scale = torch.cat([rolled[-batch:], quiet]), sampler.config.latent_regularization_scale
-            dynamic[REGULARIZATION] = weight * latent_distortion(model, self.energy.mass, drawn, scale)
+            dynamic[REGULARIZATION] = regularization * latent_distortion(model, self.energy.mass, drawn, scale)
         return dynamic, single, torch.stack(z[-2:]).detach()
 
 

@@ -465,9 +465,13 @@ def test_memory_says_when_the_batch_is_lowered(monkeypatch):
 
 def test_time_grows_with_samples_and_frames_and_is_not_guessed():
     train = replace(PRESETS["draft"].train, iterations=10, static_fraction=0.0, batch=4, window=16)
-    assert cost.training_seconds(2700, train, "cpu") == pytest.approx(10 * 68 * 2700 * cost.SECONDS_PER_SAMPLE["cpu"])
-    warm = replace(train, static_fraction=0.5, pretraining_batch=136)
+    assert cost.training_seconds(2700, train, "cpu") == pytest.approx(10 * 64 * 2700 * cost.SECONDS_PER_SAMPLE["cpu"])
+    warm = replace(train, static_fraction=0.5, pretraining_batch=128)
     assert cost.training_seconds(2700, warm, "cpu") == pytest.approx(1.5 * cost.training_seconds(2700, train, "cpu"))
+    distilled = replace(train, distillation=1.0)  # P is fitted to the 4 poses that windows end with, too
+    assert cost.training_seconds(2700, distilled, "cpu") == pytest.approx(
+        68 / 64 * cost.training_seconds(2700, train, "cpu")
+    )
     assert cost.training_seconds(2700, train, "abacus") is None
 
 

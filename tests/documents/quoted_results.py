@@ -454,16 +454,20 @@ def training_row(run: dict, *cells: str) -> str:
     return row(*cells, kept, *ends, *away, *missed)
 
 
+def relative_rise(run: dict) -> float:
+    """Return how far the last total of a training lies over its best, relative to that."""
+    return run["total"][-1] / min(run["total"]) - 1
+
+
 def limits_training() -> Text:
     names = {
         "tshirt": "T-shirt",
         "cape_no_bound": "cape, `latent_bound=0`",
         "cape_outliers": "cape, `outlier_energy=1`",
     }
-    runs, risen = result("limits_training"), {}
+    runs = result("limits_training")
     for name, run in runs.items():
         yield training_row(run, names.get(name, name.replace("_", " ")))
-        risen[name] = run["total"][-1] / min(run["total"]) - 1
     times = [run["seconds"][-1] / 60 for run in runs.values()]
     yield f"for {min(times):.0f} to {max(times):.0f} minutes of steps"
     counts = [len(run["iterations"]) for run in runs.values()]
@@ -473,7 +477,8 @@ def limits_training() -> Text:
     yield f"{min(muon['hooded_dress']['total']):.4f} J for the dress"
     yield f"with {large_step_size()['batch']} windows in a batch"
     yield f"whose best is\n  {min(result('tight_training')['hooded_dress']['total']):.4f} J"
-    yield f"skirt and dress rise by {share(risen['fringe_skirt'])} and {share(risen['hooded_dress'])} % of it"
+    rises = (share(relative_rise(runs[name])) for name in ("fringe_skirt", "hooded_dress"))
+    yield f"skirt and dress rise by {' and '.join(rises)} % of it"
     assert all(run["step energy"][-1] > run["step energy"][kept_at(run)[0]] for n, run in runs.items() if "cape" in n)
     ends = [result("step_errors")[name]["train"] for name in ("cape", "cape_last")]
     mean_step, median, most = ([fixed(at[name], 1, 0.001) for at in ends] for name in ("mean", "median", "p95"))
@@ -519,16 +524,15 @@ def static_training() -> Text:
         "cape_short": "cape, shorter",
         "cape_short_64": "cape, shorter, 64 proxies, 256 blendshapes",
     }
-    runs, rises = result("static_training"), {}
+    runs = result("static_training")
     for name, run in runs.items():
         yield training_row(run, names.get(name, name.replace("_", " ")))
-        rises[name] = run["total"][-1] / min(run["total"]) - 1
     assert set(names) < set(runs)
     away = {name: run["dynamics"][-1] for name, run in runs.items()}
     yield f"end over {milli(min(away[name] for name in OFF_REST) // 0.1 / 10)} mm away"
     assert max(away[name] for name in ("cape_64", "cape_short_64")) < min(away[name] for name in OFF_REST)
-    yield f"rise by {share(rises['fringe_skirt'])} and {share(rises['hooded_dress'])} % of their best"
     skirt, dress = (runs[name] for name in ("fringe_skirt", "hooded_dress"))
+    yield f"rise by {share(relative_rise(skirt))} and {share(relative_rise(dress))} % of their best"
     before = result("limits_training")
     yield "{:.4f} J instead of {:.4f} J for the skirt".format(
         min(skirt["total"]), min(before["fringe_skirt"]["total"])
