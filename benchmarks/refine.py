@@ -49,8 +49,8 @@ class NetworkTake:
         points = np.concatenate([decode(subject.model, motion, pose) for pose in poses])
         return cls(subject, motion, poses, points)
 
-    def refiner(self, iterations: int, feedback: bool) -> Refiner:
-        options, dressed = RefineOptions(iterations=iterations, feedback=feedback), self.subject.dressed
+    def refiner(self, iterations: int, feedback: bool, batch: int = RefineOptions.batch) -> Refiner:
+        options, dressed = RefineOptions(iterations=iterations, feedback=feedback, batch=batch), self.subject.dressed
         return Refiner(dressed.scene, dressed.fabric, options, fps=self.motion.fps, device=dressed.device)
 
     def measured(self, points: Floats) -> dict[str, float]:

@@ -3,8 +3,9 @@
 
     python benchmarks/shown_skin.py cape.safetensors --stage character.usdc --motions FOLDER --index FOLDER/index.json
 
-Shares are means over all frames of a split, and those of its worst frame. Stretch is the mean energy. The simulator
-and the refined network are measured on the first `--frames` frames of `--refined` clips; nothing is refined without.
+Shares are means over all frames of a split, and those of its worst frame. Stretch is the mean energy. With `--refine`
+the refined network is measured on whole clips, too. It and the simulator are measured on the first `--frames` frames
+of `--refined` clips.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from helpers.subjects import Subject, arguments, clip_of, measure_each, parsed
 from refine import NetworkTake
 from torch import Tensor
 
+from ssilk_core.assets import Floats
 from ssilk_core.collision import CoveredSkin, ShownCounts
 from ssilk_core.evaluation.splits import read_index
 from ssilk_core.kinematics import motion_transforms, skinning_matrices
@@ -39,6 +41,7 @@ HEADER = (
     "stretch [J]",
 )
 CHUNK = 256  # frames in memory at once
+FRAMES = 100_000  # more than any clip has
 ITERATIONS = 4
 
 
@@ -59,6 +62,31 @@ def whole_clip(
             counts.append(ShownCounts.of(skin.states(x, character)))
             stretch.append(subject.energy.stretch(x).cpu())
         yield method, ShownCounts.joined(counts), torch.cat(stretch)
+    if options.refine:
+        take = NetworkTake.of(subject, clip_of(options, clip, subject), FRAMES)
+        yield f"refine {ITERATIONS}", *seen(subject, skin, take, refined_points(take))
+
+
+def refined_points(take: NetworkTake) -> Floats:
+    """Return the refined vertices of a take (F, V, 3), which look back on the network's."""
+    refiner = take.refiner(ITERATIONS, False, CHUNK)
+    return np.stack([frame.points for frame in refiner.frames(take.motion, take.points)])
+
+
+def seen(subject: Subject, skin: CoveredSkin, take: NetworkTake, points: Floats) -> tuple[ShownCounts, Tensor]:
+    """Return the skin that shows and the stretch of vertices (F, V, 3) of a take."""
+    skeleton = subject.dressed.scene.character.skeleton
+    matrices = skinning_matrices(motion_transforms(take.motion, skeleton.parents), skeleton.bind_transforms)
+    counts, stretch = [], []
+    for start in range(0, len(points), CHUNK):
+        block = slice(start, start + CHUNK)
+        character, x = (
+            torch.tensor(each, dtype=torch.float32, device=subject.device)
+            for each in (matrices[block, :, :3].transpose(1, 2, 3, 0), points[block].transpose(1, 2, 0))
+        )
+        counts.append(ShownCounts.of(skin.states(x, character)))
+        stretch.append(subject.energy.stretch(x).cpu())
+    return ShownCounts.joined(counts), torch.cat(stretch)
 
 
 def solved(
@@ -67,15 +95,11 @@ def solved(
     """Yield the same of the first frames of a clip: the network, refined, and the simulator."""
     take = NetworkTake.of(subject, clip_of(options, clip, subject), options.frames)
     dressed, motion = subject.dressed, take.motion
-    refined = np.stack([frame.points for frame in take.refiner(ITERATIONS, False).frames(motion, take.points)])
     simulation = SimulationOptions(fps=motion.fps, precision="float32")
     (simulated,) = simulate(dressed.scene, dressed.fabric, [motion], simulation, device=subject.device)
-    skeleton = dressed.scene.character.skeleton
-    matrices = skinning_matrices(motion_transforms(motion, skeleton.parents), skeleton.bind_transforms)
-    character = torch.tensor(matrices[:, :, :3].transpose(1, 2, 3, 0), dtype=torch.float32, device=subject.device)
-    for method, points in (("network", take.points), (f"refine {ITERATIONS}", refined), ("simulator", simulated)):
-        x = torch.tensor(points.transpose(1, 2, 0), dtype=torch.float32, device=subject.device)
-        yield method, ShownCounts.of(skin.states(x, character)), subject.energy.stretch(x).cpu()
+    yield "network", *seen(subject, skin, take, take.points)
+    yield f"refine {ITERATIONS}", *seen(subject, skin, take, refined_points(take))
+    yield "simulator", *seen(subject, skin, take, simulated)
 
 
 def figures(found: list[tuple[str, ShownCounts, Tensor]]) -> dict[str, Any]:
@@ -119,6 +143,7 @@ def rows(garment: str, found: dict[str, Any]) -> list[list[str]]:
 def main() -> None:
     parser = arguments(__doc__.splitlines()[0])
     parser.add_argument("--index", type=Path, required=True, help="JSON list of clips and their splits")
+    parser.add_argument("--refine", action="store_true", help="refine the whole clips, too")
     parser.add_argument("--refined", nargs="*", default=[], metavar="CLIP", help="clips to refine and to simulate")
     parser.add_argument("--frames", type=int, default=60, help="frames of these (default 60)")
     measure_each(parsed(parser), HEADER, measure, rows)
