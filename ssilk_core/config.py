@@ -110,8 +110,6 @@ class TrainConfig:
         clearance: by which contact begins further from the body in training than in the fabric's own law [m]. A
             network misses the minimum by millimetres; this keeps them off the skin. Zero in the paper.
         static_batch: single poses in each step of dynamic training, to which P is still fitted.
-        distillation: weight of what draws P's states at the windows' ends to those that S has reached with less
-            energy (`training.objective.distillation`); zero for none, as in the paper.
         noise_probability: probability per frame of noise on a reused state. A new window always starts with noise.
         noise: standard deviation of the noise on the first two latents of a window.
         noise_correlation: correlation between the noise on the first and on the second latent; 0 in the paper.
@@ -155,7 +153,6 @@ class TrainConfig:
     newton_weight: float = 0.0
     clearance: float = 5e-3
     static_batch: int = 512
-    distillation: float = 0.0
     noise_probability: float = 0.03
     noise: float = 0.03
     noise_correlation: float = 0.99
@@ -163,7 +160,7 @@ class TrainConfig:
     latent_regularization_scale: float = 0.03
     bptt: bool = False
     optimiser: str = "muon"
-    static_learning_rate: float = 2e-3
+    static_learning_rate: float = 1e-3
     learning_rate: float = 3e-4
     final_learning_rate: float = 2e-5
     learning_rate_warmup: int = 500
@@ -205,7 +202,6 @@ class TrainConfig:
             "outlier_energy",
             "newton_weight",
             "clearance",
-            "distillation",
             "weight_decay",
         )
         fastest = max(self.static_learning_rate, self.learning_rate, self.final_learning_rate)
@@ -251,6 +247,7 @@ PRESETS = {
                 recombinations=0,
                 perturbations=0,
                 rotated_fraction=0.3,
+                static_learning_rate=2e-3,
                 learning_rate=6e-4,
                 final_learning_rate=1e-4,
                 shape_learning_rate_scale=1.0,

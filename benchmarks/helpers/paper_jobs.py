@@ -42,7 +42,6 @@ MOTION_AND_RATES = (
 USUAL = {"batch": 256, "window": 6, "static_batch": 256}
 OWN_SETTINGS = (
     *(f"{name}={value}" for name, value in USUAL.items()),
-    "distillation=0",
     "rotated_fraction=0.5",
     "max_latent_step=0.3",
     "velocity_allowance=0.5",

@@ -101,9 +101,8 @@ def step_seconds(samples: int, frames: int, device: str) -> float:
 
 
 def trained_frames(train: TrainConfig) -> int:
-    """Return the frames of a step of dynamic training: of windows without the two given ones, and of single poses."""
-    ends = train.batch if train.distillation else 0
-    return train.batch * (train.window - 2) + train.static_batch + ends
+    """Return the frames of a step of dynamic training, without the two given ones of each window."""
+    return train.batch * (train.window - 2) + train.static_batch
 
 
 def irrelevant_joints(scene: Scene, colliding: np.ndarray) -> Findings:

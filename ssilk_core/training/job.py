@@ -47,8 +47,8 @@ class TrainJob:
     def __post_init__(self) -> None:
         if not self.has_loose:
             object.__setattr__(self, "model", replace(self.model, scheme="quasi_static"))
-        if self.model.scheme == "quasi_static":  # there are no previous states to vary, and no stepper to learn from
-            object.__setattr__(self, "train", replace(self.train, state_reuse=0, noise=0, distillation=0))
+        if self.model.scheme == "quasi_static":  # there are no previous states to vary
+            object.__setattr__(self, "train", replace(self.train, state_reuse=0, noise=0))
         if not self.is_trainable:
             object.__setattr__(self, "model", replace(self.model, latent=1, widths=(1,), shapes=1))
             least = replace(

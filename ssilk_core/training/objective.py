@@ -19,9 +19,7 @@ from .newton_distance import NewtonDistance
 from .windows import WindowSampler
 
 Terms = dict[str, Tensor]
-LEAST_SQUARE = 1e-12  # of a distance between latents
 REGULARIZATION = "latent regularization"  # a term of latents, which has no frames
-DISTILLATION = "distillation"  # a term of the initialiser's states at the windows' ends
 
 
 class Objective:
@@ -114,9 +112,8 @@ class Objective:
             frames, direction: single poses for the initialiser (M,), and their gravity directions (M, 3).
 
         Returns:
-            Terms of the frames from the third on, terms of the quasi-static states of the single poses and, with
-            distillation, of the poses that the windows end with, and the last two latents (2, batch, latent) for the
-            next window.
+            Terms of the frames from the third on, terms of the quasi-static states of the single poses, and the last
+            two latents (2, batch, latent) for the next window.
         """
         model, bank, length = self.model, self.bank, sampler.config.window
         batch = len(sampler.first)
@@ -137,8 +134,6 @@ class Objective:
             rolled = model.step(
                 states[: -2 * batch], states[batch:-batch], *(v[2:].flatten(0, 1) for v in (target, pose))
             )
-        if weight := sampler.config.distillation:  # beside the single poses those that the windows end with
-            frames, direction = torch.cat([frames, times[-batch:]]), torch.cat([direction, down[-batch:]])
         quiet = model.initial(bank.static_descriptor(frames, direction))
         with torch.no_grad():
             past = model.vertices(torch.cat(z[:2]), bank.character(times[: 2 * batch]))
@@ -149,36 +144,15 @@ class Objective:
         count = (length - 2) * batch
         dynamic = {name: value[:count] for name, value in terms.items()}
         single = {name: value[count:] for name, value in terms.items()}
-        if weight:
-            energies = [torch.stack([*each.values()]).sum(0)[-batch:] for each in (single, dynamic)]
-            ends = weight * distillation(quiet[-batch:], rolled[-batch:], *energies)
-            single[DISTILLATION] = torch.cat([ends.new_zeros(len(quiet) - batch), ends])
         path = torch.cat([past, x[..., : count - batch].detach()], dim=-1)
         root = bank.root[times].T
         dynamic["inertia"], dynamic["drag"] = self.energy.inertia_and_drag(
             x, path[..., batch:], path[..., :-batch], root[:, 2 * batch :] - root[:, batch:-batch], self.dt
         )
-        if regularization := sampler.config.latent_regularization:
+        if weight := sampler.config.latent_regularization:
             drawn, scale = torch.cat([rolled[-batch:], quiet]), sampler.config.latent_regularization_scale
-            dynamic[REGULARIZATION] = regularization * latent_distortion(model, self.energy.mass, drawn, scale)
+            dynamic[REGULARIZATION] = weight * latent_distortion(model, self.energy.mass, drawn, scale)
         return dynamic, single, torch.stack(z[-2:]).detach()
-
-
-def distillation(rest: Tensor, state: Tensor, energy: Tensor, reached: Tensor) -> Tensor:
-    """Return what draws quasi-static latents p to states z of the same poses that have less energy, shape (N,) [J].
-
-    The energy of cloth has many minima, and a gradient finds the nearest one: where the initialiser has put a cape
-    over the head, it stays there. A state that the stepper has reached may lie lower. Then p is drawn to it as by a
-    parabola over the line between the two, whose height at p is the energy that there is to win:
-
-        max(0, E(p) - E(z)) |p - z|^2 / d^2,   d = |p - z| without a gradient.
-
-    Args:
-        rest, state: p and z, both (N, latent); z gets no gradient.
-        energy, reached: E(p) and E(z) without inertia and drag [J], both (N,).
-    """
-    square = (rest - state.detach()).square().sum(1)
-    return (energy - reached).detach().clamp_min(0) * square / square.detach().clamp_min(LEAST_SQUARE)
 
 
 def total(terms: Terms, half: float = 0.0) -> Tensor:

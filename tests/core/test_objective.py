@@ -13,13 +13,11 @@ from ssilk_core.config import TrainConfig
 from ssilk_core.constants import GRAVITY
 from ssilk_core.schemes import SCHEMES
 from ssilk_core.skinning import Skinning
-from ssilk_core.training.objective import Objective, distillation, total
+from ssilk_core.training.objective import Objective, total
 from ssilk_core.training.step import Stepper
 from ssilk_core.training.windows import WindowSampler
 
-CONFIG = TrainConfig(
-    batch=3, window=6, static_batch=6, rotated_fraction=0.5, noise=0.2, outlier_energy=0, distillation=0.5
-)
+CONFIG = TrainConfig(batch=3, window=6, static_batch=6, rotated_fraction=0.5, noise=0.2, outlier_energy=0)
 
 
 @pytest.fixture
@@ -64,7 +62,6 @@ def reference(objective: Objective, sampler: WindowSampler, noise: torch.Tensor,
     """The windows of all slots, one state at a time; time-major lists of terms, and the last two latents."""
     model, bank, length = objective.model, objective.bank, sampler.config.window
     dynamic = [[{} for _ in sampler.first] for _ in range(length - 2)]
-    weight, ends = sampler.config.distillation, []
     static_batch = [[{}] for _ in POSES[0]]
     latents = []
     for slot, first in enumerate(sampler.first):
@@ -84,14 +81,8 @@ def reference(objective: Objective, sampler: WindowSampler, noise: torch.Tensor,
             dynamic[t - 2][slot] = terms
             x.append(now.detach())
         latents.append(torch.stack(z[-2:])[:, 0].detach())
-        ending = at_frame(objective, rest[-1], frames[-1], down)[1]
-        won = sum(value - dynamic[-1][slot][name] for name, value in ending.items()).detach().clamp_min(0)
-        away = (rest[-1] - z[-1].detach()).square().sum(1)
-        ends.append([ending | {"distillation": weight * won * away / away.detach()}])
     for row, frame, down in zip(static_batch, POSES[0].split(1), POSES[1].split(1)):
         row[0] = at_frame(objective, model.initial(bank.static_descriptor(frame, down)), frame, down)[1]
-    if weight:
-        static_batch = [[row[0] | {"distillation": torch.zeros(1)}] for row in static_batch] + ends
     return flat(dynamic), flat(static_batch), torch.stack(latents, dim=1)
 
 
@@ -105,19 +96,17 @@ def gradients(objective: Objective, loss: torch.Tensor) -> dict[str, torch.Tenso
     return {name: torch.zeros_like(v) if g is None else g for name, v, g in zip(names, values, found)}
 
 
-@pytest.mark.parametrize(
-    ("bptt", "clearance", "weight"), [(False, 0.0, 0.0), (False, 0.0, 0.5), (True, 0.0, 0.5), (False, 0.02, 0.5)]
-)
-def test_a_window_equals_a_plain_loop(objective, bptt, clearance, weight):
-    sampler, objective.clearance = sampler_of(objective, replace(CONFIG, bptt=bptt, distillation=weight)), clearance
+@pytest.mark.parametrize(("bptt", "clearance"), [(False, 0.0), (True, 0.0), (False, 0.02)])
+def test_a_window_equals_a_plain_loop(objective, bptt, clearance):
+    sampler, objective.clearance = sampler_of(objective, replace(CONFIG, bptt=bptt)), clearance
     noise = sampler.noise()
     found, expected = objective.window(sampler, noise, *POSES), reference(objective, sampler, noise, bptt)
     for mine, theirs in zip(found[:2], expected[:2]):
         assert mine.keys() == theirs.keys()
         for name, value in mine.items():
-            assert value.abs().min() > 0 or name in ("collision", "distillation")
+            assert value.abs().min() > 0 or name == "collision"
             np.testing.assert_allclose(value.detach(), theirs[name].detach(), rtol=2e-3, atol=1e-6, err_msg=name)
-    assert found[0]["collision"].max() > 0 and (not weight or found[1]["distillation"].max() > 0)
+    assert found[0]["collision"].max() > 0
     np.testing.assert_allclose(found[2], expected[2], atol=1e-5)
     mine, theirs = (
         gradients(objective, total(dynamic) + total(static_batch)) for dynamic, static_batch, _ in (found, expected)
@@ -168,33 +157,6 @@ def test_static_terms_are_those_of_the_initialisers_states(objective):
             assert terms[name][i].item() == pytest.approx(expected[name].item(), rel=2e-3, abs=1e-6), name
 
 
-def test_a_state_of_less_energy_draws_the_initialiser_to_it():
-    rest = torch.tensor([[3.0, 0.0], [0.0, 1.0], [2.0, 2.0]], requires_grad=True)
-    state = torch.tensor([[0.0, 4.0], [0.0, 0.0], [2.0, 2.0]], requires_grad=True)
-    value = distillation(rest, state, torch.tensor([0.7, 0.1, 0.5]), torch.tensor([0.2, 0.3, 0.2]))
-    torch.testing.assert_close(value, torch.tensor([0.5, 0.0, 0.0]))  # what there is to win, if z is elsewhere
-    value.sum().backward()
-    torch.testing.assert_close(rest.grad, torch.tensor([[0.12, -0.16], [0.0, 0.0], [0.0, 0.0]]))  # 2 dE (p - z) / d^2
-    assert state.grad is None
-
-
-@pytest.mark.parametrize("weight", [0.0, 1.0])
-def test_distillation_leaves_a_minimum_that_descent_cannot(weight):
-    """In the double well (x^2 - 1)^2 + x the left one is lower; the energy's gradient alone stays right."""
-
-    def energy(x: torch.Tensor) -> torch.Tensor:
-        return ((x**2 - 1) ** 2 + x).sum(1)
-
-    rest, state = torch.tensor([[1.0]], requires_grad=True), torch.tensor([[-1.0]])
-    for _ in range(500):
-        (slope,) = torch.autograd.grad(
-            (energy(rest) + weight * distillation(rest, state, energy(rest), energy(state))).sum(), rest
-        )
-        rest = (rest - 0.01 * slope).detach().requires_grad_()
-    right, left = np.sort(np.roots([4, 0, -4, 1]))[[2, 0]]
-    assert rest.item() == pytest.approx(left if weight else right, abs=1e-3)
-
-
 def test_total_is_the_mean_over_frames_of_the_sum_of_terms():
     assert total({"a": torch.tensor([1.0, 3.0]), "b": torch.tensor([10.0])}).item() == 12
 
@@ -203,9 +165,11 @@ def test_a_step_weighs_every_frame_the_same(objective):
     """Those the initialiser answers for included, and the gradient of exactly that reaches the optimiser."""
     sampler = sampler_of(objective, replace(CONFIG, noise=0.0, learning_rate=0.0))
     dynamic, static_batch, _ = objective.window(sampler, torch.zeros(2, 3, 8), *POSES)
-    decoded = len(dynamic["gravity"]) + len(static_batch["gravity"])
-    frames = sum(value.sum() for terms in (dynamic, static_batch) for value in terms.values()) / decoded
-    expected = gradients(objective, frames)
+    frames = sum(
+        torch.cat([dynamic[name], static_batch[name]]).mean() for name in static_batch
+    )  # terms that all frames have
+    rest = sum(dynamic[name].mean() for name in ("inertia", "drag")) * 4 / 5
+    expected = gradients(objective, frames + rest)
     length = torch.cat([value.flatten() for value in expected.values()]).norm()  # only directions count
     stepper = Stepper(objective.model, objective, sampler, sampler.config)
     sampler.poses = lambda count: POSES

@@ -468,10 +468,6 @@ def test_time_grows_with_samples_and_frames_and_is_not_guessed():
     assert cost.training_seconds(2700, train, "cpu") == pytest.approx(10 * 64 * 2700 * cost.SECONDS_PER_SAMPLE["cpu"])
     warm = replace(train, static_fraction=0.5, pretraining_batch=128)
     assert cost.training_seconds(2700, warm, "cpu") == pytest.approx(1.5 * cost.training_seconds(2700, train, "cpu"))
-    distilled = replace(train, distillation=1.0)  # P is fitted to the 4 poses that windows end with, too
-    assert cost.training_seconds(2700, distilled, "cpu") == pytest.approx(
-        68 / 64 * cost.training_seconds(2700, train, "cpu")
-    )
     assert cost.training_seconds(2700, train, "abacus") is None
 
 
