@@ -274,15 +274,15 @@ PRESETS = {
         ),
         Preset(
             name="final",
-            model=ModelConfig(translations=True),
+            model=ModelConfig(shapes=128, translations=True),
             train=TrainConfig(
-                iterations=20_000,
-                static_fraction=0.3,
+                iterations=12_000,
+                static_fraction=0.5,
                 recombinations=8,
                 perturbations=3,
                 shape_learning_rate_scale=1.0,
                 ema_decay=0.9995,
-                validate_every=1000,
+                validate_every=600,
             ),
         ),
     )

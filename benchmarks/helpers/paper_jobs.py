@@ -38,10 +38,12 @@ MOTION_AND_RATES = (
     "recombinations=3",
     "perturbations=1",
     "shape_learning_rate_scale=0.3",
+    "static_learning_rate=0.002",
 )
 USUAL = {"batch": 256, "window": 6, "static_batch": 256}
 OWN_SETTINGS = (
     *(f"{name}={value}" for name, value in USUAL.items()),
+    "shapes=64",
     "rotated_fraction=0.5",
     "max_latent_step=0.3",
     "velocity_allowance=0.5",

@@ -66,7 +66,7 @@ PAPER = {
     "noise_probability": "not stated",
     "static_fraction": 0,
     "static_batch": 0,
-    "distillation": 0,
+    "static_learning_rate": "not stated",
     "learning_rate": "not stated",
     "skin_learning_rate_scale": "not stated",
     "integrator_learning_rate_scale": "not stated",

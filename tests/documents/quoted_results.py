@@ -8,7 +8,7 @@ from functools import partial
 from itertools import product
 from statistics import mean
 
-from ssilk_core.config import PRESETS
+from ssilk_core.config import PRESETS, ModelConfig
 from ssilk_core.demo.shipped import shipped_path
 from ssilk_core.energy import TERMS
 from ssilk_core.evaluation.solver_errors import AFTER
@@ -56,7 +56,7 @@ HELD_OUT = ("valid", "test", "flips")
 FULL = "full, poses included"
 OFF_REST = ("cape", "cape_seed_1", "cape_allowance", "cape_short")
 REST_NAMES = {
-    "cape": "cape that ships",
+    "cape": "cape that shipped before",
     "cape_short": "cape, shorter",
     "cape_spoiled": "cape",
     "fringe_skirt": "fringe skirt",
@@ -107,7 +107,8 @@ def opening() -> Text:
 
 
 def shown() -> Text:
-    loose = {**result("shown_skin_shipped"), **result("shown_skin_limits"), **result("shown_skin_decay")}
+    refined = result("shown_skin_refined")
+    loose = {**result("shown_skin_shipped"), **result("shown_skin_limits"), "cape": refined["cape"]}
     found = {**result("shown_skin_tight"), **loose}
     for garment in GARMENTS.values():
         own = found[garment.lower().replace("-", "").replace(" ", "_")]
@@ -115,11 +116,16 @@ def shown() -> Text:
         pairs += [own[split][SKINNING] for split in ("test", "flips")]
         bare = (share_1(own["test"][method]["bare"]) for method in ("network", SKINNING))
         yield row(garment, *(f"{share_3(at['mean'])}, {share_1(at['worst'])}" for at in pairs), *bare)
-    solved = {name: own["first 12 frames"] for name, own in loose.items()}
-    yield f"The first {solved['cape']['network']['frames']} frames of a handspring"
-    for garment, at in solved.items():
-        means_of = (share_3(at[method]["mean"]) for method in ("network", "refine 4", "simulator"))
-        yield row(garment.replace("_", " "), *means_of)
+    for garment, own in refined.items():
+        pairs = [own[split][method] for split in HELD_OUT for method in ("network", "refine 4")]
+        yield row(garment.replace("_", " "), *(f"{share_3(at['mean'])}, {share_2(at['worst'])}" for at in pairs))
+    yield "Four solver iterations in every frame (`--refine 4`)"
+    cells_of = [own[split]["refine 4"] for own in refined.values() for split in ("valid", "test")]
+    reached = [sum(at[figure] <= goal for at in cells_of) for figure, goal in (("mean", 1e-4), ("worst", 1e-3))]
+    yield f"are 0.01 % and 0.1 %, on `valid` and `test`. The mean is reached in {reached[0]} of {len(cells_of)} cells"
+    yield f"worst frame in {reached[1]}. Most of what is left"
+    at = refined["cape"]["test"]
+    assert at["refine 4"]["mean"] > at["network"]["mean"] and at["refine 4"]["in"] == "01_14", "the document says so"
     goals = {"valid": (0.0005, 0.005), "test": (0.0005, 0.005), "flips": (0.003, 0.02)}
     yield f"{share_2(goals['test'][0])} % on `valid` and `test`, and {share_1(goals['flips'][0])} % on flips"
     yield f"{share_1(goals['test'][1])} %, and {share(goals['flips'][1])} % on flips"
@@ -129,9 +135,6 @@ def shown() -> Text:
             for split, goal in goals.items()
         )
         yield f"{valid} of {len(found)} reach it on `valid`, {test} on `test` and {flips} on flips"
-    cape = found["cape"]
-    beyond = (cape["valid"]["network"]["worst"] - goals["valid"][1]) * cape["covered"]
-    assert 0 < beyond < 1, "the document says so"
     missing = [name for name, own in found.items() if own["test"]["network"]["mean"] > goals["test"][0]]
     assert missing == ["tshirt", "long_sleeve"], "the document names them"
     hardest, clips = "01_14", [found[name]["test"]["network"]["clips"] for name in missing]
@@ -143,6 +146,8 @@ def shown() -> Text:
     clips = [len(found["cape"][split]["network"]["clips"]) for split in goals]
     training = len(shipped("cape")["provenance"]["motions"])
     yield f"has {clips[0]} clips, `test` {clips[1]} and flips {clips[2]}, and training had {training} motions"
+    solved = {name: loose[name]["first 12 frames"] for name in ("fringe_skirt", "hooded_dress")}
+    yield f"the first {solved['hooded_dress']['network']['frames']} frames of a handspring"
     ratios = [at["network"]["stretch"] / at["simulator"]["stretch"] for at in solved.values()]
     yield f"{min(ratios):.1f} to {max(ratios):.1f} times the simulator's"
     bare = result("shown_skin")["tshirt"]["first 12 frames"]["simulator"]["bare"]
@@ -242,9 +247,16 @@ def from_own_start() -> Text:
         if split == "test":
             found = at["position_error"][0], at["position_error"][2], at["velocity_error"]
             reached[garment] = [value <= goal for value, goal in zip(found, goals)]
-            if garment == "cape":
-                yield f"an earlier cape is {away[0]} mm (RMS) from the simulator's after five frames"
     yield f"10 mm after {AFTER[0]} frames, {milli(goals[1])} mm after {AFTER[2]}, and {goals[2]:g} m/s"
+    rows = document("evaluate_solver_cape_rate")["figures"]
+    (at,) = (line["figures"]["solver"] for line in rows if line["method"] == "ssilk")
+    away = [milli(value) for value in at["position_error"]]
+    yield f"the cape that ships is {away[0]} mm (RMS) from the simulator's after five frames"
+    yield f"A step misses {milli(at['step_energy'])} mJ and {milli_1(at['step_distance'])} mm"
+    yield f"It is {series(away[:3])} and {away[3]} mm away"
+    yield f"after {AFTER[0]}, {AFTER[1]}, {AFTER[2]} and {AFTER[3]} frames, and {at['velocity_error']:.2f} m/s off\n"
+    found = at["position_error"][0], at["position_error"][2], at["velocity_error"]
+    assert all(value > goal for value, goal in zip(found, goals)), "the document says so"
     rows = document("evaluate_solver_cape_jump")["figures"]
     (now,) = (line["figures"]["solver"]["position_error"] for line in rows if line["method"] == "ssilk")
     yield "{}, {} and {} mm away after 5, 10 and\n  30 frames".format(*(milli(value) for value in now[:3]))
@@ -253,7 +265,7 @@ def from_own_start() -> Text:
     yield f"stays where it is, {milli_1(held['static_distance'])} mm from its own"
     away = [milli(value) for value in held["solver"]["position_error"][:3]]
     yield "it is {}, {} and {} mm away after 5, 10 and 30 frames".format(*away)
-    yield f"its velocities are {held['solver']['velocity_error']:.2f} m/s off"
+    yield f"its velocities are\n  {held['solver']['velocity_error']:.2f} m/s off"
     assert held["solver"]["position_error"][0] > goals[0], "the document says so"
     before = [result("moving_states")["cape"][f"network, after {count} [mm]"] for count in AFTER[:3]]
     yield "{:.1f}, {:.1f} and {:.1f} mm away there".format(*before)
@@ -276,7 +288,7 @@ def moving_states() -> Text:
 
 
 def missed_steps() -> Text:
-    earlier, now = result("step_errors"), result("step_errors_decay")["cape"]
+    earlier, now = result("step_errors"), result("step_errors_rate")["cape"]
     shown = {"cape": now, **{name: earlier[name] for name in ("fringe_skirt", "hooded_dress")}}
     for garment, splits in shown.items():
         for number, (split, at) in enumerate(splits.items()):
@@ -288,12 +300,12 @@ def missed_steps() -> Text:
     pairs = (("test", "mean"), ("flips", "mean"), ("flips", "median"))
     found = [fixed(run[split][name], 1, 0.001) for split, name in pairs for run in (best, last)]
     yield "{} and {} mJ on `test` and {} and {} mJ on flips in the mean, and {} and {} mJ on flips".format(*found)
-    assert now["flips"]["mean"] < 0.5 * best["flips"]["mean"], "the document says so"
-    yield f"{share(now['flips']['median'] / best['flips']['median'])} % in the median"
-    kept = [
-        run["iterations"][kept_at(run)[0]] for run in (cape_without_decay(), result("decay_training")["cape_0.5"])
-    ]
-    assert round(kept[1] / kept[0]) == 4, "the document says so"
+    decayed = result("step_errors_decay")["cape"]
+    yield "misses {} mJ on `test` and {} mJ on flips in the mean".format(
+        *(fixed(decayed[at]["mean"], 1, 0.001) for at in ("test", "flips"))
+    )
+    ratios = (share(now["flips"][name] / decayed["flips"][name]) for name in ("mean", "median"))
+    yield "{} % of it in the mean and {} % in the median".format(*ratios)
     before = result("step_errors_before")["cape"]
     yield "{} and {} mJ on `test` and flips".format(
         *(fixed(before[at]["mean"], 1, 0.001) for at in ("test", "flips"))
@@ -528,6 +540,7 @@ def static_training() -> Text:
     for name, run in runs.items():
         yield training_row(run, names.get(name, name.replace("_", " ")))
     assert set(names) < set(runs)
+    yield "a `static_learning_rate` of 0.002"
     away = {name: run["dynamics"][-1] for name, run in runs.items()}
     yield f"end over {milli(min(away[name] for name in OFF_REST) // 0.1 / 10)} mm away"
     assert max(away[name] for name in ("cape_64", "cape_short_64")) < min(away[name] for name in OFF_REST)
@@ -540,6 +553,68 @@ def static_training() -> Text:
     yield "{:.4f} J instead of {:.4f} J for the dress".format(
         min(dress["total"]), min(result("tight_training")["hooded_dress"]["total"])
     )
+
+
+def rate_training() -> Text:
+    names = {
+        "cape": "cape",
+        "cape_1e-4": "cape, `learning_rate=1e-4`",
+        "cape_distillation": "cape, P drawn to better states",
+        "cape_5e-4_seed_1": "cape, a quarter, `learning_rate=1e-4`, seed 1",
+        "cape_6e-4_seed_1": "cape, `learning_rate=6e-4`, seed 1",
+        "cape_64": "cape, 64 proxies, 256 blendshapes",
+    }
+    runs = result("rate_training")
+    for name, words in names.items():
+        yield training_row(runs[name], words)
+    assert set(names) == set(runs)
+    ends = [run["total"][-1] for run in runs.values()]
+    assert max(ends) < 0.006
+    yield f"no total is above {0.006:g} J at the end"
+    yield f"no end is further than\n  {milli(max(run['dynamics'][-1] for run in runs.values()))} mm from P's states"
+    rises = [run["total"][-1] - min(run["total"]) for run in runs.values()]
+    yield f"by {milli_1(min(rises))} to {milli_1(max(rises))} mJ"
+    assert min(min(run["total"]) for run in runs.values()) == min(runs["cape"]["total"]), "the document says so"
+    assert default("static_learning_rate") == 0.001, "half of 0.002"
+
+
+def network_sizes() -> Text:
+    found = result("sizes")
+    for name, at in found.items():
+        garment, _, size = name.rpartition("_")
+        counts = f"{at['proxies']} / {at['shapes']} / {at['latent']}"
+        times = (fixed(at[key]) for key in ("network", "frame"))
+        totals = (f"{value:.4f}".replace("-", "−") for value in at["total"])
+        steps = milli(at["step energy"]), milli_1(at["step distance"])
+        words = garment.replace("_", " ") if size == "s" else ""
+        yield row(words, size.upper(), counts, f"{at['bytes'] / 1e6:.1f}", *times, *totals, *steps)
+    yield f"trained alike in {found['cape_s']['iterations'][1]:,} iterations"
+    yield f"was cut at {found['hooded_dress_x']['iterations'][1]:,}"
+    yield f"hidden layers of {found['cape_s']['widths'][0]}, is a network for 50 µs and less"
+    least = {name: at["total"][0] for name, at in found.items()}
+    assert max(at["network"] for name, at in found.items() if name.endswith("_s")) < 50
+    yield f"it has {milli(least['cape_s'] - least['cape_l'])} mJ more than L"
+    assert round(least["hooded_dress_s"] / least["hooded_dress_l"]) == 2, "the document says so"
+    yield f"whose {ModelConfig.shapes} blendshapes are the default, is within 5 mJ of L"
+    assert all(abs(least[f"{name}_m"] - least[f"{name}_l"]) < 0.005 for name in ("cape", "fringe_skirt"))
+    yield f"{share(least['hooded_dress_m'] / least['hooded_dress_l'] - 1)} % above it in the dress"
+    ratios = [mean(found[f"{name}_x"][key] / found[f"{name}_l"][key] for name in LOOSE) for key in ("frame", "bytes")]
+    yield "for {:.1f} times the time of a frame of L and {:.1f} times its size".format(*ratios)
+    assert all(least[f"{name}_x"] == min(least[f"{name}_{size}"] for size in "smlx") for name in LOOSE)
+    steps = {name: at["step distance"] for name, at in found.items()}
+    yield f"cape are {milli_1(steps['cape_l'] - steps['cape_x'])} mm nearer to the minimum"
+    assert all(steps[f"{name}_x"] >= steps[f"{name}_l"] for name in ("fringe_skirt", "hooded_dress"))
+
+
+def levels_on_gpu() -> Text:
+    shown = {"as trained": "as trained", "hero": "`hero`", **{f"{n} iterations": f"{n} iterations" for n in (1, 2)}}
+    for at in document("trade_cuda")["points"]:
+        if name := shown.get(at["variant"]):
+            skin = at["shown_skin"]
+            solver = fixed(at["solving"]) if at["solving"] else ""
+            away = digits(1000 * at["position"], count=2) if at["position"] else "0"
+            shows = share_3(skin["mean"]), share_2(skin["worst"])
+            yield row(at["model"].replace("_", " "), name, solver, f"{at['total']:.3f}", *shows, away)
 
 
 def rest_states() -> Text:
@@ -784,7 +859,7 @@ PARTS = (
     findings, dynamics,
     ablations,
     wardrobe, long_training, limits_training, decay_training, static_training, rest_states,
-    rest, playing, sizes, levels, refinement,
+    rate_training, rest, playing, sizes, levels, levels_on_gpu, network_sizes, refinement,
     inside_the_body, stress,
     training_speed, scenes,
 )  # fmt: skip
