@@ -466,6 +466,13 @@ def training_row(run: dict, *cells: str) -> str:
     return row(*cells, kept, *ends, *away, *missed)
 
 
+def training_rows(runs: dict, names: dict[str, str]) -> Text:
+    """Yield the lines of trainings, some of which have names of their own."""
+    assert set(names) < set(runs)
+    for name, run in runs.items():
+        yield training_row(run, names.get(name, name.replace("_", " ")))
+
+
 def relative_rise(run: dict) -> float:
     """Return how far the last total of a training lies over its best, relative to that."""
     return run["total"][-1] / min(run["total"]) - 1
@@ -478,8 +485,7 @@ def limits_training() -> Text:
         "cape_outliers": "cape, `outlier_energy=1`",
     }
     runs = result("limits_training")
-    for name, run in runs.items():
-        yield training_row(run, names.get(name, name.replace("_", " ")))
+    yield from training_rows(runs, names)
     times = [run["seconds"][-1] / 60 for run in runs.values()]
     yield f"for {min(times):.0f} to {max(times):.0f} minutes of steps"
     counts = [len(run["iterations"]) for run in runs.values()]
@@ -537,9 +543,7 @@ def static_training() -> Text:
         "cape_short_64": "cape, shorter, 64 proxies, 256 blendshapes",
     }
     runs = result("static_training")
-    for name, run in runs.items():
-        yield training_row(run, names.get(name, name.replace("_", " ")))
-    assert set(names) < set(runs)
+    yield from training_rows(runs, names)
     yield "a `static_learning_rate` of 0.002"
     away = {name: run["dynamics"][-1] for name, run in runs.items()}
     yield f"end over {milli(min(away[name] for name in OFF_REST) // 0.1 / 10)} mm away"
@@ -557,7 +561,6 @@ def static_training() -> Text:
 
 def rate_training() -> Text:
     names = {
-        "cape": "cape",
         "cape_1e-4": "cape, `learning_rate=1e-4`",
         "cape_distillation": "cape, P drawn to better states",
         "cape_5e-4_seed_1": "cape, a quarter, `learning_rate=1e-4`, seed 1",
@@ -565,15 +568,15 @@ def rate_training() -> Text:
         "cape_64": "cape, 64 proxies, 256 blendshapes",
     }
     runs = result("rate_training")
-    for name, words in names.items():
-        yield training_row(runs[name], words)
-    assert set(names) == set(runs)
+    yield from training_rows(runs, names)
     ends = [run["total"][-1] for run in runs.values()]
     assert max(ends) < 0.006
     yield f"no total is above {0.006:g} J at the end"
     yield f"no end is further than\n  {milli(max(run['dynamics'][-1] for run in runs.values()))} mm from P's states"
     rises = [run["total"][-1] - min(run["total"]) for run in runs.values()]
     yield f"by {milli_1(min(rises))} to {milli_1(max(rises))} mJ"
+    best, last = result("sizes")["cape_l"]["total"]
+    yield f"rises by {milli_1(last - best)} mJ"
     assert min(min(run["total"]) for run in runs.values()) == min(runs["cape"]["total"]), "the document says so"
     assert default("static_learning_rate") == 0.001, "half of 0.002"
 
