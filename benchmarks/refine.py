@@ -42,9 +42,10 @@ class NetworkTake:
     points: Floats
 
     @classmethod
-    def of(cls, subject: Subject, clip: Motion, frames: int) -> NetworkTake:
-        """Roll the network over the first frames of a clip."""
-        motion = resample(clip, subject.file.config.fps).clip(0, frames)
+    def of(cls, subject: Subject, clip: Motion, frames: int | None = None) -> NetworkTake:
+        """Roll the network over the first frames of a clip, or over all of it."""
+        whole = resample(clip, subject.file.config.fps)
+        motion = whole if frames is None else whole.clip(0, frames)
         poses = list(garment_poses(subject.model, motion, motion.fps))
         points = np.concatenate([decode(subject.model, motion, pose) for pose in poses])
         return cls(subject, motion, poses, points)

@@ -41,8 +41,8 @@ HEADER = (
     "stretch [J]",
 )
 CHUNK = 256  # frames in memory at once
-FRAMES = 100_000  # more than any clip has
 ITERATIONS = 4
+Blocks = Iterator[tuple[Tensor, Tensor]]  # of frames: vertices (V, 3, N) and the character's matrices (J, 3, 4, N)
 
 
 def whole_clip(
@@ -52,19 +52,19 @@ def whole_clip(
     validator = subject.validator(clip_of(options, clip, subject))
     (span,) = validator.clips
     states = roll_states(subject.model, validator.bank, [span], validator.down)[0]
-    for method in ("network", "linear blend skinning"):
-        counts, stretch = [], []
+
+    def blocks(method: str) -> Blocks:
         for start in range(0, len(span), CHUNK):
             frames = torch.arange(span[start], span[min(start + CHUNK, len(span)) - 1] + 1, device=subject.device)
             character = validator.bank.character(frames)
             at = subject.model.vertices(states[start : start + CHUNK], character)
-            x = at if method == "network" else validator.lbs_vertices(character)
-            counts.append(ShownCounts.of(skin.states(x, character)))
-            stretch.append(subject.energy.stretch(x).cpu())
-        yield method, ShownCounts.joined(counts), torch.cat(stretch)
+            yield at if method == "network" else validator.lbs_vertices(character), character
+
+    for method in ("network", "linear blend skinning"):
+        yield method, *seen(subject, skin, blocks(method))
     if options.refine:
-        take = NetworkTake.of(subject, clip_of(options, clip, subject), FRAMES)
-        yield f"refine {ITERATIONS}", *seen(subject, skin, take, refined_points(take))
+        take = NetworkTake.of(subject, clip_of(options, clip, subject))
+        yield f"refine {ITERATIONS}", *seen(subject, skin, take_blocks(take, refined_points(take)))
 
 
 def refined_points(take: NetworkTake) -> Floats:
@@ -73,17 +73,23 @@ def refined_points(take: NetworkTake) -> Floats:
     return np.stack([frame.points for frame in refiner.frames(take.motion, take.points)])
 
 
-def seen(subject: Subject, skin: CoveredSkin, take: NetworkTake, points: Floats) -> tuple[ShownCounts, Tensor]:
-    """Return the skin that shows and the stretch of vertices (F, V, 3) of a take."""
-    skeleton = subject.dressed.scene.character.skeleton
+def take_blocks(take: NetworkTake, points: Floats) -> Blocks:
+    """Yield the vertices (F, V, 3) of a take in blocks."""
+    skeleton, device = take.subject.dressed.scene.character.skeleton, take.subject.device
     matrices = skinning_matrices(motion_transforms(take.motion, skeleton.parents), skeleton.bind_transforms)
-    counts, stretch = [], []
     for start in range(0, len(points), CHUNK):
         block = slice(start, start + CHUNK)
-        character, x = (
-            torch.tensor(each, dtype=torch.float32, device=subject.device)
-            for each in (matrices[block, :, :3].transpose(1, 2, 3, 0), points[block].transpose(1, 2, 0))
+        x, character = points[block].transpose(1, 2, 0), matrices[block, :, :3].transpose(1, 2, 3, 0)
+        yield (
+            torch.tensor(x, dtype=torch.float32, device=device),
+            torch.tensor(character, dtype=torch.float32, device=device),
         )
+
+
+def seen(subject: Subject, skin: CoveredSkin, blocks: Blocks) -> tuple[ShownCounts, Tensor]:
+    """Return the skin that shows and the stretch in all frames of blocks."""
+    counts, stretch = [], []
+    for x, character in blocks:
         counts.append(ShownCounts.of(skin.states(x, character)))
         stretch.append(subject.energy.stretch(x).cpu())
     return ShownCounts.joined(counts), torch.cat(stretch)
@@ -97,9 +103,10 @@ def solved(
     dressed, motion = subject.dressed, take.motion
     simulation = SimulationOptions(fps=motion.fps, precision="float32")
     (simulated,) = simulate(dressed.scene, dressed.fabric, [motion], simulation, device=subject.device)
-    yield "network", *seen(subject, skin, take, take.points)
-    yield f"refine {ITERATIONS}", *seen(subject, skin, take, refined_points(take))
-    yield "simulator", *seen(subject, skin, take, simulated)
+    for method, points in (
+        ("network", take.points), (f"refine {ITERATIONS}", refined_points(take)), ("simulator", simulated),
+    ):  # fmt: skip
+        yield method, *seen(subject, skin, take_blocks(take, points))
 
 
 def figures(found: list[tuple[str, ShownCounts, Tensor]]) -> dict[str, Any]:

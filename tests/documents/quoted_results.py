@@ -570,9 +570,9 @@ def rate_training() -> Text:
     }
     runs = result("rate_training")
     yield from training_rows(runs, names)
-    ends = [run["total"][-1] for run in runs.values()]
-    assert max(ends) < 0.006
-    yield f"no total is above {0.006:g} J at the end"
+    bound = 0.006
+    assert max(run["total"][-1] for run in runs.values()) < bound
+    yield f"no total is above {bound:g} J at the end"
     yield f"no end is further than\n  {milli(max(run['dynamics'][-1] for run in runs.values()))} mm from P's states"
     rises = [run["total"][-1] - min(run["total"]) for run in runs.values()]
     yield f"by {milli_1(min(rises))} to {milli_1(max(rises))} mJ"
@@ -591,7 +591,7 @@ def network_sizes() -> Text:
         garment, _, size = name.rpartition("_")
         counts = f"{at['proxies']} / {at['shapes']} / {at['latent']}"
         times = (fixed(at[key]) for key in ("network", "frame"))
-        totals = (f"{value:.4f}".replace("-", "−") for value in at["total"])
+        totals = (fixed(value, 4) for value in at["total"])
         steps = milli(at["step energy"]), milli_1(at["step distance"])
         words = garment.replace("_", " ") if size == "s" else ""
         yield row(words, size.upper(), counts, f"{at['bytes'] / 1e6:.1f}", *times, *totals, *steps)
@@ -614,14 +614,12 @@ def network_sizes() -> Text:
 
 
 def levels_on_gpu() -> Text:
-    shown = {"as trained": "as trained", "hero": "`hero`", **{f"{n} iterations": f"{n} iterations" for n in (1, 2)}}
     for at in document("trade_cuda")["points"]:
-        if name := shown.get(at["variant"]):
-            skin = at["shown_skin"]
-            solver = fixed(at["solving"]) if at["solving"] else ""
-            away = digits(1000 * at["position"], count=2) if at["position"] else "0"
-            shows = share_3(skin["mean"]), share_2(skin["worst"])
-            yield row(at["model"].replace("_", " "), name, solver, f"{at['total']:.3f}", *shows, away)
+        if at["variant"] in ("as trained", "1 iterations", "2 iterations", "hero"):
+            level = f"`{at['variant']}`" if at["variant"] in QUALITIES else at["variant"]
+            skin, solver = at["shown_skin"], fixed(at["solving"]) if at["solving"] else ""
+            figures = fixed(at["total"], 3), share_3(skin["mean"]), share_2(skin["worst"])
+            yield row(at["model"].replace("_", " "), level, solver, *figures, two_digits(1000 * at["position"]))
 
 
 def rest_states() -> Text:
