@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the solver shows less skin than the network in a clip's worst frame.
+
+    python benchmarks/worst_frames.py cape.safetensors --stage character.usdc --motions FOLDER --clips 01_14
+
+Solver iterations start from the network's state in that frame, and look back on the network's two states before it:
+a few, as `bake --refine` makes them, and as many as the solver needs to its tolerance. Then cloth is lifted off skin
+that still shows. What shows after so many iterations is the energy's own: no training removes it.
+"""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from helpers.subjects import Subject, arguments, clip_of, measure_each, parsed
+from refine import NetworkTake
+from shown_skin import seen, take_blocks
+
+from ssilk_core.assets import Floats
+from ssilk_core.collision import CoveredSkin
+
+ITERATIONS = (4, 200)
+BEFORE = 2  # frames that the worst one looks back on
+HEADER = ("garment", "clip", "frame", "network [%]", *(f"{count} iterations [%]" for count in ITERATIONS))
+
+
+@torch.no_grad()
+def measure(subject: Subject, options: Namespace) -> dict[str, Any]:
+    """Return, by clip, the worst frame and the shares of covered skin that show there."""
+    skin = CoveredSkin(subject.scene, device=subject.device)
+
+    def shares(take: NetworkTake, points: Floats) -> Floats:
+        return np.asarray(seen(subject, skin, take_blocks(take, points))[0].shares)
+
+    found: dict[str, Any] = {}
+    for clip in options.clips:
+        whole = NetworkTake.of(subject, clip_of(options, clip, subject))
+        shown = shares(whole, whole.points)
+        worst = max(int(shown.argmax()), BEFORE)
+        span = slice(worst - BEFORE, worst + 1)
+        take = replace(
+            whole,
+            motion=whole.motion.clip(span.start, span.stop),
+            poses=whole.poses[span],
+            points=whole.points[span],
+        )
+        at: dict[str, Any] = {"frame": worst, "network": float(shown[worst])}
+        for count in ITERATIONS:
+            at[f"{count} iterations"] = float(shares(take, solved(take, count))[-1])
+        found[clip] = at
+    return found
+
+
+def solved(take: NetworkTake, iterations: int) -> Floats:
+    """Return the vertices (F, V, 3) after some solver iterations in each frame."""
+    refiner = take.refiner(iterations, False)
+    return np.stack([frame.points for frame in refiner.frames(take.motion, take.points)])
+
+
+def rows(garment: str, found: dict[str, Any]) -> list[list[str]]:
+    """Return the lines of a garment."""
+    return [
+        [garment, clip, str(at["frame"]), f"{at['network']:.2%}",
+         *(f"{at[f'{count} iterations']:.2%}" for count in ITERATIONS)]
+        for clip, at in found.items()
+    ]  # fmt: skip
+
+
+def main() -> None:
+    parser = arguments(__doc__.splitlines()[0])
+    parser.add_argument("--clips", nargs="+", required=True, metavar="NAME", help="clips of the motions' folder")
+    measure_each(parsed(parser), HEADER, measure, rows)
+
+
+if __name__ == "__main__":
+    main()
