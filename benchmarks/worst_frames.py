@@ -5,7 +5,7 @@
 
 Solver iterations start from the network's state in that frame, and look back on the network's two states before it:
 a few, as `bake --refine` makes them, and as many as the solver needs to its tolerance. Then cloth is lifted off skin
-that still shows. What shows after so many iterations is the energy's own: no training removes it.
+that still shows.
 """
 
 from __future__ import annotations

@@ -28,10 +28,10 @@ from ..collision import CoveredPoints, PosedBody
 from ..simulate.incremental_potential import IncrementalPotential, StepInputs
 from ..simulate.newton import State
 
-POINTS = 30_001  # on the body, 8 mm apart on a person: more than, and others than, those that measure what shows
+POINTS = 30_001  # on the body, 7 mm apart on a person; others than those at which skin that shows is measured
 ROUNDS = 4  # at most; each finds anew where skin shows
-HEIGHT = 3e-3  # [m] above the points, since skin between them is not asked
-STIFFER = 9.0  # springs of each point, relative to the Hessian at the cloth that they lift
+HEIGHT = 3e-3  # [m] above the points, since skin between them is not asked and springs stop a little short
+STIFFER = 9.0  # springs of each point, relative to the Hessian at the cloth; with more points they can be softer
 DEEPEST = 0.012  # [m] beneath the skin; deeper cloth could only be lifted as a spike
 FARTHEST = 0.02  # [m] that a vertex moves in all rounds
 REDUCTION, CG_ITERATIONS = 1e-4, 300  # of the residual by each linear solve, and its longest
