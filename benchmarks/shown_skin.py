@@ -67,9 +67,9 @@ def whole_clip(
         yield f"refine {ITERATIONS}", *seen(subject, skin, take_blocks(take, refined_points(take)))
 
 
-def refined_points(take: NetworkTake) -> Floats:
+def refined_points(take: NetworkTake, iterations: int = ITERATIONS) -> Floats:
     """Return the refined vertices of a take (F, V, 3), which look back on the network's."""
-    refiner = take.refiner(ITERATIONS, False, CHUNK)
+    refiner = take.refiner(iterations, False, CHUNK)
     return np.stack([frame.points for frame in refiner.frames(take.motion, take.points)])
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from helpers.subjects import Subject, arguments, clip_of, measure_each, parsed
 from refine import NetworkTake
-from shown_skin import seen, take_blocks
+from shown_skin import refined_points, seen, take_blocks
 
 from ssilk_core.assets import Floats
 from ssilk_core.collision import CoveredSkin
@@ -50,15 +50,9 @@ def measure(subject: Subject, options: Namespace) -> dict[str, Any]:
         )
         at: dict[str, Any] = {"frame": worst, "network": float(shown[worst])}
         for count in ITERATIONS:
-            at[f"{count} iterations"] = float(shares(take, solved(take, count))[-1])
+            at[f"{count} iterations"] = float(shares(take, refined_points(take, count))[-1])
         found[clip] = at
     return found
-
-
-def solved(take: NetworkTake, iterations: int) -> Floats:
-    """Return the vertices (F, V, 3) after some solver iterations in each frame."""
-    refiner = take.refiner(iterations, False)
-    return np.stack([frame.points for frame in refiner.frames(take.motion, take.points)])
 
 
 def rows(garment: str, found: dict[str, Any]) -> list[list[str]]:

@@ -121,7 +121,7 @@ def shown() -> Text:
     for garment, own in refined.items():
         pairs = [own[split][method] for split in HELD_OUT for method in ("network", "refine 4")]
         yield row(
-            garment.replace("_", " ").replace("tshirt", "T-shirt").replace("dress", "dress, L"),
+            "hooded dress, L" if garment == "hooded_dress" else GARMENTS.get(garment) or garment.replace("_", " "),
             *(f"{share_3(at['mean'])}, {share_2(at['worst'])}" for at in pairs),
         )
     yield "Four solver iterations in every frame (`--refine 4`)"
@@ -169,8 +169,9 @@ def worst_frames() -> Text:
     found = {name: at["01_14"] for name, at in result("worst_frames").items()}
     for name, at in found.items():
         shares = (share_2(at[key]) for key in ("network", "4 iterations", "200 iterations"))
-        words = {"tshirt": "T-shirt", "hooded_dress": "hooded dress, seed 1 of [Final trainings](#final-trainings)"}
-        yield row(words.get(name, name.replace("_", " ")), at["frame"], *shares)
+        garment = GARMENTS.get(name) or name.replace("_", " ")
+        whose = ", seed 1 of [Final trainings](#final-trainings)" if name == "hooded_dress" else ""
+        yield row(garment + whose, at["frame"], *shares)
     yield "In the worst frame of 01_14"
     yield "hooded dress, seed 1 of"
     yield row("garment", "frame", "network", "4 iterations", "200 iterations")
@@ -262,18 +263,20 @@ def contact() -> Text:
     yield f"at most {max(ends[1].values()):.2f} times the best in all {len(ends[1])} garments"
 
 
+def from_solver(name: str, split: str) -> dict:
+    """Return how far the network is from the solver that starts from its own states, on the clips of a split."""
+    rows = document(f"evaluate_solver_{name}")["figures"]
+    (found,) = (line["figures"]["solver"] for line in rows if (line["method"], line["split"]) == ("ssilk", split))
+    return found
+
+
 def flips_of_cape() -> Text:
-    rows = document("evaluate_solver_cape_flips")["figures"]
-    (at,) = (line["figures"]["solver"] for line in rows if line["method"] == "ssilk")
+    at, table = from_solver("cape_flips", "flips"), from_solver("cape", "flips")
     away = [milli(value) for value in at["position_error"]]
     after = "after {}, {}, {} and {} frames".format(*AFTER)
     yield f"{series(away[:3])} and {away[3]} mm away {after}"
-    (table,) = (
-        line["figures"]["solver"]["position_error"]
-        for line in document("evaluate_solver_cape")["figures"]
-        if (line["method"], line["split"]) == ("ssilk", "flips")
-    )
-    further = [count for count, now, before in zip(AFTER, at["position_error"], table) if now > before]
+    pairs = zip(AFTER, at["position_error"], table["position_error"])
+    further = [count for count, now, before in pairs if now > before]
     yield "further away than that of the table after {} and {} frames".format(*further)
     yield f"velocity is {at['velocity_error']:.2f} m/s off, that of LBS {at['lbs_velocity_error']:.2f} m/s"
     speeds = "its velocity is {:.2f} m/s from the simulator's, that of LBS {:.2f} m/s"
@@ -287,8 +290,7 @@ def from_own_start() -> Text:
     yield row("garment", "clips", "windows", "step [mJ]", "step [mm]", *shots, "velocity [m/s]", "LBS")
     yield f"for {AFTER[-1]} frames. *Step*"
     for garment, split in product(LOOSE, ("test", "flips")):
-        rows = document(f"evaluate_solver_{garment}")["figures"]
-        (at,) = (line["figures"]["solver"] for line in rows if (line["method"], line["split"]) == ("ssilk", split))
+        at = from_solver(garment, split)
         step = milli(at["step_energy"]), f"{1000 * at['step_distance']:.1f}"
         away = [milli(value) for value in at["position_error"]]
         speeds = (f"{at[name]:.2f}" for name in ("velocity_error", "lbs_velocity_error"))
@@ -298,8 +300,7 @@ def from_own_start() -> Text:
             found = at["position_error"][0], at["position_error"][2], at["velocity_error"]
             reached[garment] = [value <= goal for value, goal in zip(found, goals)]
     yield f"10 mm after {AFTER[0]} frames, {milli(goals[1])} mm after {AFTER[2]}, and {goals[2]:g} m/s"
-    rows = document("evaluate_solver_cape_rate")["figures"]
-    (at,) = (line["figures"]["solver"] for line in rows if line["method"] == "ssilk")
+    at = from_solver("cape_rate", "test")
     away = [milli(value) for value in at["position_error"]]
     yield f"the cape that ships is {away[0]} mm (RMS) from the simulator's after five frames"
     yield f"A step misses {milli(at['step_energy'])} mJ and {milli_1(at['step_distance'])} mm"
@@ -646,7 +647,7 @@ def final_training() -> Text:
     for name, split, figure, words in (
         ("hooded_dress", "valid", "mean", "{:.3f} % of the skin in the mean, against {:.3f} %"),
         ("hooded_dress", "test", "worst", "shows {:.1f} %, against {:.1f} %"),
-        ("fringe_skirt", "valid", "worst", "level, in the worst frame with {:.2f}\n  and {:.2f} %"),
+        ("fringe_skirt", "valid", "worst", "level, in the worst frame with {:.2f} and {:.2f} %"),
         ("fringe_skirt", "test", "worst", "shows {:.1f} %, against {:.1f} %"),
     ):
         yield words.format(*(100 * found[name][split]["network"][figure] for found in (new, old)))
