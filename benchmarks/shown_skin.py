@@ -38,6 +38,7 @@ HEADER = (
     "worst frame [%]",
     "in",
     "bare [%]",
+    "limbs through [% of frames]",
     "stretch [J]",
 )
 CHUNK = 256  # frames in memory at once
@@ -116,6 +117,7 @@ def figures(found: list[tuple[str, ShownCounts, Tensor]]) -> dict[str, Any]:
     return {
         "frames": len(stretch), "mean": float(counts.shares.mean()), "worst": float(counts.shares.max()),
         "in": worst[0], "bare": float(counts.bare.mean()),
+        "pierced": None if counts.pierced is None else float(counts.pierced.any(0).double().mean()),
         "stretch": float(stretch.mean()), "clips": {name: float(own.shares.mean()) for name, own, _ in found},
     }  # fmt: skip
 
@@ -142,7 +144,7 @@ def rows(garment: str, found: dict[str, Any]) -> list[list[str]]:
     """Return the lines of a garment."""
     return [
         [garment, split, method, str(at["frames"]), f"{at['mean']:.3%}", f"{at['worst']:.2%}", at["in"],
-         f"{at['bare']:.2%}", f"{at['stretch']:.3f}"]
+         f"{at['bare']:.2%}", "" if at["pierced"] is None else f"{at['pierced']:.1%}", f"{at['stretch']:.3f}"]
         for split, methods in found.items() if isinstance(methods, dict) for method, at in methods.items()
     ]  # fmt: skip
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 COVER_REACH, SHOW_DEPTH = 0.08, 0.03  # [m]: how far cloth above covers a point, and how far beneath it is seen
 MOST_MEAN, MOST_WORST = 5e-4, 5e-3  # shares that show on average and in one frame; the eye finds more at once
@@ -22,6 +22,8 @@ class ShownSkin:
             evaluated the motion's, and of a validation in training the frame from the clip's start, at the model's
             rate.
         regions: share of what shows, of all frames together, at the joints that move most of it, largest first.
+        pierced: share of the frames in which a limb pierces loose cloth; None where it was not counted.
+        limbs: share of the frames in which each limb does, by the joint at its tip, largest first.
     """
 
     frames: int
@@ -33,11 +35,18 @@ class ShownSkin:
     regions: dict[str, float]
     bare: float | None = None
     worst_bare: float | None = None
+    pierced: float | None = None
+    limbs: dict[str, float] = field(default_factory=dict)
 
     @property
     def where(self) -> str:
         """The regions in words; empty where nothing shows, or where joints are not known."""
         return ", ".join(f"{joint} {share:.0%}" for joint, share in self.regions.items())
+
+    @property
+    def _limbs(self) -> str:
+        most = ", ".join(f"{joint} {share:.1%}" for joint, share in self.limbs.items())
+        return f"{self.pierced:.1%}" + (f" ({most})" if most else "")
 
     @property
     def is_seen(self) -> bool:
@@ -53,16 +62,22 @@ class ShownSkin:
             **({"most at": self.where} if self.where else {}),
             **({} if self.bare is None else {"bare": f"{self.bare:.2%}"}),
             **({} if self.worst_bare is None else {"bare in its worst frame": f"{self.worst_bare:.2%}"}),
+            **({} if self.pierced is None else {"frames with limbs through the cloth": self._limbs}),
         }
 
     def to_metadata(self) -> dict[str, object]:
         """Return figures of four digits, as a shot stores them."""
         known = {name: value for name, value in vars(self).items() if value is not None}
         rounded = {name: float(f"{value:.4g}") for name, value in known.items() if isinstance(value, float)}
-        return {**known, **rounded, "regions": {joint: round(share, 4) for joint, share in self.regions.items()}}
+        shares = {
+            name: {joint: round(share, 4) for joint, share in found.items()}
+            for name, found in (("regions", self.regions), ("limbs", self.limbs))
+        }
+        return {**known, **rounded, **shares}
 
     def __str__(self) -> str:
         worst = f"{self.clip}, frame {self.frame:g}" + (f"; most at {self.where}" if self.where else "")
         bare = "" if self.bare is None else f", {self.bare:.2%} is bare ({self.worst_bare:.2%} at most)"
         most = f", {self.worst:.2%} in the worst frame ({worst})" if self.worst else ""
-        return f"{self.mean:.3%} of the covered skin shows{most}{bare}"
+        through = f"; a limb is through the cloth in {self._limbs} of the frames" if self.pierced else ""
+        return f"{self.mean:.3%} of the covered skin shows{most}{bare}{through}"

@@ -15,6 +15,7 @@ from .distance import (
     signed_distance_to_planes,
     smoothed_planes,
 )
+from .limb_axes import LimbAxes, PosedLimbs, limb_axes
 from .ray_casting import RayCaster, RayHits
 from .reach import ReachableBody, reachable_body
 from .smoothed_distance import SmoothedDistance
@@ -24,14 +25,17 @@ __all__ = [
     "Contacts",
     "CoveredPoints",
     "CoveredSkin",
+    "LimbAxes",
     "Patches",
     "PosedBody",
+    "PosedLimbs",
     "RayCaster",
     "RayHits",
     "ReachableBody",
     "ShownCounts",
     "SkinStates",
     "SmoothedDistance",
+    "limb_axes",
     "nearest_planes",
     "reachable_body",
     "signed_distance",

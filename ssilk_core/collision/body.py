@@ -13,6 +13,7 @@ from ..mesh.blocks import compact_blocks
 from ..skinning import Skinning
 from .closest_point import triangle_patches
 from .distance import PosedBody
+from .limb_axes import LimbAxes, LimbPoser
 from .nearest_vertex import BODY_GROUP
 from .one_ring import triangle_rings
 
@@ -30,9 +31,20 @@ class CollisionBody:
 
     Attributes:
         vertices: indices of its vertices in the whole body.
+
+    Args:
+        limbs: axes that loose cloth must not cross; none by default.
     """
 
-    def __init__(self, body: Body, joint_count: int, *, vertices: Ints | None = None, device: torch.device) -> None:
+    def __init__(
+        self,
+        body: Body,
+        joint_count: int,
+        *,
+        vertices: Ints | None = None,
+        limbs: LimbAxes | None = None,
+        device: torch.device,
+    ) -> None:
         chosen = np.arange(body.mesh.vertex_count) if vertices is None else vertices
         self.vertices = chosen
         body.skin.check_joints(joint_count)
@@ -49,6 +61,7 @@ class CollisionBody:
         self.groups = torch.as_tensor(compact_blocks(body.mesh.points[chosen], BODY_GROUP), device=device)
         skin = SkinWeights(body.skin.path, body.skin.indices[chosen], body.skin.weights[chosen])
         self.skin = Skinning(skin).to(device)
+        self._limbs = LimbPoser(limbs, device) if limbs else None
         self.points = tensor(body.mesh.points[chosen])[:, :, None]
         self.normals = tensor(normals)[:, :, None]
 
@@ -57,11 +70,13 @@ class CollisionBody:
         """Pose the body with skinning matrices (J, 3, 4, N); normals rotate with the blended matrices.
 
         Args:
-            surface: whether the nearest body point lies on the surface, or is the nearest vertex.
+            surface: whether the nearest body point lies on the surface, or is the nearest vertex, which knows no
+                limbs.
             exact: whether that of cloth with a patch of its own is the exact one too, not one around the nearest
                 vertex (`PosedBody.rings`).
         """
         points, normals = self.skin.surface(self.points[:, :, 0], self.normals[:, :, 0], character)
         rings = self.rings if surface and not exact else None
-        exactly = (self.faces, self.patches) if surface and len(self.faces) else ()
-        return PosedBody(points, normals, rings, self.groups, *exactly)
+        faces, patches = (self.faces, self.patches) if surface and len(self.faces) else (None, None)
+        limbs = self._limbs.pose(character) if self._limbs and surface else None
+        return PosedBody(points, normals, rings, self.groups, faces, patches, limbs)

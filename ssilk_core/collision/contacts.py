@@ -4,7 +4,8 @@
 The nearest body point does not tell which side the cloth came from. A sleeve that one bad step takes through the arm
 would be pushed out on the far side and stay there. Loose cloth can touch any part of the body. Tight cloth can touch
 only the patch of the body that lies beneath it in the bind pose, within `distance.TIGHT_REACH`: it is pushed back to
-its own side, and is not caught where a body intersects itself, as in an armpit.
+its own side, and is not caught where a body intersects itself, as in an armpit. Loose cloth that a limb went through
+is pushed along the limb instead (`pierced`).
 """
 
 from __future__ import annotations
@@ -30,7 +31,9 @@ from .distance import (
     signed_distance_to_planes,
     smoothed_planes,
 )
+from .limb_axes import loose_faces
 from .nearest_vertex import GARMENT_BLOCK
+from .pierced import Piercing
 from .samples import ContactSamples
 from .smoothed_distance import SmoothedDistance
 
@@ -83,6 +86,7 @@ class Contacts:
         def group(rows: Ints, found: Patches | None = None) -> _Group:
             return _Group(tensor(rows), tensor(compact_blocks(points[rows], GARMENT_BLOCK)), found)
 
+        self._piercing = Piercing(scene, samples, device=device) if len(loose_faces(scene)) else None
         self._groups = [group(np.flatnonzero(elsewhere))] if elsewhere.any() else []
         if covered.any():
             vertices = patches[covered]
@@ -96,6 +100,13 @@ class Contacts:
         Samples that can touch nothing get planes far below them. Those far from their patch get planes across the
         direction from its nearest vertex.
         """
+        normal, offset = self._nearest_planes(x, body)
+        if self._piercing and body.limbs:
+            self._piercing.replace_planes(x, body.limbs, normal, offset)
+        return normal, offset
+
+    def _nearest_planes(self, x: Tensor, body: PosedBody) -> tuple[Tensor, Tensor]:
+        """Return the result of `planes` where no limb pierces the cloth."""
         normal, offset = self._query_groups(x, body, nearest_planes, no_planes)
         return normal, offset
 
@@ -108,7 +119,10 @@ class Contacts:
         def no_contact(x: Tensor) -> Sequence[Tensor]:
             return *no_planes(x), x.new_zeros(len(x), 3, *x.shape[1:], dtype=torch.float32)
 
-        return SmoothedDistance(*self._query_groups(x, body, find, no_contact))
+        found = SmoothedDistance(*self._query_groups(x, body, find, no_contact))
+        if self._piercing and body.limbs:
+            self._piercing.replace_planes(x, body.limbs, found.normal, found.offset, found.curvature)
+        return found
 
     def _query_groups(
         self,
@@ -131,8 +145,11 @@ class Contacts:
         return gathered
 
     def distances(self, x: Tensor, body: PosedBody) -> tuple[Tensor, Tensor]:
-        """Return signed distances of x (S, 3, N) [m] to these planes and to the whole body, both (S, N)."""
-        planes = signed_distance_to_planes(x, *self.planes(x, body))
+        """Return signed distances of x (S, 3, N) [m] to nearest planes and to the whole body, both (S, N).
+
+        Where a limb pierces the cloth they are those to the skin: `CoveredSkin` counts such limbs.
+        """
+        planes = signed_distance_to_planes(x, *self._nearest_planes(x, body))
         nearest = planes.clone()
         for group in self._groups:
             if group.patches is not None:

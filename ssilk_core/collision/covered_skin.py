@@ -5,13 +5,15 @@ Points are spread evenly over the body. A point is covered when cloth lies withi
 normal, in the bind pose. A covered point shows when cloth lies within `SHOW_DEPTH` beneath it and none within
 `COVER_REACH` above it. The share of vertices inside the body counts cloth; this share counts what is seen. A covered
 point is bare when neither is within reach: cloth that was thrown off, or swings away as a skirt may, shows nothing.
+Skin that is not covered, such as hands, can be on either side. What is counted of it is the limbs that pierce the
+cloth (`pierced`).
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -21,7 +23,10 @@ from ..assets import Floats, Ints, Mesh, Scene, SkinWeights
 from ..mesh import topology
 from ..shown_skin import COVER_REACH, SHOW_DEPTH, ShownSkin
 from ..skinning import Skinning
+from .limb_axes import LimbPoser, limb_axes
+from .pierced import Piercing
 from .ray_casting import RayCaster
+from .samples import vertex_samples
 
 SKIN_POINTS = 8000
 NAMED_REGIONS = 3
@@ -31,10 +36,14 @@ PLASTIC = 1.32471795724474602596  # root of x^3 = x + 1; its powers make the mos
 
 @dataclass(frozen=True, eq=False)
 class SkinStates:
-    """Which covered points show, and which are bare, both bool (P, N)."""
+    """Which covered points show, and which are bare, both bool (P, N), and which limbs pierce the cloth, bool (L, N).
+
+    Nothing is known of limbs by default.
+    """
 
     shows: Tensor
     bare: Tensor
+    pierced: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,28 +54,33 @@ class ShownCounts:
         shares, bare: shares of the covered points that show, and that are bare, in each frame, both of shape (N,).
         points: frames in which each covered point shows, shape (P,).
         frames: numbers of the frames in the clip, or their time codes, shape (N,).
+        pierced: which limbs pierce the cloth in each frame, bool (L, N); None where nothing is known.
     """
 
     shares: Tensor
     bare: Tensor
     points: Tensor
     frames: Tensor
+    pierced: Tensor | None = None
 
     @classmethod
     def of(cls, states: SkinStates, frames: Sequence[float] | None = None) -> ShownCounts:
         """Return the counts of a clip, from the states (P, N) in `frames`, by default the first N."""
         shares, bare = (found.double().mean(0).cpu() for found in (states.shows, states.bare))
         numbers = torch.arange(len(shares)) if frames is None else torch.from_numpy(np.asarray(frames))
-        return cls(shares, bare, states.shows.sum(1).cpu(), numbers)
+        pierced = None if states.pierced is None else states.pierced.cpu()
+        return cls(shares, bare, states.shows.sum(1).cpu(), numbers, pierced)
 
     @classmethod
     def joined(cls, parts: Sequence[ShownCounts]) -> ShownCounts:
         """Return the counts of several parts together."""
+        pierced = [part.pierced for part in parts if part.pierced is not None]
         return cls(
             torch.cat([part.shares for part in parts]),
             torch.cat([part.bare for part in parts]),
             torch.stack([part.points for part in parts]).sum(0),
             torch.cat([part.frames for part in parts]),
+            torch.cat(pierced, dim=1) if len(pierced) == len(parts) else None,
         )
 
 
@@ -127,6 +141,7 @@ class CoveredSkin:
         points: evenly spread ones.
         regions: the joint with the largest skinning weight at each point, shape (P,).
         joint_names: names of the character's joints.
+        limbs: the joint at the tip of each limb that loose cloth must not cross, shape (L,).
     """
 
     def __init__(self, scene: Scene, *, count: int = SKIN_POINTS, device: torch.device) -> None:
@@ -147,13 +162,18 @@ class CoveredSkin:
         self._rest, self._normals = (
             torch.as_tensor(values[vertices], dtype=torch.float32, device=device) for values in (body.points, normals)
         )
+        axes = limb_axes(scene)
+        self.limbs = axes.tips if axes else np.zeros(0, dtype=int)
+        self._poser = LimbPoser(axes, device) if axes else None
+        samples = vertex_samples(scene.garment.mesh.vertex_count)
+        self._piercing = Piercing(scene, samples, device=device) if axes else None
 
     def __len__(self) -> int:
         return len(self.points)
 
     @torch.no_grad()
     def states(self, x: Tensor, character: Tensor) -> SkinStates:
-        """Tell which covered points show, and which are bare; all show in a frame where the cloth is not finite.
+        """Tell what shows, what is bare and what pierces; all shows in a frame where the cloth is not finite.
 
         Args:
             x: garment positions [m], shape (V, 3, N).
@@ -161,7 +181,11 @@ class CoveredSkin:
         """
         if self._skinning is None:
             return SkinStates(*torch.zeros(2, 0, x.shape[2], dtype=torch.bool, device=x.device))
-        return self.points.states(x, *self._skinning.surface(self._rest, self._normals, character))
+        found = self.points.states(x, *self._skinning.surface(self._rest, self._normals, character))
+        pierced = torch.zeros(0, x.shape[2], dtype=torch.bool, device=x.device)
+        if self._piercing and self._poser:
+            pierced = self._piercing.find(x, self._poser.pose(character)).radius > 0
+        return replace(found, pierced=pierced)
 
     def figures(self, clips: Sequence[tuple[str, ShownCounts]]) -> ShownSkin | None:
         """Return the figures of clips by name; None where the garment covers nothing.
@@ -169,13 +193,27 @@ class CoveredSkin:
         Raises:
             ValueError: there is no frame.
         """
-        return shown_skin(clips, self._regions)
+        found = shown_skin(clips, self._regions)
+        counts = [counts.pierced for _, counts in clips if counts.pierced is not None]
+        if found is None or len(counts) < len(clips):
+            return found
+        pierced = torch.cat(counts, dim=1).double()
+        shares = pierced.mean(1).tolist()
+        limbs = sorted(zip(shares, self.limbs.tolist()), key=lambda each: -each[0])
+        return replace(
+            found,
+            pierced=float(pierced.any(0).double().mean()),
+            limbs={self._name(joint): share for share, joint in limbs[:NAMED_REGIONS] if share},
+        )
+
+    def _name(self, joint: int) -> str:
+        return self.joint_names[joint].rpartition("/")[2]
 
     def _regions(self, shown_frames: Tensor) -> dict[str, float]:
         """Return the shares of what shows at the joints with the largest ones."""
         shown = np.bincount(self.regions, shown_frames.numpy(), len(self.joint_names))
         largest = Counter(dict(enumerate(shown.tolist()))).most_common(NAMED_REGIONS)
-        return {self.joint_names[j].rpartition("/")[2]: n / float(shown.sum()) for j, n in largest if n}
+        return {self._name(joint): n / float(shown.sum()) for joint, n in largest if n}
 
 
 def shown_skin(

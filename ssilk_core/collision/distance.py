@@ -11,6 +11,7 @@ from torch import Tensor
 
 from .. import kernels
 from .closest_point import bounding_spheres, closest_on_faces, frames_at_once
+from .limb_axes import PosedLimbs
 from .nearest_vertex import BODY_GROUP, GARMENT_BLOCK, consecutive_blocks, nearest_vertex
 from .one_ring import nearest_on_rings
 from .smoothed_distance import EDGE_EPSILON, SEARCH_MARGIN, SMOOTHING_EXPONENT, SmoothedDistance, smoothed_distance
@@ -46,6 +47,7 @@ class PosedBody:
             distance is Euclidean in training and for measuring, and smoothed for simulation. Without faces and rings
             it is the nearest vertex.
         patches: the triangles in compact patches (`closest_point.triangle_patches`), int32, for the search on a GPU.
+        limbs: axes that loose cloth must not cross; none by default.
     """
 
     points: Tensor
@@ -54,10 +56,12 @@ class PosedBody:
     groups: Tensor | None = None
     faces: Tensor | None = None
     patches: Tensor | None = None
+    limbs: PosedLimbs | None = None
 
     def select(self, frames: Tensor) -> PosedBody:
         """Return the body in the frames with indices (M,)."""
-        return replace(self, points=self.points[..., frames], normals=self.normals[..., frames])
+        limbs = self.limbs and self.limbs.select(frames)
+        return replace(self, points=self.points[..., frames], normals=self.normals[..., frames], limbs=limbs)
 
 
 def gather_frames(values: Tensor, index: Tensor) -> Tensor:

@@ -20,6 +20,7 @@ from ..mesh.blocks import compact_blocks
 RAY_PATCH = 8  # triangles with one bounding sphere
 MAX_RAY_PAIRS = 1 << 20, 1 << 26  # pairs of a ray and a patch, or a triangle, at once on a CPU and on a GPU: 1 GB
 SPHERE_SLACK = 1e-4  # [m] added to bounding spheres; rounding is smaller
+TINY = 1e-9  # [m], so that a segment of no length has a direction
 EDGE_TOLERANCE = 1e-6  # in barycentric coordinates, so that no ray slips between two triangles
 
 
@@ -91,12 +92,40 @@ class RayCaster:
             found.scatter_reduce_(0, here[best], number[best], "amin")  # of equally far ones always the same
         return farthest.reshape(-1, frames), found.reshape(-1, frames)
 
+    @torch.no_grad()
+    def crossings(self, starts: Tensor, ends: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return how many triangles each segment crosses, how far along it the last of them is, and which.
+
+        Args:
+            starts, ends: of the segments [m], both (P, 3, N).
+            x: vertices of the mesh in the same frames [m], shape (V, 3, N).
+
+        Returns:
+            Counts, shares of the length and indices of triangles, zero without a crossing, all (P, N).
+        """
+        lengths = (ends - starts).norm(dim=1).clamp_min(TINY)
+        counts, last = torch.zeros_like(lengths, dtype=torch.int64), torch.zeros_like(lengths)
+        found = torch.zeros_like(counts)
+        along = (ends - starts) / lengths[:, None]
+        for ray, frame, patch, distance in self._meetings(starts, along, x, lengths, 0.0):
+            share = distance / lengths[ray, frame][:, None]
+            share = share.where((share >= 0) & (share <= 1), -1.0)
+            here = ray * lengths.shape[1] + frame
+            counts.view(-1).scatter_add_(0, here, (share >= 0).sum(1))
+            best, place = share.max(1)
+            before = last.clone()
+            last.view(-1).scatter_reduce_(0, here, best.clamp_min(0), "amax")
+            won = (best >= 0) & (best == last.view(-1)[here]) & (best >= before.view(-1)[here])
+            found.view(-1)[here[won]] = self.numbers[patch[won], place[won]]
+        return counts, last, found
+
     def _meetings(
-        self, points: Tensor, directions: Tensor, x: Tensor, above: float, beneath: float
+        self, points: Tensor, directions: Tensor, x: Tensor, above: float | Tensor, beneath: float
     ) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
         """Yield rays, frames and patches (M,) of pairs that can meet, and where the patch's triangles meet the line.
 
         Distances (M, `RAY_PATCH`) are along the directions [m], infinite where a triangle does not meet the line.
+        `above` may be (P, N).
         """
         limit, patches = MAX_RAY_PAIRS[x.is_cuda], max(1, len(self.patches))
         frames, rays = max(1, limit // max(1, len(points) * patches)), max(1, limit // patches)
@@ -109,9 +138,11 @@ class RayCaster:
             )
             triangles = vertices[:, self.patches]  # (n, patches, triangles, corners, 3)
             spheres = _bounding_spheres(triangles.flatten(2, 3))
+            reach = above[:, chosen].T[..., None] if isinstance(above, Tensor) else above
             for first in range(0, len(points), rays):
                 part = slice(first, first + rays)
-                pairs = _reachable(start[:, part], direction[:, part], *spheres, above, beneath)
+                far = reach[:, part] if isinstance(reach, Tensor) else reach
+                pairs = _reachable(start[:, part], direction[:, part], *spheres, far, beneath)
                 pairs[:, 1] += first
                 for frame, ray, patch in (some.unbind(1) for some in pairs.split(max(1, limit // RAY_PATCH))):
                     lines = start[frame, ray][:, None], direction[frame, ray][:, None]
@@ -125,7 +156,7 @@ def _bounding_spheres(corners: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _reachable(
-    start: Tensor, direction: Tensor, centre: Tensor, radius: Tensor, above: float, beneath: float
+    start: Tensor, direction: Tensor, centre: Tensor, radius: Tensor, above: float | Tensor, beneath: float
 ) -> Tensor:
     """Return frames, rays and patches of all pairs that can meet, shape (M, 3).
 
@@ -134,7 +165,9 @@ def _reachable(
     |q|^2 - (q . d)^2 <= r^2 and |q . d| <= r + h, where h is half the ray's length.
 
     Args:
-        start, direction: shape (n, P, 3); centre, radius: of the patches' spheres, as `_bounding_spheres` returns.
+        start, direction: shape (n, P, 3).
+        centre, radius: of the patches' spheres, as `_bounding_spheres` returns.
+        above, beneath: one for all rays; `above` may be (n, P, 1).
     """
     middle, one = start + direction * ((above - beneath) / 2), torch.ones_like(start[..., :1])
     squares = (middle * middle).sum(-1, keepdim=True)

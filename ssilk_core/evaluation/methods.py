@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ..assets import PINNED, Floats, Scene
-from ..collision import CollisionBody, Contacts, CoveredSkin
+from ..collision import CollisionBody, Contacts, CoveredSkin, limb_axes
 from ..constants import GRAVITY
 from ..energy import GarmentEnergy
 from ..energy.stretch import deformation_gradient_operator
@@ -78,8 +78,8 @@ class EvaluationScene:
         self.scene, self.fabric, self.fps, self.device, self.exact = scene, fabric, fps, device, exact
         self.energy = GarmentEnergy(mesh, fabric, scene.classes, device=device)
         self.columns = deformation_gradient_operator(mesh, device, torch.float32)
-        skeleton = scene.character.skeleton
-        self.body = CollisionBody(scene.character.merged_body(), skeleton.joint_count, device=device)
+        body, joints = scene.character.merged_body(), scene.character.skeleton.joint_count
+        self.body = CollisionBody(body, joints, limbs=limb_axes(scene), device=device)
         self.contacts = Contacts(scene, self.energy.cloth.samples, device=device)
         self.skin = Skinning(scene.lbs_skin).to(device)
         self.rest = torch.tensor(mesh.points, dtype=torch.float32, device=device)

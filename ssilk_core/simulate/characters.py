@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..assets import Floats, Motion, Scene
-from ..collision import CollisionBody, PosedBody
+from ..collision import CollisionBody, PosedBody, limb_axes
 from ..kinematics import (
     frames_at,
     matrix_from_quaternion,
@@ -93,7 +93,7 @@ class CharacterPoser:
     def __init__(self, scene: Scene, device: torch.device, dtype: torch.dtype) -> None:
         self.skeleton, self.dtype = scene.character.skeleton, dtype
         joints = self.skeleton.joint_count
-        self.body = CollisionBody(scene.character.merged_body(), joints, device=device)
+        self.body = CollisionBody(scene.character.merged_body(), joints, limbs=limb_axes(scene), device=device)
         self.weights = torch.as_tensor(scene.lbs_skin.dense(joints), dtype=dtype, device=device)
         self.rest = torch.as_tensor(np.array(scene.garment.mesh.points), dtype=dtype, device=device)[:, :, None]
 

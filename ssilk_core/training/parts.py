@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
-from ..collision import CollisionBody, reachable_body
+from ..collision import CollisionBody, limb_axes, reachable_body
 from ..config import TrainConfig
 from ..energy import GarmentEnergy
 from ..events import Message, Reporter, silent
@@ -90,10 +90,11 @@ def build_parts(
     bank = build_bank(motions, skeleton, joints, fps, device, max_joint_speed=MAX_JOINT_SPEED)
     held = build_bank(job.held_out, skeleton, joints, fps, device)
     energy = GarmentEnergy(scene.garment.mesh, job.fabric, scene.classes, device=device)
-    body, count = scene.character.merged_body(), skeleton.joint_count
-    touched = CollisionBody(body, count, vertices=reach.vertices, device=device) if len(reach.vertices) else None
+    body, limbs, touched = scene.character.merged_body(), limb_axes(scene), None
+    if len(reach.vertices):
+        touched = CollisionBody(body, skeleton.joint_count, vertices=reach.vertices, limbs=limbs, device=device)
     # Validation uses the whole body, to detect collisions with parts that training leaves out.
-    whole = CollisionBody(body, count, device=device)
+    whole = CollisionBody(body, skeleton.joint_count, limbs=limbs, device=device)
     rest, frames = model.decoder.rest, job.train.valid_frames
     spans = usable_spans(job.held_out, fps)
     validator = Validator(held, energy, whole, scene, rest, fps, frames, group, spans)

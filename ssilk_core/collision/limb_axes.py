@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The axes of a character's limbs, which loose cloth must not cross.
+
+Contact with the nearest point of the skin cannot free a thin limb that went through the cloth: it pushes the cloth
+around a finger to all sides, where it stays. The axis of a limb runs along the bones from the root joint to its tip.
+Cloth that crosses it an odd number of times lies across the limb. An even number is a fold, or a dent that nearest
+points mend. Limbs that are crossed in the bind pose do not count, as where a mesh is closed around one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..assets import LOOSE, Body, Floats, Ints, Scene, Skeleton
+from ..skinning import transform_points
+from .ray_casting import RayCaster
+
+MAX_RADIUS = 0.08  # [m] of a bone
+RADIUS_PERCENTILE = 90  # of the distances of a bone's skin from its line
+MIN_LENGTH = 1e-6  # [m], so that a bone of no length has a direction
+
+
+@dataclass(frozen=True, eq=False)
+class LimbAxes:
+    """M bones between joints, and the paths along them from the root to the tips of L limbs.
+
+    Attributes:
+        joints: that move the start and the end of each bone, shape (M, 2).
+        ends: start and end in the bind pose [m], shape (M, 2, 3).
+        radii: how far the skin is from each bone [m], shape (M,).
+        paths: bones of each limb from the root on, padded with M, shape (L, K).
+        beyond: length of a limb from the end of each of its bones to its tip [m], shape (L, K).
+    """
+
+    joints: Ints
+    ends: Floats
+    radii: Floats
+    paths: Ints
+    beyond: Floats
+
+    @property
+    def tips(self) -> Ints:
+        """The joint at the tip of each limb, shape (L,)."""
+        last = (self.paths < len(self.joints)).sum(axis=1) - 1
+        return self.joints[self.paths[np.arange(len(last)), last], 0]
+
+
+def limb_axes(scene: Scene) -> LimbAxes | None:
+    """Return the axes that the garment's loose cloth must not cross; None where there are none."""
+    faces, mesh = loose_faces(scene), scene.garment.mesh
+    if not scene.character.bodies or not len(faces):
+        return None
+    axes = body_axes(scene.character.merged_body(), scene.character.skeleton)
+    caster = RayCaster(replace(mesh, faces=faces), device=torch.device("cpu"))
+    start, end = torch.tensor(axes.ends, dtype=torch.float32).unbind(1)
+    points = torch.tensor(mesh.points, dtype=torch.float32)
+    counts, *_ = caster.crossings(start[..., None], end[..., None], points[..., None])
+    clear = np.append(counts[:, 0].numpy(), 0)[axes.paths].sum(axis=1) % 2 == 0
+    return replace(axes, paths=axes.paths[clear], beyond=axes.beyond[clear]) if clear.any() else None
+
+
+def loose_faces(scene: Scene) -> Ints:
+    """Return the triangles of the garment whose corners are all loose, shape (F, 3)."""
+    faces = scene.garment.mesh.faces
+    return faces[(scene.classes[faces] == LOOSE).all(axis=1)]
+
+
+def body_axes(body: Body, skeleton: Skeleton) -> LimbAxes:
+    """Return the axes of all limbs of a body, along the joints that move most of some of its skin."""
+    mover = body.skin.indices[np.arange(body.mesh.vertex_count), body.skin.weights.argmax(axis=1)]
+    origins, moving = skeleton.bind_transforms[:, :3, 3], np.unique(mover).tolist()
+    chains = {joint: _chain(joint, skeleton.parents, set(moving)) for joint in moving}
+    inner = {joint for chain in chains.values() for joint in chain[:-1]}
+    joints, ends = [], []
+    for joint in moving:  # the bone that ends in each joint but roots
+        parent = chains[joint][-2] if len(chains[joint]) > 1 else joint
+        joints.append((parent, joint))
+        ends.append((origins[parent], origins[joint]))
+    place, paths = {joint: number for number, joint in enumerate(moving)}, []
+    for joint in (joint for joint in moving if joint not in inner):
+        paths.append([*(place[each] for each in chains[joint][1:]), len(joints)])
+        joints.append((joint, joint))
+        ends.append((origins[joint], _tip(body.mesh.points[mover == joint], origins[joint])))
+    bones = np.array(ends)
+    lengths = np.append(np.linalg.norm(bones[:, 1] - bones[:, 0], axis=1), 0)
+    radii = [_radius(body.mesh.points[mover == joint], *bone) for (joint, _), bone in zip(joints, bones)]
+    padded = np.full((len(paths), max(map(len, paths))), len(joints))
+    for row, path in zip(padded, paths):
+        row[: len(path)] = path
+    onward = lengths[padded][:, ::-1].cumsum(axis=1)[:, ::-1]
+    return LimbAxes(np.array(joints), bones, np.array(radii), padded, onward - lengths[padded])
+
+
+def _chain(joint: int, parents: Ints, moving: set[int]) -> list[int]:
+    """Return the joints that move skin from the root down to `joint`."""
+    chain, at = [], joint
+    while at >= 0:
+        if at in moving:
+            chain.append(at)
+        at = int(parents[at])
+    return chain[::-1]
+
+
+def _tip(skin: Floats, origin: Floats) -> Floats:
+    """Return the end of the skin (P, 3) on the line from its joint through its middle."""
+    away = skin.mean(axis=0) - origin
+    away /= max(float(np.linalg.norm(away)), MIN_LENGTH)
+    return origin + away * max(float(((skin - origin) @ away).max()), 0)
+
+
+def _radius(skin: Floats, start: Floats, end: Floats) -> float:
+    """Return how far skin (P, 3) is from the line through a bone [m]."""
+    along = (end - start) / max(float(np.linalg.norm(end - start)), MIN_LENGTH)
+    away = skin - start
+    apart = np.linalg.norm(away - (away @ along)[:, None] * along, axis=1)
+    return min(float(np.percentile(apart, RADIUS_PERCENTILE)), MAX_RADIUS)
+
+
+@dataclass(frozen=True, eq=False)
+class PosedLimbs:
+    """Axes of limbs in N frames.
+
+    Attributes:
+        start, end: of each bone [m], shape (M, 3, N).
+        radii: shape (M,); paths, beyond: shape (L, K); as in `LimbAxes`.
+    """
+
+    start: Tensor
+    end: Tensor
+    radii: Tensor
+    paths: Tensor
+    beyond: Tensor
+
+    def select(self, frames: Tensor) -> PosedLimbs:
+        """Return the axes in the frames with indices (M,)."""
+        return replace(self, start=self.start[..., frames], end=self.end[..., frames])
+
+
+class LimbPoser:
+    """Poses the axes of limbs with skinning matrices."""
+
+    def __init__(self, axes: LimbAxes, device: torch.device) -> None:
+        def tensor(values: Floats) -> Tensor:
+            return torch.as_tensor(np.array(values), dtype=torch.float32, device=device)
+
+        self._joints = torch.as_tensor(axes.joints, device=device).T
+        self._ends = tensor(axes.ends).transpose(0, 1)[..., None]
+        self._radii, self._beyond = tensor(axes.radii), tensor(axes.beyond)
+        self._paths = torch.as_tensor(axes.paths, device=device)
+
+    def pose(self, character: Tensor) -> PosedLimbs:
+        """Pose the axes with skinning matrices (J, 3, 4, N)."""
+        start, end = (transform_points(character[joints], at) for joints, at in zip(self._joints, self._ends))
+        return PosedLimbs(start, end, self._radii, self._paths, self._beyond)

@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Limbs that pierce loose cloth: found by their axes, and pushed out along these, on every path."""
+
+import importlib.util
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from ssilk_core.assets import LOOSE, TIGHT, Body, Character, Mesh, Scene, Skeleton, SkinWeights
+from ssilk_core.collision import CollisionBody, Contacts, CoveredSkin, RayCaster, ShownCounts, limb_axes
+from ssilk_core.collision.limb_axes import MAX_RADIUS, LimbPoser, body_axes
+from ssilk_core.collision.pierced import MARGIN, SLOPE, Piercing
+from ssilk_core.collision.samples import vertex_samples
+from ssilk_core.fabrics import Fabric
+from ssilk_core.simulate.incremental_potential import IncrementalPotential, StepInputs
+
+CPU = torch.device("cpu")
+DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")  # on a CPU kernels run in an interpreter
+KERNELS = pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="kernels need Triton")
+RADIUS, LENGTH = 0.02, 0.5  # of an arm along x, which a joint at its root and one in its middle move [m]
+SHEET = 0.3  # half the side of a sheet of cloth [m]
+
+
+def joints(*places: tuple[float, float, float], parents: tuple[int, ...]) -> Skeleton:
+    bind = np.tile(np.eye(4), (len(places), 1, 1))
+    bind[:, :3, 3] = places
+    rest = bind.copy()
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            rest[joint, :3, 3] -= bind[parent, :3, 3]
+    return Skeleton("/arm", tuple(f"j{number}" for number in range(len(places))), np.array(parents), bind, rest)
+
+
+def arm() -> tuple[Body, Skeleton]:
+    shape = trimesh.creation.cylinder(radius=RADIUS, height=LENGTH, sections=12).subdivide_to_size(0.03)
+    points = shape.vertices[:, [2, 0, 1]] + [LENGTH / 2, 0, 0]
+    moved = (points[:, :1] > LENGTH / 2).astype(int)
+    skin = SkinWeights("/arm", moved, np.ones((len(points), 1)))
+    return Body(Mesh("/arm", points, shape.faces), skin), joints((0, 0, 0), (LENGTH / 2, 0, 0), parents=(-1, 0))
+
+
+def sheet(at: float, kind: int = LOOSE) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A sheet across the arm at a place along x: points, faces, classes."""
+    grid = np.linspace(-SHEET, SHEET, 22)  # an even number, so that no vertex or edge lies on the axis
+    y, z = (each.reshape(-1) for each in np.meshgrid(grid, grid + 0.003, indexing="ij"))
+    number = np.arange(22 * 22).reshape(22, 22)
+    a, b, c, d = (part.reshape(-1) for part in (number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]))
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    return np.stack([np.full_like(y, at), y, z], axis=1), faces, np.full(len(y), kind)
+
+
+def dressed(scene: Scene, rest: float, kind: int = LOOSE) -> Scene:
+    body, skeleton = arm()
+    points, faces, classes = sheet(rest, kind)
+    skin = SkinWeights("/sheet", np.zeros((len(points), 1), dtype=int), np.ones((len(points), 1)))
+    garment = replace(scene.garment, mesh=Mesh("/sheet", points, faces), skin=skin, classes=classes)
+    no_joints = {"joint_names": (), "parents": np.zeros(0, dtype=int), "bind_transforms": np.zeros((0, 4, 4))}
+    rig = replace(scene.rig, skin=skin, **no_joints)
+    return Scene(Character("/arm", skeleton, (body,)), garment, rig)
+
+
+def still(count: int, frames: int = 1) -> torch.Tensor:
+    return torch.eye(3, 4)[None, :, :, None].repeat(count, 1, 1, frames)
+
+
+def test_axes_run_along_bones_to_the_tips_of_the_skin():
+    body, skeleton = arm()
+    axes = body_axes(body, skeleton)
+    assert axes.tips.tolist() == [1]
+    path = [number for number in axes.paths[0] if number < len(axes.joints)]
+    ends = axes.ends[path]
+    np.testing.assert_allclose(ends[0, 0], [0, 0, 0])
+    np.testing.assert_allclose(ends[-1, 1], [LENGTH, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(ends[1:, 0], ends[:-1, 1], atol=1e-12)  # no gap in which cloth could pass
+    lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    assert lengths.sum() == pytest.approx(LENGTH)
+    np.testing.assert_allclose(axes.beyond[0][: len(path)], [LENGTH / 2, 0], atol=1e-9)
+    assert (axes.radii <= MAX_RADIUS).all() and axes.radii[path[-1]] == pytest.approx(RADIUS, rel=0.05)
+
+
+def test_helper_joints_that_move_no_skin_are_no_limbs():
+    body, _ = arm()
+    skeleton = joints((0, 0, 0), (LENGTH / 2, 0, 0), (2, 0, 0), (0, 3, 0), parents=(-1, 0, 1, 0))
+    axes = body_axes(body, skeleton)
+    assert axes.tips.tolist() == [1] and axes.ends.max() <= LENGTH + 1e-9
+
+
+def test_only_loose_cloth_that_was_not_crossed_at_rest_counts(scene):
+    assert limb_axes(dressed(scene, 0.7)) is not None
+    assert limb_axes(dressed(scene, 0.3)) is None  # the arm passes through it in the bind pose
+    assert limb_axes(dressed(scene, 0.7, TIGHT)) is None
+
+
+def test_an_odd_number_of_crossings_pierces(scene):
+    whole = dressed(scene, 0.7)
+    axes = limb_axes(whole)
+    count = whole.garment.mesh.vertex_count
+    points = torch.tensor(whole.garment.mesh.points, dtype=torch.float32)
+    once = points - torch.tensor([0.4, 0, 0])
+    folded = points.clone()  # two sheets in one: the upper half is laid over the lower one
+    folded[:, 0] = 0.32 + 0.05 * torch.sign(points[:, 1] + 0.101)
+    folded[:, 1] = (points[:, 1] + 0.101).abs() - 0.101
+    x = torch.stack([points, once, folded], dim=-1)
+    limbs = LimbPoser(axes, CPU).pose(still(2, 3))
+    found = Piercing(whole, vertex_samples(count), device=CPU).find(x, limbs)
+    assert (found.radius > 0)[0].tolist() == [False, True, False]
+    np.testing.assert_allclose(found.point[0, :, 1], [0.7, 0, 0], atol=0.03)  # of the sheet at rest
+    np.testing.assert_allclose(found.direction[0, :, 1], [1, 0, 0], atol=1e-6)
+    assert float(found.tip[0, 1]) == pytest.approx(LENGTH)
+    assert float(found.radius[0, 1]) == pytest.approx(RADIUS + MARGIN, rel=0.05)
+    counts = ShownCounts.of(CoveredSkin(whole, device=CPU).states(x, still(2, 3)))
+    assert counts.pierced is None or counts.pierced.any(0).tolist() == [False, True, False]
+
+
+def test_pierced_cloth_is_pushed_along_the_limb_by_the_energy_of_its_depth(scene):
+    """d = -SLOPE w, w the way to the tip: its gradient is along the bone, and the rest of the cloth is unchanged."""
+    whole = dressed(scene, 0.7)
+    body = CollisionBody(*_body(whole), limbs=limb_axes(whole), device=CPU)
+    x = torch.tensor(whole.garment.mesh.points, dtype=torch.float32)[..., None] - torch.tensor([0.4, 0, 0])[:, None]
+    contacts = Contacts(whole, vertex_samples(len(x)), device=CPU)
+    posed = body.pose(still(2))
+    normal, offset = contacts.planes(x, posed)
+    near = (normal[:, :, 0] - torch.tensor([SLOPE, 0, 0])).abs().amax(1) < 1e-6
+    assert 4 <= int(near.sum()) < 40
+    assert float(x[near, 1:, 0].norm(dim=1).max()) < RADIUS + MARGIN + 0.02  # around a triangle of that size
+    distance = (normal * x).sum(1) - offset
+    np.testing.assert_allclose(distance[near], -SLOPE * 0.2, atol=1e-6)
+    plain = Contacts(whole, vertex_samples(len(x)), device=CPU).planes(x, replace(posed, limbs=None))
+    assert torch.equal(normal[~near], plain[0][~near]) and torch.equal(offset[~near], plain[1][~near])
+    smoothed = contacts.smoothed(x, posed)
+    assert torch.equal(smoothed.normal[near], normal[near]) and not smoothed.curvature[near].any()
+    met, whole_body = contacts.distances(x, posed)
+    assert torch.equal(met, whole_body) and float(met.min()) > -RADIUS - 1e-3  # energies tell of the skin alone
+    drafted = body.pose(still(2), surface=False)
+    assert drafted.limbs is None
+
+
+def _body(scene: Scene) -> tuple[Body, int]:
+    return scene.character.merged_body(), scene.character.skeleton.joint_count
+
+
+def test_the_force_is_minus_the_gradient_of_the_energy(scene):
+    whole = dressed(scene, 0.7)
+    potential = IncrementalPotential(whole, Fabric("default"), device=CPU)
+    posed = CollisionBody(*_body(whole), limbs=limb_axes(whole), device=CPU).pose(still(2))
+    x = torch.tensor(whole.garment.mesh.points)[..., None] - torch.tensor([0.4, 0, 0])[:, None]
+    inputs = StepInputs(posed, torch.zeros(3, 1, dtype=torch.float64))
+
+    def energy(moved: torch.Tensor) -> float:
+        return float(potential.energy(moved, inputs, potential.body_distance(moved, inputs)))
+
+    gradient = potential.gradient(x, inputs, potential.body_distance(x, inputs))
+    along = torch.zeros_like(x)
+    along[:, 0] = 1.0
+    slope, step = float((gradient * along).sum()), 1e-5
+    assert slope < 0  # towards the tip the energy falls
+    assert (energy(x + step * along) - energy(x - step * along)) / (2 * step) == pytest.approx(slope, rel=1e-3)
+
+
+def test_crossings_are_those_that_solving_finds():
+    random = np.random.default_rng(0)
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.3)
+    x = ball.vertices[:, :, None] + random.normal(0, 0.01, (len(ball.vertices), 3, 2))
+    starts, ends = random.uniform(-0.5, 0.5, (2, 40, 3, 2))
+    caster = RayCaster(Mesh("/ball", ball.vertices, ball.faces), device=CPU)
+    asked = [torch.tensor(values, dtype=torch.float32) for values in (starts, ends, x)]
+    counts, last, triangle = caster.crossings(*asked)
+    for frame in range(2):
+        corners = x[ball.faces, :, frame]
+        along = ends[..., frame] - starts[..., frame]
+        sides = np.stack(
+            np.broadcast_arrays(
+                (corners[:, 1] - corners[:, 0])[None], (corners[:, 2] - corners[:, 0])[None], -along[:, None]
+            ),
+            axis=-1,
+        )
+        u, v, t = np.moveaxis(
+            np.linalg.solve(sides, (starts[:, None, :, frame] - corners[None, :, 0])[..., None])[..., 0], -1, 0
+        )
+        met = (u >= 0) & (v >= 0) & (u + v <= 1) & (t >= 0) & (t <= 1)
+        np.testing.assert_array_equal(counts[:, frame], met.sum(axis=1))
+        np.testing.assert_allclose(last[:, frame], np.where(met, t, 0).max(axis=1), atol=1e-5)
+        np.testing.assert_array_equal(triangle[:, frame], np.where(met, t, 0).argmax(axis=1))
+    assert 10 < int((counts > 0).sum()) < 80
+
+
+@KERNELS
+def test_kernels_find_and_push_as_the_reference_does(scene):
+    from ssilk_core.kernels.crossings import crossings_kernel, replace_planes_kernel
+
+    whole = dressed(scene, 0.7)
+    points = torch.tensor(whole.garment.mesh.points, dtype=torch.float32)
+    x = torch.stack([points - torch.tensor([by, 0, 0]) for by in (0.0, 0.3, 0.45)], dim=-1)
+    limbs = LimbPoser(limb_axes(whole), CPU).pose(still(2, 3))
+    piercing = Piercing(whole, vertex_samples(len(x)), device=CPU)
+    counts, _, triangle = piercing._caster.crossings(limbs.start, limbs.end, x)
+    asked = (each.to(DEVICE) for each in (limbs.start, limbs.end, x, piercing._caster.faces))
+    own_counts, own_triangle = crossings_kernel(*asked)
+    assert torch.equal(own_counts.cpu().long(), counts) and counts.any()
+    assert torch.equal(own_triangle.cpu(), triangle)
+    pierced = piercing.find(x, limbs)
+    planes = torch.zeros_like(x), torch.zeros(len(x), 3)
+    piercing.replace_planes(x, limbs, *planes)
+    own = [torch.zeros_like(each, device=DEVICE) for each in planes]
+    where = tuple(each.to(DEVICE) for each in (pierced.point, pierced.direction, pierced.tip, pierced.radius))
+    replace_planes_kernel(piercing._rest.to(DEVICE), piercing._loose.to(DEVICE), where, SLOPE, *own)
+    for mine, theirs in zip(own, planes):
+        assert torch.equal(mine.cpu(), theirs)
