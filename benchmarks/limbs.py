@@ -10,7 +10,6 @@ by more iterations of the solver. What is counted are the frames with any limb t
 from __future__ import annotations
 
 from argparse import Namespace
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -44,13 +43,7 @@ def measure(subject: Subject, options: Namespace) -> dict[str, Any]:
         assert counts.pierced is not None
         through = np.convolve(counts.pierced.any(0), np.ones(options.frames), mode="valid")
         first = int(through.argmax())
-        span = slice(first, first + options.frames)
-        take = replace(
-            whole,
-            motion=whole.motion.clip(span.start, span.stop),
-            poses=whole.poses[span],
-            points=whole.points[span],
-        )
+        take = whole.clip(first, first + options.frames)
         at: dict[str, Any] = {"first frame": first, "frames": options.frames, "network": figures(take, take.points)}
         for count in ITERATIONS:
             at[f"{count} iterations"] = figures(take, refined_points(take, count))

@@ -50,6 +50,11 @@ class NetworkTake:
         points = np.concatenate([decode(subject.model, motion, pose) for pose in poses])
         return cls(subject, motion, poses, points)
 
+    def clip(self, start: int, stop: int) -> NetworkTake:
+        """Return the frames from `start` to `stop`."""
+        motion, poses = self.motion.clip(start, stop), self.poses[start:stop]
+        return replace(self, motion=motion, poses=poses, points=self.points[start:stop])
+
     def refiner(self, iterations: int, feedback: bool, batch: int = RefineOptions.batch) -> Refiner:
         options, dressed = RefineOptions(iterations=iterations, feedback=feedback, batch=batch), self.subject.dressed
         return Refiner(dressed.scene, dressed.fabric, options, fps=self.motion.fps, device=dressed.device)

@@ -11,7 +11,6 @@ that still shows.
 from __future__ import annotations
 
 from argparse import Namespace
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -41,13 +40,7 @@ def measure(subject: Subject, options: Namespace) -> dict[str, Any]:
         whole = NetworkTake.of(subject, clip_of(options, clip, subject))
         shown = shares(whole, whole.points)
         worst = max(int(shown.argmax()), BEFORE)
-        span = slice(worst - BEFORE, worst + 1)
-        take = replace(
-            whole,
-            motion=whole.motion.clip(span.start, span.stop),
-            poses=whole.poses[span],
-            points=whole.points[span],
-        )
+        take = whole.clip(worst - BEFORE, worst + 1)
         at: dict[str, Any] = {"frame": worst, "network": float(shown[worst])}
         for count in ITERATIONS:
             at[f"{count} iterations"] = float(shares(take, refined_points(take, count))[-1])

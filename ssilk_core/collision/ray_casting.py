@@ -113,9 +113,8 @@ class RayCaster:
             here = ray * lengths.shape[1] + frame
             counts.view(-1).scatter_add_(0, here, (share >= 0).sum(1))
             best, place = share.max(1)
-            before = last.clone()
             last.view(-1).scatter_reduce_(0, here, best.clamp_min(0), "amax")
-            won = (best >= 0) & (best == last.view(-1)[here]) & (best >= before.view(-1)[here])
+            won = (best >= 0) & (best == last.view(-1)[here])
             found.view(-1)[here[won]] = self.numbers[patch[won], place[won]]
         return counts, last, found
 
