@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..assets import Body, Ints, Mesh, SkinWeights
+from ..assets import Body, Ints, SkinWeights
 from ..mesh import topology
 from ..mesh.blocks import compact_blocks
 from ..skinning import Skinning
@@ -18,19 +18,12 @@ from .nearest_vertex import BODY_GROUP
 from .one_ring import triangle_rings
 
 
-def faces_among(mesh: Mesh, chosen: Ints) -> Ints:
-    """Return the faces whose corners are all among `chosen` vertices, indexed within these, shape (F, 3)."""
-    place = np.full(mesh.vertex_count, -1)
-    place[chosen] = np.arange(len(chosen))
-    faces = place[mesh.faces]
-    return faces[(faces >= 0).all(axis=1)]
-
-
 class CollisionBody:
     """Body vertices and normals under skinning matrices, for the vertices candidates (all by default).
 
     Attributes:
         vertices: indices of its vertices in the whole body.
+        limbs: poses the axes that loose cloth must not cross.
 
     Args:
         limbs: axes that loose cloth must not cross; none by default.
@@ -53,7 +46,7 @@ class CollisionBody:
         def tensor(values: np.ndarray) -> Tensor:
             return torch.as_tensor(values, dtype=torch.float32, device=device)
 
-        faces = faces_among(body.mesh, chosen)
+        faces = topology.faces_among(body.mesh, chosen)
         rings = triangle_rings(faces, len(chosen))
         self.faces = torch.as_tensor(faces, device=device)
         self.patches = torch.as_tensor(triangle_patches(body.mesh.points[chosen], faces), device=device)
@@ -61,12 +54,14 @@ class CollisionBody:
         self.groups = torch.as_tensor(compact_blocks(body.mesh.points[chosen], BODY_GROUP), device=device)
         skin = SkinWeights(body.skin.path, body.skin.indices[chosen], body.skin.weights[chosen])
         self.skin = Skinning(skin).to(device)
-        self._limbs = LimbPoser(limbs, device) if limbs else None
+        self.limbs = LimbPoser(limbs, body, device) if limbs else None
         self.points = tensor(body.mesh.points[chosen])[:, :, None]
         self.normals = tensor(normals)[:, :, None]
 
     @torch.no_grad()
-    def pose(self, character: Tensor, *, surface: bool = True, exact: bool = False) -> PosedBody:
+    def pose(
+        self, character: Tensor, *, surface: bool = True, exact: bool = False, buried: Tensor | None = None
+    ) -> PosedBody:
         """Pose the body with skinning matrices (J, 3, 4, N); normals rotate with the blended matrices.
 
         Args:
@@ -74,9 +69,10 @@ class CollisionBody:
                 limbs.
             exact: whether that of cloth with a patch of its own is the exact one too, not one around the nearest
                 vertex (`PosedBody.rings`).
+            buried: limbs that do not count, where they are known (`LimbPoser.buried`).
         """
         points, normals = self.skin.surface(self.points[:, :, 0], self.normals[:, :, 0], character)
         rings = self.rings if surface and not exact else None
         faces, patches = (self.faces, self.patches) if surface and len(self.faces) else (None, None)
-        limbs = self._limbs.pose(character) if self._limbs and surface else None
+        limbs = self.limbs.pose(character, buried) if self.limbs and surface else None
         return PosedBody(points, normals, rings, self.groups, faces, patches, limbs)

@@ -22,7 +22,6 @@ from ..assets import PINNED, TIGHT, Floats, Ints, Mesh, Scene
 from ..mesh import topology
 from ..mesh.blocks import compact_blocks
 from ..mesh.geodesic import edge_graph
-from .body import faces_among
 from .distance import (
     MAX_QUERY_DISTANCE,
     Patches,
@@ -90,7 +89,7 @@ class Contacts:
         self._groups = [group(np.flatnonzero(elsewhere))] if elsewhere.any() else []
         if covered.any():
             vertices = patches[covered]
-            faces = faces_around(vertices, faces_among(body, chosen), len(chosen))
+            faces = faces_around(vertices, topology.faces_among(body, chosen), len(chosen))
             self._groups.append(group(tight[covered], Patches(tensor(vertices.astype(np.int32)), tensor(faces))))
 
     def planes(self, x: Tensor, body: PosedBody) -> tuple[Tensor, Tensor]:

@@ -164,7 +164,7 @@ class CoveredSkin:
         )
         axes = limb_axes(scene)
         self.limbs = axes.tips if axes else np.zeros(0, dtype=int)
-        self._poser = LimbPoser(axes, device) if axes else None
+        self._poser = LimbPoser(axes, merged, device) if axes else None
         samples = vertex_samples(scene.garment.mesh.vertex_count)
         self._piercing = Piercing(scene, samples, device=device) if axes else None
 

@@ -4,7 +4,9 @@
 Contact with the nearest point of the skin cannot free a thin limb that went through the cloth: it pushes the cloth
 around a finger to all sides, where it stays. The axis of a limb runs along the bones from the root joint to its tip.
 Cloth that crosses it an odd number of times lies across the limb. An even number is a fold, or a dent that nearest
-points mend. Limbs that are crossed in the bind pose do not count, as where a mesh is closed around one.
+points mend. Limbs that are crossed in the bind pose do not count, as where a mesh is closed around one. Nor does a
+limb while it is buried: while its tip lies in another part of the body, as a thumb in a thigh, which cloth cannot
+keep apart.
 """
 
 from __future__ import annotations
@@ -15,13 +17,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..assets import LOOSE, Body, Floats, Ints, Scene, Skeleton
-from ..skinning import transform_points
+from .. import kernels
+from ..assets import LOOSE, Body, Floats, Ints, Mesh, Scene, Skeleton
+from ..mesh import topology
+from ..skinning import Skinning, transform_points
 from .ray_casting import RayCaster
 
 MAX_RADIUS = 0.08  # [m] of a bone
 RADIUS_PERCENTILE = 90  # of the distances of a bone's skin from its line
 MIN_LENGTH = 1e-6  # [m], so that a bone of no length has a direction
+# Of the body's diagonal. Nothing is buried in skin so near to a tip at rest: the fingers of a fist lie in its palm.
+TIP_REACH = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,10 +49,15 @@ class LimbAxes:
     beyond: Floats
 
     @property
+    def last(self) -> Ints:
+        """The bone at the tip of each limb, shape (L,)."""
+        count = (self.paths < len(self.joints)).sum(axis=1)
+        return self.paths[np.arange(len(count)), count - 1]
+
+    @property
     def tips(self) -> Ints:
         """The joint at the tip of each limb, shape (L,)."""
-        last = (self.paths < len(self.joints)).sum(axis=1) - 1
-        return self.joints[self.paths[np.arange(len(last)), last], 0]
+        return self.joints[self.last, 0]
 
 
 def limb_axes(scene: Scene) -> LimbAxes | None:
@@ -59,7 +70,7 @@ def limb_axes(scene: Scene) -> LimbAxes | None:
     start, end = torch.tensor(axes.ends, dtype=torch.float32).unbind(1)
     points = torch.tensor(mesh.points, dtype=torch.float32)
     counts, *_ = caster.crossings(start[..., None], end[..., None], points[..., None])
-    clear = np.append(counts[:, 0].numpy(), 0)[axes.paths].sum(axis=1) % 2 == 0
+    clear = (along_paths(counts, torch.as_tensor(axes.paths)).sum(1) % 2 == 0)[:, 0].numpy()
     return replace(axes, paths=axes.paths[clear], beyond=axes.beyond[clear]) if clear.any() else None
 
 
@@ -120,6 +131,11 @@ def _radius(skin: Floats, start: Floats, end: Floats) -> float:
     return min(float(np.percentile(apart, RADIUS_PERCENTILE)), MAX_RADIUS)
 
 
+def along_paths(values: Tensor, paths: Tensor) -> Tensor:
+    """Return the values (M, N) of the bones of each path (L, K), zero where it is padded, shape (L, K, N)."""
+    return torch.cat([values, torch.zeros_like(values[:1])])[paths]
+
+
 @dataclass(frozen=True, eq=False)
 class PosedLimbs:
     """Axes of limbs in N frames.
@@ -127,6 +143,7 @@ class PosedLimbs:
     Attributes:
         start, end: of each bone [m], shape (M, 3, N).
         radii: shape (M,); paths, beyond: shape (L, K); as in `LimbAxes`.
+        buried: whether the tip of each limb lies in another part of the body, bool (L, N).
     """
 
     start: Tensor
@@ -134,16 +151,18 @@ class PosedLimbs:
     radii: Tensor
     paths: Tensor
     beyond: Tensor
+    buried: Tensor
 
     def select(self, frames: Tensor) -> PosedLimbs:
         """Return the axes in the frames with indices (M,)."""
-        return replace(self, start=self.start[..., frames], end=self.end[..., frames])
+        start, end, buried = (values[..., frames] for values in (self.start, self.end, self.buried))
+        return replace(self, start=start, end=end, buried=buried)
 
 
 class LimbPoser:
-    """Poses the axes of limbs with skinning matrices."""
+    """Poses the axes of a body's limbs with skinning matrices."""
 
-    def __init__(self, axes: LimbAxes, device: torch.device) -> None:
+    def __init__(self, axes: LimbAxes, body: Body, device: torch.device) -> None:
         def tensor(values: Floats) -> Tensor:
             return torch.as_tensor(np.array(values), dtype=torch.float32, device=device)
 
@@ -151,8 +170,62 @@ class LimbPoser:
         self._ends = tensor(axes.ends).transpose(0, 1)[..., None]
         self._radii, self._beyond = tensor(axes.radii), tensor(axes.beyond)
         self._paths = torch.as_tensor(axes.paths, device=device)
+        self._caster = None
+        if part := _away_from_tips(body, axes):
+            self._rest, self._skin = tensor(part.mesh.points), Skinning(part.skin).to(device)
+            self._caster = RayCaster(part.mesh, device=device)
+            self._at_rest = self._inside(self._caster, (self._ends[0], self._ends[1]), self._rest[..., None])
 
-    def pose(self, character: Tensor) -> PosedLimbs:
-        """Pose the axes with skinning matrices (J, 3, 4, N)."""
+    def pose(self, character: Tensor, buried: Tensor | None = None) -> PosedLimbs:
+        """Pose the axes with skinning matrices (J, 3, 4, N).
+
+        Args:
+            buried: the result of `buried` in these frames, where it is known.
+        """
+        start, end = self._bones(character)
+        buried = self.buried(character) if buried is None else buried
+        return PosedLimbs(start, end, self._radii, self._paths, self._beyond, buried)
+
+    @torch.no_grad()
+    def buried(self, character: Tensor) -> Tensor:
+        """Tell which limbs have their tip in another part of the body, bool (L, N).
+
+        Their axes cross the skin an odd number of times more, or less, than in the bind pose. Skin near tips does not
+        count.
+        """
+        if self._caster is None:
+            return torch.zeros(len(self._paths), character.shape[-1], dtype=torch.bool, device=character.device)
+        skin = self._skin(self._rest, None, self._skin.weights, character)
+        return self._inside(self._caster, self._bones(character), skin) ^ self._at_rest
+
+    def _bones(self, character: Tensor) -> tuple[Tensor, Tensor]:
         start, end = (transform_points(character[joints], at) for joints, at in zip(self._joints, self._ends))
-        return PosedLimbs(start, end, self._radii, self._paths, self._beyond)
+        return start, end
+
+    def _inside(self, caster: RayCaster, bones: tuple[Tensor, Tensor], skin: Tensor) -> Tensor:
+        """Tell which axes, along bones with starts and ends (M, 3, N), cross skin (V, 3, N) an odd number of times.
+
+        Returns:
+            bool (L, N).
+        """
+        if kernels.supports(skin):
+            from ..kernels.crossings import crossings_kernel
+
+            counts, _ = crossings_kernel(*bones, skin, caster.faces)
+        else:
+            counts, *_ = caster.crossings(*bones, skin)
+        return along_paths(counts, self._paths).sum(1) % 2 == 1
+
+
+def _away_from_tips(body: Body, axes: LimbAxes) -> Body | None:
+    """Return the part of a body that is away from the tips of all limbs; None where there is none."""
+    from scipy.spatial import cKDTree
+
+    mesh, skin = body.mesh, body.skin
+    apart, _ = cKDTree(axes.ends[axes.last, 1]).query(mesh.points)
+    chosen = np.flatnonzero(apart > TIP_REACH * mesh.diagonal)
+    faces = topology.faces_among(mesh, chosen)
+    if not len(faces):
+        return None
+    part = replace(skin, indices=skin.indices[chosen], weights=skin.weights[chosen])
+    return Body(Mesh(mesh.path, mesh.points[chosen], faces), part)

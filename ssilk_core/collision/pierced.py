@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Loose cloth that a limb went through: it is pushed along the limb, past its tip.
 
-A limb pierces the cloth where its axis (`limb_axes`) crosses it an odd number of times. Around the crossing nearest
-to the tip the cloth touches no skin. With the way w that is left along the axis to the tip, its distance to the body
-is
+A limb that is not buried pierces the cloth where its axis (`limb_axes`) crosses it an odd number of times. Around
+the crossing nearest to the tip the cloth touches no skin. With the way w that is left along the axis to the tip, its
+distance to the body is
 
     d = -SLOPE w,
 
@@ -20,7 +20,7 @@ from torch import Tensor
 
 from .. import kernels
 from ..assets import LOOSE, Scene
-from .limb_axes import MIN_LENGTH, PosedLimbs, loose_faces
+from .limb_axes import MIN_LENGTH, PosedLimbs, along_paths, loose_faces
 from .ray_casting import RayCaster
 from .samples import ContactSamples
 
@@ -73,8 +73,8 @@ class Piercing:
         else:
             counts, _, triangle = self._caster.crossings(limbs.start, limbs.end, x)
         paths = limbs.paths
-        counts = torch.cat([counts, torch.zeros_like(counts[:1])])[paths]  # (L, K, N)
-        pierced = counts.sum(1) % 2 == 1
+        counts = along_paths(counts, paths)
+        pierced = (counts.sum(1) % 2 == 1) & ~limbs.buried
         place = torch.arange(1, paths.shape[1] + 1, device=x.device)[:, None]
         step = (place * (counts > 0)).amax(1).sub(1).clamp_min(0)  # the last bone of the path that is crossed
         bone = paths.gather(1, step).clamp_max(len(limbs.start) - 1)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..assets import Floats, Ints
+from ..assets import Floats, Ints, Mesh
 
 NO_AREA = 1e-7  # ratio of twice a triangle's area to its longest edge squared; the limit of single precision
 SLIVER = 50.0  # ratio of a triangle's longest edge to its height; clean cloth stays below 15
@@ -156,3 +156,11 @@ def is_inside_out(points: Floats, faces: Ints) -> bool:
     """Return whether the normals of a closed mesh point inward: its faces enclose a negative volume."""
     a, b, c = np.moveaxis((points - points.mean(axis=0))[faces], 1, 0)
     return bool(np.einsum("fi,fi->", a, np.cross(b, c)) < 0)
+
+
+def faces_among(mesh: Mesh, chosen: Ints) -> Ints:
+    """Return the faces whose corners are all among `chosen` vertices, indexed within these, shape (F, 3)."""
+    place = np.full(mesh.vertex_count, -1)
+    place[chosen] = np.arange(len(chosen))
+    faces = place[mesh.faces]
+    return faces[(faces >= 0).all(axis=1)]

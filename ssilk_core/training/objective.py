@@ -19,6 +19,7 @@ from .newton_distance import NewtonDistance
 from .windows import WindowSampler
 
 Terms = dict[str, Tensor]
+POSED_AT_ONCE = 1024  # frames, to find limbs that do not count
 REGULARIZATION = "latent regularization"  # a term of latents, which has no frames
 
 
@@ -52,6 +53,11 @@ class Objective:
             self.contacts = Contacts(
                 model.scene, energy.cloth.samples, vertices=body.vertices, pinned=False, device=device
             )
+        # A property of poses: found once, not in each step.
+        self.buried = None
+        if body and body.limbs and surface:
+            every = torch.arange(bank.frame_count, device=device).split(POSED_AT_ONCE)
+            self.buried = torch.cat([body.limbs.buried(bank.character(frames)) for frames in every], dim=1)
         self.skin = None
         if len(tethered := energy.tethered.cpu().numpy()):
             skin = model.scene.lbs_skin
@@ -63,12 +69,18 @@ class Objective:
         self.newton = NewtonDistance(model.scene, energy, self.dt, newton_weight) if newton_weight else None
         self.scale = GRAVITY * float(energy.mass.sum()) * model.scene.garment.mesh.diagonal
 
-    def quasi_static_terms(self, x: Tensor, direction: Tensor, character: Tensor) -> Terms:
-        """Return all terms but inertia and drag of positions x (V, 3, N) under gravity directions (N, 3)."""
+    def quasi_static_terms(
+        self, x: Tensor, direction: Tensor, character: Tensor, buried: Tensor | None = None
+    ) -> Terms:
+        """Return all terms but inertia and drag of positions x (V, 3, N) under gravity directions (N, 3).
+
+        Args:
+            buried: limbs that do not count, where they are known (`LimbPoser.buried`).
+        """
         energy, root = self.energy, character[0, :, 3]  # heights over the root keep the value of gravity small
         stretch, bending = energy.elastic(x)
         sampled = energy.cloth.positions(x)
-        planes = self._planes(sampled.detach(), character)
+        planes = self._planes(sampled.detach(), character, buried)
         gravity, collision = energy.gravity_and_collision(x, root, GRAVITY * direction.T, sampled, *planes)
         if self.newton:
             self.newton.planes = planes
@@ -79,7 +91,7 @@ class Objective:
             terms["stitch"] = energy.stitch(x)
         return terms
 
-    def _planes(self, x: Tensor, character: Tensor) -> tuple[Tensor, Tensor]:
+    def _planes(self, x: Tensor, character: Tensor, buried: Tensor | None) -> tuple[Tensor, Tensor]:
         """Return the plane that each sample x (S, 3, N) can touch, moved outwards by the clearance.
 
         Returns:
@@ -87,14 +99,17 @@ class Objective:
         """
         if self.body is None:
             return no_planes(x)
-        normal, offset = self.contacts.planes(x, self.body.pose(character, surface=self.surface))
+        normal, offset = self.contacts.planes(x, self.body.pose(character, surface=self.surface, buried=buried))
         return normal, offset + self.clearance
+
+    def _buried(self, frames: Tensor) -> Tensor | None:
+        return None if self.buried is None else self.buried[:, frames]
 
     def static(self, frames: Tensor, direction: Tensor) -> Terms:
         """Return the terms of the initialiser's quasi-static states on single poses (Section 3.1)."""
         z = self.model.initial(self.bank.static_descriptor(frames, direction))
         character = self.bank.character(frames)
-        return self.quasi_static_terms(self._vertices(z, character, 0), direction, character)
+        return self.quasi_static_terms(self._vertices(z, character, 0), direction, character, self._buried(frames))
 
     def _vertices(self, z: Tensor, character: Tensor, moving: int) -> Tensor:
         """Decode latents (N, latent), of which so many have inertia, to positions (V, 3, N)."""
@@ -138,9 +153,10 @@ class Objective:
         with torch.no_grad():
             past = model.vertices(torch.cat(z[:2]), bank.character(times[: 2 * batch]))
         # One decoder call for the windows from the third frame on and the single poses.
-        character = bank.character(torch.cat([times[2 * batch :], frames]))
+        asked = torch.cat([times[2 * batch :], frames])
+        character = bank.character(asked)
         x = self._vertices(torch.cat([rolled, quiet]), character, (length - 2) * batch)
-        terms = self.quasi_static_terms(x, torch.cat([down[2 * batch :], direction]), character)
+        terms = self.quasi_static_terms(x, torch.cat([down[2 * batch :], direction]), character, self._buried(asked))
         count = (length - 2) * batch
         dynamic = {name: value[:count] for name, value in terms.items()}
         single = {name: value[count:] for name, value in terms.items()}

@@ -14,8 +14,11 @@ from ssilk_core.collision import CollisionBody, Contacts, CoveredSkin, RayCaster
 from ssilk_core.collision.limb_axes import MAX_RADIUS, LimbPoser, body_axes
 from ssilk_core.collision.pierced import MARGIN, SLOPE, Piercing
 from ssilk_core.collision.samples import vertex_samples
+from ssilk_core.energy import GarmentEnergy
 from ssilk_core.fabrics import Fabric
+from ssilk_core.motion_bank import build_bank
 from ssilk_core.simulate.incremental_potential import IncrementalPotential, StepInputs
+from ssilk_core.training.objective import Objective
 
 CPU = torch.device("cpu")
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")  # on a CPU kernels run in an interpreter
@@ -104,7 +107,7 @@ def test_an_odd_number_of_crossings_pierces(scene):
     folded[:, 0] = 0.32 + 0.05 * torch.sign(points[:, 1] + 0.101)
     folded[:, 1] = (points[:, 1] + 0.101).abs() - 0.101
     x = torch.stack([points, once, folded], dim=-1)
-    limbs = LimbPoser(axes, CPU).pose(still(2, 3))
+    limbs = LimbPoser(axes, _body(whole)[0], CPU).pose(still(2, 3))
     found = Piercing(whole, vertex_samples(count), device=CPU).find(x, limbs)
     assert (found.radius > 0)[0].tolist() == [False, True, False]
     np.testing.assert_allclose(found.point[0, :, 1], [0.7, 0, 0], atol=0.03)  # of the sheet at rest
@@ -114,6 +117,47 @@ def test_an_odd_number_of_crossings_pierces(scene):
     covering = dressed(scene, 0.55)  # the tip: without covered skin nothing is counted
     counts = ShownCounts.of(CoveredSkin(covering, device=CPU).states(x, still(2, 3)))
     assert counts.pierced is not None and counts.pierced.any(0).tolist() == [False, True, False]
+
+
+def test_a_limb_whose_tip_lies_in_another_part_of_the_body_does_not_count(scene):
+    """A board, moved by a joint of its own, comes over the tip of the arm, which cloth lies across."""
+    whole = dressed(scene, 0.7)
+    (body,), board = whole.character.bodies, trimesh.creation.box((0.1, 1.2, 1.2))
+    points = np.concatenate([body.mesh.points, board.vertices + [2.0, 0.0, 0.02]])
+    faces = np.concatenate([body.mesh.faces, board.faces + body.mesh.vertex_count])
+    moved = np.concatenate([body.skin.indices, np.full((len(board.vertices), 1), 2)])
+    both = Body(Mesh("/arm", points, faces), SkinWeights("/arm", moved, np.ones((len(points), 1))))
+    axes = body_axes(both, joints((0, 0, 0), (LENGTH / 2, 0, 0), (2, 0, 0), parents=(-1, 0, -1)))
+    hand = axes.tips.tolist().index(1)
+    character = still(3, 3)
+    character[2, 0, 3] = torch.tensor([0.0, LENGTH - 2, LENGTH / 2 - 2])  # away, at the tip, at the elbow
+    for shift in (0.0, 30.0):  # anywhere in the world
+        character[:, 0, 3] += shift
+        assert LimbPoser(axes, both, CPU).buried(character)[hand].tolist() == [False, True, False]
+    character[:, 0, 3] -= 30
+    limbs = LimbPoser(axes, both, CPU).pose(character)
+    assert limbs.buried[hand].tolist() == [False, True, False]
+    assert limbs.select(torch.tensor([1])).buried.shape == (len(axes.tips), 1)
+    points = torch.tensor(whole.garment.mesh.points, dtype=torch.float32)[..., None].repeat(1, 1, 3)
+    points[:, 0] -= 0.4
+    found = Piercing(whole, vertex_samples(len(points)), device=CPU).find(points, limbs)
+    assert (found.radius[hand] > 0).tolist() == [True, False, True]
+
+    skin = SkinWeights("/tip", np.ones((3, 1), dtype=int), np.ones((3, 1)))
+    only = Body(Mesh("/tip", axes.ends[axes.last[hand], 1] + 0.01 * np.eye(3), np.array([[0, 1, 2]])), skin)
+    assert not LimbPoser(axes, only, CPU).buried(character).any()  # all of it is near a tip
+
+
+def test_training_finds_buried_limbs_once_as_each_pose_does(toy_motion, toy_model, patched_scene):
+    scene, cpu = patched_scene, CPU
+    model, skeleton = toy_model(scene), scene.character.skeleton
+    bank = build_bank([toy_motion(scene, 30)], skeleton, model.joints, model.config.fps, cpu)
+    body = CollisionBody(*_body(scene), limbs=body_axes(_body(scene)[0], skeleton), device=cpu)
+    energy = GarmentEnergy(scene.garment.mesh, Fabric("toy"), scene.classes)
+    frames = torch.arange(bank.frame_count)
+    objective = Objective(model, energy, body, bank)
+    assert torch.equal(objective.buried, body.pose(bank.character(frames)).limbs.buried)
+    assert Objective(model, energy, body, bank, surface=False).buried is None
 
 
 def test_pierced_cloth_is_pushed_along_the_limb_by_the_energy_of_its_depth(scene):
@@ -195,7 +239,7 @@ def test_kernels_find_and_push_as_the_reference_does(scene):
     whole = dressed(scene, 0.7)
     points = torch.tensor(whole.garment.mesh.points, dtype=torch.float32)
     x = torch.stack([points - torch.tensor([by, 0, 0]) for by in (0.0, 0.3, 0.45)], dim=-1)
-    limbs = LimbPoser(limb_axes(whole), CPU).pose(still(2, 3))
+    limbs = LimbPoser(limb_axes(whole), _body(whole)[0], CPU).pose(still(2, 3))
     piercing = Piercing(whole, vertex_samples(len(x)), device=CPU)
     counts, _, triangle = piercing._caster.crossings(limbs.start, limbs.end, x)
     asked = (each.to(DEVICE) for each in (limbs.start, limbs.end, x, piercing._caster.faces))
