@@ -28,6 +28,7 @@ from ssilk_core.training.verdict import curve_lbs
 
 NESTED = {
     "shows": ("shown_skin", "mean"),
+    "limbs": ("shown_skin", "pierced"),
     "step energy": ("step_errors", "energy"),
     "step distance": ("step_errors", "distance"),
 }  # parts of a validation, which earlier versions did not have
@@ -36,6 +37,7 @@ UNITS = {
     "collisions": "share of vertices",
     "dynamics": "m",
     "shows": "share of covered skin",
+    "limbs": "share of frames",
     "step distance": "m",
 }  # of others: J
 SHOWN = 0.9  # share of the values that a panel shows: the first ones would flatten all others
@@ -86,8 +88,8 @@ def read_run(text: str) -> Run:
         fail(str(path), "the curve has no point yet", "one validation at least is needed", "train longer")
     values = {key: np.array([point["validation"].get(key, 0.0) for point in points]) for key in PANELS}
     for key, (part, figure) in NESTED.items():
-        measured = [point["validation"].get(part) for point in points]
-        values[key] = np.array([each[figure] for each in measured]) if all(measured) else np.zeros(0)
+        measured = [(point["validation"].get(part) or {}).get(figure) for point in points]
+        values[key] = np.zeros(0) if None in measured else np.array(measured)
     iterations, seconds = (np.array([point[key] for point in points]) for key in ("iteration", "seconds"))
     return Run(name or Path(model).stem, iterations, seconds, values, curve_lbs(document)["total"])
 
@@ -139,18 +141,19 @@ def _line(run: Run, times: list[float], iterations: int, totals: list[float]) ->
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("runs", nargs="+", metavar="[NAME=]MODEL", help=f"up to {len(COLOURS)} trained models")
+    parser.add_argument(
+        "runs", nargs="+", metavar="[NAME=]MODEL", help=f"trained models; up to {len(COLOURS)} are drawn"
+    )
     parser.add_argument("--hardware", required=True, help="what the runs were trained on, for the foot of the table")
     parser.add_argument(
         "--totals", type=float, nargs="+", metavar="JOULES", help="(default: the total all runs reach)"
     )
     parser.add_argument("--name", default="curves", help="of the result files (default curves)")
     options = parser.parse_args()
-    if not len(options.runs) <= len(COLOURS):
-        fail("curves", f"{len(options.runs)} runs", f"{len(COLOURS)} can be told apart")
     runs = [read_run(text) for text in options.runs]
     totals = options.totals or [max(float(run.best[-1]) for run in runs)]
-    draw(RESULTS / f"{options.name}.png", runs)
+    if len(runs) <= len(COLOURS):  # no more can be told apart
+        draw(RESULTS / f"{options.name}.png", runs)
     figures = {
         run.name: {
             "iterations": run.iterations.tolist(),

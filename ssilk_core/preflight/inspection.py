@@ -154,7 +154,8 @@ def _on_scene(inputs: PreflightInput, blocked: bool) -> Findings:
 
 def _on_training(scene: Scene, inputs: PreflightInput) -> Findings:
     if find_spec("torch"):
+        yield from motion.buried_limbs(scene, inputs.motions)
         yield from cost.training_cost(scene, inputs.motions, inputs.preset)
     else:
-        text = "joints, memory and time were not checked: torch is not installed (pip install 'ssilk[train]')"
+        text = "limbs, joints, memory and time were not checked: torch is not installed (pip install 'ssilk[train]')"
         yield Finding(severity="info", code="not-checked", prim=scene.garment.mesh.path, found=text)

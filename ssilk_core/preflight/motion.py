@@ -4,16 +4,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..assets import Floats, Ints, Motion, Skeleton
-from ..kinematics import CUT_SPEED, MAX_JOINT_SPEED, split_at_cuts
+from ..assets import Floats, Ints, Motion, Scene, Skeleton
+from ..kinematics import CUT_SPEED, MAX_JOINT_SPEED, motion_transforms, skinning_matrices, split_at_cuts
 from .finding import Finding, Findings, format_count, format_joints, index_tuple
 
 STILL_ANGLE = 0.5  # [degrees]
 USUAL_RATES = (15.0, 240.0)  # [1/s] lowest and highest
+CHECKED_RATE = 5  # [1/s] at which limbs are looked for inside the body
+MANY_BURIED = 0.02  # share of the frames
+NAMED_LIMBS = 3
 MAX_SAMPLE_GAP = 0.5  # [s] gap that is reported if it is also ten times the usual sampling interval
 
 
@@ -179,6 +182,44 @@ def still_joints(motions: Sequence[Motion], skeleton: Skeleton) -> Findings:
             why="the garment cannot learn the effect of these joints; they should not rotate in shots either",
             elements="joints",
             indices=index_tuple(still),
+        )
+
+
+def buried_limbs(scene: Scene, motions: Sequence[Motion]) -> Findings:
+    """Yield the limbs whose tips lie in another part of the body, of those that loose cloth must not cross."""
+    import torch
+
+    from ..collision import limb_axes
+    from ..collision.limb_axes import LimbPoser
+
+    axes, skeleton = limb_axes(scene), scene.character.skeleton
+    if axes is None:
+        return
+    poser, buried = LimbPoser(axes, scene.character.merged_body(), torch.device("cpu")), []
+    for motion in motions:
+        chosen = np.arange(0, motion.frame_count, max(1, round(motion.fps / CHECKED_RATE)))
+        world = motion_transforms(replace(motion, rotations=motion.rotations[chosen],
+                                          translations=motion.translations[chosen]), skeleton.parents)  # fmt: skip
+        matrices = skinning_matrices(world, skeleton.bind_transforms)[:, :, :3].transpose(1, 2, 3, 0)
+        buried.append(poser.buried(torch.as_tensor(matrices, dtype=torch.float32)).numpy())
+    every, clips = np.concatenate(buried, axis=1), [found.any(axis=0).mean() for found in buried]
+    shares, most = every.mean(axis=1), int(np.argmax(clips))
+    order = [limb for limb in np.argsort(-shares, kind="stable") if shares[limb]]
+    if order:
+        named = ", ".join(
+            f"{format_joints(skeleton, axes.tips[[limb]])} {shares[limb]:.1%}" for limb in order[:NAMED_LIMBS]
+        )
+        yield Finding(
+            severity="warning" if every.any(axis=0).mean() >= MANY_BURIED else "info",
+            code="buried-limbs",
+            prim=skeleton.path,
+            count=len(order),
+            found=f"in {every.any(axis=0).mean():.1%} of the frames a limb ends inside another part of the body "
+            f"({named}; most in {motions[most].path}, {clips[most]:.0%})",
+            why="no cloth fits in between, and loose cloth passes through the limb there",
+            fix="in shots, move the limb off the body",
+            elements="joints",
+            indices=index_tuple(axes.tips[order]),
         )
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 import trimesh
 
-from ssilk_core.assets import LOOSE, TIGHT, Body, Character, Mesh, Scene, Skeleton, SkinWeights
+from ssilk_core.assets import LOOSE, TIGHT, Body, Character, Mesh, Motion, Scene, Skeleton, SkinWeights
 from ssilk_core.collision import CollisionBody, Contacts, CoveredSkin, RayCaster, ShownCounts, limb_axes
 from ssilk_core.collision.limb_axes import MAX_RADIUS, LimbPoser, body_axes
 from ssilk_core.collision.pierced import MARGIN, SLOPE, Piercing
@@ -17,6 +17,7 @@ from ssilk_core.collision.samples import vertex_samples
 from ssilk_core.energy import GarmentEnergy
 from ssilk_core.fabrics import Fabric
 from ssilk_core.motion_bank import build_bank
+from ssilk_core.preflight.motion import buried_limbs
 from ssilk_core.simulate.incremental_potential import IncrementalPotential, StepInputs
 from ssilk_core.training.objective import Objective
 
@@ -63,6 +64,16 @@ def dressed(scene: Scene, rest: float, kind: int = LOOSE) -> Scene:
     no_joints = {"joint_names": (), "parents": np.zeros(0, dtype=int), "bind_transforms": np.zeros((0, 4, 4))}
     rig = replace(scene.rig, skin=skin, **no_joints)
     return Scene(Character("/arm", skeleton, (body,)), garment, rig)
+
+
+def with_board(scene: Scene) -> tuple[Body, Skeleton]:
+    """The arm, and a board two metres away that a root joint of its own moves."""
+    (body,), board = scene.character.bodies, trimesh.creation.box((0.1, 1.2, 1.2))
+    points = np.concatenate([body.mesh.points, board.vertices + [2.0, 0.0, 0.02]])
+    faces = np.concatenate([body.mesh.faces, board.faces + body.mesh.vertex_count])
+    moved = np.concatenate([body.skin.indices, np.full((len(board.vertices), 1), 2)])
+    both = Body(Mesh("/arm", points, faces), SkinWeights("/arm", moved, np.ones((len(points), 1))))
+    return both, joints((0, 0, 0), (LENGTH / 2, 0, 0), (2, 0, 0), parents=(-1, 0, -1))
 
 
 def still(count: int, frames: int = 1) -> torch.Tensor:
@@ -122,20 +133,16 @@ def test_an_odd_number_of_crossings_pierces(scene):
 def test_a_limb_whose_tip_lies_in_another_part_of_the_body_does_not_count(scene):
     """A board, moved by a joint of its own, comes over the tip of the arm, which cloth lies across."""
     whole = dressed(scene, 0.7)
-    (body,), board = whole.character.bodies, trimesh.creation.box((0.1, 1.2, 1.2))
-    points = np.concatenate([body.mesh.points, board.vertices + [2.0, 0.0, 0.02]])
-    faces = np.concatenate([body.mesh.faces, board.faces + body.mesh.vertex_count])
-    moved = np.concatenate([body.skin.indices, np.full((len(board.vertices), 1), 2)])
-    both = Body(Mesh("/arm", points, faces), SkinWeights("/arm", moved, np.ones((len(points), 1))))
-    axes = body_axes(both, joints((0, 0, 0), (LENGTH / 2, 0, 0), (2, 0, 0), parents=(-1, 0, -1)))
+    body, skeleton = with_board(whole)
+    axes = body_axes(body, skeleton)
     hand = axes.tips.tolist().index(1)
     character = still(3, 3)
     character[2, 0, 3] = torch.tensor([0.0, LENGTH - 2, LENGTH / 2 - 2])  # away, at the tip, at the elbow
     for shift in (0.0, 30.0):  # anywhere in the world
         character[:, 0, 3] += shift
-        assert LimbPoser(axes, both, CPU).buried(character)[hand].tolist() == [False, True, False]
+        assert LimbPoser(axes, body, CPU).buried(character)[hand].tolist() == [False, True, False]
     character[:, 0, 3] -= 30
-    limbs = LimbPoser(axes, both, CPU).pose(character)
+    limbs = LimbPoser(axes, body, CPU).pose(character)
     assert limbs.buried[hand].tolist() == [False, True, False]
     assert limbs.select(torch.tensor([1])).buried.shape == (len(axes.tips), 1)
     points = torch.tensor(whole.garment.mesh.points, dtype=torch.float32)[..., None].repeat(1, 1, 3)
@@ -146,6 +153,22 @@ def test_a_limb_whose_tip_lies_in_another_part_of_the_body_does_not_count(scene)
     skin = SkinWeights("/tip", np.ones((3, 1), dtype=int), np.ones((3, 1)))
     only = Body(Mesh("/tip", axes.ends[axes.last[hand], 1] + 0.01 * np.eye(3), np.array([[0, 1, 2]])), skin)
     assert not LimbPoser(axes, only, CPU).buried(character).any()  # all of it is near a tip
+
+
+def test_preflight_tells_which_limbs_are_buried_in_which_motion(scene):
+    whole = dressed(scene, 0.7)
+    body, skeleton = with_board(whole)
+    whole = replace(whole, character=Character("/arm", skeleton, (body,)))
+    translations = np.tile(skeleton.rest_transforms[:, :3, 3], (20, 1, 1))
+    turns = np.tile([1.0, 0, 0, 0], (20, 3, 1))
+    apart = Motion("/apart", 10.0, turns, translations)
+    translations = translations.copy()
+    translations[:5, 2, 0] = LENGTH  # the board, in a quarter of the frames
+    (found,) = buried_limbs(whole, [apart, Motion("/pressed", 10.0, turns, translations)])
+    assert found.code == "buried-limbs" and found.severity == "warning" and found.indices == (1,)
+    assert "in 15.0% of the frames" in found.found and "j1 15.0%" in found.found
+    assert "most in /pressed, 30%" in found.found  # every second frame is looked at
+    assert not [*buried_limbs(whole, [apart])]
 
 
 def test_training_finds_buried_limbs_once_as_each_pose_does(toy_motion, toy_model, patched_scene):
