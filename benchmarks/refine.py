@@ -4,9 +4,9 @@
     python benchmarks/refine.py cape.safetensors --stage cape.usdc --motions FOLDER --clips 01_walk
 
 Energies are means over frames, inertia by each method's own past, gravity from the root. Jitter is the RMS of the
-third difference of positions. What joints lose is measured on what `bake --refine` stores: proxy rotations, and
-blendshapes of the shot's own in place of the model's. The last row of each clip is the simulator, which starts from
-no network.
+third difference of positions. Skin that shows and limbs through the cloth are those of the solver's points. What
+joints lose is measured on what `bake --refine` stores: proxy rotations, and blendshapes of the shot's own in place of
+the model's. The last row of each clip is the simulator, which starts from no network.
 """
 
 from __future__ import annotations
@@ -16,20 +16,22 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import torch
 from helpers.reports import table, write_results
 from helpers.subjects import Subject, arguments, clip_of, open_subject, parsed
 
 from ssilk_core.assets import Floats, GarmentPose, Motion
+from ssilk_core.collision import ShownCounts
 from ssilk_core.decomposition import decompose
 from ssilk_core.errors import SsilkError
-from ssilk_core.kinematics import deform, resample
+from ssilk_core.kinematics import deform, motion_transforms, resample, skinning_matrices
 from ssilk_core.refine import RefineOptions, Refiner
 from ssilk_core.rollout import decode, garment_poses
 from ssilk_core.simulate import SimulationOptions, simulate
 
-HEADER = ("garment, clip", "iterations", "looks back on", "s a frame", "energy [J]", "inside the body", "moved [mm]",
-          "jitter [mm]", "own shapes", "joints lose [mm]", "at most [mm]", "energy of the joints [J]",
-          "inside")  # fmt: skip
+HEADER = ("garment, clip", "iterations", "looks back on", "s a frame", "energy [J]", "inside the body",
+          "shows, worst frame", "limbs through", "moved [mm]", "from the simulator [mm]", "jitter [mm]", "own shapes",
+          "joints lose [mm]", "at most [mm]", "energy of the joints [J]", "inside")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,12 +63,21 @@ class NetworkTake:
 
     def measured(self, points: Floats) -> dict[str, float]:
         """Return the figures of vertices (F, V, 3), by their own past."""
-        changes = list(self.refiner(1, True).changes(self.motion, points, points))
+        changes, dressed = list(self.refiner(1, True).changes(self.motion, points, points)), self.subject.dressed
+        skeleton = dressed.scene.character.skeleton
+        matrices = skinning_matrices(motion_transforms(self.motion, skeleton.parents), skeleton.bind_transforms)
+        x, character = (
+            torch.tensor(values, dtype=torch.float32, device=dressed.device)
+            for values in (points.transpose(1, 2, 0), matrices[:, :, :3].transpose(1, 2, 3, 0))
+        )
+        counts = ShownCounts.of(dressed.covered.states(x, character))
         return {
             "energy": float(np.mean([change.after for change in changes])),
             "inside": float(np.mean([change.inside_after for change in changes])),
-            "moved": float(np.sqrt(((points - self.points) ** 2).sum(-1).mean())),
-            "jitter": float(np.sqrt((np.diff(points, 3, axis=0) ** 2).sum(-1).mean())),
+            "shows": float(counts.shares.max()),
+            "limbs": 0.0 if counts.pierced is None else float(counts.pierced.any(0).double().mean()),
+            "moved": rms(points - self.points),
+            "jitter": rms(np.diff(points, 3, axis=0)),
         }
 
     def stored(self, points: Floats) -> dict[str, float]:
@@ -88,28 +99,35 @@ class NetworkTake:
         }
 
 
-def refined(take: NetworkTake, iterations: int, feedback: bool) -> dict[str, float]:
-    """Return the figures of one budget; none for no iterations."""
+def refined(take: NetworkTake, iterations: int, feedback: bool, reference: Floats) -> dict[str, float]:
+    """Return the figures of one budget, none for no iterations, with the distance from the simulator's vertices."""
     if not iterations:
-        return {"seconds": 0.0, **take.measured(take.points)}
+        return {"seconds": 0.0, **take.measured(take.points), "apart": rms(take.points - reference)}
     begun = time.perf_counter()
     points = np.stack([frame.points for frame in take.refiner(iterations, feedback).frames(take.motion, take.points)])
     seconds = (time.perf_counter() - begun) / len(points)
-    return {"seconds": seconds, **take.measured(points), **take.stored(points)}
+    return {
+        "seconds": seconds, **take.measured(points), "apart": rms(points - reference), **take.stored(points)
+    }  # fmt: skip
 
 
-def simulated(take: NetworkTake) -> dict[str, float]:
-    """Return the figures of the simulator."""
+def rms(away: Floats) -> float:
+    return float(np.sqrt((away**2).sum(-1).mean()))
+
+
+def simulated(take: NetworkTake) -> tuple[dict[str, float], Floats]:
+    """Return the figures of the simulator, and its vertices (F, V, 3)."""
     dressed, begun = take.subject.dressed, time.perf_counter()
     options = SimulationOptions(fps=take.motion.fps)
     (points,) = simulate(dressed.scene, dressed.fabric, [take.motion], options, device=dressed.device)
-    return {"seconds": (time.perf_counter() - begun) / len(points), **take.measured(points)}
+    return {"seconds": (time.perf_counter() - begun) / len(points), **take.measured(points), "apart": 0.0}, points
 
 
 def row(where: str, iterations: str, past: str, found: dict[str, float]) -> list[str]:
     """Return one line of the table."""
     line = [where, iterations, past, f"{found['seconds']:.3g}", f"{found['energy']:.4f}", f"{found['inside']:.2%}",
-            f"{1000 * found['moved']:.1f}", f"{1000 * found['jitter']:.2f}"]  # fmt: skip
+            f"{found['shows']:.2%}", f"{found['limbs']:.0%}"]  # fmt: skip
+    line += [f"{1000 * found[name]:.1f}" for name in ("moved", "apart")] + [f"{1000 * found['jitter']:.2f}"]
     if "lost" not in found:
         return [*line, "", "", "", "", ""]
     lost = [f"{1000 * found[name]:.2f}" for name in ("lost", "lost at most")]
@@ -119,14 +137,15 @@ def row(where: str, iterations: str, past: str, found: dict[str, float]) -> list
 def measure(take: NetworkTake, where: str, budgets: list[int]) -> tuple[list[list[str]], dict[str, Any]]:
     """Return the rows of one garment and clip, and their figures."""
     rows, figures = [], {}
+    own, reference = simulated(take)
     for iterations in budgets:
         for feedback in (False, True) if iterations else (False,):
             past = ("refined" if feedback else "network") if iterations else ""
-            figures[f"{iterations} {past}".strip()] = found = refined(take, iterations, feedback)
+            figures[f"{iterations} {past}".strip()] = found = refined(take, iterations, feedback, reference)
             rows.append(row(where, str(iterations), past, found))
             print(rows[-1], flush=True)
-    figures["simulator"] = found = simulated(take)
-    return [*rows, row(where, "simulator", "itself", found)], figures
+    figures["simulator"] = own
+    return [*rows, row(where, "simulator", "itself", own)], figures
 
 
 def main() -> None:

@@ -27,6 +27,7 @@ class Quality:
         shapes, joints, influences: largest numbers of blendshapes, proxies, and influences per vertex.
         fps: highest frame rate of a shot [1/s]; None for that of its motion.
         refine: solver iterations per frame, starting from the network's state.
+        feedback: refined frames look back on refined ones.
         about: one-line description.
     """
 
@@ -36,6 +37,7 @@ class Quality:
     influences: int = UNLIMITED
     fps: float | None = None
     refine: int = 0
+    feedback: bool = False
     about: str
 
     @property
@@ -53,7 +55,7 @@ QUALITIES = {
         Quality(name="crowd", shapes=12, joints=8, influences=4, fps=15.0, about="many characters, far away"),
         Quality(name="game", shapes=32, joints=16, influences=4, fps=30.0, about="real time, four influences"),
         Quality(name="film", shapes=48, about="no visible difference from the full model"),
-        Quality(name="hero", refine=4, about="the full model, refined by the solver"),
+        Quality(name="hero", refine=4, feedback=True, about="the full model, carried on by the solver"),
     )
 }
 

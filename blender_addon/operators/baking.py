@@ -47,7 +47,7 @@ ABOUT = {
     "crowd": "For many characters, far away: few shapes and proxies, four influences",
     "game": "For real time: some shapes and proxies, four influences",
     "film": "What cannot be told from the whole model",
-    "hero": "Refined by a solver, on bones and shape keys of this shot's own; takes long",
+    "hero": "Carried on by a solver, on bones and shape keys of this shot's own; takes long",
 }
 QUALITY_ITEMS = [
     (WHOLE, "Whole", "All that the model has"),

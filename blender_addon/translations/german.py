@@ -345,8 +345,8 @@ WORDS = {
         "Für viele Figuren in der Ferne: wenige Formen und Stellvertreter, vier Einflüsse"
     ),
     "Hero": "Hauptfigur",
-    "Refined by a solver, on bones and shape keys of this shot's own; takes long": (
-        "Von einem Löser verfeinert, auf Knochen und eigenen Formschlüsseln dieses Shots; dauert lange"
+    "Carried on by a solver, on bones and shape keys of this shot's own; takes long": (
+        "Von einem Löser weitergeführt, auf Knochen und eigenen Formschlüsseln dieses Shots; dauert lange"
     ),
     "To USD": "Nach USD",
     "Write a UsdSkel shot, with the body": "Einen UsdSkel-Shot schreiben, mit dem Körper",

@@ -29,8 +29,8 @@ _NUMBER = r"-?[0-9]{1,9}(?:\.[0-9]{1,9})?"
 class BakeRequest:
     """One garment over one motion: all that decides how the garment moves.
 
-    Fields are named as the options of 'ssilk bake', which has none for `feedback`, names `root` in MODEL:/ROOT, and
-    names `garment` and `shot` by patterns or in a list. A shot stores its request, so that it can be verified later.
+    Fields are named as the options of 'ssilk bake', which names `root` in MODEL:/ROOT, and `garment` and `shot` by
+    patterns or in a list. A shot stores its request, so that it can be verified later.
 
     Attributes:
         model: file written by 'ssilk train'.
@@ -45,7 +45,7 @@ class BakeRequest:
         target: who receives the shot, a name in `ssilk_core.targets.TARGETS`.
         lbs: bake linear blend skinning instead of the network.
         refine: iterations of the simulator's solver in each frame, from the network's state; 0 for none.
-        feedback: refined frames look back on refined frames instead of the network's.
+        feedback: refined frames look back on refined frames instead of the network's, one after the other.
         refined_output: "joints" writes refined frames as joints and as many blendshapes as they need (see
             `decomposition`), "points" as points.
         hide_covered: hide the body's faces that the garment covers in every frame (see `mesh.hidden_faces`).
@@ -95,6 +95,9 @@ class BakeRequest:
             fail("--fps", f"{self.fps:g} frames per second", ALLOWED_FPS)
         if not 0 <= self.refine <= MAX_REFINE or int(self.refine) != self.refine:
             fail("--refine", f"{self.refine:g} iterations", f"1 to {MAX_REFINE} are allowed, or 0 for none")
+        if self.feedback and not self.refine:
+            found, allowed = "nothing is refined", "it says what refined frames look back on"
+            fail("--feedback", found, allowed, "add --refine N, or leave it out: --quality hero has both")
         if self.refined_output not in REFINED_OUTPUTS:
             fail("--refined-output", f"'{self.refined_output}'", f"it is one of {', '.join(REFINED_OUTPUTS)}")
         if self.lbs and self.keep:

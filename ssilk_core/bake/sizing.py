@@ -80,7 +80,8 @@ def _at_quality(request: BakeRequest, quality: str | None, budget: str | None) -
             "leave one of them out",
         )
     if quality:
-        request = replace(request, refine=request.refine or quality_named(quality).refine)
+        level = quality_named(quality)
+        request = replace(request, refine=request.refine or level.refine, feedback=request.feedback or level.feedback)
     if budget and request.refine:
         fail(
             "--budget",

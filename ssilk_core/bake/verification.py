@@ -107,7 +107,8 @@ def verify_file(rollout: BakeRollout, path: Path, report: Reporter) -> Verificat
     """Check a file and compare it, re-skinned by its format's rules alone, with the rollout that it should hold.
 
     Points of an earlier refinement are compared by energy (`verify_energies`), unless the rollout has its own. Joints
-    of one are compared with the refined points, with the tolerance that they were fitted with.
+    of one are compared with the refined points, with the tolerance that they were fitted with. With feedback they are
+    compared when they are baked, and not later.
 
     Raises:
         VerificationError: a check fails, or a vertex is further off than allowed.
@@ -125,6 +126,10 @@ def verify_file(rollout: BakeRollout, path: Path, report: Reporter) -> Verificat
         and rollout.refinement is None
         and not rollout.request.writes_points
     ):
+        if rollout.request.feedback:
+            # Frames depend on all before them: the last digits of another machine grow to millimetres in seconds.
+            report(Message(f"{path}: it was compared with the solver's points when it was baked, and is not now"))
+            return Verification(frames=len(times))
         return compare_trajectories(shot, refined_points(rollout, report), samples_per_frame=samples)
     expected = rollout.vertices(report) if shot.is_skinned else rollout.points(report)
     found = compare_points(shot, expected, samples_per_frame=samples)

@@ -192,6 +192,11 @@ def _add_output(verb: argparse.ArgumentParser) -> None:
         help="iterations of the simulator's solver in each frame, from the network's state (default 0)",
     )
     verb.add_argument(
+        "--feedback",
+        action="store_true",
+        help="refined frames look back on refined ones: the garment moves as the solver has it, not as the network",
+    )
+    verb.add_argument(
         "--refined-output",
         choices=REFINED_OUTPUTS,
         default=REFINED_OUTPUTS[0],
@@ -244,6 +249,7 @@ def requests_of(options: argparse.Namespace) -> list[BakeRequest]:
             target=options.target,
             lbs=options.lbs,
             refine=options.refine,
+            feedback=options.feedback,
             refined_output=options.refined_output,
             hide_covered=options.hide_covered,
             device=options.device,

@@ -11,8 +11,8 @@ below the network's. The previous states for inertia are
   starts from the network's state, or from that plus the last correction, whichever has less energy. With enough
   iterations this is the simulator.
 
-The first frame of a shot, and after a cut, is quasi-static with feedback. Without feedback its previous states are
-itself at rest: without any inertia the next frame would jump back.
+The first frame of a shot, and after a cut, is quasi-static with feedback, and solved to the end: the shot goes on
+from it. Without feedback its previous states are itself at rest: without any inertia the next frame would jump back.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ class RefineOptions:
     """How much a shot is refined.
 
     Attributes:
-        iterations: maximum number of Newton iterations in each frame.
+        iterations: maximum number of Newton iterations in each frame; those of the first one with feedback are not
+            limited so.
         feedback: use refined frames as previous states instead of the network's.
         batch: frames refined at once; one with feedback.
         tolerance: see `SolverOptions`.
@@ -62,6 +63,13 @@ class RefineOptions:
     @property
     def solver(self) -> SolverOptions:
         return SolverOptions(iterations=self.iterations, tolerance=self.tolerance)
+
+    @property
+    def first_solver(self) -> SolverOptions:
+        """Options for the first frame of a shot."""
+        if not self.feedback:
+            return self.solver
+        return SolverOptions(iterations=max(self.iterations, SolverOptions.iterations), tolerance=self.tolerance)
 
 
 @dataclass(frozen=True)
@@ -180,11 +188,11 @@ class Refiner:
         self, before: State, tail: _Tail | None, world: Tensor, poses: PosedCharacters, inputs: StepInputs
     ) -> Tensor:
         """Return the solver's positions relative to the roots (V, 3, N)."""
-        start = before.x
+        start, solver = before.x, self.options.solver if tail else self.options.first_solver
         if tail and self.options.feedback:
             corrected = self.simulator.apply_pins(world + tail.correction - poses.root, poses)
             start = self.simulator.best_start([start, corrected], inputs)
-        return minimise_from(self.potential, start, inputs, self.options.solver).x
+        return minimise_from(self.potential, start, inputs, solver).x
 
     def _history(self, tail: _Tail | None, world: Tensor, poses: PosedCharacters) -> StepHistory | None:
         """Return the previous states of consecutive frames."""

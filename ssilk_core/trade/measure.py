@@ -85,6 +85,7 @@ class VariantMeter:
             self.take_set,
             fps=variant.fps,
             refine=variant.refine,
+            feedback=variant.feedback,
             simulated=variant.simulated,
         )
         tally = self._tally(method, self.whole)

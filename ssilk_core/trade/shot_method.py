@@ -33,6 +33,7 @@ class ShotMethod:
         fps: frame rate of the shot [1/s]. Poses of garment and character are interpolated between frames, as in USD.
         refine: solver iterations per frame; 0 for no refinement. Frames of a solver are played as a bake stores them:
             as joints and blendshapes of the shot's own, or as points where these cannot reach them.
+        feedback: as in `RefineOptions`.
         simulated: let the simulator compute the frames.
 
     Attributes:
@@ -49,10 +50,12 @@ class ShotMethod:
         *,
         fps: float,
         refine: int = 0,
+        feedback: bool = False,
         simulated: bool = False,
     ) -> None:
         self.name, self.player, self.dressed, self.take_set, self.fps = name, player, dressed, take_set, fps
-        self.options, self.simulated = RefineOptions(iterations=refine) if refine else None, simulated
+        self.options = RefineOptions(iterations=refine, feedback=feedback) if refine else None
+        self.simulated = simulated
         self.solving: list[float] = []
         self.shots: dict[int, Decomposition] = {}
         self._points = lru_cache(1)(self._take)

@@ -42,6 +42,7 @@ class Variant:
         precision: precision of the parameters, one of `PRECISIONS`.
         fps: frame rate of the shot [1/s].
         refine: solver iterations per frame.
+        feedback: refined frames look back on refined ones.
         simulated: the simulator computes the shot, without the network.
     """
 
@@ -51,6 +52,7 @@ class Variant:
     precision: str = "float32"
     fps: float
     refine: int = 0
+    feedback: bool = False
     simulated: bool = False
 
     @property
@@ -105,4 +107,5 @@ def _levels(base: Variant, *, solved: bool) -> Iterator[Variant]:
         if solved or not level.refine:
             kept, fps = level.size.within(base.size), level.rate(base.fps)
             reduced = replace(base, swept="level", precision="int16")  # as 'ssilk reduce' writes models
-            yield replace(reduced, name=level.name, size=kept, fps=fps, refine=level.refine)
+            reduced = replace(reduced, refine=level.refine, feedback=level.feedback)
+            yield replace(reduced, name=level.name, size=kept, fps=fps)

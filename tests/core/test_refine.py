@@ -88,6 +88,14 @@ def test_with_feedback_it_becomes_the_simulator(scene, rollout) -> None:
     assert np.abs(alone - expected).max() > 1e-3
 
 
+def test_with_feedback_a_shot_begins_at_rest(scene, rollout) -> None:
+    motion, points = rollout
+    _, changes = refined(scene, motion, points, iterations=1, feedback=True)
+    assert changes[0].residual < RefineOptions(iterations=1).tolerance < changes[1].residual
+    _, alone = refined(scene, motion, points, iterations=1)
+    assert alone[0].residual > changes[0].residual
+
+
 def test_a_cut_is_not_looked_back_over(scene, rollout) -> None:
     motion, points = rollout
     moved = motion.translations.copy()

@@ -133,6 +133,20 @@ def test_the_level_for_heroes_is_refined(there, capsys):
     assert detail["refined: iterations"] > 0 and Shot("hero.usda").is_skinned
 
 
+def test_with_feedback_the_cloth_goes_on_from_refined_frames(there, capsys):
+    words = ["--refine", "3", "--refined-output", "points", "--feedback"]
+    assert main([*BAKE, "-o", "feedback.usda", *words]) == 0
+    away = np.linalg.norm(points_of("feedback.usda") - points_of("points.usda"), axis=-1).max(axis=1)
+    assert away[-1] > 1e-4, "in points.usda each frame looks back on the network's"
+    assert main(["verify", "feedback.usda"]) == 0
+    assert main([*BAKE, "-o", "level.usda", "--quality", "hero"]) == 0
+    assert main([*BAKE, "-o", "said.usda", "--refine", "4", "--feedback"]) == 0
+    np.testing.assert_array_equal(points_of("level.usda"), points_of("said.usda"))
+    capsys.readouterr()
+    assert main(["verify", "said.usda"]) == 0
+    assert "it was compared with the solver's points when it was baked" in capsys.readouterr().err
+
+
 def test_samples_within_frames_are_refined_too(there):
     request = BakeRequest(model="model.safetensors", stage="rigged.usda", motion="brief.usda")
     bake(replace(request, refine=1, refined_output="points", feedback=True, samples_per_frame=2), "blurred.usda")
@@ -145,6 +159,7 @@ def test_samples_within_frames_are_refined_too(there):
     [
         (["--refine", "-1"], "a whole number from 0 to 10000"),
         (["--refine", "2", "--budget", "1MB"], "a budget for refined frames"),
+        (["--feedback"], "--feedback: nothing is refined"),
     ],
 )
 def test_what_cannot_be_done_is_refused(there, capsys, words, complaint):
