@@ -60,7 +60,13 @@ class CollisionBody:
 
     @torch.no_grad()
     def pose(
-        self, character: Tensor, *, surface: bool = True, exact: bool = False, buried: Tensor | None = None
+        self,
+        character: Tensor,
+        *,
+        surface: bool = True,
+        exact: bool = False,
+        limbs: bool = True,
+        buried: Tensor | None = None,
     ) -> PosedBody:
         """Pose the body with skinning matrices (J, 3, 4, N); normals rotate with the blended matrices.
 
@@ -69,10 +75,11 @@ class CollisionBody:
                 limbs.
             exact: whether that of cloth with a patch of its own is the exact one too, not one around the nearest
                 vertex (`PosedBody.rings`).
+            limbs: whether loose cloth meets limbs that went through it.
             buried: limbs that do not count, where they are known (`LimbPoser.buried`).
         """
         points, normals = self.skin.surface(self.points[:, :, 0], self.normals[:, :, 0], character)
         rings = self.rings if surface and not exact else None
         faces, patches = (self.faces, self.patches) if surface and len(self.faces) else (None, None)
-        limbs = self.limbs.pose(character, buried) if self.limbs and surface else None
-        return PosedBody(points, normals, rings, self.groups, faces, patches, limbs)
+        axes = self.limbs.pose(character, buried) if self.limbs and limbs and surface else None
+        return PosedBody(points, normals, rings, self.groups, faces, patches, axes)

@@ -11,13 +11,13 @@ keep apart.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from .. import kernels
 from ..assets import LOOSE, Body, Floats, Ints, Mesh, Scene, Skeleton
 from ..mesh import topology
 from ..skinning import Skinning, transform_points
@@ -28,6 +28,8 @@ RADIUS_PERCENTILE = 90  # of the distances of a bone's skin from its line
 MIN_LENGTH = 1e-6  # [m], so that a bone of no length has a direction
 # Of the body's diagonal. Nothing is buried in skin so near to a tip at rest: the fingers of a fist lie in its palm.
 TIP_REACH = 0.1
+FRAMES_AT_ONCE = 256
+MAX_PAIRS = 1 << 21  # of points and triangles in all frames at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +162,11 @@ class PosedLimbs:
 
 
 class LimbPoser:
-    """Poses the axes of a body's limbs with skinning matrices."""
+    """Poses the axes of a body's limbs with skinning matrices.
+
+    Args:
+        body: all of it, also where only a part collides.
+    """
 
     def __init__(self, axes: LimbAxes, body: Body, device: torch.device) -> None:
         def tensor(values: Floats) -> Tensor:
@@ -169,12 +175,12 @@ class LimbPoser:
         self._joints = torch.as_tensor(axes.joints, device=device).T
         self._ends = tensor(axes.ends).transpose(0, 1)[..., None]
         self._radii, self._beyond = tensor(axes.radii), tensor(axes.beyond)
-        self._paths = torch.as_tensor(axes.paths, device=device)
-        self._caster = None
+        self._paths, self._last = (torch.as_tensor(each, device=device) for each in (axes.paths, axes.last))
+        self._faces = None
         if part := _away_from_tips(body, axes):
+            self._faces = torch.as_tensor(np.array(part.mesh.faces), device=device)
             self._rest, self._skin = tensor(part.mesh.points), Skinning(part.skin).to(device)
-            self._caster = RayCaster(part.mesh, device=device)
-            self._at_rest = self._inside(self._caster, (self._ends[0], self._ends[1]), self._rest[..., None])
+            self._at_rest = inside(self._ends[1, self._last], self._rest[..., None], self._faces)
 
     def pose(self, character: Tensor, buried: Tensor | None = None) -> PosedLimbs:
         """Pose the axes with skinning matrices (J, 3, 4, N).
@@ -182,39 +188,43 @@ class LimbPoser:
         Args:
             buried: the result of `buried` in these frames, where it is known.
         """
-        start, end = self._bones(character)
+        start, end = (transform_points(character[joints], at) for joints, at in zip(self._joints, self._ends))
         buried = self.buried(character) if buried is None else buried
         return PosedLimbs(start, end, self._radii, self._paths, self._beyond, buried)
 
     @torch.no_grad()
     def buried(self, character: Tensor) -> Tensor:
-        """Tell which limbs have their tip in another part of the body, bool (L, N).
+        """Tell which limbs have their tip in another part of the body, and not so in the bind pose, bool (L, N).
 
-        Their axes cross the skin an odd number of times more, or less, than in the bind pose. Skin near tips does not
-        count.
+        Skin near the tips of limbs does not count.
         """
-        if self._caster is None:
+        if self._faces is None:
             return torch.zeros(len(self._paths), character.shape[-1], dtype=torch.bool, device=character.device)
-        skin = self._skin(self._rest, None, self._skin.weights, character)
-        return self._inside(self._caster, self._bones(character), skin) ^ self._at_rest
+        joints = self._joints[1, self._last]
+        found = []
+        for part in character.split(FRAMES_AT_ONCE, dim=-1):
+            skin = self._skin(self._rest, None, self._skin.weights, part)
+            found.append(inside(transform_points(part[joints], self._ends[1, self._last]), skin, self._faces))
+        return torch.cat(found, dim=1) & ~self._at_rest
 
-    def _bones(self, character: Tensor) -> tuple[Tensor, Tensor]:
-        start, end = (transform_points(character[joints], at) for joints, at in zip(self._joints, self._ends))
-        return start, end
 
-    def _inside(self, caster: RayCaster, bones: tuple[Tensor, Tensor], skin: Tensor) -> Tensor:
-        """Tell which axes, along bones with starts and ends (M, 3, N), cross skin (V, 3, N) an odd number of times.
+def inside(points: Tensor, x: Tensor, faces: Tensor) -> Tensor:
+    """Tell which points (P, 3, N) lie inside a surface with the vertices x (V, 3, N), bool (P, N).
 
-        Returns:
-            bool (L, N).
-        """
-        if kernels.supports(skin):
-            from ..kernels.crossings import crossings_kernel
-
-            counts, _ = crossings_kernel(*bones, skin, caster.faces)
-        else:
-            counts, *_ = caster.crossings(*bones, skin)
-        return along_paths(counts, self._paths).sum(1) % 2 == 1
+    There its winding number is more than a half: the sum of the solid angles of the triangles over 4 pi (van Oosterom
+    and Strackee, 1983). A hole takes away its solid angle alone.
+    """
+    count, frames = len(points), x.shape[2]
+    winding = x.new_zeros(count, frames)
+    step = max(1, MAX_PAIRS // max(1, count * frames))
+    for some in faces.split(step):
+        a, b, c = (x[corner] - points[:, None] for corner in some.T)  # (P, F, 3, N)
+        lengths = [each.norm(dim=2) for each in (a, b, c)]
+        volume = (a * torch.linalg.cross(b, c, dim=2)).sum(2)
+        other = lengths[0] * lengths[1] * lengths[2]
+        other += (a * b).sum(2) * lengths[2] + (b * c).sum(2) * lengths[0] + (c * a).sum(2) * lengths[1]
+        winding += torch.atan2(volume, other).sum(1) / (2 * math.pi)
+    return winding.abs() > 0.5
 
 
 def _away_from_tips(body: Body, axes: LimbAxes) -> Body | None:

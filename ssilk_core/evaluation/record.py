@@ -67,7 +67,7 @@ def frame_energies(
 ) -> dict[str, Tensor]:
     """Return `energy.frames.energy_terms` of the last frames of a path (V, 3, past + N), shape (N,)."""
     x, character = path[..., -len(frames) :], take_set.character(take, frames)
-    body, joined = dressed.body.pose(character, exact=dressed.exact), path[..., -len(frames) - 2 :]
+    body, joined = dressed.body.pose(character, exact=dressed.exact, limbs=False), path[..., -len(frames) - 2 :]
     down = x.new_tensor([0.0, -1.0, 0.0])
     return energy_terms(dressed.energy, x, dressed.lbs(character), dressed.contacts, body, joined, dressed.fps, down)
 

@@ -19,7 +19,6 @@ from .newton_distance import NewtonDistance
 from .windows import WindowSampler
 
 Terms = dict[str, Tensor]
-POSED_AT_ONCE = 1024  # frames, to find limbs that do not count
 REGULARIZATION = "latent regularization"  # a term of latents, which has no frames
 
 
@@ -34,6 +33,8 @@ class Objective:
             because training cannot move them.
         newton_weight: see `NewtonDistance`; zero for the energy alone.
         clearance: see `config.TrainConfig` [m].
+        buried: limbs that do not count in each frame of the bank, bool (L, F), where they are known
+            (`LimbPoser.buried`).
     """
 
     def __init__(
@@ -45,19 +46,15 @@ class Objective:
         surface: bool = True,
         newton_weight: float = 0.0,
         clearance: float = 0.0,
+        buried: Tensor | None = None,
     ) -> None:
         self.model, self.energy, self.bank = model, energy, bank
-        self.surface, self.clearance = surface, clearance
+        self.surface, self.clearance, self.buried = surface, clearance, buried
         self.body, device = body, bank.static.device
         if body:
             self.contacts = Contacts(
                 model.scene, energy.cloth.samples, vertices=body.vertices, pinned=False, device=device
             )
-        # A property of poses: found once, not in each step.
-        self.buried = None
-        if body and body.limbs and surface:
-            every = torch.arange(bank.frame_count, device=device).split(POSED_AT_ONCE)
-            self.buried = torch.cat([body.limbs.buried(bank.character(frames)) for frames in every], dim=1)
         self.skin = None
         if len(tethered := energy.tethered.cpu().numpy()):
             skin = model.scene.lbs_skin

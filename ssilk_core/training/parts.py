@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
+from torch import Tensor
 
 from ..collision import CollisionBody, limb_axes, reachable_body
 from ..config import TrainConfig
@@ -22,6 +24,8 @@ from .shape_smoothing import ShapeSmoothing
 from .step import Stepper
 from .validation import Validator
 from .windows import WindowSampler
+
+POSED_AT_ONCE = 1024  # frames, to find limbs that do not count
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +46,14 @@ class TrainingParts:
     device: torch.device
     group: ProcessGroup = SINGLE_PROCESS
     smoothing: ShapeSmoothing | None = None
+
+    @cached_property
+    def buried(self) -> Tensor | None:
+        """Limbs that do not count in each frame of the bank, bool (L, F): found once, not in each step."""
+        if self.body is None or self.body.limbs is None:
+            return None
+        every = torch.arange(self.bank.frame_count, device=self.device).split(POSED_AT_ONCE)
+        return torch.cat([self.body.limbs.buried(self.bank.character(frames)) for frames in every], dim=1)
 
     def detail(self) -> dict[str, object]:
         """Return figures about the run, for messages."""
@@ -65,8 +77,9 @@ class TrainingParts:
         sampler = WindowSampler(self.bank, own, self.model.config.latent, generator)
         surface = config.closest_point == "triangles"
         objective = Objective(
-            self.model, self.energy, self.body, self.bank, surface, config.newton_weight, config.clearance
-        )
+            self.model, self.energy, self.body, self.bank, surface, config.newton_weight, config.clearance,
+            self.buried if surface else None,
+        )  # fmt: skip
         average = group.average if group.size > 1 else None
         return Stepper(self.model, objective, sampler, own, average, self.smoothing)
 

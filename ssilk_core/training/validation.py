@@ -215,7 +215,7 @@ class Validator:
                 quiet = model.initial(self.bank.static_descriptor(frames[window], direction))
                 still = model.vertices(quiet, character)
             joined = x if tail is None else torch.cat([tail, x], dim=-1)
-            posed = self.body.pose(character)
+            posed = self.body.pose(character, limbs=False)
             terms = energy_terms(self.energy, x, lbs, self.contacts, posed, joined, self.fps, self.down)
             parts.append({**terms, "dynamics": ((x - still) ** 2).sum(1).mean(0)})
             tail = joined[..., -2:]

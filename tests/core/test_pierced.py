@@ -3,6 +3,7 @@
 
 import importlib.util
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,14 +12,13 @@ import trimesh
 
 from ssilk_core.assets import LOOSE, TIGHT, Body, Character, Mesh, Motion, Scene, Skeleton, SkinWeights
 from ssilk_core.collision import CollisionBody, Contacts, CoveredSkin, RayCaster, ShownCounts, limb_axes
-from ssilk_core.collision.limb_axes import MAX_RADIUS, LimbPoser, body_axes
+from ssilk_core.collision.limb_axes import MAX_RADIUS, LimbPoser, body_axes, inside
 from ssilk_core.collision.pierced import MARGIN, SLOPE, Piercing
 from ssilk_core.collision.samples import vertex_samples
-from ssilk_core.energy import GarmentEnergy
 from ssilk_core.fabrics import Fabric
-from ssilk_core.motion_bank import build_bank
 from ssilk_core.preflight.motion import buried_limbs
 from ssilk_core.simulate.incremental_potential import IncrementalPotential, StepInputs
+from ssilk_core.training import parts
 from ssilk_core.training.objective import Objective
 
 CPU = torch.device("cpu")
@@ -171,16 +171,62 @@ def test_preflight_tells_which_limbs_are_buried_in_which_motion(scene):
     assert not [*buried_limbs(whole, [apart])]
 
 
-def test_training_finds_buried_limbs_once_as_each_pose_does(toy_motion, toy_model, patched_scene):
-    scene, cpu = patched_scene, CPU
-    model, skeleton = toy_model(scene), scene.character.skeleton
-    bank = build_bank([toy_motion(scene, 30)], skeleton, model.joints, model.config.fps, cpu)
-    body = CollisionBody(*_body(scene), limbs=body_axes(_body(scene)[0], skeleton), device=cpu)
-    energy = GarmentEnergy(scene.garment.mesh, Fabric("toy"), scene.classes)
-    frames = torch.arange(bank.frame_count)
-    objective = Objective(model, energy, body, bank)
-    assert torch.equal(objective.buried, body.pose(bank.character(frames)).limbs.buried)
-    assert Objective(model, energy, body, bank, surface=False).buried is None
+def test_a_limb_that_bends_past_the_skin_near_its_tip_is_not_buried():
+    """An arm bent back onto itself: its axis leaves its own skin once, and where it would come back is too near."""
+    body, skeleton = arm()
+    axes, character = body_axes(body, skeleton), still(2)
+    turn = torch.tensor([[-1.0, 0, 0], [0, -1, 0], [0, 0, 1]])  # about the elbow
+    character[1, :, :3, 0], character[1, 0, 3, 0] = turn, LENGTH
+    character[1, 1, 3, 0] = 3 * RADIUS  # beside the upper arm
+    assert not LimbPoser(axes, body, CPU).buried(character).any()
+    character[1, 1, 3, 0] = 0  # the hand lies in the upper arm
+    assert LimbPoser(axes, body, CPU).buried(character).all()
+
+
+def test_what_is_inside_at_rest_does_not_count_as_buried(scene):
+    body, _ = with_board(dressed(scene, 0.7))
+    near = joints((0, 0, 0), (LENGTH / 2, 0, 0), (0, 0, 0), parents=(-1, 0, -1))
+    points = body.mesh.points - np.where(body.skin.indices == 2, [2 - LENGTH, 0, 0], 0)
+    pressed = replace(body, mesh=Mesh("/arm", points, body.mesh.faces))  # the hand lies in the board at rest
+    axes = body_axes(pressed, near)
+    hand = axes.tips.tolist().index(1)
+    assert not LimbPoser(axes, pressed, CPU).buried(still(3))[hand].any()
+
+
+def test_a_point_is_inside_where_the_surface_winds_around_it():
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.3)
+    x = torch.tensor(np.stack([ball.vertices, 2 * ball.vertices], axis=-1), dtype=torch.float32)
+    points = torch.tensor([[0.0, 0, 0], [0.28, 0, 0], [0.4, 0, 0], [0.7, 0, 0]])[..., None].expand(-1, -1, 2)
+    faces = torch.tensor(np.array(ball.faces))
+    for each in (faces, faces.flip(1), faces[faces.min(dim=1).values > 0]):  # closed, inside out, with a hole
+        found = inside(points, x, each)
+        assert found.tolist() == [[True, True], [True, True], [False, True], [False, False]]
+
+
+def test_training_leaves_buried_limbs_out_as_each_pose_does(monkeypatch, scene):
+    """Frames of the arm through a sheet, in some of which its hand lies in a board."""
+    whole = dressed(scene, 0.7)
+    body, skeleton = with_board(whole)
+    axes = body_axes(body, skeleton)
+    hand = axes.tips.tolist().index(1)
+    poser, character = LimbPoser(axes, body, CPU), still(3, 5)
+    character[2, 0, 3] = torch.tensor([0.0, LENGTH - 2, 0.0, LENGTH - 2, 0.0])
+    bank = SimpleNamespace(frame_count=5, character=lambda frames: character[..., frames])
+    collision = CollisionBody(body, 3, limbs=axes, device=CPU)
+    monkeypatch.setattr(parts, "POSED_AT_ONCE", 2)
+    found = parts.TrainingParts(None, bank, None, collision, None, 0, CPU).buried
+    assert torch.equal(found, poser.buried(character))
+    assert found[hand].tolist() == [False, True, False, True, False]
+    assert parts.TrainingParts(None, bank, None, None, None, 0, CPU).buried is None
+
+    objective = Objective.__new__(Objective)  # only what finds planes
+    objective.body, objective.surface, objective.clearance, objective.buried = collision, True, 0.0, found
+    objective.contacts = Contacts(whole, vertex_samples(whole.garment.mesh.vertex_count), device=CPU)
+    x = torch.tensor(whole.garment.mesh.points, dtype=torch.float32)[..., None] - torch.tensor([0.4, 0, 0])[:, None]
+    frames = torch.tensor([1, 0])
+    normal, _ = objective._planes(x.expand(-1, -1, 2), character[..., frames], objective._buried(frames))
+    pushed = ((normal[:, 0] - SLOPE).abs() < 1e-6).any(0)
+    assert pushed.tolist() == [False, True]
 
 
 def test_pierced_cloth_is_pushed_along_the_limb_by_the_energy_of_its_depth(scene):

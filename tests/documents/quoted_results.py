@@ -8,7 +8,6 @@ from functools import partial
 from itertools import product
 from statistics import mean
 
-from ssilk_core.collision.pierced import SLOPE
 from ssilk_core.config import PRESETS, ModelConfig
 from ssilk_core.demo.shipped import shipped_path
 from ssilk_core.energy import TERMS
@@ -174,6 +173,9 @@ def shown() -> Text:
     assert all(own[split]["network"]["worst"] < own[split][SKINNING]["worst"] for own, split in splits)
 
 
+LOOSE = ("cape", "fringe_skirt", "hooded_dress")
+
+
 def limbs() -> Text:
     hands = result("shown_skin_hands")
     for garment in ("cape", "hooded dress", "fringe skirt"):
@@ -197,17 +199,24 @@ def limbs() -> Text:
                 " / ".join(fixed(one["stretch"], 3) for one in found),
             )  # fmt: skip
             yield f"the {at['frames']} frames are refined"
-    trainings = ("slope 0, seed 0", "slope 0.05, seed 0", "slope 0.2, seed 0", "slope 0.2, seed 1")
-    for name, runs in result("limb_training").items():
-        kept = [
-            mean(at for count, at in zip(own["iterations"], own["limbs"]) if 9600 <= count <= 14_400)
-            for own in (runs[training] for training in trainings)
-        ]
-        assert max(kept[2:]) < kept[0], "the document says so"
-        yield row(name.replace("_", " "), *map(share_1, kept))
-    yield "in the validations between 9,600 and 14,400 iterations"
-    yield f"0.05 | {SLOPE} (as it is) | {SLOPE}, another seed"
-    yield "`--set iterations=16000`"
+    trained, less = result("shown_skin_long"), 0
+    for garment in LOOSE:
+        cells_of = []
+        for split in HELD_OUT:
+            now, then = (found[garment][split]["network"]["pierced"] for found in (trained, hands))
+            cells_of += [then, now]
+            less += now < then
+        yield row(garment.replace("_", " "), *map(share_1, cells_of))
+    yield f"It is less in {less} of {len(LOOSE) * len(HELD_OUT)} cells"
+    long = result("long_training")
+    kept = [kept_at(long[name])[0] for name in ("cape_seed_1", "fringe_skirt_seed_2", "hooded_dress_seed_2")]
+    counts = [long["cape"]["iterations"][at] for at in kept]
+    yield f"with the remedy, for {min(counts):,} to {max(counts):,} iterations"
+    drops = [
+        1 - trained["hooded_dress"][split]["network"]["pierced"] / hands["hooded_dress"][split]["network"]["pierced"]
+        for split in ("valid", "test")
+    ]
+    assert min(drops) > 1 / 5 and max(drops) < 1 / 3, "the document says so"
 
 
 def worst_frames() -> Text:
@@ -260,52 +269,10 @@ def clearance() -> Text:
         yield f"{ends[0]} to {ends[1]} J for the {garment}"
 
 
-LOOSE = ("cape", "fringe_skirt", "hooded_dress")
-
-
 def kept_at(run: dict) -> tuple[int, str]:
     """Return the best validation of a training, and at which of its iterations that was."""
     best = run["total"].index(min(run["total"]))
     return best, f"{run['iterations'][best]:,} of {run['iterations'][-1]:,}"
-
-
-def less_skin(now: dict, before: dict) -> Text:
-    """Yield in how many cells, of a loose garment and a split, less skin shows under the network."""
-    cells_of = list(product(LOOSE, HELD_OUT))
-    for figure, words in (("mean", "the mean"), ("worst", "the worst frame")):
-        less = sum(now[n][s]["network"][figure] < before[n][s]["network"][figure] for n, s in cells_of)
-        yield f"{words} is lower in {less} of {len(cells_of)} cells"
-
-
-def moving() -> Text:
-    runs, skins = result("moving_training"), (result("shown_skin_moving"), result("shown_skin_turning"))
-    for name in LOOSE:
-        for skin, ending, words in ((skins[1], "_turning", "turn"), (skins[0], "", "turn and move")):
-            run, own = runs[name + ending], [skin[name][split]["network"] for split in HELD_OUT]
-            best, kept = kept_at(run)
-            pairs = (f"{share_3(at['mean'])}, {share_1(at['worst'])}" for at in own)
-            yield row(name.replace("_", " ") if ending else "", words, kept, f"{run['total'][best]:.4f}", *pairs)
-    yield from less_skin(*skins)
-
-
-def contact() -> Text:
-    trainings = result("moving_training"), result("contact_training"), result("tight_training")
-    skins = result("shown_skin_moving"), result("shown_skin_loose"), result("shown_skin_shipped")
-    for name in LOOSE:
-        for words, runs, skin in zip(("neither", "loose cloth", "both"), trainings, skins):
-            run, own = runs[name], [skin[name][split]["network"] for split in HELD_OUT]
-            best, kept = kept_at(run)
-            pairs = (f"{share_3(at['mean'])}, {share_1(at['worst'])}" for at in own)
-            figures = (f"{run[term][best]:.3f}".replace("-", "−") for term in ("total", "stretch", "gravity"))
-            yield row(name.replace("_", " ") if words == "neither" else "", words, kept, *figures, *pairs)
-    for before in skins[:2]:
-        yield from less_skin(skins[2], before)
-    dress = trainings[2]["hooded_dress"]
-    best = kept_at(dress)[0]
-    yield f"falls to {dress['stretch'][best]:.3f} J with both, and the total to {dress['total'][best]:.3f} J"
-    ends = [{n: run["total"][-1] / min(run["total"]) for n, run in runs.items()} for runs in trainings[1:]]
-    yield ", ".join(f"{name.replace('_', ' ')} {ends[0][name]:.2f}" for name in LOOSE)
-    yield f"at most {max(ends[1].values()):.2f} times the best in all {len(ends[1])} garments"
 
 
 def from_solver(name: str, split: str) -> dict:
@@ -536,23 +503,45 @@ def wardrobe() -> Text:
 
 
 def long_training() -> Text:
-    runs = result("long_training")
+    runs, norms, stopped = result("long_training"), result("matrix_norms"), result("norm_training")
     for name, run in runs.items():
-        words = name.replace("_light", ", `light`").replace("_seed", ", seed").replace("_", " ")
-        best, kept = kept_at(run)
-        totals = (f"{run['total'][at]:.4f}".replace("-", "−") for at in (best, -1))
-        yield row(words, kept, duration(run["seconds"][-1]), *totals)
-    cape = runs["cape"]
-    yield f"{cape['iterations'][1] - cape['iterations'][0]:,} iterations after it most is won"
-    moved = []
-    for run in (cape, runs["cape_seed_1"], runs["hooded_dress"], runs["fringe_skirt"]):
-        best = run["total"].index(min(run["total"]))
-        moved.append("{:.0f}, {:.0f} and {:.0f} mm".format(*(1000 * run["dynamics"][at] for at in (1, best, -1))))
-    yield "cape {}; cape, seed 1, {}; hooded dress {}; fringe skirt {}".format(*moved)
-    risen = cape["gravity"][-1] - cape["gravity"][cape["total"].index(min(cape["total"]))]
-    yield f"its gravity grows by {risen:.3f} J"
-    ends = {name: run["total"][-1] - min(run["total"]) <= 0.1 * abs(min(run["total"])) for name, run in runs.items()}
-    assert ends["hooded_dress"] and ends["fringe_skirt"] and not (ends["cape"] or ends["cape_seed_1"])
+        yield training_row(run, name.replace("_seed_", ", seed ").replace("_", " "))
+    within = [name for name, run in runs.items() if "cape" not in name and relative_rise(run) <= 0.1]
+    assert len(within) == 5 and "fringe_skirt_seed_1" not in within, "the document says so"
+    yield f"The skirt of seed 1 rises by {share(relative_rise(runs['fringe_skirt_seed_1']))} % of it"
+    capes = [runs[name] for name in ("cape", "cape_seed_1", "cape_seed_2")]
+    assert min(capes[0]["total"]) == capes[0]["total"][-1], "still falling"
+    best = (f"{min(run['total']):.4f}".replace("-", "−") for run in capes[1:])
+    yield "were at {} and {} J, and\n  are at {:.2f} and {:.2f} J".format(
+        *best, *(run["total"][-1] for run in capes[1:])
+    )
+    last = runs["cape"]["iterations"].index(28_800)
+    totals = [run["total"][last] for run in capes]
+    yield "After 28,800 iterations the totals of the capes are {:.2f}, {:.2f} and {:.2f} J".format(*totals)
+    assert all(run["stretch"][last] + run["inertia"][last] > run["total"][last] / 2 for run in capes)
+    after = runs["cape"]["iterations"].index(38_400)
+    yield f"back to {max(run['total'][after] for run in capes):.4f} J and\n  less by iteration 38,400"
+    long, ships = norms["cape_long"], norms["cape"]
+    yield f"matrix of P is {max(long['P']):.1f} in the cape of seed 1, of D {max(long['D']):.1f}, and"
+    yield f"{max(ships['P']):.1f} and\n  {max(ships['D']):.1f} in the cape that ships"
+    yield f"kept after {ships['iteration']:,} iterations"
+    yield f"Those of S stay: {max(long['S']):.1f} and {max(ships['S']):.1f}"
+    for name in ("fringe_skirt", "hooded_dress"):
+        assert all(max(norms[f"{name}_long"][part]) > 1.4 * max(norms[name][part]) for part in "PD")
+    (count,) = {at["iteration"] for at in stopped.values()}
+    inertia = {name: f"{at['inertia']:.3f}" for name, at in stopped.items()}
+    none = [inertia[f"none, seed {seed}"] for seed in range(3)]
+    yield f"after {count:,} static iterations, when the three above had an inertia of {none[0]}, {none[1]} and"
+    yield f"{none[2]} J. With"
+    yield f"it is {inertia['norm 2, seed 0']} and {inertia['norm 2, seed 2']} J"
+    yield f"with 1.5 times that root {inertia['norm 1.5, seed 0']} J (seed 0)"
+    yield f"with `weight_decay=1` {inertia['weight_decay=1, seed 2']} J (seed 2)"
+    least = [min(min(run["total"]) for name, run in runs.items() if garment in name) for garment in LOOSE[1:]]
+    yield "with {:.4f} and {:.4f} J".format(*least)
+    shipped_totals = (
+        min(result(f"{kind}_training")[name]["total"]) for kind, name in zip(("limits", "tight"), LOOSE[1:])
+    )
+    assert all(now < then for now, then in zip(least, shipped_totals)), "the document says so"
 
 
 def training_row(run: dict, *cells: str) -> str:
@@ -993,7 +982,7 @@ def scenes() -> Text:
 
 
 PARTS = (
-    opening, conditions, shown, limbs, worst_frames, clearance, moving, contact, from_own_start, missed_steps,
+    opening, conditions, shown, limbs, worst_frames, clearance, from_own_start, missed_steps,
     moving_states,
     static_states, table1,
     findings, dynamics,
