@@ -35,11 +35,12 @@ LEAD = 1.0  # [s] of a motion before its shot that are rolled out, so that the g
 
 @dataclass(frozen=True, eq=False)
 class _ReadMotion:
-    """A motion as it was read, the shot's samples of it, how many come before them, and which frames these are;
-    and at which of them the character becomes hidden (True) or visible (False)."""
+    """A motion as it was read, the shot's samples of it, the same with those before them, how many these are, and which
+    frames the shot's are; and at which the character becomes hidden (True) or visible (False)."""
 
     source: Motion
     sampled: Motion
+    whole: Motion
     lead: int
     frames: FrameRange | None
     hidden: list[tuple[int, bool]]
@@ -90,6 +91,7 @@ class LoadedGarment:
             deformer=kept.deformer,
             motion=read.sampled,
             source=source,
+            whole=read.whole,
             lead=read.lead,
             frames=read.frames,
             hidden=read.hidden,
@@ -111,6 +113,7 @@ class LoadedGarment:
         if frames is None:
             source = read_motion(request.motion, character.skeleton, root=root)
             sampled, begun, handles = _sampled(source, (request.fps or source.fps) * samples, np.zeros(1)), 0, 0
+            whole = sampled
         else:
             fps = (request.fps or frames.fps) * samples
             rate, handles = fps / frames.fps, frames.before * samples
@@ -122,10 +125,11 @@ class LoadedGarment:
             later = max(min(_ceil(last / rate), frames.later), frames.count)
             within = (frames.first - earlier * frames.step, frames.first + later * frames.step)
             source = read_motion(request.motion, character.skeleton, root=root, within=within)
-            sampled = _sampled(source, fps, earlier + np.arange(-handles, last + 1) / rate)
-            sampled = replace(sampled, start=frames.first / frames.step * fps / frames.fps - handles)
+            whole = _sampled(source, fps, earlier + np.arange(-begun, last + 1) / rate)
+            whole = replace(whole, start=frames.first / frames.step * fps / frames.fps - begun)
+            sampled = whole.clip(begun - handles, whole.frame_count)
         hidden = read_hidden(request.motion, sampled, root=root)
-        return _ReadMotion(source, sampled, begun - handles, frames, hidden)
+        return _ReadMotion(source, sampled, whole, begun - handles, frames, hidden)
 
     def _cut(self, motion: Motion) -> tuple[LoadedGarment, SizeReduction]:
         """Return the garment cut to the size that the request keeps, so as to be best for this motion."""

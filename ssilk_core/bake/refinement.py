@@ -69,10 +69,15 @@ def refined_points(rollout: BakeRollout, report: Reporter = silent) -> Iterator[
 
 
 def _refined_frames(rollout: BakeRollout, report: Reporter) -> Iterator[RefinedFrame]:
-    told = Countdown(rollout.motion.frame_count, report)
-    for frame in _refiner(rollout).frames(rollout.motion, rollout.network_vertices()):
+    left_out, played = 0, rollout
+    if rollout.request.feedback:  # the cloth is on its way when the shot begins
+        left_out, played = rollout.lead, rollout.with_lead()
+        report(Message("the solver puts the garment to rest first, which takes as long as many frames"))
+    told = Countdown(played.motion.frame_count, report)
+    for number, frame in enumerate(_refiner(played).frames(played.motion, played.network_vertices())):
         told()
-        yield frame
+        if number >= left_out:
+            yield frame
 
 
 def _decomposed(rollout: BakeRollout, points: Sequence[Floats], add_shapes: bool) -> Decomposition:

@@ -96,7 +96,7 @@ class BakeRequest:
         if not 0 <= self.refine <= MAX_REFINE or int(self.refine) != self.refine:
             fail("--refine", f"{self.refine:g} iterations", f"1 to {MAX_REFINE} are allowed, or 0 for none")
         if self.feedback and not self.refine:
-            found, allowed = "nothing is refined", "it says what refined frames look back on"
+            found, allowed = "no --refine", "it says what refined frames look back on"
             fail("--feedback", found, allowed, "add --refine N, or leave it out: --quality hero has both")
         if self.refined_output not in REFINED_OUTPUTS:
             fail("--refined-output", f"'{self.refined_output}'", f"it is one of {', '.join(REFINED_OUTPUTS)}")

@@ -33,8 +33,8 @@ class Verification:
     """How a written shot compares with what was computed.
 
     Points that an earlier bake refined are judged by energy instead: no frame has more than the network's state.
-    Joints and blendshapes that stand for refined, simulated or cached points are compared with these. Those that were
-    refined with feedback are compared when they are baked, and checked for being valid later.
+    Joints and blendshapes that stand for refined, simulated or cached points are compared with these. Shots that were
+    refined with feedback are later checked for being complete alone.
 
     Attributes:
         frames: samples of the shot.
@@ -59,7 +59,7 @@ class Verification:
                 "mean energy [J]": f"{self.mean_energy_j:.4g}",
             }
         if self.largest_error_m is None or self.allowed_error_m is None:
-            return {"frames": self.frames, "compared": "when it was baked"}
+            return {"frames that are complete": self.frames}
         rms = {} if self.rms_error_m is None else {"RMS error [mm]": f"{1000 * self.rms_error_m:.3g}"}
         return {
             **rms,

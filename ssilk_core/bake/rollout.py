@@ -51,6 +51,7 @@ class BakeRollout:
         model: the network; None under linear blend skinning.
         deformer: the garment as its target takes it.
         motion: the character's motion at the shot's samples; `source` is the motion as it was read.
+        whole: the same from the first sample on that is rolled out.
         lead: samples before the shot that are rolled out, at its rate.
         frames: which frames of the motion the shot plays; None for a pose without samples.
         hidden: at which frames of the motion the garment becomes hidden (True) or visible (False).
@@ -68,6 +69,7 @@ class BakeRollout:
     model: GarmentModel | None
     deformer: Deformer
     motion: Motion
+    whole: Motion
     source: Motion
     hidden: list[tuple[int, bool]]
     units: StageUnits
@@ -114,6 +116,10 @@ class BakeRollout:
             part = pose.part(shown)
             if part.frame_count:
                 yield replace(part, start=part.start - self.lead)
+
+    def with_lead(self) -> BakeRollout:
+        """Return the rollout of the shot together with the samples before it."""
+        return replace(self, motion=self.whole, lead=0, recovered=[])
 
     def _source_frame(self, sample: int) -> float:
         """Return the frame of `source` at a sample of the shot, a fraction where the grids differ."""

@@ -9,12 +9,11 @@ A file that fails verification (exit code 3) is not kept, and an older file of i
 the same garments under linear blend skinning, to compare with.
 
 --refine continues from the network with the simulator's solver in every frame: it lowers the energy of each frame,
-and adds wrinkles that no blendshape of the model has. The course of the cloth stays the network's. With --feedback it
-becomes the solver's: frames are refined one after the other, each from what the last ones became. Refined with enough
-iterations that is the simulator. A refined shot gets blendshapes of its own, as many as
-it takes to stay within 1 mm (RMS) and 5 mm (any vertex) of the solver's points; the result says how many, and what
-the points would take. In one file they replace the model's, in a folder of layers they come on top, in the shot's own
-layer. --refined-output points writes time-sampled points instead, bound to no skeleton; in a folder of layers, they
+and adds wrinkles that no blendshape of the model has. The course of the cloth stays the network's. With --feedback
+each frame goes on from what the last ones became, and the cloth follows the solver; with enough iterations this is
+the simulator. A refined shot gets blendshapes of its own, as many as it takes to stay within 1 mm (RMS) and 5 mm
+(any vertex) of the solver's points; the result says how many, and what the points would take. In one file they
+replace the model's, in a folder of layers they come on top, in the shot's own layer. --refined-output points writes time-sampled points instead, bound to no skeleton; in a folder of layers, they
 are the variant "points" of "deformation", beside the network's joints.
 """
 

@@ -194,7 +194,7 @@ def _add_output(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--feedback",
         action="store_true",
-        help="refined frames look back on refined ones: the garment moves as the solver has it, not as the network",
+        help="refined frames look back on refined ones: the garment follows the solver, not the network",
     )
     verb.add_argument(
         "--refined-output",

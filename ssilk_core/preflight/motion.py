@@ -14,7 +14,7 @@ from .finding import Finding, Findings, format_count, format_joints, index_tuple
 
 STILL_ANGLE = 0.5  # [degrees]
 USUAL_RATES = (15.0, 240.0)  # [1/s] lowest and highest
-CHECKED_RATE = 5  # [1/s] at which limbs are looked for inside the body
+CHECKED_RATE, MOST_CHECKED = 5.0, 500  # poses a second, and in all, in which limbs are looked for inside the body
 MANY_BURIED = 0.02  # share of the frames
 NAMED_LIMBS = 3
 MAX_SAMPLE_GAP = 0.5  # [s] gap that is reported if it is also ten times the usual sampling interval
@@ -193,11 +193,13 @@ def buried_limbs(scene: Scene, motions: Sequence[Motion]) -> Findings:
     from ..collision.limb_axes import LimbPoser
 
     axes, skeleton = limb_axes(scene), scene.character.skeleton
-    if axes is None:
+    if axes is None or not motions:
         return
     poser, buried = LimbPoser(axes, scene.character.merged_body(), torch.device("cpu")), []
+    seconds = sum(motion.frame_count / motion.fps for motion in motions)
+    rate = min(CHECKED_RATE, MOST_CHECKED / seconds)
     for motion in motions:
-        chosen = np.arange(0, motion.frame_count, max(1, round(motion.fps / CHECKED_RATE)))
+        chosen = np.arange(0, motion.frame_count, max(1, round(motion.fps / rate)))
         world = motion_transforms(replace(motion, rotations=motion.rotations[chosen],
                                           translations=motion.translations[chosen]), skeleton.parents)  # fmt: skip
         matrices = skinning_matrices(world, skeleton.bind_transforms)[:, :, :3].transpose(1, 2, 3, 0)
@@ -215,7 +217,7 @@ def buried_limbs(scene: Scene, motions: Sequence[Motion]) -> Findings:
             prim=skeleton.path,
             count=len(order),
             found=f"in {every.any(axis=0).mean():.1%} of the frames a limb ends inside another part of the body "
-            f"({named}; most in {motions[most].path}, {clips[most]:.0%})",
+            f"({named}; most in {motions[most].path}, {clips[most]:.1%})",
             why="no cloth fits in between, and loose cloth passes through the limb there",
             fix="in shots, move the limb off the body",
             elements="joints",

@@ -11,8 +11,9 @@ below the network's. The previous states for inertia are
   starts from the network's state, or from that plus the last correction, whichever has less energy. With enough
   iterations this is the simulator.
 
-The first frame of a shot, and after a cut, is quasi-static with feedback, and solved to the end: the shot goes on
-from it. Without feedback its previous states are itself at rest: without any inertia the next frame would jump back.
+The first frame of a shot, and after a cut, is quasi-static with feedback, and solved as the simulator does: the shot
+goes on from it. Without feedback its previous states are itself at rest: without any inertia the next frame would
+jump back.
 """
 
 from __future__ import annotations
@@ -35,6 +36,8 @@ from ..simulate.incremental_potential import StepInputs
 from ..simulate.newton import SolverOptions, State, minimise_from
 from ..simulate.simulator import StepHistory
 from .clearing import SkinClearing
+
+QUASI_STATIC_ITERATIONS = SimulationOptions().quasi_static_solver.iterations
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +72,7 @@ class RefineOptions:
         """Options for the first frame of a shot."""
         if not self.feedback:
             return self.solver
-        return SolverOptions(iterations=max(self.iterations, SolverOptions.iterations), tolerance=self.tolerance)
+        return SolverOptions(iterations=max(self.iterations, QUASI_STATIC_ITERATIONS), tolerance=self.tolerance)
 
 
 @dataclass(frozen=True)

@@ -167,7 +167,8 @@ def test_preflight_tells_which_limbs_are_buried_in_which_motion(scene):
     (found,) = buried_limbs(whole, [apart, Motion("/pressed", 10.0, turns, translations)])
     assert found.code == "buried-limbs" and found.severity == "warning" and found.indices == (1,)
     assert "in 15.0% of the frames" in found.found and "j1 15.0%" in found.found
-    assert "most in /pressed, 30%" in found.found  # every second frame is looked at
+    assert "most in /pressed, 30.0%" in found.found  # every second frame is looked at
+    assert not [*buried_limbs(whole, [])]
     assert not [*buried_limbs(whole, [apart])]
 
 

@@ -144,7 +144,20 @@ def test_with_feedback_the_cloth_goes_on_from_refined_frames(there, capsys):
     np.testing.assert_array_equal(points_of("level.usda"), points_of("said.usda"))
     capsys.readouterr()
     assert main(["verify", "said.usda"]) == 0
-    assert "it was compared with the solver's points when it was baked" in capsys.readouterr().err
+    assert "its vertices are not compared with the solver's again" in capsys.readouterr().err
+    stage = Usd.Stage.Open("said.usda")
+    stage.SetEndTimeCode(2)
+    stage.Export("cut.usda")
+    assert main(["verify", "cut.usda"]) == 3 and "3 samples; 5 are needed" in capsys.readouterr().err
+
+
+def test_with_feedback_the_cloth_is_on_its_way_when_a_range_begins(there):
+    """The motion before the range is refined as well: its frames do not begin at rest."""
+    request = BakeRequest(model="model.safetensors", stage="rigged.usda", motion="brief.usda")
+    request = replace(request, refine=2, feedback=True, refined_output="points")
+    bake(request, "whole.usda")
+    bake(replace(request, range="2-4"), "part.usda")
+    np.testing.assert_allclose(points_of("part.usda"), points_of("whole.usda")[-3:], atol=1e-5)
 
 
 def test_samples_within_frames_are_refined_too(there):
@@ -159,7 +172,7 @@ def test_samples_within_frames_are_refined_too(there):
     [
         (["--refine", "-1"], "a whole number from 0 to 10000"),
         (["--refine", "2", "--budget", "1MB"], "a budget for refined frames"),
-        (["--feedback"], "--feedback: nothing is refined"),
+        (["--feedback"], "--feedback: no --refine"),
     ],
 )
 def test_what_cannot_be_done_is_refused(there, capsys, words, complaint):
