@@ -35,8 +35,8 @@ LEAD = 1.0  # [s] of a motion before its shot that are rolled out, so that the g
 
 @dataclass(frozen=True, eq=False)
 class _ReadMotion:
-    """A motion as it was read, the shot's samples of it, the same with those before them, how many these are, and which
-    frames the shot's are; and at which the character becomes hidden (True) or visible (False)."""
+    """A motion as it was read, the shot's samples of it, the same with those before them, how many these are, which
+    frames the shot's are, and at which the character becomes hidden (True) or visible (False)."""
 
     source: Motion
     sampled: Motion

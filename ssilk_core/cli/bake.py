@@ -13,8 +13,9 @@ and adds wrinkles that no blendshape of the model has. The course of the cloth s
 each frame goes on from what the last ones became, and the cloth follows the solver; with enough iterations this is
 the simulator. A refined shot gets blendshapes of its own, as many as it takes to stay within 1 mm (RMS) and 5 mm
 (any vertex) of the solver's points; the result says how many, and what the points would take. In one file they
-replace the model's, in a folder of layers they come on top, in the shot's own layer. --refined-output points writes time-sampled points instead, bound to no skeleton; in a folder of layers, they
-are the variant "points" of "deformation", beside the network's joints.
+replace the model's, in a folder of layers they come on top, in the shot's own layer. --refined-output points writes
+time-sampled points instead, bound to no skeleton; in a folder of layers, they are the variant "points" of
+"deformation", beside the network's joints.
 """
 
 from __future__ import annotations
