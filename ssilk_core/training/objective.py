@@ -88,7 +88,7 @@ class Objective:
             terms["stitch"] = energy.stitch(x)
         return terms
 
-    def _planes(self, x: Tensor, character: Tensor, buried: Tensor | None) -> tuple[Tensor, Tensor]:
+    def _planes(self, x: Tensor, character: Tensor, buried: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return the plane that each sample x (S, 3, N) can touch, moved outwards by the clearance.
 
         Returns:
