@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from helpers.subjects import Subject, arguments, clip_of, measure_each, parsed
 from refine import NetworkTake
-from shown_skin import refined_points, seen, take_blocks
+from shown_skin import refined_points, seen
 
 from ssilk_core.assets import Floats
 from ssilk_core.collision import CoveredSkin
@@ -32,14 +32,14 @@ def measure(subject: Subject, options: Namespace) -> dict[str, Any]:
     skin = CoveredSkin(subject.scene, device=subject.device)
 
     def figures(take: NetworkTake, points: Floats) -> dict[str, Any]:
-        counts, stretch = seen(subject, skin, take_blocks(take, points))
+        counts, stretch = seen(subject, skin, take.blocks(points))
         assert counts.pierced is not None
         return {"through": int(counts.pierced.any(0).sum()), "stretch": float(stretch.mean())}
 
     found: dict[str, Any] = {}
     for clip in options.clips:
         whole = NetworkTake.of(subject, clip_of(options, clip, subject))
-        counts, _ = seen(subject, skin, take_blocks(whole, whole.points))
+        counts, _ = seen(subject, skin, whole.blocks(whole.points))
         assert counts.pierced is not None
         through = np.convolve(counts.pierced.any(0), np.ones(options.frames), mode="valid")
         first = int(through.argmax())

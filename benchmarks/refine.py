@@ -12,6 +12,7 @@ the model's. The last row of each clip is the simulator, which starts from no ne
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,6 +20,7 @@ import numpy as np
 import torch
 from helpers.reports import table, write_results
 from helpers.subjects import Subject, arguments, clip_of, open_subject, parsed
+from torch import Tensor
 
 from ssilk_core.assets import Floats, GarmentPose, Motion
 from ssilk_core.collision import ShownCounts
@@ -32,6 +34,8 @@ from ssilk_core.simulate import SimulationOptions, simulate
 HEADER = ("garment, clip", "iterations", "looks back on", "s a frame", "energy [J]", "inside the body",
           "shows, worst frame", "limbs through", "moved [mm]", "from the simulator [mm]", "jitter [mm]", "own shapes",
           "joints lose [mm]", "at most [mm]", "energy of the joints [J]", "inside")  # fmt: skip
+CHUNK = 256  # frames in memory at once
+Blocks = Iterator[tuple[Tensor, Tensor]]  # of frames: vertices (V, 3, N) and the character's matrices (J, 3, 4, N)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,25 +61,32 @@ class NetworkTake:
         motion, poses = self.motion.clip(start, stop), self.poses[start:stop]
         return replace(self, motion=motion, poses=poses, points=self.points[start:stop])
 
+    def blocks(self, points: Floats) -> Blocks:
+        """Yield vertices (F, V, 3) in blocks of frames."""
+        skeleton, device = self.subject.scene.character.skeleton, self.subject.device
+        matrices = skinning_matrices(motion_transforms(self.motion, skeleton.parents), skeleton.bind_transforms)
+        for start in range(0, len(points), CHUNK):
+            block = slice(start, start + CHUNK)
+            x, character = points[block].transpose(1, 2, 0), matrices[block, :, :3].transpose(1, 2, 3, 0)
+            yield (
+                torch.tensor(x, dtype=torch.float32, device=device),
+                torch.tensor(character, dtype=torch.float32, device=device),
+            )
+
     def refiner(self, iterations: int, feedback: bool, batch: int = RefineOptions.batch) -> Refiner:
         options, dressed = RefineOptions(iterations=iterations, feedback=feedback, batch=batch), self.subject.dressed
         return Refiner(dressed.scene, dressed.fabric, options, fps=self.motion.fps, device=dressed.device)
 
     def measured(self, points: Floats) -> dict[str, float]:
         """Return the figures of vertices (F, V, 3), by their own past."""
-        changes, dressed = list(self.refiner(1, True).changes(self.motion, points, points)), self.subject.dressed
-        skeleton = dressed.scene.character.skeleton
-        matrices = skinning_matrices(motion_transforms(self.motion, skeleton.parents), skeleton.bind_transforms)
-        x, character = (
-            torch.tensor(values, dtype=torch.float32, device=dressed.device)
-            for values in (points.transpose(1, 2, 0), matrices[:, :, :3].transpose(1, 2, 3, 0))
-        )
-        counts = ShownCounts.of(dressed.covered.states(x, character))
+        changes = list(self.refiner(1, True).changes(self.motion, points, points))
+        skin = self.subject.dressed.covered
+        counts = ShownCounts.joined([ShownCounts.of(skin.states(*block)) for block in self.blocks(points)])
         return {
             "energy": float(np.mean([change.after for change in changes])),
             "inside": float(np.mean([change.inside_after for change in changes])),
             "shows": float(counts.shares.max()),
-            "limbs": 0.0 if counts.pierced is None else float(counts.pierced.any(0).double().mean()),
+            "limbs": counts.pierced_share or 0.0,
             "moved": rms(points - self.points),
             "jitter": rms(np.diff(points, 3, axis=0)),
         }

@@ -18,13 +18,12 @@ from typing import Any
 import numpy as np
 import torch
 from helpers.subjects import Subject, arguments, clip_of, measure_each, parsed
-from refine import NetworkTake
+from refine import CHUNK, Blocks, NetworkTake
 from torch import Tensor
 
 from ssilk_core.assets import Floats
 from ssilk_core.collision import CoveredSkin, ShownCounts
 from ssilk_core.evaluation.splits import read_index
-from ssilk_core.kinematics import motion_transforms, skinning_matrices
 from ssilk_core.motion_bank import roll_states
 from ssilk_core.simulate import SimulationOptions, simulate
 
@@ -41,9 +40,7 @@ HEADER = (
     "limbs through [% of frames]",
     "stretch [J]",
 )
-CHUNK = 256  # frames in memory at once
 ITERATIONS = 4
-Blocks = Iterator[tuple[Tensor, Tensor]]  # of frames: vertices (V, 3, N) and the character's matrices (J, 3, 4, N)
 
 
 def whole_clip(
@@ -65,26 +62,13 @@ def whole_clip(
         yield method, *seen(subject, skin, blocks(method))
     if options.refine:
         take = NetworkTake.of(subject, clip_of(options, clip, subject))
-        yield f"refine {ITERATIONS}", *seen(subject, skin, take_blocks(take, refined_points(take)))
+        yield f"refine {ITERATIONS}", *seen(subject, skin, take.blocks(refined_points(take)))
 
 
 def refined_points(take: NetworkTake, iterations: int = ITERATIONS) -> Floats:
     """Return the refined vertices of a take (F, V, 3), which look back on the network's."""
     refiner = take.refiner(iterations, False, CHUNK)
     return np.stack([frame.points for frame in refiner.frames(take.motion, take.points)])
-
-
-def take_blocks(take: NetworkTake, points: Floats) -> Blocks:
-    """Yield the vertices (F, V, 3) of a take in blocks."""
-    skeleton, device = take.subject.dressed.scene.character.skeleton, take.subject.device
-    matrices = skinning_matrices(motion_transforms(take.motion, skeleton.parents), skeleton.bind_transforms)
-    for start in range(0, len(points), CHUNK):
-        block = slice(start, start + CHUNK)
-        x, character = points[block].transpose(1, 2, 0), matrices[block, :, :3].transpose(1, 2, 3, 0)
-        yield (
-            torch.tensor(x, dtype=torch.float32, device=device),
-            torch.tensor(character, dtype=torch.float32, device=device),
-        )
 
 
 def seen(subject: Subject, skin: CoveredSkin, blocks: Blocks) -> tuple[ShownCounts, Tensor]:
@@ -107,7 +91,7 @@ def solved(
     for method, points in (
         ("network", take.points), (f"refine {ITERATIONS}", refined_points(take)), ("simulator", simulated),
     ):  # fmt: skip
-        yield method, *seen(subject, skin, take_blocks(take, points))
+        yield method, *seen(subject, skin, take.blocks(points))
 
 
 def figures(found: list[tuple[str, ShownCounts, Tensor]]) -> dict[str, Any]:
@@ -117,7 +101,7 @@ def figures(found: list[tuple[str, ShownCounts, Tensor]]) -> dict[str, Any]:
     return {
         "frames": len(stretch), "mean": float(counts.shares.mean()), "worst": float(counts.shares.max()),
         "in": worst[0], "bare": float(counts.bare.mean()),
-        "pierced": None if counts.pierced is None else float(counts.pierced.any(0).double().mean()),
+        "pierced": counts.pierced_share,
         "stretch": float(stretch.mean()), "clips": {name: float(own.shares.mean()) for name, own, _ in found},
     }  # fmt: skip
 

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from helpers.subjects import Subject, arguments, clip_of, measure_each, parsed
 from refine import NetworkTake
-from shown_skin import refined_points, seen, take_blocks
+from shown_skin import refined_points, seen
 
 from ssilk_core.assets import Floats
 from ssilk_core.collision import CoveredSkin
@@ -33,7 +33,7 @@ def measure(subject: Subject, options: Namespace) -> dict[str, Any]:
     skin = CoveredSkin(subject.scene, device=subject.device)
 
     def shares(take: NetworkTake, points: Floats) -> Floats:
-        return np.asarray(seen(subject, skin, take_blocks(take, points))[0].shares)
+        return np.asarray(seen(subject, skin, take.blocks(points))[0].shares)
 
     found: dict[str, Any] = {}
     for clip in options.clips:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import zip_longest
 from pathlib import Path
@@ -118,17 +118,13 @@ def verify_file(rollout: BakeRollout, path: Path, report: Reporter) -> Verificat
     need_valid(path, report)
     shot, samples = open_shot(path), rollout.request.samples_per_frame
     times = shot.sample_times(samples)
-    if rollout.request.refine and rollout.request.feedback and rollout.refinement is None:
-        return _verify_extent(shot, path, rollout, report)
-    if not shot.is_skinned and rollout.request.refine and rollout.refinement is None:
-        return verify_energies(rollout, map(shot.garment_points, times), report)
-    if (
-        shot.is_skinned
-        and rollout.request.refine
-        and rollout.refinement is None
-        and not rollout.request.writes_points
-    ):
-        return compare_trajectories(shot, refined_points(rollout, report), samples_per_frame=samples)
+    if rollout.request.refine and rollout.refinement is None:
+        if rollout.request.feedback:
+            return _verify_extent(shot, times, path, rollout, report)
+        if not shot.is_skinned:
+            return verify_energies(rollout, map(shot.garment_points, times), report)
+        if not rollout.request.writes_points:
+            return compare_trajectories(shot, refined_points(rollout, report), samples_per_frame=samples)
     expected = rollout.vertices(report) if shot.is_skinned else rollout.points(report)
     found = compare_points(shot, expected, samples_per_frame=samples)
     if not found.passed:
@@ -140,12 +136,13 @@ def verify_file(rollout: BakeRollout, path: Path, report: Reporter) -> Verificat
     return Verification(frames=len(times), largest_error_m=found.worst, allowed_error_m=found.bound)
 
 
-def _verify_extent(shot: PosedGarment, path: Path, rollout: BakeRollout, report: Reporter) -> Verification:
+def _verify_extent(
+    shot: PosedGarment, times: Sequence[float], path: Path, rollout: BakeRollout, report: Reporter
+) -> Verification:
     """Check that a shot has all frames and vertices of a rollout.
 
     Refined with feedback a frame depends on all before it, and on another machine other last digits grow with each.
     """
-    times = shot.sample_times(rollout.request.samples_per_frame)
     if len(times) != rollout.motion.frame_count:
         raise VerificationError(f"{path}: it has {len(times)} samples; {rollout.motion.frame_count} are needed.")
     count = rollout.deformer.scene.garment.mesh.vertex_count

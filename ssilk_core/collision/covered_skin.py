@@ -71,6 +71,11 @@ class ShownCounts:
         pierced = None if states.pierced is None else states.pierced.cpu()
         return cls(shares, bare, states.shows.sum(1).cpu(), numbers, pierced)
 
+    @property
+    def pierced_share(self) -> float | None:
+        """Share of the frames in which any limb pierces the cloth; None where nothing is known."""
+        return None if self.pierced is None else float(self.pierced.any(0).double().mean())
+
     @classmethod
     def joined(cls, parts: Sequence[ShownCounts]) -> ShownCounts:
         """Return the counts of several parts together."""
@@ -194,15 +199,14 @@ class CoveredSkin:
             ValueError: there is no frame.
         """
         found = shown_skin(clips, self._regions)
-        counts = [counts.pierced for _, counts in clips if counts.pierced is not None]
-        if found is None or len(counts) < len(clips):
+        together = ShownCounts.joined([counts for _, counts in clips])
+        if found is None or together.pierced is None:
             return found
-        pierced = torch.cat(counts, dim=1).double()
-        shares = pierced.mean(1).tolist()
+        shares = together.pierced.double().mean(1).tolist()
         limbs = sorted(zip(shares, self.limbs.tolist()), key=lambda each: -each[0])
         return replace(
             found,
-            pierced=float(pierced.any(0).double().mean()),
+            pierced=together.pierced_share,
             limbs={self._name(joint): share for share, joint in limbs[:NAMED_REGIONS] if share},
         )
 

@@ -11,7 +11,6 @@ keep apart.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,6 +21,7 @@ from ..assets import LOOSE, Body, Floats, Ints, Mesh, Scene, Skeleton
 from ..mesh import topology
 from ..skinning import Skinning, transform_points
 from .ray_casting import RayCaster
+from .winding_number import ENCLOSED, winding_number
 
 MAX_RADIUS = 0.08  # [m] of a bone
 RADIUS_PERCENTILE = 90  # of the distances of a bone's skin from its line
@@ -211,20 +211,14 @@ class LimbPoser:
 def inside(points: Tensor, x: Tensor, faces: Tensor) -> Tensor:
     """Tell which points (P, 3, N) lie inside a surface with the vertices x (V, 3, N), bool (P, N).
 
-    There its winding number is more than a half: the sum of the solid angles of the triangles over 4 pi (van Oosterom
-    and Strackee, 1983). A hole takes away its solid angle alone.
+    The surface may be inside out. A hole in it takes away its solid angle alone.
     """
-    count, frames = len(points), x.shape[2]
-    winding = x.new_zeros(count, frames)
-    step = max(1, MAX_PAIRS // max(1, count * frames))
-    for some in faces.split(step):
-        a, b, c = (x[corner] - points[:, None] for corner in some.T)  # (P, F, 3, N)
-        lengths = [each.norm(dim=2) for each in (a, b, c)]
-        volume = (a * torch.linalg.cross(b, c, dim=2)).sum(2)
-        other = lengths[0] * lengths[1] * lengths[2]
-        other += (a * b).sum(2) * lengths[2] + (b * c).sum(2) * lengths[0] + (c * a).sum(2) * lengths[1]
-        winding += torch.atan2(volume, other).sum(1) / (2 * math.pi)
-    return winding.abs() > 0.5
+    points, x, found = points.permute(0, 2, 1), x.permute(2, 0, 1), []
+    at_once = max(1, MAX_PAIRS // max(1, len(points) * len(faces)))
+    for frames in torch.arange(len(x), device=x.device).split(at_once):
+        corners = x[frames][:, faces] - points[:, frames, None, None]  # (P, n, F, 3, 3)
+        found.append(winding_number(corners.flatten(0, 1)).view(len(points), -1).abs() > ENCLOSED)
+    return torch.cat(found, dim=1)
 
 
 def _away_from_tips(body: Body, axes: LimbAxes) -> Body | None:

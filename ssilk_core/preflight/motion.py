@@ -205,18 +205,18 @@ def buried_limbs(scene: Scene, motions: Sequence[Motion]) -> Findings:
         matrices = skinning_matrices(world, skeleton.bind_transforms)[:, :, :3].transpose(1, 2, 3, 0)
         buried.append(poser.buried(torch.as_tensor(matrices, dtype=torch.float32)).numpy())
     every, clips = np.concatenate(buried, axis=1), [found.any(axis=0).mean() for found in buried]
-    shares, most = every.mean(axis=1), int(np.argmax(clips))
+    share, shares, most = every.any(axis=0).mean(), every.mean(axis=1), int(np.argmax(clips))
     order = [limb for limb in np.argsort(-shares, kind="stable") if shares[limb]]
     if order:
         named = ", ".join(
             f"{format_joints(skeleton, axes.tips[[limb]])} {shares[limb]:.1%}" for limb in order[:NAMED_LIMBS]
         )
         yield Finding(
-            severity="warning" if every.any(axis=0).mean() >= MANY_BURIED else "info",
+            severity="warning" if share >= MANY_BURIED else "info",
             code="buried-limbs",
             prim=skeleton.path,
             count=len(order),
-            found=f"in {every.any(axis=0).mean():.1%} of the frames a limb ends inside another part of the body "
+            found=f"in {share:.1%} of the frames a limb ends inside another part of the body "
             f"({named}; most in {motions[most].path}, {clips[most]:.1%})",
             why="no cloth fits in between, and loose cloth passes through the limb there",
             fix="in shots, move the limb off the body",

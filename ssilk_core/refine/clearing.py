@@ -25,6 +25,7 @@ from torch import Tensor
 
 from ..assets import Scene
 from ..collision import CoveredPoints, PosedBody
+from ..collision.winding_number import ENCLOSED, winding_number
 from ..simulate.incremental_potential import IncrementalPotential, StepInputs
 from ..simulate.newton import State
 
@@ -36,7 +37,6 @@ DEEPEST = 0.012  # [m] beneath the skin; deeper cloth could only be lifted as a 
 FARTHEST = 0.02  # [m] that a vertex moves in all rounds
 REDUCTION, CG_ITERATIONS = 1e-4, 300  # of the residual by each linear solve, and its longest
 MOST_FREE = 0.5  # share of the cloth's weights at free corners from which on it is lifted
-ENCLOSED = 0.5  # winding number from which on a point lies inside
 CORNERS = list(combinations_with_replacement(range(3), 2))  # pairs of them in a triangle
 PAIRS_AT_ONCE = 1 << 20  # of a point and a triangle
 
@@ -183,16 +183,3 @@ def _barycentric(points: Tensor, triangles: Tensor) -> Tensor:
     u = (torch.linalg.cross(away, second) * normal).sum(1) / square
     v = (torch.linalg.cross(first, away) * normal).sum(1) / square
     return torch.stack([1 - u - v, u, v], dim=1).clamp(0, 1)
-
-
-def winding_number(corners: Tensor) -> Tensor:
-    """Return how often surfaces wind around the origin, shape (M,), from the corners of triangles (M, F, 3, 3).
-
-    The sum of the triangles' solid angles over 4 pi, each by van Oosterom and Strackee (1983):
-    tan(angle / 2) = a . (b x c) / (|a||b||c| + (a . b)|c| + (b . c)|a| + (c . a)|b|).
-    """
-    a, b, c = corners.unbind(2)
-    la, lb, lc = (each.norm(dim=-1) for each in (a, b, c))
-    volume = (a * torch.linalg.cross(b, c)).sum(-1)
-    rest = la * lb * lc + (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
-    return torch.atan2(volume, rest).sum(-1) / (2 * torch.pi)
