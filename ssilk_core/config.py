@@ -276,13 +276,15 @@ PRESETS = {
             name="final",
             model=ModelConfig(shapes=128, translations=True),
             train=TrainConfig(
-                iterations=12_000,
+                iterations=60_000,
                 static_fraction=0.5,
                 recombinations=8,
                 perturbations=3,
+                static_learning_rate=5e-4,
                 shape_learning_rate_scale=1.0,
+                weight_decay=0.5,
                 ema_decay=0.9995,
-                validate_every=600,
+                validate_every=2400,
             ),
         ),
     )
