@@ -113,10 +113,18 @@ def training() -> Text:
     yield from optimiser()
     yield f"`final` takes {PRESETS['final'].train.ema_decay:g}"
     yield large_step()
+    yield f"With `weight_decay={final_decay():g}` and half the static rate"
+    decayed = result("long_decay_training")
+    last = min(decayed[name]["iterations"][-1] for name in ("cape_decay", "cape_half_rate_decay"))
+    yield f"they did not in {last:,} iterations and more"
     preview, final = (preset_minutes(PRESETS[name]) for name in ("preview", "final"))
     yield f"`preview` takes {60 * preview:.0f} s and `final` {final:.0f} minutes"
     yield "(`recombinations={0.recombinations}`, `perturbations={0.perturbations}`)".format(PRESETS["final"].train)
     yield from side_by_side()
+
+
+def final_decay() -> float:
+    return PRESETS["final"].train.weight_decay
 
 
 def side_by_side() -> Text:
@@ -129,7 +137,7 @@ def side_by_side() -> Text:
 
 def optimiser() -> Text:
     yield f"| `optimiser` | {default('optimiser')} | not stated |"
-    yield f"| `weight_decay` | {default('weight_decay'):g} | not stated |"
+    yield f"| `weight_decay` | {default('weight_decay'):g} | not stated | `final` takes {final_decay():g}, so that"
     yield f"with {large_step_size()['batch']} windows in a batch"
     allowed = default("velocity_allowance"), checkpoint.OLDER_LIMITS["velocity_allowance"]
     yield "{:g} is `velocity_allowance`; older models have {:g}".format(*allowed)
