@@ -2,11 +2,13 @@
 """Measure what speed and size cost in accuracy, for everything that can be changed without training again.
 
 Blendshapes, proxies, influences, precision, frame rate, refinement and quality levels are varied one at a time, and
-the simulator makes the shot without a network. Networks of several sizes and garments can be compared: further models
-of a garment are measured whole and at their levels. Costs are the times of playing and of the solver, memory, and the
-sizes of model and shot. Accuracy is energy, collisions, skin that shows, and the distance of vertices and velocities
-from the whole model. Times are of this machine and of the first clip. --output writes each point when it is measured;
-an interrupted sweep continues from there. A variant that fails is told, and the exit code is 4 then.
+the simulator goes on by itself from the network's first two states. Networks of several sizes and garments can be
+compared: further models of a garment are measured whole and at their levels. Costs are the times of playing and of
+the solver, memory, and the sizes of model and shot. Accuracy is energy, collisions, skin that shows, and the distance
+of vertices and velocities from the whole model. All are measured on the same frames, the first ones of each clip,
+because the simulator takes seconds for each on a processor. Times are of this machine and of the first clip. --output
+writes each point when it is measured; an interrupted sweep continues from there. A variant that fails is told, and
+the exit code is 4 then.
 """
 
 from __future__ import annotations
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
     from ..trade.measure import StoredTake, VariantMeter, Weigh
 
 CLIPS = 2  # are measured on where --clips names none
+FRAMES = 60  # two seconds of each; the simulator of a cape takes some minutes for them
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -44,7 +47,11 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--clips", nargs="+", default=[], metavar="NAME", help="measure on these (default: the first two)"
     )
-    verb.add_argument("--no-refine", action="store_true", help="leave out the solver, which takes most of the time")
+    verb.add_argument("--frames", type=shared.NumberRange(4, 10**6, int), default=FRAMES, metavar="N",
+                      help="measure on the first N frames of each clip, at the models' rate (default "
+                           f"{FRAMES})")  # fmt: skip
+    verb.add_argument("--no-refine", action="store_true",
+                      help="leave out refinement and simulator, which take most of the time")  # fmt: skip
     verb.add_argument("-o", "--output", type=Path, help="figures to write (.json), and a plot beside them (.png)")
     verb.add_argument("--device", default="cpu", help="where PyTorch and the solver run (default cpu)")
 
@@ -55,7 +62,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     from ..trade.collision_cost import measure_collisions
     from ..trade.plot import trade_panels
     from ..trade.sweep import Results, sweep
-    from ..trade.table import collision_table, table
+    from ..trade.table import caption, collision_table, table
     from ..trade.variants import other_network, variants
 
     if options.output:
@@ -67,7 +74,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     bench = Bench(options)
     results = Results(options.output, bench.asked)
     results.resume(report)
-    report(Started("trade", 0, {"clips": list(bench.clips)}))
+    report(Started("trade", 0, {"clips": list(bench.clips), "frames": bench.frames}))
     failed = 0
     try:
         for path, file in bench.files.items():
@@ -81,9 +88,11 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
             failed += sweep(meter, tried, results, report)
     finally:  # an interrupted sweep shows what it has
         if results.points and options.output:
-            write_chart(options.output.with_suffix(".png"), trade_panels(results.points), size=(4.6, 3.6))
+            panels = trade_panels(results.points, bench.frames)
+            write_chart(options.output.with_suffix(".png"), panels, size=(4.6, 3.6))
         if not options.json:
-            print(table(results.points), collision_table(results.collision_costs), sep="\n")
+            tables = table(results.points), collision_table(results.collision_costs)
+            print(caption(bench.frames, solved=any(point.solving for point in results.points)), *tables, sep="\n")
     report(Result("trade", {"points": [asdict(point) for point in results.points]} if options.json else {}))
     return EXIT_TASKS if failed else EXIT_OK
 
@@ -93,6 +102,8 @@ class Bench:
 
     Attributes:
         clips: motions to measure on, by name.
+        takes: what is measured of them.
+        frames: how many frames that is of each clip.
         others: motions that models are reduced for.
         first_of_garment: the first model of each garment, with the garment's name.
         asked: what distinguishes one sweep from another.
@@ -101,6 +112,7 @@ class Bench:
     def __init__(self, options: argparse.Namespace) -> None:
         from ..checkpoint import load_model
         from ..devices import select_device
+        from ..evaluation.takes import takes_of, within
         from ..files import sha256
 
         self.options, self.device = options, select_device(options.device)
@@ -119,10 +131,14 @@ class Bench:
             self._check(path, file, first)
         self.paths, self.others = self._motions(first)
         self.clips = {name: self._read(path, first) for name, path in self.paths.items()}
+        cut = [within(takes_of(name, clip, first.config.fps), options.frames) for name, clip in self.clips.items()]
+        self.takes = [take for own in cut for take in own]
+        self.frames = {name: sum(take.frame_count for take in own) for name, own in zip(self.clips, cut)}
         self.asked: dict[str, Any] = {
             "models": {str(path): sha256(path) for path in options.models},
             "stage": sha256(options.stage),
             "clips": list(self.clips),
+            "frames": self.frames,
             "hardware": f"{platform.processor() or platform.machine()}, {self.device}",
             "ssilk": __version__,
         }
@@ -147,19 +163,15 @@ class Bench:
                 "rename a prim",
             )
 
-    def meter(self, path: Path, file: ModelFile, *, only: str | None = None) -> VariantMeter:
-        """Return the meter of a model on all clips, reduced for other motions; or on `only` one, reduced for it."""
+    def meter(self, path: Path, file: ModelFile) -> VariantMeter:
+        """Return the meter of a model on all takes, reduced for other motions."""
         from ..evaluation.methods import build_take_set
-        from ..evaluation.takes import takes_of
         from ..reduction import Reducer
         from ..trade.measure import VariantMeter
 
         dressed = self._dressed(file)
-        clips = {only: self.clips[only]} if only else self.clips
-        takes = [take for name, clip in clips.items() for take in takes_of(name, clip, dressed.fps)]
-        take_set = build_take_set(takes, dressed, file.joints)
-        reducer = Reducer(file, [self.clips[only]] if only else self.others)
-        return VariantMeter(path.stem, reducer, dressed, take_set, self._weigh(path))
+        take_set = build_take_set(self.takes, dressed, file.joints)
+        return VariantMeter(path.stem, Reducer(file, self.others), dressed, take_set, self._weigh(path))
 
     def _dressed(self, file: ModelFile) -> EvaluationScene:
         """Put a garment on the character of the stage."""

@@ -134,15 +134,14 @@ def _shots(simulator: Simulator, windows: Sequence[_World], mass: Tensor, told: 
     """
     past = _history(simulator, [(world, 2) for world in windows])
     found = torch.full((3, AFTER[-1], len(windows)), torch.nan, dtype=torch.float64)
-    for frame in range(2, len(windows[0].x)):
-        places = [(world, frame) for world in windows if len(world.x) > frame]
+    steps = [[(world, at) for world in windows if len(world.x) > at] for at in range(2, len(windows[0].x))]
+    states = simulator.carry_on(past, (_poses(simulator, places) for places in steps))
+    for step, (places, state) in enumerate(zip(steps, states)):
         past = past.first(len(places))
-        poses = _poses(simulator, places)
-        world = simulator.step(poses, past).x.double() + poses.root
-        away, moved = _stacked(places, 0) - world, world - past.last
-        lbs = poses.lbs + poses.root - past.lbs - past.root
+        away, moved = _stacked(places, 0) - state.last, state.last - past.last
+        lbs = state.lbs + state.root - past.lbs - past.root
         missed = [away, _stacked(places, 0) - _stacked(places, 1) - moved, lbs - moved]
-        found[:, frame - 2, : len(places)] = torch.stack([mean_square(each, mass.double()) for each in missed]).cpu()
-        past = StepHistory(world, past.last, poses.root, poses.lbs)
+        found[:, step, : len(places)] = torch.stack([mean_square(each, mass.double()) for each in missed]).cpu()
+        past = state
         told(len(places))
     return found

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -51,6 +52,12 @@ def takes_of(clip: str, motion: Motion, fps: float, longest: int | None = None) 
     spans = split_into_spans(motion, 0, fps, 1, longest)
     clock = motion.start, motion.fps / fps
     return [Take(clip, span.first, span.motion, *clock) for span in spans if span.motion.frame_count >= SHORTEST]
+
+
+def within(takes: Iterable[Take], frames: int) -> list[Take]:
+    """Return takes as far as they lie in the first frames of their clips; those of under four are left out."""
+    kept = [replace(take, motion=take.motion.clip(0, max(frames - take.first, 0))) for take in takes]
+    return [take for take in kept if take.frame_count >= SHORTEST]
 
 
 def _played(motion: Motion, fps: float, seconds: Floats) -> Motion:

@@ -81,7 +81,8 @@ def extremes(document: Mapping[str, Any]) -> Section:
 def trade(document: Mapping[str, Any]) -> Section:
     """Return the charts and the tables of 'ssilk trade'."""
     points = [TradePoint.of(each) for each in document["points"]]
-    chart = svg_chart("errors over costs", trade_panels(points), size=(4.0, 3.4)) if points else ""
+    panels = trade_panels(points, document["asked"].get("frames", {}))
+    chart = svg_chart("errors over costs", panels, size=(4.0, 3.4)) if points else ""
     judged = records(document.get("judging", ()))
     return Section("Trade", chart + records(document["points"]) + judged + facts(document["asked"]))
 

@@ -8,7 +8,7 @@ where single precision is finest; between steps positions are kept in world spac
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -157,10 +157,20 @@ class Simulator:
             poses = self.poser.poses_at(running, step)
             past = past and past.first(len(running))
             solution = self.step(poses, past) if past else self._first(poses)
-            world = solution.x.double() + poses.root
-            past = StepHistory(world, past.last if past else None, poses.root, poses.lbs)
+            past = _advanced(past, poses, solution)
             if step % self.options.substeps == 0:
-                yield from _frames(running, step // self.options.substeps, world, solution)
+                yield from _frames(running, step // self.options.substeps, past.last, solution)
+
+    def carry_on(self, past: StepHistory, characters: Iterable[PosedCharacters]) -> Iterator[StepHistory]:
+        """Yield the states after each step that follows `past`, however it came about.
+
+        Args:
+            characters: poses of each step, of as many shots as the step before, or of the first of these.
+        """
+        for poses in characters:
+            past = past.first(poses.root.shape[-1])
+            past = _advanced(past, poses, self.step(poses, past))
+            yield past
 
     def _first(self, poses: PosedCharacters) -> Solution:
         """Return the states that spans start with, and report: on a processor they can take minutes."""
@@ -207,6 +217,12 @@ class Simulator:
         for number, start in enumerate(starts[1:], start=1):
             best = torch.where(chosen == number, start, best)
         return best
+
+
+def _advanced(past: StepHistory | None, poses: PosedCharacters, solution: Solution) -> StepHistory:
+    """Return the previous states for the step after a solution."""
+    world = solution.x.double() + poses.root
+    return StepHistory(world, past.last if past else None, poses.root, poses.lbs)
 
 
 def _frames(spans: Sequence[MotionSpan], frame: int, world: Tensor, solution: Solution) -> Iterator[SimulatedFrame]:

@@ -74,8 +74,13 @@ class VariantMeter:
         self._cut = lru_cache(1)(lambda size: reducer.reduce(size).file)
         self._torch = lru_cache(1)(self._torch_time)
 
-    def point(self, variant: Variant) -> TradePoint:
-        """Measure one variant."""
+    @property
+    def frames(self) -> int:
+        """Number of frames that each variant is measured on."""
+        return sum(take.frame_count for take in self.take_set.takes)
+
+    def point(self, variant: Variant, advanced: Callable[[], object] = lambda: None) -> TradePoint:
+        """Measure one variant; `advanced` is called after each frame of a solver."""
         cut = self._cut(variant.size)
         player = Player(variant.in_precision(cut))
         method = ShotMethod(
@@ -87,6 +92,7 @@ class VariantMeter:
             refine=variant.refine,
             feedback=variant.feedback,
             simulated=variant.simulated,
+            advanced=advanced,
         )
         tally = self._tally(method, self.whole)
         total = float(tally.totals().mean())

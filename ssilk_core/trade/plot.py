@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import isfinite
 
@@ -26,25 +26,29 @@ ACROSS_MODELS = ("total", "mean_shown_skin")  # errors that compare networks; a 
 NAMED = (WHOLE, "level", "refinement", "simulator")  # sweeps whose points are all labelled
 
 
-def trade_panels(points: Sequence[TradePoint]) -> list[list[ChartPanel]]:
+def trade_panels(points: Sequence[TradePoint], frames: Mapping[str, int]) -> list[list[ChartPanel]]:
     """Return a row of panels for each garment and error, with a panel for each cost.
 
     Each sweep has a colour. Full models, levels, shots of a solver and points of the Pareto front are labelled.
+
+    Args:
+        frames: number of frames of each clip that all points are of; empty where it is not known.
     """
+    count = f", {sum(frames.values())} frames of {len(frames)} clips" if frames else ""
     garments = dict.fromkeys(point.garment for point in points)
-    return [row for name in garments for row in _rows([point for point in points if point.garment == name])]
+    return [row for name in garments for row in _rows([p for p in points if p.garment == name], name + count)]
 
 
-def _rows(points: Sequence[TradePoint]) -> list[list[ChartPanel]]:
+def _rows(points: Sequence[TradePoint], title: str) -> list[list[ChartPanel]]:
     """Return the rows of one garment."""
     errors = ERRORS if len({point.model for point in points}) == 1 else ACROSS_MODELS
     lowest = min(point.total for point in points)
     above = [replace(point, total=point.total - lowest) for point in points]
     measured = [error for error in errors if all(isfinite(getattr(point, error)) for point in above)]
-    return [[_panel(above, cost, error) for cost in COSTS] for error in measured]
+    return [[_panel(above, cost, error, title) for cost in COSTS] for error in measured]
 
 
-def _panel(points: Sequence[TradePoint], cost: str, error: str) -> ChartPanel:
+def _panel(points: Sequence[TradePoint], cost: str, error: str, title: str) -> ChartPanel:
     (x, unit), (y, scale, linear) = COSTS[cost], ERRORS[error]
     places = [(unit * getattr(point, cost), scale * getattr(point, error)) for point in points]
     best = front(places)
@@ -52,9 +56,14 @@ def _panel(points: Sequence[TradePoint], cost: str, error: str) -> ChartPanel:
     for index, (point, place) in enumerate(zip(points, places)):
         named = index in best or point.swept in NAMED
         groups.setdefault(point.swept, []).append((*place, _words(point, points[0].model) if named else ""))
-    title = points[0].garment if cost == next(iter(COSTS)) else ""
     return ChartPanel(
-        title=title, x=x, y=y, points=groups, front=[places[index] for index in best], log_x=True, linear_below=linear
+        title=title if cost == next(iter(COSTS)) else "",
+        x=x,
+        y=y,
+        points=groups,
+        front=[places[index] for index in best],
+        log_x=True,
+        linear_below=linear,
     )
 
 

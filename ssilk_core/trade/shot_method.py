@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import lru_cache
 
@@ -21,8 +22,10 @@ from ..runtime import Player
 from ..runtime.character import character_matrices
 from ..runtime.skinning import skin_garment
 from ..sampling import sample_pose
-from ..simulate import SimulationOptions, simulate
+from ..simulate import Simulator
+from ..simulate.simulator import StepHistory
 
+GIVEN = 2  # frames of the network that the simulator goes on from, as two steps back make a velocity
 BLOCK_FRAMES = 64  # frames in each block of vertex computations
 
 
@@ -34,10 +37,11 @@ class ShotMethod:
         refine: solver iterations per frame; 0 for no refinement. Frames of a solver are played as a bake stores them:
             as joints and blendshapes of the shot's own, or as points where these cannot reach them.
         feedback: as in `RefineOptions`.
-        simulated: let the simulator compute the frames.
+        simulated: let the simulator compute the frames; it goes on from the network's own first two.
+        advanced: called after each frame of a solver.
 
     Attributes:
-        solving: time of the solver for a frame [ms], for each take that was computed.
+        solving: time of the solver for a frame that it computes [ms], for each take that was computed.
         shots: takes of a solver as joints and blendshapes.
     """
 
@@ -52,10 +56,13 @@ class ShotMethod:
         refine: int = 0,
         feedback: bool = False,
         simulated: bool = False,
+        advanced: Callable[[], object] = lambda: None,
     ) -> None:
         self.name, self.player, self.dressed, self.take_set, self.fps = name, player, dressed, take_set, fps
-        self.options = RefineOptions(iterations=refine, feedback=feedback) if refine else None
-        self.simulated = simulated
+        self.refiner, self.simulator, self.advanced = None, dressed.simulator if simulated else None, advanced
+        if refine:
+            options = RefineOptions(iterations=refine, feedback=feedback)
+            self.refiner = Refiner(dressed.scene, dressed.fabric, options, fps=dressed.fps, device=dressed.device)
         self.solving: list[float] = []
         self.shots: dict[int, Decomposition] = {}
         self._points = lru_cache(1)(self._take)
@@ -71,25 +78,32 @@ class ShotMethod:
     def _take(self, take: int) -> Floats:
         """Return all frames of a take, shape (N, V, 3)."""
         motion = self.take_set.takes[take].motion
-        if self.simulated or self.options is not None:
-            begun = time.perf_counter()
-            points = self._simulated(motion) if self.options is None else self._refined(motion, self.options)
-            self.solving.append(1000 * (time.perf_counter() - begun) / len(points))
-            points = self._stored(take, points)
-        else:
-            points = self.unrefined(motion)
+        points = self.unrefined(motion)
+        if self.refiner:
+            points = self._stored(take, self._solved(frame.points for frame in self.refiner.frames(motion, points)))
+        elif self.simulator:
+            rest = self._solved(self._carried_on(self.simulator, motion, points[:GIVEN]))
+            points = self._stored(take, np.concatenate([points[:GIVEN], rest]))
         return points - motion.translations[0, 0]
 
-    def _refined(self, motion: Motion, options: RefineOptions) -> Floats:
-        """Return refined vertices at the frames of a motion [m], shape (N, V, 3)."""
-        dressed = self.dressed
-        refiner = Refiner(dressed.scene, dressed.fabric, options, fps=motion.fps, device=dressed.device)
-        return np.stack([frame.points for frame in refiner.frames(motion, self.unrefined(motion))])
+    def _solved(self, frames: Iterator[Floats]) -> Floats:
+        """Return frames (N, V, 3) that a solver computes as they are asked for, and note the time that it takes."""
+        begun, points = time.perf_counter(), []
+        for frame in frames:
+            points.append(frame)
+            self.advanced()
+        self.solving.append(1000 * (time.perf_counter() - begun) / len(points))
+        return np.stack(points)
 
-    def _simulated(self, motion: Motion) -> Floats:
-        """Return the simulator's vertices at the frames of a motion [m], shape (N, V, 3)."""
-        dressed, options = self.dressed, SimulationOptions(fps=motion.fps, precision="float32")
-        return simulate(dressed.scene, dressed.fabric, [motion], options, device=dressed.device)[0]
+    def _carried_on(self, simulator: Simulator, motion: Motion, given: Floats) -> Iterator[Floats]:
+        """Yield the simulator's vertices (V, 3) [m] in the frames after the first two, which are given (2, V, 3)."""
+        states = torch.as_tensor(given, dtype=torch.float64, device=self.dressed.device)
+        frames = (slice(frame, frame + 1) for frame in range(GIVEN - 1, motion.frame_count))
+        characters = (simulator.poser.pose(motion.rotations[at], motion.translations[at]) for at in frames)
+        last = next(characters)
+        past = StepHistory(states[1, ..., None], states[0, ..., None], last.root, last.lbs)
+        for state in simulator.carry_on(past, characters):
+            yield state.last[..., 0].cpu().numpy()
 
     def _stored(self, take: int, points: Floats) -> Floats:
         """Return vertices as a bake's joints and blendshapes have them [m], shape (N, V, 3)."""

@@ -15,6 +15,7 @@ from ..files import replacing
 from .collision_cost import CollisionCost
 from .measure import VariantMeter
 from .point import TradePoint
+from .shot_method import GIVEN
 from .variants import Variant
 
 
@@ -73,18 +74,29 @@ class Results:
 def sweep(meter: VariantMeter, variants: Iterable[Variant], results: Results, report: Reporter = silent) -> int:
     """Measure the variants of a model that `results` lacks, and add each after its measurement.
 
+    Those without a solver come first, and are counted. Each of the others tells its progress in frames.
+
     Return how many failed; each is warned of, and the others go on.
     """
-    tried, failed = list(variants), 0
+    tried, failed = sorted(variants, key=lambda variant: variant.solved), 0
     missing = [variant for variant in tried if not results.found(meter.name, variant)]
-    told = Countdown(len(tried), report, done=len(tried) - len(missing))
+    quick, left = (sum(not variant.solved for variant in each) for each in (tried, missing))
+    told = Countdown(quick, report, done=quick - left)
     for variant in missing:
         try:
-            point = meter.point(variant)
+            point = _solved(meter, variant, report) if variant.solved else meter.point(variant)
         except SsilkError as error:
             failed += 1
             report(Message(f"{meter.name}, {variant.name}: not measured, {error}", "warning"))
         else:
             results.add(point)
-        told()
+        if not variant.solved:
+            told()
     return failed
+
+
+def _solved(meter: VariantMeter, variant: Variant, report: Reporter) -> TradePoint:
+    """Measure a variant of which the solver computes the frames, and report each."""
+    given = GIVEN * len(meter.take_set.takes) if variant.simulated else 0
+    report(Message(f"{meter.name}, {variant.name}: the solver computes {meter.frames - given} frames"))
+    return meter.point(variant, Countdown(meter.frames - given, report))

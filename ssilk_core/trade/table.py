@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from ..evaluation.tables import aligned
 from .collision_cost import CollisionCost
@@ -13,6 +13,13 @@ HEADER = ("garment", "model", "swept", "variant", "size", "ms a frame", "95 %", 
           "model [MB]", f"{SECONDS} s shot [MB]", "total [J]", "excess [J]", "inside", "skin shows", "worst", "bare",
           "RMS [mm]", "velocity [mm/s]", "best at")  # fmt: skip
 MARKS = {"making": "time", "shot_bytes": "shot", "model_bytes": "model"}
+
+
+def caption(frames: Mapping[str, int], *, solved: bool) -> str:
+    """Return the words above a table: the frames of each clip that its rows are of, and where `solved` ones begin."""
+    named = ", ".join(f"{count} of {name}" for name, count in frames.items())
+    begins = "; the simulator goes on from the first two states of the garment's first network" if solved else ""
+    return f"all rows are of the same frames, the first {named}{begins}"
 
 
 def table(points: Sequence[TradePoint]) -> str:

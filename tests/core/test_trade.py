@@ -16,22 +16,22 @@ from ssilk_core.energy import TERMS
 from ssilk_core.errors import SsilkError
 from ssilk_core.evaluation.methods import EvaluationScene, Network, build_take_set
 from ssilk_core.evaluation.record import recorded
-from ssilk_core.evaluation.takes import takes_of
-from ssilk_core.events import Message
+from ssilk_core.evaluation.solver_errors import solver_errors
+from ssilk_core.evaluation.takes import takes_of, within
+from ssilk_core.events import Message, Progress
 from ssilk_core.fabrics import FABRICS
 from ssilk_core.kinematics import deform, resample, sample_motion
 from ssilk_core.reduction import ModelSize, Reducer
 from ssilk_core.runtime import Player
 from ssilk_core.runtime.stored import StoredPlayer
 from ssilk_core.sampling import sample_pose
-from ssilk_core.simulate import SimulationOptions, simulate
 from ssilk_core.trade.collision_cost import measure_collisions
 from ssilk_core.trade.measure import VariantMeter
 from ssilk_core.trade.plot import trade_panels
 from ssilk_core.trade.point import TradePoint, front
 from ssilk_core.trade.shot_method import ShotMethod
 from ssilk_core.trade.sweep import Results, sweep
-from ssilk_core.trade.table import collision_table, table
+from ssilk_core.trade.table import caption, collision_table, table
 from ssilk_core.trade.variants import PRECISIONS, WHOLE, other_network, variants
 
 FPS = 30.0
@@ -170,14 +170,34 @@ def test_refined_variants_are_counted_as_what_a_bake_stores(meter, bench, points
     np.testing.assert_allclose(stored[..., 0].numpy(), first, atol=1e-5)
 
 
-def test_the_simulator_makes_a_shot_without_the_network(meter, bench):
+def test_the_simulator_goes_on_from_the_networks_first_two_states(meter, bench, model, monkeypatch):
     reducer, dressed, take_set = bench
     method = ShotMethod("simulator", reducer.player, dressed, take_set, fps=FPS, simulated=True)
-    stored = method.vertices(1, range(20)).permute(2, 0, 1)
-    motion, options = take_set.takes[1].motion, SimulationOptions(fps=FPS, precision="float32")
-    (expected,) = simulate(dressed.scene, dressed.fabric, [motion], options)
-    np.testing.assert_allclose(stored, expected - motion.translations[0, 0], atol=5e-3)  # a bake's bound
+    stored = method.vertices(1, range(20)).permute(2, 0, 1).numpy()
     assert len(method.solving) == 1 and method.shots[1].own_shapes > 0
+    monkeypatch.setattr(ShotMethod, "_stored", lambda self, take, points: points)
+    told: list[int] = []
+    exact = ShotMethod(
+        "simulator", reducer.player, dressed, take_set, fps=FPS, simulated=True, advanced=lambda: told.append(1)
+    )
+    points = exact.vertices(1, range(20)).permute(2, 0, 1).numpy()
+    assert len(told) == 18
+    np.testing.assert_allclose(stored, points, atol=5e-3)  # a bake's bound
+    network = every_frame(reducer, take_set.takes[1].motion) - take_set.takes[1].motion.translations[0, 0]
+    np.testing.assert_array_equal(points[:2], network[:2].astype(np.float32))
+    # It is the simulation that the network is compared with in the evaluation.
+    missed = solver_errors(dressed, take_set, Network(model, take_set), [(1, range(20))])
+    mass = dressed.energy.mass.numpy()
+    away = np.sqrt(((points - network)[6] ** 2).sum(-1) @ mass / mass.sum())  # after five frames
+    assert missed and missed.position_error[0] == pytest.approx(away, rel=1e-3) and away > 1e-3
+
+
+def test_takes_are_cut_to_the_first_frames_of_their_clip(bench):
+    long, short = bench[2].takes
+    cut = within([long, replace(short, first=30)], 36)
+    assert [take.frame_count for take in cut] == [36, 6]
+    np.testing.assert_allclose(cut[0].motion.rotations, long.motion.rotations[:36], atol=1e-12)
+    assert [take.frame_count for take in within([long, replace(short, first=33)], 36)] == [36]  # three are too few
 
 
 def test_points_that_joints_cannot_reach_are_counted_as_points(meter, bench, monkeypatch):
@@ -271,6 +291,27 @@ def test_a_variant_that_fails_is_told_and_the_others_are_measured(meter, points,
     assert warning.level == "warning" and "int16: not measured, frame 3" in warning.text
 
 
+def test_each_solver_tells_its_frames_after_the_quick_variants(meter, points, monkeypatch):
+    tried, said = [chosen(meter, name) for name in ("as trained", "simulator", "hero", "int16")], []
+
+    def told(variant, advanced=None):
+        for _ in range((66 if variant.simulated else 70) if advanced else 0):
+            advanced()
+        return replace(points["int16"], swept=variant.swept, variant=variant.name)
+
+    monkeypatch.setattr(meter, "point", told)
+    results = Results(None, {})
+    assert sweep(meter, tried, results, said.append) == 0
+    assert [point.variant for point in results.points] == ["as trained", "int16", "simulator", "hero"]
+    ends = [(event.done, event.total) for event in said if isinstance(event, Progress) and event.done == event.total]
+    assert ends == [(2, 2), (66, 66), (70, 70)]
+    messages = [event.text for event in said if isinstance(event, Message)]
+    assert messages == [
+        "toy, simulator: the solver computes 66 frames",
+        "toy, hero: the solver computes 70 frames",
+    ]
+
+
 @pytest.mark.parametrize("text", ["", "[]", '{"asked": 1}', '{"asked": {}, "points": [{"model": "m"}]}'])
 def test_files_that_hold_something_else_are_refused(tmp_path, text):
     (tmp_path / "other.json").write_text(text)
@@ -282,13 +323,17 @@ def test_tables_and_charts_show_every_point(points):
     lines = table(list(points.values())).splitlines()
     assert len(lines) == len(points) + 2 and all(name in text for name, text in zip(points, lines[2:]))
     assert "time" in "".join(lines[2:]) and "nan" not in "".join(lines)
-    for row in trade_panels(list(points.values())):
+    assert caption({"jump": 60, "flip": 40}, solved=False).endswith(
+        "the same frames, the first 60 of jump, 40 of flip"
+    )
+    assert "first two states" in caption({"jump": 60}, solved=True)
+    for row in trade_panels(list(points.values()), {}):
         for panel in row:
             shown = [point for group in panel.points.values() for point in group]
             assert len(shown) == len(points) and set(panel.front) <= {place[:2] for place in shown}
             assert {"toy", "1 iterations"} <= {words for _, _, words in shown}
             assert "[" in panel.x and "[" in panel.y
-    making = trade_panels(list(points.values()))[0][0].points["refinement"][0][0]
+    making = trade_panels(list(points.values()), {})[0][0].points["refinement"][0][0]
     assert making == pytest.approx(points["1 iterations"].milliseconds + points["1 iterations"].solving)
 
 
@@ -296,8 +341,9 @@ def test_garments_have_rows_of_their_own_and_networks_their_names(points):
     cape = [replace(point, garment="Cape") for point in points.values() if point.variant != "2 blendshapes"]
     light = replace(points["as trained"], garment="Cape", model="light", total=points["as trained"].total + 1)
     skirt = [replace(point, garment="Skirt", shown_skin=None) for point in cape]
-    rows = trade_panels([*cape, light, *skirt])
-    assert [row[0].title for row in rows] == ["Cape"] * 2 + ["Skirt"] * 2
+    rows = trade_panels([*cape, light, *skirt], {"jump": 60, "flip": 40})
+    titles = [f"{garment}, 100 frames of 2 clips" for garment in ("Cape", "Skirt")]
+    assert [row[0].title for row in rows] == titles[:1] * 2 + titles[1:] * 2
     assert "RMS" not in rows[0][0].y and "RMS" in rows[2][0].y  # distances are from one's own whole model
     (_, first, _), (_, second, words) = rows[0][0].points[WHOLE]
     assert words == "light" and second - first == pytest.approx(1)

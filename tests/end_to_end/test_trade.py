@@ -41,16 +41,17 @@ def no_clock(monkeypatch):
 
 
 def test_a_sweep_is_written_drawn_and_taken_up_again(world, capsys, no_clock):
-    assert run(f"{TRADE} --clips long short --no-refine -o trade.json") == 0
+    assert run(f"{TRADE} --clips long short --frames 12 --no-refine -o trade.json") == 0
     document, text = json.loads((world / "trade.json").read_text()), capsys.readouterr().out
     points = {point["variant"]: point for point in document["points"]}
     assert {"as trained", "2 blendshapes", "0 proxies", "int16", "15 frames/s", "crowd", "film"} <= points.keys()
     assert all(name in text for name in points) and document["asked"]["clips"] == ["long", "short"]
+    assert document["asked"]["frames"] == {"long": 12, "short": 10} and "the first 12 of long, 10 of short" in text
     whole, half = points["as trained"], points["15 frames/s"]
     assert whole["position"] == 0 and half["shot_bytes"] < whole["shot_bytes"]
     assert points["2 blendshapes"]["shot_bytes"] < whole["shot_bytes"]
     assert (world / "trade.png").stat().st_size > 1000
-    assert run(f"{TRADE} --clips long short --no-refine -o trade.json") == 0
+    assert run(f"{TRADE} --clips long short --frames 12 --no-refine -o trade.json") == 0
     assert f"{len(points)} variants were measured before" in capsys.readouterr().err
     assert json.loads((world / "trade.json").read_text()) == document
 
@@ -71,6 +72,7 @@ def test_models_are_put_on_one_table(world, capsys, no_clock):
     ("options", "message"),
     [
         ("--clips nothing", "no clip is called nothing; it holds long, other, short and so on"),
+        ("--frames 3", "'3' is not a whole number from 4 to 1e+06"),
         ("-o trade.txt", "it ends in .json"),
         ("-o model.json --stage nowhere.usda", "nowhere.usda: there is no such file"),
         ("--motions clip.usda", "clip.usda: there is no such folder"),
