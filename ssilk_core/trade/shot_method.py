@@ -125,7 +125,8 @@ class ShotMethod:
         steps, last = motion.fps / self.fps, motion.frame_count - 1
         frames = np.minimum(np.arange(shot.frame_count) * steps, last)
         stored = sample_pose(GarmentPose.joined(list(self.player.play(motion).poses())), frames)
-        at = np.arange(motion.frame_count) / steps
+        # The last frame of a shot holds the end of the motion, however far that is from the one before.
+        at = np.interp(np.arange(motion.frame_count), frames, np.arange(shot.frame_count))
         starts = range(0, motion.frame_count, BLOCK_FRAMES)
         return np.concatenate([self._between(shot, stored, at[start : start + BLOCK_FRAMES]) for start in starts])
 

@@ -227,6 +227,7 @@ def test_between_frames_of_a_shot_poses_are_interpolated(meter, bench, model):
     motion = take_set.takes[0].motion
     slow = ShotMethod("slow", reducer.player, dressed, take_set, fps=10.0).unrefined(motion)
     np.testing.assert_allclose(slow[::3], every_frame(reducer, motion)[::3], atol=1e-5)  # frames of the shot
+    np.testing.assert_allclose(slow[-1], every_frame(reducer, motion)[-1], atol=1e-5)  # which none of them falls on
     shot, at = resample(motion, 10.0, cover=True), np.array([1 / 3])
     pose = sample_pose(next(iter(reducer.player.play(motion).poses())), np.array([3.0, 6.0]))
     rotations, translations = sample_motion(shot.clip(1, 3), at)
