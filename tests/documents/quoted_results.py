@@ -742,6 +742,31 @@ def levels_on_gpu() -> Text:
             yield row(at["model"].replace("_", " "), level, solver, *figures, two_digits(1000 * at["position"]))
 
 
+def levels_and_simulator() -> Text:
+    found = document("trade_simulator")
+    (count,) = set(found["asked"]["frames"].values())
+    yield f"the first {count} frames of each"
+    for at in found["points"]:
+        skin, level = at["shown_skin"], f"`{at['variant']}`" if at["variant"] in QUALITIES else at["variant"]
+        yield row(
+            GARMENTS[at["garment"]],
+            level,
+            two_digits(at["solving"]) if at["solving"] else "",
+            fixed(at["total"], 3),
+            share_3(skin["mean"]),
+            share_2(skin["worst"]),
+            two_digits(1000 * at["position"]),
+            fixed(at["shot_bytes"], 2, 1e6),
+        )
+    network, one, hero, simulator = (
+        next(at for at in found["points"] if at["variant"] == name)
+        for name in ("as trained", "1 iterations", "hero", "simulator")
+    )
+    yield f"leaves the network's by {milli(simulator['position'])} mm, `hero` by {milli(hero['position'])} mm"
+    assert round(simulator["solving"] / hero["solving"]) == 10, "the document says so"
+    assert hero["total"] < simulator["total"] < network["total"] < one["total"], "the document says so"
+
+
 def rest_states() -> Text:
     found = result("rest_states")
     worst = {}
@@ -1001,7 +1026,8 @@ PARTS = (
     findings, dynamics,
     ablations,
     wardrobe, long_training, long_decay_training, limits_training, static_training, rest_states,
-    rate_training, final_training, rest, playing, sizes, levels, levels_on_gpu, network_sizes, refinement,
+    rate_training, final_training, rest, playing, sizes, levels, levels_and_simulator, levels_on_gpu,
+    network_sizes, refinement,
     inside_the_body, stress,
     training_speed, scenes,
 )  # fmt: skip
