@@ -195,9 +195,12 @@ class Simulator:
     def step(self, poses: PosedCharacters, past: StepHistory) -> Solution:
         """Return the states one step after `past`, relative to the roots."""
         inputs = self.inputs(poses, past)
+        return self.solve(self.best_start(self.starts(poses, past, inputs), inputs), inputs)
+
+    def starts(self, poses: PosedCharacters, past: StepHistory, inputs: StepInputs) -> list[Tensor]:
+        """Return states (V, 3, N) that a step after `past` may start from: predicted, still, and with the body."""
         assert inputs.predicted is not None
-        starts = [inputs.predicted, past.local, past.follow_lbs(poses)]
-        return self.solve(self.best_start([self.apply_pins(x, poses) for x in starts], inputs), inputs)
+        return [self.apply_pins(x, poses) for x in (inputs.predicted, past.local, past.follow_lbs(poses))]
 
     def solve(self, start: Tensor, inputs: StepInputs) -> Solution:
         """Return the minima of one step, from `start` (V, 3, N)."""

@@ -88,6 +88,29 @@ def test_with_feedback_it_becomes_the_simulator(scene, rollout) -> None:
     assert np.abs(alone - expected).max() > 1e-3
 
 
+def jitter(points):
+    """RMS third difference of vertices (F, V, 3) [m]."""
+    return np.sqrt((np.diff(points, 3, axis=0) ** 2).sum(-1).mean())
+
+
+@pytest.fixture(scope="module")
+def shaken(scene, rollout):
+    """The rollout with a loose garment that goes to and fro by 20 mm, from frame to frame."""
+    motion, points = rollout
+    away = np.where(np.arange(FRAMES) % 2, 0.02, 0.0)[:, None, None] * [1, 0, 0]
+    return motion, points + away * (scene.classes != PINNED)[:, None]
+
+
+def test_without_feedback_jitter_of_the_network_is_not_amplified(scene, shaken) -> None:
+    found, _ = refined(scene, *shaken, iterations=8)
+    assert jitter(found) < 1.2 * jitter(shaken[1])  # the ball adds some
+
+
+def test_with_feedback_jitter_of_the_network_is_left_behind(scene, rollout, shaken) -> None:
+    smooth, rough = (refined(scene, *each, iterations=3, feedback=True)[0] for each in (rollout, shaken))
+    assert jitter(rough) < 1.1 * jitter(smooth) < 0.1 * jitter(shaken[1])
+
+
 def test_with_feedback_a_shot_begins_at_rest(scene, rollout) -> None:
     motion, points = rollout
     _, changes = refined(scene, motion, points, iterations=1, feedback=True)
