@@ -55,7 +55,7 @@ QUALITIES = {
         Quality(name="crowd", shapes=12, joints=8, influences=4, fps=15.0, about="many characters, far away"),
         Quality(name="game", shapes=32, joints=16, influences=4, fps=30.0, about="real time, four influences"),
         Quality(name="film", shapes=48, about="no visible difference from the full model"),
-        Quality(name="hero", refine=4, feedback=True, about="the full model, carried on by the solver"),
+        Quality(name="hero", refine=8, feedback=True, about="the full model, carried on by the solver"),
     )
 }
 
