@@ -17,7 +17,7 @@ ABOUT = {
     "draft": "A first look, after minutes on any machine",
     "preview": "Nearly the final quality, after minutes on a GPU",
     "light": "A small network for many characters, after minutes on a GPU",
-    "final": "What shots are made with, after a quarter of an hour on a fast GPU",
+    "final": "What shots are made with, after ten to twenty minutes on a fast GPU",
 }
 CHOICES = [(name, name.capitalize(), ABOUT[name]) for name in PRESETS]
 

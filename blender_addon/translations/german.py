@@ -282,8 +282,8 @@ WORDS = {
         "Ein kleines Netz für viele Figuren, nach Minuten auf einer GPU"
     ),
     "Final": "Endgültig",
-    "What shots are made with, after a quarter of an hour on a fast GPU": (
-        "Womit Einstellungen entstehen, nach einer Viertelstunde auf einer schnellen GPU"
+    "What shots are made with, after ten to twenty minutes on a fast GPU": (
+        "Womit Einstellungen entstehen, nach zehn bis zwanzig Minuten auf einer schnellen GPU"
     ),
     "Iterations": "Schritte",
     "Optimiser steps; zero for as many as the preset has": "Schritte des Optimierers; null: so viele wie die Vorgabe",

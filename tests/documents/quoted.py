@@ -41,7 +41,7 @@ from .shared import (
 
 def readme() -> Text:
     preview, final = (preset_minutes(PRESETS[name]) for name in ("preview", "final"))
-    yield f"about {60 * preview:.0f} seconds on a shared H200 and `--preset final` about {final:.0f} minutes"
+    yield f"about {preview:.0f} minutes on a shared H200 and `--preset final` about {final:.0f} minutes"
     yield f"{two_gpus(32, 1024):.1f} times as fast with 1,024 windows of 32 poses in a batch"
     yield f"{two_gpus(32, 64):.2f} times as fast with 64 windows"
 
@@ -118,7 +118,7 @@ def training() -> Text:
     last = min(decayed[name]["iterations"][-1] for name in ("cape_decay", "cape_half_rate_decay"))
     yield f"they did not in {last:,} iterations and more"
     preview, final = (preset_minutes(PRESETS[name]) for name in ("preview", "final"))
-    yield f"`preview` takes {60 * preview:.0f} s and `final` {final:.0f} minutes"
+    yield f"`preview` takes {preview:.0f} minutes and `final` {final:.0f}"
     yield "(`recombinations={0.recombinations}`, `perturbations={0.perturbations}`)".format(PRESETS["final"].train)
     yield from side_by_side()
 

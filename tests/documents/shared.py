@@ -41,8 +41,8 @@ def cache_share() -> str:
 
 
 def preset_minutes(preset: Preset) -> float:
-    """Return how long a preset's iterations take, at the pace of a cape on an H200 that two trainings share [min]."""
-    cape = result("static_training")["cape_short"]
+    """Return how long a preset's iterations take, at the pace of a cape on an H200 that three trainings share [min]."""
+    cape = result("long_decay_training")["cape_half_rate_decay"]
     return preset.train.iterations * cape["seconds"][-1] / cape["iterations"][-1] / 60
 
 
