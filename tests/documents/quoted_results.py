@@ -10,7 +10,6 @@ from statistics import mean
 
 from ssilk_core.config import PRESETS, ModelConfig
 from ssilk_core.demo.shipped import shipped_path
-from ssilk_core.energy import TERMS
 from ssilk_core.evaluation.solver_errors import AFTER
 from ssilk_core.fabrics import FABRICS
 from ssilk_core.quality import QUALITIES

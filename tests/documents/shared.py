@@ -41,7 +41,7 @@ def cache_share() -> str:
 
 
 def preset_minutes(preset: Preset) -> float:
-    """Return how long a preset's iterations take, at the pace of a cape on an H200 that three trainings share [min]."""
+    """Return how long a preset takes, at the pace of a cape on an H200 that three trainings share [min]."""
     cape = result("long_decay_training")["cape_half_rate_decay"]
     return preset.train.iterations * cape["seconds"][-1] / cape["iterations"][-1] / 60
 
