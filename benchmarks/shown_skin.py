@@ -66,7 +66,7 @@ def whole_clip(
 
 
 def refined_points(take: NetworkTake, iterations: int = ITERATIONS) -> Floats:
-    """Return the refined vertices of a take (F, V, 3), which look back on the network's."""
+    """Return the refined vertices of a take (F, V, 3), held where the network has them."""
     refiner = take.refiner(iterations, False, CHUNK)
     return np.stack([frame.points for frame in refiner.frames(take.motion, take.points)])
 

@@ -3,9 +3,9 @@
 
     python benchmarks/worst_frames.py cape.safetensors --stage character.usdc --motions FOLDER --clips 01_14
 
-Solver iterations start from the network's state in that frame, and look back on the network's two states before it:
-a few, as `bake --refine` makes them, and as many as the solver needs to its tolerance. Then cloth is lifted off skin
-that still shows.
+Solver iterations start from the network's state in that frame, and inertia holds the cloth there: a few, as
+`bake --refine` makes them, and as many as the solver needs to its tolerance. Then cloth is lifted off skin that still
+shows.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ssilk_core.assets import Floats
 from ssilk_core.collision import CoveredSkin
 
 ITERATIONS = (4, 200)
-BEFORE = 2  # frames that the worst one looks back on
+BEFORE = 2  # frames before the worst one: the first of a shot has no inertia
 HEADER = ("garment", "clip", "frame", "network [%]", *(f"{count} iterations [%]" for count in ITERATIONS))
 
 
