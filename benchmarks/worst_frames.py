@@ -23,7 +23,7 @@ from ssilk_core.assets import Floats
 from ssilk_core.collision import CoveredSkin
 
 ITERATIONS = (4, 200)
-BEFORE = 2  # frames before the worst one: the first of a shot has no inertia
+BEFORE = 1  # frames before the worst one, for its drag
 HEADER = ("garment", "clip", "frame", "network [%]", *(f"{count} iterations [%]" for count in ITERATIONS))
 
 

@@ -116,7 +116,7 @@ def verify_energies(rollout: BakeRollout, points: Iterable[Floats], report: Repo
     """Check points [m], shape (V, 3) each, that an earlier bake refined, without refining them again.
 
     The last digits of a refinement depend on the machine, and the solver amplifies them. On any machine, no frame
-    may have more energy than the network's state, with the past that it was refined with.
+    may have more energy than the network's state, with inertia as it was refined with.
 
     Raises:
         VerificationError: a frame has more.

@@ -45,7 +45,8 @@ class BakeRequest:
         target: who receives the shot, a name in `ssilk_core.targets.TARGETS`.
         lbs: bake linear blend skinning instead of the network.
         refine: iterations of the simulator's solver in each frame, from the network's state; 0 for none.
-        feedback: refined frames look back on refined frames instead of the network's, one after the other.
+        feedback: refined frames look back on refined frames, one after the other; else inertia holds each where the
+            network has it.
         refined_output: "joints" writes refined frames as joints and as many blendshapes as they need (see
             `decomposition`), "points" as points.
         hide_covered: hide the body's faces that the garment covers in every frame (see `mesh.hidden_faces`).

@@ -114,7 +114,7 @@ class RefinementSummary:
 
     Attributes:
         iterations: of the solver in each frame, at most.
-        energy_before_j, energy_j: of the network's state, and of the refined one with the same past [J].
+        energy_before_j, energy_j: means of `refine.FrameChange.before` and `after` [J].
         inside_before, inside: share of the vertices inside the body.
         moved_m: RMS distance over the mass [m].
         shapes: how the refined vertices became joints and blendshapes; None where points are written.

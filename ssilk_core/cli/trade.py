@@ -6,7 +6,8 @@ the simulator goes on by itself from the network's first two states. Networks of
 compared: further models of a garment are measured whole and at their levels. Costs are the times of playing and of
 the solver, memory, and the sizes of model and shot. Accuracy is energy, collisions, skin that shows, and the distance
 of vertices and velocities from the whole model. All are measured on the same frames, the first ones of each clip,
-because the simulator takes seconds for each on a processor. Times are of this machine and of the first clip. --output
+because the simulator takes seconds for each on a processor. A shot of a solver has the blendshapes that these frames
+need. Times are of this machine and of the first clip. --output
 writes each point when it is measured; an interrupted sweep continues from there. A variant that fails is told, and
 the exit code is 4 then.
 """
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from ..trade.measure import StoredTake, VariantMeter, Weigh
 
 CLIPS = 2  # are measured on where --clips names none
-FRAMES = 60  # two seconds of each; the simulator of a cape takes some minutes for them
+FRAMES = 60  # two seconds of each, for which the simulator of a cape takes a quarter of an hour on a processor
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -92,9 +93,16 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
             write_chart(options.output.with_suffix(".png"), panels, size=(4.6, 3.6))
         if not options.json:
             tables = table(results.points), collision_table(results.collision_costs)
-            print(caption(bench.frames, solved=any(point.solving for point in results.points)), *tables, sep="\n")
+            print(
+                caption(bench.frames, simulated=any(point.swept == "simulator" for point in results.points)),
+                *tables,
+                sep="\n",
+            )
     report(Result("trade", {"points": [asdict(point) for point in results.points]} if options.json else {}))
     return EXIT_TASKS if failed else EXIT_OK
+
+
+MEASUREMENT = 2  # raised when points of earlier versions cannot be compared with new ones
 
 
 class Bench:
@@ -139,6 +147,7 @@ class Bench:
             "stage": sha256(options.stage),
             "clips": list(self.clips),
             "frames": self.frames,
+            "measurement": MEASUREMENT,
             "hardware": f"{platform.processor() or platform.machine()}, {self.device}",
             "ssilk": __version__,
         }

@@ -56,8 +56,8 @@ def takes_of(clip: str, motion: Motion, fps: float, longest: int | None = None) 
 
 def within(takes: Iterable[Take], frames: int) -> list[Take]:
     """Return takes as far as they lie in the first frames of their clips; those of under four are left out."""
-    kept = [replace(take, motion=take.motion.clip(0, max(frames - take.first, 0))) for take in takes]
-    return [take for take in kept if take.frame_count >= SHORTEST]
+    begun = [take for take in takes if frames - take.first >= SHORTEST]
+    return [replace(take, motion=take.motion.clip(0, frames - take.first)) for take in begun]
 
 
 def _played(motion: Motion, fps: float, seconds: Floats) -> Motion:

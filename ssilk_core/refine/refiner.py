@@ -35,7 +35,7 @@ from ..kinematics import split_at_cuts
 from ..simulate import SimulationOptions, Simulator
 from ..simulate.characters import PosedCharacters
 from ..simulate.incremental_potential import StepInputs
-from ..simulate.newton import SolverOptions, State, minimise_from
+from ..simulate.newton import SolverOptions, State, minimise_from, need_finite
 from ..simulate.simulator import StepHistory
 from .clearing import SkinClearing
 
@@ -49,7 +49,7 @@ class RefineOptions:
     Attributes:
         iterations: maximum number of Newton iterations in each frame; those of the first one with feedback are not
             limited so.
-        feedback: use refined frames as previous states instead of the network's.
+        feedback: inertia follows the refined frames before, in place of holding a frame where the network has it.
         batch: frames refined at once; one with feedback.
         tolerance: see `SolverOptions`.
     """
@@ -82,7 +82,8 @@ class FrameChange:
     """The change of one frame by refinement.
 
     Attributes:
-        before, after: energy of the network's state and of the refined one, with the same previous states [J].
+        before, after: energy of the network's state and of the refined one [J]; without feedback that of inertia is
+            zero before, and after it that of the step away from the network's state.
         inside_before, inside_after: share of the vertices inside the part of the body that they can touch
             (`collision.contacts`).
         moved: RMS displacement, weighted by mass [m].
@@ -202,6 +203,7 @@ class Refiner:
         inputs: StepInputs,
     ) -> Tensor:
         """Return the solver's positions relative to the roots (V, 3, N)."""
+        need_finite(before)
         start, solver = before.x, self.options.solver if tail else self.options.first_solver
         if tail and past and self.options.feedback:
             corrected = self.simulator.apply_pins(world + tail.correction - poses.root, poses)
@@ -214,7 +216,7 @@ class Refiner:
         if tail is None:
             return None if self.options.feedback else StepHistory(world, None, poses.root, poses.lbs)
         seen, count = torch.cat([tail.world, world[..., :-1]], dim=-1), world.shape[-1]
-        before = seen[..., -count - 1 : -1] if seen.shape[-1] > count else None
+        before = seen[..., -count - 1 : -1] if self.options.feedback and seen.shape[-1] > count else None
         root = torch.cat([tail.root, poses.root[:, :-1]], dim=1)
         return StepHistory(seen[..., -count:], before, root, torch.cat([tail.lbs, poses.lbs[..., :-1]], dim=-1))
 
@@ -237,9 +239,9 @@ class Refiner:
 
 
 def _blocks(count: int, size: int) -> Iterator[tuple[int, int]]:
-    """Yield the blocks of frames; the first two, which lack previous states, are refined one by one."""
-    yield from ((frame, frame + 1) for frame in range(min(2, count)))
-    yield from ((start, min(start + size, count)) for start in range(2, count, size))
+    """Yield the blocks of frames; the first one, which lacks a previous state, is refined by itself."""
+    yield 0, 1
+    yield from ((start, min(start + size, count)) for start in range(1, count, size))
 
 
 @dataclass

@@ -148,6 +148,18 @@ def minimise_from(
     return search.solution
 
 
+def need_finite(first: State) -> None:
+    """Raise `SsilkError` where a frame's first state has no finite energy."""
+    bad = int((~first.energy.isfinite()).sum())
+    if bad != 0:
+        fail(
+            "simulation",
+            f"the first state of {bad} of {len(first.energy)} frames has no finite energy",
+            "positions, body and time step must be finite",
+            "look for NaN in stage and motion",
+        )
+
+
 class _Search:
     """The search of `minimise_from`: the active frames, and the best state of every frame.
 
@@ -165,15 +177,8 @@ class _Search:
     ) -> None:
         self.potential, self.options, self.inputs = potential, options, inputs
         self.state = State.at(potential, start, inputs)
+        need_finite(self.state)
         energy = self.state.energy
-        bad = int((~energy.isfinite()).sum())
-        if bad != 0:
-            fail(
-                "simulation",
-                f"the first state of {bad} of {len(energy)} frames has no finite energy",
-                "positions, body and time step must be finite",
-                "look for NaN in stage and motion",
-            )
         self.active = torch.arange(len(energy), device=start.device)
         self.moving = torch.ones_like(energy, dtype=torch.bool)
         self.fixed = torch.zeros_like(start[:, 0], dtype=torch.bool)

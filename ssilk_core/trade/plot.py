@@ -34,7 +34,7 @@ def trade_panels(points: Sequence[TradePoint], frames: Mapping[str, int]) -> lis
     Args:
         frames: number of frames of each clip that all points are of; empty where it is not known.
     """
-    count = f", {sum(frames.values())} frames of {len(frames)} clips" if frames else ""
+    count = f", {sum(frames.values())} frames, {len(frames)} clip{'s'[: len(frames) > 1]}" if frames else ""
     garments = dict.fromkeys(point.garment for point in points)
     return [row for name in garments for row in _rows([p for p in points if p.garment == name], name + count)]
 

@@ -41,7 +41,7 @@ class ShotMethod:
         advanced: called after each frame of a solver.
 
     Attributes:
-        solving: time of the solver for a frame that it computes [ms], for each take that was computed.
+        solving: time of the solver for a frame but the first that it computes [ms], for each take that was computed.
         shots: takes of a solver as joints and blendshapes.
     """
 
@@ -87,12 +87,16 @@ class ShotMethod:
         return points - motion.translations[0, 0]
 
     def _solved(self, frames: Iterator[Floats]) -> Floats:
-        """Return frames (N, V, 3) that a solver computes as they are asked for, and note the time that it takes."""
-        begun, points = time.perf_counter(), []
+        """Return frames (N, V, 3) that a solver computes as they are asked for; note the time of all but the first.
+
+        With feedback the first is put to rest, which takes as long as many others.
+        """
+        points, ends = [], []
         for frame in frames:
             points.append(frame)
+            ends.append(time.perf_counter())
             self.advanced()
-        self.solving.append(1000 * (time.perf_counter() - begun) / len(points))
+        self.solving.append(1000 * (ends[-1] - ends[0]) / (len(points) - 1))
         return np.stack(points)
 
     def _carried_on(self, simulator: Simulator, motion: Motion, given: Floats) -> Iterator[Floats]:

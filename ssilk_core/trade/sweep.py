@@ -55,7 +55,8 @@ class Results:
 
     def found(self, model: str, variant: Variant) -> bool:
         """Return whether a variant has been measured."""
-        return any((p.model, p.swept, p.variant) == (model, variant.swept, variant.name) for p in self.points)
+        asked = model, variant.swept, variant.name, variant.refine
+        return any((p.model, p.swept, p.variant, p.refine) == asked for p in self.points)
 
     def add(self, point: TradePoint) -> None:
         """Add a point and write the file."""

@@ -15,10 +15,10 @@ HEADER = ("garment", "model", "swept", "variant", "size", "ms a frame", "95 %", 
 MARKS = {"making": "time", "shot_bytes": "shot", "model_bytes": "model"}
 
 
-def caption(frames: Mapping[str, int], *, solved: bool) -> str:
-    """Return the words above a table: the frames of each clip that its rows are of, and where `solved` ones begin."""
+def caption(frames: Mapping[str, int], *, simulated: bool) -> str:
+    """Return the words above a table: the frames of each clip that are measured, and where the simulator begins."""
     named = ", ".join(f"{count} of {name}" for name, count in frames.items())
-    begins = "; the simulator goes on from the first two states of the garment's first network" if solved else ""
+    begins = "; the simulator goes on from the first two states of the garment's first network" if simulated else ""
     return f"all rows are of the same frames, the first {named}{begins}"
 
 

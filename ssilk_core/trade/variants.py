@@ -43,7 +43,7 @@ class Variant:
         fps: frame rate of the shot [1/s].
         refine: solver iterations per frame.
         feedback: refined frames look back on refined ones.
-        simulated: the simulator computes the shot, without the network.
+        simulated: the simulator computes the shot, from the network's first two states.
     """
 
     swept: str

@@ -198,6 +198,7 @@ def test_takes_are_cut_to_the_first_frames_of_their_clip(bench):
     assert [take.frame_count for take in cut] == [36, 6]
     np.testing.assert_allclose(cut[0].motion.rotations, long.motion.rotations[:36], atol=1e-12)
     assert [take.frame_count for take in within([long, replace(short, first=33)], 36)] == [36]  # three are too few
+    assert [take.frame_count for take in within([long, replace(short, first=50)], 36)] == [36]
 
 
 def test_points_that_joints_cannot_reach_are_counted_as_points(meter, bench, monkeypatch):
@@ -324,10 +325,10 @@ def test_tables_and_charts_show_every_point(points):
     lines = table(list(points.values())).splitlines()
     assert len(lines) == len(points) + 2 and all(name in text for name, text in zip(points, lines[2:]))
     assert "time" in "".join(lines[2:]) and "nan" not in "".join(lines)
-    assert caption({"jump": 60, "flip": 40}, solved=False).endswith(
+    assert caption({"jump": 60, "flip": 40}, simulated=False).endswith(
         "the same frames, the first 60 of jump, 40 of flip"
     )
-    assert "first two states" in caption({"jump": 60}, solved=True)
+    assert "first two states" in caption({"jump": 60}, simulated=True)
     for row in trade_panels(list(points.values()), {}):
         for panel in row:
             shown = [point for group in panel.points.values() for point in group]
@@ -343,7 +344,7 @@ def test_garments_have_rows_of_their_own_and_networks_their_names(points):
     light = replace(points["as trained"], garment="Cape", model="light", total=points["as trained"].total + 1)
     skirt = [replace(point, garment="Skirt", shown_skin=None) for point in cape]
     rows = trade_panels([*cape, light, *skirt], {"jump": 60, "flip": 40})
-    titles = [f"{garment}, 100 frames of 2 clips" for garment in ("Cape", "Skirt")]
+    titles = [f"{garment}, 100 frames, 2 clips" for garment in ("Cape", "Skirt")]
     assert [row[0].title for row in rows] == titles[:1] * 2 + titles[1:] * 2
     assert "RMS" not in rows[0][0].y and "RMS" in rows[2][0].y  # distances are from one's own whole model
     (_, first, _), (_, second, words) = rows[0][0].points[WHOLE]

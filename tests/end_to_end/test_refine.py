@@ -14,6 +14,7 @@ from ssilk_usd.provenance import read_provenance
 
 from ssilk_core.bake import BakeRequest, bake
 from ssilk_core.cli import main
+from ssilk_core.quality import QUALITIES
 
 BAKE = ["bake", "model.safetensors", "--stage", "rigged.usda", "--motion", "brief.usda"]
 
@@ -137,10 +138,10 @@ def test_with_feedback_the_cloth_goes_on_from_refined_frames(there, capsys):
     words = ["--refine", "3", "--refined-output", "points", "--feedback"]
     assert main([*BAKE, "-o", "feedback.usda", *words]) == 0
     away = np.linalg.norm(points_of("feedback.usda") - points_of("points.usda"), axis=-1).max(axis=1)
-    assert away[-1] > 1e-4, "in points.usda each frame looks back on the network's"
+    assert away[-1] > 1e-4, "in points.usda each frame is held where the network has it"
     assert main(["verify", "feedback.usda"]) == 0
     assert main([*BAKE, "-o", "level.usda", "--quality", "hero"]) == 0
-    assert main([*BAKE, "-o", "said.usda", "--refine", "4", "--feedback"]) == 0
+    assert main([*BAKE, "-o", "said.usda", "--refine", str(QUALITIES["hero"].refine), "--feedback"]) == 0
     np.testing.assert_array_equal(points_of("level.usda"), points_of("said.usda"))
     capsys.readouterr()
     assert main(["verify", "said.usda"]) == 0
