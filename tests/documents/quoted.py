@@ -120,6 +120,7 @@ def training() -> Text:
     preview, final = (preset_minutes(PRESETS[name]) for name in ("preview", "final"))
     yield f"`preview` takes {preview:.0f} minutes and `final` {final:.0f}"
     yield "(`recombinations={0.recombinations}`, `perturbations={0.perturbations}`)".format(PRESETS["final"].train)
+    yield f"the default static rate and {result('final_training')['tshirt']['iterations'][-1]:,} iterations"
     yield from side_by_side()
 
 
