@@ -64,7 +64,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     from ..trade.plot import trade_panels
     from ..trade.sweep import Results, sweep
     from ..trade.table import caption, collision_table, table
-    from ..trade.variants import other_network, variants
+    from ..trade.variants import SIMULATOR, other_network, variants
 
     if options.output:
         if options.output.suffix != ".json":
@@ -93,11 +93,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
             write_chart(options.output.with_suffix(".png"), panels, size=(4.6, 3.6))
         if not options.json:
             tables = table(results.points), collision_table(results.collision_costs)
-            print(
-                caption(bench.frames, simulated=any(point.swept == "simulator" for point in results.points)),
-                *tables,
-                sep="\n",
-            )
+            simulated = any(point.swept == SIMULATOR for point in results.points)
+            print(caption(bench.frames, simulated=simulated), *tables, sep="\n")
     report(Result("trade", {"points": [asdict(point) for point in results.points]} if options.json else {}))
     return EXIT_TASKS if failed else EXIT_OK
 

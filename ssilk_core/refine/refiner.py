@@ -203,9 +203,9 @@ class Refiner:
         inputs: StepInputs,
     ) -> Tensor:
         """Return the solver's positions relative to the roots (V, 3, N)."""
-        need_finite(before)
         start, solver = before.x, self.options.solver if tail else self.options.first_solver
         if tail and past and self.options.feedback:
+            need_finite(before)  # the best of several starts may be finite where it is not
             corrected = self.simulator.apply_pins(world + tail.correction - poses.root, poses)
             starts = [start, corrected, *self.simulator.starts(poses, past, inputs)]
             start = self.simulator.best_start(starts, inputs)

@@ -9,7 +9,7 @@ from math import isfinite
 
 from ..charts import ChartPanel
 from .point import SECONDS, TradePoint, front
-from .variants import WHOLE
+from .variants import SIMULATOR, WHOLE
 
 COSTS = {
     "making": ("time to make a frame, solver included [ms]", 1.0),
@@ -23,7 +23,7 @@ ERRORS = {
     "mean_shown_skin": ("covered skin that shows [%]", 1e2, 1e-2),
 }
 ACROSS_MODELS = ("total", "mean_shown_skin")  # errors that compare networks; a distance is from one's own whole model
-NAMED = (WHOLE, "level", "refinement", "simulator")  # sweeps whose points are all labelled
+NAMED = (WHOLE, "level", "refinement", SIMULATOR)  # sweeps whose points are all labelled
 
 
 def trade_panels(points: Sequence[TradePoint], frames: Mapping[str, int]) -> list[list[ChartPanel]]:
@@ -34,7 +34,7 @@ def trade_panels(points: Sequence[TradePoint], frames: Mapping[str, int]) -> lis
     Args:
         frames: number of frames of each clip that all points are of; empty where it is not known.
     """
-    count = f", {sum(frames.values())} frames, {len(frames)} clip{'s'[: len(frames) > 1]}" if frames else ""
+    count = f", {sum(frames.values())} frames, {len(frames)} clip{'s' if len(frames) > 1 else ''}" if frames else ""
     garments = dict.fromkeys(point.garment for point in points)
     return [row for name in garments for row in _rows([p for p in points if p.garment == name], name + count)]
 

@@ -147,3 +147,11 @@ def test_what_does_not_fit_is_refused(scene, rollout) -> None:
     broken[0, 3] = np.nan
     with pytest.raises(SsilkError, match="first state of 1 of 1 frames has no finite energy"):
         refined(scene, motion, broken, iterations=1)
+
+
+def test_with_feedback_a_network_state_that_is_not_finite_is_refused(scene, rollout) -> None:
+    motion, points = rollout
+    broken = points.copy()
+    broken[3, np.flatnonzero(scene.classes != PINNED)[0]] = np.nan  # the simulator's own starts are finite there
+    with pytest.raises(SsilkError, match="first state of 1 of 1 frames has no finite energy"):
+        refined(scene, motion, broken, iterations=1, feedback=True)

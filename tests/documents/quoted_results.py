@@ -579,8 +579,7 @@ def long_decay_training() -> Text:
     }
     runs, norms, before = result("long_decay_training"), result("matrix_norms"), result("long_training")
     assert set(runs) == set(names)
-    (seed,) = {shipped("cape")["provenance"]["train"]["seed"]}
-    yield f"of seed {seed}, but for half of that rate"
+    yield f"of seed {shipped('cape')['provenance']['train']['seed']}, but for half of that rate"
     for name, run in runs.items():
         yield training_row(run, *names[name])
     at = runs["cape_half_rate"]["iterations"].index(28_800)
