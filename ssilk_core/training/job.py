@@ -76,7 +76,8 @@ class TrainJob:
         """Return the motions, and those recombined from them and perturbed."""
         skeleton, train = self.scene.character.skeleton, self.train
         more = recombine_motions(self.motions, skeleton, train.recombinations, train.seed)
-        return [*self.motions, *more, *perturb_motions(self.motions, train.perturbations, train.seed)]
+        more += perturb_motions(self.motions, skeleton, train.perturbations, train.seed)
+        return [*self.motions, *more]
 
     def identity(self) -> dict[str, Any]:
         """Return the inputs that a resumed run must share, as JSON stores them; stitches of one island are none."""

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motions with joints turned at random, for poses that no clip holds: flips, falls, glitches of motion capture."""
+"""Motions with joints turned at random, or nearer to the bind pose, for poses that no clip holds.
+
+Random turns stand for flips, falls and glitches of motion capture. Motions keyed by hand stay near the bind pose with
+many joints at once, such as the spine, the shoulders and the hands, and captured motions never do.
+"""
 
 from __future__ import annotations
 
@@ -8,31 +12,63 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..assets import Floats, Motion
-from ..kinematics import multiply_quaternions
+from ..assets import Floats, Motion, Skeleton
+from ..kinematics import local_transforms, multiply_quaternions, quaternion_from_matrix, slerp
+from .recombine import limb_joints
 
 USUAL_TURN, LARGE_TURN = np.radians(12), np.radians(35)  # standard deviation about each axis
 LARGE_PROBABILITY = 0.1  # that a joint turns far
-SLOWEST, FASTEST = 0.1, 0.7  # [Hz] of the turns
+BLEND_PROBABILITY = 0.5  # that a motion is blended with the bind pose
+WHOLE_PROBABILITY = 0.5  # that a limb of a blended motion is so as much as the whole body; others are so less
+SLOWEST, FASTEST = 0.1, 0.7  # [Hz] of the turns and blends
 
 
-def perturb_motions(motions: Sequence[Motion], copies: int, seed: int) -> list[Motion]:
-    """Return `copies` of each motion with slow random turns of every joint but the root, about random axes."""
+def perturb_motions(motions: Sequence[Motion], skeleton: Skeleton, copies: int, seed: int) -> list[Motion]:
+    """Return `copies` of each motion with slow random turns of every joint but the root, about random axes.
+
+    About half of the copies then go to and fro between these poses and the bind pose, each limb with its own part.
+    """
     generator = np.random.default_rng(seed)
-    return [_perturbed(motion, generator) for motion in [*motions] * copies]
+    return [_perturbed(motion, skeleton, generator) for motion in [*motions] * copies]
 
 
-def _perturbed(motion: Motion, generator: np.random.Generator) -> Motion:
+def _perturbed(motion: Motion, skeleton: Skeleton, generator: np.random.Generator) -> Motion:
+    rotations = multiply_quaternions(motion.rotations, _quaternions(_turns(motion, generator)))
+    if generator.random() < BLEND_PROBABILITY:
+        rotations = slerp(rotations, _bind_rotations(skeleton), _bind_weights(motion, skeleton, generator))
+    return replace(motion, path=f"{motion.path} perturbed", rotations=rotations)
+
+
+def _turns(motion: Motion, generator: np.random.Generator) -> Floats:
+    """Return rotation vectors (F, J, 3) [rad] that change slowly; those of the root are zero."""
     count = motion.rotations.shape[1]
     far = generator.random((count, 1)) < LARGE_PROBABILITY
     size = np.where(far, LARGE_TURN, USUAL_TURN)
     still, swing = (size * generator.normal(size=(count, 3)) / np.sqrt(2) for _ in range(2))
-    rate, phase = generator.uniform(SLOWEST, FASTEST, (count, 1)), generator.uniform(0, 2 * np.pi, (count, 1))
-    time = np.arange(motion.frame_count)[:, None, None] / motion.fps
-    turns = still + np.sqrt(2) * swing * np.sin(2 * np.pi * rate * time + phase)
+    turns = still + np.sqrt(2) * swing * _waves(motion, generator, count)[..., None]
     turns[:, 0] = 0
-    rotations = multiply_quaternions(motion.rotations, _quaternions(turns))
-    return replace(motion, path=f"{motion.path} perturbed", rotations=rotations)
+    return turns
+
+
+def _bind_weights(motion: Motion, skeleton: Skeleton, generator: np.random.Generator) -> Floats:
+    """Return how far joints are on their way to the bind pose, from 0 to 1, shape (F, J); the root never is."""
+    limbs = limb_joints(skeleton)
+    parts = np.ones(motion.rotations.shape[1])
+    for joints in limbs:  # outer limbs come last
+        parts[joints] = 1 if generator.random() < WHOLE_PROBABILITY else generator.random()
+    parts[0] = 0
+    return (0.5 + 0.5 * _waves(motion, generator, 1)) * parts
+
+
+def _bind_rotations(skeleton: Skeleton) -> Floats:
+    return quaternion_from_matrix(local_transforms(skeleton.bind_transforms, skeleton.parents)[:, :3, :3])
+
+
+def _waves(motion: Motion, generator: np.random.Generator, count: int) -> Floats:
+    """Return sines of random rates and phases, shape (F, `count`)."""
+    rate, phase = generator.uniform(SLOWEST, FASTEST, count), generator.uniform(0, 2 * np.pi, count)
+    time = np.arange(motion.frame_count)[:, None] / motion.fps
+    return np.sin(2 * np.pi * rate * time + phase)
 
 
 def _quaternions(turns: Floats) -> Floats:
