@@ -30,11 +30,13 @@ from ..simulate.incremental_potential import IncrementalPotential, StepInputs
 from ..simulate.newton import State
 
 POINTS = 30_001  # on the body, 7 mm apart on a person; others than those at which skin that shows is measured
-ROUNDS = 4  # at most; each finds anew where skin shows
+ROUNDS = 12  # at most; each finds anew where skin shows
 HEIGHT = 3e-3  # [m] above the points, since skin between them is not asked and springs stop a little short
 STIFFER = 9.0  # springs of each point, relative to the Hessian at the cloth; with more points they can be softer
-DEEPEST = 0.012  # [m] beneath the skin; deeper cloth could only be lifted as a spike
-FARTHEST = 0.02  # [m] that a vertex moves in all rounds
+DEEPEST = 0.02  # [m] beneath the skin; deeper cloth could only be lifted as a spike
+SHALLOWEST = 0.002  # [m]; a frame that does not gain lifts cloth half as deep, down to here
+LEFT = 0.9  # share of the points that show, at most, after a round that gains
+FARTHEST = 0.03  # [m] that a vertex moves in all rounds
 REDUCTION, CG_ITERATIONS = 1e-4, 300  # of the residual by each linear solve, and its longest
 MOST_FREE = 0.5  # share of the cloth's weights at free corners from which on it is lifted
 CORNERS = list(combinations_with_replacement(range(3), 2))  # pairs of them in a triangle
@@ -61,16 +63,16 @@ class Lifts:
 
     @property
     def asking(self) -> Tensor:
-        """Frames in which cloth can rise, in ascending order (K,)."""
-        return self.frame.unique()
+        """Number of points that ask in each frame (N,)."""
+        return torch.bincount(self.frame, minlength=len(self.shown))
 
-    def select(self, frames: Tensor) -> Lifts:
-        """Return what is asked in the frames with indices (K,), in ascending order."""
-        place = torch.full_like(self.shown, -1)
-        place[frames] = torch.arange(len(frames), device=frames.device)
-        kept = place[self.frame] >= 0
-        face, weights, normal, gap = (each[kept] for each in (self.face, self.weights, self.normal, self.gap))
-        return Lifts(place[self.frame[kept]], face, weights, normal, gap, self.shown[frames])
+    def within(self, depth: Tensor) -> Lifts:
+        """Return what is asked of cloth up to the depths (N,) beneath the skin in each frame."""
+        kept = self.gap <= HEIGHT + depth[self.frame]
+        frame, face, weights, normal, gap = (
+            each[kept] for each in (self.frame, self.face, self.weights, self.normal, self.gap)
+        )
+        return Lifts(frame, face, weights, normal, gap, self.shown)
 
 
 class SkinClearing:
@@ -100,22 +102,24 @@ class SkinClearing:
         """
         if inputs.body is None or not len(self.points):
             return x
-        found, lifts = x, self._lifts(x, inputs.body)
-        left = lifts.asking
-        lifts, inputs = lifts.select(left), inputs.select(left)
-        state = State.at(self.potential, x[..., left], inputs) if len(left) else None
+        found, left = x, self._lifts(x, inputs.body).asking.nonzero().squeeze(1)
+        depth = x.new_full((len(left),), DEEPEST)
         for _ in range(ROUNDS):
             if not len(left):
                 break
-            assert inputs.body and state
-            moved = state.x + self._step(state, inputs, lifts) - x[..., left]
-            moved = moved * (FARTHEST / moved.norm(dim=1).amax(0).clamp_min(FARTHEST))
-            trial = State.at(self.potential, x[..., left] + moved, inputs)
-            after = self._lifts(trial.x, inputs.body)
-            better = (after.shown < lifts.shown) & (trial.energy <= most[left])
+            some = inputs.select(left)
+            assert some.body
+            state = State.at(self.potential, found[..., left], some)
+            before = self._lifts(state.x, some.body)
+            moved = state.x + self._step(state, some, before.within(depth)) - x[..., left]
+            moved = moved * (FARTHEST / moved.norm(dim=1, keepdim=True).clamp_min(FARTHEST))
+            trial = State.at(self.potential, x[..., left] + moved, some)
+            after = self._lifts(trial.x, some.body)
+            better = (after.shown <= LEFT * before.shown) & (trial.energy <= most[left])
             found = found.index_copy(-1, left[better], trial.x[..., better])
-            kept = after.asking[better[after.asking]]
-            left, lifts, inputs, state = left[kept], after.select(kept), inputs.select(kept), trial.select(kept)
+            depth = depth.where(better, depth / 2)
+            kept = (after.asking.where(better, before.asking) > 0) & (depth > SHALLOWEST)
+            left, depth = left[kept], depth[kept]
         return found
 
     def _lifts(self, x: Tensor, body: PosedBody) -> Lifts:

@@ -14,7 +14,7 @@ from ssilk_core.assets import LOOSE, PINNED, Body, Garment, Mesh, ProxyRig, Scen
 from ssilk_core.collision import CollisionBody
 from ssilk_core.fabrics import Fabric
 from ssilk_core.refine import clearing as module
-from ssilk_core.refine.clearing import DEEPEST, FARTHEST, HEIGHT, STIFFER, SkinClearing, winding_number
+from ssilk_core.refine.clearing import DEEPEST, FARTHEST, HEIGHT, SHALLOWEST, STIFFER, SkinClearing, winding_number
 from ssilk_core.simulate.incremental_potential import IncrementalPotential, StepInputs
 from ssilk_core.simulate.newton import State
 
@@ -95,10 +95,23 @@ def test_pinned_and_deep_cloth_is_left(shell):
     clearing, points = SkinClearing(shell, potential), shell.garment.mesh.points
     pinned = torch.tensor(np.where(points[:, 2:] < -CAP * (RADIUS + GAP), 0.9, 1.0) * points)[:, :, None]
     lifts = clearing._lifts(pinned, inputs.body)
-    assert lifts.shown.item() > 50 and not len(lifts.asking)
+    assert lifts.shown.item() > 50 and not lifts.asking.any()
     assert torch.equal(clearing.lift(pinned, inputs, torch.full((1,), torch.inf)), pinned)
-    deep = clearing._lifts(dented(shell, 2, depth=2 * DEEPEST), inputs.body)
+    deep = clearing._lifts(dented(shell, 2, depth=1.4 * DEEPEST), inputs.body)
     assert len(deep.frame) < 0.5 * deep.shown.item() and deep.gap.max() <= DEEPEST + HEIGHT
+
+
+def test_a_frame_that_does_not_gain_lifts_cloth_that_lies_less_deep(monkeypatch, shell):
+    potential, inputs = at_rest(shell)
+    clearing, x, depths = SkinClearing(shell, potential), dented(shell, 2), []
+    within = module.Lifts.within
+    monkeypatch.setattr(module.Lifts, "within", lambda lifts, depth: depths.append(depth.item()) or within(lifts, depth))
+    assert torch.equal(clearing.lift(x, inputs, torch.full((1,), -torch.inf)), x)
+    assert depths == [DEEPEST, DEEPEST / 2, DEEPEST / 4, DEEPEST / 8] and depths[-1] > SHALLOWEST >= depths[-1] / 2
+    lifts = clearing._lifts(x, inputs.body)
+    some = lifts.within(torch.tensor([0.9 * DEPTH]))
+    assert 0 < len(some.frame) < len(lifts.frame) and some.gap.max() <= 0.9 * DEPTH + HEIGHT
+    assert some.asking.item() == len(some.frame) and some.shown is lifts.shown
 
 
 def test_skin_inside_another_part_asks_for_nothing(shell):
