@@ -120,7 +120,8 @@ def training() -> Text:
     preview, final = (preset_minutes(PRESETS[name]) for name in ("preview", "final"))
     yield f"`preview` takes {preview:.0f} minutes and `final` {final:.0f}"
     yield "(`recombinations={0.recombinations}`, `perturbations={0.perturbations}`)".format(PRESETS["final"].train)
-    yield f"the default static rate and {result('final_training')['tshirt']['iterations'][-1]:,} iterations"
+    tight = result("bind_pose_training")["tshirt"]
+    yield f"(`--set iterations={tight['iterations'][-1]}`), {duration(tight['seconds'][-1])} where"
     yield from side_by_side()
 
 
