@@ -102,8 +102,8 @@ class TrainConfig:
         state_reuse: share of windows that continue from the final state of the previous window in the same slot.
         rotated_fraction: share of windows with a random rotation, uniform on SO(3); the others stay upright.
         recombinations: number of extra motions for each motion, whose limbs move as in another motion.
-        perturbations: number of extra motions for each motion with joints turned at random, half of which also
-            go to and fro between these poses and the bind pose.
+        perturbations: number of extra motions for each motion with joints turned at random, about half of
+            which go to and fro between these poses and the bind pose.
         outlier_energy: stretch and collision at which a frame counts half in the loss, relative to the garment's
             weight times its size; zero for the plain mean over frames, as in the paper (`training.objective.total`).
         newton_weight: weight of the distance to a Newton step beside the energy (`training.newton_distance`); zero

@@ -16,7 +16,7 @@ it is not seen.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
 
 import numpy as np
@@ -34,13 +34,14 @@ ROUNDS = 12  # at most; each finds anew where skin shows
 HEIGHT = 3e-3  # [m] above the points, since skin between them is not asked and springs stop a little short
 STIFFER = 9.0  # springs of each point, relative to the Hessian at the cloth; with more points they can be softer
 DEEPEST = 0.02  # [m] beneath the skin; deeper cloth could only be lifted as a spike
-SHALLOWEST = 0.002  # [m]; a frame that does not gain lifts cloth half as deep, down to here
-LEFT = 0.9  # share of the points that show, at most, after a round that gains
+SHALLOWEST = 0.002  # [m]; a frame that does not gain lifts cloth half as deep, but no less than this
+LEAST_GAIN = 0.1  # of the points that ask, by which fewer must show; with less, a frame goes on for nothing
 FARTHEST = 0.03  # [m] that a vertex moves in all rounds
 REDUCTION, CG_ITERATIONS = 1e-4, 300  # of the residual by each linear solve, and its longest
 MOST_FREE = 0.5  # share of the cloth's weights at free corners from which on it is lifted
 CORNERS = list(combinations_with_replacement(range(3), 2))  # pairs of them in a triangle
 PAIRS_AT_ONCE = 1 << 20  # of a point and a triangle
+ROWS = ("frame", "face", "weights", "normal", "gap")  # what `Lifts` has of each point
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,13 +67,31 @@ class Lifts:
         """Number of points that ask in each frame (N,)."""
         return torch.bincount(self.frame, minlength=len(self.shown))
 
+    @property
+    def deepest(self) -> Tensor:
+        """How deep the cloth lies that is asked to rise, at most, in each frame [m]; zero for none (N,)."""
+        depths = self.gap.new_zeros(len(self.shown))
+        return depths.scatter_reduce(0, self.frame, self.gap - HEIGHT, "amax")
+
     def within(self, depth: Tensor) -> Lifts:
-        """Return what is asked of cloth up to the depths (N,) beneath the skin in each frame."""
-        kept = self.gap <= HEIGHT + depth[self.frame]
-        frame, face, weights, normal, gap = (
-            each[kept] for each in (self.frame, self.face, self.weights, self.normal, self.gap)
-        )
-        return Lifts(frame, face, weights, normal, gap, self.shown)
+        """Return what is asked of cloth up to the depths (N,) beneath the skin in each frame [m]."""
+        return self._chosen(self.gap - HEIGHT <= depth[self.frame])
+
+    def select(self, frames: Tensor) -> Lifts:
+        """Return what is asked in the frames with indices (K,), in ascending order."""
+        place = torch.full_like(self.shown, -1)
+        place[frames] = torch.arange(len(frames), device=frames.device)
+        lifts = self._chosen(place[self.frame] >= 0)
+        return replace(lifts, frame=place[lifts.frame], shown=self.shown[frames])
+
+    def where(self, stay: Tensor, other: Lifts) -> Lifts:
+        """Return what is asked in the frames that stay (N,), and what others ask in all other frames."""
+        own, new = self._chosen(stay[self.frame]), other._chosen(~stay[other.frame])
+        rows = {name: torch.cat([getattr(own, name), getattr(new, name)]) for name in ROWS}
+        return replace(self, shown=self.shown.where(stay, other.shown), **rows)
+
+    def _chosen(self, kept: Tensor) -> Lifts:
+        return replace(self, **{name: getattr(self, name)[kept] for name in ROWS})
 
 
 class SkinClearing:
@@ -102,24 +121,28 @@ class SkinClearing:
         """
         if inputs.body is None or not len(self.points):
             return x
-        found, left = x, self._lifts(x, inputs.body).asking.nonzero().squeeze(1)
-        depth = x.new_full((len(left),), DEEPEST)
+        found, before = x, self._lifts(x, inputs.body)
+        left = before.asking.nonzero().squeeze(1)
+        before, inputs, most = before.select(left), inputs.select(left), most[left]
+        state = State.at(self.potential, x[..., left], inputs) if len(left) else None
+        depth = before.deepest
         for _ in range(ROUNDS):
-            if not len(left):
+            if not state or not len(left):
                 break
-            some = inputs.select(left)
-            assert some.body
-            state = State.at(self.potential, found[..., left], some)
-            before = self._lifts(state.x, some.body)
-            moved = state.x + self._step(state, some, before.within(depth)) - x[..., left]
+            assert inputs.body
+            asked = before.within(depth)
+            moved = state.x + self._step(state, inputs, asked) - x[..., left]
             moved = moved * (FARTHEST / moved.norm(dim=1, keepdim=True).clamp_min(FARTHEST))
-            trial = State.at(self.potential, x[..., left] + moved, some)
-            after = self._lifts(trial.x, some.body)
-            better = (after.shown <= LEFT * before.shown) & (trial.energy <= most[left])
-            found = found.index_copy(-1, left[better], trial.x[..., better])
-            depth = depth.where(better, depth / 2)
-            kept = (after.asking.where(better, before.asking) > 0) & (depth > SHALLOWEST)
-            left, depth = left[kept], depth[kept]
+            trial = State.at(self.potential, x[..., left] + moved, inputs)
+            after = self._lifts(trial.x, inputs.body)
+            better = (before.shown - after.shown >= LEAST_GAIN * asked.asking) & (trial.energy <= most)
+            (gained,) = better.nonzero(as_tuple=True)
+            found = found.index_copy(-1, left[gained], trial.x[..., gained])
+            state, before = state.replace_frames(gained, trial.select(gained)), before.where(~better, after)
+            depth = depth.where(better, depth / 2).minimum(before.deepest)
+            (kept,) = ((before.within(depth).asking > 0) & (depth >= SHALLOWEST)).nonzero(as_tuple=True)
+            left, inputs, most, depth = left[kept], inputs.select(kept), most[kept], depth[kept]
+            state, before = state.select(kept), before.select(kept)
         return found
 
     def _lifts(self, x: Tensor, body: PosedBody) -> Lifts:

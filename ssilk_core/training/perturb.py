@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Motions with joints turned at random, or nearer to the bind pose, for poses that no clip holds.
 
-Random turns stand for flips, falls and glitches of motion capture. Motions keyed by hand stay near the bind pose with
-many joints at once, such as the spine, the shoulders and the hands, and captured motions never do.
+Random turns stand for flips, falls and glitches of motion capture. Many joints near the bind pose at once, such as
+the spine, the shoulders and the hands, stand for motions that are keyed by hand.
 """
 
 from __future__ import annotations
@@ -19,14 +19,16 @@ from .recombine import limb_joints
 USUAL_TURN, LARGE_TURN = np.radians(12), np.radians(35)  # standard deviation about each axis
 LARGE_PROBABILITY = 0.1  # that a joint turns far
 BLEND_PROBABILITY = 0.5  # that a motion is blended with the bind pose
-WHOLE_PROBABILITY = 0.5  # that a limb of a blended motion is so as much as the whole body; others are so less
+WHOLE_PROBABILITY = 0.5  # that a limb of a blended motion goes all the way; others go a part of it
+FADING_ANGLE = np.radians(120)  # from the bind pose; beyond it a joint goes less far, and at 180 degrees not at all
 SLOWEST, FASTEST = 0.1, 0.7  # [Hz] of the turns and blends
 
 
 def perturb_motions(motions: Sequence[Motion], skeleton: Skeleton, copies: int, seed: int) -> list[Motion]:
     """Return `copies` of each motion with slow random turns of every joint but the root, about random axes.
 
-    About half of the copies then go to and fro between these poses and the bind pose, each limb with its own part.
+    About half of the copies then go to and fro between these poses and the bind pose, each limb its own part of the
+    way.
     """
     generator = np.random.default_rng(seed)
     return [_perturbed(motion, skeleton, generator) for motion in [*motions] * copies]
@@ -35,7 +37,7 @@ def perturb_motions(motions: Sequence[Motion], skeleton: Skeleton, copies: int, 
 def _perturbed(motion: Motion, skeleton: Skeleton, generator: np.random.Generator) -> Motion:
     rotations = multiply_quaternions(motion.rotations, _quaternions(_turns(motion, generator)))
     if generator.random() < BLEND_PROBABILITY:
-        rotations = slerp(rotations, _bind_rotations(skeleton), _bind_weights(motion, skeleton, generator))
+        rotations = _towards(rotations, _bind_rotations(skeleton), _bind_weights(motion, skeleton, generator))
     return replace(motion, path=f"{motion.path} perturbed", rotations=rotations)
 
 
@@ -48,6 +50,13 @@ def _turns(motion: Motion, generator: np.random.Generator) -> Floats:
     turns = still + np.sqrt(2) * swing * _waves(motion, generator, count)[..., None]
     turns[:, 0] = 0
     return turns
+
+
+def _towards(rotations: Floats, bind: Floats, weights: Floats) -> Floats:
+    """Return rotations (F, J, 4) on their way to those of the bind pose, without jumps at its far side."""
+    half = np.arccos(np.abs((rotations * bind).sum(axis=-1)).clip(max=1))
+    fading = (np.pi / 2 - half) / (np.pi / 2 - FADING_ANGLE / 2)
+    return slerp(rotations, bind, weights * fading.clip(0, 1))
 
 
 def _bind_weights(motion: Motion, skeleton: Skeleton, generator: np.random.Generator) -> Floats:

@@ -41,6 +41,11 @@ def shell(scene) -> Scene:
     return Scene(replace(scene.character, bodies=(body,)), garment, rig)
 
 
+@pytest.fixture(autouse=True)
+def fewer_points(monkeypatch) -> None:
+    monkeypatch.setattr(module, "POINTS", 8001)  # a ball needs no more
+
+
 def dented(shell: Scene, axis: int, depth: float = DEPTH) -> torch.Tensor:
     """The shell with a cap around an axis beneath the skin, shape (V, 3, 1)."""
     points = shell.garment.mesh.points
@@ -103,15 +108,62 @@ def test_pinned_and_deep_cloth_is_left(shell):
 
 def test_a_frame_that_does_not_gain_lifts_cloth_that_lies_less_deep(monkeypatch, shell):
     potential, inputs = at_rest(shell)
-    clearing, x, depths = SkinClearing(shell, potential), dented(shell, 2), []
+    clearing, x, asked = SkinClearing(shell, potential), dented(shell, 2), []
     within = module.Lifts.within
-    monkeypatch.setattr(module.Lifts, "within", lambda lifts, depth: depths.append(depth.item()) or within(lifts, depth))
+
+    def spy(lifts, depth):
+        asked.append(within(lifts, depth))
+        return asked[-1]
+
+    monkeypatch.setattr(module.Lifts, "within", spy)
     assert torch.equal(clearing.lift(x, inputs, torch.full((1,), -torch.inf)), x)
-    assert depths == [DEEPEST, DEEPEST / 2, DEEPEST / 4, DEEPEST / 8] and depths[-1] > SHALLOWEST >= depths[-1] / 2
-    lifts = clearing._lifts(x, inputs.body)
-    some = lifts.within(torch.tensor([0.9 * DEPTH]))
-    assert 0 < len(some.frame) < len(lifts.frame) and some.gap.max() <= 0.9 * DEPTH + HEIGHT
-    assert some.asking.item() == len(some.frame) and some.shown is lifts.shown
+    depths = [lifts.deepest.item() for lifts in asked]
+    assert depths[0] == pytest.approx(DEPTH, abs=5e-4) and depths == sorted(depths, reverse=True)
+    assert all(later <= DEPTH / 2 for later in depths[1:]) and DEPTH / 4 < SHALLOWEST
+
+
+def test_what_cannot_rise_does_not_hold_the_rest_back(shell):
+    potential, inputs = at_rest(shell)
+    clearing, points = SkinClearing(shell, potential), torch.tensor(shell.garment.mesh.points)[:, :, None]
+    band = (shell.classes == PINNED)[:, None, None] & (points.numpy() < -0.5 * RADIUS)[:, 2:]
+    x = dented(shell, 2).where(~torch.tensor(band), 0.9 * points)
+    before = clearing._lifts(x, inputs.body)
+    assert 0 < before.asking.item() < 0.3 * before.shown.item()
+    after = clearing._lifts(clearing.lift(x, inputs, torch.full((1,), torch.inf)), inputs.body)
+    assert after.asking.item() == 0 and after.shown.item() <= before.shown.item() - before.asking.item()
+
+
+def test_a_vertex_that_moved_as_far_as_it_may_does_not_stop_the_others(monkeypatch, shell):
+    potential, inputs = at_rest(shell)
+    clearing, x = SkinClearing(shell, potential), dented(shell, 2)
+    step, far = clearing._step, int((x[:, 2, 0]).argmax())
+
+    def step_with_a_leap(state, inputs, lifts):
+        found = step(state, inputs, lifts)
+        found[far] *= 100
+        return found
+
+    monkeypatch.setattr(clearing, "_step", step_with_a_leap)
+    moved = (clearing.lift(x, inputs, torch.full((1,), torch.inf)) - x).norm(dim=1)[:, 0]
+    assert moved[far].item() == pytest.approx(FARTHEST)
+    assert moved[torch.arange(len(moved)) != far].max() > 0.8 * (DEPTH + HEIGHT)
+
+
+def test_frames_take_the_lifts_of_others_and_their_own(shell):
+    potential, inputs = at_rest(shell)
+    clearing = SkinClearing(shell, potential)
+    one, two = (clearing._lifts(torch.cat([dented(shell, axis)] * 2, -1), twice(inputs)) for axis in (0, 2))
+    mixed = one.where(torch.tensor([False, True]), two)
+    for frame, source in ((0, two), (1, one)):
+        part, whole = (lifts.select(torch.tensor([frame])) for lifts in (mixed, source))
+        for name in module.ROWS:
+            assert torch.equal(getattr(part, name), getattr(whole, name))
+        assert part.shown.item() == whole.shown.item()
+
+
+def twice(inputs: StepInputs):
+    """The body of a frame in two frames."""
+    return inputs.body.select(torch.zeros(2, dtype=torch.int64))
 
 
 def test_skin_inside_another_part_asks_for_nothing(shell):

@@ -20,6 +20,7 @@ from ssilk_core.fabrics import FABRICS, Fabric
 from ssilk_core.farm.openjd import CHUNK, CHUNK_SECONDS
 from ssilk_core.mesh import hidden_faces
 from ssilk_core.mesh.stitches import TOUCH
+from ssilk_core.refine import clearing
 
 from .measured import default, digits, duration, fixed, micro, milli, percent, result, row, series
 from .quoted_results import results
@@ -121,7 +122,7 @@ def training() -> Text:
     yield f"`preview` takes {preview:.0f} minutes and `final` {final:.0f}"
     yield "(`recombinations={0.recombinations}`, `perturbations={0.perturbations}`)".format(PRESETS["final"].train)
     tight = result("bind_pose_training")["tshirt"]
-    yield f"(`--set iterations={tight['iterations'][-1]}`), {duration(tight['seconds'][-1])} where"
+    yield f"(`--set iterations={tight['iterations'][-1]}`), {duration(tight['seconds'][-1])} for the T-shirt"
     yield from side_by_side()
 
 
@@ -279,6 +280,8 @@ def pipeline() -> Text:
     for name, texts in targets.items():
         line = compact_row(f"one file for {name}, garment alone")
         yield row(f"`{name}`", *texts, *(digits(1000 * line[error], 2) for error in ("largest", "mean")))
+    yield f"lies more than {milli(clearing.DEEPEST)} mm beneath"
+    yield f"no vertex is lifted by more than {milli(clearing.FARTHEST)} mm"
     heaviest = compact_row("for comparison: the 4 heaviest influences, nothing learned")
     yield f"The 4 heaviest influences alone would be up to {milli(heaviest['largest'])} mm off"
     yield f"takes {cache_share()} of the point cache"
