@@ -122,6 +122,14 @@ def test_a_frame_that_does_not_gain_lifts_cloth_that_lies_less_deep(monkeypatch,
     assert all(later <= DEPTH / 2 for later in depths[1:]) and DEPTH / 4 < SHALLOWEST
 
 
+def test_a_round_gains_where_enough_of_what_asks_is_covered(monkeypatch, shell):
+    potential, inputs = at_rest(shell)
+    clearing, x, unbounded = SkinClearing(shell, potential), dented(shell, 2), torch.full((1,), torch.inf)
+    for least, lifted in ((0.5, True), (1e3, False)):
+        monkeypatch.setattr(module, "LEAST_GAIN", least)
+        assert torch.equal(clearing.lift(x, inputs, unbounded), x) != lifted
+
+
 def test_what_cannot_rise_does_not_hold_the_rest_back(shell):
     potential, inputs = at_rest(shell)
     clearing, points = SkinClearing(shell, potential), torch.tensor(shell.garment.mesh.points)[:, :, None]

@@ -761,6 +761,8 @@ def rest() -> Text:
     options = document("evaluate_cape")["options"]
     yield f"held for {options['hold']:g} s"
     yield f"loops for {options['loop']:,} frames"
+    (rests,) = (line["figures"] for line in document("evaluate_cape_shipped")["figures"] if line["method"] == "ssilk")
+    yield f"are {fixed(rests['loop_drift']['loop_distance'], 1, 1e-6)} µm apart"
     clips, frames = result("long_rollout").values(), 10_000
     assert all(
         0 <= len(clip["J"]["stretch"]) * clip["frames of a loop"] - frames < clip["frames of a loop"]
