@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Charts by matplotlib: panels of curves and points, as PNG files and as SVG text inside a page.
 
-The output depends on the data alone: it holds no date and no random identifier. Colours are those of Okabe and Ito
-(https://jfly.uni-koeln.de/color), and each has a marker of its own, so that they differ for every kind of vision.
+The output depends on the data alone: it holds no date and no random identifier. Most colours are those of Okabe and
+Ito (https://jfly.uni-koeln.de/color), and each has a marker of its own, so that they differ for every kind of vision.
 """
 
 from __future__ import annotations
@@ -24,11 +24,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#882255", "#6b6b6b")
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#882255", "#6b6b6b", "#117733")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<")
 INK = "#22262b"  # text and axes; in a page they take the colour of the text around them
 COLUMNS = 600  # a longer curve shows the largest and the smallest value of each of so many parts
 MARKED = 12  # points of a named curve, about, that have a marker
+DECADES = 1e3  # an axis that spans more than these has ticks at powers of ten alone, which have room
 PLACES = ((5, 3, "left", "bottom"), (5, -3, "left", "top"), (-5, 3, "right", "bottom"), (-5, -3, "right", "top"))
 """Where words stand beside a point: a distance [points] and their alignment."""
 BESIDE = 40  # pixels that words may reach beyond the axes
@@ -157,7 +158,9 @@ def _scale(axes: Axes, panel: ChartPanel) -> None:
     plain = FuncFormatter(lambda value, _: f"{value:g}")
     if panel.log_x:
         axes.set_xscale("log")
-        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        places = [x for group in panel.points.values() for x, _, _ in group] or [1.0]
+        wide = max(places) > DECADES * min(places)
+        axes.xaxis.set_major_locator(LogLocator(subs=(1,) if wide else (1, 2, 5)))
         axes.xaxis.set_major_formatter(plain)
         axes.xaxis.set_minor_formatter(NullFormatter())
     else:

@@ -68,6 +68,13 @@ def test_logarithmic_axes_keep_zero_and_label_plain_numbers():
     assert {"0.1", "1", "10", "0", "100", "nothing", "much"} <= set(found)
 
 
+@pytest.mark.parametrize("highest, ticks", [(50.0, {"0.2", "0.5", "20"}), (5e4, {"100", "1000", "10000"})])
+def test_a_logarithmic_axis_has_only_as_many_labels_as_find_room(highest, ticks):
+    points = {"a": [(0.1, 1.0, ""), (highest, 2.0, "")]}
+    found = set(words(svg_chart("log", [[ChartPanel(x="ms", y="mm", points=points, log_x=True)]], size=(6, 4))))
+    assert ticks <= found and ({"0.2", "20", "200"} & found != set()) == (highest == 50)
+
+
 def test_words_of_points_do_not_cover_each_other():
     crowd = {"a": [(1.0, 1.0, f"a long name {number}") for number in range(9)]}
     found = words(svg_chart("crowd", [[ChartPanel(x="ms", y="mm", points=crowd)]], size=(4, 3)))
