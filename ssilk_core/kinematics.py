@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .assets import Deformer, Floats, GarmentPose, Ints, Motion, ProxyRig, Scene, SkinWeights
+from .assets import Deformer, Floats, GarmentPose, Ints, Motion, ProxyRig, Scene, Skeleton, SkinWeights
 
 POSES_AT_ONCE = 256  # frames in each chunk of LBS poses
 
@@ -125,6 +125,12 @@ def local_transforms(world: Floats, parents: Ints) -> Floats:
     above = np.asarray(parents)[children]
     local[..., children, :, :] = invert_rigid(world[..., above, :, :]) @ world[..., children, :, :]
     return local
+
+
+def bind_pose(skeleton: Skeleton) -> tuple[Floats, Floats]:
+    """Return the joints' rotations (J, 4) and translations (J, 3) [m] in the bind pose, joint to parent."""
+    local = local_transforms(skeleton.bind_transforms, skeleton.parents)
+    return quaternion_from_matrix(local[:, :3, :3]), local[:, :3, 3]
 
 
 def motion_transforms(motion: Motion, parents: Ints) -> Floats:

@@ -122,15 +122,14 @@ class SkinClearing:
         if inputs.body is None or not len(self.points):
             return x
         found, before = x, self._lifts(x, inputs.body)
-        left = before.asking.nonzero().squeeze(1)
+        (left,) = before.asking.nonzero(as_tuple=True)
+        if not len(left):
+            return x
         before, inputs, most = before.select(left), inputs.select(left), most[left]
-        state = State.at(self.potential, x[..., left], inputs) if len(left) else None
-        depth = before.deepest
+        state, depth = State.at(self.potential, x[..., left], inputs), before.deepest
+        asked = before.within(depth)
         for _ in range(ROUNDS):
-            if not state or not len(left):
-                break
             assert inputs.body
-            asked = before.within(depth)
             moved = state.x + self._step(state, inputs, asked) - x[..., left]
             moved = moved * (FARTHEST / moved.norm(dim=1, keepdim=True).clamp_min(FARTHEST))
             trial = State.at(self.potential, x[..., left] + moved, inputs)
@@ -140,9 +139,12 @@ class SkinClearing:
             found = found.index_copy(-1, left[gained], trial.x[..., gained])
             state, before = state.replace_frames(gained, trial.select(gained)), before.where(~better, after)
             depth = depth.where(better, depth / 2).minimum(before.deepest)
-            (kept,) = ((before.within(depth).asking > 0) & (depth >= SHALLOWEST)).nonzero(as_tuple=True)
+            asked = before.within(depth)
+            (kept,) = ((asked.asking > 0) & (depth >= SHALLOWEST)).nonzero(as_tuple=True)
+            if not len(kept):
+                break
             left, inputs, most, depth = left[kept], inputs.select(kept), most[kept], depth[kept]
-            state, before = state.select(kept), before.select(kept)
+            state, before, asked = state.select(kept), before.select(kept), asked.select(kept)
         return found
 
     def _lifts(self, x: Tensor, body: PosedBody) -> Lifts:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..assets import Floats, Motion, Skeleton
-from ..kinematics import local_transforms, multiply_quaternions, quaternion_from_matrix, sample_motion, slerp
+from ..kinematics import bind_pose, multiply_quaternions, sample_motion, slerp
 
 BLOCK = 256  # frames
 SWAY = 4.0  # [s] period of the procedural motion
@@ -66,8 +66,7 @@ class ProceduralMotion:
 def sway(skeleton: Skeleton, fps: float) -> ProceduralMotion:
     """Return a looping motion in which every joint rotates by its own sines about the bind pose."""
     random, loop = np.random.default_rng(0), SWAY
-    local = local_transforms(skeleton.bind_transforms, skeleton.parents)
-    rest, places = quaternion_from_matrix(local[:, :3, :3]), local[:, :3, 3]
+    rest, places = bind_pose(skeleton)
     turns = random.integers(1, 4, (skeleton.joint_count, 3)) * 2 * np.pi / loop  # [rad/s]
     phase, size = random.uniform(0, 6, turns.shape), random.uniform(0.05, 0.25, turns.shape)
 

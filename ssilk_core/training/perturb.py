@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..assets import Floats, Motion, Skeleton
-from ..kinematics import local_transforms, multiply_quaternions, quaternion_from_matrix, slerp
+from ..assets import Floats, Ints, Motion, Skeleton
+from ..kinematics import bind_pose, multiply_quaternions, slerp
 from .recombine import limb_joints
 
 USUAL_TURN, LARGE_TURN = np.radians(12), np.radians(35)  # standard deviation about each axis
@@ -31,13 +31,14 @@ def perturb_motions(motions: Sequence[Motion], skeleton: Skeleton, copies: int, 
     way.
     """
     generator = np.random.default_rng(seed)
-    return [_perturbed(motion, skeleton, generator) for motion in [*motions] * copies]
+    bind, limbs = bind_pose(skeleton)[0], limb_joints(skeleton)
+    return [_perturbed(motion, bind, limbs, generator) for motion in [*motions] * copies]
 
 
-def _perturbed(motion: Motion, skeleton: Skeleton, generator: np.random.Generator) -> Motion:
+def _perturbed(motion: Motion, bind: Floats, limbs: Sequence[Ints], generator: np.random.Generator) -> Motion:
     rotations = multiply_quaternions(motion.rotations, _quaternions(_turns(motion, generator)))
     if generator.random() < BLEND_PROBABILITY:
-        rotations = _towards(rotations, _bind_rotations(skeleton), _bind_weights(motion, skeleton, generator))
+        rotations = _towards(rotations, bind, _bind_weights(motion, limbs, generator))
     return replace(motion, path=f"{motion.path} perturbed", rotations=rotations)
 
 
@@ -59,18 +60,13 @@ def _towards(rotations: Floats, bind: Floats, weights: Floats) -> Floats:
     return slerp(rotations, bind, weights * fading.clip(0, 1))
 
 
-def _bind_weights(motion: Motion, skeleton: Skeleton, generator: np.random.Generator) -> Floats:
+def _bind_weights(motion: Motion, limbs: Sequence[Ints], generator: np.random.Generator) -> Floats:
     """Return how far joints are on their way to the bind pose, from 0 to 1, shape (F, J); the root never is."""
-    limbs = limb_joints(skeleton)
     parts = np.ones(motion.rotations.shape[1])
     for joints in limbs:  # outer limbs come last
         parts[joints] = 1 if generator.random() < WHOLE_PROBABILITY else generator.random()
     parts[0] = 0
     return (0.5 + 0.5 * _waves(motion, generator, 1)) * parts
-
-
-def _bind_rotations(skeleton: Skeleton) -> Floats:
-    return quaternion_from_matrix(local_transforms(skeleton.bind_transforms, skeleton.parents)[:, :3, :3])
 
 
 def _waves(motion: Motion, generator: np.random.Generator, count: int) -> Floats:

@@ -88,8 +88,7 @@ def opening() -> Text:
     yield f"{cache_share()} of its point cache"
     yield f"The cape that ships is {shipped_path('cape').stat().st_size / 1e6:.1f} MB"
     yield f"An earlier cape takes {frame_time():.2f} ms"
-    (rests,) = (line["figures"] for line in document("evaluate_cape_shipped")["figures"] if line["method"] == "ssilk")
-    settling, hold = rests["settling"], document("evaluate_cape_shipped")["options"]["hold"]
+    settling, hold = shipped_rest()["settling"], document("evaluate_cape_shipped")["options"]["hold"]
     assert settling["settled_share"] == 1, "the document says so"
     yield f"after all of {settling['stops']} stops within {hold:g} s"
     yield f"within\n  {settling['settling_time']:.2f} s. It then stands {milli_1(settling['static_distance'])} mm"
@@ -722,11 +721,11 @@ def levels_and_simulator() -> Text:
     found = document("trade_simulator")
     (count,) = set(found["asked"]["frames"].values())
     yield f"the first {count} frames of each"
-    names, ratios = {"Cape": "cape", "FringeSkirt": "fringe skirt"}, []
+    ratios = []
     for at in found["points"]:
         skin, variant = at["shown_skin"], "light" if at["model"].endswith("_light") else at["variant"]
         yield row(
-            names[at["garment"]],
+            GARMENTS[at["garment"]],
             f"`{variant}`" if variant in {"light", *QUALITIES} else variant,
             two_digits(at["solving"]) if at["solving"] else "",
             fixed(at["total"], 3),
@@ -753,6 +752,12 @@ def levels_and_simulator() -> Text:
     assert skirt["simulator"] < skirt["as trained"] < skirt["hero"], "the document says so"
 
 
+def shipped_rest() -> dict:
+    """Return the figures of the cape that ships, at stops and in loops of `test`."""
+    (found,) = (line["figures"] for line in document("evaluate_cape_shipped")["figures"] if line["method"] == "ssilk")
+    return found
+
+
 def rest() -> Text:
     columns = {
         "settling/stops": fixed,
@@ -769,8 +774,7 @@ def rest() -> Text:
     options = document("evaluate_cape")["options"]
     yield f"held for {options['hold']:g} s"
     yield f"loops for {options['loop']:,} frames"
-    (rests,) = (line["figures"] for line in document("evaluate_cape_shipped")["figures"] if line["method"] == "ssilk")
-    yield f"are {fixed(rests['loop_drift']['loop_distance'], 1, 1e-6)} µm apart"
+    yield f"are {fixed(shipped_rest()['loop_drift']['loop_distance'], 1, 1e-6)} µm apart"
     clips, frames = result("long_rollout").values(), 10_000
     assert all(
         0 <= len(clip["J"]["stretch"]) * clip["frames of a loop"] - frames < clip["frames of a loop"]
@@ -843,7 +847,7 @@ def levels() -> Text:
         own = point["refine"] or point["variant"] == "simulator"  # a shot has blendshapes of its own
         played = times[point["model"]]["numpy"] if whole else {}
         yield row(
-            {"Cape": "cape", "FringeSkirt": "fringe skirt", "HoodedDress": "hooded dress"}[point["garment"]],
+            GARMENTS[point["garment"]],
             "`light`"
             if light
             else AS_HERO
