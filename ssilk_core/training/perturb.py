@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motions with joints turned at random, or nearer to the bind pose, for poses that no clip holds.
+"""Motions with joints turned at random, nearer to the bind pose, or turning over, for what few clips hold.
 
-Random turns stand for flips, falls and glitches of motion capture. Many joints near the bind pose at once, such as
-the spine, the shoulders and the hands, stand for motions that are keyed by hand.
+Random turns stand for falls and glitches of motion capture. Many joints near the bind pose at once, such as the
+spine, the shoulders and the hands, stand for motions that are keyed by hand. Where the whole body turns over, as in
+flips, gravity changes its direction within a second.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..assets import Floats, Ints, Motion, Skeleton
+from ..constants import GRAVITY
 from ..kinematics import bind_pose, multiply_quaternions, slerp
 from .recombine import limb_joints
 
@@ -22,13 +24,18 @@ BLEND_PROBABILITY = 0.5  # that a motion is blended with the bind pose
 WHOLE_PROBABILITY = 0.5  # that a limb of a blended motion goes all the way; others go a part of it
 FADING_ANGLE = np.radians(120)  # from the bind pose; beyond it a joint goes less far, and at 180 degrees not at all
 SLOWEST, FASTEST = 0.1, 0.7  # [Hz] of the turns and blends
+TUMBLE_PROBABILITY = 0.5  # that a motion turns over, again and again
+TUMBLE_SECONDS = 0.6, 1.6  # [s] that a turn takes, and that lie between two turns
+HOP_PROBABILITY = 0.5  # that the root flies freely in a turn
+FLIGHT_SECONDS = 0.3, 0.8  # [s]
+PUSH_SECONDS = 0.2  # [s] in which the ground speeds the root up, and slows it down again
 
 
 def perturb_motions(motions: Sequence[Motion], skeleton: Skeleton, copies: int, seed: int) -> list[Motion]:
     """Return `copies` of each motion with slow random turns of every joint but the root, about random axes.
 
     About half of the copies then go to and fro between these poses and the bind pose, each limb its own part of the
-    way.
+    way. About half turn over as a whole, about the root joint.
     """
     generator = np.random.default_rng(seed)
     bind, limbs = bind_pose(skeleton)[0], limb_joints(skeleton)
@@ -39,7 +46,31 @@ def _perturbed(motion: Motion, bind: Floats, limbs: Sequence[Ints], generator: n
     rotations = multiply_quaternions(motion.rotations, _quaternions(_turns(motion, generator)))
     if generator.random() < BLEND_PROBABILITY:
         rotations = _towards(rotations, bind, _bind_weights(motion, limbs, generator))
-    return replace(motion, path=f"{motion.path} perturbed", rotations=rotations)
+    perturbed = replace(motion, path=f"{motion.path} perturbed", rotations=rotations)
+    return _tumbling(perturbed, generator) if generator.random() < TUMBLE_PROBABILITY else perturbed
+
+
+def _tumbling(motion: Motion, generator: np.random.Generator) -> Motion:
+    """Return a motion whose root turns over about random axes, and at times flies freely meanwhile."""
+    rotations, translations = motion.rotations.copy(), motion.translations.copy()
+    time, start = np.arange(motion.frame_count) / motion.fps, generator.uniform(0, TUMBLE_SECONDS[1])
+    while start < time[-1]:
+        lasts, axis = generator.uniform(*TUMBLE_SECONDS), generator.normal(size=3)
+        part = ((time - start) / lasts).clip(0, 1)
+        angle = 2 * np.pi * part**2 * (3 - 2 * part)  # ends as it began, at rest
+        turn = _quaternions(angle[:, None] * axis / np.linalg.norm(axis))
+        rotations[:, 0] = multiply_quaternions(turn, rotations[:, 0])
+        if generator.random() < HOP_PROBABILITY:
+            flight = generator.uniform(*FLIGHT_SECONDS)
+            translations[:, 0, 1] += _hop(time - start - (lasts - flight) / 2, flight)
+        start += lasts + generator.uniform(*TUMBLE_SECONDS)
+    return replace(motion, rotations=rotations, translations=translations)
+
+
+def _hop(time: Floats, flight: float) -> Floats:
+    """Return heights [m] at times since a take-off whose flight lasts so long, with pushes before and after [s]."""
+    since = time[:, None] + np.linspace(-0.5, 0.5, 9) * PUSH_SECONDS
+    return (0.5 * GRAVITY * since * (flight - since)).clip(min=0).mean(axis=1)
 
 
 def _turns(motion: Motion, generator: np.random.Generator) -> Floats:

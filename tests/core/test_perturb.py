@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motions turned at random or nearer to the bind pose, and the loss in which poses without good states count less."""
+"""Perturbed motions, and the loss in which poses without good states count less."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,8 @@ from ssilk_core.training.objective import REGULARIZATION, total
 from ssilk_core.training.perturb import perturb_motions
 
 
-def test_every_joint_but_the_root_turns_and_alike_for_a_seed(scene, toy_motion):
+def test_every_joint_but_the_root_turns_and_alike_for_a_seed(scene, toy_motion, monkeypatch):
+    monkeypatch.setattr(perturb, "TUMBLE_PROBABILITY", 0.0)
     motions, skeleton = [toy_motion(scene, 40), toy_motion(scene, 25, speed=2.0)], scene.character.skeleton
     found, again = (perturb_motions(motions, skeleton, 2, 3) for _ in range(2))
     assert len(found) == 4 and perturb_motions(motions, skeleton, 0, 3) == []
@@ -34,13 +35,12 @@ def test_about_half_of_the_motions_go_to_and_fro_between_their_poses_and_the_bin
     assert 20 <= (near < 0.01).sum() <= 40
     blended = found[near.argmin()]
     assert np.median(angles(blended.rotations, bind)[:, 1:].max(axis=1)) > 0.1
-    assert max(np.abs(np.diff(angles(m.rotations, bind), axis=0)).max() for m in found) < 0.3
+    assert max(np.abs(np.diff(angles(m.rotations, bind)[:, 1:], axis=0)).max() for m in found) < 0.3
 
 
 def test_limbs_go_their_own_parts_of_the_way_and_the_root_goes_none(monkeypatch):
-    monkeypatch.setattr(perturb, "BLEND_PROBABILITY", 1.0)
-    monkeypatch.setattr(perturb, "USUAL_TURN", 0.0)
-    monkeypatch.setattr(perturb, "LARGE_TURN", 0.0)
+    for name, value in {"USUAL_TURN": 0, "LARGE_TURN": 0, "BLEND_PROBABILITY": 1, "TUMBLE_PROBABILITY": 0}.items():
+        monkeypatch.setattr(perturb, name, value)
     names = ("Hips", "Hips/Leg", "Hips/Spine", "Hips/Spine/Arm", "Hips/Spine/Arm/Hand", "Hips/Spine/Head")
     bind = np.tile(np.eye(4), (6, 1, 1))
     skeleton = Skeleton("/toy", names, np.array([-1, 0, 0, 2, 3, 2]), bind, bind)
@@ -65,6 +65,33 @@ def test_a_joint_that_turns_past_the_far_side_of_the_bind_pose_does_not_jump():
     np.testing.assert_allclose(
         angles(found, [1, 0, 0, 0])[half], 0.3 * angles(rotations, [1, 0, 0, 0])[half], atol=1e-6
     )
+
+
+def test_about_half_of_the_motions_turn_over_as_a_whole_and_start_upright(scene, toy_motion):
+    base = toy_motion(scene, 300)
+    found = perturb_motions([base], scene.character.skeleton, 60, 1)
+    turned = np.array([angles(motion.rotations[:, 0], base.rotations[:, 0]) for motion in found])
+    over = turned.max(axis=1) > np.radians(150)
+    assert 20 <= over.sum() <= 40 and (turned[~over] < 1e-6).all()
+    assert (turned[:, 0] < np.radians(3)).all() and np.abs(np.diff(turned, axis=1)).max() < 2 * np.pi * 1.5 / 0.6 / 30
+    heights = np.array([motion.translations[:, 0, 1] - base.translations[:, 0, 1] for motion in found])
+    hops = heights.max(axis=1) > 0.05
+    assert (hops <= over).all() and 0 < hops.sum() <= over.sum() and (heights >= 0).all() and heights.max() < 0.8
+
+
+def test_a_turn_begins_and_ends_at_rest_and_a_hop_falls_freely(monkeypatch):
+    for name, value in {"USUAL_TURN": 0, "LARGE_TURN": 0, "BLEND_PROBABILITY": 0, "TUMBLE_PROBABILITY": 1}.items():
+        monkeypatch.setattr(perturb, name, value)
+    monkeypatch.setattr(perturb, "HOP_PROBABILITY", 1)
+    names, bind = ("Hips", "Hips/Spine"), np.tile(np.eye(4), (2, 1, 1))
+    skeleton = Skeleton("/toy", names, np.array([-1, 0]), bind, bind)
+    still = np.tile([1.0, 0, 0, 0], (600, 2, 1))
+    (motion,) = perturb_motions([Motion("/toy", 120.0, still, np.zeros((600, 2, 3)))], skeleton, 1, 5)
+    rate = angles(motion.rotations[1:, 0], motion.rotations[:-1, 0]) * 120
+    assert (rate < 1e-3).mean() > 0.1 and np.abs(np.diff(rate)).max() < 1.5 < rate.max()
+    assert np.array_equal(motion.rotations[:, 1], still[:, 1])
+    fall = np.diff(motion.translations[:, 0, 1], 2) * 120**2
+    assert (np.abs(fall + 9.81) < 1e-6).sum() > 36 and fall.min() > -9.82 and fall.max() < 60
 
 
 def angles(p, q):
