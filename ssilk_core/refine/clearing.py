@@ -34,7 +34,7 @@ ROUNDS = 12  # at most; each finds anew where skin shows
 HEIGHT = 3e-3  # [m] above the points, since skin between them is not asked and springs stop a little short
 STIFFER = 9.0  # springs of each point, relative to the Hessian at the cloth; with more points they can be softer
 DEEPEST = 0.02  # [m] beneath the skin; deeper cloth could only be lifted as a spike
-SHALLOWEST = 0.002  # [m]; a frame that does not gain lifts cloth half as deep, but no less than this
+SHALLOWEST = 0.002  # [m]; a frame that does not gain lifts cloth half as deep, but not from less than this
 LEAST_GAIN = 0.1  # of the points that ask, by which fewer must show; with less, a frame goes on for nothing
 FARTHEST = 0.03  # [m] that a vertex moves in all rounds
 REDUCTION, CG_ITERATIONS = 1e-4, 300  # of the residual by each linear solve, and its longest
@@ -140,7 +140,7 @@ class SkinClearing:
             state, before = state.replace_frames(gained, trial.select(gained)), before.where(~better, after)
             depth = depth.where(better, depth / 2).minimum(before.deepest)
             asked = before.within(depth)
-            (kept,) = ((asked.asking > 0) & (depth >= SHALLOWEST)).nonzero(as_tuple=True)
+            (kept,) = ((asked.asking > 0) & (better | (depth >= SHALLOWEST))).nonzero(as_tuple=True)
             if not len(kept):
                 break
             left, inputs, most, depth = left[kept], inputs.select(kept), most[kept], depth[kept]
