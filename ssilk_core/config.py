@@ -101,9 +101,11 @@ class TrainConfig:
             two poses are given.
         state_reuse: share of windows that continue from the final state of the previous window in the same slot.
         rotated_fraction: share of windows with a random rotation, uniform on SO(3); the others stay upright.
-        recombinations: number of extra motions for each motion, whose limbs move as in another motion.
-        perturbations: number of extra motions for each motion with joints turned at random, about half of
-            which go to and fro between these poses and the bind pose.
+        recombinations: number of extra motions for each motion, whose limbs move as in another motion; fewer where
+            all poses would be more than `training.job.MOST_POSES`.
+        perturbations: likewise with joints turned at random. About half go to and fro between these poses and the
+            bind pose.
+        tumbling: share of these that turn over as a whole, as in flips.
         outlier_energy: stretch and collision at which a frame counts half in the loss, relative to the garment's
             weight times its size; zero for the plain mean over frames, as in the paper (`training.objective.total`).
         newton_weight: weight of the distance to a Newton step beside the energy (`training.newton_distance`); zero
@@ -150,6 +152,7 @@ class TrainConfig:
     rotated_fraction: float = 0.2
     recombinations: int = 3
     perturbations: int = 1
+    tumbling: float = 0.25
     outlier_energy: float = 0.1
     newton_weight: float = 0.0
     clearance: float = 5e-3
@@ -186,7 +189,7 @@ class TrainConfig:
         _need_between(self, 1, NO_BOUND, "iterations", "batch", "pretraining_batch", "static_batch", "validate_every")
         _need_between(self, 3, NO_BOUND, "valid_frames")
         _need_between(self, 0, 1, "state_reuse", "rotated_fraction", "noise_correlation", "noise_probability")
-        _need_between(self, 0, 1, "shape_smoothing")
+        _need_between(self, 0, 1, "shape_smoothing", "tumbling")
         _need_between(self, 0, MOST_OF_ALL, "static_fraction", "ema_decay")
         _need_between(
             self,
@@ -279,8 +282,8 @@ PRESETS = {
             train=TrainConfig(
                 iterations=60_000,
                 static_fraction=0.5,
-                recombinations=8,
-                perturbations=3,
+                recombinations=24,
+                perturbations=24,
                 static_learning_rate=5e-4,
                 shape_learning_rate_scale=1.0,
                 weight_decay=0.5,

@@ -17,6 +17,8 @@ from .perturb import perturb_motions
 from .recombine import recombine_motions
 from .state import json_round_trip, scene_digest
 
+MOST_POSES = 1_000_000  # of all training motions, some 5 GB; only extra motions are left out for it
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrainJob:
@@ -72,11 +74,20 @@ class TrainJob:
         """Whether there is anything to learn; a garment that is pinned everywhere gets the smallest network."""
         return bool((self.scene.classes != PINNED).any())
 
+    def extra_motions(self) -> tuple[int, int]:
+        """Return how many motions are recombined from each, and how many are perturbed, so that all poses fit."""
+        wanted = self.train.recombinations, self.train.perturbations
+        poses = sum(motion.frame_count / motion.fps for motion in self.motions) * self.model.fps
+        fitting = max(0.0, MOST_POSES / poses - 1)
+        recombinations, perturbations = (int(count * min(1.0, fitting / max(1, sum(wanted)))) for count in wanted)
+        return recombinations, perturbations
+
     def training_motions(self) -> list[Motion]:
         """Return the motions, and those recombined from them and perturbed."""
-        skeleton, train = self.scene.character.skeleton, self.train
-        more = recombine_motions(self.motions, skeleton, train.recombinations, train.seed)
-        more += perturb_motions(self.motions, skeleton, train.perturbations, train.seed)
+        skeleton, seed = self.scene.character.skeleton, self.train.seed
+        recombinations, perturbations = self.extra_motions()
+        more = recombine_motions(self.motions, skeleton, recombinations, seed)
+        more += perturb_motions(self.motions, skeleton, perturbations, seed, self.train.tumbling)
         return [*self.motions, *more]
 
     def identity(self) -> dict[str, Any]:

@@ -93,7 +93,9 @@ def build_parts(
         SsilkError: the motions are too short.
     """
     scene, skeleton, fps = job.scene, job.scene.character.skeleton, job.model.fps
-    motions = job.training_motions()
+    motions, extra = job.training_motions(), job.extra_motions()
+    if extra != (job.train.recombinations, job.train.perturbations):
+        report(Message("{} recombined and {} perturbed motions are added for each, as many as fit".format(*extra)))
     every = [*motions, *job.held_out]
     report(Message(f"the body is posed in {format_count(len(every), 'motions')}, to find what the garment can touch"))
     reach = reachable_body(scene, every)

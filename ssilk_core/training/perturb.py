@@ -24,30 +24,31 @@ BLEND_PROBABILITY = 0.5  # that a motion is blended with the bind pose
 WHOLE_PROBABILITY = 0.5  # that a limb of a blended motion goes all the way; others go a part of it
 FADING_ANGLE = np.radians(120)  # from the bind pose; beyond it a joint goes less far, and at 180 degrees not at all
 SLOWEST, FASTEST = 0.1, 0.7  # [Hz] of the turns and blends
-TUMBLE_PROBABILITY = 0.5  # that a motion turns over, again and again
 TUMBLE_SECONDS = 0.6, 1.6  # [s] that a turn takes, and that lie between two turns
 HOP_PROBABILITY = 0.5  # that the root flies freely in a turn
 FLIGHT_SECONDS = 0.3, 0.8  # [s]
 PUSH_SECONDS = 0.2  # [s] in which the ground speeds the root up, and slows it down again
 
 
-def perturb_motions(motions: Sequence[Motion], skeleton: Skeleton, copies: int, seed: int) -> list[Motion]:
+def perturb_motions(
+    motions: Sequence[Motion], skeleton: Skeleton, copies: int, seed: int, tumbling: float
+) -> list[Motion]:
     """Return `copies` of each motion with slow random turns of every joint but the root, about random axes.
 
     About half of the copies then go to and fro between these poses and the bind pose, each limb its own part of the
-    way. About half turn over as a whole, about the root joint.
+    way. A share `tumbling` turns over as a whole, about the root joint, again and again.
     """
     generator = np.random.default_rng(seed)
     bind, limbs = bind_pose(skeleton)[0], limb_joints(skeleton)
-    return [_perturbed(motion, bind, limbs, generator) for motion in [*motions] * copies]
+    found = [_perturbed(motion, bind, limbs, generator) for motion in [*motions] * copies]
+    return [_tumbling(motion, generator) if generator.random() < tumbling else motion for motion in found]
 
 
 def _perturbed(motion: Motion, bind: Floats, limbs: Sequence[Ints], generator: np.random.Generator) -> Motion:
     rotations = multiply_quaternions(motion.rotations, _quaternions(_turns(motion, generator)))
     if generator.random() < BLEND_PROBABILITY:
         rotations = _towards(rotations, bind, _bind_weights(motion, limbs, generator))
-    perturbed = replace(motion, path=f"{motion.path} perturbed", rotations=rotations)
-    return _tumbling(perturbed, generator) if generator.random() < TUMBLE_PROBABILITY else perturbed
+    return replace(motion, path=f"{motion.path} perturbed", rotations=rotations)
 
 
 def _tumbling(motion: Motion, generator: np.random.Generator) -> Motion:

@@ -12,11 +12,10 @@ from ssilk_core.training.objective import REGULARIZATION, total
 from ssilk_core.training.perturb import perturb_motions
 
 
-def test_every_joint_but_the_root_turns_and_alike_for_a_seed(scene, toy_motion, monkeypatch):
-    monkeypatch.setattr(perturb, "TUMBLE_PROBABILITY", 0.0)
+def test_every_joint_but_the_root_turns_and_alike_for_a_seed(scene, toy_motion):
     motions, skeleton = [toy_motion(scene, 40), toy_motion(scene, 25, speed=2.0)], scene.character.skeleton
-    found, again = (perturb_motions(motions, skeleton, 2, 3) for _ in range(2))
-    assert len(found) == 4 and perturb_motions(motions, skeleton, 0, 3) == []
+    found, again = (perturb_motions(motions, skeleton, 2, 3, 0.0) for _ in range(2))
+    assert len(found) == 4 and perturb_motions(motions, skeleton, 0, 3, 0.0) == []
     for motion, other, base in zip(found, again, motions * 2, strict=True):
         np.testing.assert_array_equal(motion.rotations, other.rotations)
         np.testing.assert_allclose(np.linalg.norm(motion.rotations, axis=-1), 1)
@@ -30,7 +29,7 @@ def test_every_joint_but_the_root_turns_and_alike_for_a_seed(scene, toy_motion, 
 def test_about_half_of_the_motions_go_to_and_fro_between_their_poses_and_the_bind_pose(scene, toy_motion):
     skeleton = scene.character.skeleton  # without limbs: all joints go all the way
     bind = quaternion_from_matrix(local_transforms(skeleton.bind_transforms, skeleton.parents)[:, :3, :3])
-    found = perturb_motions([toy_motion(scene, 400)], skeleton, 60, 1)
+    found = perturb_motions([toy_motion(scene, 400)], skeleton, 60, 1, 0.0)
     near = np.array([angles(m.rotations, bind)[:, 1:].max(axis=1).min() for m in found])
     assert 20 <= (near < 0.01).sum() <= 40
     blended = found[near.argmin()]
@@ -39,14 +38,14 @@ def test_about_half_of_the_motions_go_to_and_fro_between_their_poses_and_the_bin
 
 
 def test_limbs_go_their_own_parts_of_the_way_and_the_root_goes_none(monkeypatch):
-    for name, value in {"USUAL_TURN": 0, "LARGE_TURN": 0, "BLEND_PROBABILITY": 1, "TUMBLE_PROBABILITY": 0}.items():
+    for name, value in {"USUAL_TURN": 0, "LARGE_TURN": 0, "BLEND_PROBABILITY": 1}.items():
         monkeypatch.setattr(perturb, name, value)
     names = ("Hips", "Hips/Leg", "Hips/Spine", "Hips/Spine/Arm", "Hips/Spine/Arm/Hand", "Hips/Spine/Head")
     bind = np.tile(np.eye(4), (6, 1, 1))
     skeleton = Skeleton("/toy", names, np.array([-1, 0, 0, 2, 3, 2]), bind, bind)
     turned = np.tile([np.cos(0.4), np.sin(0.4), 0, 0], (600, 6, 1))
     parts = []
-    for motion in perturb_motions([Motion("/toy", 30.0, turned, np.zeros((600, 6, 3)))], skeleton, 40, 5):
+    for motion in perturb_motions([Motion("/toy", 30.0, turned, np.zeros((600, 6, 3)))], skeleton, 40, 5, 0.0):
         way = 1 - angles(motion.rotations, [1, 0, 0, 0]) / 0.8
         np.testing.assert_allclose(way[:, 0], 0, atol=1e-9)
         np.testing.assert_allclose(way[:, 3], way[:, 4], atol=1e-9)  # a hand goes with its arm
@@ -67,12 +66,12 @@ def test_a_joint_that_turns_past_the_far_side_of_the_bind_pose_does_not_jump():
     )
 
 
-def test_about_half_of_the_motions_turn_over_as_a_whole_and_start_upright(scene, toy_motion):
+def test_a_share_of_the_motions_turns_over_as_a_whole_and_starts_upright(scene, toy_motion):
     base = toy_motion(scene, 300)
-    found = perturb_motions([base], scene.character.skeleton, 60, 1)
+    found = perturb_motions([base], scene.character.skeleton, 60, 1, 0.4)
     turned = np.array([angles(motion.rotations[:, 0], base.rotations[:, 0]) for motion in found])
     over = turned.max(axis=1) > np.radians(150)
-    assert 20 <= over.sum() <= 40 and (turned[~over] < 1e-6).all()
+    assert 15 <= over.sum() <= 33 and (turned[~over] < 1e-6).all()
     assert (turned[:, 0] < np.radians(3)).all() and np.abs(np.diff(turned, axis=1)).max() < 2 * np.pi * 1.5 / 0.6 / 30
     heights = np.array([motion.translations[:, 0, 1] - base.translations[:, 0, 1] for motion in found])
     hops = heights.max(axis=1) > 0.05
@@ -80,13 +79,12 @@ def test_about_half_of_the_motions_turn_over_as_a_whole_and_start_upright(scene,
 
 
 def test_a_turn_begins_and_ends_at_rest_and_a_hop_falls_freely(monkeypatch):
-    for name, value in {"USUAL_TURN": 0, "LARGE_TURN": 0, "BLEND_PROBABILITY": 0, "TUMBLE_PROBABILITY": 1}.items():
+    for name, value in {"USUAL_TURN": 0, "LARGE_TURN": 0, "BLEND_PROBABILITY": 0, "HOP_PROBABILITY": 1}.items():
         monkeypatch.setattr(perturb, name, value)
-    monkeypatch.setattr(perturb, "HOP_PROBABILITY", 1)
     names, bind = ("Hips", "Hips/Spine"), np.tile(np.eye(4), (2, 1, 1))
     skeleton = Skeleton("/toy", names, np.array([-1, 0]), bind, bind)
     still = np.tile([1.0, 0, 0, 0], (600, 2, 1))
-    (motion,) = perturb_motions([Motion("/toy", 120.0, still, np.zeros((600, 2, 3)))], skeleton, 1, 5)
+    (motion,) = perturb_motions([Motion("/toy", 120.0, still, np.zeros((600, 2, 3)))], skeleton, 1, 5, 1.0)
     rate = angles(motion.rotations[1:, 0], motion.rotations[:-1, 0]) * 120
     assert (rate < 1e-3).mean() > 0.1 and np.abs(np.diff(rate)).max() < 1.5 < rate.max()
     assert np.array_equal(motion.rotations[:, 1], still[:, 1])

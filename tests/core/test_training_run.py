@@ -30,11 +30,13 @@ from ssilk_core.model.network import GarmentModel
 from ssilk_core.motion_bank import build_bank
 from ssilk_core.shown_skin import ShownSkin
 from ssilk_core.training import divergence, validation
+from ssilk_core.training import job as job_module
 from ssilk_core.training import run as training
 from ssilk_core.training.curve import CurvePoint, append_point, curve_path
 from ssilk_core.training.divergence import fault_path
 from ssilk_core.training.job import TrainJob, split_motions
 from ssilk_core.training.objective import Objective
+from ssilk_core.training.parts import build_parts
 from ssilk_core.training.run import train
 from ssilk_core.training.run_files import RunFiles
 from ssilk_core.training.signals import stop_on_signals
@@ -114,6 +116,21 @@ def assert_same_state(one: TrainJob, other: TrainJob) -> None:
     ]
     assert untimed[0] == untimed[1] and tensors.keys() == others.keys()
     assert all(torch.equal(value, others[name]) for name, value in tensors.items())
+
+
+def test_extra_motions_are_as_many_as_fit(job, monkeypatch):
+    whole = job("extra", replace(SHORT, recombinations=6, perturbations=3))
+    own, longer = len(whole.training_motions()), sum(motion.frame_count for motion in whole.motions)
+    assert whole.extra_motions() == (6, 3) and own == 2 * (1 + 3)  # the toy has no limbs
+    monkeypatch.setattr(job_module, "MOST_POSES", longer * whole.model.fps / whole.motions[0].fps * 5.5)
+    assert whole.extra_motions() == (3, 1)  # half of them
+    found = whole.training_motions()
+    assert len(found) == 2 * (1 + 1) and found[:2] == [*whole.motions]
+    told = []
+    build_parts(whole, torch.device("cpu"), report=told.append)
+    assert any("3 recombined and 1 perturbed" in event.text for event in told)
+    monkeypatch.setattr(job_module, "MOST_POSES", 1)
+    assert whole.training_motions() == [*whole.motions]
 
 
 def test_training_lowers_the_energy_of_held_out_motion(job):
