@@ -75,26 +75,36 @@ def build_bank(
     """
     if not motions:
         fail("motions", "none given", "at least one is needed", "name motion files with --motions")
-    clips = [resample(span, fps) for span in usable_spans(motions, fps, max_joint_speed)]
-    if not clips:
+    spans = usable_spans(motions, fps, max_joint_speed)
+    if not spans:
         fail(motions[0].path, "every motion is shorter than four frames", "longer ones are needed")
-    features = [pose_features(clip, skeleton, joints) for clip in clips]
-    matrices = [centred_matrices(clip, skeleton)[0] for clip in clips]
-    roots = [m[:, 0, :3, :3] @ skeleton.bind_transforms[0, :3, 3] + m[:, 0, :3, 3] for m in matrices]
-    ends = np.cumsum([clip.frame_count for clip in clips])
+    # In single precision clip by clip: a large bank in double precision does not fit a host.
+    parts = [_tensors(resample(span, fps), skeleton, joints) for span in spans]
+    ends = np.cumsum([len(part["root"]) for part in parts])
+    starts = np.concatenate([[0], ends[:-1]])
 
-    def tensor(arrays: list[Floats]) -> Tensor:
-        return torch.as_tensor(np.concatenate(arrays), dtype=torch.float32, device=device)
+    def joined(name: str) -> Tensor:
+        return torch.as_tensor(np.concatenate([part.pop(name) for part in parts]), device=device)
 
     return MotionBank(
-        tensor([m[:, :, :3].reshape(len(m), -1) for m in matrices]),
-        tensor(roots),
-        tensor([f.static for f in features]),
-        tensor([f.dynamic for f in features]),
-        tensor([f.down for f in features]),
-        torch.as_tensor(ends - [clip.frame_count for clip in clips], device=device),
-        torch.as_tensor(ends, device=device),
+        **{name: joined(name) for name in [*parts[0]]},
+        starts=torch.as_tensor(starts, device=device),
+        stops=torch.as_tensor(ends, device=device),
     )
+
+
+def _tensors(clip: Motion, skeleton: Skeleton, joints: np.ndarray) -> dict[str, np.ndarray]:
+    """Return what a `MotionBank` has of the frames of one clip, by name, in single precision."""
+    features, matrices = pose_features(clip, skeleton, joints), centred_matrices(clip, skeleton)[0]
+    root = matrices[:, 0, :3, :3] @ skeleton.bind_transforms[0, :3, 3] + matrices[:, 0, :3, 3]
+    values = {
+        "matrices": matrices[:, :, :3].reshape(len(matrices), -1),
+        "root": root,
+        "static": features.static,
+        "dynamic": features.dynamic,
+        "down": features.down,
+    }
+    return {name: value.astype(np.float32) for name, value in values.items()}
 
 
 def usable_spans(motions: Sequence[Motion], fps: float, max_joint_speed: float = np.inf) -> list[Motion]:

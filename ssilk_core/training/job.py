@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from .perturb import perturb_motions
 from .recombine import recombine_motions
 from .state import json_round_trip, scene_digest
 
-MOST_POSES = 1_000_000  # of all training motions, some 5 GB; only extra motions are left out for it
+MOST_POSES = 1_000_000  # of all training motions at the model's rate; only extra motions are left out for it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,11 +77,11 @@ class TrainJob:
 
     def extra_motions(self) -> tuple[int, int]:
         """Return how many motions are recombined from each, and how many are perturbed, so that all poses fit."""
-        wanted = self.train.recombinations, self.train.perturbations
+        recombined, perturbed = self.train.recombinations, self.train.perturbations
         poses = sum(motion.frame_count / motion.fps for motion in self.motions) * self.model.fps
-        fitting = max(0.0, MOST_POSES / poses - 1)
-        recombinations, perturbations = (int(count * min(1.0, fitting / max(1, sum(wanted)))) for count in wanted)
-        return recombinations, perturbations
+        fitting = min(recombined + perturbed, int(max(0.0, MOST_POSES / max(1.0, poses) - 1)))
+        perturbed = ceil(fitting * perturbed / max(1, recombined + perturbed))
+        return fitting - perturbed, perturbed
 
     def training_motions(self) -> list[Motion]:
         """Return the motions, and those recombined from them and perturbed."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motions with joints turned at random, nearer to the bind pose, or turning over, for what few clips hold.
+"""Motions with joints turned at random, nearer to the bind pose, or turning over, as few clips have them.
 
 Random turns stand for falls and glitches of motion capture. Many joints near the bind pose at once, such as the
 spine, the shoulders and the hands, stand for motions that are keyed by hand. Where the whole body turns over, as in
@@ -15,7 +15,7 @@ import numpy as np
 
 from ..assets import Floats, Ints, Motion, Skeleton
 from ..constants import GRAVITY
-from ..kinematics import bind_pose, multiply_quaternions, slerp
+from ..kinematics import bind_pose, matrix_from_quaternion, motion_transforms, multiply_quaternions, slerp
 from .recombine import limb_joints
 
 USUAL_TURN, LARGE_TURN = np.radians(12), np.radians(35)  # standard deviation about each axis
@@ -26,8 +26,8 @@ FADING_ANGLE = np.radians(120)  # from the bind pose; beyond it a joint goes les
 SLOWEST, FASTEST = 0.1, 0.7  # [Hz] of the turns and blends
 TUMBLE_SECONDS = 0.6, 1.6  # [s] that a turn takes, and that lie between two turns
 HOP_PROBABILITY = 0.5  # that the root flies freely in a turn
-FLIGHT_SECONDS = 0.3, 0.8  # [s]
-PUSH_SECONDS = 0.2  # [s] in which the ground speeds the root up, and slows it down again
+FLIGHT_SECONDS = 0.4, 0.9  # [s] from the middle of the push to that of the landing
+PUSH_SECONDS = 0.2  # [s] in which the ground speeds the body up, and slows it down again
 
 
 def perturb_motions(
@@ -36,12 +36,12 @@ def perturb_motions(
     """Return `copies` of each motion with slow random turns of every joint but the root, about random axes.
 
     About half of the copies then go to and fro between these poses and the bind pose, each limb its own part of the
-    way. A share `tumbling` turns over as a whole, about the root joint, again and again.
+    way. A share `tumbling` turns as a whole, about the middle of its joints and random axes, again and again.
     """
     generator = np.random.default_rng(seed)
     bind, limbs = bind_pose(skeleton)[0], limb_joints(skeleton)
     found = [_perturbed(motion, bind, limbs, generator) for motion in [*motions] * copies]
-    return [_tumbling(motion, generator) if generator.random() < tumbling else motion for motion in found]
+    return [_tumbling(motion, skeleton, generator) if generator.random() < tumbling else motion for motion in found]
 
 
 def _perturbed(motion: Motion, bind: Floats, limbs: Sequence[Ints], generator: np.random.Generator) -> Motion:
@@ -51,26 +51,32 @@ def _perturbed(motion: Motion, bind: Floats, limbs: Sequence[Ints], generator: n
     return replace(motion, path=f"{motion.path} perturbed", rotations=rotations)
 
 
-def _tumbling(motion: Motion, generator: np.random.Generator) -> Motion:
-    """Return a motion whose root turns over about random axes, and at times flies freely meanwhile."""
-    rotations, translations = motion.rotations.copy(), motion.translations.copy()
+def _tumbling(motion: Motion, skeleton: Skeleton, generator: np.random.Generator) -> Motion:
+    """Return a motion that turns as a whole, once and again, and at times flies freely meanwhile."""
     time, start = np.arange(motion.frame_count) / motion.fps, generator.uniform(0, TUMBLE_SECONDS[1])
+    turn, height = np.tile([1.0, 0, 0, 0], (motion.frame_count, 1)), np.zeros(motion.frame_count)
     while start < time[-1]:
         lasts, axis = generator.uniform(*TUMBLE_SECONDS), generator.normal(size=3)
         part = ((time - start) / lasts).clip(0, 1)
         angle = 2 * np.pi * part**2 * (3 - 2 * part)  # ends as it began, at rest
-        turn = _quaternions(angle[:, None] * axis / np.linalg.norm(axis))
-        rotations[:, 0] = multiply_quaternions(turn, rotations[:, 0])
+        turn = multiply_quaternions(_quaternions(angle[:, None] * axis / np.linalg.norm(axis)), turn)
         if generator.random() < HOP_PROBABILITY:
             flight = generator.uniform(*FLIGHT_SECONDS)
-            translations[:, 0, 1] += _hop(time - start - (lasts - flight) / 2, flight)
+            height += _hop(time - start - (lasts - flight) / 2, flight)
         start += lasts + generator.uniform(*TUMBLE_SECONDS)
+    rotations, translations = motion.rotations.copy(), motion.translations.copy()
+    middle = motion_transforms(motion, skeleton.parents)[:, :, :3, 3].mean(axis=1)
+    for root in np.flatnonzero(skeleton.parents < 0):
+        rotations[:, root] = multiply_quaternions(turn, rotations[:, root])
+        away = matrix_from_quaternion(turn) @ (translations[:, root] - middle)[..., None]
+        translations[:, root] = middle + away[..., 0]
+        translations[:, root, 1] += height
     return replace(motion, rotations=rotations, translations=translations)
 
 
 def _hop(time: Floats, flight: float) -> Floats:
-    """Return heights [m] at times since a take-off whose flight lasts so long, with pushes before and after [s]."""
-    since = time[:, None] + np.linspace(-0.5, 0.5, 9) * PUSH_SECONDS
+    """Return heights [m] at times since the middle of a push [s] from which the body flies so long."""
+    since = time[:, None] + np.linspace(-0.5, 0.5, 65) * PUSH_SECONDS
     return (0.5 * GRAVITY * since * (flight - since)).clip(min=0).mean(axis=1)
 
 

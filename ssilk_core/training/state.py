@@ -29,8 +29,8 @@ from .validation import Score
 
 Tensors = dict[str, Tensor]
 
-# Of training states; 1: other names, 2 to 4, 9, 10: other contact, 5, 6: other groups, 7, 8: other settings.
-FORMAT = 11
+# Of training states; 1: other names, 2 to 4, 9, 10: other contact, 5, 6: other groups, 7, 8, 11: other settings.
+FORMAT = 12
 HEADER_NAME = "ssilk_state"  # of the JSON document in the metadata
 SAMPLER_PREFIX = "sampler."  # of the sampler's tensors; all others are parameters or optimiser state
 

@@ -122,6 +122,22 @@ def test_a_frame_that_does_not_gain_lifts_cloth_that_lies_less_deep(monkeypatch,
     assert all(later <= DEPTH / 2 for later in depths[1:]) and DEPTH / 4 < SHALLOWEST
 
 
+def test_a_frame_that_gains_goes_on_however_little_is_left(monkeypatch, shell):
+    potential, inputs = at_rest(shell)
+    clearing, x = SkinClearing(shell, potential), dented(shell, 2)
+    step, rounds = clearing._step, []
+
+    def short_step(state, inputs, lifts):
+        rounds.append(lifts.shown.item())
+        return 0.7 * step(state, inputs, lifts)
+
+    monkeypatch.setattr(clearing, "_step", short_step)
+    monkeypatch.setattr(module, "SHALLOWEST", 1.0)  # all cloth lies less deep
+    found = clearing.lift(x, inputs, torch.full((1,), torch.inf))
+    assert len(rounds) > 1 and rounds[1] < rounds[0]
+    assert clearing._lifts(found, inputs.body).shown.item() < 0.5 * rounds[1]
+
+
 def test_a_round_gains_where_enough_of_what_asks_is_covered(monkeypatch, shell):
     potential, inputs = at_rest(shell)
     clearing, x, unbounded = SkinClearing(shell, potential), dented(shell, 2), torch.full((1,), torch.inf)

@@ -1,12 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Perturbed motions, and the loss in which poses without good states count less."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from ssilk_core.assets import Motion, Skeleton
-from ssilk_core.kinematics import local_transforms, quaternion_from_matrix
+from ssilk_core.kinematics import (
+    local_transforms,
+    matrix_from_quaternion,
+    motion_transforms,
+    multiply_quaternions,
+    quaternion_from_matrix,
+)
 from ssilk_core.training import perturb
 from ssilk_core.training.objective import REGULARIZATION, total
 from ssilk_core.training.perturb import perturb_motions
@@ -67,29 +75,64 @@ def test_a_joint_that_turns_past_the_far_side_of_the_bind_pose_does_not_jump():
 
 
 def test_a_share_of_the_motions_turns_over_as_a_whole_and_starts_upright(scene, toy_motion):
-    base = toy_motion(scene, 300)
+    base, parents = toy_motion(scene, 300), scene.character.skeleton.parents
     found = perturb_motions([base], scene.character.skeleton, 60, 1, 0.4)
     turned = np.array([angles(motion.rotations[:, 0], base.rotations[:, 0]) for motion in found])
     over = turned.max(axis=1) > np.radians(150)
     assert 15 <= over.sum() <= 33 and (turned[~over] < 1e-6).all()
     assert (turned[:, 0] < np.radians(3)).all() and np.abs(np.diff(turned, axis=1)).max() < 2 * np.pi * 1.5 / 0.6 / 30
-    heights = np.array([motion.translations[:, 0, 1] - base.translations[:, 0, 1] for motion in found])
-    hops = heights.max(axis=1) > 0.05
-    assert (hops <= over).all() and 0 < hops.sum() <= over.sum() and (heights >= 0).all() and heights.max() < 0.8
+    back = base.rotations[:, 0] * [1, -1, -1, -1]
+    turns = (multiply_quaternions(motion.rotations[:, 0], back) for motion, turns in zip(found, over) if turns)
+    lowest = np.array([matrix_from_quaternion(turn)[:, 1, 1].min() for turn in turns])
+    assert (lowest < -0.5).mean() > 0.5  # upside down
+    middle = np.array([motion_transforms(motion, parents)[:, :, :3, 3].mean(axis=1) for motion in found])
+    moved = middle - np.array(
+        [motion_transforms(straight(m, base), parents)[:, :, :3, 3].mean(axis=1) for m in found]
+    )
+    np.testing.assert_allclose(moved[..., [0, 2]], 0, atol=1e-9)  # about the middle
+    aloft = moved[..., 1] > 1e-3
+    assert not aloft[~over].any() and 0.05 < aloft[over].mean() < 0.4 and (moved[..., 1] > -1e-9).all()
 
 
-def test_a_turn_begins_and_ends_at_rest_and_a_hop_falls_freely(monkeypatch):
+def straight(motion: Motion, base: Motion) -> Motion:
+    """The motion with its root as it was before it turned."""
+    rotations, translations = motion.rotations.copy(), motion.translations.copy()
+    rotations[:, 0], translations[:, 0] = base.rotations[:, 0], base.translations[:, 0]
+    return replace(motion, rotations=rotations, translations=translations)
+
+
+@pytest.fixture
+def tumbled(monkeypatch) -> Motion:
+    """A motion of four seconds at 120 Hz that turns, hops, and does nothing else; it faces sideways."""
     for name, value in {"USUAL_TURN": 0, "LARGE_TURN": 0, "BLEND_PROBABILITY": 0, "HOP_PROBABILITY": 1}.items():
         monkeypatch.setattr(perturb, name, value)
     names, bind = ("Hips", "Hips/Spine"), np.tile(np.eye(4), (2, 1, 1))
     skeleton = Skeleton("/toy", names, np.array([-1, 0]), bind, bind)
-    still = np.tile([1.0, 0, 0, 0], (600, 2, 1))
-    (motion,) = perturb_motions([Motion("/toy", 120.0, still, np.zeros((600, 2, 3)))], skeleton, 1, 5, 1.0)
-    rate = angles(motion.rotations[1:, 0], motion.rotations[:-1, 0]) * 120
+    (motion,) = perturb_motions([Motion("/toy", 120.0, SIDEWAYS, np.zeros((480, 2, 3)))], skeleton, 1, 5, 1.0)
+    return motion
+
+
+SIDEWAYS = np.tile([np.sqrt(0.5), 0, np.sqrt(0.5), 0], (480, 2, 1))
+
+
+def test_a_turn_begins_and_ends_at_rest_and_has_an_axis_of_the_world(tumbled):
+    root = tumbled.rotations[:, 0]
+    rate = angles(root[1:], root[:-1]) * 120
     assert (rate < 1e-3).mean() > 0.1 and np.abs(np.diff(rate)).max() < 1.5 < rate.max()
-    assert np.array_equal(motion.rotations[:, 1], still[:, 1])
-    fall = np.diff(motion.translations[:, 0, 1], 2) * 120**2
-    assert (np.abs(fall + 9.81) < 1e-6).sum() > 36 and fall.min() > -9.82 and fall.max() < 60
+    assert np.array_equal(tumbled.rotations[:, 1], SIDEWAYS[:, 1])
+    first = slice(np.flatnonzero(rate > 1e-3)[0], np.flatnonzero(rate > 1e-3)[0] + 30)
+    turn = multiply_quaternions(root[first], SIDEWAYS[first, 0] * [1, -1, -1, -1])  # beside what was before
+    axes = turn[5:, 1:] / np.linalg.norm(turn[5:, 1:], axis=-1, keepdims=True)
+    np.testing.assert_allclose(axes, np.tile(axes[:1], (len(axes), 1)), atol=1e-6)
+
+
+def test_a_hop_falls_freely_in_the_middle_of_a_turn(tumbled):
+    height, turned = tumbled.translations[:, 0, 1], angles(tumbled.rotations[:, 0], SIDEWAYS[:, 0])
+    fall = np.diff(height, 2) * 120**2
+    flies, pushed = np.abs(fall + 9.81) < 1e-6, fall > 1e-6
+    assert flies.sum() / 120 > 0.2 and fall.min() > -9.82 and 5 < fall.max() < 45 and pushed.sum() / 120 > 0.1
+    top = height.argmax()
+    assert turned[top] > np.radians(170) and height[top] > 0.5 * 9.81 * 0.2**2 - 0.03
 
 
 def angles(p, q):

@@ -123,14 +123,25 @@ def test_extra_motions_are_as_many_as_fit(job, monkeypatch):
     own, longer = len(whole.training_motions()), sum(motion.frame_count for motion in whole.motions)
     assert whole.extra_motions() == (6, 3) and own == 2 * (1 + 3)  # the toy has no limbs
     monkeypatch.setattr(job_module, "MOST_POSES", longer * whole.model.fps / whole.motions[0].fps * 5.5)
-    assert whole.extra_motions() == (3, 1)  # half of them
+    assert whole.extra_motions() == (2, 2)  # four of nine, a third of them perturbed, or a little more
     found = whole.training_motions()
-    assert len(found) == 2 * (1 + 1) and found[:2] == [*whole.motions]
+    assert len(found) == 2 * (1 + 2) and found[:2] == [*whole.motions]
     told = []
     build_parts(whole, torch.device("cpu"), report=told.append)
-    assert any("3 recombined and 1 perturbed" in event.text for event in told)
-    monkeypatch.setattr(job_module, "MOST_POSES", 1)
-    assert whole.training_motions() == [*whole.motions]
+    assert any("2 recombined and 2 perturbed" in event.text for event in told)
+    few = job("few", replace(SHORT, recombinations=3, perturbations=1))
+    for copies, expected in ((4.99, (2, 1)), (2.0, (0, 1)), (1.99, (0, 0))):
+        monkeypatch.setattr(job_module, "MOST_POSES", longer * whole.model.fps / whole.motions[0].fps * copies)
+        assert few.extra_motions() == expected
+    assert few.training_motions() == [*few.motions]
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_a_share_of_the_perturbed_motions_turns_over(job, share):
+    whole = job("tumbling", replace(SHORT, perturbations=4, tumbling=share))
+    own = [motion.rotations[:, 0] for motion in whole.motions] * 5
+    same = [np.allclose(motion.rotations[:, 0], root) for motion, root in zip(whole.training_motions(), own)]
+    assert all(same[:2]) and all(same[2:]) == (not share) and any(same[2:]) == (not share)
 
 
 def test_training_lowers_the_energy_of_held_out_motion(job):

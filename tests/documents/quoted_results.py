@@ -94,9 +94,7 @@ def opening() -> Text:
     yield f"within\n  {settling['settling_time']:.2f} s. It then stands {milli_1(settling['static_distance'])} mm"
     yield f"{lower('total_excess')['ncs']} of {len(CELLS)} cells"
     found = {**result("shown_skin_hands"), **result("shown_skin_shipped")}
-    tests = [
-        share_1(found[name]["test"]["network"]["pierced"]) for name in ("cape", "fringe_skirt", "hooded_dress")
-    ]
+    tests = [share_1(found[name]["test"]["network"]["pierced"]) for name in ("cape", "fringe_skirt", "hooded_dress")]
     yield (
         f"In {tests[0]} % of the frames of `test` a limb is through the cape that ships, in {tests[1]} % through the "
         f"skirt and in {tests[2]} % through the dress"
