@@ -184,3 +184,17 @@ def test_commands_are_those_of_the_command_line():
     assert ours
     for words in ours:
         parser().parse_args(words[1:])
+
+
+def anchors(text: str) -> set[str]:
+    """Return the anchors of a document's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.+)$", re.sub(r"```.*?```", "", text, flags=re.DOTALL), flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("document", QUOTED)
+def test_links_to_headings_find_them(document):
+    path = ROOT / document
+    for name, anchor in re.findall(r"\]\(([^)\s#:]*)#([^)\s]+)\)", path.read_text()):
+        target = path.parent / name if name else path
+        assert anchor in anchors(target.read_text()), f"{document}: no heading {name}#{anchor}"
