@@ -79,7 +79,7 @@ def build_bank(
     if not spans:
         fail(motions[0].path, "every motion is shorter than four frames", "longer ones are needed")
     # In single precision clip by clip: a large bank in double precision does not fit a host.
-    parts = [_tensors(resample(span, fps), skeleton, joints) for span in spans]
+    parts = [_arrays(resample(span, fps), skeleton, joints) for span in spans]
     ends = np.cumsum([len(part["root"]) for part in parts])
     starts = np.concatenate([[0], ends[:-1]])
 
@@ -93,7 +93,7 @@ def build_bank(
     )
 
 
-def _tensors(clip: Motion, skeleton: Skeleton, joints: np.ndarray) -> dict[str, np.ndarray]:
+def _arrays(clip: Motion, skeleton: Skeleton, joints: np.ndarray) -> dict[str, np.ndarray]:
     """Return what a `MotionBank` has of the frames of one clip, by name, in single precision."""
     features, matrices = pose_features(clip, skeleton, joints), centred_matrices(clip, skeleton)[0]
     root = matrices[:, 0, :3, :3] @ skeleton.bind_transforms[0, :3, 3] + matrices[:, 0, :3, 3]

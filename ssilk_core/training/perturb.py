@@ -25,7 +25,7 @@ WHOLE_PROBABILITY = 0.5  # that a limb of a blended motion goes all the way; oth
 FADING_ANGLE = np.radians(120)  # from the bind pose; beyond it a joint goes less far, and at 180 degrees not at all
 SLOWEST, FASTEST = 0.1, 0.7  # [Hz] of the turns and blends
 TUMBLE_SECONDS = 0.6, 1.6  # [s] that a turn takes, and that lie between two turns
-HOP_PROBABILITY = 0.5  # that the root flies freely in a turn
+HOP_PROBABILITY = 0.5  # that the body flies freely in a turn
 FLIGHT_SECONDS = 0.4, 0.9  # [s] from the middle of the push to that of the landing
 PUSH_SECONDS = 0.2  # [s] in which the ground speeds the body up, and slows it down again
 

@@ -85,13 +85,15 @@ def test_a_share_of_the_motions_turns_over_as_a_whole_and_starts_upright(scene, 
     turns = (multiply_quaternions(motion.rotations[:, 0], back) for motion, turns in zip(found, over) if turns)
     lowest = np.array([matrix_from_quaternion(turn)[:, 1, 1].min() for turn in turns])
     assert (lowest < -0.5).mean() > 0.5  # upside down
-    middle = np.array([motion_transforms(motion, parents)[:, :, :3, 3].mean(axis=1) for motion in found])
-    moved = middle - np.array(
-        [motion_transforms(straight(m, base), parents)[:, :, :3, 3].mean(axis=1) for m in found]
-    )
+    moved = np.array([middle(motion, parents) - middle(straight(motion, base), parents) for motion in found])
     np.testing.assert_allclose(moved[..., [0, 2]], 0, atol=1e-9)  # about the middle
     aloft = moved[..., 1] > 1e-3
     assert not aloft[~over].any() and 0.05 < aloft[over].mean() < 0.4 and (moved[..., 1] > -1e-9).all()
+
+
+def middle(motion: Motion, parents: np.ndarray) -> np.ndarray:
+    """The mean place of the joints in each frame, shape (F, 3)."""
+    return motion_transforms(motion, parents)[:, :, :3, 3].mean(axis=1)
 
 
 def straight(motion: Motion, base: Motion) -> Motion:
@@ -99,6 +101,9 @@ def straight(motion: Motion, base: Motion) -> Motion:
     rotations, translations = motion.rotations.copy(), motion.translations.copy()
     rotations[:, 0], translations[:, 0] = base.rotations[:, 0], base.translations[:, 0]
     return replace(motion, rotations=rotations, translations=translations)
+
+
+SIDEWAYS = np.tile([np.sqrt(0.5), 0, np.sqrt(0.5), 0], (480, 2, 1))
 
 
 @pytest.fixture
@@ -110,9 +115,6 @@ def tumbled(monkeypatch) -> Motion:
     skeleton = Skeleton("/toy", names, np.array([-1, 0]), bind, bind)
     (motion,) = perturb_motions([Motion("/toy", 120.0, SIDEWAYS, np.zeros((480, 2, 3)))], skeleton, 1, 5, 1.0)
     return motion
-
-
-SIDEWAYS = np.tile([np.sqrt(0.5), 0, np.sqrt(0.5), 0], (480, 2, 1))
 
 
 def test_a_turn_begins_and_ends_at_rest_and_has_an_axis_of_the_world(tumbled):

@@ -275,11 +275,16 @@ def kept_at(run: dict) -> tuple[int, str]:
     return best, f"{run['iterations'][best]:,} of {run['iterations'][-1]:,}"
 
 
+def beside_solver(name: str, split: str) -> dict:
+    """Return the figures of a network that ships, measured beside the solver on the clips of a split."""
+    rows = document(f"evaluate_solver_{name}")["figures"]
+    (found,) = (line["figures"] for line in rows if (line["method"], line["split"]) == ("ssilk", split))
+    return found
+
+
 def from_solver(name: str, split: str) -> dict:
     """Return how far the network is from the solver that starts from its own states, on the clips of a split."""
-    rows = document(f"evaluate_solver_{name}")["figures"]
-    (found,) = (line["figures"]["solver"] for line in rows if (line["method"], line["split"]) == ("ssilk", split))
-    return found
+    return beside_solver(name, split)["solver"]
 
 
 def from_own_start() -> Text:
@@ -628,25 +633,17 @@ def bind_pose_training() -> Text:
     assert train.iterations == cape["iterations"][-1] == skirt["iterations"][-1]
 
 
-def least_total(run: dict) -> float:
-    return min(run["total"])
-
-
-def last_iteration(run: dict) -> int:
-    return run["iterations"][-1]
-
-
 def tumbling_training() -> Text:
     runs, skin = result("tumbling_training"), result("shown_skin_tumbling")
     times = [run["seconds"][-1] / 60 for run in runs.values()]
     yield f"for {min(times):.0f} to {max(times):.0f} minutes of steps"
     for name, run in runs.items():
         yield training_row(run, tumbling_name(name))
-    one, two = (-min(runs[f"cape_seed_{seed}"]["total"]) for seed in (1, 2))
-    was_one = -min(result("long_decay_training")["cape_half_rate_decay"]["total"])
-    was_two, iterations = (f(result("bind_pose_training")["cape_seed_2"]) for f in (least_total, last_iteration))
-    yield f"The best of seed 2 is −{two:.4f} J, and without such motions it was −{-was_two:.4f} J, in {iterations:,}"
-    yield f"that of seed 1 is −{one:.4f} J, not −{was_one:.4f} J"
+    before = result("long_decay_training")["cape_half_rate_decay"], result("bind_pose_training")["cape_seed_2"]
+    was_one, was_two = (fixed(min(run["total"]), 4) for run in before)
+    one, two = (fixed(min(runs[f"cape_seed_{seed}"]["total"]), 4) for seed in (1, 2))
+    yield f"The best of seed 2 is {two} J, and without such motions it was {was_two} J, in"
+    yield f"{before[1]['iterations'][-1]:,} iterations; that of seed 1 is {one} J, not {was_one} J"
     last = {name: run["total"][-1] - min(run["total"]) for name, run in runs.items()}
     capes = [milli_1(rise) for name, rise in last.items() if "cape" in name]
     yield "After their best the capes rise by {}, {} and {} mJ".format(*capes)
@@ -659,17 +656,15 @@ def tumbling_training() -> Text:
             cells_of = [found[split]["network"] for split in HELD_OUT]
             pairs = (f"{share_3(at['mean'])}, {share_1(at['worst'])}" for at in cells_of)
             yield row(TUMBLING[name], *pairs, *(f"{at['stretch']:.2f}" for at in cells_of[:2]))
-    for name, of, words in (("tshirt_more_motions", "mean", "{} to {} % on `test`"),
-                            ("tshirt_more_motions", "worst", "worst frame from {} to {} %")):  # fmt: skip
-        form = share_3 if of == "mean" else share_1
-        yield words.format(*(form(skin[each]["test"]["network"][of]) for each in ("tshirt", name)))
+    shirts = [skin[name]["test"]["network"] for name in ("tshirt", "tshirt_more_motions")]
+    yield "{} to {} % on `test`".format(*(share_3(at["mean"]) for at in shirts))
+    yield "worst frame from {} to {} %".format(*(share_1(at["worst"]) for at in shirts))
     tight = {"tshirt_more_motions", "long_sleeve", "pants"}
     for split, goal in (("valid", 0.0005), ("test", 0.0005), ("flips", 0.003)):
         assert all(skin[name][split]["network"]["mean"] <= goal for name in tight), "the document says so"
     capes = [skin[f"cape_{each}"]["test"]["network"]["mean"] for each in ("more_motions", "seed_1")]
     yield "shows {} % on `test`, that of seed 1 shows {} %".format(*map(share_3, capes))
-    now, then = (found["hooded_dress" + words] for found, words in (
-        (result("shown_skin_shipped"), ""), (result("shown_skin_refined"), "_before")))  # fmt: skip
+    now, then = result("shown_skin_shipped")["hooded_dress"], result("shown_skin_refined")["hooded_dress_before"]
     flips = (share_3(dress["flips"]["network"]["mean"]) for dress in (now, then))
     yield "on flips it shows {} % of the skin, the one that shipped before {} %".format(*flips)
     worst = (share_1(dress["test"]["network"]["worst"]) for dress in (now, then))
@@ -706,17 +701,13 @@ def tumbling_name(name: str) -> str:
 
 def tumbling_flips() -> Text:
     found = {(at["model"], at["split"]): at for at in result("evaluate_solver_tumbling")}
-    before = {name: document(f"evaluate_solver_{name}")["figures"] for name in LOOSE}
     shots = ("after 5 [mm]", *AFTER[1:])
     yield row("training", "energy [J]", "inertia [J]", "jerk", *shots, "velocity [m/s]", "LBS")
     for name in result("tumbling_training"):
         yield flips_row(tumbling_name(name), found[name, "flips"])
     for garment in ("cape", "fringe_skirt"):
-        (own,) = (
-            line["figures"] for line in before[garment] if (line["method"], line["split"]) == ("ssilk", "flips")
-        )
-        flat = {**own, "inertia": own["terms"]["inertia"]}
-        yield flips_row(f"{garment.replace('_', ' ')} that ships", flat)
+        own = beside_solver(garment, "flips")
+        yield flips_row(f"{garment.replace('_', ' ')} that ships", {**own, "inertia": own["terms"]["inertia"]})
     test, ships = found["cape_more_motions", "test"]["solver"], from_solver("cape", "test")
     yield "is {}, {}, {} and {} mm away".format(*(milli(value) for value in test["position_error"]))
     yield f"{test['velocity_error']:.2f} m/s off"
@@ -1064,8 +1055,7 @@ PARTS = (
     findings, dynamics,
     ablations,
     wardrobe, long_training, long_decay_training, bind_pose_training, tumbling_training,
-    limits_training,
-    final_training, rest, playing, sizes, levels_and_simulator, levels_on_gpu,
+    limits_training, final_training, rest, playing, sizes, levels_and_simulator, levels_on_gpu,
     network_sizes, refinement,
     inside_the_body, stress,
     training_speed, scenes,
